@@ -1,0 +1,2 @@
+//! The `plantctl` command.
+fn main() {}

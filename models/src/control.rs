@@ -1,0 +1,1 @@
+//! Linear-quadratic control on the discrete map.

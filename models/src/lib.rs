@@ -1,0 +1,27 @@
+//! The mechanics of plantd: scenes, models, the midpoint variational integrator, its exact
+//! linearization, and linear-quadratic control on it.
+//!
+//! ```text
+//! Scene (what a person writes) --compile--> Model (immutable, shared)
+//!                                             |
+//!                              Plant { Arc<Model>, state, workspace }
+//!                                             |
+//!                    step(u) -> StepReport      linearize(u) -> Linearization
+//! ```
+//!
+//! A step solves the forced, constrained discrete Euler-Lagrange equations of Johnson, Schultz and
+//! Murphey, "Structured Linearization of Discrete Mechanical Systems for Analysis and Optimal
+//! Control" (IEEE T-ASE 12(1), 2015). Units are SI, angles are radians.
+
+pub mod builtin;
+pub mod control;
+mod model;
+mod plant;
+pub mod scene;
+
+pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
+pub use plant::{
+    Energy, ForceSplit, Initial, InitialError, Linearization, Plant, Settings, Snapshot,
+    SnapshotError, State, StepError, StepReport,
+};
+pub use scene::{Problem, Scene, SceneError};

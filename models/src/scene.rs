@@ -1,0 +1,332 @@
+//! Scenes: the declarative description of a mechanism, in TOML or JSON.
+//!
+//! All quantities are SI; angles are radians. Unknown keys are errors. [`crate::Model::compile`]
+//! reports every error of a scene at once, each with its path.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A mechanism: a tree of frames with joints and bodies, what acts on it, and what constrains it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Scene {
+    /// Version of the scene format; 1.
+    pub format: u32,
+    /// Name: lower-case letters, digits and hyphens.
+    pub name: String,
+    /// One sentence for people.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub description: String,
+    /// Suggested time step, seconds.
+    #[serde(default = "default_time_step")]
+    pub time_step_s: f64,
+    /// Acceleration of gravity, world axes, m/s².
+    #[serde(default)]
+    pub gravity: [f64; 3],
+    /// Damping of every dynamic coordinate that does not set its own, N·s/m or N·m·s/rad.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub damping: f64,
+    /// The frames. A parent may come before or after its children.
+    pub frames: Vec<Frame>,
+    /// Settings of coordinates. Prescribed coordinates must be listed here and keep this order;
+    /// dynamic ones only if they need a setting: their order is that of the frames, depth first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub coordinates: Vec<Coordinate>,
+    /// Springs.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub springs: Vec<Spring>,
+    /// Generalized-force inputs, in the order of the input vector.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub inputs: Vec<Input>,
+    /// Holonomic constraints.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub constraints: Vec<Constraint>,
+    /// Named configurations to hold, linearize or regulate about.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub operating_points: Vec<OperatingPoint>,
+}
+
+fn default_time_step() -> f64 {
+    0.01
+}
+fn is_zero(x: &f64) -> bool {
+    *x == 0.0
+}
+
+/// A frame, placed in its parent; its joint moves it away from there.
+///
+/// `pose = parent pose * translation * rotation * joint(coordinate)`
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Frame {
+    /// Name, unique in the scene; `world` is taken.
+    pub name: String,
+    /// Name of the parent frame.
+    #[serde(default = "world", skip_serializing_if = "is_world")]
+    pub parent: String,
+    /// Origin in the parent's axes, m.
+    #[serde(default, skip_serializing_if = "is_zero3")]
+    pub translation: [f64; 3],
+    /// Orientation in the parent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rotation: Option<Rotation>,
+    /// Joint; none means: fixed in the parent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joint: Option<Joint>,
+    /// Rigid body fixed in the frame.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub body: Option<Body>,
+}
+
+fn world() -> String {
+    "world".to_owned()
+}
+fn is_world(name: &str) -> bool {
+    name == "world"
+}
+fn is_zero3(v: &[f64; 3]) -> bool {
+    *v == [0.0; 3]
+}
+
+/// An orientation.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Rotation {
+    /// Unit quaternion `[w, x, y, z]`; normalised if it is within 1e-6 of unit length.
+    Quaternion([f64; 4]),
+    /// Rotation matrix, rows.
+    Matrix([[f64; 3]; 3]),
+    /// Roll, pitch, yaw about the fixed x, y, z axes: `Rz(yaw) Ry(pitch) Rx(roll)`, rad.
+    Rpy([f64; 3]),
+}
+
+/// A joint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Joint {
+    /// No motion.
+    Fixed {},
+    /// Turns about an axis through the frame's origin; positive by the right hand.
+    Revolute {
+        /// Axis in the frame; need not have unit length.
+        axis: [f64; 3],
+        /// Coordinate, rad; the frame's name if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+    },
+    /// Slides along an axis.
+    Prismatic {
+        /// Axis in the frame; need not have unit length.
+        axis: [f64; 3],
+        /// Coordinate, m; the frame's name if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+    },
+}
+
+/// A rigid body.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Body {
+    /// Mass, kg; zero is allowed where there is inertia elsewhere.
+    pub mass: f64,
+    /// Centre of mass in the frame, m.
+    #[serde(default, skip_serializing_if = "is_zero3")]
+    pub center_of_mass: [f64; 3],
+    /// Inertia about the centre of mass in the frame's axes,
+    /// `[ixx, iyy, izz]` or `[ixx, iyy, izz, ixy, ixz, iyz]`, kg·m². None means a point mass.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub inertia: Vec<f64>,
+}
+
+/// Settings of a coordinate.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Coordinate {
+    /// Name.
+    pub name: String,
+    /// Dynamic or prescribed.
+    #[serde(default)]
+    pub kind: CoordinateKind,
+    /// Value in the initial configuration, m or rad.
+    #[serde(default)]
+    pub initial: f64,
+    /// Damping, N·s/m or N·m·s/rad; not given means the scene's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub damping: Option<f64>,
+}
+
+/// Who moves a coordinate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum CoordinateKind {
+    /// The dynamics.
+    #[default]
+    Dynamic,
+    /// The input, position by position. May drive a joint, lengths of constraints, or both.
+    Prescribed,
+}
+
+/// A point fixed in a frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Point {
+    /// Frame name, or `world`.
+    pub frame: String,
+    /// Position in the frame, m.
+    #[serde(default, skip_serializing_if = "is_zero3")]
+    pub at: [f64; 3],
+}
+
+/// A linear spring.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Spring {
+    /// `V = ½ stiffness (|a − b| − rest_length)²`.
+    TwoPoint {
+        /// One end.
+        a: Point,
+        /// Other end.
+        b: Point,
+        /// N/m.
+        stiffness: f64,
+        /// m.
+        #[serde(default)]
+        rest_length: f64,
+    },
+    /// `V = ½ stiffness (q − rest)²`.
+    Coordinate {
+        /// Coordinate.
+        coordinate: String,
+        /// N/m or N·m/rad.
+        stiffness: f64,
+        /// m or rad.
+        #[serde(default)]
+        rest: f64,
+    },
+}
+
+/// A generalized force `gain · u` on one dynamic coordinate.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Input {
+    /// Name.
+    pub name: String,
+    /// Coordinate on which it acts.
+    pub coordinate: String,
+    /// Factor.
+    #[serde(default = "one")]
+    pub gain: f64,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+/// A holonomic constraint `h(q) = 0`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Constraint {
+    /// `h = |a − b|² − length²`.
+    Distance {
+        /// Name, unique among constraints.
+        name: String,
+        /// One end.
+        a: Point,
+        /// Other end.
+        b: Point,
+        /// Length.
+        length: Length,
+    },
+    /// `h = (a − b)·e` for each listed world axis `e`.
+    PointToPoint {
+        /// Name, unique among constraints.
+        name: String,
+        /// One point.
+        a: Point,
+        /// Other point.
+        b: Point,
+        /// One to three different axes.
+        axes: Vec<Axis>,
+    },
+}
+
+/// Length of a distance constraint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case", deny_unknown_fields, untagged)]
+pub enum Length {
+    /// Fixed, m; greater than zero.
+    Fixed(f64),
+    /// Name of a prescribed coordinate.
+    Coordinate(String),
+}
+
+/// A world axis.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Axis {
+    /// x.
+    X,
+    /// y.
+    Y,
+    /// z.
+    Z,
+}
+
+/// A named configuration, held at rest.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct OperatingPoint {
+    /// Name.
+    pub name: String,
+    /// Coordinates that differ from the initial configuration.
+    #[serde(default)]
+    pub coordinates: std::collections::BTreeMap<String, f64>,
+    /// Inputs that are not zero.
+    #[serde(default, skip_serializing_if = "std::collections::BTreeMap::is_empty")]
+    pub inputs: std::collections::BTreeMap<String, f64>,
+}
+
+/// One error of a scene.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Problem {
+    /// Where, for example `frames[3].body.mass`.
+    pub path: String,
+    /// What is wrong.
+    pub message: String,
+}
+
+/// All errors of a scene.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{}", self.problems.iter().map(|p| format!("{}: {}", p.path, p.message)).collect::<Vec<_>>().join("\n"))]
+pub struct SceneError {
+    /// At least one.
+    pub problems: Vec<Problem>,
+}
+
+impl Scene {
+    /// Reads TOML.
+    pub fn from_toml(_text: &str) -> Result<Self, SceneError> {
+        unimplemented!()
+    }
+    /// Reads JSON.
+    pub fn from_json(_text: &str) -> Result<Self, SceneError> {
+        unimplemented!()
+    }
+    /// Reads JSON if the first character that is not white space is `{`, else TOML.
+    pub fn from_text(_text: &str) -> Result<Self, SceneError> {
+        unimplemented!()
+    }
+    /// Writes TOML.
+    pub fn to_toml(&self) -> String {
+        unimplemented!()
+    }
+    /// The JSON Schema of the format.
+    pub fn json_schema() -> serde_json::Value {
+        unimplemented!()
+    }
+    /// Everything that is wrong with the scene; empty when it will compile.
+    pub fn validate(&self) -> Vec<Problem> {
+        unimplemented!()
+    }
+}

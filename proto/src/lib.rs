@@ -1,0 +1,15 @@
+//! The public contract of plantd: the messages and services of `plantd.v1`, and the layout of the
+//! shared-memory link.
+//!
+//! The `.proto` files beside this crate are the reference; everything in [`v1`] is generated from
+//! them when the crate is built.
+
+/// Messages, clients and servers of the package `plantd.v1`.
+#[allow(missing_docs, unreachable_pub, clippy::all)]
+pub mod v1 {
+    tonic::include_proto!("plantd.v1");
+}
+
+/// The contract as an encoded `FileDescriptorSet`, for server reflection.
+pub const FILE_DESCRIPTOR_SET: &[u8] =
+    include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));

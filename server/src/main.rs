@@ -1,0 +1,2 @@
+//! The `plantd` server binary.
+fn main() {}
