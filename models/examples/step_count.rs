@@ -1,0 +1,75 @@
+//! Calls one operation of a plant again and again, for a profiler that counts instructions.
+//!
+//! `step_count SCENE OPERATION COUNT`: SCENE is a built-in scene or a file, OPERATION one of `step`,
+//! `linearize`, `step-and-linearize`. The calls go through functions that are never inlined and keep
+//! their names, so that `valgrind --tool=callgrind --toggle-collect=measured_call` counts them and
+//! nothing else.
+
+use std::error::Error;
+use std::sync::Arc;
+
+use plantd_models::{Linearization, Model, Plant, Scene, Settings, builtin};
+
+/// A plant with all that its operations need.
+struct Measured {
+    plant: Plant,
+    input: Vec<f64>,
+    out: Linearization,
+    operation: Operation,
+}
+
+#[derive(Clone, Copy)]
+enum Operation {
+    Step,
+    Linearize,
+    StepAndLinearize,
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [scene, operation, count] = &arguments[..] else {
+        return Err("usage: step_count SCENE step|linearize|step-and-linearize COUNT".into());
+    };
+    let operation = match operation.as_str() {
+        "step" => Operation::Step,
+        "linearize" => Operation::Linearize,
+        "step-and-linearize" => Operation::StepAndLinearize,
+        other => return Err(format!("unknown operation `{other}`").into()),
+    };
+    let scene = match builtin::scene(scene) {
+        Some(scene) => scene,
+        None => Scene::from_text(&std::fs::read_to_string(scene)?)?,
+    };
+    let model = Arc::new(Model::compile(&scene)?);
+    let mut measured = Measured {
+        plant: Plant::new(Arc::clone(&model), Settings::new(&model))?,
+        input: vec![0.0; model.dimensions().input()],
+        out: Linearization::new(&model),
+        operation,
+    };
+    for _ in 0..count.parse::<u32>()? {
+        // A linearization stays where it is: move on, so that calls differ as they do in use.
+        if matches!(operation, Operation::Linearize) {
+            measured.plant.hold_input(&mut measured.input);
+            measured.plant.step(&measured.input)?;
+        }
+        measured.plant.hold_input(&mut measured.input);
+        if !measured_call(&mut measured) {
+            return Err("the step failed".into());
+        }
+    }
+    Ok(())
+}
+
+// SAFETY: no other function of this program has this name.
+#[unsafe(no_mangle)]
+#[inline(never)]
+fn measured_call(measured: &mut Measured) -> bool {
+    let Measured { plant, input, out, operation } = measured;
+    match operation {
+        Operation::Step => plant.step(input),
+        Operation::Linearize => plant.linearize(input, out),
+        Operation::StepAndLinearize => plant.step_and_linearize(input, out),
+    }
+    .is_ok()
+}

@@ -1,2 +1,0 @@
-//! verify
-fn main() {}

@@ -1,0 +1,152 @@
+//! `cargo verify`: everything that must hold before a change lands, in stages.
+
+mod python;
+mod stage;
+mod tools;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+
+use stage::{Failure, Outcome, Stage, run};
+
+const USAGE: &str = "\
+Runs every check of the workspace.
+
+Usage: cargo verify [--quick] [--only STAGE[,STAGE...]] [--list]
+
+  --quick    formatting, lints and tests only
+  --only     these stages only
+  --list     print the stages
+";
+
+/// Every stage, in order: cheap ones first, so that a slip shows early.
+const STAGES: &[Stage] = &[
+    Stage { name: "format", quick: true, run: format },
+    Stage { name: "tools", quick: false, run: tools::install_missing },
+    Stage { name: "proto-lint", quick: false, run: python::lint_proto },
+    Stage { name: "clippy", quick: true, run: clippy },
+    Stage { name: "docs", quick: false, run: docs },
+    Stage { name: "build", quick: true, run: build },
+    Stage { name: "tests", quick: true, run: tests },
+    Stage { name: "doctests", quick: false, run: doctests },
+    Stage { name: "python", quick: false, run: python::test_client },
+];
+
+/// What the stages need to know.
+struct Context {
+    /// Top folder of the workspace.
+    root: PathBuf,
+    /// Cargo's target folder.
+    target: PathBuf,
+    /// Whether an earlier stage found that the workspace does not build.
+    broken: bool,
+}
+
+impl Context {
+    fn cargo(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new("cargo");
+        command.args(arguments).current_dir(&self.root);
+        command
+    }
+
+    /// A folder for what the checks themselves need.
+    fn scratch(&self) -> PathBuf {
+        self.target.join("verify")
+    }
+}
+
+fn main() -> ExitCode {
+    let stages = match selection(std::env::args().skip(1)) {
+        Ok(Some(stages)) => stages,
+        Ok(None) => return ExitCode::SUCCESS,
+        Err(message) => {
+            eprintln!("{message}\n\n{USAGE}");
+            return ExitCode::from(2);
+        }
+    };
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let root = root.canonicalize().unwrap_or(root);
+    let target = std::env::var_os("CARGO_TARGET_DIR")
+        .map_or_else(|| root.join("target"), |dir| root.join(dir));
+    let mut context = Context { root, target, broken: false };
+    if stage::run_all(&stages, &mut context) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+/// The stages that the command line asks for; none if it only asks for help.
+fn selection(
+    mut arguments: impl Iterator<Item = String>,
+) -> Result<Option<Vec<&'static Stage>>, String> {
+    let mut stages: Vec<&Stage> = STAGES.iter().collect();
+    while let Some(argument) = arguments.next() {
+        match argument.as_str() {
+            "--quick" => stages.retain(|stage| stage.quick),
+            "--only" => {
+                let names = arguments.next().ok_or("--only needs a list of stages")?;
+                let names: Vec<&str> = names.split(',').collect();
+                if let Some(name) = names.iter().find(|n| STAGES.iter().all(|s| s.name != **n)) {
+                    return Err(format!("there is no stage `{name}`"));
+                }
+                stages.retain(|stage| names.contains(&stage.name));
+            }
+            "--list" => {
+                STAGES.iter().for_each(|stage| println!("{}", stage.name));
+                return Ok(None);
+            }
+            "--help" | "-h" => {
+                print!("{USAGE}");
+                return Ok(None);
+            }
+            other => return Err(format!("unknown argument `{other}`")),
+        }
+    }
+    Ok(Some(stages))
+}
+
+fn format(context: &mut Context) -> Outcome {
+    run(&mut context.cargo(&["fmt", "--all", "--check"]))
+}
+
+fn clippy(context: &mut Context) -> Outcome {
+    let lint = ["clippy", "--workspace", "--all-targets", "--locked", "--", "-D", "warnings"];
+    run(&mut context.cargo(&lint))
+}
+
+fn docs(context: &mut Context) -> Outcome {
+    let mut command = context.cargo(&["doc", "--workspace", "--no-deps", "--locked"]);
+    run(command.env("RUSTDOCFLAGS", "-D warnings"))
+}
+
+/// Builds all targets at once: binaries, which the tests start, see the same features as the tests,
+/// so nothing is compiled twice.
+fn build(context: &mut Context) -> Outcome {
+    let built = run(&mut context.cargo(&["build", "--workspace", "--all-targets", "--locked"]))
+        .and_then(|()| {
+            let counter = ["build", "--release", "--locked", "-p", "plantd-models"];
+            run(context.cargo(&counter).args(["--example", "step_count"]))
+        });
+    context.broken = built.is_err();
+    built
+}
+
+fn tests(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    if tools::has("cargo", &["nextest", "--version"]) {
+        run(&mut context.cargo(&["nextest", "run", "--workspace", "--locked"]))
+    } else {
+        println!("cargo-nextest is not installed: cargo test runs the tests");
+        let targets = ["--lib", "--bins", "--tests", "--examples"];
+        run(context.cargo(&["test", "--workspace", "--locked", "--no-fail-fast"]).args(targets))
+    }
+}
+
+fn doctests(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    run(&mut context.cargo(&["test", "--workspace", "--locked", "--doc"]))
+}
+
+impl Context {
+    /// Refuses to go on after a failed build, whose errors say all there is to say.
+    fn must_build(&self) -> Outcome {
+        if self.broken { Err(Failure::Failed("the build failed".to_owned())) } else { Ok(()) }
+    }
+}
