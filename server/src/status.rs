@@ -1,0 +1,14 @@
+//! The one place where errors become statuses.
+
+use plantd_models::StepError;
+
+/// The reason of a failed step, as in `google.rpc.ErrorInfo`.
+pub fn step_error_reason(error: &StepError) -> &'static str {
+    match error {
+        StepError::Dimension { .. } => "INPUT_DIMENSION",
+        StepError::InputNotFinite { .. } => "INPUT_NOT_FINITE",
+        StepError::NotConverged { .. } => "NOT_CONVERGED",
+        StepError::NotFinite { .. } => "MOTION_NOT_FINITE",
+        StepError::Singular { .. } => "SINGULAR",
+    }
+}

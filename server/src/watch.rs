@@ -1,0 +1,168 @@
+//! What a plant publishes to its watchers: per watcher one slot, in which the latest frame wins.
+//!
+//! The driver copies the state into the slot of each watcher whose turn it is and goes on; a frame
+//! that was not fetched is overwritten and counted. Without watchers this costs one load. A watcher
+//! takes its frame by swapping buffers, so the driver never waits for more than that.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use plantd_models::{Plant, State, StepReport};
+use tokio::sync::Notify;
+
+use crate::session::Session;
+
+/// A state with the step that led to it.
+#[derive(Clone, Debug, Default)]
+pub struct Frame {
+    /// The state.
+    pub state: State,
+    /// Report of the step.
+    pub report: StepReport,
+    /// Input of the step; before the first one, the input that holds the plant.
+    pub input: Vec<f64>,
+}
+
+impl Frame {
+    /// Copies into memory that is allocated at the first call only.
+    fn copy_from(&mut self, plant: &Plant, report: &StepReport, input: &[f64]) {
+        fn copy(target: &mut Vec<f64>, source: &[f64]) {
+            target.clear();
+            target.extend_from_slice(source);
+        }
+        self.state.step = plant.step_index();
+        copy(&mut self.state.q, plant.q());
+        copy(&mut self.state.p, plant.p());
+        copy(&mut self.state.v, plant.v());
+        copy(&mut self.state.multipliers, plant.multipliers());
+        copy(&mut self.input, input);
+        self.report = *report;
+    }
+}
+
+/// The watchers of one plant.
+#[derive(Default)]
+pub struct Watchers {
+    count: AtomicUsize,
+    slots: Mutex<Vec<Arc<Slot>>>,
+}
+
+impl Watchers {
+    /// How many there are.
+    pub fn count(&self) -> usize {
+        self.count.load(Ordering::Acquire)
+    }
+
+    /// Offers a state to all watchers whose turn it is.
+    pub(crate) fn publish(&self, plant: &Plant, report: &StepReport, input: &[f64]) {
+        if self.count() == 0 {
+            return;
+        }
+        for slot in lock(&self.slots).iter() {
+            slot.offer(plant, report, input);
+        }
+    }
+
+    fn add(&self, slot: Arc<Slot>) {
+        let mut slots = lock(&self.slots);
+        slots.push(slot);
+        self.count.store(slots.len(), Ordering::Release);
+    }
+
+    fn remove(&self, slot: &Arc<Slot>) {
+        let mut slots = lock(&self.slots);
+        slots.retain(|other| !Arc::ptr_eq(other, slot));
+        self.count.store(slots.len(), Ordering::Release);
+    }
+}
+
+struct Slot {
+    every: u64,
+    cell: Mutex<Cell>,
+    filled: Notify,
+}
+
+#[derive(Default)]
+struct Cell {
+    frame: Frame,
+    is_fresh: bool,
+    dropped: u64,
+}
+
+impl Slot {
+    fn offer(&self, plant: &Plant, report: &StepReport, input: &[f64]) {
+        if !plant.step_index().is_multiple_of(self.every) {
+            return;
+        }
+        let mut cell = lock(&self.cell);
+        cell.frame.copy_from(plant, report, input);
+        if cell.is_fresh {
+            cell.dropped += 1;
+        } else {
+            cell.is_fresh = true;
+            drop(cell);
+            self.filled.notify_one();
+        }
+    }
+}
+
+/// A watcher's place; dropping it ends the watch.
+pub struct Subscription {
+    session: Arc<Session>,
+    slot: Arc<Slot>,
+    frame: Frame,
+    dropped: u64,
+}
+
+impl Subscription {
+    pub(crate) fn new(session: Arc<Session>, every: u64) -> Self {
+        let slot =
+            Arc::new(Slot { every: every.max(1), cell: Mutex::default(), filled: Notify::new() });
+        session.watchers().add(Arc::clone(&slot));
+        session.metrics().watcher_started();
+        Self { session, slot, frame: Frame::default(), dropped: 0 }
+    }
+
+    pub(crate) fn offer(&self, plant: &Plant, report: &StepReport, input: &[f64]) {
+        self.slot.offer(plant, report, input);
+    }
+
+    /// The session that is watched.
+    pub fn session(&self) -> &Arc<Session> {
+        &self.session
+    }
+
+    /// Waits for the next frame; returns it with the number of frames lost so far.
+    pub async fn next(&mut self) -> (&Frame, u64) {
+        while !self.take() {
+            self.slot.filled.notified().await;
+        }
+        (&self.frame, self.dropped)
+    }
+
+    /// Fetches the frame in the slot, if it is a new one.
+    fn take(&mut self) -> bool {
+        let mut cell = lock(&self.slot.cell);
+        if !cell.is_fresh {
+            return false;
+        }
+        cell.is_fresh = false;
+        std::mem::swap(&mut cell.frame, &mut self.frame);
+        let lost = cell.dropped - self.dropped;
+        self.dropped = cell.dropped;
+        drop(cell);
+        self.session.metrics().watch_dropped(lost);
+        true
+    }
+}
+
+impl Drop for Subscription {
+    fn drop(&mut self) {
+        self.session.watchers().remove(&self.slot);
+        self.session.metrics().watcher_ended();
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
