@@ -14,10 +14,14 @@
 //! Control" (IEEE T-ASE 12(1), 2015). Units are SI, angles are radians.
 
 pub mod builtin;
+mod compile;
 pub mod control;
+mod elimination;
 mod model;
 mod plant;
 pub mod scene;
+mod spatial;
+mod tree;
 
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
 pub use plant::{

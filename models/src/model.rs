@@ -1,10 +1,117 @@
 //! Models: compiled scenes.
 
+use std::fmt::Write as _;
+
+use crate::elimination::Elimination;
 use crate::scene::{CoordinateKind, Scene, SceneError};
+use crate::spatial::Vec3;
+use crate::tree::{Attachment, JointKind, Tree};
 
 /// A compiled scene: immutable, shared by all plants made from it.
 #[derive(Debug)]
-pub struct Model {}
+pub struct Model {
+    pub(crate) scene: Scene,
+    pub(crate) dimensions: Dimensions,
+    pub(crate) coordinates: Vec<Coordinate>,
+    pub(crate) constraint_names: Vec<String>,
+    pub(crate) operating_points: Vec<OperatingPoint>,
+    pub(crate) digest: u64,
+    /// Joints that carry inertia or springs: what a step walks at the midpoint.
+    pub(crate) dynamics: Tree,
+    /// Joint in `dynamics` of each dynamic coordinate.
+    pub(crate) joint_of: Vec<usize>,
+    /// `None` without gravity.
+    pub(crate) gravity: Option<Vec3>,
+    /// Damping of each dynamic coordinate; empty without damping.
+    pub(crate) damping: Vec<f64>,
+    /// Coordinate and gain of each input.
+    pub(crate) inputs: Vec<(usize, f64)>,
+    pub(crate) coordinate_springs: Vec<CoordinateSpring>,
+    pub(crate) point_springs: Vec<PointSpring>,
+    /// Joints that points of constraints depend on: what a step walks at its ends.
+    pub(crate) closure: Tree,
+    pub(crate) constraints: Vec<Constraint>,
+    pub(crate) elimination: Elimination,
+    /// Ancestor and descendant pairs of dynamic coordinates, with their place in the factorization.
+    pub(crate) pairs: Vec<Pair>,
+    /// Ancestor and descendant pairs of which exactly one is prescribed.
+    pub(crate) mixed_pairs: Vec<MixedPair>,
+}
+
+/// Two dynamic joints on one path to the root, or one joint twice.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pair {
+    /// Joint in `dynamics`.
+    pub(crate) ancestor: u32,
+    /// Joint in `dynamics`.
+    pub(crate) descendant: u32,
+    /// Coordinate of the ancestor.
+    pub(crate) row: u32,
+    /// Coordinate of the descendant.
+    pub(crate) column: u32,
+    /// Place in the factorization.
+    pub(crate) slot: u32,
+}
+
+/// A pair of joints of the dynamics tree of which exactly one is prescribed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct MixedPair {
+    pub(crate) ancestor: usize,
+    pub(crate) descendant: usize,
+}
+
+/// `V = ½ k (q − rest)²`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct CoordinateSpring {
+    pub(crate) coordinate: usize,
+    pub(crate) stiffness: f64,
+    pub(crate) rest: f64,
+}
+
+/// `V = ½ k (|a − b| − rest)²`.
+#[derive(Clone, Debug)]
+pub(crate) struct PointSpring {
+    pub(crate) ends: PointPair,
+    pub(crate) stiffness: f64,
+    pub(crate) rest_length: f64,
+}
+
+/// Two points and the joints that move one against the other.
+#[derive(Clone, Debug)]
+pub(crate) struct PointPair {
+    pub(crate) a: Attachment,
+    pub(crate) b: Attachment,
+    /// Joints on the path between the points, ancestors before descendants; joints that carry both
+    /// points drop out, because they do not change the distance.
+    pub(crate) path: Vec<PathJoint>,
+}
+
+/// A joint on the path between two points.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PathJoint {
+    pub(crate) joint: usize,
+    pub(crate) coordinate: usize,
+    /// The joint carries `a` (otherwise `b`).
+    pub(crate) carries_a: bool,
+}
+
+/// One constraint equation.
+#[derive(Clone, Debug)]
+pub(crate) struct Constraint {
+    pub(crate) points: PointPair,
+    pub(crate) kind: ConstraintKind,
+}
+
+/// What a constraint equation says of `d = a − b`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum ConstraintKind {
+    /// `|d|² − length² = 0`.
+    Distance(f64),
+    /// The same, with a prescribed coordinate as length.
+    DrivenDistance(usize),
+    /// `d · axis = 0`; the axis is a world axis.
+    Axis(usize),
+}
 
 /// Sizes of a model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,36 +166,93 @@ pub struct OperatingPoint {
 }
 
 impl Model {
-    /// Compiles a scene.
-    pub fn compile(_scene: &Scene) -> Result<Self, SceneError> {
-        unimplemented!()
+    /// Compiles a scene. All errors of the scene are reported at once.
+    pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
+        let problems = scene.validate();
+        if problems.is_empty() {
+            Ok(crate::compile::compile(scene))
+        } else {
+            Err(SceneError { problems })
+        }
     }
+
     /// The scene it was compiled from.
     pub fn scene(&self) -> &Scene {
-        unimplemented!()
+        &self.scene
     }
+
     /// Sizes.
     pub fn dimensions(&self) -> Dimensions {
-        unimplemented!()
+        self.dimensions
     }
+
     /// Coordinates: dynamic ones in depth-first order, then prescribed ones as listed.
     pub fn coordinates(&self) -> &[Coordinate] {
-        unimplemented!()
+        &self.coordinates
     }
+
     /// Names of the constraint equations, in the order of the multipliers; for example `elbow.x`.
     pub fn constraint_names(&self) -> &[String] {
-        unimplemented!()
+        &self.constraint_names
     }
+
     /// Operating points, first one `initial`: the initial configuration without input forces.
     pub fn operating_points(&self) -> &[OperatingPoint] {
-        unimplemented!()
+        &self.operating_points
     }
-    /// What a step evaluates and what it skips, for people to read.
-    pub fn plan(&self) -> String {
-        unimplemented!()
+
+    /// Index of a coordinate.
+    pub fn coordinate_index(&self, name: &str) -> Option<usize> {
+        self.coordinates.iter().position(|c| c.name == name)
     }
+
     /// A hash of everything that the motion depends on; equal for equal scenes.
     pub fn digest(&self) -> u64 {
-        unimplemented!()
+        self.digest
+    }
+
+    /// What a step evaluates and what it skips, for people to read.
+    pub fn plan(&self) -> String {
+        let d = self.dimensions;
+        let mut plan = String::new();
+        let mut line = |text: String| {
+            let _ = writeln!(plan, "{text}");
+        };
+        line(format!(
+            "coordinates   {} dynamic, {} prescribed; state {}, input {}",
+            d.dynamic,
+            d.prescribed,
+            d.state(),
+            d.input()
+        ));
+        let joints = &self.dynamics.joints;
+        let revolute = joints.iter().filter(|j| j.kind == JointKind::Revolute).count();
+        line(format!(
+            "midpoint      {} joints of {} moving frames: {revolute} revolute, {} prismatic",
+            joints.len(),
+            self.scene.frames.iter().filter(|f| f.joint.is_some()).count(),
+            joints.len() - revolute
+        ));
+        line(format!(
+            "factorization tree-sparse, {} entries of {} in each triangle, {} {}",
+            self.elimination.entries(),
+            d.dynamic * (d.dynamic + 1) / 2,
+            self.elimination.islands(),
+            if self.elimination.islands() == 1 { "island" } else { "islands" }
+        ));
+        let skipped = |is: bool| if is { "" } else { " (skipped)" };
+        line(format!("gravity       {}", if self.gravity.is_some() { "uniform" } else { "none (skipped)" }));
+        let springs = self.coordinate_springs.len() + self.point_springs.len();
+        line(format!("springs       {springs}{}", skipped(springs > 0)));
+        let damped = self.damping.iter().filter(|c| **c != 0.0).count();
+        line(format!("damping       {damped} coordinates{}", skipped(damped > 0)));
+        line(format!("inputs        {}{}", d.inputs, skipped(d.inputs > 0)));
+        line(format!(
+            "constraints   {} equations over {} joints{}",
+            d.constraints,
+            self.closure.joints.len(),
+            skipped(d.constraints > 0)
+        ));
+        plan
     }
 }

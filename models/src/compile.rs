@@ -1,0 +1,530 @@
+//! From scene to model: names resolved, fixed joints merged, bodies lumped, what is not needed
+//! dropped.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::elimination::Elimination;
+use crate::model::{
+    Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions, MixedPair, Model,
+    OperatingPoint, Pair, PathJoint, PointPair, PointSpring,
+};
+use crate::scene::{self, CoordinateKind, Length, Scene, Spring};
+use crate::spatial::{Mat3, Sym3, Vec3};
+use crate::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
+
+/// Compiles a scene that has been validated.
+pub(crate) fn compile(scene: &Scene) -> Model {
+    let layout = Layout::new(scene);
+    let needs = layout.needs(scene);
+    let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &needs.dynamics);
+    let (closure, in_closure) = Tree::pruned(&layout.joints, &needs.closure);
+    let dynamic = layout.dynamic;
+
+    let point_springs = layout.point_springs(scene, &dynamics, &in_dynamics);
+    let (constraints, constraint_names) = layout.constraints(scene, &closure, &in_closure);
+
+    let mut joint_of = vec![WORLD; dynamic];
+    for (index, joint) in dynamics.joints.iter().enumerate() {
+        if joint.coordinate < dynamic {
+            joint_of[joint.coordinate] = index;
+        }
+    }
+    let elimination = Elimination::new(&couplings(dynamic, &dynamics, &joint_of, &point_springs));
+    let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
+
+    let damping: Vec<f64> = layout.coordinates[..dynamic]
+        .iter()
+        .map(|c| settings(scene, &c.name).and_then(|s| s.damping).unwrap_or(scene.damping))
+        .collect();
+    let gravity = Vec3(scene.gravity);
+    Model {
+        dimensions: Dimensions {
+            dynamic,
+            prescribed: layout.coordinates.len() - dynamic,
+            inputs: scene.inputs.len(),
+            constraints: constraints.len(),
+        },
+        operating_points: layout.operating_points(scene),
+        digest: digest(scene),
+        gravity: (gravity != Vec3::ZERO).then_some(gravity),
+        damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },
+        inputs: scene.inputs.iter().map(|i| (layout.index[&i.coordinate], i.gain)).collect(),
+        coordinate_springs: layout.coordinate_springs(scene),
+        point_springs,
+        constraints,
+        constraint_names,
+        dynamics,
+        joint_of,
+        closure,
+        elimination,
+        pairs,
+        mixed_pairs,
+        coordinates: layout.coordinates,
+        scene: scene.clone(),
+    }
+}
+
+fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {
+    scene.coordinates.iter().find(|c| c.name == name)
+}
+
+/// Where a frame is: fixed in the frame of a joint (or the world).
+#[derive(Clone, Copy)]
+struct Placement {
+    joint: usize,
+    rotation: Mat3,
+    translation: Vec3,
+}
+
+/// The scene with its names resolved.
+struct Layout {
+    joints: Vec<Joint>,
+    frames: BTreeMap<String, Placement>,
+    coordinates: Vec<Coordinate>,
+    dynamic: usize,
+    index: BTreeMap<String, usize>,
+}
+
+/// Which joints which walk needs.
+struct Needs {
+    dynamics: Vec<bool>,
+    closure: Vec<bool>,
+}
+
+impl Layout {
+    fn new(scene: &Scene) -> Self {
+        let mut children: BTreeMap<&str, Vec<&scene::Frame>> = BTreeMap::new();
+        for frame in &scene.frames {
+            children.entry(&frame.parent).or_default().push(frame);
+        }
+        let world =
+            Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
+        let mut layout = Self {
+            joints: Vec::new(),
+            frames: BTreeMap::from([("world".to_owned(), world)]),
+            coordinates: Vec::new(),
+            dynamic: 0,
+            index: BTreeMap::new(),
+        };
+        let mut names = Vec::new();
+        let mut stack: Vec<&scene::Frame> =
+            children.get("world").map(|c| c.iter().rev().copied().collect()).unwrap_or_default();
+        while let Some(frame) = stack.pop() {
+            layout.place(frame, &mut names);
+            stack.extend(children.get(frame.name.as_str()).into_iter().flatten().rev());
+        }
+        layout.number(scene, &names);
+        layout.lump_subtrees();
+        layout
+    }
+
+    /// Places one frame, whose parent is placed, and its body.
+    fn place(&mut self, frame: &scene::Frame, names: &mut Vec<String>) {
+        let parent = self.frames[&frame.parent];
+        let mut placement = Placement {
+            joint: parent.joint,
+            rotation: parent.rotation.times(&rotation(frame.rotation.as_ref())),
+            translation: parent.translation + parent.rotation.apply(Vec3(frame.translation)),
+        };
+        if let Some((kind, axis, name)) = moving(frame) {
+            let turned = Mat3::with_z_along(axis * (1.0 / axis.norm()));
+            let index = self.joints.len();
+            self.joints.push(Joint {
+                parent: placement.joint,
+                root: if placement.joint == WORLD {
+                    index
+                } else {
+                    self.joints[placement.joint].root
+                },
+                kind,
+                rotation: placement.rotation.times(&turned),
+                translation: placement.translation,
+                coordinate: usize::MAX,
+                body: Body::default(),
+                subtree_mass: 0.0,
+                anchor: false,
+            });
+            names.push(name.to_owned());
+            placement = Placement {
+                joint: index,
+                rotation: turned.transpose(),
+                translation: Vec3::ZERO,
+            };
+        }
+        if let (Some(body), true) = (&frame.body, placement.joint != WORLD) {
+            let joint = &mut self.joints[placement.joint];
+            joint.body = lumped(&joint.body, &placed(body, &placement));
+        }
+        self.frames.insert(frame.name.clone(), placement);
+    }
+
+    /// Orders the coordinates: dynamic ones depth first, prescribed ones as listed.
+    fn number(&mut self, scene: &Scene, joint_names: &[String]) {
+        let prescribed = |name: &str| {
+            settings(scene, name).is_some_and(|c| c.kind == CoordinateKind::Prescribed)
+        };
+        let dynamic = joint_names.iter().filter(|name| !prescribed(name)).cloned();
+        let listed = scene
+            .coordinates
+            .iter()
+            .filter(|c| c.kind == CoordinateKind::Prescribed)
+            .map(|c| c.name.clone());
+        let order: Vec<String> = dynamic.chain(listed).collect();
+        self.dynamic = joint_names.iter().filter(|name| !prescribed(name)).count();
+        self.index = order.iter().cloned().enumerate().map(|(i, name)| (name, i)).collect();
+        for (joint, name) in self.joints.iter_mut().zip(joint_names) {
+            joint.coordinate = self.index[name];
+        }
+        self.coordinates = order
+            .into_iter()
+            .map(|name| {
+                let joint = joint_names.iter().position(|n| *n == name);
+                Coordinate {
+                    kind: if prescribed(&name) {
+                        CoordinateKind::Prescribed
+                    } else {
+                        CoordinateKind::Dynamic
+                    },
+                    is_angle: joint.is_some_and(|j| self.joints[j].kind == JointKind::Revolute),
+                    initial: settings(scene, &name).map_or(0.0, |c| c.initial),
+                    name,
+                }
+            })
+            .collect();
+    }
+
+    fn lump_subtrees(&mut self) {
+        for i in (0..self.joints.len()).rev() {
+            self.joints[i].subtree_mass += self.joints[i].body.mass;
+            let (mass, parent) = (self.joints[i].subtree_mass, self.joints[i].parent);
+            if parent != WORLD {
+                self.joints[parent].subtree_mass += mass;
+            }
+        }
+    }
+
+    fn attachment(&self, point: &scene::Point) -> Attachment {
+        let frame = self.frames[&point.frame];
+        Attachment {
+            joint: frame.joint,
+            point: frame.translation + frame.rotation.apply(Vec3(point.at)),
+        }
+    }
+
+    /// A joint is needed where it, or a joint below it, carries what the walk evaluates.
+    fn needs(&self, scene: &Scene) -> Needs {
+        let mut needs = Needs {
+            dynamics: self
+                .joints
+                .iter()
+                .map(|j| !matches!(j.body.inertia, Rotational::None))
+                .collect(),
+            closure: vec![false; self.joints.len()],
+        };
+        let mut mark = |walk: fn(&mut Needs) -> &mut Vec<bool>, point: &scene::Point| {
+            let joint = self.attachment(point).joint;
+            if joint != WORLD {
+                walk(&mut needs)[joint] = true;
+            }
+        };
+        for spring in &scene.springs {
+            if let Spring::TwoPoint { a, b, .. } = spring {
+                mark(|n| &mut n.dynamics, a);
+                mark(|n| &mut n.dynamics, b);
+            }
+        }
+        for constraint in &scene.constraints {
+            let (a, b) = ends(constraint);
+            mark(|n| &mut n.closure, a);
+            mark(|n| &mut n.closure, b);
+        }
+        for i in (0..self.joints.len()).rev() {
+            let parent = self.joints[i].parent;
+            if parent != WORLD {
+                needs.dynamics[parent] |= needs.dynamics[i];
+                needs.closure[parent] |= needs.closure[i];
+            }
+        }
+        needs
+    }
+
+    fn point_pair(
+        &self,
+        a: &scene::Point,
+        b: &scene::Point,
+        tree: &Tree,
+        index: &[usize],
+    ) -> PointPair {
+        let resolve = |point| {
+            let at = self.attachment(point);
+            let joint = if at.joint == WORLD { WORLD } else { index[at.joint] };
+            Attachment { joint, ..at }
+        };
+        let (a, b) = (resolve(a), resolve(b));
+        let (path_a, path_b) = (tree.path(a.joint), tree.path(b.joint));
+        let common = path_a.iter().zip(&path_b).take_while(|(x, y)| x == y).count();
+        let entry = |joint: usize, carries_a| PathJoint {
+            joint,
+            coordinate: tree.joints[joint].coordinate,
+            carries_a,
+        };
+        let path = path_a[common..]
+            .iter()
+            .map(|&joint| entry(joint, true))
+            .chain(path_b[common..].iter().map(|&joint| entry(joint, false)))
+            .collect();
+        PointPair { a, b, path }
+    }
+
+    fn point_springs(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Vec<PointSpring> {
+        let two_point = |spring: &Spring| match spring {
+            Spring::TwoPoint { a, b, stiffness, rest_length } => Some(PointSpring {
+                ends: self.point_pair(a, b, tree, index),
+                stiffness: *stiffness,
+                rest_length: *rest_length,
+            }),
+            Spring::Coordinate { .. } => None,
+        };
+        scene.springs.iter().filter_map(two_point).collect()
+    }
+
+    /// Springs of prescribed coordinates do no work on dynamic ones and are dropped.
+    fn coordinate_springs(&self, scene: &Scene) -> Vec<CoordinateSpring> {
+        let coordinate = |spring: &Spring| match spring {
+            Spring::Coordinate { coordinate, stiffness, rest } => Some(CoordinateSpring {
+                coordinate: self.index[coordinate],
+                stiffness: *stiffness,
+                rest: *rest,
+            }),
+            Spring::TwoPoint { .. } => None,
+        };
+        let springs = scene.springs.iter().filter_map(coordinate);
+        springs.filter(|s| s.coordinate < self.dynamic).collect()
+    }
+
+    fn constraints(
+        &self,
+        scene: &Scene,
+        tree: &Tree,
+        index: &[usize],
+    ) -> (Vec<Constraint>, Vec<String>) {
+        let (mut constraints, mut names) = (Vec::new(), Vec::new());
+        for constraint in &scene.constraints {
+            let (a, b) = ends(constraint);
+            let points = self.point_pair(a, b, tree, index);
+            match constraint {
+                scene::Constraint::Distance { name, length, .. } => {
+                    let kind = match length {
+                        Length::Fixed(length) => ConstraintKind::Distance(*length),
+                        Length::Coordinate(c) => ConstraintKind::DrivenDistance(self.index[c]),
+                    };
+                    constraints.push(Constraint { points, kind });
+                    names.push(name.clone());
+                }
+                scene::Constraint::PointToPoint { name, axes, .. } => {
+                    for axis in axes {
+                        let kind = ConstraintKind::Axis(*axis as usize);
+                        constraints.push(Constraint { points: points.clone(), kind });
+                        names.push(format!("{name}.{}", ["x", "y", "z"][*axis as usize]));
+                    }
+                }
+            }
+        }
+        (constraints, names)
+    }
+
+    fn operating_points(&self, scene: &Scene) -> Vec<OperatingPoint> {
+        let initial: Vec<f64> = self.coordinates.iter().map(|c| c.initial).collect();
+        let at = |name: &str, q: Vec<f64>, inputs: &BTreeMap<String, f64>| {
+            let forces =
+                scene.inputs.iter().map(|i| inputs.get(&i.name).copied().unwrap_or_default());
+            let u = forces.chain(q[self.dynamic..].iter().copied()).collect();
+            OperatingPoint { name: name.to_owned(), q, u }
+        };
+        let mut points = vec![at("initial", initial.clone(), &BTreeMap::new())];
+        for point in &scene.operating_points {
+            let mut q = initial.clone();
+            for (name, value) in &point.coordinates {
+                q[self.index[name]] = *value;
+            }
+            points.push(at(&point.name, q, &point.inputs));
+        }
+        points
+    }
+}
+
+fn ends(constraint: &scene::Constraint) -> (&scene::Point, &scene::Point) {
+    match constraint {
+        scene::Constraint::Distance { a, b, .. }
+        | scene::Constraint::PointToPoint { a, b, .. } => (a, b),
+    }
+}
+
+/// Kind, axis and coordinate name of a frame's joint, if it moves.
+fn moving(frame: &scene::Frame) -> Option<(JointKind, Vec3, &str)> {
+    let (kind, axis, coordinate) = match frame.joint.as_ref()? {
+        scene::Joint::Fixed {} => return None,
+        scene::Joint::Revolute { axis, coordinate } => (JointKind::Revolute, axis, coordinate),
+        scene::Joint::Prismatic { axis, coordinate } => (JointKind::Prismatic, axis, coordinate),
+    };
+    Some((kind, Vec3(*axis), coordinate.as_deref().unwrap_or(&frame.name)))
+}
+
+fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
+    match rotation {
+        None => Mat3::IDENTITY,
+        Some(scene::Rotation::Matrix(rows)) => Mat3::from_rows(*rows),
+        Some(scene::Rotation::Rpy([roll, pitch, yaw])) => {
+            about_z(*yaw).times(&about_y(*pitch)).times(&about_x(*roll))
+        }
+        Some(scene::Rotation::Quaternion(q)) => {
+            let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
+            let [w, x, y, z] = q.map(|c| c / norm);
+            Mat3::from_rows([
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+                [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+                [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+            ])
+        }
+    }
+}
+
+fn about_x(angle: f64) -> Mat3 {
+    let (s, c) = angle.sin_cos();
+    Mat3::from_rows([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+}
+
+fn about_y(angle: f64) -> Mat3 {
+    let (s, c) = angle.sin_cos();
+    Mat3::from_rows([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+}
+
+fn about_z(angle: f64) -> Mat3 {
+    let (s, c) = angle.sin_cos();
+    Mat3::from_rows([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+}
+
+/// A body of the scene in the frame of the joint that carries it.
+fn placed(body: &scene::Body, placement: &Placement) -> Body {
+    let center = placement.translation + placement.rotation.apply(Vec3(body.center_of_mass));
+    let inertia = match body.inertia[..] {
+        [xx, yy, zz] => Sym3 { xx, yy, zz, ..Sym3::default() },
+        [xx, yy, zz, xy, xz, yz] => Sym3 { xx, yy, zz, xy, xz, yz },
+        _ => Sym3::default(),
+    };
+    let isotropic = inertia == Sym3 { xx: inertia.xx, yy: inertia.xx, zz: inertia.xx, ..Sym3::default() };
+    let rotated = if isotropic { inertia } else { inertia.rotated(&placement.rotation) };
+    Body { mass: body.mass, center, inertia: classified(body.mass, rotated) }
+}
+
+/// Two bodies in one frame as one.
+fn lumped(a: &Body, b: &Body) -> Body {
+    if matches!(a.inertia, Rotational::None) {
+        return *b;
+    }
+    if matches!(b.inertia, Rotational::None) {
+        return *a;
+    }
+    let mass = a.mass + b.mass;
+    let center = if mass > 0.0 {
+        (a.center * a.mass + b.center * b.mass) * (1.0 / mass)
+    } else {
+        Vec3::ZERO
+    };
+    let about_center = |body: &Body| {
+        full(&body.inertia).add(&Sym3::of_point(body.mass, body.center - center))
+    };
+    Body { mass, center, inertia: classified(mass, about_center(a).add(&about_center(b))) }
+}
+
+fn full(inertia: &Rotational) -> Sym3 {
+    match *inertia {
+        Rotational::None | Rotational::Point => Sym3::default(),
+        Rotational::Isotropic(i) => Sym3 { xx: i, yy: i, zz: i, ..Sym3::default() },
+        Rotational::Full(tensor) => tensor,
+    }
+}
+
+fn classified(mass: f64, tensor: Sym3) -> Rotational {
+    if tensor == Sym3::default() {
+        if mass == 0.0 { Rotational::None } else { Rotational::Point }
+    } else if tensor == full(&Rotational::Isotropic(tensor.xx)) {
+        Rotational::Isotropic(tensor.xx)
+    } else {
+        Rotational::Full(tensor)
+    }
+}
+
+/// Which dynamic coordinates each one is coupled with, among those before it.
+fn couplings(
+    dynamic: usize,
+    tree: &Tree,
+    joint_of: &[usize],
+    springs: &[PointSpring],
+) -> Vec<BTreeSet<usize>> {
+    let mut couplings = vec![BTreeSet::new(); dynamic];
+    let mut couple = |coordinates: &[usize]| {
+        for (k, &later) in coordinates.iter().enumerate() {
+            for &earlier in &coordinates[..k] {
+                couplings[later.max(earlier)].insert(later.min(earlier));
+            }
+        }
+    };
+    let dynamic_only = |c: &usize| *c < dynamic;
+    for &joint in joint_of {
+        let path = tree.path(joint);
+        let path = path.iter().map(|&j| tree.joints[j].coordinate).filter(dynamic_only);
+        couple(&path.collect::<Vec<_>>());
+    }
+    for spring in springs {
+        let path = spring.ends.path.iter().map(|p| p.coordinate).filter(dynamic_only);
+        couple(&path.collect::<Vec<_>>());
+    }
+    couplings
+}
+
+fn joint_pairs(
+    dynamic: usize,
+    tree: &Tree,
+    elimination: &Elimination,
+) -> (Vec<Pair>, Vec<MixedPair>) {
+    let (mut pairs, mut mixed) = (Vec::new(), Vec::new());
+    for (joint, descendant) in tree.joints.iter().enumerate() {
+        for above in tree.path(joint) {
+            let ancestor = &tree.joints[above];
+            match (ancestor.coordinate < dynamic, descendant.coordinate < dynamic) {
+                (true, true) => {
+                    let slot = elimination.slot(descendant.coordinate, ancestor.coordinate);
+                    pairs.push(Pair {
+                        ancestor: above as u32,
+                        descendant: joint as u32,
+                        row: ancestor.coordinate as u32,
+                        column: descendant.coordinate as u32,
+                        slot: slot.expect("coupled coordinates share an elimination path") as u32,
+                    });
+                }
+                (false, false) => {}
+                _ => mixed.push(MixedPair { ancestor: above, descendant: joint }),
+            }
+        }
+    }
+    (pairs, mixed)
+}
+
+/// FNV-1a over the scene without what does not move it.
+fn digest(scene: &Scene) -> u64 {
+    let essence = Scene {
+        description: String::new(),
+        operating_points: Vec::new(),
+        ..scene.clone()
+    };
+    let text = serde_json::to_string(&essence).unwrap_or_default();
+    fnv1a(text.as_bytes())
+}
+
+/// The 64-bit FNV-1a hash.
+pub(crate) fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+    })
+}

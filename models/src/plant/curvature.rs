@@ -1,0 +1,143 @@
+//! Second derivatives of the Lagrangian: four dot products for each ancestor and descendant, O(n·depth).
+//!
+//! ```text
+//! leaf to root:  F_j = I^c_j J_j      P_j = J_j ×* H_j + I^c_j J̇_j      I^c: inertia of the subtree
+//! i above j:     ∂²L/∂v_i∂v_j = J_i·F_j      ∂²L/∂v_i∂q_j = J_i·P_j      ∂²L/∂q_i∂v_j = J̇_i·F_j
+//!                ∂²L/∂q_i∂q_j = J̇_i·P_j + w_i·(f_j × g)      w_i: angular part of J_i, f_j: force part of F_j
+//! ```
+
+use crate::plant::kinematics::Poses;
+use crate::plant::momenta::Momenta;
+use crate::plant::tree_lu::TreeLu;
+use crate::model::Pair;
+use crate::spatial::{Force, Inertia, Motion, Sym3, Vec3};
+use crate::tree::{Rotational, Tree, WORLD};
+
+/// Generators of the second derivatives.
+#[derive(Clone, Debug)]
+pub(crate) struct Curvature {
+    tensor: Vec<Sym3>,
+    /// `F`.
+    pub(crate) force: Vec<Force>,
+    /// `P`.
+    pub(crate) rate: Vec<Force>,
+}
+
+/// Second derivatives of `L` for one pair of joints.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SecondDerivatives {
+    pub(crate) qq: f64,
+    /// `∂²L/∂v_ancestor ∂q_descendant`.
+    pub(crate) v_above_q_below: f64,
+    /// `∂²L/∂q_ancestor ∂v_descendant`.
+    pub(crate) q_above_v_below: f64,
+    pub(crate) vv: f64,
+}
+
+impl Curvature {
+    pub(crate) fn new(tree: &Tree) -> Self {
+        let n = tree.joints.len();
+        Self {
+            tensor: vec![Sym3::default(); n],
+            force: vec![Force::default(); n],
+            rate: vec![Force::default(); n],
+        }
+    }
+
+    /// Computes the generators from poses and momenta of the same configuration and velocity.
+    #[inline(never)]
+    pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses, momenta: &Momenta) {
+        for (i, joint) in tree.joints.iter().enumerate() {
+            let rotation = &poses.rotation[i];
+            let spin = match &joint.body.inertia {
+                Rotational::None => {
+                    self.tensor[i] = Sym3::default();
+                    continue;
+                }
+                Rotational::Point => Sym3::default(),
+                Rotational::Isotropic(i) => Sym3 { xx: *i, yy: *i, zz: *i, ..Sym3::default() },
+                Rotational::Full(tensor) => tensor.rotated(rotation),
+            };
+            let center = poses.position[i] + rotation.apply(joint.body.center);
+            self.tensor[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
+        }
+        for (i, joint) in tree.joints.iter().enumerate().rev() {
+            if joint.parent != WORLD {
+                self.tensor[joint.parent] = self.tensor[joint.parent].add(&self.tensor[i]);
+            }
+            let composite = Inertia {
+                mass: joint.subtree_mass,
+                moment: momenta.moment[i],
+                tensor: self.tensor[i],
+            };
+            let axis = momenta.axis[i];
+            self.force[i] = composite.momentum(axis);
+            self.rate[i] = axis
+                .cross_force(momenta.momentum[i])
+                .add_scaled(1.0, composite.momentum(momenta.axis_rate[i]));
+        }
+    }
+
+    /// Second derivatives of a pair of joints on one path to the root.
+    #[inline(always)]
+    pub(crate) fn pair(
+        &self,
+        momenta: &Momenta,
+        gravity: Option<Vec3>,
+        ancestor: usize,
+        descendant: usize,
+    ) -> SecondDerivatives {
+        let (axis, axis_rate) = (momenta.axis[ancestor], momenta.axis_rate[ancestor]);
+        let (force, rate) = (self.force[descendant], self.rate[descendant]);
+        let weight = gravity.map_or(0.0, |g| axis.w.dot(force.f.cross(g)));
+        SecondDerivatives {
+            qq: axis_rate.dot(rate) + weight,
+            v_above_q_below: axis.dot(rate),
+            q_above_v_below: axis_rate.dot(force),
+            vv: axis.dot(force),
+        }
+    }
+
+    /// Writes the Jacobian of the residual by the increment, without springs and forces:
+    /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
+    ///
+    /// Both entries of a pair come from `½h J̇ ∓ J` of the ancestor and `½P ± F/h` of the descendant.
+    #[inline(never)]
+    pub(crate) fn fill_newton_matrix(
+        &self,
+        pairs: &[Pair],
+        momenta: &Momenta,
+        gravity: Option<Vec3>,
+        step: f64,
+        matrix: &mut TreeLu,
+    ) {
+        let (half, inverse) = (0.5 * step, 1.0 / step);
+        let (mut plus, mut minus) = (Force::default(), Force::default());
+        let mut weight = Vec3::ZERO;
+        for pair in pairs.iter().rev() {
+            let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
+            if i == j {
+                // Pairs come grouped by descendant, and backwards the descendant itself comes first.
+                let (f, p) = (self.force[j], self.rate[j]);
+                plus = Force::default().add_scaled(0.5, p).add_scaled(inverse, f);
+                minus = Force::default().add_scaled(0.5, p).add_scaled(-inverse, f);
+                weight = gravity.map_or(Vec3::ZERO, |g| f.f.cross(g) * (0.25 * step));
+            }
+            let (axis, axis_rate) = (momenta.axis[i], momenta.axis_rate[i]);
+            let gravity_term = axis.w.dot(weight);
+            let scaled = Motion { w: axis_rate.w * half, v: axis_rate.v * half };
+            matrix.upper[pair.slot as usize] = scaled.add_scaled(-1.0, axis).dot(plus) + gravity_term;
+            matrix.lower[pair.slot as usize] = scaled.add_scaled(1.0, axis).dot(minus) + gravity_term;
+        }
+    }
+
+    /// Writes the mass matrix `L_vv` of the dynamic coordinates.
+    pub(crate) fn fill_mass_matrix(&self, pairs: &[Pair], momenta: &Momenta, matrix: &mut TreeLu) {
+        for pair in pairs {
+            let entry =
+                momenta.axis[pair.ancestor as usize].dot(self.force[pair.descendant as usize]);
+            matrix.upper[pair.slot as usize] = entry;
+            matrix.lower[pair.slot as usize] = entry;
+        }
+    }
+}

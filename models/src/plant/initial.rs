@@ -1,0 +1,363 @@
+//! Where a plant starts: states from momenta, velocities, two configurations, or a guess; and the
+//! velocity and energy that belong to a state.
+
+use crate::Model;
+use crate::plant::closure::Closure;
+use crate::plant::newton::{Workspace, fill_schur};
+use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::{Energy, PreciseState, Plant, forces, springs};
+
+/// A configuration may violate a constraint by this fraction of the lengths involved.
+const CONSTRAINT_TOLERANCE: f64 = 1e-6;
+/// Corrections before a projection onto the constraints is given up.
+const PROJECTION_ITERATIONS: usize = 100;
+/// A projection moves no coordinate by more than this in one correction, m or rad.
+const PROJECTION_STEP: f64 = 0.5;
+
+/// How a state is given.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Initial {
+    /// The scene's initial configuration, at rest.
+    Scene,
+    /// A named operating point, at rest with its input.
+    OperatingPoint(String),
+    /// Configuration `q` (nd + nk), momentum `p` (nd), velocity of prescribed coordinates `v` (nk).
+    Momentum {
+        /// Configuration.
+        q: Vec<f64>,
+        /// Momentum.
+        p: Vec<f64>,
+        /// Velocity of prescribed coordinates.
+        v: Vec<f64>,
+    },
+    /// Configuration and velocity, both nd + nk: `p = M(q) v`.
+    Velocity {
+        /// Configuration.
+        q: Vec<f64>,
+        /// Velocity.
+        v: Vec<f64>,
+    },
+    /// Two configurations one time step apart, no input forces: `p = D2 Ld(q0, q1) + F⁺`. The plant
+    /// starts at the second.
+    TwoConfigurations {
+        /// One time step earlier.
+        q0: Vec<f64>,
+        /// At the start.
+        q1: Vec<f64>,
+    },
+    /// A guess that Newton's method projects onto the constraints; named coordinates and prescribed
+    /// ones keep their value. The plant starts there at rest.
+    Projection {
+        /// The guess.
+        q: Vec<f64>,
+        /// Coordinates that keep their value.
+        hold: Vec<String>,
+    },
+}
+
+/// Why a state was refused. The plant is as it was.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum InitialError {
+    /// A vector has the wrong length.
+    #[error("{name} has {actual} entries; {expected} are needed")]
+    Dimension {
+        /// Which vector.
+        name: &'static str,
+        /// Entries it must have.
+        expected: usize,
+        /// Entries it has.
+        actual: usize,
+    },
+    /// A number is NaN or infinite.
+    #[error("{name}[{index}] is {value}")]
+    NotFinite {
+        /// Which vector.
+        name: &'static str,
+        /// Index of the entry.
+        index: usize,
+        /// The entry.
+        value: f64,
+    },
+    /// No operating point or coordinate of that name.
+    #[error("there is no {kind} `{name}`")]
+    Unknown {
+        /// What was looked for.
+        kind: &'static str,
+        /// Its name.
+        name: String,
+    },
+    /// The configuration violates a constraint by more than 1e-6 relative.
+    #[error("constraint `{constraint}` is violated by {violation:e}")]
+    OffConstraint {
+        /// Name of the constraint equation.
+        constraint: String,
+        /// Its value `h(q)`.
+        violation: f64,
+    },
+    /// The projection found no configuration that satisfies the constraints.
+    #[error("no configuration found near the guess; constraint `{constraint}` stays violated by {violation:e}")]
+    Projection {
+        /// Name of the worst constraint equation.
+        constraint: String,
+        /// Its value `h(q)`.
+        violation: f64,
+    },
+    /// A time step or an iteration limit is out of range.
+    #[error("{name} is {value}; it must be finite and greater than zero")]
+    Settings {
+        /// Which setting.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+    },
+}
+
+impl Plant {
+    /// Puts the plant into a state, step 0.
+    pub fn initialize(&mut self, initial: &Initial) -> Result<(), InitialError> {
+        let state = self.state_of(initial)?;
+        self.check_constraints(&state.q)?;
+        self.state = state;
+        self.workspace.forget();
+        Ok(())
+    }
+
+    fn state_of(&mut self, initial: &Initial) -> Result<PreciseState, InitialError> {
+        let d = self.model.dimensions;
+        let (n, nd) = (d.coordinates(), d.dynamic);
+        let mut state = PreciseState::new(&self.model);
+        match initial {
+            Initial::Scene => {}
+            Initial::OperatingPoint(name) => {
+                let model = self.model.clone();
+                let point = model.operating_points.iter().find(|point| point.name == *name);
+                let point = point.ok_or_else(|| InitialError::Unknown {
+                    kind: "operating point",
+                    name: name.clone(),
+                })?;
+                state.p = self.momentum_between(&point.q, &point.q, &point.u[..d.inputs]);
+                state.q.copy_from_slice(&point.q);
+            }
+            Initial::Momentum { q, p, v } => {
+                state.q = checked("q", q, n)?;
+                state.p = checked("p", p, nd)?;
+                state.v = checked("v", v, d.prescribed)?;
+            }
+            Initial::Velocity { q, v } => {
+                state.q = checked("q", q, n)?;
+                let v = checked("v", v, n)?;
+                state.v.copy_from_slice(&v[nd..]);
+                state.p = self.workspace.momentum_of(&self.model, &state.q, &v);
+            }
+            Initial::TwoConfigurations { q0, q1 } => {
+                let q0 = checked("q0", q0, n)?;
+                state.q = checked("q1", q1, n)?;
+                state.p = self.momentum_between(&q0, &state.q, &[]);
+                state.v.copy_from_slice(&self.workspace.velocity[nd..]);
+            }
+            Initial::Projection { q, hold } => {
+                let guess = checked("q", q, n)?;
+                let mut moves: Vec<bool> = (0..n).map(|i| i < nd).collect();
+                for name in hold {
+                    let index = self.model.coordinate_index(name).ok_or_else(|| {
+                        InitialError::Unknown { kind: "coordinate", name: name.clone() }
+                    })?;
+                    moves[index] = false;
+                }
+                state.q = self.project(guess, &moves)?;
+            }
+        }
+        Ok(state)
+    }
+
+    /// `D2 Ld(q0, q1) + F⁺ = L_v + ½h L_q + (1 − a) h f`.
+    fn momentum_between(&mut self, q0: &[f64], q1: &[f64], inputs: &[f64]) -> Vec<f64> {
+        let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
+        for i in 0..q0.len() {
+            workspace.q_mid[i] = 0.5 * (q0[i] + q1[i]);
+            workspace.velocity[i] = (q1[i] - q0[i]) / h;
+        }
+        forces::input_forces(&self.model.inputs, inputs, &mut workspace.input_force);
+        workspace.force.copy_from_slice(&workspace.input_force);
+        workspace.evaluate_lagrangian(&self.model);
+        let at_end = (1.0 - self.settings.force_split.at_start()) * h;
+        let momentum = (0..workspace.l_v.len())
+            .map(|i| workspace.l_v[i] + 0.5 * h * workspace.l_q[i] + at_end * workspace.force[i])
+            .collect();
+        workspace.input_force.fill(0.0);
+        workspace.force.fill(0.0);
+        momentum
+    }
+
+    fn check_constraints(&mut self, q: &[f64]) -> Result<(), InitialError> {
+        let closure = &mut self.workspace.end;
+        self.workspace.end_is_exact = false;
+        closure.evaluate(&self.model, q);
+        closure.differentiate(&self.model, q);
+        closure.evaluate(&self.model, q);
+        for (c, (value, round_off)) in closure.value.iter().zip(&closure.round_off).enumerate() {
+            if !(value.abs() <= round_off / f64::EPSILON * CONSTRAINT_TOLERANCE) {
+                let constraint = self.model.constraint_names[c].clone();
+                return Err(InitialError::OffConstraint { constraint, violation: *value });
+            }
+        }
+        Ok(())
+    }
+
+    /// Newton's method with the shortest correction, `dq = −Aᵀ (A Aᵀ)⁻¹ h`, `A` the columns that move.
+    fn project(&self, mut q: Vec<f64>, moves: &[bool]) -> Result<Vec<f64>, InitialError> {
+        let model = &self.model;
+        let (n, nc) = (q.len(), model.dimensions.constraints);
+        let mut closure = Closure::new(model);
+        let mut normal = PivotedLu::new(nc);
+        let mut best = f64::INFINITY;
+        for _ in 0..PROJECTION_ITERATIONS {
+            closure.evaluate(model, &q);
+            closure.differentiate(model, &q);
+            let violation = closure.violation();
+            if violation <= 1.0 || (violation <= 1e3 && violation >= 0.5 * best) {
+                return Ok(q);
+            }
+            best = best.min(violation);
+            let rows: Vec<&[f64]> = closure.jacobian.chunks(n).collect();
+            for i in 0..nc {
+                for j in 0..nc {
+                    normal.matrix[i * nc + j] =
+                        (0..n).filter(|k| moves[*k]).map(|k| rows[i][k] * rows[j][k]).sum();
+                }
+            }
+            normal.factor();
+            let mut weights = closure.value.clone();
+            normal.solve(&mut weights);
+            let correction: Vec<f64> = (0..n)
+                .map(|k| if moves[k] { (0..nc).map(|c| rows[c][k] * weights[c]).sum() } else { 0.0 })
+                .collect();
+            let longest = correction.iter().fold(0.0, |m: f64, c| m.max(c.abs()));
+            let scale = if longest > PROJECTION_STEP { PROJECTION_STEP / longest } else { 1.0 };
+            for (q, correction) in q.iter_mut().zip(&correction) {
+                *q -= scale * correction;
+            }
+        }
+        let relative = |c: &usize| (closure.value[*c] / closure.round_off[*c]).abs();
+        let worst = (0..nc).max_by(|a, b| relative(a).total_cmp(&relative(b))).unwrap_or_default();
+        Err(InitialError::Projection {
+            constraint: model.constraint_names[worst].clone(),
+            violation: closure.value[worst],
+        })
+    }
+
+    /// Velocity `q̇` (nd + nk) that belongs to the projected momentum (allocates).
+    ///
+    /// `M q̇ = p − Dhᵀ μ` on the dynamic rows, with `μ` such that `Dh q̇ = 0`.
+    pub fn velocity(&mut self) -> Vec<f64> {
+        self.workspace.find_velocity(&self.model, &self.state);
+        [&self.workspace.residual[..], &self.state.v].concat()
+    }
+
+    /// Energy of the state, with the projected momentum.
+    pub fn energy(&mut self) -> Energy {
+        let velocity = self.velocity();
+        let model = &self.model;
+        let workspace = &mut self.workspace;
+        workspace.gradient_at(model, &self.state.q, &velocity);
+        let tree = &model.dynamics;
+        let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
+        let weight: f64 = roots
+            .map(|(i, root)| {
+                let moment = workspace.momenta.moment[i]
+                    + workspace.poses.origin[i] * root.subtree_mass;
+                model.gravity.map_or(0.0, |g| g.dot(moment))
+            })
+            .sum();
+        let springs = springs::potential(
+            &model.coordinate_springs,
+            &model.point_springs,
+            tree,
+            &workspace.poses,
+            &self.state.q,
+        );
+        Energy {
+            kinetic_j: 0.5 * workspace.momenta.twice_kinetic_energy(tree, &velocity),
+            potential_j: springs - weight,
+        }
+    }
+}
+
+fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f64>, InitialError> {
+    if values.len() != expected {
+        return Err(InitialError::Dimension { name, expected, actual: values.len() });
+    }
+    match values.iter().position(|value| !value.is_finite()) {
+        Some(index) => Err(InitialError::NotFinite { name, index, value: values[index] }),
+        None => Ok(values.to_vec()),
+    }
+}
+
+impl Workspace {
+    /// The state has changed: nothing of the last step holds.
+    pub(crate) fn forget(&mut self) {
+        self.start_is_valid = false;
+        self.end_is_exact = false;
+    }
+
+    /// Gradient of the Lagrangian without springs at any configuration and velocity.
+    fn gradient_at(&mut self, model: &Model, q: &[f64], velocity: &[f64]) {
+        self.poses.evaluate(&model.dynamics, q);
+        self.momenta.gradient(
+            &model.dynamics,
+            &self.poses,
+            velocity,
+            model.gravity,
+            &mut self.l_q,
+            &mut self.l_v,
+        );
+    }
+
+    /// `p = M(q) q̇` on the dynamic rows.
+    fn momentum_of(&mut self, model: &Model, q: &[f64], velocity: &[f64]) -> Vec<f64> {
+        self.gradient_at(model, q, velocity);
+        self.l_v.clone()
+    }
+
+    /// Finds the velocity of the dynamic coordinates that belongs to a state, into `residual`.
+    pub(crate) fn find_velocity(&mut self, model: &Model, state: &PreciseState) {
+        let d = model.dimensions;
+        // With only the prescribed coordinates moving, `L_v` is their share of the momentum.
+        self.velocity[..d.dynamic].fill(0.0);
+        self.velocity[d.dynamic..].copy_from_slice(&state.v);
+        let velocity = std::mem::take(&mut self.velocity);
+        self.gradient_at(model, &state.q, &velocity);
+        self.velocity = velocity;
+        self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
+        self.matrix.clear();
+        self.curvature.fill_mass_matrix(&model.pairs, &self.momenta, &mut self.matrix);
+        self.matrix.factor(&model.elimination);
+        for (i, r) in self.residual.iter_mut().enumerate() {
+            *r = state.p[i] - self.l_v[i];
+        }
+        self.matrix.solve(&model.elimination, &mut self.residual);
+        if d.constraints > 0 {
+            self.project_velocity(model, state);
+        }
+    }
+
+    /// Takes the part of the velocity away that violates `Dh q̇ = 0`.
+    fn project_velocity(&mut self, model: &Model, state: &PreciseState) {
+        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        self.prepare_start(model, &state.q);
+        self.find_responses(model);
+        fill_schur(model, &self.start, &self.responses, &mut self.schur);
+        let rows = self.start.jacobian.chunks(n);
+        for (rate, row) in self.constraint_residual.iter_mut().zip(rows) {
+            let velocity = self.residual.iter().chain(&state.v);
+            *rate = row.iter().zip(velocity).map(|(entry, v)| entry * v).sum();
+        }
+        self.schur.solve(&mut self.constraint_residual);
+        for (i, v) in self.residual.iter_mut().enumerate() {
+            for (response, weight) in self.responses[i * nc..].iter().zip(&self.constraint_residual)
+            {
+                *v -= response * weight;
+            }
+        }
+    }
+}

@@ -1,0 +1,350 @@
+//! The exact first-order linearization of a step, in increment form.
+//!
+//! Unknown `y = (x, λ)`, parameters `θ = (q_d, q_k, p, k, u)`: start configuration (dynamic,
+//! prescribed), momentum, next prescribed positions, inputs. With both ends of the step shifted
+//! together no terms of size `1/h` cancel. At the midpoint, with `a` the weight of `F⁻`,
+//!
+//! ```text
+//! C_q = ½h L_qq − L_vq        C_v = ½h L_qv − L_vv + a h f_v        H = Σ λ D²h(q[k])
+//!
+//! column      of r1                       of r2
+//! q_d         (C_q − H)_dd                A1_d
+//! q_k         (½C_q − C_v/h − H)_dk       0
+//! p           1                           0
+//! k           (½C_q + C_v/h)_dk           A1_k
+//!
+//! x' = K⁻¹ (A0ᵀ λ' − r1')      S λ' = A1 K⁻¹ r1' − r2'      q[k+1]' = q_d' + x'
+//! p[k+1]' = p' + (½h L_qq + L_qv + h f_v/h) x' + h L_qq q_d' + (prescribed) − A0ᵀ λ' − H q'
+//! ```
+//!
+//! An input on coordinate `i` acts like momentum: its column is `a h` times that of `p_i`, plus
+//! `(1 − a) h` on `p[k+1]_i`.
+
+use nalgebra::DMatrix;
+
+use crate::Model;
+use crate::plant::{Plant, StepError, springs};
+
+/// The exact first-order linearization of one step, preallocated.
+#[derive(Clone, Debug)]
+pub struct Linearization {
+    nd: usize,
+    nk: usize,
+    time_step_s: f64,
+    /// Coordinate and gain of each input.
+    inputs: Vec<(usize, f64)>,
+    at_start: f64,
+    /// Columns of the solved parameters `(q_d, q_k, p, k)`.
+    width: usize,
+    /// `x'`, row-major, nd by width.
+    increment: Vec<f64>,
+    /// `p[k+1]'`, row-major, nd by width.
+    momentum: Vec<f64>,
+    /// `λ'`, row-major, nc by width.
+    multipliers: Vec<f64>,
+}
+
+impl Linearization {
+    /// Room for the linearization of a model.
+    pub fn new(model: &Model) -> Self {
+        let d = model.dimensions();
+        let width = 2 * (d.dynamic + d.prescribed);
+        Self {
+            nd: d.dynamic,
+            nk: d.prescribed,
+            time_step_s: model.scene().time_step_s,
+            inputs: model.inputs.clone(),
+            at_start: 0.5,
+            width,
+            increment: vec![0.0; d.dynamic * width],
+            momentum: vec![0.0; d.dynamic * width],
+            multipliers: vec![0.0; d.constraints * width],
+        }
+    }
+
+    /// `A = ∂f/∂x`, square of `2 nd + 2 nk`; its `v` columns are zero.
+    pub fn a(&self) -> DMatrix<f64> {
+        let (nd, nk) = (self.nd, self.nk);
+        let (n, state_columns) = (nd + nk, 2 * nd + nk);
+        let mut a = DMatrix::zeros(2 * n, 2 * n);
+        for i in 0..nd {
+            for j in 0..state_columns {
+                a[(i, j)] = self.increment[i * self.width + j];
+                a[(n + i, j)] = self.momentum[i * self.width + j];
+            }
+            a[(i, i)] += 1.0;
+        }
+        for k in 0..nk {
+            a[(n + nd + k, nd + k)] = -1.0 / self.time_step_s;
+        }
+        a
+    }
+
+    /// `B = ∂f/∂u`, `2 nd + 2 nk` by `ni + nk`.
+    pub fn b(&self) -> DMatrix<f64> {
+        let (nd, nk, ni) = (self.nd, self.nk, self.inputs.len());
+        let (n, next) = (nd + nk, 2 * nd + nk);
+        let mut b = DMatrix::zeros(2 * n, ni + nk);
+        for (column, &(coordinate, gain)) in self.inputs.iter().enumerate() {
+            let (at_start, impulse) = self.input_impulses(gain);
+            for i in 0..nd {
+                let momentum = i * self.width + n + coordinate;
+                b[(i, column)] = at_start * self.increment[momentum];
+                b[(n + i, column)] = at_start * self.momentum[momentum];
+            }
+            b[(n + coordinate, column)] += impulse - at_start;
+        }
+        for k in 0..nk {
+            for i in 0..nd {
+                b[(i, ni + k)] = self.increment[i * self.width + next + k];
+                b[(n + i, ni + k)] = self.momentum[i * self.width + next + k];
+            }
+            b[(nd + k, ni + k)] = 1.0;
+            b[(n + nd + k, ni + k)] = 1.0 / self.time_step_s;
+        }
+        b
+    }
+
+    /// `∂λ/∂x`, nc by `2 nd + 2 nk`.
+    pub fn multipliers_x(&self) -> DMatrix<f64> {
+        let state_columns = 2 * self.nd + self.nk;
+        let rows = self.constraints();
+        DMatrix::from_fn(rows, 2 * (self.nd + self.nk), |c, j| {
+            if j < state_columns { self.multipliers[c * self.width + j] } else { 0.0 }
+        })
+    }
+
+    /// `∂λ/∂u`, nc by `ni + nk`.
+    pub fn multipliers_u(&self) -> DMatrix<f64> {
+        let ni = self.inputs.len();
+        DMatrix::from_fn(self.constraints(), ni + self.nk, |c, j| {
+            let row = &self.multipliers[c * self.width..][..self.width];
+            match self.inputs.get(j) {
+                Some(&(coordinate, gain)) => {
+                    self.input_impulses(gain).0 * row[self.nd + self.nk + coordinate]
+                }
+                None => row[2 * self.nd + self.nk + j - ni],
+            }
+        })
+    }
+
+    /// Impulse of a unit input at the start of the step, and over the whole of it.
+    fn input_impulses(&self, gain: f64) -> (f64, f64) {
+        let impulse = self.time_step_s * gain;
+        (self.at_start * impulse, impulse)
+    }
+
+    fn constraints(&self) -> usize {
+        self.multipliers.len().checked_div(self.width).unwrap_or_default()
+    }
+}
+
+impl Plant {
+    /// Linearizes at the solution in the workspace.
+    pub(crate) fn linearize_solution(&mut self, out: &mut Linearization) -> Result<(), StepError> {
+        let d = self.model.dimensions;
+        assert!(
+            out.nd == d.dynamic
+                && out.nk == d.prescribed
+                && out.constraints() == d.constraints
+                && out.inputs == self.model.inputs,
+            "the linearization belongs to another model"
+        );
+        out.time_step_s = self.settings.time_step_s;
+        out.at_start = self.settings.force_split.at_start();
+        let workspace = &mut self.workspace;
+        workspace.factor_newton_matrix(&self.model, &self.settings)?;
+        self.fill_right_hand_sides(out);
+        let workspace = &mut self.workspace;
+        workspace.matrix.solve_rows(&self.model.elimination, &mut out.increment, out.width);
+        if d.constraints > 0 {
+            workspace.finish_end(&self.model, &self.state);
+            workspace.factor_schur(&self.model);
+            self.solve_multipliers(out);
+        }
+        for x in &mut out.increment {
+            *x = -*x;
+        }
+        self.differentiate_momentum(out);
+        Ok(())
+    }
+
+    /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
+    fn fill_right_hand_sides(&mut self, out: &mut Linearization) {
+        let (model, workspace) = (&self.model, &mut self.workspace);
+        let h = self.settings.time_step_s;
+        let (nd, nk, width) = (out.nd, out.nk, out.width);
+        out.increment.fill(0.0);
+        out.momentum.fill(0.0);
+        workspace.stiffness.fill(0.0);
+        workspace.end_slopes.fill(0.0);
+        for pair in &model.pairs {
+            let (i, j) = (pair.row as usize, pair.column as usize);
+            let second = workspace.curvature.pair(
+                &workspace.momenta,
+                model.gravity,
+                pair.ancestor as usize,
+                pair.descendant as usize,
+            );
+            let half = 0.5 * h * second.qq;
+            out.increment[i * width + j] = half - second.v_above_q_below;
+            out.increment[j * width + i] = half - second.q_above_v_below;
+            workspace.end_slopes[i * nd + j] = half + second.q_above_v_below;
+            workspace.end_slopes[j * nd + i] = half + second.v_above_q_below;
+            workspace.stiffness[i * nd + j] = h * second.qq;
+            workspace.stiffness[j * nd + i] = h * second.qq;
+        }
+        for pair in &model.mixed_pairs {
+            let second = workspace.curvature.pair(
+                &workspace.momenta,
+                model.gravity,
+                pair.ancestor,
+                pair.descendant,
+            );
+            let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
+            let descendant = model.dynamics.joints[pair.descendant].coordinate;
+            // Row of the dynamic coordinate, column of the prescribed one.
+            let (row, column, vq, qv) = if ancestor < nd {
+                (ancestor, descendant, second.v_above_q_below, second.q_above_v_below)
+            } else {
+                (descendant, ancestor, second.q_above_v_below, second.v_above_q_below)
+            };
+            let c_q = 0.25 * h * second.qq - 0.5 * vq;
+            let c_v = 0.5 * qv - second.vv / h;
+            let next = nd + column + nk;
+            out.increment[row * width + column] += c_q - c_v;
+            out.increment[row * width + next] += c_q + c_v;
+            out.momentum[row * width + column] += 0.5 * h * second.qq - qv;
+            out.momentum[row * width + next] += 0.5 * h * second.qq + qv;
+        }
+        self.add_springs(out);
+        self.add_constraint_hessian(out);
+        for i in 0..nd {
+            let momentum = i * width + nd + nk + i;
+            out.increment[momentum] = 1.0;
+            out.momentum[momentum] += 1.0;
+        }
+    }
+
+    /// Springs add `−V_qq` to `L_qq`.
+    fn add_springs(&mut self, out: &mut Linearization) {
+        let (model, workspace) = (&self.model, &mut self.workspace);
+        let h = self.settings.time_step_s;
+        let (nd, nk, width) = (out.nd, out.nk, out.width);
+        let (stiffness, slopes) = (&mut workspace.stiffness, &mut workspace.end_slopes);
+        let mut add = |row: usize, column: usize, value: f64| {
+            if column < nd {
+                out.increment[row * width + column] -= 0.5 * h * value;
+                slopes[row * nd + column] -= 0.5 * h * value;
+                stiffness[row * nd + column] -= h * value;
+            } else {
+                for column in [column, nd + column + nk] {
+                    out.increment[row * width + column] -= 0.25 * h * value;
+                    out.momentum[row * width + column] -= 0.5 * h * value;
+                }
+            }
+        };
+        for spring in &model.coordinate_springs {
+            add(spring.coordinate, spring.coordinate, spring.stiffness);
+        }
+        springs::for_each_second_derivative(
+            &model.point_springs,
+            &model.dynamics,
+            &workspace.poses,
+            |i, j, value| {
+                if i < nd {
+                    add(i, j, value);
+                }
+                if j < nd && i != j {
+                    add(j, i, value);
+                }
+            },
+        );
+    }
+
+    /// The constraints' impulses turn with the start configuration.
+    fn add_constraint_hessian(&mut self, out: &mut Linearization) {
+        if self.model.dimensions.constraints == 0 {
+            return;
+        }
+        let (model, workspace) = (&self.model, &mut self.workspace);
+        workspace.start.hessian(model, &workspace.multipliers, &mut workspace.constraint_hessian);
+        let n = model.dimensions.coordinates();
+        for i in 0..out.nd {
+            let row = &workspace.constraint_hessian[i * n..][..n];
+            let range = i * out.width..i * out.width + n;
+            for (entry, value) in out.increment[range.clone()].iter_mut().zip(row) {
+                *entry -= value;
+            }
+            for (entry, value) in out.momentum[range].iter_mut().zip(row) {
+                *entry -= value;
+            }
+        }
+    }
+
+    /// From `K⁻¹ r1'` in `out.increment`: solves `S λ' = A1 K⁻¹ r1' − r2'` and subtracts `K⁻¹ A0ᵀ λ'`.
+    fn solve_multipliers(&mut self, out: &mut Linearization) {
+        let (model, workspace) = (&self.model, &mut self.workspace);
+        let d = model.dimensions;
+        let (n, nd, nc, width) = (d.coordinates(), d.dynamic, d.constraints, out.width);
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let jacobian = &workspace.end.jacobian[c * n..][..n];
+            let target = &mut out.multipliers[c * width..][..width];
+            target[..nd].iter_mut().zip(jacobian).for_each(|(t, entry)| *t = -entry);
+            target[nd..nd + n].fill(0.0);
+            target[nd + n..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
+            for joint in &constraint.points.path {
+                if joint.coordinate < nd {
+                    let row = &out.increment[joint.coordinate * width..][..width];
+                    add_scaled(target, jacobian[joint.coordinate], row);
+                }
+            }
+        }
+        workspace.schur.solve_rows(&mut out.multipliers, width);
+        for i in 0..nd {
+            let target = &mut out.increment[i * width..][..width];
+            for c in 0..nc {
+                let response = workspace.responses[i * nc + c];
+                add_scaled(target, -response, &out.multipliers[c * width..][..width]);
+            }
+        }
+    }
+
+    /// Adds what depends on `x'` and `λ'` to `out.momentum`.
+    fn differentiate_momentum(&mut self, out: &mut Linearization) {
+        let (model, workspace) = (&self.model, &mut self.workspace);
+        let d = model.dimensions;
+        let (n, nd, width) = (d.coordinates(), d.dynamic, out.width);
+        for (i, c) in model.damping.iter().enumerate() {
+            workspace.end_slopes[i * nd + i] -= c;
+        }
+        for i in 0..nd {
+            let target = &mut out.momentum[i * width..][..width];
+            let stiffness = &workspace.stiffness[i * nd..][..nd];
+            target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
+            for (j, slope) in workspace.end_slopes[i * nd..][..nd].iter().enumerate() {
+                if *slope != 0.0 {
+                    add_scaled(target, *slope, &out.increment[j * width..][..width]);
+                }
+            }
+        }
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let source = &out.multipliers[c * width..][..width];
+            for joint in &constraint.points.path {
+                if joint.coordinate < nd {
+                    let entry = workspace.start.jacobian[c * n + joint.coordinate];
+                    let target = &mut out.momentum[joint.coordinate * width..][..width];
+                    add_scaled(target, -entry, source);
+                }
+            }
+        }
+    }
+}
+
+/// `target += factor * source`.
+#[inline(always)]
+fn add_scaled(target: &mut [f64], factor: f64, source: &[f64]) {
+    for (t, s) in target.iter_mut().zip(source) {
+        *t += factor * s;
+    }
+}

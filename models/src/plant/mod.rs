@@ -1,0 +1,383 @@
+//! Plants: a model with a state and a workspace.
+//!
+//! The files in the order in which a step runs: [`initial`], [`kinematics`], [`momenta`],
+//! [`springs`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`], [`pivoted_lu`],
+//! [`newton`], [`linearize`]; then [`snapshot`].
+
+mod closure;
+mod curvature;
+mod forces;
+mod initial;
+mod kinematics;
+mod linearize;
+mod momenta;
+mod newton;
+mod pivoted_lu;
+mod snapshot;
+mod springs;
+mod tree_lu;
+
+use std::sync::Arc;
+
+use nalgebra::DMatrix;
+
+use crate::Model;
+use newton::Workspace;
+
+pub use initial::{Initial, InitialError};
+pub use linearize::Linearization;
+pub use snapshot::{Snapshot, SnapshotError};
+
+/// How a plant is stepped.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settings {
+    /// Time step `h`, s; finite and greater than zero.
+    pub time_step_s: f64,
+    /// How forces are split between the ends of a step.
+    pub force_split: ForceSplit,
+    /// Corrections before a step is given up.
+    pub max_iterations: u32,
+}
+
+impl Settings {
+    /// The model's time step, symmetric split, 40 iterations.
+    pub fn new(model: &Model) -> Self {
+        Self {
+            time_step_s: model.scene().time_step_s,
+            force_split: ForceSplit::default(),
+            max_iterations: 40,
+        }
+    }
+}
+
+/// How the force impulse of a step is split into `F⁻` and `F⁺`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ForceSplit {
+    /// `F⁻ = F⁺ = ½ h f`: second order.
+    #[default]
+    Symmetric,
+    /// `F⁻ = h f`, `F⁺ = 0`, as in the paper: first order with forcing.
+    Paper,
+}
+
+impl ForceSplit {
+    /// Weight `a` of `F⁻`: `F⁻ = a h f`, `F⁺ = (1 − a) h f`.
+    pub(crate) fn at_start(self) -> f64 {
+        match self {
+            Self::Symmetric => 0.5,
+            Self::Paper => 1.0,
+        }
+    }
+}
+
+/// A state, by value.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct State {
+    /// Steps since the plant was initialised.
+    pub step: u64,
+    /// Configuration, nd + nk.
+    pub q: Vec<f64>,
+    /// Momentum, nd.
+    pub p: Vec<f64>,
+    /// Velocity of prescribed coordinates over the last step, nk.
+    pub v: Vec<f64>,
+    /// Constraint impulses of the last step, nc; zero before the first.
+    pub multipliers: Vec<f64>,
+}
+
+impl State {
+    /// `x = (q, p, v)`.
+    pub fn x(&self) -> Vec<f64> {
+        [&self.q[..], &self.p, &self.v].concat()
+    }
+}
+
+/// What the solver did.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct StepReport {
+    /// Residual evaluations, each followed by one correction.
+    pub iterations: u32,
+    /// Factorizations of the Newton matrix.
+    pub factorizations: u32,
+    /// Final residual in units of its own round-off.
+    pub residual: f64,
+    /// Final constraint violation in units of its own round-off.
+    pub constraint_residual: f64,
+    /// Smallest pivot of the Newton matrix relative to its largest entry.
+    pub reciprocal_condition: f64,
+}
+
+/// Why a step failed. The plant is as it was.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum StepError {
+    /// The input has the wrong length.
+    #[error("the input has {actual} entries; {expected} are needed")]
+    Dimension { expected: usize, actual: usize },
+    /// An entry of the input is NaN or infinite.
+    #[error("input {index} (`{name}`) is {value}")]
+    InputNotFinite { index: usize, name: String, value: f64 },
+    /// Newton's method did not reach the round-off level.
+    #[error("no convergence after {iterations} iterations: residual is {residual:e} times round-off; the step may be too large for the motion")]
+    NotConverged { iterations: u32, residual: f64 },
+    /// The iteration left the finite numbers.
+    #[error("the motion left the finite numbers after {iterations} iterations")]
+    NotFinite { iterations: u32 },
+    /// The Newton matrix is singular.
+    #[error("singular Newton matrix at coordinate `{coordinate}` (pivot {pivot:e} of the largest entry)")]
+    Singular { coordinate: String, pivot: f64 },
+}
+
+/// Kinetic and potential energy, J.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Energy {
+    /// `T(q, v)`.
+    pub kinetic_j: f64,
+    /// Gravity and springs.
+    pub potential_j: f64,
+}
+
+/// The state with what keeps its digits: sums are compensated, and past increments start the solver.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct PreciseState {
+    pub(crate) step: u64,
+    pub(crate) q: Vec<f64>,
+    /// What `q` of the dynamic coordinates lost to rounding.
+    pub(crate) q_low: Vec<f64>,
+    pub(crate) p: Vec<f64>,
+    /// What `p` lost to rounding.
+    pub(crate) p_low: Vec<f64>,
+    pub(crate) v: Vec<f64>,
+    pub(crate) multipliers: Vec<f64>,
+    /// Increments of the last three steps, latest first.
+    pub(crate) increments: [Vec<f64>; 3],
+    /// Multipliers of the last three steps, latest first.
+    pub(crate) impulses: [Vec<f64>; 3],
+    /// How many of them there are.
+    pub(crate) history: u8,
+}
+
+impl PreciseState {
+    fn zeros(nd: usize, nk: usize, nc: usize) -> Self {
+        let history = |n: usize| [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
+        Self {
+            step: 0,
+            q: vec![0.0; nd + nk],
+            q_low: vec![0.0; nd],
+            p: vec![0.0; nd],
+            p_low: vec![0.0; nd],
+            v: vec![0.0; nk],
+            multipliers: vec![0.0; nc],
+            increments: history(nd),
+            impulses: history(nc),
+            history: 0,
+        }
+    }
+
+    /// At rest in the initial configuration of the scene.
+    fn new(model: &Model) -> Self {
+        let d = model.dimensions();
+        let q = model.coordinates().iter().map(|c| c.initial).collect();
+        Self { q, ..Self::zeros(d.dynamic, d.prescribed, d.constraints) }
+    }
+}
+
+/// A plant: the discrete map `x[k+1] = f(x[k], u[k])` with its state.
+///
+/// After construction [`Plant::step`], [`Plant::linearize`] and [`Plant::step_and_linearize`]
+/// allocate nothing, take no lock, do no input or output, and do not panic.
+#[derive(Clone, Debug)]
+pub struct Plant {
+    model: Arc<Model>,
+    settings: Settings,
+    state: PreciseState,
+    workspace: Workspace,
+}
+
+impl Plant {
+    /// A plant in the scene's initial configuration, at rest.
+    pub fn new(model: Arc<Model>, settings: Settings) -> Result<Self, InitialError> {
+        let positive = |name, value: f64| {
+            if value.is_finite() && value > 0.0 {
+                Ok(())
+            } else {
+                Err(InitialError::Settings { name, value })
+            }
+        };
+        positive("time_step_s", settings.time_step_s)?;
+        positive("max_iterations", f64::from(settings.max_iterations))?;
+        let mut plant = Self {
+            state: PreciseState::new(&model),
+            workspace: Workspace::new(&model),
+            settings,
+            model,
+        };
+        plant.initialize(&Initial::Scene)?;
+        Ok(plant)
+    }
+
+    /// The model.
+    pub fn model(&self) -> &Arc<Model> {
+        &self.model
+    }
+
+    /// The settings.
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    /// Takes one step with `u = (inputs, next prescribed positions)`.
+    ///
+    /// Solves for the increment `x = q[k+1] − q[k]` and the multipliers `λ`:
+    ///
+    /// ```text
+    /// 0 = p + ½h L_q − L_v + a h f − Dh(q[k])ᵀ λ      at (q[k] + ½x, x/h)
+    /// 0 = h(q[k+1])
+    /// p[k+1] = p + h (L_q + f) − Dh(q[k])ᵀ λ
+    /// ```
+    ///
+    /// Two to four residual evaluations of O(n) and one factorization for a smooth state. A step
+    /// that fails leaves the plant as it was.
+    pub fn step(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
+        let report = self.solve(u)?;
+        self.commit();
+        Ok(report)
+    }
+
+    /// Linearizes the map at the current state and `u`, and stays there.
+    pub fn linearize(
+        &mut self,
+        u: &[f64],
+        out: &mut Linearization,
+    ) -> Result<StepReport, StepError> {
+        let report = self.solve(u)?;
+        self.linearize_solution(out)?;
+        Ok(report)
+    }
+
+    /// Takes one step and linearizes it at its solution.
+    pub fn step_and_linearize(
+        &mut self,
+        u: &[f64],
+        out: &mut Linearization,
+    ) -> Result<StepReport, StepError> {
+        let report = self.linearize(u, out)?;
+        self.commit();
+        Ok(report)
+    }
+
+    /// Writes the input that exerts no force and leaves prescribed coordinates where they are.
+    ///
+    /// # Panics
+    ///
+    /// If `u` does not have `ni + nk` entries.
+    pub fn hold_input(&self, u: &mut [f64]) {
+        let d = self.model.dimensions;
+        let (inputs, prescribed) = u.split_at_mut(d.inputs);
+        inputs.fill(0.0);
+        prescribed.copy_from_slice(&self.state.q[d.dynamic..]);
+    }
+
+    /// Steps since the plant was initialised.
+    pub fn step_index(&self) -> u64 {
+        self.state.step
+    }
+
+    /// `step_index × h`, s.
+    pub fn time_s(&self) -> f64 {
+        self.state.step as f64 * self.settings.time_step_s
+    }
+
+    /// Configuration, nd + nk.
+    pub fn q(&self) -> &[f64] {
+        &self.state.q
+    }
+
+    /// Momentum, nd (the paper's: not projected onto the constraints).
+    pub fn p(&self) -> &[f64] {
+        &self.state.p
+    }
+
+    /// Velocity of prescribed coordinates over the last step, nk.
+    pub fn v(&self) -> &[f64] {
+        &self.state.v
+    }
+
+    /// Constraint impulses of the last step, nc.
+    pub fn multipliers(&self) -> &[f64] {
+        &self.state.multipliers
+    }
+
+    /// The state by value (allocates).
+    pub fn state(&self) -> State {
+        State {
+            step: self.state.step,
+            q: self.state.q.clone(),
+            p: self.state.p.clone(),
+            v: self.state.v.clone(),
+            multipliers: self.state.multipliers.clone(),
+        }
+    }
+
+    /// Constraint Jacobian `Dh` at the current configuration, nc by nd + nk (allocates).
+    pub fn constraint_jacobian(&mut self) -> DMatrix<f64> {
+        self.workspace.prepare_start(&self.model, &self.state.q);
+        let d = self.model.dimensions;
+        DMatrix::from_row_slice(
+            d.constraints,
+            d.coordinates(),
+            &self.workspace.start.jacobian,
+        )
+    }
+
+    fn solve(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
+        self.check_input(u)?;
+        self.workspace.solve(&self.model, &self.settings, &self.state, u)
+    }
+
+    fn check_input(&self, u: &[f64]) -> Result<(), StepError> {
+        let d = self.model.dimensions;
+        if u.len() != d.input() {
+            return Err(StepError::Dimension { expected: d.input(), actual: u.len() });
+        }
+        match u.iter().position(|value| !value.is_finite()) {
+            None => Ok(()),
+            Some(index) => {
+                let name = match self.model.scene.inputs.get(index) {
+                    Some(input) => input.name.clone(),
+                    None => self.model.coordinates[d.dynamic + index - d.inputs].name.clone(),
+                };
+                Err(StepError::InputNotFinite { index, name, value: u[index] })
+            }
+        }
+    }
+
+    /// Moves on to the solution in the workspace.
+    fn commit(&mut self) {
+        let (state, workspace) = (&mut self.state, &mut self.workspace);
+        let nd = self.model.dimensions.dynamic;
+        for i in 0..nd {
+            let (q, low) = two_sum(state.q[i], workspace.increment[i] + state.q_low[i]);
+            (state.q[i], state.q_low[i]) = (q, low);
+            let (p, low) = two_sum(state.p[i], workspace.impulse[i] + state.p_low[i]);
+            (state.p[i], state.p_low[i]) = (p, low);
+        }
+        state.q[nd..].copy_from_slice(&workspace.q_end[nd..]);
+        state.v.copy_from_slice(&workspace.velocity[nd..]);
+        state.multipliers.copy_from_slice(&workspace.multipliers);
+        state.increments.rotate_right(1);
+        state.increments[0].copy_from_slice(&workspace.increment);
+        state.impulses.rotate_right(1);
+        state.impulses[0].copy_from_slice(&workspace.multipliers);
+        state.history = (state.history + 1).min(3);
+        state.step += 1;
+        workspace.move_on();
+    }
+}
+
+/// The sum of two numbers, and what rounding took from it.
+#[inline(always)]
+fn two_sum(a: f64, b: f64) -> (f64, f64) {
+    let sum = a + b;
+    let b_in_sum = sum - a;
+    (sum, (a - (sum - b_in_sum)) + (b - b_in_sum))
+}

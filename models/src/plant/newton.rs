@@ -1,0 +1,455 @@
+//! The solver of a step: chord Newton on the increment, from an extrapolated guess, to round-off.
+//!
+//! With `A0 = Dh(q[k])` and `A1 = Dh(q[k+1])` a correction solves
+//!
+//! ```text
+//! [ K   −A0ᵀ ] [dx]     [r1]       S = A1 K⁻¹ A0ᵀ,   S dλ = A1 K⁻¹ r1 − r2
+//! [ A1    0  ] [dλ] = − [r2],      dx = K⁻¹ (A0ᵀ dλ − r1)
+//! ```
+//!
+//! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
+//! measured in units of its own round-off; the solver stops where arithmetic does.
+
+use crate::Model;
+use crate::plant::closure::{Closure, larger};
+use crate::plant::curvature::Curvature;
+use crate::plant::kinematics::Poses;
+use crate::plant::momenta::Momenta;
+use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::tree_lu::{SmallestPivot, TreeLu};
+use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, springs};
+
+/// A residual this small, in units of round-off, is as good as zero.
+const CONVERGED: f64 = 4.0;
+/// A residual that no longer falls, with a fresh Jacobian, is at its floor if it is below this.
+const FLOOR: f64 = 1e4;
+/// The same for a Jacobian that was kept.
+const CHORD_FLOOR: f64 = 1e2;
+/// A residual that falls slower than this asks for a new Jacobian.
+const SLOW: f64 = 0.2;
+/// A pivot below this fraction of the largest entry is zero.
+const SINGULAR: f64 = 1e-14;
+
+/// All memory that a step and its linearization need.
+#[derive(Clone, Debug)]
+pub(crate) struct Workspace {
+    pub(crate) increment: Vec<f64>,
+    pub(crate) multipliers: Vec<f64>,
+    /// Change of the momentum over the step.
+    pub(crate) impulse: Vec<f64>,
+    /// Configuration at the midpoint.
+    pub(crate) q_mid: Vec<f64>,
+    /// Configuration at the end.
+    pub(crate) q_end: Vec<f64>,
+    /// Velocity over the step.
+    pub(crate) velocity: Vec<f64>,
+    pub(crate) l_q: Vec<f64>,
+    pub(crate) l_v: Vec<f64>,
+    pub(crate) input_force: Vec<f64>,
+    /// Inputs and damping at the midpoint.
+    pub(crate) force: Vec<f64>,
+    pub(crate) residual: Vec<f64>,
+    pub(crate) constraint_residual: Vec<f64>,
+    pub(crate) poses: Poses,
+    pub(crate) momenta: Momenta,
+    pub(crate) curvature: Curvature,
+    pub(crate) matrix: TreeLu,
+    /// Constraints at `q[k]`.
+    pub(crate) start: Closure,
+    /// `start` holds the constraints at the state's configuration.
+    pub(crate) start_is_valid: bool,
+    /// Constraints at `q[k+1]`.
+    pub(crate) end: Closure,
+    /// `end` holds the constraints, Jacobian included, at the solution.
+    pub(crate) end_is_exact: bool,
+    /// `K⁻¹ A0ᵀ`, row-major, nd by nc.
+    pub(crate) responses: Vec<f64>,
+    pub(crate) schur: PivotedLu,
+    /// `Σ λ D²h`, for the linearization.
+    pub(crate) constraint_hessian: Vec<f64>,
+    /// `½h L_qq + L_qv`, for the linearization, row-major.
+    pub(crate) end_slopes: Vec<f64>,
+    /// `h L_qq`, for the linearization, row-major.
+    pub(crate) stiffness: Vec<f64>,
+}
+
+impl Workspace {
+    pub(crate) fn new(model: &Model) -> Self {
+        let d = model.dimensions;
+        let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
+        let zeros = |len: usize| vec![0.0; len];
+        Self {
+            increment: zeros(nd),
+            multipliers: zeros(nc),
+            impulse: zeros(nd),
+            q_mid: zeros(n),
+            q_end: zeros(n),
+            velocity: zeros(n),
+            l_q: zeros(nd),
+            l_v: zeros(nd),
+            input_force: zeros(nd),
+            force: zeros(nd),
+            residual: zeros(nd),
+            constraint_residual: zeros(nc),
+            poses: Poses::new(&model.dynamics),
+            momenta: Momenta::new(&model.dynamics),
+            curvature: Curvature::new(&model.dynamics),
+            matrix: TreeLu::new(&model.elimination),
+            start: Closure::new(model),
+            start_is_valid: false,
+            end: Closure::new(model),
+            end_is_exact: false,
+            responses: zeros(nd * nc),
+            schur: PivotedLu::new(nc),
+            constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
+            end_slopes: zeros(nd * nd),
+            stiffness: zeros(nd * nd),
+        }
+    }
+
+    /// Solves one step from `motion`; the solution stays in the workspace.
+    pub(crate) fn solve(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+        u: &[f64],
+    ) -> Result<StepReport, StepError> {
+        self.prepare(model, settings, state, u);
+        if state.history > 0 {
+            self.extrapolate(state);
+            let report = self.iterate(model, settings, state, false);
+            if report.is_ok() {
+                return report;
+            }
+        }
+        self.ballistic(model, settings, state);
+        self.iterate(model, settings, state, true)
+    }
+
+    /// What does not change within a step: prescribed state, input forces, constraints at the start.
+    fn prepare(&mut self, model: &Model, settings: &Settings, state: &PreciseState, u: &[f64]) {
+        let d = model.dimensions;
+        let (inputs, next) = u.split_at(d.inputs);
+        for (k, next) in next.iter().enumerate() {
+            let i = d.dynamic + k;
+            self.q_mid[i] = 0.5 * (state.q[i] + next);
+            self.velocity[i] = (next - state.q[i]) / settings.time_step_s;
+            self.q_end[i] = *next;
+        }
+        if d.inputs > 0 {
+            forces::input_forces(&model.inputs, inputs, &mut self.input_force);
+            self.force.copy_from_slice(&self.input_force);
+        }
+        self.prepare_start(model, &state.q);
+    }
+
+    /// Constraints at the start of the step, kept from the end of the last one where possible.
+    pub(crate) fn prepare_start(&mut self, model: &Model, q: &[f64]) {
+        if model.dimensions.constraints > 0 && !self.start_is_valid {
+            self.start.evaluate(model, q);
+            self.start.differentiate(model, q);
+            self.start_is_valid = true;
+        }
+    }
+
+    /// The end of this step is the start of the next.
+    pub(crate) fn move_on(&mut self) {
+        if self.end_is_exact {
+            std::mem::swap(&mut self.start, &mut self.end);
+        }
+        self.start_is_valid = self.end_is_exact;
+        self.end_is_exact = false;
+    }
+
+    /// Guess: the polynomial through the increments of up to three past steps.
+    fn extrapolate(&mut self, state: &PreciseState) {
+        let guess = |past: [&[f64]; 3], out: &mut [f64]| match state.history {
+            1 => out.copy_from_slice(past[0]),
+            2 => {
+                for (i, out) in out.iter_mut().enumerate() {
+                    *out = 2.0 * past[0][i] - past[1][i];
+                }
+            }
+            _ => {
+                for (i, out) in out.iter_mut().enumerate() {
+                    *out = 3.0 * (past[0][i] - past[1][i]) + past[2][i];
+                }
+            }
+        };
+        guess(state.increments.each_ref().map(Vec::as_slice), &mut self.increment);
+        guess(state.impulses.each_ref().map(Vec::as_slice), &mut self.multipliers);
+    }
+
+    /// Guess: the velocity that belongs to the momentum goes on.
+    fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
+        self.find_velocity(model, state);
+        for (x, v) in self.increment.iter_mut().zip(&self.residual) {
+            *x = settings.time_step_s * v;
+        }
+        self.multipliers.copy_from_slice(&state.multipliers);
+        // The velocity was found with the prescribed velocities of the last step, not of this one.
+        for i in model.dimensions.dynamic..self.velocity.len() {
+            self.velocity[i] = (self.q_end[i] - state.q[i]) / settings.time_step_s;
+        }
+    }
+
+    /// Corrects the guess until the residual is at round-off.
+    fn iterate(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+        always_factor: bool,
+    ) -> Result<StepReport, StepError> {
+        let mut report = StepReport { reciprocal_condition: 1.0, ..StepReport::default() };
+        let mut previous = f64::INFINITY;
+        let mut fresh = false;
+        while report.iterations < settings.max_iterations {
+            report.iterations += 1;
+            report.residual = self.evaluate(model, settings, state);
+            report.constraint_residual = self.evaluate_end(model, state);
+            let size = larger(report.residual, report.constraint_residual);
+            if !size.is_finite() {
+                return Err(StepError::NotFinite { iterations: report.iterations });
+            }
+            if report.iterations == 1 && size <= CONVERGED {
+                self.accept(model, settings);
+                return Ok(report);
+            }
+            let floor = if fresh { FLOOR } else { CHORD_FLOOR };
+            let at_floor = size <= floor && size > 0.5 * previous;
+            let converged = size <= CONVERGED || at_floor;
+            fresh = !converged && (always_factor || previous.is_infinite() || size > SLOW * previous);
+            if fresh {
+                let pivot = self.factor(model, settings)?;
+                report.reciprocal_condition = pivot.relative;
+                report.factorizations += 1;
+            }
+            self.correct(model);
+            if converged {
+                self.accept(model, settings);
+                return Ok(report);
+            }
+            previous = size;
+        }
+        Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
+    }
+
+    /// Residual `r1` at the current increment; returns its size in units of round-off.
+    fn evaluate(&mut self, model: &Model, settings: &Settings, state: &PreciseState) -> f64 {
+        let h = settings.time_step_s;
+        let inverse = 1.0 / h;
+        for (i, x) in self.increment.iter().enumerate() {
+            self.q_mid[i] = state.q[i] + (state.q_low[i] + 0.5 * x);
+            self.velocity[i] = x * inverse;
+        }
+        self.evaluate_lagrangian(model);
+        let weight = settings.force_split.at_start() * h;
+        let mut round_off = f64::MIN_POSITIVE;
+        for i in 0..self.residual.len() {
+            let (half_q, force) = (0.5 * h * self.l_q[i], weight * self.force[i]);
+            let inertial = state.p[i] - self.l_v[i];
+            self.residual[i] = (inertial + (half_q + force)) + state.p_low[i];
+            let magnitude = state.p[i].abs()
+                + self.l_v[i].abs()
+                + half_q.abs() * (1.0 + self.q_mid[i].abs())
+                + force.abs();
+            round_off = larger(round_off, magnitude);
+        }
+        if model.dimensions.constraints > 0 {
+            self.start.subtract_impulses(model, &self.multipliers, &mut self.residual);
+        }
+        let largest = self.residual.iter().fold(0.0, |m, r| larger(m, r.abs()));
+        largest / (f64::EPSILON * round_off)
+    }
+
+    /// Gradient of the Lagrangian and forces at the midpoint.
+    pub(crate) fn evaluate_lagrangian(&mut self, model: &Model) {
+        self.poses.evaluate(&model.dynamics, &self.q_mid);
+        self.momenta.gradient(
+            &model.dynamics,
+            &self.poses,
+            &self.velocity,
+            model.gravity,
+            &mut self.l_q,
+            &mut self.l_v,
+        );
+        if model.has_springs() {
+            springs::add_gradient(
+                &model.coordinate_springs,
+                &model.point_springs,
+                &model.dynamics,
+                &self.poses,
+                &self.q_mid,
+                &mut self.l_q,
+            );
+        }
+        if !model.damping.is_empty() {
+            forces::add_damping(&model.damping, &self.velocity, &self.input_force, &mut self.force);
+        }
+    }
+
+    /// Constraint values `r2` at the current increment; returns their size in units of round-off.
+    fn evaluate_end(&mut self, model: &Model, state: &PreciseState) -> f64 {
+        if model.dimensions.constraints == 0 {
+            return 0.0;
+        }
+        self.place_end(state);
+        self.end_is_exact = false;
+        self.end.evaluate(model, &self.q_end);
+        self.end.violation()
+    }
+
+    fn place_end(&mut self, state: &PreciseState) {
+        for (i, x) in self.increment.iter().enumerate() {
+            self.q_end[i] = state.q[i] + (state.q_low[i] + x);
+        }
+    }
+
+    /// Factors `K` and `S` at the last evaluation.
+    fn factor(&mut self, model: &Model, settings: &Settings) -> Result<SmallestPivot, StepError> {
+        let pivot = self.factor_newton_matrix(model, settings)?;
+        if model.dimensions.constraints > 0 {
+            self.end.differentiate(model, &self.q_end);
+            self.factor_schur(model);
+        }
+        Ok(pivot)
+    }
+
+    /// Factors `K` at the last evaluation.
+    pub(crate) fn factor_newton_matrix(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+    ) -> Result<SmallestPivot, StepError> {
+        let h = settings.time_step_s;
+        self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
+        if !model.point_springs.is_empty() {
+            self.matrix.clear();
+        }
+        self.curvature.fill_newton_matrix(
+            &model.pairs,
+            &self.momenta,
+            model.gravity,
+            h,
+            &mut self.matrix,
+        );
+        if model.has_springs() {
+            springs::add_to_newton_matrix(
+                &model.coordinate_springs,
+                &model.point_springs,
+                &model.dynamics,
+                &self.poses,
+                h,
+                &model.elimination,
+                &mut self.matrix,
+            );
+        }
+        for (i, c) in model.damping.iter().enumerate() {
+            let slot = model.elimination.offsets[i + 1] - 1;
+            self.matrix.add_to_diagonal(slot, -settings.force_split.at_start() * c);
+        }
+        let pivot = self.matrix.factor(&model.elimination);
+        if pivot.relative >= SINGULAR || model.dimensions.dynamic == 0 {
+            Ok(pivot)
+        } else {
+            let coordinate = model.coordinates[pivot.row].name.clone();
+            Err(StepError::Singular { coordinate, pivot: pivot.relative })
+        }
+    }
+
+    /// Factors `S = A1 K⁻¹ A0ᵀ` with the Jacobians in `start` and `end`.
+    pub(crate) fn factor_schur(&mut self, model: &Model) {
+        self.find_responses(model);
+        fill_schur(model, &self.end, &self.responses, &mut self.schur);
+    }
+
+    /// Solves for the responses `K⁻¹ A0ᵀ` with the matrix that is factored.
+    pub(crate) fn find_responses(&mut self, model: &Model) {
+        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        for i in 0..model.dimensions.dynamic {
+            for c in 0..nc {
+                self.responses[i * nc + c] = self.start.jacobian[c * n + i];
+            }
+        }
+        self.matrix.solve_rows(&model.elimination, &mut self.responses, nc);
+    }
+
+    /// One correction with the factors at hand.
+    fn correct(&mut self, model: &Model) {
+        self.matrix.solve(&model.elimination, &mut self.residual);
+        let nc = model.dimensions.constraints;
+        if nc > 0 {
+            let n = model.dimensions.coordinates();
+            for (c, constraint) in model.constraints.iter().enumerate() {
+                let row = &self.end.jacobian[c * n..][..n];
+                let mut value = -self.end.value[c];
+                for joint in &constraint.points.path {
+                    if let Some(r) = self.residual.get(joint.coordinate) {
+                        value += row[joint.coordinate] * r;
+                    }
+                }
+                self.constraint_residual[c] = value;
+            }
+            self.schur.solve(&mut self.constraint_residual);
+            for (lambda, change) in self.multipliers.iter_mut().zip(&self.constraint_residual) {
+                *lambda += change;
+            }
+            for (i, r) in self.residual.iter_mut().enumerate() {
+                for (response, change) in
+                    self.responses[i * nc..].iter().zip(&self.constraint_residual)
+                {
+                    *r -= response * change;
+                }
+            }
+        }
+        for (x, r) in self.increment.iter_mut().zip(&self.residual) {
+            *x -= r;
+        }
+    }
+
+    /// The impulse of the solution.
+    fn accept(&mut self, model: &Model, settings: &Settings) {
+        for (i, impulse) in self.impulse.iter_mut().enumerate() {
+            *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
+        }
+        if model.dimensions.constraints > 0 {
+            self.start.subtract_impulses(model, &self.multipliers, &mut self.impulse);
+        }
+    }
+
+    /// Constraints with Jacobian at the solution, for the linearization and the next step.
+    pub(crate) fn finish_end(&mut self, model: &Model, state: &PreciseState) {
+        if model.dimensions.constraints > 0 && !self.end_is_exact {
+            self.place_end(state);
+            self.end.evaluate(model, &self.q_end);
+            self.end.differentiate(model, &self.q_end);
+            self.end_is_exact = true;
+        }
+    }
+}
+
+/// Factors `A X` for the constraint Jacobian `A` of `closure` and `X`, row-major, nd by nc.
+pub(crate) fn fill_schur(model: &Model, closure: &Closure, x: &[f64], schur: &mut PivotedLu) {
+    let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+    for (c, constraint) in model.constraints.iter().enumerate() {
+        let target = &mut schur.matrix[c * nc..][..nc];
+        target.fill(0.0);
+        for joint in &constraint.points.path {
+            if joint.coordinate < model.dimensions.dynamic {
+                let entry = closure.jacobian[c * n + joint.coordinate];
+                for (t, x) in target.iter_mut().zip(&x[joint.coordinate * nc..]) {
+                    *t += entry * x;
+                }
+            }
+        }
+    }
+    schur.factor();
+}
+
+impl Model {
+    pub(crate) fn has_springs(&self) -> bool {
+        !self.coordinate_springs.is_empty() || !self.point_springs.is_empty()
+    }
+}

@@ -1,0 +1,128 @@
+//! Dense LU with complete pivoting, for the small Schur complement of the constraints.
+//!
+//! Rows that depend on others (redundant constraints) show as vanishing pivots: they are left out,
+//! and their multipliers are zero.
+
+/// Pivots below this fraction of the largest count as zero.
+const RANK_TOLERANCE: f64 = 1e-11;
+
+/// A square matrix, row-major, and its factorization in place.
+#[derive(Clone, Debug)]
+pub(crate) struct PivotedLu {
+    pub(crate) matrix: Vec<f64>,
+    order: usize,
+    rank: usize,
+    rows: Vec<usize>,
+    columns: Vec<usize>,
+    scale: Vec<f64>,
+    scratch: Vec<f64>,
+}
+
+impl PivotedLu {
+    pub(crate) fn new(order: usize) -> Self {
+        Self {
+            matrix: vec![0.0; order * order],
+            order,
+            rank: 0,
+            rows: vec![0; order],
+            columns: vec![0; order],
+            scale: vec![1.0; order],
+            scratch: vec![0.0; order],
+        }
+    }
+
+    /// Factors what stands in `matrix`, scaled to a unit diagonal first.
+    pub(crate) fn factor(&mut self) {
+        let n = self.order;
+        for i in 0..n {
+            let diagonal = self.matrix[i * n + i].abs();
+            self.scale[i] = if diagonal > 0.0 { diagonal.sqrt().recip() } else { 1.0 };
+            self.rows[i] = i;
+            self.columns[i] = i;
+        }
+        for i in 0..n {
+            for j in 0..n {
+                self.matrix[i * n + j] *= self.scale[i] * self.scale[j];
+            }
+        }
+        self.rank = n;
+        let mut first = 0.0;
+        for k in 0..n {
+            let (row, column, pivot) = self.largest_from(k);
+            if k == 0 {
+                first = pivot;
+            }
+            // Written so that a NaN ends the factorization too.
+            if !(pivot > RANK_TOLERANCE * first) {
+                self.rank = k;
+                return;
+            }
+            self.swap(k, row, column);
+            for i in k + 1..n {
+                let factor = self.matrix[i * n + k] / self.matrix[k * n + k];
+                self.matrix[i * n + k] = factor;
+                for j in k + 1..n {
+                    self.matrix[i * n + j] -= factor * self.matrix[k * n + j];
+                }
+            }
+        }
+    }
+
+    fn largest_from(&self, k: usize) -> (usize, usize, f64) {
+        let n = self.order;
+        let mut largest = (k, k, 0.0);
+        for i in k..n {
+            for j in k..n {
+                let entry = self.matrix[i * n + j].abs();
+                if entry > largest.2 {
+                    largest = (i, j, entry);
+                }
+            }
+        }
+        largest
+    }
+
+    fn swap(&mut self, k: usize, row: usize, column: usize) {
+        let n = self.order;
+        self.rows.swap(k, row);
+        self.columns.swap(k, column);
+        for j in 0..n {
+            self.matrix.swap(k * n + j, row * n + j);
+        }
+        for i in 0..n {
+            self.matrix.swap(i * n + k, i * n + column);
+        }
+    }
+
+    /// Solves in place; multipliers of redundant rows are zero.
+    pub(crate) fn solve(&mut self, x: &mut [f64]) {
+        self.solve_rows(x, 1);
+    }
+
+    /// Solves in place for a row-major right-hand side of `width` columns.
+    pub(crate) fn solve_rows(&mut self, x: &mut [f64], width: usize) {
+        let (n, rank) = (self.order, self.rank);
+        for column in 0..width {
+            for k in 0..rank {
+                let row = self.rows[k];
+                let mut value = x[row * width + column] * self.scale[row];
+                for j in 0..k {
+                    value -= self.matrix[k * n + j] * self.scratch[j];
+                }
+                self.scratch[k] = value;
+            }
+            for k in (0..rank).rev() {
+                let mut value = self.scratch[k];
+                for j in k + 1..rank {
+                    value -= self.matrix[k * n + j] * self.scratch[j];
+                }
+                self.scratch[k] = value / self.matrix[k * n + k];
+            }
+            self.scratch[rank..n].fill(0.0);
+            for k in 0..n {
+                let target = self.columns[k];
+                x[target * width + column] = self.scratch[k] * self.scale[target];
+            }
+        }
+    }
+}

@@ -1,0 +1,167 @@
+//! Snapshots: everything that a plant needs to go on bit for bit.
+//!
+//! Encoding, little-endian: magic `PLNTSNAP`, version (u32), model digest (u64), time step (f64 bits),
+//! force split (u8), iteration limit (u32), nd, nk, nc (u32 each), step (u64), history (u8), the
+//! numbers as f64 bits, and the FNV-1a hash (u64) of all that.
+
+use crate::compile::fnv1a;
+use crate::plant::{ForceSplit, PreciseState, Plant, Settings};
+
+const MAGIC: &[u8; 8] = b"PLNTSNAP";
+const VERSION: u32 = 1;
+
+/// Everything a plant needs to go on bit for bit.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Snapshot {
+    model_digest: u64,
+    settings: Settings,
+    state: PreciseState,
+}
+
+/// Why a snapshot was refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SnapshotError {
+    /// Not a snapshot, cut short, or damaged.
+    #[error("not a snapshot: {0}")]
+    Malformed(&'static str),
+    /// Taken from another model, or with other settings.
+    #[error("the snapshot was taken with another {0}")]
+    Mismatch(&'static str),
+}
+
+impl Plant {
+    /// Takes a snapshot.
+    pub fn snapshot(&self) -> Snapshot {
+        Snapshot {
+            model_digest: self.model.digest(),
+            settings: self.settings,
+            state: self.state.clone(),
+        }
+    }
+
+    /// Restores a snapshot of a plant of the same model and settings, step count included.
+    pub fn restore(&mut self, snapshot: &Snapshot) -> Result<(), SnapshotError> {
+        let same_sizes = |a: &PreciseState, b: &PreciseState| {
+            a.q.len() == b.q.len()
+                && a.p.len() == b.p.len()
+                && a.multipliers.len() == b.multipliers.len()
+        };
+        if snapshot.model_digest != self.model.digest()
+            || !same_sizes(&snapshot.state, &self.state)
+        {
+            return Err(SnapshotError::Mismatch("model"));
+        }
+        if snapshot.settings != self.settings {
+            return Err(SnapshotError::Mismatch("setting"));
+        }
+        self.state.clone_from(&snapshot.state);
+        self.workspace.forget();
+        Ok(())
+    }
+}
+
+impl PreciseState {
+    /// All vectors, in the order of the encoding.
+    fn vectors(&mut self) -> [&mut Vec<f64>; 12] {
+        let [x0, x1, x2] = &mut self.increments;
+        let [l0, l1, l2] = &mut self.impulses;
+        [
+            &mut self.q,
+            &mut self.q_low,
+            &mut self.p,
+            &mut self.p_low,
+            &mut self.v,
+            &mut self.multipliers,
+            x0,
+            x1,
+            x2,
+            l0,
+            l1,
+            l2,
+        ]
+    }
+}
+
+impl Snapshot {
+    /// Encodes (versioned, little-endian, with a checksum).
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut state = self.state.clone();
+        let mut bytes = Vec::from(MAGIC);
+        bytes.extend(VERSION.to_le_bytes());
+        bytes.extend(self.model_digest.to_le_bytes());
+        bytes.extend(self.settings.time_step_s.to_le_bytes());
+        bytes.push(match self.settings.force_split {
+            ForceSplit::Symmetric => 0,
+            ForceSplit::Paper => 1,
+        });
+        bytes.extend(self.settings.max_iterations.to_le_bytes());
+        for size in [state.p.len(), state.v.len(), state.multipliers.len()] {
+            bytes.extend((size as u32).to_le_bytes());
+        }
+        bytes.extend(state.step.to_le_bytes());
+        bytes.push(state.history);
+        for vector in state.vectors() {
+            bytes.extend(vector.iter().flat_map(|value| value.to_le_bytes()));
+        }
+        bytes.extend(fnv1a(&bytes).to_le_bytes());
+        bytes
+    }
+
+    /// Decodes. Allocates no more than a small multiple of `bytes.len()`.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
+        let malformed = SnapshotError::Malformed;
+        let split = bytes.len().checked_sub(8).ok_or(malformed("cut short"))?;
+        let (body, hash) = bytes.split_at(split);
+        if !body.starts_with(MAGIC) {
+            return Err(malformed("wrong magic number"));
+        }
+        if fnv1a(body).to_le_bytes() != hash {
+            return Err(malformed("checksum does not match"));
+        }
+        let mut reader = Reader(&body[MAGIC.len()..]);
+        if u32::from_le_bytes(reader.take()?) != VERSION {
+            return Err(malformed("unknown version"));
+        }
+        let model_digest = u64::from_le_bytes(reader.take()?);
+        let settings = Settings {
+            time_step_s: f64::from_le_bytes(reader.take()?),
+            force_split: match reader.take::<1>()? {
+                [0] => ForceSplit::Symmetric,
+                [1] => ForceSplit::Paper,
+                _ => return Err(malformed("unknown force split")),
+            },
+            max_iterations: u32::from_le_bytes(reader.take()?),
+        };
+        let mut size = || Ok(u32::from_le_bytes(reader.take()?) as usize);
+        let (nd, nk, nc) = (size()?, size()?, size()?);
+        let step = u64::from_le_bytes(reader.take()?);
+        let [history] = reader.take()?;
+        let numbers = 7 * nd + 2 * nk + 4 * nc;
+        if reader.0.len() != 8 * numbers || history > 3 {
+            return Err(malformed("sizes do not match"));
+        }
+        let mut state = PreciseState::zeros(nd, nk, nc);
+        (state.step, state.history) = (step, history);
+        for vector in state.vectors() {
+            for value in vector {
+                *value = f64::from_le_bytes(reader.take()?);
+                if !value.is_finite() {
+                    return Err(malformed("a number is not finite"));
+                }
+            }
+        }
+        Ok(Self { model_digest, settings, state })
+    }
+}
+
+/// Bytes still to be read.
+struct Reader<'a>(&'a [u8]);
+
+impl Reader<'_> {
+    fn take<const N: usize>(&mut self) -> Result<[u8; N], SnapshotError> {
+        let (head, tail) =
+            self.0.split_first_chunk().ok_or(SnapshotError::Malformed("cut short"))?;
+        self.0 = tail;
+        Ok(*head)
+    }
+}
