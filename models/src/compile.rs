@@ -23,13 +23,7 @@ pub(crate) fn compile(scene: &Scene) -> Model {
     let point_springs = layout.point_springs(scene, &dynamics, &in_dynamics);
     let (constraints, constraint_names) = layout.constraints(scene, &closure, &in_closure);
 
-    let mut joint_of = vec![WORLD; dynamic];
-    for (index, joint) in dynamics.joints.iter().enumerate() {
-        if joint.coordinate < dynamic {
-            joint_of[joint.coordinate] = index;
-        }
-    }
-    let elimination = Elimination::new(&couplings(dynamic, &dynamics, &joint_of, &point_springs));
+    let elimination = Elimination::new(&couplings(dynamic, &dynamics, &point_springs));
     let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
 
     let damping: Vec<f64> = layout.coordinates[..dynamic]
@@ -54,7 +48,6 @@ pub(crate) fn compile(scene: &Scene) -> Model {
         constraints,
         constraint_names,
         dynamics,
-        joint_of,
         closure,
         elimination,
         pairs,
@@ -97,8 +90,7 @@ impl Layout {
         for frame in &scene.frames {
             children.entry(&frame.parent).or_default().push(frame);
         }
-        let world =
-            Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
+        let world = Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
         let mut layout = Self {
             joints: Vec::new(),
             frames: BTreeMap::from([("world".to_owned(), world)]),
@@ -145,11 +137,8 @@ impl Layout {
                 anchor: false,
             });
             names.push(name.to_owned());
-            placement = Placement {
-                joint: index,
-                rotation: turned.transpose(),
-                translation: Vec3::ZERO,
-            };
+            placement =
+                Placement { joint: index, rotation: turned.transpose(), translation: Vec3::ZERO };
         }
         if let (Some(body), true) = (&frame.body, placement.joint != WORLD) {
             let joint = &mut self.joints[placement.joint];
@@ -355,8 +344,9 @@ impl Layout {
 
 fn ends(constraint: &scene::Constraint) -> (&scene::Point, &scene::Point) {
     match constraint {
-        scene::Constraint::Distance { a, b, .. }
-        | scene::Constraint::PointToPoint { a, b, .. } => (a, b),
+        scene::Constraint::Distance { a, b, .. } | scene::Constraint::PointToPoint { a, b, .. } => {
+            (a, b)
+        }
     }
 }
 
@@ -412,7 +402,8 @@ fn placed(body: &scene::Body, placement: &Placement) -> Body {
         [xx, yy, zz, xy, xz, yz] => Sym3 { xx, yy, zz, xy, xz, yz },
         _ => Sym3::default(),
     };
-    let isotropic = inertia == Sym3 { xx: inertia.xx, yy: inertia.xx, zz: inertia.xx, ..Sym3::default() };
+    let isotropic =
+        inertia == Sym3 { xx: inertia.xx, yy: inertia.xx, zz: inertia.xx, ..Sym3::default() };
     let rotated = if isotropic { inertia } else { inertia.rotated(&placement.rotation) };
     Body { mass: body.mass, center, inertia: classified(body.mass, rotated) }
 }
@@ -431,9 +422,8 @@ fn lumped(a: &Body, b: &Body) -> Body {
     } else {
         Vec3::ZERO
     };
-    let about_center = |body: &Body| {
-        full(&body.inertia).add(&Sym3::of_point(body.mass, body.center - center))
-    };
+    let about_center =
+        |body: &Body| full(&body.inertia).add(&Sym3::of_point(body.mass, body.center - center));
     Body { mass, center, inertia: classified(mass, about_center(a).add(&about_center(b))) }
 }
 
@@ -456,12 +446,7 @@ fn classified(mass: f64, tensor: Sym3) -> Rotational {
 }
 
 /// Which dynamic coordinates each one is coupled with, among those before it.
-fn couplings(
-    dynamic: usize,
-    tree: &Tree,
-    joint_of: &[usize],
-    springs: &[PointSpring],
-) -> Vec<BTreeSet<usize>> {
+fn couplings(dynamic: usize, tree: &Tree, springs: &[PointSpring]) -> Vec<BTreeSet<usize>> {
     let mut couplings = vec![BTreeSet::new(); dynamic];
     let mut couple = |coordinates: &[usize]| {
         for (k, &later) in coordinates.iter().enumerate() {
@@ -471,7 +456,7 @@ fn couplings(
         }
     };
     let dynamic_only = |c: &usize| *c < dynamic;
-    for &joint in joint_of {
+    for joint in 0..tree.joints.len() {
         let path = tree.path(joint);
         let path = path.iter().map(|&j| tree.joints[j].coordinate).filter(dynamic_only);
         couple(&path.collect::<Vec<_>>());
@@ -513,11 +498,8 @@ fn joint_pairs(
 
 /// FNV-1a over the scene without what does not move it.
 fn digest(scene: &Scene) -> u64 {
-    let essence = Scene {
-        description: String::new(),
-        operating_points: Vec::new(),
-        ..scene.clone()
-    };
+    let essence =
+        Scene { description: String::new(), operating_points: Vec::new(), ..scene.clone() };
     let text = serde_json::to_string(&essence).unwrap_or_default();
     fnv1a(text.as_bytes())
 }

@@ -18,8 +18,6 @@ pub struct Model {
     pub(crate) digest: u64,
     /// Joints that carry inertia or springs: what a step walks at the midpoint.
     pub(crate) dynamics: Tree,
-    /// Joint in `dynamics` of each dynamic coordinate.
-    pub(crate) joint_of: Vec<usize>,
     /// `None` without gravity.
     pub(crate) gravity: Option<Vec3>,
     /// Damping of each dynamic coordinate; empty without damping.
@@ -241,7 +239,10 @@ impl Model {
             if self.elimination.islands() == 1 { "island" } else { "islands" }
         ));
         let skipped = |is: bool| if is { "" } else { " (skipped)" };
-        line(format!("gravity       {}", if self.gravity.is_some() { "uniform" } else { "none (skipped)" }));
+        line(format!(
+            "gravity       {}",
+            if self.gravity.is_some() { "uniform" } else { "none (skipped)" }
+        ));
         let springs = self.coordinate_springs.len() + self.point_springs.len();
         line(format!("springs       {springs}{}", skipped(springs > 0)));
         let damped = self.damping.iter().filter(|c| **c != 0.0).count();

@@ -184,14 +184,7 @@ impl Sym3 {
     pub(crate) fn of_point(mass: f64, c: Vec3) -> Self {
         let (x, y, z) = (mass * c[0], mass * c[1], mass * c[2]);
         let (xx, yy, zz) = (x * c[0], y * c[1], z * c[2]);
-        Self {
-            xx: yy + zz,
-            yy: xx + zz,
-            zz: xx + yy,
-            xy: -x * c[1],
-            xz: -x * c[2],
-            yz: -y * c[2],
-        }
+        Self { xx: yy + zz, yy: xx + zz, zz: xx + yy, xy: -x * c[1], xz: -x * c[2], yz: -y * c[2] }
     }
 }
 

@@ -6,10 +6,10 @@
 //!                ∂²L/∂q_i∂q_j = J̇_i·P_j + w_i·(f_j × g)      w_i: angular part of J_i, f_j: force part of F_j
 //! ```
 
+use crate::model::Pair;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::tree_lu::TreeLu;
-use crate::model::Pair;
 use crate::spatial::{Force, Inertia, Motion, Sym3, Vec3};
 use crate::tree::{Rotational, Tree, WORLD};
 
@@ -126,8 +126,10 @@ impl Curvature {
             let (axis, axis_rate) = (momenta.axis[i], momenta.axis_rate[i]);
             let gravity_term = axis.w.dot(weight);
             let scaled = Motion { w: axis_rate.w * half, v: axis_rate.v * half };
-            matrix.upper[pair.slot as usize] = scaled.add_scaled(-1.0, axis).dot(plus) + gravity_term;
-            matrix.lower[pair.slot as usize] = scaled.add_scaled(1.0, axis).dot(minus) + gravity_term;
+            matrix.upper[pair.slot as usize] =
+                scaled.add_scaled(-1.0, axis).dot(plus) + gravity_term;
+            matrix.lower[pair.slot as usize] =
+                scaled.add_scaled(1.0, axis).dot(minus) + gravity_term;
         }
     }
 

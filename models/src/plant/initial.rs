@@ -5,7 +5,7 @@ use crate::Model;
 use crate::plant::closure::Closure;
 use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::{Energy, PreciseState, Plant, forces, springs};
+use crate::plant::{Energy, Plant, PreciseState, forces, springs};
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
 const CONSTRAINT_TOLERANCE: f64 = 1e-6;
@@ -95,7 +95,9 @@ pub enum InitialError {
         violation: f64,
     },
     /// The projection found no configuration that satisfies the constraints.
-    #[error("no configuration found near the guess; constraint `{constraint}` stays violated by {violation:e}")]
+    #[error(
+        "no configuration found near the guess; constraint `{constraint}` stays violated by {violation:e}"
+    )]
     Projection {
         /// Name of the worst constraint equation.
         constraint: String,
@@ -230,7 +232,9 @@ impl Plant {
             let mut weights = closure.value.clone();
             normal.solve(&mut weights);
             let correction: Vec<f64> = (0..n)
-                .map(|k| if moves[k] { (0..nc).map(|c| rows[c][k] * weights[c]).sum() } else { 0.0 })
+                .map(
+                    |k| if moves[k] { (0..nc).map(|c| rows[c][k] * weights[c]).sum() } else { 0.0 },
+                )
                 .collect();
             let longest = correction.iter().fold(0.0, |m: f64, c| m.max(c.abs()));
             let scale = if longest > PROJECTION_STEP { PROJECTION_STEP / longest } else { 1.0 };
@@ -264,8 +268,8 @@ impl Plant {
         let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
         let weight: f64 = roots
             .map(|(i, root)| {
-                let moment = workspace.momenta.moment[i]
-                    + workspace.poses.origin[i] * root.subtree_mass;
+                let moment =
+                    workspace.momenta.moment[i] + workspace.poses.origin[i] * root.subtree_mass;
                 model.gravity.map_or(0.0, |g| g.dot(moment))
             })
             .sum();

@@ -112,19 +112,48 @@ pub struct StepReport {
 pub enum StepError {
     /// The input has the wrong length.
     #[error("the input has {actual} entries; {expected} are needed")]
-    Dimension { expected: usize, actual: usize },
+    Dimension {
+        /// Entries it must have.
+        expected: usize,
+        /// Entries it has.
+        actual: usize,
+    },
     /// An entry of the input is NaN or infinite.
     #[error("input {index} (`{name}`) is {value}")]
-    InputNotFinite { index: usize, name: String, value: f64 },
+    InputNotFinite {
+        /// Index of the entry.
+        index: usize,
+        /// Name of the input or prescribed coordinate.
+        name: String,
+        /// The entry.
+        value: f64,
+    },
     /// Newton's method did not reach the round-off level.
-    #[error("no convergence after {iterations} iterations: residual is {residual:e} times round-off; the step may be too large for the motion")]
-    NotConverged { iterations: u32, residual: f64 },
+    #[error(
+        "no convergence after {iterations} iterations: residual is {residual:e} times round-off; the step may be too large for the motion"
+    )]
+    NotConverged {
+        /// Iterations done.
+        iterations: u32,
+        /// Residual in units of its round-off.
+        residual: f64,
+    },
     /// The iteration left the finite numbers.
     #[error("the motion left the finite numbers after {iterations} iterations")]
-    NotFinite { iterations: u32 },
+    NotFinite {
+        /// Iterations done.
+        iterations: u32,
+    },
     /// The Newton matrix is singular.
-    #[error("singular Newton matrix at coordinate `{coordinate}` (pivot {pivot:e} of the largest entry)")]
-    Singular { coordinate: String, pivot: f64 },
+    #[error(
+        "singular Newton matrix at coordinate `{coordinate}` (pivot {pivot:e} of the largest entry)"
+    )]
+    Singular {
+        /// Coordinate of the vanishing pivot.
+        coordinate: String,
+        /// The pivot relative to the largest entry.
+        pivot: f64,
+    },
 }
 
 /// Kinetic and potential energy, J.
@@ -322,11 +351,7 @@ impl Plant {
     pub fn constraint_jacobian(&mut self) -> DMatrix<f64> {
         self.workspace.prepare_start(&self.model, &self.state.q);
         let d = self.model.dimensions;
-        DMatrix::from_row_slice(
-            d.constraints,
-            d.coordinates(),
-            &self.workspace.start.jacobian,
-        )
+        DMatrix::from_row_slice(d.constraints, d.coordinates(), &self.workspace.start.jacobian)
     }
 
     fn solve(&mut self, u: &[f64]) -> Result<StepReport, StepError> {

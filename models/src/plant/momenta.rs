@@ -75,11 +75,8 @@ impl Momenta {
                 }
                 JointKind::Prismatic => Motion { w: Vec3::ZERO, v: direction },
             };
-            let parent = if joint.parent == WORLD {
-                Motion::default()
-            } else {
-                self.twist[joint.parent]
-            };
+            let parent =
+                if joint.parent == WORLD { Motion::default() } else { self.twist[joint.parent] };
             let twist = parent.add_scaled(velocity[joint.coordinate], axis);
             self.axis[i] = axis;
             self.axis_rate[i] = parent.cross(axis);

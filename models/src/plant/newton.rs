@@ -220,7 +220,8 @@ impl Workspace {
             let floor = if fresh { FLOOR } else { CHORD_FLOOR };
             let at_floor = size <= floor && size > 0.5 * previous;
             let converged = size <= CONVERGED || at_floor;
-            fresh = !converged && (always_factor || previous.is_infinite() || size > SLOW * previous);
+            fresh =
+                !converged && (always_factor || previous.is_infinite() || size > SLOW * previous);
             if fresh {
                 let pivot = self.factor(model, settings)?;
                 report.reciprocal_condition = pivot.relative;

@@ -5,7 +5,7 @@
 //! numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
 use crate::compile::fnv1a;
-use crate::plant::{ForceSplit, PreciseState, Plant, Settings};
+use crate::plant::{ForceSplit, Plant, PreciseState, Settings};
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
 const VERSION: u32 = 1;
@@ -46,8 +46,7 @@ impl Plant {
                 && a.p.len() == b.p.len()
                 && a.multipliers.len() == b.multipliers.len()
         };
-        if snapshot.model_digest != self.model.digest()
-            || !same_sizes(&snapshot.state, &self.state)
+        if snapshot.model_digest != self.model.digest() || !same_sizes(&snapshot.state, &self.state)
         {
             return Err(SnapshotError::Mismatch("model"));
         }

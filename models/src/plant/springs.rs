@@ -121,10 +121,8 @@ pub(crate) fn potential(
     q: &[f64],
 ) -> f64 {
     let energy = |stiffness: f64, stretch: f64| 0.5 * stiffness * stretch * stretch;
-    let coordinate: f64 = coordinate_springs
-        .iter()
-        .map(|s| energy(s.stiffness, q[s.coordinate] - s.rest))
-        .sum();
+    let coordinate: f64 =
+        coordinate_springs.iter().map(|s| energy(s.stiffness, q[s.coordinate] - s.rest)).sum();
     let point: f64 = point_springs
         .iter()
         .map(|s| {
