@@ -4,6 +4,8 @@
 //! The `.proto` files beside this crate are the reference; everything in [`v1`] is generated from
 //! them when the crate is built.
 
+pub mod link;
+
 /// Messages, clients and servers of the package `plantd.v1`.
 #[allow(missing_docs, unreachable_pub, clippy::all)]
 pub mod v1 {
@@ -11,5 +13,4 @@ pub mod v1 {
 }
 
 /// The contract as an encoded `FileDescriptorSet`, for server reflection.
-pub const FILE_DESCRIPTOR_SET: &[u8] =
-    include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
+pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));

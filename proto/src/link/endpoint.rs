@@ -1,0 +1,157 @@
+//! One side of a link: its ports, and when to poll, sleep and notify.
+
+use std::sync::atomic::{Ordering, fence};
+use std::time::Duration;
+
+use iceoryx2::identifiers::UniquePublisherId;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::{BackpressureStrategy, CallbackProgression, ipc};
+use iceoryx2::sample::Sample;
+use iceoryx2::service::port_factory::PortFactory as _;
+
+use super::domain::{Channel, Direction, DomainError, transport};
+use super::{Header, LinkServices, ProcessIdentity, monotonic_ns};
+
+/// A received message.
+pub type Message = Sample<ipc::Service, [f64], Header>;
+
+/// After this long a poller lets others run between two looks, ns: with more pollers than
+/// processors the one that is waited for would otherwise not run.
+const POLL_UNDISTURBED_NS: u64 = 20_000;
+
+/// One side of a link. Its ports belong to the thread that made them.
+#[derive(Debug)]
+pub struct Endpoint {
+    publisher: Publisher<ipc::Service, [f64], Header>,
+    subscriber: Subscriber<ipc::Service, [f64], Header>,
+    notifier: Notifier<ipc::Service>,
+    listener: Listener<ipc::Service>,
+    incoming: Channel,
+    own: ProcessIdentity,
+    poll_ns: u64,
+    poll_end_ns: u64,
+}
+
+impl Endpoint {
+    /// The server's side: sends states of at most `state_len` entries.
+    pub fn server(
+        services: LinkServices,
+        state_len: usize,
+        poll_ns: u64,
+    ) -> Result<Self, DomainError> {
+        Self::new(services.state, services.input, state_len, poll_ns)
+    }
+
+    /// A driver's side: sends inputs of at most `input_len` entries.
+    pub fn driver(
+        services: LinkServices,
+        input_len: usize,
+        poll_ns: u64,
+    ) -> Result<Self, DomainError> {
+        Self::new(services.input, services.state, input_len, poll_ns)
+    }
+
+    fn new(out: Direction, back: Direction, len: usize, poll_ns: u64) -> Result<Self, DomainError> {
+        // The receiving ports come first: an answer must find them.
+        let listener = back.bell.listener_builder().create().map_err(transport("a listener"))?;
+        let subscriber =
+            back.channel.subscriber_builder().create().map_err(transport("a subscriber"))?;
+        let notifier = out.bell.notifier_builder().create().map_err(transport("a notifier"))?;
+        let publisher = out
+            .channel
+            .publisher_builder()
+            .initial_max_slice_len(len.max(1))
+            .max_loaned_samples(1)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(transport("a publisher"))?;
+        let own = ProcessIdentity::own();
+        let incoming = back.channel;
+        Ok(Self {
+            publisher,
+            subscriber,
+            notifier,
+            listener,
+            incoming,
+            own,
+            poll_ns,
+            poll_end_ns: 0,
+        })
+    }
+
+    /// Sends the concatenated `parts`, and wakes the receivers when one of them may sleep:
+    /// `peer_poll_end_ns` is when the last one stops polling. Fills in who sends, and when.
+    pub fn send(
+        &mut self,
+        mut header: Header,
+        parts: &[&[f64]],
+        peer_poll_end_ns: u64,
+    ) -> Result<(), DomainError> {
+        let len = parts.iter().map(|part| part.len()).sum();
+        let mut sample = self.publisher.loan_slice(len).map_err(transport("loaning memory"))?;
+        let mut rest = sample.payload_mut();
+        for part in parts {
+            let (head, tail) = rest.split_at_mut(part.len());
+            head.copy_from_slice(part);
+            rest = tail;
+        }
+        header.pid = self.own.pid;
+        header.process_start = self.own.start;
+        header.poll_ns = self.poll_ns;
+        header.stamp_ns = monotonic_ns();
+        self.poll_end_ns = header.poll_end_ns();
+        *sample.user_header_mut() = header;
+        sample.send().map_err(transport("sending"))?;
+        // The message must be visible before the clock is read: a receiver that has missed it has
+        // read a later time from the same clock.
+        fence(Ordering::SeqCst);
+        if monotonic_ns() >= peer_poll_end_ns {
+            self.notifier.notify().map_err(transport("notifying"))?;
+        }
+        Ok(())
+    }
+
+    /// The next message, if there is one.
+    pub fn try_receive(&self) -> Result<Option<Message>, DomainError> {
+        self.subscriber.receive().map_err(transport("receiving"))
+    }
+
+    /// The next message, or nothing when none has come at `deadline_ns`. Polls until the time that
+    /// the last message sent has promised, then sleeps.
+    pub fn receive(&self, deadline_ns: u64) -> Result<Option<Message>, DomainError> {
+        let start_ns = monotonic_ns();
+        loop {
+            let now_ns = monotonic_ns();
+            fence(Ordering::SeqCst);
+            if let Some(message) = self.try_receive()? {
+                return Ok(Some(message));
+            }
+            if now_ns >= deadline_ns {
+                return Ok(None);
+            }
+            if now_ns >= self.poll_end_ns {
+                // A signal may end the sleep early: then the loop looks again and goes on.
+                let _ =
+                    self.listener.timed_wait(|_| {}, Duration::from_nanos(deadline_ns - now_ns));
+            } else if now_ns - start_ns < POLL_UNDISTURBED_NS {
+                std::hint::spin_loop();
+            } else {
+                std::thread::yield_now();
+            }
+        }
+    }
+
+    /// Whether the sender of a message still belongs to the link. A dead one belongs to it until
+    /// some member of the domain cleans up.
+    pub fn is_connected(&self, sender: UniquePublisherId) -> bool {
+        let mut found = false;
+        self.incoming.dynamic_config().list_publishers(|publisher| {
+            found = publisher.publisher_id == sender;
+            if found { CallbackProgression::Stop } else { CallbackProgression::Continue }
+        });
+        found
+    }
+}
