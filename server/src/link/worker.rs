@@ -1,0 +1,328 @@
+//! The thread of one link.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use iceoryx2::identifiers::UniquePublisherId;
+use plantd_models::{StepError, StepReport};
+use plantd_proto::link::{
+    Code, DomainError, Endpoint, Header, Holder, Kind, LinkServices, Message, ProcessIdentity,
+    monotonic_ns, random_instance,
+};
+
+use super::LinkConfig;
+use crate::session::{DriveError, DriverKind, Lease, Session};
+
+/// How often the thread looks whether it shall end and whether its driver lives, ns.
+const CHECK_PERIOD_NS: u64 = 100_000_000;
+
+/// Pause after an error of the transport, so that one that lasts does not take a processor.
+const PAUSE_AFTER_ERROR: Duration = Duration::from_millis(10);
+
+/// One link and its driver.
+pub(super) struct Worker {
+    session: Arc<Session>,
+    endpoint: Endpoint,
+    stop: Arc<AtomicBool>,
+    /// What all headers of this link have in common.
+    header: Header,
+    driver: Option<Driver>,
+    idle_timeout_ns: u64,
+    next_check_ns: u64,
+    /// The input, copied out of memory that the driver can write to.
+    input: Vec<f64>,
+    has_warned: bool,
+}
+
+/// The driver that holds the lease.
+struct Driver {
+    instance: u64,
+    publisher: UniquePublisherId,
+    process: ProcessIdentity,
+    /// The process can be seen from here: it is not in another pid namespace.
+    is_visible: bool,
+    sequence: u64,
+    last_heard_ns: u64,
+    lease: Lease,
+}
+
+/// A failure of one input or attachment: goes to the driver, the link goes on.
+#[derive(Clone, Copy)]
+struct Failure {
+    code: Code,
+    a: u64,
+    b: u64,
+    value: f64,
+    report: StepReport,
+}
+
+impl Worker {
+    pub(super) fn new(
+        session: Arc<Session>,
+        services: LinkServices,
+        config: &LinkConfig,
+        stop: Arc<AtomicBool>,
+    ) -> Result<Self, DomainError> {
+        let dimensions = session.model().dimensions();
+        let header = Header {
+            server: random_instance(),
+            time_step_s: session.settings().time_step_s,
+            model_digest: session.model().digest(),
+            dynamic: dimensions.dynamic as u32,
+            prescribed: dimensions.prescribed as u32,
+            inputs: dimensions.inputs as u32,
+            constraints: dimensions.constraints as u32,
+            ..Header::new(Kind::State)
+        };
+        let endpoint = Endpoint::server(services, header.state_len(), config.wait.poll_ns())?;
+        session.set_link_open(true);
+        tracing::info!(plant = session.id(), "shared-memory link is open");
+        Ok(Self {
+            session,
+            endpoint,
+            stop,
+            header,
+            driver: None,
+            idle_timeout_ns: config.idle_timeout.map_or(u64::MAX, |t| t.as_nanos() as u64),
+            next_check_ns: 0,
+            input: vec![0.0; header.input_len()],
+            has_warned: false,
+        })
+    }
+
+    /// Serves drivers until the link is closed or the plant deleted.
+    pub(super) fn run(mut self) {
+        while !self.stop.load(Ordering::Acquire) && !self.session.is_closed() {
+            let outcome = match self.endpoint.receive(monotonic_ns() + CHECK_PERIOD_NS) {
+                Ok(Some(message)) => self.handle(&message),
+                Ok(None) => Ok(()),
+                Err(error) => Err(error),
+            };
+            if let Err(error) = outcome {
+                self.note_transport_error(&error);
+            }
+            if monotonic_ns() >= self.next_check_ns {
+                self.check_driver();
+            }
+        }
+    }
+
+    /// A dying driver can make a port fail once; the link goes on.
+    fn note_transport_error(&mut self, error: &DomainError) {
+        if !std::mem::replace(&mut self.has_warned, true) {
+            tracing::warn!(plant = self.session.id(), %error, "shared-memory link");
+        }
+        std::thread::sleep(PAUSE_AFTER_ERROR);
+    }
+
+    /// Takes the lease back from a driver that died, left, or is idle for too long.
+    fn check_driver(&mut self) {
+        let now_ns = monotonic_ns();
+        self.next_check_ns = now_ns + CHECK_PERIOD_NS;
+        let Some(driver) = &self.driver else { return };
+        let why = if !driver.is_alive(&self.endpoint) {
+            "is gone"
+        } else if now_ns.saturating_sub(driver.last_heard_ns) > self.idle_timeout_ns {
+            "was idle for too long"
+        } else {
+            return;
+        };
+        tracing::warn!(plant = self.session.id(), pid = driver.process.pid, why, "lost the driver");
+        self.driver = None;
+    }
+
+    fn handle(&mut self, message: &Message) -> Result<(), DomainError> {
+        let request = *message.user_header();
+        if !request.is_of_this_layout() {
+            return self.refuse(&request, Failure::new(Code::Layout));
+        }
+        match Kind::from_number(request.kind) {
+            Some(Kind::Input) => self.step(&request, message.payload()),
+            Some(Kind::Attach) => self.attach(&request, message.origin()),
+            Some(Kind::Detach) => {
+                if self.driver.take_if(|driver| driver.instance == request.driver).is_some() {
+                    tracing::info!(plant = self.session.id(), pid = request.pid, "driver left");
+                }
+                Ok(())
+            }
+            _ => self.refuse(&request, Failure::new(Code::Kind)),
+        }
+    }
+
+    /// Gives the lease to a driver, if it is free. One that asks again gets the same answer.
+    fn attach(&mut self, request: &Header, sender: UniquePublisherId) -> Result<(), DomainError> {
+        let again = self.driver.as_ref().is_some_and(|driver| driver.instance == request.driver);
+        if !again {
+            // The holder may have died since the last check.
+            self.check_driver();
+            if let Some(driver) = &self.driver {
+                let held = Failure::lease_held(Holder::Link, driver.process.pid);
+                return self.refuse(request, held);
+            }
+            let lease = match self.session.acquire(DriverKind::Link) {
+                Ok(lease) => lease,
+                Err(held) => return self.refuse(request, Failure::lease_held(holder(held.by), 0)),
+            };
+            tracing::info!(plant = self.session.id(), pid = request.pid, "driver attached");
+            self.driver = Some(Driver::new(request, sender, lease));
+        }
+        self.answer(request, Kind::Attached, &StepReport::default())
+    }
+
+    fn step(&mut self, request: &Header, u: &[f64]) -> Result<(), DomainError> {
+        match self.try_step(request, u) {
+            Ok(report) => self.answer(request, Kind::State, &report),
+            Err(failure) => self.refuse(request, failure),
+        }
+    }
+
+    fn try_step(&mut self, request: &Header, u: &[f64]) -> Result<StepReport, Failure> {
+        let driver = self
+            .driver
+            .as_mut()
+            .filter(|d| d.instance == request.driver && request.server == self.header.server)
+            .ok_or(Failure::new(Code::NotAttached))?;
+        driver.last_heard_ns = monotonic_ns();
+        let expected = driver.sequence + 1;
+        driver.sequence = request.sequence;
+        if request.sequence != expected {
+            return Err(Failure { a: expected, ..Failure::new(Code::Sequence) });
+        }
+        if u.len() != self.input.len() {
+            let (a, b) = (self.input.len() as u64, u.len() as u64);
+            return Err(Failure { a, b, ..Failure::new(Code::Dimension) });
+        }
+        self.input.copy_from_slice(u);
+        let lease = &mut driver.lease;
+        lease.step(&self.input).map_err(|error| match error {
+            DriveError::Closed => Failure::new(Code::PlantDeleted),
+            DriveError::Step(error) => Failure::step(&error, lease.session()),
+        })
+    }
+
+    /// Sends the state of the plant to its driver.
+    fn answer(
+        &mut self,
+        request: &Header,
+        kind: Kind,
+        report: &StepReport,
+    ) -> Result<(), DomainError> {
+        let Some(driver) = &self.driver else { return Ok(()) };
+        let (endpoint, common) = (&mut self.endpoint, self.header);
+        driver.lease.with_plant(|plant| {
+            let header = Header {
+                kind: kind as u32,
+                driver: request.driver,
+                sequence: request.sequence,
+                step: plant.step_index(),
+                time_s: plant.time_s(),
+                ..with_report(common, report)
+            };
+            let parts = [plant.q(), plant.p(), plant.v(), plant.multipliers()];
+            endpoint.send(header, &parts, request.poll_end_ns())
+        })
+    }
+
+    fn refuse(&mut self, request: &Header, failure: Failure) -> Result<(), DomainError> {
+        let header = Header {
+            kind: Kind::Failure as u32,
+            code: failure.code as u32,
+            driver: request.driver,
+            sequence: request.sequence,
+            detail_a: failure.a,
+            detail_b: failure.b,
+            detail_value: failure.value,
+            ..with_report(self.header, &failure.report)
+        };
+        self.endpoint.send(header, &[], request.poll_end_ns())
+    }
+}
+
+impl Drop for Worker {
+    /// Tells all drivers that the link ends.
+    fn drop(&mut self) {
+        let is_deleted = self.session.is_closed();
+        let code = if is_deleted { Code::PlantDeleted } else { Code::LinkClosed };
+        let header = Header { kind: Kind::Closed as u32, code: code as u32, ..self.header };
+        if let Err(error) = self.endpoint.send(header, &[], 0) {
+            tracing::debug!(plant = self.session.id(), %error, "shared-memory link, closing");
+        }
+        self.session.set_link_open(false);
+        tracing::info!(plant = self.session.id(), "shared-memory link is closed");
+    }
+}
+
+impl Driver {
+    fn new(request: &Header, publisher: UniquePublisherId, lease: Lease) -> Self {
+        let process = ProcessIdentity { pid: request.pid, start: request.process_start };
+        Self {
+            instance: request.driver,
+            publisher,
+            process,
+            is_visible: process.is_running(),
+            sequence: 0,
+            last_heard_ns: monotonic_ns(),
+            lease,
+        }
+    }
+
+    /// The process lives, and its port was neither closed nor cleaned up.
+    fn is_alive(&self, endpoint: &Endpoint) -> bool {
+        (!self.is_visible || self.process.is_running()) && endpoint.is_connected(self.publisher)
+    }
+}
+
+impl Failure {
+    fn new(code: Code) -> Self {
+        Self { code, a: 0, b: 0, value: 0.0, report: StepReport::default() }
+    }
+
+    fn lease_held(by: Holder, pid: u32) -> Self {
+        Self { a: by as u64, b: pid.into(), ..Self::new(Code::LeaseHeld) }
+    }
+
+    /// The numbers of an error of a step, in the fields that [`Code`] says.
+    fn step(error: &StepError, session: &Session) -> Self {
+        let solver =
+            |iterations, residual| StepReport { iterations, residual, ..StepReport::default() };
+        match *error {
+            StepError::Dimension { expected, actual } => {
+                Self { a: expected as u64, b: actual as u64, ..Self::new(Code::Dimension) }
+            }
+            StepError::InputNotFinite { index, value, .. } => {
+                Self { a: index as u64, value, ..Self::new(Code::InputNotFinite) }
+            }
+            StepError::NotConverged { iterations, residual } => {
+                Self { report: solver(iterations, residual), ..Self::new(Code::NotConverged) }
+            }
+            StepError::NotFinite { iterations } => {
+                Self { report: solver(iterations, 0.0), ..Self::new(Code::NotFinite) }
+            }
+            StepError::Singular { ref coordinate, pivot } => {
+                let mut coordinates = session.model().coordinates().iter();
+                let index = coordinates.position(|c| c.name == *coordinate).unwrap_or(0);
+                Self { a: index as u64, value: pivot, ..Self::new(Code::Singular) }
+            }
+        }
+    }
+}
+
+fn with_report(header: Header, report: &StepReport) -> Header {
+    Header {
+        iterations: report.iterations,
+        factorizations: report.factorizations,
+        residual: report.residual,
+        constraint_residual: report.constraint_residual,
+        reciprocal_condition: report.reciprocal_condition,
+        ..header
+    }
+}
+
+fn holder(by: DriverKind) -> Holder {
+    match by {
+        DriverKind::Step => Holder::Step,
+        DriverKind::Drive => Holder::Drive,
+        DriverKind::Link => Holder::Link,
+    }
+}
