@@ -14,6 +14,10 @@ pub(crate) struct Elimination {
     pub(crate) offsets: Vec<usize>,
     /// Ancestors of each row, root first, the row itself last.
     pub(crate) ancestors: Vec<usize>,
+    /// Row `i` owns `descendants[descendant_offsets[i]..descendant_offsets[i + 1]]`.
+    descendant_offsets: Vec<usize>,
+    /// Proper descendants of each row, and the slots of their entries with it.
+    descendants: Vec<(usize, usize)>,
 }
 
 impl Elimination {
@@ -30,7 +34,7 @@ impl Elimination {
                 rows[p].extend(passed_up);
             }
         }
-        let mut elimination = Self { offsets: vec![0], ancestors: Vec::new() };
+        let mut elimination = Self { offsets: vec![0], ..Self::default() };
         for j in 0..n {
             let mut path = vec![j];
             while let Some(p) = parent[path[path.len() - 1]] {
@@ -40,7 +44,19 @@ impl Elimination {
             elimination.ancestors.extend(path);
             elimination.offsets.push(elimination.ancestors.len());
         }
+        elimination.descendant_offsets = vec![0];
+        for i in 0..n {
+            let below = (i + 1..n).filter_map(|j| elimination.slot(j, i).map(|slot| (j, slot)));
+            let below: Vec<_> = below.collect();
+            elimination.descendants.extend(below);
+            elimination.descendant_offsets.push(elimination.descendants.len());
+        }
         elimination
+    }
+
+    /// Proper descendants of a row, and the slots of their entries with it.
+    pub(crate) fn below(&self, row: usize) -> &[(usize, usize)] {
+        &self.descendants[self.descendant_offsets[row]..self.descendant_offsets[row + 1]]
     }
 
     /// Rows.

@@ -5,6 +5,7 @@ use crate::Model;
 use crate::plant::closure::Closure;
 use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::rows::padded;
 use crate::plant::{Energy, Plant, PreciseState, forces, springs};
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
@@ -211,7 +212,7 @@ impl Plant {
         let model = &self.model;
         let (n, nc) = (q.len(), model.dimensions.constraints);
         let mut closure = Closure::new(model);
-        let mut normal = PivotedLu::new(nc);
+        let mut normal = PivotedLu::new(nc, 0);
         let mut best = f64::INFINITY;
         for _ in 0..PROJECTION_ITERATIONS {
             closure.evaluate(model, &q);
@@ -347,7 +348,8 @@ impl Workspace {
 
     /// Takes the part of the velocity away that violates `Dh q̇ = 0`.
     fn project_velocity(&mut self, model: &Model, state: &PreciseState) {
-        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        let n = model.dimensions.coordinates();
+        let stride = padded(model.dimensions.constraints);
         self.prepare_start(model, &state.q);
         self.find_responses(model);
         fill_schur(model, &self.start, &self.responses, &mut self.schur);
@@ -358,7 +360,8 @@ impl Workspace {
         }
         self.schur.solve(&mut self.constraint_residual);
         for (i, v) in self.residual.iter_mut().enumerate() {
-            for (response, weight) in self.responses[i * nc..].iter().zip(&self.constraint_residual)
+            for (response, weight) in
+                self.responses[i * stride..].iter().zip(&self.constraint_residual)
             {
                 *v -= response * weight;
             }

@@ -23,6 +23,7 @@
 use nalgebra::DMatrix;
 
 use crate::Model;
+use crate::plant::rows::{add_rows, padded};
 use crate::plant::{Plant, StepError, springs};
 
 /// The exact first-order linearization of one step, preallocated.
@@ -34,13 +35,13 @@ pub struct Linearization {
     /// Coordinate and gain of each input.
     inputs: Vec<(usize, f64)>,
     at_start: f64,
-    /// Columns of the solved parameters `(q_d, q_k, p, k)`.
-    width: usize,
-    /// `x'`, row-major, nd by width.
+    /// Length of a row: the columns of the parameters `(q_d, q_k, p, k)`, padded.
+    stride: usize,
+    /// `x'`, row-major, nd rows.
     increment: Vec<f64>,
-    /// `p[k+1]'`, row-major, nd by width.
+    /// `p[k+1]'`, row-major, nd rows.
     momentum: Vec<f64>,
-    /// `λ'`, row-major, nc by width.
+    /// `λ'`, row-major, nc rows.
     multipliers: Vec<f64>,
 }
 
@@ -48,29 +49,29 @@ impl Linearization {
     /// Room for the linearization of a model.
     pub fn new(model: &Model) -> Self {
         let d = model.dimensions();
-        let width = 2 * (d.dynamic + d.prescribed);
+        let stride = padded(2 * d.coordinates());
         Self {
             nd: d.dynamic,
             nk: d.prescribed,
             time_step_s: model.scene().time_step_s,
             inputs: model.inputs.clone(),
             at_start: 0.5,
-            width,
-            increment: vec![0.0; d.dynamic * width],
-            momentum: vec![0.0; d.dynamic * width],
-            multipliers: vec![0.0; d.constraints * width],
+            stride,
+            increment: vec![0.0; d.dynamic * stride],
+            momentum: vec![0.0; d.dynamic * stride],
+            multipliers: vec![0.0; d.constraints * stride],
         }
     }
 
     /// `A = ∂f/∂x`, square of `2 nd + 2 nk`; its `v` columns are zero.
     pub fn a(&self) -> DMatrix<f64> {
         let (nd, nk) = (self.nd, self.nk);
-        let (n, state_columns) = (nd + nk, 2 * nd + nk);
+        let (n, state_columns) = (nd + nk, self.next_columns());
         let mut a = DMatrix::zeros(2 * n, 2 * n);
         for i in 0..nd {
             for j in 0..state_columns {
-                a[(i, j)] = self.increment[i * self.width + j];
-                a[(n + i, j)] = self.momentum[i * self.width + j];
+                a[(i, j)] = self.increment[i * self.stride + j];
+                a[(n + i, j)] = self.momentum[i * self.stride + j];
             }
             a[(i, i)] += 1.0;
         }
@@ -83,12 +84,12 @@ impl Linearization {
     /// `B = ∂f/∂u`, `2 nd + 2 nk` by `ni + nk`.
     pub fn b(&self) -> DMatrix<f64> {
         let (nd, nk, ni) = (self.nd, self.nk, self.inputs.len());
-        let (n, next) = (nd + nk, 2 * nd + nk);
+        let (n, next) = (nd + nk, self.next_columns());
         let mut b = DMatrix::zeros(2 * n, ni + nk);
         for (column, &(coordinate, gain)) in self.inputs.iter().enumerate() {
             let (at_start, impulse) = self.input_impulses(gain);
             for i in 0..nd {
-                let momentum = i * self.width + n + coordinate;
+                let momentum = i * self.stride + n + coordinate;
                 b[(i, column)] = at_start * self.increment[momentum];
                 b[(n + i, column)] = at_start * self.momentum[momentum];
             }
@@ -96,8 +97,8 @@ impl Linearization {
         }
         for k in 0..nk {
             for i in 0..nd {
-                b[(i, ni + k)] = self.increment[i * self.width + next + k];
-                b[(n + i, ni + k)] = self.momentum[i * self.width + next + k];
+                b[(i, ni + k)] = self.increment[i * self.stride + next + k];
+                b[(n + i, ni + k)] = self.momentum[i * self.stride + next + k];
             }
             b[(nd + k, ni + k)] = 1.0;
             b[(n + nd + k, ni + k)] = 1.0 / self.time_step_s;
@@ -107,10 +108,10 @@ impl Linearization {
 
     /// `∂λ/∂x`, nc by `2 nd + 2 nk`.
     pub fn multipliers_x(&self) -> DMatrix<f64> {
-        let state_columns = 2 * self.nd + self.nk;
+        let state_columns = self.next_columns();
         let rows = self.constraints();
         DMatrix::from_fn(rows, 2 * (self.nd + self.nk), |c, j| {
-            if j < state_columns { self.multipliers[c * self.width + j] } else { 0.0 }
+            if j < state_columns { self.multipliers[c * self.stride + j] } else { 0.0 }
         })
     }
 
@@ -118,12 +119,12 @@ impl Linearization {
     pub fn multipliers_u(&self) -> DMatrix<f64> {
         let ni = self.inputs.len();
         DMatrix::from_fn(self.constraints(), ni + self.nk, |c, j| {
-            let row = &self.multipliers[c * self.width..][..self.width];
+            let row = &self.multipliers[c * self.stride..][..self.stride];
             match self.inputs.get(j) {
                 Some(&(coordinate, gain)) => {
                     self.input_impulses(gain).0 * row[self.nd + self.nk + coordinate]
                 }
-                None => row[2 * self.nd + self.nk + j - ni],
+                None => row[self.next_columns() + j - ni],
             }
         })
     }
@@ -134,8 +135,13 @@ impl Linearization {
         (self.at_start * impulse, impulse)
     }
 
+    /// First column of the next prescribed positions.
+    fn next_columns(&self) -> usize {
+        2 * self.nd + self.nk
+    }
+
     fn constraints(&self) -> usize {
-        self.multipliers.len().checked_div(self.width).unwrap_or_default()
+        self.multipliers.len().checked_div(self.stride).unwrap_or_default()
     }
 }
 
@@ -156,7 +162,15 @@ impl Plant {
         workspace.factor_newton_matrix(&self.model, &self.settings)?;
         self.fill_right_hand_sides(out);
         let workspace = &mut self.workspace;
-        workspace.matrix.solve_rows(&self.model.elimination, &mut out.increment, out.width);
+        // Without inertia or springs on prescribed joints, the columns of `k` in r1' are zero.
+        let moving = !self.model.mixed_pairs.is_empty() || !self.model.point_springs.is_empty();
+        let columns = if moving { out.stride } else { padded(out.next_columns()) };
+        workspace.matrix.solve_rows(
+            &self.model.elimination,
+            &mut out.increment,
+            out.stride,
+            columns,
+        );
         if d.constraints > 0 {
             workspace.finish_end(&self.model, &self.state);
             workspace.factor_schur(&self.model);
@@ -173,7 +187,7 @@ impl Plant {
     fn fill_right_hand_sides(&mut self, out: &mut Linearization) {
         let (model, workspace) = (&self.model, &mut self.workspace);
         let h = self.settings.time_step_s;
-        let (nd, nk, width) = (out.nd, out.nk, out.width);
+        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
         out.increment.fill(0.0);
         out.momentum.fill(0.0);
         workspace.stiffness.fill(0.0);
@@ -187,8 +201,8 @@ impl Plant {
                 pair.descendant as usize,
             );
             let half = 0.5 * h * second.qq;
-            out.increment[i * width + j] = half - second.v_above_q_below;
-            out.increment[j * width + i] = half - second.q_above_v_below;
+            out.increment[i * stride + j] = half - second.v_above_q_below;
+            out.increment[j * stride + i] = half - second.q_above_v_below;
             workspace.end_slopes[i * nd + j] = half + second.q_above_v_below;
             workspace.end_slopes[j * nd + i] = half + second.v_above_q_below;
             workspace.stiffness[i * nd + j] = h * second.qq;
@@ -212,15 +226,15 @@ impl Plant {
             let c_q = 0.25 * h * second.qq - 0.5 * vq;
             let c_v = 0.5 * qv - second.vv / h;
             let next = nd + column + nk;
-            out.increment[row * width + column] += c_q - c_v;
-            out.increment[row * width + next] += c_q + c_v;
-            out.momentum[row * width + column] += 0.5 * h * second.qq - qv;
-            out.momentum[row * width + next] += 0.5 * h * second.qq + qv;
+            out.increment[row * stride + column] += c_q - c_v;
+            out.increment[row * stride + next] += c_q + c_v;
+            out.momentum[row * stride + column] += 0.5 * h * second.qq - qv;
+            out.momentum[row * stride + next] += 0.5 * h * second.qq + qv;
         }
         self.add_springs(out);
         self.add_constraint_hessian(out);
         for i in 0..nd {
-            let momentum = i * width + nd + nk + i;
+            let momentum = i * stride + nd + nk + i;
             out.increment[momentum] = 1.0;
             out.momentum[momentum] += 1.0;
         }
@@ -230,17 +244,17 @@ impl Plant {
     fn add_springs(&mut self, out: &mut Linearization) {
         let (model, workspace) = (&self.model, &mut self.workspace);
         let h = self.settings.time_step_s;
-        let (nd, nk, width) = (out.nd, out.nk, out.width);
+        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
         let (stiffness, slopes) = (&mut workspace.stiffness, &mut workspace.end_slopes);
         let mut add = |row: usize, column: usize, value: f64| {
             if column < nd {
-                out.increment[row * width + column] -= 0.5 * h * value;
+                out.increment[row * stride + column] -= 0.5 * h * value;
                 slopes[row * nd + column] -= 0.5 * h * value;
                 stiffness[row * nd + column] -= h * value;
             } else {
                 for column in [column, nd + column + nk] {
-                    out.increment[row * width + column] -= 0.25 * h * value;
-                    out.momentum[row * width + column] -= 0.5 * h * value;
+                    out.increment[row * stride + column] -= 0.25 * h * value;
+                    out.momentum[row * stride + column] -= 0.5 * h * value;
                 }
             }
         };
@@ -272,7 +286,7 @@ impl Plant {
         let n = model.dimensions.coordinates();
         for i in 0..out.nd {
             let row = &workspace.constraint_hessian[i * n..][..n];
-            let range = i * out.width..i * out.width + n;
+            let range = i * out.stride..i * out.stride + n;
             for (entry, value) in out.increment[range.clone()].iter_mut().zip(row) {
                 *entry -= value;
             }
@@ -286,27 +300,22 @@ impl Plant {
     fn solve_multipliers(&mut self, out: &mut Linearization) {
         let (model, workspace) = (&self.model, &mut self.workspace);
         let d = model.dimensions;
-        let (n, nd, nc, width) = (d.coordinates(), d.dynamic, d.constraints, out.width);
+        let (n, nd, nc, stride) = (d.coordinates(), d.dynamic, d.constraints, out.stride);
+        let next = out.next_columns();
         for (c, constraint) in model.constraints.iter().enumerate() {
             let jacobian = &workspace.end.jacobian[c * n..][..n];
-            let target = &mut out.multipliers[c * width..][..width];
-            target[..nd].iter_mut().zip(jacobian).for_each(|(t, entry)| *t = -entry);
-            target[nd..nd + n].fill(0.0);
-            target[nd + n..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
-            for joint in &constraint.points.path {
-                if joint.coordinate < nd {
-                    let row = &out.increment[joint.coordinate * width..][..width];
-                    add_scaled(target, jacobian[joint.coordinate], row);
-                }
-            }
+            let target = &mut out.multipliers[c * stride..][..stride];
+            target.fill(0.0);
+            target.iter_mut().zip(&jacobian[..nd]).for_each(|(t, entry)| *t = -entry);
+            target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
+            let dynamic = constraint.points.path.iter().map(|joint| joint.coordinate);
+            let terms = dynamic.filter(|i| *i < nd).map(|i| (jacobian[i], i));
+            add_rows(target, &out.increment, stride, terms);
         }
-        workspace.schur.solve_rows(&mut out.multipliers, width);
-        for i in 0..nd {
-            let target = &mut out.increment[i * width..][..width];
-            for c in 0..nc {
-                let response = workspace.responses[i * nc + c];
-                add_scaled(target, -response, &out.multipliers[c * width..][..width]);
-            }
+        workspace.schur.solve_rows(&mut out.multipliers, stride);
+        for (i, target) in out.increment.chunks_exact_mut(stride).enumerate() {
+            let responses = workspace.responses[i * padded(nc)..][..nc].iter().enumerate();
+            add_rows(target, &out.multipliers, stride, responses.map(|(c, r)| (-r, c)));
         }
     }
 
@@ -314,37 +323,24 @@ impl Plant {
     fn differentiate_momentum(&mut self, out: &mut Linearization) {
         let (model, workspace) = (&self.model, &mut self.workspace);
         let d = model.dimensions;
-        let (n, nd, width) = (d.coordinates(), d.dynamic, out.width);
+        let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
         for (i, c) in model.damping.iter().enumerate() {
             workspace.end_slopes[i * nd + i] -= c;
         }
-        for i in 0..nd {
-            let target = &mut out.momentum[i * width..][..width];
+        for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
             let stiffness = &workspace.stiffness[i * nd..][..nd];
             target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
-            for (j, slope) in workspace.end_slopes[i * nd..][..nd].iter().enumerate() {
-                if *slope != 0.0 {
-                    add_scaled(target, *slope, &out.increment[j * width..][..width]);
-                }
-            }
+            let slopes = workspace.end_slopes[i * nd..][..nd].iter().enumerate();
+            let terms = slopes.filter(|(_, slope)| **slope != 0.0).map(|(j, slope)| (*slope, j));
+            add_rows(target, &out.increment, stride, terms);
         }
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let source = &out.multipliers[c * width..][..width];
-            for joint in &constraint.points.path {
-                if joint.coordinate < nd {
-                    let entry = workspace.start.jacobian[c * n + joint.coordinate];
-                    let target = &mut out.momentum[joint.coordinate * width..][..width];
-                    add_scaled(target, -entry, source);
-                }
+            let dynamic = constraint.points.path.iter().map(|joint| joint.coordinate);
+            for i in dynamic.filter(|i| *i < nd) {
+                let entry = workspace.start.jacobian[c * n + i];
+                let target = &mut out.momentum[i * stride..][..stride];
+                add_rows(target, &out.multipliers, stride, std::iter::once((-entry, c)));
             }
         }
-    }
-}
-
-/// `target += factor * source`.
-#[inline(always)]
-fn add_scaled(target: &mut [f64], factor: f64, source: &[f64]) {
-    for (t, s) in target.iter_mut().zip(source) {
-        *t += factor * s;
     }
 }

@@ -13,6 +13,7 @@ mod linearize;
 mod momenta;
 mod newton;
 mod pivoted_lu;
+mod rows;
 mod snapshot;
 mod springs;
 mod tree_lu;

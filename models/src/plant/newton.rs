@@ -16,6 +16,7 @@ use crate::plant::curvature::Curvature;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::rows::padded;
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, springs};
 
@@ -62,7 +63,7 @@ pub(crate) struct Workspace {
     pub(crate) end: Closure,
     /// `end` holds the constraints, Jacobian included, at the solution.
     pub(crate) end_is_exact: bool,
-    /// `K⁻¹ A0ᵀ`, row-major, nd by nc.
+    /// `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
     pub(crate) responses: Vec<f64>,
     pub(crate) schur: PivotedLu,
     /// `Σ λ D²h`, for the linearization.
@@ -99,8 +100,8 @@ impl Workspace {
             start_is_valid: false,
             end: Closure::new(model),
             end_is_exact: false,
-            responses: zeros(nd * nc),
-            schur: PivotedLu::new(nc),
+            responses: zeros(nd * padded(nc)),
+            schur: PivotedLu::new(nc, padded(2 * n)),
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),
             stiffness: zeros(nd * nd),
@@ -369,20 +370,21 @@ impl Workspace {
     /// Solves for the responses `K⁻¹ A0ᵀ` with the matrix that is factored.
     pub(crate) fn find_responses(&mut self, model: &Model) {
         let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        let stride = padded(nc);
         for i in 0..model.dimensions.dynamic {
             for c in 0..nc {
-                self.responses[i * nc + c] = self.start.jacobian[c * n + i];
+                self.responses[i * stride + c] = self.start.jacobian[c * n + i];
             }
         }
-        self.matrix.solve_rows(&model.elimination, &mut self.responses, nc);
+        self.matrix.solve_rows(&model.elimination, &mut self.responses, stride, stride);
     }
 
     /// One correction with the factors at hand.
     fn correct(&mut self, model: &Model) {
         self.matrix.solve(&model.elimination, &mut self.residual);
-        let nc = model.dimensions.constraints;
-        if nc > 0 {
+        if model.dimensions.constraints > 0 {
             let n = model.dimensions.coordinates();
+            let stride = padded(model.dimensions.constraints);
             for (c, constraint) in model.constraints.iter().enumerate() {
                 let row = &self.end.jacobian[c * n..][..n];
                 let mut value = -self.end.value[c];
@@ -399,7 +401,7 @@ impl Workspace {
             }
             for (i, r) in self.residual.iter_mut().enumerate() {
                 for (response, change) in
-                    self.responses[i * nc..].iter().zip(&self.constraint_residual)
+                    self.responses[i * stride..].iter().zip(&self.constraint_residual)
                 {
                     *r -= response * change;
                 }
@@ -431,16 +433,17 @@ impl Workspace {
     }
 }
 
-/// Factors `A X` for the constraint Jacobian `A` of `closure` and `X`, row-major, nd by nc.
+/// Factors `A X` for the constraint Jacobian `A` of `closure` and `X`, row-major, nd by padded nc.
 pub(crate) fn fill_schur(model: &Model, closure: &Closure, x: &[f64], schur: &mut PivotedLu) {
     let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+    let stride = padded(nc);
     for (c, constraint) in model.constraints.iter().enumerate() {
         let target = &mut schur.matrix[c * nc..][..nc];
         target.fill(0.0);
         for joint in &constraint.points.path {
             if joint.coordinate < model.dimensions.dynamic {
                 let entry = closure.jacobian[c * n + joint.coordinate];
-                for (t, x) in target.iter_mut().zip(&x[joint.coordinate * nc..]) {
+                for (t, x) in target.iter_mut().zip(&x[joint.coordinate * stride..]) {
                     *t += entry * x;
                 }
             }

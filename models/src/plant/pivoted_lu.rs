@@ -3,6 +3,8 @@
 //! Rows that depend on others (redundant constraints) show as vanishing pivots: they are left out,
 //! and their multipliers are zero.
 
+use crate::plant::rows::add_rows;
+
 /// Pivots below this fraction of the largest count as zero.
 const RANK_TOLERANCE: f64 = 1e-11;
 
@@ -15,11 +17,14 @@ pub(crate) struct PivotedLu {
     rows: Vec<usize>,
     columns: Vec<usize>,
     scale: Vec<f64>,
+    inverse_pivot: Vec<f64>,
+    /// A permuted right-hand side.
     scratch: Vec<f64>,
 }
 
 impl PivotedLu {
-    pub(crate) fn new(order: usize) -> Self {
+    /// Room for a matrix and for right-hand sides of up to `stride` columns (whole blocks).
+    pub(crate) fn new(order: usize, stride: usize) -> Self {
         Self {
             matrix: vec![0.0; order * order],
             order,
@@ -27,7 +32,8 @@ impl PivotedLu {
             rows: vec![0; order],
             columns: vec![0; order],
             scale: vec![1.0; order],
-            scratch: vec![0.0; order],
+            inverse_pivot: vec![0.0; order],
+            scratch: vec![0.0; order * stride.max(1)],
         }
     }
 
@@ -58,8 +64,10 @@ impl PivotedLu {
                 return;
             }
             self.swap(k, row, column);
+            let inverse = 1.0 / self.matrix[k * n + k];
+            self.inverse_pivot[k] = inverse;
             for i in k + 1..n {
-                let factor = self.matrix[i * n + k] / self.matrix[k * n + k];
+                let factor = self.matrix[i * n + k] * inverse;
                 self.matrix[i * n + k] = factor;
                 for j in k + 1..n {
                     self.matrix[i * n + j] -= factor * self.matrix[k * n + j];
@@ -96,32 +104,56 @@ impl PivotedLu {
 
     /// Solves in place; multipliers of redundant rows are zero.
     pub(crate) fn solve(&mut self, x: &mut [f64]) {
-        self.solve_rows(x, 1);
+        let (n, rank) = (self.order, self.rank);
+        for k in 0..rank {
+            let row = self.rows[k];
+            let mut value = x[row] * self.scale[row];
+            for j in 0..k {
+                value -= self.matrix[k * n + j] * self.scratch[j];
+            }
+            self.scratch[k] = value;
+        }
+        for k in (0..rank).rev() {
+            let mut value = self.scratch[k];
+            for j in k + 1..rank {
+                value -= self.matrix[k * n + j] * self.scratch[j];
+            }
+            self.scratch[k] = value * self.inverse_pivot[k];
+        }
+        self.scratch[rank..n].fill(0.0);
+        for k in 0..n {
+            let target = self.columns[k];
+            x[target] = self.scratch[k] * self.scale[target];
+        }
     }
 
-    /// Solves in place for a row-major right-hand side of `width` columns.
-    pub(crate) fn solve_rows(&mut self, x: &mut [f64], width: usize) {
+    /// The same for a row-major right-hand side; `stride` is whole blocks.
+    pub(crate) fn solve_rows(&mut self, x: &mut [f64], stride: usize) {
         let (n, rank) = (self.order, self.rank);
-        for column in 0..width {
-            for k in 0..rank {
-                let row = self.rows[k];
-                let mut value = x[row * width + column] * self.scale[row];
-                for j in 0..k {
-                    value -= self.matrix[k * n + j] * self.scratch[j];
-                }
-                self.scratch[k] = value;
+        for k in 0..rank {
+            let (above, target) = self.scratch.split_at_mut(k * stride);
+            let target = &mut target[..stride];
+            let row = self.rows[k];
+            for (t, entry) in target.iter_mut().zip(&x[row * stride..]) {
+                *t = entry * self.scale[row];
             }
-            for k in (0..rank).rev() {
-                let mut value = self.scratch[k];
-                for j in k + 1..rank {
-                    value -= self.matrix[k * n + j] * self.scratch[j];
-                }
-                self.scratch[k] = value / self.matrix[k * n + k];
+            let terms = self.matrix[k * n..][..k].iter().enumerate().map(|(j, l)| (-l, j));
+            add_rows(target, above, stride, terms);
+        }
+        for k in (0..rank).rev() {
+            let (target, below) = self.scratch[k * stride..].split_at_mut(stride);
+            let row = self.matrix[k * n..][k + 1..rank].iter().enumerate();
+            add_rows(target, below, stride, row.map(|(j, u)| (-u, j)));
+            for t in target {
+                *t *= self.inverse_pivot[k];
             }
-            self.scratch[rank..n].fill(0.0);
-            for k in 0..n {
-                let target = self.columns[k];
-                x[target * width + column] = self.scratch[k] * self.scale[target];
+        }
+        self.scratch[rank * stride..n * stride].fill(0.0);
+        for k in 0..n {
+            let target = self.columns[k];
+            let source = &self.scratch[k * stride..];
+            for (t, entry) in x[target * stride..][..stride].iter_mut().zip(source) {
+                *t = entry * self.scale[target];
             }
         }
     }

@@ -2,6 +2,7 @@
 //! Featherstone's LTL, without fill-in. O(n·depth²) to factor, O(n·depth) to solve.
 
 use crate::elimination::Elimination;
+use crate::plant::rows::add_rows;
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
 #[derive(Clone, Debug)]
@@ -113,39 +114,32 @@ impl TreeLu {
         }
     }
 
-    /// Solves `K X = B` in place for a row-major matrix of `width` columns.
+    /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
+    /// are whole blocks.
     #[inline(never)]
-    pub(crate) fn solve_rows(&self, elimination: &Elimination, x: &mut [f64], width: usize) {
-        for k in (0..elimination.len()).rev() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
-            let (above, row) = x.split_at_mut(k * width);
-            let row = &row[..width];
-            for (&ancestor, u) in
-                elimination.ancestors[range.clone()].iter().zip(&self.upper[range])
-            {
-                subtract_scaled(&mut above[ancestor * width..][..width], *u, row);
-            }
+    pub(crate) fn solve_rows(
+        &self,
+        elimination: &Elimination,
+        x: &mut [f64],
+        stride: usize,
+        columns: usize,
+    ) {
+        for i in (0..elimination.len()).rev() {
+            let (row, below) = x[i * stride..].split_at_mut(stride);
+            let terms = elimination.below(i).iter();
+            let terms = terms.map(|&(j, slot)| (-self.upper[slot], j - i - 1));
+            add_rows(&mut row[..columns], below, stride, terms);
         }
-        for k in 0..elimination.len() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
-            let (above, row) = x.split_at_mut(k * width);
-            let row = &mut row[..width];
-            for (&ancestor, l) in
-                elimination.ancestors[range.clone()].iter().zip(&self.lower[range])
-            {
-                subtract_scaled(row, *l, &above[ancestor * width..][..width]);
-            }
+        for i in 0..elimination.len() {
+            let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;
+            let (above, row) = x.split_at_mut(i * stride);
+            let row = &mut row[..columns];
+            let ancestors = elimination.ancestors[range.clone()].iter();
+            let terms = ancestors.zip(&self.lower[range]).map(|(&j, l)| (-l, j));
+            add_rows(row, above, stride, terms);
             for entry in row {
-                *entry *= self.inverse_pivot[k];
+                *entry *= self.inverse_pivot[i];
             }
         }
-    }
-}
-
-/// `target -= factor * source`.
-#[inline(always)]
-fn subtract_scaled(target: &mut [f64], factor: f64, source: &[f64]) {
-    for (t, s) in target.iter_mut().zip(source) {
-        *t -= factor * s;
     }
 }
