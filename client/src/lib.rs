@@ -1,1 +1,68 @@
-//! plantd-client
+//! Client of plantd: simulated plants that step when a controller says so.
+//!
+//! [`Client`] speaks gRPC over TCP or a Unix-domain socket. [`Driver`] closes a control loop with
+//! one call per step:
+//!
+//! ```no_run
+//! use plantd_client::{Client, GainExt, diagonal, operating_point, v1};
+//!
+//! # async fn balance() -> plantd_client::Result<()> {
+//! let client = Client::connect("http://127.0.0.1:50051").await?;
+//! let weights = v1::LqrWeights {
+//!     q: Some(diagonal([100.0, 1.0])),
+//!     r: Some(diagonal([1.0])),
+//!     q_final: None,
+//! };
+//! let regulator = client
+//!     .solve_lqr(v1::SolveLqrRequest {
+//!         model: "pendulum".to_owned(),
+//!         point: Some(operating_point("upright")),
+//!         weights: Some(weights),
+//!         ..Default::default()
+//!     })
+//!     .await?;
+//! let gain = regulator.gain.expect("an LQR has a gain");
+//!
+//! let plant = client
+//!     .create_plant(v1::CreatePlantRequest { model: "pendulum".to_owned(), ..Default::default() })
+//!     .await?;
+//! let mut state = plant.state.expect("a plant has a state");
+//! let mut driver = client.drive(&plant.id).await?;
+//! for _ in 0..1000 {
+//!     state = driver.step(&gain.control(&state)).await?.state.expect("a step has a state");
+//! }
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! What the server refuses comes back as an [`Error`] with the gRPC code, the reason and the faults
+//! of the request:
+//!
+//! ```no_run
+//! # async fn upload(client: plantd_client::Client, scene: String) -> plantd_client::Result<()> {
+//! if let Err(error) = client.create_model(scene).await {
+//!     for fault in error.violations() {
+//!         eprintln!("{}: {}", fault.field, fault.description);
+//!     }
+//! }
+//! # Ok(())
+//! # }
+//! ```
+
+mod channel;
+mod client;
+mod driver;
+mod error;
+mod matrix;
+mod stream;
+
+pub use channel::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
+pub use client::Client;
+pub use driver::Driver;
+pub use error::{Error, Refusal, Result, Violation};
+pub use matrix::{GainExt, MatrixExt, StateExt, diagonal, operating_point};
+pub use stream::Answers;
+
+/// The messages and stubs of the contract, `plantd.v1`.
+pub use plantd_proto::v1;
+pub use tonic::Code;

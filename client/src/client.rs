@@ -1,0 +1,259 @@
+//! The client: one method per thing that a controller's author wants.
+
+use plantd_proto::v1::{
+    self, control_service_client::ControlServiceClient, model_service_client::ModelServiceClient,
+    plant_service_client::PlantServiceClient,
+};
+use tonic::transport::Channel;
+
+use crate::channel::{self, ConnectOptions, MAX_RECEIVE_BYTES};
+use crate::{Answers, Driver, Error, Result};
+
+/// A connection to a server. Clones share it and are cheap.
+///
+/// Methods whose request has many options take the request message itself; fill in what matters and
+/// leave the rest to `..Default::default()`.
+#[derive(Clone, Debug)]
+pub struct Client {
+    channel: Channel,
+    options: ConnectOptions,
+}
+
+impl Client {
+    /// Connects to `http://host:port` (or just `host:port`) or `unix:/path`.
+    pub async fn connect(address: impl AsRef<str>) -> Result<Self> {
+        Self::connect_with(address, ConnectOptions::default()).await
+    }
+
+    /// Connects with other limits than the default ones.
+    pub async fn connect_with(address: impl AsRef<str>, options: ConnectOptions) -> Result<Self> {
+        let channel = channel::connect(address.as_ref(), &options).await?;
+        Ok(Self { channel, options })
+    }
+
+    // ---- the generated stubs, for what is not wrapped ----
+
+    /// The generated client of `ModelService`.
+    pub fn models(&self) -> ModelServiceClient<Channel> {
+        ModelServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
+    }
+
+    /// The generated client of `PlantService`.
+    pub fn plants(&self) -> PlantServiceClient<Channel> {
+        PlantServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
+    }
+
+    /// The generated client of `ControlService`.
+    pub fn control(&self) -> ControlServiceClient<Channel> {
+        ControlServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
+    }
+
+    /// The channel itself, for services that are not plantd's own (health, reflection).
+    pub fn channel(&self) -> Channel {
+        self.channel.clone()
+    }
+
+    /// A request that the server gives up after the connection's request timeout.
+    fn limited<T>(&self, message: T) -> tonic::Request<T> {
+        let mut request = tonic::Request::new(message);
+        request.set_timeout(self.options.request_timeout);
+        request
+    }
+
+    /// Waits until a stream is open.
+    async fn open<T>(
+        &self,
+        call: impl Future<Output = Result<tonic::Response<tonic::Streaming<T>>, tonic::Status>>,
+    ) -> Result<Answers<T>> {
+        let response = channel::within(self.options.request_timeout, call).await?;
+        Ok(Answers::new(response.into_inner()))
+    }
+}
+
+/// Models.
+impl Client {
+    /// All models, built-in ones first.
+    pub async fn list_models(&self) -> Result<Vec<v1::Model>> {
+        let mut all = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = v1::ListModelsRequest { page_size: 0, page_token };
+            let page = self.models().list_models(self.limited(request)).await?.into_inner();
+            all.extend(page.models);
+            if page.next_page_token.is_empty() {
+                return Ok(all);
+            }
+            page_token = page.next_page_token;
+        }
+    }
+
+    /// One model, with its scene and its plan.
+    pub async fn get_model(&self, name: impl Into<String>) -> Result<v1::Model> {
+        let request = v1::GetModelRequest { name: name.into() };
+        let answer = self.models().get_model(self.limited(request)).await?.into_inner();
+        answer.model.ok_or(Error::Protocol("an answer without a model"))
+    }
+
+    /// Uploads a scene (TOML or JSON) under its own name.
+    ///
+    /// # Errors
+    /// A faulty scene is refused with all its errors in [`Error::violations`].
+    pub async fn create_model(&self, scene: impl Into<String>) -> Result<v1::Model> {
+        let request = v1::CreateModelRequest { scene: scene.into(), ..Default::default() };
+        self.create_model_as(request).await
+    }
+
+    /// Uploads a scene, under another name or with its notation stated.
+    pub async fn create_model_as(&self, request: v1::CreateModelRequest) -> Result<v1::Model> {
+        let answer = self.models().create_model(self.limited(request)).await?.into_inner();
+        answer.model.ok_or(Error::Protocol("an answer without a model"))
+    }
+
+    /// Checks a scene without keeping it; a good one has no problems and comes with its model.
+    pub async fn validate_scene(
+        &self,
+        scene: impl Into<String>,
+    ) -> Result<v1::ValidateSceneResponse> {
+        let request = v1::ValidateSceneRequest { scene: scene.into(), ..Default::default() };
+        Ok(self.models().validate_scene(self.limited(request)).await?.into_inner())
+    }
+
+    /// Forgets an uploaded model; its plants live on.
+    pub async fn delete_model(&self, name: impl Into<String>) -> Result<()> {
+        let request = v1::DeleteModelRequest { name: name.into() };
+        self.models().delete_model(self.limited(request)).await?;
+        Ok(())
+    }
+}
+
+/// Plants.
+impl Client {
+    /// Creates a plant.
+    pub async fn create_plant(&self, request: v1::CreatePlantRequest) -> Result<v1::PlantInfo> {
+        let answer = self.plants().create_plant(self.limited(request)).await?.into_inner();
+        answer.plant.ok_or(Error::Protocol("an answer without a plant"))
+    }
+
+    /// A plant, its state and its energy.
+    pub async fn get_plant(&self, id: impl Into<String>) -> Result<v1::GetPlantResponse> {
+        let request = v1::GetPlantRequest { id: id.into() };
+        Ok(self.plants().get_plant(self.limited(request)).await?.into_inner())
+    }
+
+    /// All plants, by id.
+    pub async fn list_plants(&self) -> Result<Vec<v1::PlantInfo>> {
+        let mut all = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = v1::ListPlantsRequest { page_size: 0, page_token };
+            let page = self.plants().list_plants(self.limited(request)).await?.into_inner();
+            all.extend(page.plants);
+            if page.next_page_token.is_empty() {
+                return Ok(all);
+            }
+            page_token = page.next_page_token;
+        }
+    }
+
+    /// Ends a plant; whoever drives or watches it gets `NOT_FOUND`.
+    pub async fn delete_plant(&self, id: impl Into<String>) -> Result<()> {
+        let request = v1::DeletePlantRequest { id: id.into() };
+        self.plants().delete_plant(self.limited(request)).await?;
+        Ok(())
+    }
+
+    /// Takes one or more steps in one call. To close a loop use [`Client::drive`]: it is faster and
+    /// keeps others from stepping in between.
+    pub async fn step(&self, request: v1::StepRequest) -> Result<v1::StepResponse> {
+        Ok(self.plants().step(self.limited(request)).await?.into_inner())
+    }
+
+    /// Takes the lease of a plant, to step it in lockstep.
+    pub async fn drive(&self, id: impl Into<String>) -> Result<Driver> {
+        let open = v1::DriveOpen { id: id.into(), linearization: false };
+        Driver::open(self, open, self.options.request_timeout).await
+    }
+
+    /// The same with the linearization of each step in its answer.
+    pub async fn drive_linearized(&self, id: impl Into<String>) -> Result<Driver> {
+        let open = v1::DriveOpen { id: id.into(), linearization: true };
+        Driver::open(self, open, self.options.request_timeout).await
+    }
+
+    /// Watches a plant. Latest wins: who reads slowly loses messages, which `dropped` counts.
+    pub async fn watch(&self, request: v1::WatchRequest) -> Result<Answers<v1::WatchResponse>> {
+        let mut stub = self.plants();
+        self.open(stub.watch(request)).await
+    }
+
+    /// Puts a plant back to step 0, in the state that it was created with.
+    pub async fn reset(&self, id: impl Into<String>) -> Result<v1::State> {
+        self.reset_to(v1::ResetRequest { id: id.into(), initial: None }).await
+    }
+
+    /// Puts a plant back to step 0, in a given state.
+    pub async fn reset_to(&self, request: v1::ResetRequest) -> Result<v1::State> {
+        let answer = self.plants().reset(self.limited(request)).await?.into_inner();
+        answer.state.ok_or(Error::Protocol("an answer without a state"))
+    }
+
+    /// Takes a snapshot: a plant restored from it continues bit for bit.
+    pub async fn snapshot(&self, id: impl Into<String>) -> Result<Vec<u8>> {
+        let request = v1::SnapshotRequest { id: id.into() };
+        Ok(self.plants().snapshot(self.limited(request)).await?.into_inner().snapshot)
+    }
+
+    /// Restores a snapshot of a plant of the same model and settings, step count included.
+    pub async fn restore(&self, id: impl Into<String>, snapshot: Vec<u8>) -> Result<v1::State> {
+        let request = v1::RestoreRequest { id: id.into(), snapshot };
+        let answer = self.plants().restore(self.limited(request)).await?.into_inner();
+        answer.state.ok_or(Error::Protocol("an answer without a state"))
+    }
+
+    /// Opens the shared-memory link of a plant and says how to reach it.
+    pub async fn open_link(&self, id: impl Into<String>) -> Result<v1::OpenLinkResponse> {
+        let request = v1::OpenLinkRequest { id: id.into() };
+        Ok(self.plants().open_link(self.limited(request)).await?.into_inner())
+    }
+}
+
+/// Linearizations, regulators and rollouts; nothing here touches a plant.
+impl Client {
+    /// Linearizes the map of a model at one point.
+    pub async fn linearize(&self, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse> {
+        Ok(self.control().linearize(self.limited(request)).await?.into_inner())
+    }
+
+    /// Linearizes the map at every step of a trajectory, in order.
+    pub async fn linearize_trajectory(
+        &self,
+        request: v1::LinearizeTrajectoryRequest,
+    ) -> Result<Answers<v1::LinearizeTrajectoryResponse>> {
+        let mut stub = self.control();
+        self.open(stub.linearize_trajectory(request)).await
+    }
+
+    /// Infinite-horizon LQR about an equilibrium.
+    pub async fn solve_lqr(&self, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResponse> {
+        Ok(self.control().solve_lqr(self.limited(request)).await?.into_inner())
+    }
+
+    /// Time-varying LQR along a trajectory: one gain per step, first step first; the last message
+    /// holds only the final reference state.
+    pub async fn solve_trajectory_lqr(
+        &self,
+        request: v1::SolveTrajectoryLqrRequest,
+    ) -> Result<Answers<v1::SolveTrajectoryLqrResponse>> {
+        let mut stub = self.control();
+        self.open(stub.solve_trajectory_lqr(request)).await
+    }
+
+    /// Runs many simulations at once; answers come in the order in which they end.
+    pub async fn rollout(
+        &self,
+        request: v1::RolloutRequest,
+    ) -> Result<Answers<v1::RolloutResponse>> {
+        let mut stub = self.control();
+        self.open(stub.rollout(request)).await
+    }
+}

@@ -1,0 +1,113 @@
+//! Driving a plant: one message per step each way.
+
+use std::time::Duration;
+
+use plantd_proto::v1;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+
+use crate::channel::within;
+use crate::{Client, Error, Result};
+
+/// Holds the lease of a plant and steps it in lockstep.
+///
+/// The lease ends when the driver is dropped; [`Driver::close`] also waits for the server to have
+/// noticed, so that the next driver is sure to be let in.
+#[derive(Debug)]
+pub struct Driver {
+    requests: mpsc::Sender<v1::DriveRequest>,
+    responses: tonic::Streaming<v1::DriveResponse>,
+    plant: v1::PlantInfo,
+    sequence: u64,
+    step_timeout: Duration,
+}
+
+impl Driver {
+    pub(crate) async fn open(
+        client: &Client,
+        open: v1::DriveOpen,
+        step_timeout: Duration,
+    ) -> Result<Self> {
+        // One message is ever under way, so one place is enough.
+        let (requests, queue) = mpsc::channel(1);
+        let open = v1::drive_request::Request::Open(open);
+        requests.try_send(v1::DriveRequest { request: Some(open) }).expect("the queue is empty");
+        let mut plants = client.plants();
+        let call = plants.drive(ReceiverStream::new(queue));
+        let mut responses = within(step_timeout, call).await?.into_inner();
+        let opened = within(step_timeout, responses.message()).await?;
+        let Some(v1::DriveResponse {
+            response: Some(v1::drive_response::Response::Opened(opened)),
+        }) = opened
+        else {
+            return Err(Error::Protocol("Drive did not begin with `opened`"));
+        };
+        let plant = opened.plant.ok_or(Error::Protocol("`opened` without a plant"))?;
+        Ok(Self { requests, responses, plant, sequence: 0, step_timeout })
+    }
+
+    /// The plant as it was when the driver opened it.
+    pub fn plant(&self) -> &v1::PlantInfo {
+        &self.plant
+    }
+
+    /// Takes one step with the input `u` (input forces, then next prescribed positions).
+    ///
+    /// # Errors
+    /// [`Error::Step`] if the step was refused or failed: the plant is where it was and the driver
+    /// goes on. Any other error means that the driver has lost the plant.
+    pub async fn step(&mut self, u: &[f64]) -> Result<v1::DriveStep> {
+        self.sequence += 1;
+        let input = v1::DriveInput { sequence: self.sequence, u: u.to_vec() };
+        let request = v1::drive_request::Request::Input(input);
+        let sent = self.requests.send(v1::DriveRequest { request: Some(request) }).await;
+        if sent.is_err() {
+            // The server has hung up; its last message says why.
+            return Err(self.ending().await);
+        }
+        within(self.step_timeout, answer(&mut self.responses, self.sequence)).await
+    }
+
+    /// Gives the lease back and waits until the server has done so.
+    pub async fn close(self) -> Result<()> {
+        let Self { requests, mut responses, step_timeout, .. } = self;
+        drop(requests);
+        within(step_timeout, async {
+            while responses.message().await?.is_some() {}
+            Ok::<_, Error>(())
+        })
+        .await
+    }
+
+    async fn ending(&mut self) -> Error {
+        loop {
+            match within(self.step_timeout, self.responses.message()).await {
+                Ok(Some(_)) => {}
+                Ok(None) => return Error::StreamClosed,
+                Err(error) => return error,
+            }
+        }
+    }
+}
+
+/// Waits for the answer to input `sequence`. Earlier ones belong to steps whose future was dropped.
+async fn answer(
+    responses: &mut tonic::Streaming<v1::DriveResponse>,
+    sequence: u64,
+) -> Result<v1::DriveStep> {
+    use v1::drive_response::Response;
+    loop {
+        let message = responses.message().await?.ok_or(Error::StreamClosed)?;
+        match message.response {
+            Some(Response::Step(step)) if step.sequence == sequence => return Ok(step),
+            Some(Response::Failure(v1::DriveFailure { sequence: s, failure })) if s == sequence => {
+                let failure = failure.ok_or(Error::Protocol("a failed step without a cause"))?;
+                return Err(Error::Step(Box::new(failure.into())));
+            }
+            Some(Response::Step(v1::DriveStep { sequence: s, .. }))
+            | Some(Response::Failure(v1::DriveFailure { sequence: s, .. }))
+                if s < sequence => {}
+            _ => return Err(Error::Protocol("Drive answered what was not asked")),
+        }
+    }
+}

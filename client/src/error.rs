@@ -1,0 +1,208 @@
+//! What can go wrong, with the details that the server sends.
+
+use std::fmt;
+
+use plantd_proto::v1;
+use tonic::Code;
+use tonic_types::StatusExt as _;
+
+/// Result of everything that talks to a server.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// Why a call did not do what it was asked for.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The address is neither `http://host:port` nor `unix:/path`.
+    #[error("`{address}` is not an address; write http://host:port or unix:/path")]
+    Address {
+        /// What was given.
+        address: String,
+    },
+    /// Nobody answers there.
+    #[error("cannot connect to {address}: {}", root_cause(.source))]
+    Connect {
+        /// Where.
+        address: String,
+        /// Why not.
+        source: tonic::transport::Error,
+    },
+    /// The call was refused or failed, or a stream ended with an error.
+    #[error("{0}")]
+    Rpc(Box<Refusal>),
+    /// One step of a [`Driver`](crate::Driver) was refused or failed. The plant is where it was
+    /// and the driver goes on.
+    #[error("step not taken: {0}")]
+    Step(Box<Refusal>),
+    /// The server ended a stream that should have gone on.
+    #[error("the server closed the stream")]
+    StreamClosed,
+    /// The server sent something that the contract does not allow: versions do not fit.
+    #[error("unexpected answer from the server: {0}")]
+    Protocol(&'static str),
+}
+
+impl Error {
+    /// What the server said, if it was the server that refused.
+    pub fn refusal(&self) -> Option<&Refusal> {
+        match self {
+            Self::Rpc(refusal) | Self::Step(refusal) => Some(refusal),
+            _ => None,
+        }
+    }
+
+    /// The gRPC code, if the server refused.
+    pub fn code(&self) -> Option<Code> {
+        self.refusal().map(|refusal| refusal.code)
+    }
+
+    /// The upper-case reason such as `LEASE_HELD`, or the empty string if there is none.
+    pub fn reason(&self) -> &str {
+        self.refusal().map_or("", |refusal| &refusal.reason)
+    }
+
+    /// The faults found in the request, each with its path; empty if it was not the request.
+    pub fn violations(&self) -> &[Violation] {
+        self.refusal().map_or(&[], |refusal| &refusal.violations)
+    }
+}
+
+impl From<tonic::Status> for Error {
+    fn from(status: tonic::Status) -> Self {
+        Self::Rpc(Box::new(Refusal::from(&status)))
+    }
+}
+
+/// The server's `no`: a gRPC status with its `google.rpc` details.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Refusal {
+    /// gRPC code.
+    pub code: Code,
+    /// A sentence that names the culprit.
+    pub message: String,
+    /// Upper-case reason (`google.rpc.ErrorInfo`), or empty.
+    pub reason: String,
+    /// Faults of the request (`google.rpc.BadRequest`).
+    pub violations: Vec<Violation>,
+}
+
+/// One fault of a request.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Violation {
+    /// Path of the field, for example `frames[3].body.mass` in a scene.
+    pub field: String,
+    /// What is wrong with it.
+    pub description: String,
+}
+
+impl From<&tonic::Status> for Refusal {
+    fn from(status: &tonic::Status) -> Self {
+        let details = status.get_error_details();
+        let violations = details.bad_request().map_or_else(Vec::new, |request| {
+            let violation = |v: &tonic_types::FieldViolation| Violation {
+                field: v.field.clone(),
+                description: v.description.clone(),
+            };
+            request.field_violations.iter().map(violation).collect()
+        });
+        Self {
+            code: status.code(),
+            message: status.message().to_owned(),
+            reason: details.error_info().map_or_else(String::new, |info| info.reason.clone()),
+            violations,
+        }
+    }
+}
+
+impl From<v1::Failure> for Refusal {
+    fn from(failure: v1::Failure) -> Self {
+        Self {
+            code: Code::from_i32(failure.code),
+            message: failure.message,
+            reason: failure.reason,
+            violations: Vec::new(),
+        }
+    }
+}
+
+impl Refusal {
+    /// The code as the gRPC specification spells it, for example `NOT_FOUND`.
+    pub fn code_name(&self) -> &'static str {
+        match self.code {
+            Code::Ok => "OK",
+            Code::Cancelled => "CANCELLED",
+            Code::Unknown => "UNKNOWN",
+            Code::InvalidArgument => "INVALID_ARGUMENT",
+            Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
+            Code::NotFound => "NOT_FOUND",
+            Code::AlreadyExists => "ALREADY_EXISTS",
+            Code::PermissionDenied => "PERMISSION_DENIED",
+            Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
+            Code::FailedPrecondition => "FAILED_PRECONDITION",
+            Code::Aborted => "ABORTED",
+            Code::OutOfRange => "OUT_OF_RANGE",
+            Code::Unimplemented => "UNIMPLEMENTED",
+            Code::Internal => "INTERNAL",
+            Code::Unavailable => "UNAVAILABLE",
+            Code::DataLoss => "DATA_LOSS",
+            Code::Unauthenticated => "UNAUTHENTICATED",
+        }
+    }
+}
+
+/// `NOT_FOUND (PLANT_NOT_FOUND): there is no plant ...`, then one indented line per violation that
+/// the message does not already carry.
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.code_name())?;
+        if !self.reason.is_empty() {
+            write!(f, " ({})", self.reason)?;
+        }
+        write!(f, ": {}", self.message)?;
+        for violation in &self.violations {
+            if !self.message.contains(&violation.description) {
+                write!(f, "\n  {}: {}", violation.field, violation.description)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The innermost error, which is the one that a person can act on ("connection refused").
+fn root_cause(error: &dyn std::error::Error) -> String {
+    let mut cause = error;
+    while let Some(inner) = cause.source() {
+        cause = inner;
+    }
+    cause.to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use tonic_types::{ErrorDetails, StatusExt as _};
+
+    use super::*;
+
+    #[test]
+    fn details_of_a_status_are_kept_and_printed() {
+        let mut details = ErrorDetails::new();
+        details
+            .set_error_info("SCENE_INVALID", "plantd", std::collections::HashMap::new())
+            .add_bad_request_violation("frames[3].body.mass", "must not be negative");
+        let status = tonic::Status::with_error_details(Code::InvalidArgument, "1 error", details);
+        let error = Error::from(status);
+        assert_eq!(error.code(), Some(Code::InvalidArgument));
+        assert_eq!(error.reason(), "SCENE_INVALID");
+        assert_eq!(error.violations()[0].field, "frames[3].body.mass");
+        assert_eq!(
+            error.to_string(),
+            "INVALID_ARGUMENT (SCENE_INVALID): 1 error\n  frames[3].body.mass: must not be negative"
+        );
+    }
+
+    #[test]
+    fn a_status_without_details_is_still_readable() {
+        let error = Error::from(tonic::Status::not_found("there is no plant `a`"));
+        assert_eq!(error.to_string(), "NOT_FOUND: there is no plant `a`");
+        assert!(error.reason().is_empty() && error.violations().is_empty());
+    }
+}

@@ -1,0 +1,121 @@
+//! Small helpers on the contract's messages, so that a controller needs no linear-algebra library.
+
+use plantd_proto::v1;
+
+/// Reading and writing of [`v1::Matrix`].
+pub trait MatrixExt: Sized {
+    /// A matrix of these rows, which must have equal lengths; no rows give a 0 × 0 matrix.
+    ///
+    /// # Panics
+    /// If the rows differ in length.
+    fn from_rows<R: AsRef<[f64]>>(rows: &[R]) -> Self;
+    /// The rows, top to bottom.
+    fn rows_iter(&self) -> impl Iterator<Item = &[f64]>;
+    /// Entry of row `row` and column `col`.
+    ///
+    /// # Panics
+    /// If there is no such entry.
+    fn at(&self, row: usize, col: usize) -> f64;
+    /// The product with a column vector.
+    ///
+    /// # Panics
+    /// If the vector has not as many entries as the matrix has columns.
+    fn times(&self, vector: &[f64]) -> Vec<f64>;
+}
+
+impl MatrixExt for v1::Matrix {
+    fn from_rows<R: AsRef<[f64]>>(rows: &[R]) -> Self {
+        let cols = rows.first().map_or(0, |row| row.as_ref().len());
+        let mut data = Vec::with_capacity(rows.len() * cols);
+        for row in rows {
+            assert_eq!(row.as_ref().len(), cols, "rows differ in length");
+            data.extend_from_slice(row.as_ref());
+        }
+        Self { rows: rows.len() as u32, cols: cols as u32, data }
+    }
+
+    fn rows_iter(&self) -> impl Iterator<Item = &[f64]> {
+        let cols = self.cols as usize;
+        (0..self.rows as usize).map(move |row| &self.data[row * cols..(row + 1) * cols])
+    }
+
+    fn at(&self, row: usize, col: usize) -> f64 {
+        assert!(col < self.cols as usize, "column {col} of {}", self.cols);
+        self.data[row * self.cols as usize + col]
+    }
+
+    fn times(&self, vector: &[f64]) -> Vec<f64> {
+        assert_eq!(vector.len(), self.cols as usize, "length of the vector");
+        let dot = |row: &[f64]| row.iter().zip(vector).map(|(a, b)| a * b).sum();
+        self.rows_iter().map(dot).collect()
+    }
+}
+
+/// Reading of [`v1::State`].
+pub trait StateExt {
+    /// The state vector `x = (q, p, v)` in which linearizations and gains are expressed.
+    fn x(&self) -> Vec<f64>;
+}
+
+impl StateExt for v1::State {
+    fn x(&self) -> Vec<f64> {
+        [self.q.as_slice(), &self.p, &self.v].concat()
+    }
+}
+
+/// Use of [`v1::Gain`].
+pub trait GainExt {
+    /// The feedback law `u = u_reference − K (x − x_reference)`.
+    ///
+    /// Differences of angles are taken as they are: a joint that has turned by 2π is 2π away.
+    fn control(&self, state: &v1::State) -> Vec<f64>;
+}
+
+impl GainExt for v1::Gain {
+    fn control(&self, state: &v1::State) -> Vec<f64> {
+        let error: Vec<f64> = state.x().iter().zip(&self.x_reference).map(|(x, r)| x - r).collect();
+        let correction = self.k.as_ref().map(|k| k.times(&error)).unwrap_or_default();
+        let mut u = self.u_reference.clone();
+        for (u, du) in u.iter_mut().zip(correction) {
+            *u -= du;
+        }
+        u
+    }
+}
+
+/// A weight with these diagonal entries.
+pub fn diagonal(values: impl Into<Vec<f64>>) -> v1::Weight {
+    let diagonal = v1::Diagonal { values: values.into() };
+    v1::Weight { form: Some(v1::weight::Form::Diagonal(diagonal)) }
+}
+
+/// The operating point of that name, where a linearization or a regulator is wanted.
+pub fn operating_point(name: impl Into<String>) -> v1::Point {
+    v1::Point { source: Some(v1::point::Source::OperatingPoint(name.into())) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gain_steers_against_the_error() {
+        let gain = v1::Gain {
+            step: 0,
+            k: Some(v1::Matrix::from_rows(&[[2.0, 3.0]])),
+            x_reference: vec![1.0, 0.5],
+            u_reference: vec![10.0],
+        };
+        let state = v1::State { q: vec![2.0], p: vec![0.0], ..Default::default() };
+        assert_eq!(gain.control(&state), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);
+    }
+
+    #[test]
+    fn rows_come_back_as_they_went_in() {
+        let matrix = v1::Matrix::from_rows(&[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]);
+        assert_eq!((matrix.rows, matrix.cols), (2, 3));
+        assert_eq!(matrix.rows_iter().nth(1), Some([4.0, 5.0, 6.0].as_slice()));
+        assert_eq!(matrix.at(1, 0), 4.0);
+        assert_eq!(v1::Matrix::from_rows::<[f64; 1]>(&[]).rows_iter().count(), 0);
+    }
+}
