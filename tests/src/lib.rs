@@ -1,1 +1,3 @@
 //! plantd-tests
+
+pub mod server;
