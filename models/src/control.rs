@@ -1,1 +1,62 @@
-//! Linear-quadratic control on the discrete map.
+//! Linear-quadratic control on the discrete map `x[k+1] = A x[k] + B u[k]`.
+//!
+//! The cost is `Σ ½ xᵀQx + ½ uᵀRu`, with `½ xᵀ Q_f x` at the end of a finite horizon, and the
+//! feedback law is `u = u_ref − K (x − x_ref)`.
+//!
+//! | question | answer |
+//! | --- | --- |
+//! | gains along a trajectory | [`finite_horizon`], [`finite_horizon_on_manifold`] |
+//! | a regulator about an equilibrium | [`infinite_horizon`], [`infinite_horizon_on_manifold`] |
+//! | directions that a constrained system can move in | [`Tangent`], [`tangent_basis`] |
+//! | what the inputs reach | [`controllability_rank`] |
+//!
+//! Everything here allocates and may take milliseconds to seconds: it belongs on a worker, never
+//! on a control path. Costs are given in flops of `n` states and `m` inputs.
+
+mod controllability;
+mod doubling;
+mod error;
+mod finite_horizon;
+mod infinite_horizon;
+mod manifold;
+mod spectrum;
+mod weights;
+
+pub use controllability::controllability_rank;
+pub use error::RiccatiError;
+pub use finite_horizon::{FiniteHorizon, Sample, finite_horizon, finite_horizon_on_manifold};
+pub use infinite_horizon::{Regulator, infinite_horizon, infinite_horizon_on_manifold};
+pub use manifold::{Tangent, tangent_basis};
+pub use spectrum::spectral_radius;
+pub use weights::{Weights, WeightsError};
+
+use nalgebra::DMatrix;
+
+/// Replaces a matrix that is symmetric but for round-off by its symmetric part.
+fn symmetrize(m: &mut DMatrix<f64>) {
+    for column in 0..m.ncols() {
+        for row in 0..column {
+            let mean = 0.5 * (m[(row, column)] + m[(column, row)]);
+            m[(row, column)] = mean;
+            m[(column, row)] = mean;
+        }
+    }
+}
+
+/// `m ≥ 0` up to round-off: `m` shifted by `1e-12` of its largest diagonal entry has a Cholesky
+/// factor.
+fn is_positive_semidefinite(m: &DMatrix<f64>) -> bool {
+    let largest = m.diagonal().amax();
+    if largest == 0.0 {
+        return m.iter().all(|&entry| entry == 0.0);
+    }
+    let mut shifted = m / largest;
+    for i in 0..m.nrows() {
+        shifted[(i, i)] += 1e-12;
+    }
+    shifted.cholesky().is_some()
+}
+
+fn all_finite(m: &DMatrix<f64>) -> bool {
+    m.iter().all(|entry| entry.is_finite())
+}

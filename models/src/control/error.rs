@@ -1,0 +1,88 @@
+//! Why a Riccati equation could not be solved.
+
+/// Why there is no regulator.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RiccatiError {
+    /// A matrix has the wrong shape.
+    #[error(
+        "{matrix} of sample {sample} is {rows} x {cols}; {expected_rows} x {expected_cols} is needed"
+    )]
+    Dimension {
+        /// `A`, `B`, or `T` for a tangent space.
+        matrix: &'static str,
+        /// Index of the sample; 0 for an infinite horizon.
+        sample: usize,
+        /// Rows it has.
+        rows: usize,
+        /// Columns it has.
+        cols: usize,
+        /// Rows it should have.
+        expected_rows: usize,
+        /// Columns it should have.
+        expected_cols: usize,
+    },
+    /// The number of tangent spaces is not one more than the number of samples.
+    #[error("{actual} tangent spaces for {samples} samples; one more than samples is needed")]
+    TangentCount {
+        /// Samples.
+        samples: usize,
+        /// Tangent spaces.
+        actual: usize,
+    },
+    /// A matrix holds NaN or infinity.
+    #[error("{matrix} of sample {sample} is not finite")]
+    NotFinite {
+        /// `A` or `B`.
+        matrix: &'static str,
+        /// Index of the sample; 0 for an infinite horizon.
+        sample: usize,
+    },
+    /// The cost to go left the finite numbers, or `R + BᵀPB` lost its definiteness.
+    #[error(
+        "the cost to go cannot be represented at sample {sample}: the motion grows too fast there, or the weights span too many orders of magnitude"
+    )]
+    Overflow {
+        /// Index of the sample, counted from the start.
+        sample: usize,
+    },
+    /// A mode that does not decay by itself is out of reach of the inputs.
+    #[error(
+        "not stabilisable: no input reaches the mode with eigenvalue {real:+.6} {imaginary:+.6}i (modulus {modulus:.6})"
+    )]
+    NotStabilisable {
+        /// Real part of the eigenvalue of `A`.
+        real: f64,
+        /// Imaginary part.
+        imaginary: f64,
+        /// Modulus, about 1 or greater.
+        modulus: f64,
+    },
+    /// A mode on the unit circle costs nothing, so that no regulator is best.
+    #[error(
+        "not detectable: the weights do not see the mode with eigenvalue {real:+.6} {imaginary:+.6}i on the unit circle; give it a state weight"
+    )]
+    NotDetectable {
+        /// Real part of the eigenvalue of `A`.
+        real: f64,
+        /// Imaginary part.
+        imaginary: f64,
+    },
+    /// Doubling ended without a solution that passes the checks.
+    #[error(
+        "no solution after {iterations} doublings: relative residual {residual:e}, spectral radius {spectral_radius}; the problem is too ill-conditioned"
+    )]
+    NotConverged {
+        /// Doublings.
+        iterations: u32,
+        /// Relative residual of the Riccati equation; infinite when the iteration overflowed.
+        residual: f64,
+        /// Largest modulus of the eigenvalues of `A − BK`; infinite when the iteration overflowed.
+        spectral_radius: f64,
+    },
+    /// The eigenvalues of a matrix were not found.
+    #[error("the eigenvalues of the {size} x {size} closed loop were not found")]
+    Eigenvalues {
+        /// Size of the matrix.
+        size: usize,
+    },
+}

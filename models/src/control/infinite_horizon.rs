@@ -1,0 +1,217 @@
+//! Regulator about an equilibrium: the discrete algebraic Riccati equation.
+
+use nalgebra::{Complex, DMatrix};
+
+use super::finite_horizon::{Sample, check, gain};
+use super::spectrum::{eigenvalues, spectral_radius};
+use super::{RiccatiError, Tangent, Weights, doubling, is_positive_semidefinite, symmetrize};
+
+/// Residual above which Newton's method polishes the solution.
+const RESIDUAL_POLISH: f64 = 1e-12;
+/// Residual above which there is no solution to speak of.
+const RESIDUAL_MAX: f64 = 1e-8;
+/// Newton steps at most; each squares the error.
+const POLISH_MAX: u32 = 12;
+/// State weight, relative to the largest one, that makes every mode visible while searching for a
+/// first stabilising gain.
+const VISIBILITY: f64 = 1e-10;
+/// A mode with a modulus above this does not decay by itself.
+const MODULUS_MARGINAL: f64 = 1.0 - 1e-9;
+/// Distance to losing rank, relative to the size of the matrix, at which rank counts as lost.
+const RANK_LOST: f64 = 1e-9;
+
+/// A regulator `u = u_ref − K (x − x_ref)`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Regulator {
+    /// `K`, m × n.
+    pub gain: DMatrix<f64>,
+    /// `P`, n × n, symmetric positive semidefinite: the cost to go is `½ dxᵀ P dx`.
+    pub value: DMatrix<f64>,
+    /// Largest modulus of the eigenvalues of the closed loop `A − BK`; less than 1.
+    pub spectral_radius: f64,
+    /// `‖Q + KᵀRK + (A − BK)ᵀ P (A − BK) − P‖ / ‖P‖`, Frobenius.
+    pub residual: f64,
+    /// Doublings.
+    pub iterations: u32,
+}
+
+/// Solves the infinite-horizon regulator problem of `x[k+1] = A x + B u`; `q_final` plays no part.
+///
+/// Structure-preserving doubling, about `15n³` flops for each of 6 to 30 doublings; `A` may be
+/// singular, as it is with constraints and prescribed coordinates. What comes out has passed three
+/// checks: it solves the equation, it is positive semidefinite, and it stabilises. When a check
+/// fails, the modes of `A` tell why.
+pub fn infinite_horizon(
+    a: &DMatrix<f64>,
+    b: &DMatrix<f64>,
+    weights: &Weights,
+) -> Result<Regulator, RiccatiError> {
+    let sample = Sample { a: a.clone(), b: b.clone() };
+    check(0, &sample, weights.states(), weights.inputs())?;
+    solve(a, b, weights.q(), weights.r())
+}
+
+/// The same on the constraint manifold, at an equilibrium with that tangent space: the cost counts
+/// only what the tangent space holds, the gain acts on the full state, and the spectral radius
+/// leaves out directions off the manifold.
+pub fn infinite_horizon_on_manifold(
+    a: &DMatrix<f64>,
+    b: &DMatrix<f64>,
+    tangent: &Tangent,
+    weights: &Weights,
+) -> Result<Regulator, RiccatiError> {
+    let sample = Sample { a: a.clone(), b: b.clone() };
+    check(0, &sample, weights.states(), weights.inputs())?;
+    tangent.check(0, weights.states())?;
+    let a = tangent.reduce(a) * tangent.basis();
+    let reduced = solve(&a, &tangent.reduce(b), &tangent.restrict(weights.q()), weights.r())?;
+    Ok(Regulator {
+        gain: tangent.extend_gain(&reduced.gain),
+        value: tangent.extend_value(&reduced.value),
+        ..reduced
+    })
+}
+
+fn solve(
+    a: &DMatrix<f64>,
+    b: &DMatrix<f64>,
+    q: &DMatrix<f64>,
+    r: &DMatrix<f64>,
+) -> Result<Regulator, RiccatiError> {
+    let problem = Problem { a, b, q, r };
+    let (regulator, iterations) = problem.attempt(q);
+    if let Some(regulator) = regulator.filter(Regulator::is_good) {
+        return Ok(regulator);
+    }
+    if let Some(reason) = problem.diagnose()? {
+        return Err(reason);
+    }
+    // An unstable mode without weight leads doubling to a solution that leaves the mode alone.
+    // With a little weight everywhere it stabilises, and Newton's method then keeps to the
+    // stabilising branch of the equation as it was asked.
+    let mut visible = q.clone();
+    let weight = VISIBILITY * q.diagonal().amax().max(f64::MIN_POSITIVE.sqrt());
+    for i in 0..visible.nrows() {
+        visible[(i, i)] += weight;
+    }
+    let (regulator, more_iterations) = problem.attempt(&visible);
+    let iterations = iterations + more_iterations;
+    match regulator {
+        Some(regulator) if regulator.is_good() => Ok(Regulator { iterations, ..regulator }),
+        Some(Regulator { residual, spectral_radius, .. }) => {
+            Err(RiccatiError::NotConverged { iterations, residual, spectral_radius })
+        }
+        None => Err(RiccatiError::NotConverged {
+            iterations,
+            residual: f64::INFINITY,
+            spectral_radius: f64::INFINITY,
+        }),
+    }
+}
+
+impl Regulator {
+    /// The a-posteriori checks, written so that NaN fails.
+    fn is_good(&self) -> bool {
+        self.residual <= RESIDUAL_MAX
+            && self.spectral_radius < 1.0
+            && is_positive_semidefinite(&self.value)
+    }
+}
+
+/// The equation `P = Q + AᵀPA − AᵀPB (R + BᵀPB)⁻¹ BᵀPA`.
+struct Problem<'a> {
+    a: &'a DMatrix<f64>,
+    b: &'a DMatrix<f64>,
+    q: &'a DMatrix<f64>,
+    r: &'a DMatrix<f64>,
+}
+
+impl Problem<'_> {
+    /// Doubling with state weight `q`, polished for the weight of the problem; with the number of
+    /// doublings. The caller judges the result.
+    fn attempt(&self, q: &DMatrix<f64>) -> (Option<Regulator>, u32) {
+        let Some(r) = self.r.clone().cholesky() else {
+            return (None, 0);
+        };
+        let mut g = self.b * r.solve(&self.b.transpose());
+        symmetrize(&mut g);
+        match doubling::riccati(self.a, &g, q) {
+            Err(iterations) => (None, iterations),
+            Ok(doubled) => {
+                let rough = self.evaluate(doubled.value, doubled.iterations);
+                (rough.map(|rough| self.polish(rough)), doubled.iterations)
+            }
+        }
+    }
+
+    fn evaluate(&self, value: DMatrix<f64>, iterations: u32) -> Option<Regulator> {
+        let gain = gain(self.a, self.b, self.r, &value)?;
+        let closed_loop = self.a - self.b * &gain;
+        let spectral_radius = spectral_radius(&closed_loop).ok()?;
+        let defect =
+            self.stage_cost(&gain) + closed_loop.transpose() * (&value * &closed_loop) - &value;
+        let residual = defect.norm() / value.norm().max(f64::MIN_POSITIVE);
+        Some(Regulator { gain, value, spectral_radius, residual, iterations })
+    }
+
+    /// Newton-Kleinman: the cost of the gain in hand, then the gain that is best for that cost.
+    /// From a stabilising gain it converges to the stabilising solution, monotonically.
+    fn polish(&self, mut regulator: Regulator) -> Regulator {
+        for _ in 0..POLISH_MAX {
+            if regulator.residual <= RESIDUAL_POLISH || regulator.spectral_radius >= 1.0 {
+                break;
+            }
+            let closed_loop = self.a - self.b * &regulator.gain;
+            let Some(better) = doubling::lyapunov(&closed_loop, &self.stage_cost(&regulator.gain))
+                .and_then(|value| self.evaluate(value, regulator.iterations))
+                .filter(|better| better.residual < regulator.residual)
+            else {
+                break;
+            };
+            regulator = better;
+        }
+        regulator
+    }
+
+    /// `Q + KᵀRK`.
+    fn stage_cost(&self, gain: &DMatrix<f64>) -> DMatrix<f64> {
+        let mut cost = gain.transpose() * (self.r * gain) + self.q;
+        symmetrize(&mut cost);
+        cost
+    }
+
+    /// Why there is no regulator, if the modes of `A` that do not decay tell
+    /// (Popov-Belevitch-Hautus).
+    fn diagnose(&self) -> Result<Option<RiccatiError>, RiccatiError> {
+        let modes = eigenvalues(self.a)?;
+        let lasting = || modes.iter().filter(|z| z.norm() >= MODULUS_MARGINAL && z.im >= 0.0);
+        if let Some(mode) = lasting().find(|&&z| loses_rank(self.a, self.b, z)) {
+            let (real, imaginary, modulus) = (mode.re, mode.im, mode.norm());
+            return Ok(Some(RiccatiError::NotStabilisable { real, imaginary, modulus }));
+        }
+        let a_t = self.a.transpose();
+        let mut on_circle = lasting().filter(|z| z.norm() <= 2.0 - MODULUS_MARGINAL);
+        let unseen = on_circle.find(|&&z| loses_rank(&a_t, self.q, z));
+        Ok(unseen.map(|z| RiccatiError::NotDetectable { real: z.re, imaginary: z.im }))
+    }
+}
+
+/// Whether `[A − zI, B]` has a direction that neither side reaches: the mode `z` cannot be moved by
+/// `B`. Both sides count relative to their own size, so that units do not matter.
+fn loses_rank(a: &DMatrix<f64>, b: &DMatrix<f64>, z: Complex<f64>) -> bool {
+    let (n, m) = b.shape();
+    let scale = |m: &DMatrix<f64>| if m.norm() > 0.0 { m.norm().recip() } else { 0.0 };
+    let (a_scale, b_scale) = (scale(a), scale(b));
+    let mut pencil = DMatrix::<Complex<f64>>::zeros(n, n + m);
+    for row in 0..n {
+        for col in 0..n {
+            pencil[(row, col)] = Complex::from(a[(row, col)] * a_scale);
+        }
+        pencil[(row, row)] -= z * a_scale;
+        for col in 0..m {
+            pencil[(row, n + col)] = Complex::from(b[(row, col)] * b_scale);
+        }
+    }
+    let svd = nalgebra::SVD::try_new(pencil, false, false, f64::EPSILON, 60 * (n + m));
+    svd.is_some_and(|svd| svd.singular_values.min() < RANK_LOST)
+}
