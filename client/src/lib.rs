@@ -1,6 +1,7 @@
 //! Client of plantd: simulated plants that step when a controller says so.
 //!
-//! [`Client`] speaks gRPC over TCP or a Unix-domain socket. [`Driver`] closes a control loop with
+//! [`Client`] speaks gRPC over TCP or a Unix-domain socket; [`link::LinkDriver`] is the fast way for
+//! a process on the server's machine. [`Driver`] closes a control loop with
 //! one call per step:
 //!
 //! ```no_run
@@ -53,6 +54,7 @@ mod channel;
 mod client;
 mod driver;
 mod error;
+pub mod link;
 mod matrix;
 mod stream;
 

@@ -43,7 +43,7 @@ pub use domain::{
     Bell, Channel, Direction, Domain, DomainError, LinkNode, LinkServices, SHARED_MEMORY_DIRECTORY,
     default_root,
 };
-pub use endpoint::{Endpoint, Message};
+pub use endpoint::{Endpoint, Message, Wait};
 pub use header::{
     Code, Field, HEADER_FIELDS, Header, Holder, Kind, LAYOUT_VERSION, MAGIC, POLL_FOREVER_NS,
     SCHEMA_HASH,

@@ -14,9 +14,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use plantd_proto::link::{
-    Domain, DomainError, LAYOUT_VERSION, LinkNode, POLL_FOREVER_NS, default_root,
-};
+use plantd_proto::link::{Domain, DomainError, LAYOUT_VERSION, LinkNode, Wait, default_root};
 
 use crate::session::Session;
 use worker::Worker;
@@ -27,27 +25,18 @@ pub struct LinkConfig {
     /// Root path of the iceoryx2 domain; made (mode 0700) when it does not exist.
     pub root: PathBuf,
     /// How a link waits for the next input.
-    pub wait: LinkWait,
+    pub wait: Wait,
     /// A driver that sends nothing for this long loses the lease; `None` means never.
     pub idle_timeout: Option<Duration>,
     /// How often resources of dead processes are removed.
     pub clean_up_period: Duration,
 }
 
-/// How a link waits for the next input.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LinkWait {
-    /// Polls for this long after each answer, then sleeps until the driver rings. Zero: never polls.
-    PollThenSleep(Duration),
-    /// Polls all the time: takes a processor for each open link.
-    Poll,
-}
-
 impl Default for LinkConfig {
     fn default() -> Self {
         Self {
             root: default_root(),
-            wait: LinkWait::PollThenSleep(Duration::from_micros(50)),
+            wait: Wait::default(),
             idle_timeout: None,
             clean_up_period: Duration::from_millis(250),
         }
@@ -226,13 +215,4 @@ fn start_housekeeper(node: Arc<LinkNode>, period: Duration) -> Result<Thread, Li
         })?
     };
     Ok(Thread { stop, handle })
-}
-
-impl LinkWait {
-    fn poll_ns(self) -> u64 {
-        match self {
-            Self::PollThenSleep(time) => time.as_nanos().try_into().unwrap_or(POLL_FOREVER_NS),
-            Self::Poll => POLL_FOREVER_NS,
-        }
-    }
 }

@@ -13,7 +13,7 @@ use iceoryx2::sample::Sample;
 use iceoryx2::service::port_factory::PortFactory as _;
 
 use super::domain::{Channel, Direction, DomainError, transport};
-use super::{Header, LinkServices, ProcessIdentity, monotonic_ns};
+use super::{Header, LinkServices, POLL_FOREVER_NS, ProcessIdentity, monotonic_ns};
 
 /// A received message.
 pub type Message = Sample<ipc::Service, [f64], Header>;
@@ -21,6 +21,32 @@ pub type Message = Sample<ipc::Service, [f64], Header>;
 /// After this long a poller lets others run between two looks, ns: with more pollers than
 /// processors the one that is waited for would otherwise not run.
 const POLL_UNDISTURBED_NS: u64 = 20_000;
+
+/// How a side waits for what comes next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Wait {
+    /// Polls for this long after each message that it has sent, then sleeps until the other side
+    /// rings. Zero: never polls.
+    PollThenSleep(Duration),
+    /// Polls all the time: the fastest, and takes a processor while it waits.
+    Poll,
+}
+
+impl Default for Wait {
+    /// Polls for 50 µs: quick while the other side answers quickly, and an idle link costs nothing.
+    fn default() -> Self {
+        Self::PollThenSleep(Duration::from_micros(50))
+    }
+}
+
+impl Wait {
+    fn poll_ns(self) -> u64 {
+        match self {
+            Self::PollThenSleep(time) => time.as_nanos().try_into().unwrap_or(POLL_FOREVER_NS),
+            Self::Poll => POLL_FOREVER_NS,
+        }
+    }
+}
 
 /// One side of a link. Its ports belong to the thread that made them.
 #[derive(Debug)]
@@ -40,21 +66,21 @@ impl Endpoint {
     pub fn server(
         services: LinkServices,
         state_len: usize,
-        poll_ns: u64,
+        wait: Wait,
     ) -> Result<Self, DomainError> {
-        Self::new(services.state, services.input, state_len, poll_ns)
+        Self::new(services.state, services.input, state_len, wait)
     }
 
     /// A driver's side: sends inputs of at most `input_len` entries.
     pub fn driver(
         services: LinkServices,
         input_len: usize,
-        poll_ns: u64,
+        wait: Wait,
     ) -> Result<Self, DomainError> {
-        Self::new(services.input, services.state, input_len, poll_ns)
+        Self::new(services.input, services.state, input_len, wait)
     }
 
-    fn new(out: Direction, back: Direction, len: usize, poll_ns: u64) -> Result<Self, DomainError> {
+    fn new(out: Direction, back: Direction, len: usize, wait: Wait) -> Result<Self, DomainError> {
         // The receiving ports come first: an answer must find them.
         let listener = back.bell.listener_builder().create().map_err(transport("a listener"))?;
         let subscriber =
@@ -77,7 +103,7 @@ impl Endpoint {
             listener,
             incoming,
             own,
-            poll_ns,
+            poll_ns: wait.poll_ns(),
             poll_end_ns: 0,
         })
     }

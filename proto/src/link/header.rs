@@ -228,8 +228,6 @@ numbered! {
         PlantDeleted = 11,
         /// The link was closed, or the server shuts down.
         LinkClosed = 12,
-        /// The server cannot go on; its log says why.
-        Internal = 13,
     }
 }
 

@@ -75,7 +75,7 @@ impl Worker {
             constraints: dimensions.constraints as u32,
             ..Header::new(Kind::State)
         };
-        let endpoint = Endpoint::server(services, header.state_len(), config.wait.poll_ns())?;
+        let endpoint = Endpoint::server(services, header.state_len(), config.wait)?;
         session.set_link_open(true);
         tracing::info!(plant = session.id(), "shared-memory link is open");
         Ok(Self {
