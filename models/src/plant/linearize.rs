@@ -309,13 +309,16 @@ impl Plant {
             target.iter_mut().zip(&jacobian[..nd]).for_each(|(t, entry)| *t = -entry);
             target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
             let dynamic = constraint.points.path.iter().map(|joint| joint.coordinate);
-            let terms = dynamic.filter(|i| *i < nd).map(|i| (jacobian[i], i));
-            add_rows(target, &out.increment, stride, terms);
+            workspace.terms.clear();
+            workspace.terms.extend(dynamic.filter(|i| *i < nd).map(|i| (jacobian[i], i)));
+            add_rows(target, &out.increment, stride, &workspace.terms);
         }
         workspace.schur.solve_rows(&mut out.multipliers, stride);
         for (i, target) in out.increment.chunks_exact_mut(stride).enumerate() {
             let responses = workspace.responses[i * padded(nc)..][..nc].iter().enumerate();
-            add_rows(target, &out.multipliers, stride, responses.map(|(c, r)| (-r, c)));
+            workspace.terms.clear();
+            workspace.terms.extend(responses.map(|(c, r)| (-r, c)));
+            add_rows(target, &out.multipliers, stride, &workspace.terms);
         }
     }
 
@@ -331,15 +334,16 @@ impl Plant {
             let stiffness = &workspace.stiffness[i * nd..][..nd];
             target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
             let slopes = workspace.end_slopes[i * nd..][..nd].iter().enumerate();
-            let terms = slopes.filter(|(_, slope)| **slope != 0.0).map(|(j, slope)| (*slope, j));
-            add_rows(target, &out.increment, stride, terms);
+            workspace.terms.clear();
+            workspace.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
+            add_rows(target, &out.increment, stride, &workspace.terms);
         }
         for (c, constraint) in model.constraints.iter().enumerate() {
             let dynamic = constraint.points.path.iter().map(|joint| joint.coordinate);
             for i in dynamic.filter(|i| *i < nd) {
                 let entry = workspace.start.jacobian[c * n + i];
                 let target = &mut out.momentum[i * stride..][..stride];
-                add_rows(target, &out.multipliers, stride, std::iter::once((-entry, c)));
+                add_rows(target, &out.multipliers, stride, &[(-entry, c)]);
             }
         }
     }

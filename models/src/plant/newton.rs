@@ -16,7 +16,7 @@ use crate::plant::curvature::Curvature;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::rows::padded;
+use crate::plant::rows::{Term, padded};
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, springs};
 
@@ -72,6 +72,7 @@ pub(crate) struct Workspace {
     pub(crate) end_slopes: Vec<f64>,
     /// `h L_qq`, for the linearization, row-major.
     pub(crate) stiffness: Vec<f64>,
+    pub(crate) terms: Vec<Term>,
 }
 
 impl Workspace {
@@ -105,6 +106,7 @@ impl Workspace {
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),
             stiffness: zeros(nd * nd),
+            terms: Vec::with_capacity(nd.max(nc)),
         }
     }
 
@@ -186,7 +188,8 @@ impl Workspace {
     fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
         self.find_velocity(model, state);
         for (x, v) in self.increment.iter_mut().zip(&self.residual) {
-            *x = settings.time_step_s * v;
+            // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
+            *x = if v.is_finite() { settings.time_step_s * v } else { 0.0 };
         }
         self.multipliers.copy_from_slice(&state.multipliers);
         // The velocity was found with the prescribed velocities of the last step, not of this one.

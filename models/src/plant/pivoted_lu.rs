@@ -3,7 +3,7 @@
 //! Rows that depend on others (redundant constraints) show as vanishing pivots: they are left out,
 //! and their multipliers are zero.
 
-use crate::plant::rows::add_rows;
+use crate::plant::rows::{Term, add_rows};
 
 /// Pivots below this fraction of the largest count as zero.
 const RANK_TOLERANCE: f64 = 1e-11;
@@ -20,6 +20,7 @@ pub(crate) struct PivotedLu {
     inverse_pivot: Vec<f64>,
     /// A permuted right-hand side.
     scratch: Vec<f64>,
+    terms: Vec<Term>,
 }
 
 impl PivotedLu {
@@ -34,6 +35,7 @@ impl PivotedLu {
             scale: vec![1.0; order],
             inverse_pivot: vec![0.0; order],
             scratch: vec![0.0; order * stride.max(1)],
+            terms: Vec::with_capacity(order),
         }
     }
 
@@ -137,13 +139,17 @@ impl PivotedLu {
             for (t, entry) in target.iter_mut().zip(&x[row * stride..]) {
                 *t = entry * self.scale[row];
             }
-            let terms = self.matrix[k * n..][..k].iter().enumerate().map(|(j, l)| (-l, j));
-            add_rows(target, above, stride, terms);
+            let factors = self.matrix[k * n..][..k].iter().enumerate();
+            self.terms.clear();
+            self.terms.extend(factors.map(|(j, l)| (-l, j)));
+            add_rows(target, above, stride, &self.terms);
         }
         for k in (0..rank).rev() {
             let (target, below) = self.scratch[k * stride..].split_at_mut(stride);
-            let row = self.matrix[k * n..][k + 1..rank].iter().enumerate();
-            add_rows(target, below, stride, row.map(|(j, u)| (-u, j)));
+            let factors = self.matrix[k * n..][k + 1..rank].iter().enumerate();
+            self.terms.clear();
+            self.terms.extend(factors.map(|(j, u)| (-u, j)));
+            add_rows(target, below, stride, &self.terms);
             for t in target {
                 *t *= self.inverse_pivot[k];
             }
@@ -156,5 +162,53 @@ impl PivotedLu {
                 *t = entry * self.scale[target];
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+
+    fn filled(dense: &DMatrix<f64>) -> PivotedLu {
+        let mut lu = PivotedLu::new(dense.nrows(), 8);
+        lu.matrix.copy_from_slice(dense.transpose().as_slice());
+        lu.factor();
+        lu
+    }
+
+    #[test]
+    fn badly_scaled_rows_do_not_count_as_redundant() {
+        let scale = DMatrix::from_diagonal(&DVector::from_vec(vec![1e6, 1.0, 1e-7]));
+        let core = DMatrix::from_row_slice(3, 3, &[2.0, 0.3, -0.4, 0.1, 3.0, 0.2, 0.5, -0.6, 4.0]);
+        let dense = &scale * core * &scale;
+        let x = DVector::from_vec(vec![1e-6, -2.0, 3e7]);
+        let mut solution = (&dense * &x).as_slice().to_vec();
+        let mut lu = filled(&dense);
+        lu.solve(&mut solution);
+        assert_eq!(lu.rank, 3);
+        assert!((DVector::from_vec(solution).component_div(&x).add_scalar(-1.0)).amax() < 1e-12);
+    }
+
+    #[test]
+    fn a_consistent_redundant_system_is_solved() {
+        // The third row is the sum of the others.
+        let a = DMatrix::from_row_slice(
+            3,
+            4,
+            &[1.0, 0.2, 0.0, 0.4, 0.0, 1.0, 0.5, 0.0, 1.0, 1.2, 0.5, 0.4],
+        );
+        let dense = &a * a.transpose();
+        let b = &dense * DVector::from_vec(vec![1.0, 2.0, -1.0]);
+        let mut lu = filled(&dense);
+        let mut single = b.as_slice().to_vec();
+        lu.solve(&mut single);
+        assert_eq!(lu.rank, 2);
+        assert!((&dense * DVector::from_vec(single.clone()) - &b).amax() < 1e-12);
+        let mut rows = vec![0.0; 3 * 8];
+        (0..3).for_each(|i| rows[i * 8 + 5] = b[i]);
+        lu.solve_rows(&mut rows, 8);
+        (0..3).for_each(|i| assert!((rows[i * 8 + 5] - single[i]).abs() < 1e-14));
     }
 }

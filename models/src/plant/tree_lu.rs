@@ -2,7 +2,7 @@
 //! Featherstone's LTL, without fill-in. O(n·depth²) to factor, O(n·depth) to solve.
 
 use crate::elimination::Elimination;
-use crate::plant::rows::add_rows;
+use crate::plant::rows::{Term, add_rows};
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
 #[derive(Clone, Debug)]
@@ -12,6 +12,7 @@ pub(crate) struct TreeLu {
     /// `lower[slot] = K[row, ancestor]`.
     pub(crate) lower: Vec<f64>,
     inverse_pivot: Vec<f64>,
+    terms: Vec<Term>,
 }
 
 /// The smallest pivot of a factorization.
@@ -28,6 +29,7 @@ impl TreeLu {
             upper: vec![0.0; elimination.entries()],
             lower: vec![0.0; elimination.entries()],
             inverse_pivot: vec![0.0; elimination.len()],
+            terms: Vec::with_capacity(elimination.len()),
         }
     }
 
@@ -118,7 +120,7 @@ impl TreeLu {
     /// are whole blocks.
     #[inline(never)]
     pub(crate) fn solve_rows(
-        &self,
+        &mut self,
         elimination: &Elimination,
         x: &mut [f64],
         stride: usize,
@@ -127,19 +129,106 @@ impl TreeLu {
         for i in (0..elimination.len()).rev() {
             let (row, below) = x[i * stride..].split_at_mut(stride);
             let terms = elimination.below(i).iter();
-            let terms = terms.map(|&(j, slot)| (-self.upper[slot], j - i - 1));
-            add_rows(&mut row[..columns], below, stride, terms);
+            self.terms.clear();
+            self.terms.extend(terms.map(|&(j, slot)| (-self.upper[slot], j - i - 1)));
+            add_rows(&mut row[..columns], below, stride, &self.terms);
         }
         for i in 0..elimination.len() {
             let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;
             let (above, row) = x.split_at_mut(i * stride);
             let row = &mut row[..columns];
             let ancestors = elimination.ancestors[range.clone()].iter();
-            let terms = ancestors.zip(&self.lower[range]).map(|(&j, l)| (-l, j));
-            add_rows(row, above, stride, terms);
+            self.terms.clear();
+            self.terms.extend(ancestors.zip(&self.lower[range]).map(|(&j, l)| (-l, j)));
+            add_rows(row, above, stride, &self.terms);
             for entry in row {
                 *entry *= self.inverse_pivot[i];
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+
+    /// A forest with a coupling between two branches: rows 3 and 5 share no path without it.
+    fn elimination() -> Elimination {
+        let couplings = [&[][..], &[0], &[0, 1], &[0, 1, 2], &[0], &[0, 3, 4], &[], &[6]];
+        Elimination::new(&couplings.map(|c| c.iter().copied().collect::<BTreeSet<_>>()))
+    }
+
+    /// A diagonally dominant matrix on the pattern, with the dense one that it stands for.
+    fn matrix(elimination: &Elimination) -> (TreeLu, DMatrix<f64>) {
+        let n = elimination.len();
+        let (mut lu, mut dense) = (TreeLu::new(elimination), DMatrix::zeros(n, n));
+        for row in 0..n {
+            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
+                let ancestor = elimination.ancestors[slot];
+                let (u, l) = ((slot as f64 * 0.7).sin(), (slot as f64 * 1.3).cos());
+                let (u, l) = if ancestor == row { (6.0 + u, 6.0 + u) } else { (u, l) };
+                (lu.upper[slot], lu.lower[slot]) = (u, l);
+                (dense[(ancestor, row)], dense[(row, ancestor)]) = (u, l);
+            }
+        }
+        (lu, dense)
+    }
+
+    #[test]
+    fn a_solution_satisfies_the_dense_system() {
+        let elimination = elimination();
+        let (mut lu, dense) = matrix(&elimination);
+        let b = DVector::from_fn(elimination.len(), |i, _| (i as f64).cos());
+        let mut x = b.as_slice().to_vec();
+        assert!(lu.factor(&elimination).relative > 0.1);
+        lu.solve(&elimination, &mut x);
+        assert!((dense * DVector::from_vec(x) - b).amax() < 1e-14);
+    }
+
+    #[test]
+    fn rows_are_solved_like_single_columns() {
+        let elimination = elimination();
+        let (mut lu, _) = matrix(&elimination);
+        lu.factor(&elimination);
+        let (n, stride) = (elimination.len(), 24);
+        let mut rows: Vec<f64> = (0..n * stride).map(|i| (i as f64).sin()).collect();
+        for column in 0..stride {
+            let mut single: Vec<f64> =
+                (0..n).map(|i| ((i * stride + column) as f64).sin()).collect();
+            lu.solve(&elimination, &mut single);
+            let mut copy = rows.clone();
+            lu.solve_rows(&elimination, &mut copy, stride, stride);
+            for (i, value) in single.iter().enumerate() {
+                assert!((copy[i * stride + column] - value).abs() < 1e-14);
+            }
+        }
+        let untouched = rows[stride - 1];
+        lu.solve_rows(&elimination, &mut rows, stride, 16);
+        assert_eq!(rows[stride - 1], untouched, "columns beyond the given ones stay");
+    }
+
+    #[test]
+    fn a_vanishing_pivot_is_named() {
+        let elimination = elimination();
+        let (mut lu, _) = matrix(&elimination);
+        // Row 7 hangs from row 6 alone: make their block singular.
+        let (diagonal, coupling) = (elimination.offsets[8] - 1, elimination.offsets[7]);
+        let root = elimination.offsets[7] - 1;
+        (lu.upper[diagonal], lu.upper[coupling], lu.lower[coupling], lu.upper[root]) =
+            (2.0, 2.0, 2.0, 2.0);
+        let smallest = lu.factor(&elimination);
+        assert_eq!((smallest.row, smallest.relative), (6, 0.0));
+    }
+
+    #[test]
+    fn nan_is_the_smallest_pivot() {
+        let elimination = elimination();
+        let (mut lu, _) = matrix(&elimination);
+        lu.upper[elimination.offsets[5] - 1] = f64::NAN;
+        assert!(!(lu.factor(&elimination).relative >= 0.0));
     }
 }
