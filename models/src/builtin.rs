@@ -1,6 +1,11 @@
-//! Built-in scenes.
+//! Built-in scenes: TOML files of `scenes/`, and two families that are generated for any size.
+
+use std::f64::consts::{FRAC_PI_2, PI};
 
 use crate::Scene;
+use crate::scene::{
+    Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Point,
+};
 
 /// Names of the built-in scenes. `chain-N` and `scissor-N` stand for whole families.
 pub const NAMES: &[&str] = &[
@@ -15,8 +20,223 @@ pub const NAMES: &[&str] = &[
     "marionette",
 ];
 
+/// Most links of a chain.
+const MAX_LINKS: usize = 1024;
+/// Most segments of a scissor.
+const MAX_SEGMENTS: usize = 64;
+
 /// The built-in scene of that name; any `chain-N` with 1 ≤ N ≤ 1024 and `scissor-N` with
 /// 1 ≤ N ≤ 64 exists.
-pub fn scene(_name: &str) -> Option<Scene> {
-    unimplemented!()
+pub fn scene(name: &str) -> Option<Scene> {
+    let text = match name {
+        "pendulum" => include_str!("../scenes/pendulum.toml"),
+        "damped-pendulum" => include_str!("../scenes/damped-pendulum.toml"),
+        "double-pendulum" => include_str!("../scenes/double-pendulum.toml"),
+        "cart-pole" => include_str!("../scenes/cart-pole.toml"),
+        "spherical-pendulum" => include_str!("../scenes/spherical-pendulum.toml"),
+        "four-bar" => include_str!("../scenes/four-bar.toml"),
+        "marionette" => include_str!("../scenes/marionette.toml"),
+        _ => return family(name),
+    };
+    // A test reads every file; an error here would be one of this crate, not of its caller.
+    Scene::from_toml(text).ok()
+}
+
+fn family(name: &str) -> Option<Scene> {
+    let (family, size) = name.rsplit_once('-')?;
+    // Only the canonical spelling: a name stands for one scene and a scene for one name.
+    let n: usize = size.parse().ok().filter(|n: &usize| n.to_string() == size)?;
+    match family {
+        "chain" if (1..=MAX_LINKS).contains(&n) => Some(chain(n)),
+        "scissor" if (1..=MAX_SEGMENTS).contains(&n) => Some(scissor(n)),
+        _ => None,
+    }
+}
+
+fn empty(name: String, description: String) -> Scene {
+    Scene {
+        format: 1,
+        name,
+        description,
+        time_step_s: 0.01,
+        gravity: [0.0, 0.0, -9.8],
+        damping: 0.0,
+        frames: Vec::new(),
+        coordinates: Vec::new(),
+        springs: Vec::new(),
+        inputs: Vec::new(),
+        constraints: Vec::new(),
+        operating_points: Vec::new(),
+    }
+}
+
+/// A frame that turns about the y axis, by a coordinate of its own name.
+fn hinge(name: String, parent: &str, translation: [f64; 3], body: Body) -> Frame {
+    Frame {
+        name,
+        parent: parent.to_owned(),
+        translation,
+        rotation: None,
+        joint: Some(Joint::Revolute { axis: [0.0, 1.0, 0.0], coordinate: None }),
+        body: Some(body),
+    }
+}
+
+fn dynamic(name: String, initial: f64) -> Coordinate {
+    Coordinate { name, kind: Default::default(), initial, damping: None }
+}
+
+/// `n` uniform thin rods, 1 m and 1 kg together, hinged about one axis, released from horizontal.
+fn chain(n: usize) -> Scene {
+    let length = 1.0 / n as f64;
+    let mass = length;
+    let across = mass * length * length / 12.0;
+    let link = |i: usize| format!("link{i}");
+    let mut scene = empty(
+        format!("chain-{n}"),
+        format!(
+            "{n} uniform thin rods, 1 m and 1 kg together, hinged about one axis, released from horizontal."
+        ),
+    );
+    for i in 0..n {
+        let body = Body {
+            mass,
+            center_of_mass: [0.0, 0.0, -length / 2.0],
+            inertia: vec![across, across, 0.0],
+        };
+        let (parent, z) = if i == 0 { ("world".to_owned(), 0.0) } else { (link(i - 1), -length) };
+        scene.frames.push(hinge(link(i), &parent, [0.0, 0.0, z], body));
+    }
+    scene.coordinates.push(dynamic(link(0), FRAC_PI_2));
+    scene.inputs.push(Input { name: "torque".to_owned(), coordinate: link(0), gain: 1.0 });
+    for (name, angle) in [("hanging", 0.0), ("upright", PI)] {
+        scene.operating_points.push(OperatingPoint {
+            name: name.to_owned(),
+            coordinates: [(link(0), angle)].into(),
+            inputs: Default::default(),
+        });
+    }
+    scene
+}
+
+/// A stack of `n` pairs of crossed links below a rail: one pair's upper ends hang from a fixed hinge
+/// and from a slider, each further pair from the ends of the pair above.
+///
+/// The tree has two strands, each of which changes sides at every pair; point-to-point constraints
+/// join the middles of each pair.
+fn scissor(n: usize) -> Scene {
+    const LENGTH: f64 = 5.0;
+    const OPENING: f64 = PI / 20.0;
+    let mut scene = empty(
+        format!("scissor-{n}"),
+        format!(
+            "{n} pairs of crossed links of 5 m below a rail, nearly flat, opening under gravity."
+        ),
+    );
+    let link = || Body {
+        mass: 1.0,
+        center_of_mass: [LENGTH / 2.0, 0.0, 0.0],
+        inertia: vec![1.0, 1.0, 1.0],
+    };
+    scene.frames.push(Frame {
+        name: "slider".to_owned(),
+        parent: "world".to_owned(),
+        translation: [0.0; 3],
+        rotation: None,
+        joint: Some(Joint::Prismatic { axis: [1.0, 0.0, 0.0], coordinate: None }),
+        body: Some(Body { mass: 1.0, center_of_mass: [0.0; 3], inertia: Vec::new() }),
+    });
+    scene.coordinates.push(dynamic("slider".to_owned(), LENGTH * OPENING.cos()));
+    // Seen from its parent link, every link but the first of a strand folds back by twice the opening.
+    for (start, first_is_right) in [("slider", true), ("world", false)] {
+        let mut parent = start.to_owned();
+        for i in 0..n {
+            let right = first_is_right == (i % 2 == 0);
+            let name = format!("{}{i}", if right { "right" } else { "left" });
+            let at = if i == 0 { 0.0 } else { LENGTH };
+            let angle = match (i, right) {
+                (0, true) => PI - OPENING,
+                (0, false) => OPENING,
+                (_, true) => PI - 2.0 * OPENING,
+                (_, false) => PI + 2.0 * OPENING,
+            };
+            scene.frames.push(hinge(name.clone(), &parent, [at, 0.0, 0.0], link()));
+            scene.coordinates.push(dynamic(name.clone(), angle));
+            parent = name;
+        }
+    }
+    for i in 0..n {
+        let middle =
+            |side: &str| Point { frame: format!("{side}{i}"), at: [LENGTH / 2.0, 0.0, 0.0] };
+        scene.constraints.push(Constraint::PointToPoint {
+            name: format!("pivot{i}"),
+            a: middle("left"),
+            b: middle("right"),
+            axes: vec![Axis::X, Axis::Z],
+        });
+    }
+    scene.inputs.push(Input {
+        name: "force".to_owned(),
+        coordinate: "slider".to_owned(),
+        gain: 1.0,
+    });
+    scene
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::{Initial, Model, Plant, Settings};
+
+    #[test]
+    fn every_scene_is_valid_and_bears_its_name() {
+        for name in
+            NAMES.iter().copied().chain(["chain-1", "chain-1024", "scissor-1", "scissor-64"])
+        {
+            let scene = scene(name).unwrap_or_else(|| panic!("{name} does not exist"));
+            assert_eq!(scene.name, name);
+            assert_eq!(scene.validate(), [], "{name}");
+        }
+    }
+
+    #[test]
+    fn only_canonical_names_exist() {
+        for name in
+            ["", "chain", "chain-", "chain-0", "chain-04", "chain-+4", "chain-1025", "chain--4"]
+        {
+            assert!(scene(name).is_none(), "{name}");
+        }
+        for name in ["scissor-0", "scissor-65", "pendulum-1", "Pendulum", "scene.schema"] {
+            assert!(scene(name).is_none(), "{name}");
+        }
+    }
+
+    #[test]
+    fn plants_start_and_step_at_every_operating_point() {
+        for name in NAMES.iter().copied().chain(["scissor-1", "scissor-12"]) {
+            let model = Arc::new(Model::compile(&scene(name).unwrap()).unwrap());
+            let mut plant = Plant::new(model.clone(), Settings::new(&model)).unwrap();
+            for point in model.operating_points() {
+                plant.initialize(&Initial::OperatingPoint(point.name.clone())).unwrap();
+                plant.step(&point.u).unwrap_or_else(|e| panic!("{name} at {}: {e}", point.name));
+            }
+        }
+    }
+
+    #[test]
+    fn named_operating_points_are_equilibria() {
+        for name in NAMES {
+            let model = Arc::new(Model::compile(&scene(name).unwrap()).unwrap());
+            let mut plant = Plant::new(model.clone(), Settings::new(&model)).unwrap();
+            for point in model.operating_points().iter().filter(|p| p.name != "initial") {
+                plant.initialize(&Initial::OperatingPoint(point.name.clone())).unwrap();
+                plant.step(&point.u).unwrap();
+                for (now, then) in plant.q().iter().zip(&point.q) {
+                    assert!((now - then).abs() < 1e-14, "{name} at {}: {now} {then}", point.name);
+                }
+            }
+        }
+    }
 }

@@ -3,6 +3,15 @@
 //! All quantities are SI; angles are radians. Unknown keys are errors. [`crate::Model::compile`]
 //! reports every error of a scene at once, each with its path.
 
+mod limits;
+mod text;
+mod validate;
+
+pub use limits::{
+    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_FRAMES, MAX_INPUTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS,
+    MAX_SPRINGS, MAX_TEXT_BYTES,
+};
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -262,7 +271,9 @@ pub enum Length {
 }
 
 /// A world axis.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[derive(
+    Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum Axis {
     /// x.
@@ -298,35 +309,59 @@ pub struct Problem {
 
 /// All errors of a scene.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{}", self.problems.iter().map(|p| format!("{}: {}", p.path, p.message)).collect::<Vec<_>>().join("\n"))]
+#[error("{}", self.problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
 pub struct SceneError {
     /// At least one.
     pub problems: Vec<Problem>,
 }
 
-impl Scene {
-    /// Reads TOML.
-    pub fn from_toml(_text: &str) -> Result<Self, SceneError> {
-        unimplemented!()
+impl std::fmt::Display for Problem {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if self.path.is_empty() {
+            return f.write_str(&self.message);
+        }
+        write!(f, "{}: {}", self.path, self.message)
     }
-    /// Reads JSON.
-    pub fn from_json(_text: &str) -> Result<Self, SceneError> {
-        unimplemented!()
+}
+
+impl Joint {
+    /// Axis, and the coordinate's name if the joint gives one; none for a fixed joint.
+    pub fn motion(&self) -> Option<(&[f64; 3], Option<&str>)> {
+        match self {
+            Self::Fixed {} => None,
+            Self::Revolute { axis, coordinate } | Self::Prismatic { axis, coordinate } => {
+                Some((axis, coordinate.as_deref()))
+            }
+        }
     }
-    /// Reads JSON if the first character that is not white space is `{`, else TOML.
-    pub fn from_text(_text: &str) -> Result<Self, SceneError> {
-        unimplemented!()
+}
+
+impl Frame {
+    /// Name of the coordinate that its joint moves by; none without a moving joint.
+    pub fn coordinate(&self) -> Option<&str> {
+        let (_, name) = self.joint.as_ref()?.motion()?;
+        Some(name.unwrap_or(&self.name))
     }
-    /// Writes TOML.
-    pub fn to_toml(&self) -> String {
-        unimplemented!()
+}
+
+impl Constraint {
+    /// Name.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Distance { name, .. } | Self::PointToPoint { name, .. } => name,
+        }
     }
-    /// The JSON Schema of the format.
-    pub fn json_schema() -> serde_json::Value {
-        unimplemented!()
+    /// Number of its equations.
+    pub fn equations(&self) -> usize {
+        match self {
+            Self::Distance { .. } => 1,
+            Self::PointToPoint { axes, .. } => axes.len(),
+        }
     }
-    /// Everything that is wrong with the scene; empty when it will compile.
-    pub fn validate(&self) -> Vec<Problem> {
-        unimplemented!()
+    /// Its two points.
+    pub fn points(&self) -> (&Point, &Point) {
+        match self {
+            Self::Distance { a, b, .. } | Self::PointToPoint { a, b, .. } => (a, b),
+        }
     }
 }

@@ -1,0 +1,18 @@
+//! Limits on scenes: what a scene from an unknown sender may cost.
+
+/// Longest text of a scene, bytes.
+pub const MAX_TEXT_BYTES: usize = 16 << 20;
+/// Longest name, bytes.
+pub const MAX_NAME_BYTES: usize = 64;
+/// Most frames.
+pub const MAX_FRAMES: usize = 4096;
+/// Most coordinates, dynamic and prescribed together. The linearization has `(2 n)²` entries.
+pub const MAX_COORDINATES: usize = 1024;
+/// Most springs.
+pub const MAX_SPRINGS: usize = 4096;
+/// Most inputs.
+pub const MAX_INPUTS: usize = 1024;
+/// Most constraint equations.
+pub const MAX_CONSTRAINTS: usize = 1024;
+/// Most operating points.
+pub const MAX_OPERATING_POINTS: usize = 256;

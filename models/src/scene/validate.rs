@@ -1,0 +1,155 @@
+//! Validation: every error of a scene at once, each with its path.
+
+mod actions;
+mod coordinates;
+mod frames;
+mod shapes;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use super::{
+    Constraint, CoordinateKind, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_FRAMES, MAX_INPUTS,
+    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_SPRINGS, Problem, Scene,
+};
+
+impl Scene {
+    /// Everything that is wrong with the scene; empty when it will compile.
+    pub fn validate(&self) -> Vec<Problem> {
+        let mut check = Check::new(self);
+        check.limits();
+        if !check.problems.is_empty() {
+            // The rest of the work grows with the sizes that are out of bounds.
+            return check.problems;
+        }
+        check.header();
+        check.frames();
+        check.coordinates();
+        check.springs();
+        check.inputs();
+        check.constraints();
+        check.operating_points();
+        check.problems
+    }
+}
+
+/// A validation in progress: the scene, its names resolved, and the problems so far.
+struct Check<'a> {
+    scene: &'a Scene,
+    problems: Vec<Problem>,
+    /// Index of the first frame of each name.
+    frames: BTreeMap<&'a str, usize>,
+    /// Parent of each frame; none for children of the world and of unknown parents.
+    parents: Vec<Option<usize>>,
+    /// Whether names and parents form a tree, so that ancestors may be walked.
+    is_tree: bool,
+    /// The first frame that each coordinate moves.
+    movers: BTreeMap<&'a str, usize>,
+    /// Kind of every coordinate that a joint or an entry of `coordinates` names.
+    kinds: BTreeMap<&'a str, CoordinateKind>,
+}
+
+impl<'a> Check<'a> {
+    fn new(scene: &'a Scene) -> Self {
+        Self {
+            scene,
+            problems: Vec::new(),
+            frames: BTreeMap::new(),
+            parents: Vec::new(),
+            is_tree: true,
+            movers: BTreeMap::new(),
+            kinds: BTreeMap::new(),
+        }
+    }
+
+    fn report(&mut self, path: impl Into<String>, message: impl Into<String>) {
+        self.problems.push(Problem { path: path.into(), message: message.into() });
+    }
+
+    fn limits(&mut self) {
+        let scene = self.scene;
+        let joints = scene.frames.iter().filter(|f| f.coordinate().is_some()).count();
+        let equations: usize = scene.constraints.iter().map(Constraint::equations).sum();
+        for (path, count, most) in [
+            ("frames", scene.frames.len(), MAX_FRAMES),
+            ("frames", joints, MAX_COORDINATES),
+            ("coordinates", scene.coordinates.len(), MAX_COORDINATES),
+            ("springs", scene.springs.len(), MAX_SPRINGS),
+            ("inputs", scene.inputs.len(), MAX_INPUTS),
+            ("constraints", scene.constraints.len().max(equations), MAX_CONSTRAINTS),
+            ("operating_points", scene.operating_points.len(), MAX_OPERATING_POINTS),
+        ] {
+            if count > most {
+                let what =
+                    if path == "frames" && most == MAX_COORDINATES { "joints" } else { path };
+                self.report(path, format!("{count} {what}; at most {most} are allowed"));
+            }
+        }
+    }
+
+    fn header(&mut self) {
+        let scene = self.scene;
+        if scene.format != 1 {
+            self.report(
+                "format",
+                format!("version {} is not known; this is version 1", scene.format),
+            );
+        }
+        let is_plain = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-';
+        if scene.name.is_empty()
+            || scene.name.len() > MAX_NAME_BYTES
+            || !scene.name.bytes().all(is_plain)
+        {
+            let message =
+                format!("must be 1 to {MAX_NAME_BYTES} lower-case letters, digits and hyphens");
+            self.report("name", message);
+        }
+        self.positive("time_step_s".into(), scene.time_step_s);
+        self.finite_all("gravity", &scene.gravity);
+        self.not_negative("damping".into(), scene.damping);
+    }
+
+    /// The syntax of a name, and that `seen` does not have it yet.
+    fn name(&mut self, path: String, name: &'a str, seen: &mut BTreeMap<&'a str, usize>) {
+        let is_plain = |b: u8| b.is_ascii_alphanumeric() || b == b'-' || b == b'_';
+        if name.is_empty() || name.len() > MAX_NAME_BYTES || !name.bytes().all(is_plain) {
+            let message = format!(
+                "must be 1 to {MAX_NAME_BYTES} ASCII letters, digits, hyphens and underscores"
+            );
+            self.report(path.clone(), message);
+        }
+        if let Some(first) = seen.get(name) {
+            self.report(path, format!("`{name}` is also the name of number {first}"));
+        } else {
+            seen.insert(name, seen.len());
+        }
+    }
+
+    fn finite(&mut self, path: String, x: f64) -> bool {
+        if !x.is_finite() {
+            self.report(path, format!("is {x}; must be a finite number"));
+        }
+        x.is_finite()
+    }
+
+    fn finite_all(&mut self, path: &str, xs: &[f64]) -> bool {
+        let mut all = true;
+        for (i, &x) in xs.iter().enumerate() {
+            all &= self.finite(format!("{path}[{i}]"), x);
+        }
+        all
+    }
+
+    fn positive(&mut self, path: String, x: f64) {
+        if self.finite(path.clone(), x) && x <= 0.0 {
+            self.report(path, format!("is {x}; must be greater than zero"));
+        }
+    }
+
+    fn not_negative(&mut self, path: String, x: f64) {
+        if self.finite(path.clone(), x) && x < 0.0 {
+            self.report(path, format!("is {x}; must not be negative"));
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! Coordinates, inputs and operating points: everything that refers to coordinates by name.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::Check;
+use crate::scene::{Constraint, CoordinateKind, Joint, Length};
+
+impl<'a> Check<'a> {
+    pub(super) fn coordinates(&mut self) {
+        let lengths = self.length_coordinates();
+        let mut seen = BTreeMap::new();
+        for (i, coordinate) in self.scene.coordinates.iter().enumerate() {
+            let path = format!("coordinates[{i}]");
+            let name = coordinate.name.as_str();
+            self.name(format!("{path}.name"), name, &mut seen);
+            let prescribed = coordinate.kind == CoordinateKind::Prescribed;
+            if prescribed && lengths.contains(name) {
+                self.positive(format!("{path}.initial"), coordinate.initial);
+            } else {
+                self.finite(format!("{path}.initial"), coordinate.initial);
+            }
+            if let Some(damping) = coordinate.damping {
+                self.not_negative(format!("{path}.damping"), damping);
+                if prescribed {
+                    self.report(
+                        format!("{path}.damping"),
+                        "has no effect on a prescribed coordinate",
+                    );
+                }
+            }
+            if !self.movers.contains_key(name) && !(prescribed && lengths.contains(name)) {
+                let message = if lengths.contains(name) {
+                    format!("no joint moves by `{name}`; a length must be prescribed")
+                } else {
+                    format!("no joint moves by `{name}` and no length follows it")
+                };
+                self.report(format!("{path}.name"), message);
+            }
+        }
+    }
+
+    /// Coordinates that are lengths of constraints.
+    fn length_coordinates(&self) -> BTreeSet<&'a str> {
+        let lengths = self.scene.constraints.iter().filter_map(|constraint| match constraint {
+            Constraint::Distance { length: Length::Coordinate(name), .. } => Some(name.as_str()),
+            _ => None,
+        });
+        lengths.collect()
+    }
+
+    /// That a length names a prescribed coordinate, which is not an angle.
+    pub(super) fn length_coordinate(&mut self, path: String, name: &str) {
+        match self.kinds.get(name) {
+            None => {
+                self.report(path, format!("there is no prescribed coordinate `{name}`"));
+                return;
+            }
+            Some(CoordinateKind::Dynamic) => {
+                self.report(
+                    path,
+                    format!("coordinate `{name}` is dynamic; a length must be prescribed"),
+                );
+                return;
+            }
+            Some(CoordinateKind::Prescribed) => {}
+        }
+        let joint = self.movers.get(name).and_then(|&i| self.scene.frames[i].joint.as_ref());
+        if matches!(joint, Some(Joint::Revolute { .. })) {
+            self.report(path, format!("coordinate `{name}` is an angle"));
+        }
+    }
+
+    /// That a force or spring acts on a coordinate that can give way.
+    pub(super) fn dynamic_coordinate(&mut self, path: String, name: &str) {
+        match self.kinds.get(name) {
+            None => self.report(path, format!("there is no coordinate `{name}`")),
+            Some(CoordinateKind::Prescribed) => {
+                self.report(
+                    path,
+                    format!("coordinate `{name}` is prescribed; a force on it has no effect"),
+                );
+            }
+            Some(CoordinateKind::Dynamic) => {}
+        }
+    }
+
+    pub(super) fn inputs(&mut self) {
+        let mut seen = BTreeMap::new();
+        for (i, input) in self.scene.inputs.iter().enumerate() {
+            let path = format!("inputs[{i}]");
+            self.name(format!("{path}.name"), &input.name, &mut seen);
+            if self.kinds.get(input.name.as_str()) == Some(&CoordinateKind::Prescribed) {
+                let message = format!("`{}` is also a prescribed coordinate", input.name);
+                self.report(format!("{path}.name"), message);
+            }
+            self.dynamic_coordinate(format!("{path}.coordinate"), &input.coordinate);
+            if self.finite(format!("{path}.gain"), input.gain) && input.gain == 0.0 {
+                self.report(format!("{path}.gain"), "is zero; the input would have no effect");
+            }
+        }
+    }
+
+    pub(super) fn operating_points(&mut self) {
+        let lengths = self.length_coordinates();
+        let inputs: BTreeSet<_> = self.scene.inputs.iter().map(|i| i.name.as_str()).collect();
+        let mut seen = BTreeMap::new();
+        for (i, point) in self.scene.operating_points.iter().enumerate() {
+            let path = format!("operating_points[{i}]");
+            self.name(format!("{path}.name"), &point.name, &mut seen);
+            if point.name == "initial" {
+                self.report(format!("{path}.name"), "`initial` is the initial configuration");
+            }
+            for (name, &value) in &point.coordinates {
+                let path = format!("{path}.coordinates.{name}");
+                if !self.kinds.contains_key(name.as_str()) {
+                    self.report(path.clone(), format!("there is no coordinate `{name}`"));
+                }
+                if lengths.contains(name.as_str()) {
+                    self.positive(path, value);
+                } else {
+                    self.finite(path, value);
+                }
+            }
+            for (name, &value) in &point.inputs {
+                let path = format!("{path}.inputs.{name}");
+                if !inputs.contains(name.as_str()) {
+                    self.report(path.clone(), format!("there is no input `{name}`"));
+                }
+                self.finite(path, value);
+            }
+        }
+    }
+}

@@ -1,0 +1,160 @@
+//! The tree of frames: names, parents, joints, inertia.
+
+use std::collections::BTreeMap;
+
+use super::Check;
+use crate::scene::{CoordinateKind, Joint};
+
+impl Check<'_> {
+    pub(super) fn frames(&mut self) {
+        self.frame_names();
+        self.parents();
+        for index in 0..self.scene.frames.len() {
+            self.frame_contents(index);
+        }
+        self.movers();
+        self.kinds();
+        if self.is_tree {
+            self.inertia_beyond_joints();
+        }
+    }
+
+    fn frame_names(&mut self) {
+        let mut seen = BTreeMap::new();
+        for (i, frame) in self.scene.frames.iter().enumerate() {
+            let path = format!("frames[{i}].name");
+            if frame.name == "world" {
+                self.report(path.clone(), "`world` is the name of the root");
+            }
+            let before = self.problems.len();
+            self.name(path, &frame.name, &mut seen);
+            self.is_tree &= self.problems.len() == before;
+            if frame.name != "world" {
+                self.frames.entry(&frame.name).or_insert(i);
+            }
+        }
+    }
+
+    /// Resolves the parents, and reports unknown ones and each cycle once.
+    fn parents(&mut self) {
+        for (i, frame) in self.scene.frames.iter().enumerate() {
+            let parent = self.frames.get(frame.parent.as_str()).copied();
+            if parent.is_none() && frame.parent != "world" {
+                self.is_tree = false;
+                self.report(
+                    format!("frames[{i}].parent"),
+                    format!("there is no frame `{}`", frame.parent),
+                );
+            }
+            self.parents.push(parent);
+        }
+        // Walk up from every frame; `visit` says in which walk a frame was met first.
+        let mut visit = vec![usize::MAX; self.parents.len()];
+        for start in 0..self.parents.len() {
+            let mut at = Some(start);
+            while let Some(i) = at.filter(|&i| visit[i] == usize::MAX) {
+                visit[i] = start;
+                at = self.parents[i];
+            }
+            if let Some(i) = at.filter(|&i| visit[i] == start) {
+                self.cycle(i);
+            }
+        }
+    }
+
+    fn cycle(&mut self, member: usize) {
+        self.is_tree = false;
+        let mut members = vec![member];
+        let mut at = self.parents[member];
+        while let Some(i) = at.filter(|&i| i != member) {
+            members.push(i);
+            at = self.parents[i];
+        }
+        let first = members.iter().copied().min().unwrap_or(member);
+        let names: Vec<_> =
+            members.iter().take(8).map(|&i| self.scene.frames[i].name.as_str()).collect();
+        let message =
+            format!("is part of a cycle of {} frames: {}", members.len(), names.join(" in "));
+        self.report(format!("frames[{first}].parent"), message);
+    }
+
+    fn frame_contents(&mut self, index: usize) {
+        let frame = &self.scene.frames[index];
+        let path = format!("frames[{index}]");
+        self.finite_all(&format!("{path}.translation"), &frame.translation);
+        if let Some(rotation) = &frame.rotation {
+            self.rotation(&format!("{path}.rotation"), rotation);
+        }
+        if let Some((axis, _)) = frame.joint.as_ref().and_then(Joint::motion) {
+            self.axis(&format!("{path}.joint.axis"), axis);
+        }
+        if let Some(body) = &frame.body {
+            self.body(&format!("{path}.body"), body);
+        }
+    }
+
+    /// Finds which joint each coordinate moves; one coordinate moves one joint.
+    fn movers(&mut self) {
+        for (i, frame) in self.scene.frames.iter().enumerate() {
+            let Some(name) = frame.coordinate() else { continue };
+            let path = if name == frame.name {
+                format!("frames[{i}].joint")
+            } else {
+                format!("frames[{i}].joint.coordinate")
+            };
+            if let Some(&first) = self.movers.get(name) {
+                let other = &self.scene.frames[first].name;
+                self.report(path, format!("coordinate `{name}` already moves frame `{other}`"));
+            } else {
+                self.movers.insert(name, i);
+                if name != frame.name {
+                    self.name(path, name, &mut BTreeMap::new());
+                }
+            }
+        }
+    }
+
+    fn kinds(&mut self) {
+        for name in self.movers.keys() {
+            self.kinds.insert(name, CoordinateKind::Dynamic);
+        }
+        for coordinate in &self.scene.coordinates {
+            self.kinds.insert(&coordinate.name, coordinate.kind);
+        }
+    }
+
+    /// A dynamic coordinate must move something that resists: mass for a slide, mass or inertia for
+    /// a hinge. A mass on the axis of a hinge passes here; a step reports it as singular.
+    fn inertia_beyond_joints(&mut self) {
+        let frames = &self.scene.frames;
+        let has_mass = self.ancestors_of(|i| frames[i].body.as_ref().is_some_and(|b| b.mass > 0.0));
+        let has_inertia = self.ancestors_of(|i| {
+            frames[i].body.as_ref().is_some_and(|b| b.inertia.iter().any(|&x| x != 0.0))
+        });
+        for (i, frame) in frames.iter().enumerate() {
+            let Some(name) = frame.coordinate() else { continue };
+            if self.kinds.get(name) != Some(&CoordinateKind::Dynamic) {
+                continue;
+            }
+            let slides = matches!(frame.joint, Some(Joint::Prismatic { .. }));
+            if !has_mass[i] && (slides || !has_inertia[i]) {
+                let what = if slides { "mass" } else { "mass or inertia" };
+                let message = format!("dynamic coordinate `{name}` moves nothing that has {what}");
+                self.report(format!("frames[{i}].joint"), message);
+            }
+        }
+    }
+
+    /// Marks the frames for which `holds`, and all their ancestors.
+    fn ancestors_of(&self, holds: impl Fn(usize) -> bool) -> Vec<bool> {
+        let mut marked = vec![false; self.parents.len()];
+        for i in (0..marked.len()).filter(|&i| holds(i)) {
+            let mut at = Some(i);
+            while let Some(j) = at.filter(|&j| !marked[j]) {
+                marked[j] = true;
+                at = self.parents[j];
+            }
+        }
+        marked
+    }
+}

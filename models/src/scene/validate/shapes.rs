@@ -1,0 +1,92 @@
+//! Axes, rotations and bodies.
+
+use nalgebra::{Matrix3, Vector3, Vector4};
+
+use super::Check;
+use crate::scene::{Body, Rotation};
+
+/// How far a quaternion or a rotation matrix may be from orthonormal: what seven digits leave.
+const ORTHONORMAL_TOLERANCE: f64 = 1e-6;
+/// How far moments of inertia may be from possible ones, relative to the largest.
+const INERTIA_TOLERANCE: f64 = 1e-9;
+/// Axes outside of this range of lengths are taken for mistakes; their squares stay normal numbers.
+const AXIS_LENGTHS: std::ops::RangeInclusive<f64> = 1e-100..=1e100;
+
+impl Check<'_> {
+    pub(super) fn axis(&mut self, path: &str, axis: &[f64; 3]) {
+        if !self.finite_all(path, axis) {
+            return;
+        }
+        let length = Vector3::from(*axis).norm();
+        if !AXIS_LENGTHS.contains(&length) {
+            self.report(path, format!("has length {length}; it must have a direction"));
+        }
+    }
+
+    pub(super) fn rotation(&mut self, path: &str, rotation: &Rotation) {
+        match rotation {
+            Rotation::Quaternion(wxyz) => {
+                let path = format!("{path}.quaternion");
+                let length = Vector4::from(*wxyz).norm();
+                if self.finite_all(&path, wxyz) && (length - 1.0).abs() > ORTHONORMAL_TOLERANCE {
+                    self.report(path, format!("has length {length}; must be 1"));
+                }
+            }
+            Rotation::Matrix(rows) => self.rotation_matrix(format!("{path}.matrix"), rows),
+            Rotation::Rpy(angles) => {
+                self.finite_all(&format!("{path}.rpy"), angles);
+            }
+        }
+    }
+
+    fn rotation_matrix(&mut self, path: String, rows: &[[f64; 3]; 3]) {
+        let mut finite = true;
+        for (i, row) in rows.iter().enumerate() {
+            finite &= self.finite_all(&format!("{path}[{i}]"), row);
+        }
+        if !finite {
+            return;
+        }
+        let r = Matrix3::from_fn(|i, j| rows[i][j]);
+        let defect = (r * r.transpose() - Matrix3::identity()).amax();
+        if defect > ORTHONORMAL_TOLERANCE {
+            self.report(path, format!("is not orthonormal: R Rᵀ differs from 1 by {defect:e}"));
+        } else if r.determinant() < 0.0 {
+            self.report(path, "is a reflection: its determinant is −1");
+        }
+    }
+
+    pub(super) fn body(&mut self, path: &str, body: &Body) {
+        self.not_negative(format!("{path}.mass"), body.mass);
+        self.finite_all(&format!("{path}.center_of_mass"), &body.center_of_mass);
+        let path = format!("{path}.inertia");
+        let moments = &body.inertia;
+        if !matches!(moments.len(), 0 | 3 | 6) {
+            self.report(path, format!("has {} entries; must have none, 3 or 6", moments.len()));
+            return;
+        }
+        if self.finite_all(&path, moments) && !moments.is_empty() {
+            self.inertia(path, moments);
+        }
+    }
+
+    fn inertia(&mut self, path: String, moments: &[f64]) {
+        let largest = moments.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
+        if largest == 0.0 {
+            return;
+        }
+        let m = |i: usize| moments.get(i).map_or(0.0, |x| x / largest);
+        let tensor = Matrix3::new(m(0), m(3), m(4), m(3), m(1), m(5), m(4), m(5), m(2));
+        let mut principal: [f64; 3] = tensor.symmetric_eigenvalues().into();
+        principal.sort_by(f64::total_cmp);
+        let [a, b, c] = principal;
+        let shown = principal.map(|x| x * largest);
+        if a < -INERTIA_TOLERANCE {
+            self.report(path, format!("has a negative principal moment: {shown:?}"));
+        } else if a + b < c * (1.0 - INERTIA_TOLERANCE) {
+            let message =
+                format!("no body has these principal moments: {shown:?} violate a + b ≥ c");
+            self.report(path, message);
+        }
+    }
+}
