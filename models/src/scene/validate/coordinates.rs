@@ -28,7 +28,8 @@ impl<'a> Check<'a> {
                     );
                 }
             }
-            if !self.movers.contains_key(name) && !(prescribed && lengths.contains(name)) {
+            let used = self.movers.contains_key(name) || (prescribed && lengths.contains(name));
+            if !used {
                 let message = if lengths.contains(name) {
                     format!("no joint moves by `{name}`; a length must be prescribed")
                 } else {
