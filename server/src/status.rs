@@ -10,5 +10,6 @@ pub fn step_error_reason(error: &StepError) -> &'static str {
         StepError::NotConverged { .. } => "NOT_CONVERGED",
         StepError::NotFinite { .. } => "MOTION_NOT_FINITE",
         StepError::Singular { .. } => "SINGULAR",
+        StepError::TooFast { .. } => "TOO_FAST",
     }
 }

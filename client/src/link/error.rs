@@ -102,6 +102,16 @@ pub enum StepFailure {
         /// Pivot relative to the largest entry.
         pivot: f64,
     },
+    /// A joint turned by more than half a turn.
+    #[error(
+        "coordinate {coordinate} turned by {increment:.3} rad in one step; the step is too large for the motion"
+    )]
+    TooFast {
+        /// Index of the coordinate.
+        coordinate: usize,
+        /// Its increment, rad.
+        increment: f64,
+    },
 }
 
 /// Who drives a plant.
@@ -142,6 +152,7 @@ pub(super) fn from_failure(answer: &Header) -> LinkError {
         }
         Some(Code::NotFinite) => StepFailure::NotFinite { iterations },
         Some(Code::Singular) => StepFailure::Singular { coordinate: a, pivot: value },
+        Some(Code::TooFast) => StepFailure::TooFast { coordinate: a, increment: value },
         Some(Code::Dimension) => return LinkError::Dimension { expected: a, actual: b },
         Some(Code::Sequence) => return LinkError::Sequence { expected: answer.detail_a },
         Some(Code::LeaseHeld) => return LinkError::LeaseHeld { by: holder(answer) },

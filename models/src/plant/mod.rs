@@ -145,6 +145,16 @@ pub enum StepError {
         /// Iterations done.
         iterations: u32,
     },
+    /// A joint turned by more than half a turn: the solution is not the continuation of the motion.
+    #[error(
+        "`{coordinate}` turned by {increment:.3} rad in one step; the step is too large for the motion"
+    )]
+    TooFast {
+        /// Coordinate of the joint.
+        coordinate: String,
+        /// Its increment, rad.
+        increment: f64,
+    },
     /// The Newton matrix is singular.
     #[error(
         "singular Newton matrix at coordinate `{coordinate}` (pivot {pivot:e} of the largest entry)"

@@ -218,8 +218,7 @@ impl Workspace {
                 return Err(StepError::NotFinite { iterations: report.iterations });
             }
             if report.iterations == 1 && size <= CONVERGED {
-                self.accept(model, settings);
-                return Ok(report);
+                return self.accept(model, settings).map(|()| report);
             }
             let floor = if fresh { FLOOR } else { CHORD_FLOOR };
             let at_floor = size <= floor && size > 0.5 * previous;
@@ -233,8 +232,7 @@ impl Workspace {
             }
             self.correct(model);
             if converged {
-                self.accept(model, settings);
-                return Ok(report);
+                return self.accept(model, settings).map(|()| report);
             }
             previous = size;
         }
@@ -415,14 +413,21 @@ impl Workspace {
         }
     }
 
-    /// The impulse of the solution.
-    fn accept(&mut self, model: &Model, settings: &Settings) {
+    /// Checks the solution, and finds its impulse.
+    fn accept(&mut self, model: &Model, settings: &Settings) -> Result<(), StepError> {
+        for (coordinate, x) in model.coordinates.iter().zip(&self.increment) {
+            if coordinate.is_angle && x.abs() > std::f64::consts::PI {
+                let coordinate = coordinate.name.clone();
+                return Err(StepError::TooFast { coordinate, increment: *x });
+            }
+        }
         for (i, impulse) in self.impulse.iter_mut().enumerate() {
             *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
         }
         if model.dimensions.constraints > 0 {
             self.start.subtract_impulses(model, &self.multipliers, &mut self.impulse);
         }
+        Ok(())
     }
 
     /// Constraints with Jacobian at the solution, for the linearization and the next step.

@@ -286,6 +286,7 @@ impl Failure {
     fn step(error: &StepError, session: &Session) -> Self {
         let solver =
             |iterations, residual| StepReport { iterations, residual, ..StepReport::default() };
+        let index_of = |name: &str| session.model().coordinate_index(name).unwrap_or(0) as u64;
         match *error {
             StepError::Dimension { expected, actual } => {
                 Self { a: expected as u64, b: actual as u64, ..Self::new(Code::Dimension) }
@@ -300,9 +301,10 @@ impl Failure {
                 Self { report: solver(iterations, 0.0), ..Self::new(Code::NotFinite) }
             }
             StepError::Singular { ref coordinate, pivot } => {
-                let mut coordinates = session.model().coordinates().iter();
-                let index = coordinates.position(|c| c.name == *coordinate).unwrap_or(0);
-                Self { a: index as u64, value: pivot, ..Self::new(Code::Singular) }
+                Self { a: index_of(coordinate), value: pivot, ..Self::new(Code::Singular) }
+            }
+            StepError::TooFast { ref coordinate, increment } => {
+                Self { a: index_of(coordinate), value: increment, ..Self::new(Code::TooFast) }
             }
         }
     }
