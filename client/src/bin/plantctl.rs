@@ -1,2 +1,0 @@
-//! The `plantctl` command.
-fn main() {}

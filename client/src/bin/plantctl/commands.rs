@@ -1,0 +1,369 @@
+//! What the commands do.
+
+use std::io::{Read as _, Write as _};
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::{Context as _, Result};
+use plantd_client::{Client, MatrixExt as _, v1};
+use serde_json::{Value, json};
+
+use crate::args::{Args, Command, Field, Plural, Point, Settings, Singular, Weights};
+use crate::{FAILED, json, text};
+
+/// Runs a command; the code is that of a command which ran.
+pub(crate) async fn run(args: Args) -> Result<ExitCode> {
+    let client = Client::connect(&args.address).await?;
+    let output = Output { json: args.json };
+    match args.command {
+        Command::List { what } => list(&client, output, what).await?,
+        Command::Show { what: Singular::Model, name } => {
+            let model = client.get_model(name).await?;
+            output.print(|| json::message("Model", &model), || text::model(&model))?;
+        }
+        Command::Show { what: Singular::Plant, name } => show_plant(&client, output, name).await?,
+        Command::Upload { scene, name } => {
+            let request = v1::CreateModelRequest {
+                name: name.unwrap_or_default(),
+                scene: read_text(&scene)?,
+                ..Default::default()
+            };
+            let model = client.create_model_as(request).await?;
+            output.print(|| json::message("Model", &model), || text::model(&model))?;
+        }
+        Command::Create { model, id, settings, initial, link } => {
+            let request = v1::CreatePlantRequest {
+                id: id.unwrap_or_default(),
+                model,
+                settings: Some(settings.into()),
+                initial: initial.into(),
+                open_link: link,
+            };
+            let plant = client.create_plant(request).await?;
+            output.print(
+                || json::message("PlantInfo", &plant),
+                || text::plants(std::slice::from_ref(&plant)),
+            )?;
+        }
+        Command::Step { id, u, count, all } => {
+            let rows: Vec<_> = u.into_iter().map(|row| row.0).collect();
+            step(&client, output, id, &rows, count, all).await?;
+        }
+        Command::Watch { id, fields, every, coordinates, count, weights } => {
+            let request = v1::WatchRequest {
+                fields: fields.iter().map(|&f| v1::WatchField::from(f).into()).collect(),
+                weights: None,
+                id,
+                every,
+                coordinates,
+            };
+            watch(&client, output, request, &fields, &weights, count).await?;
+        }
+        Command::Linearize { point, settings } => {
+            linearize(&client, output, point, settings).await?;
+        }
+        Command::Lqr { point, settings, weights, full } => {
+            lqr(&client, output, point, settings, &weights, full).await?;
+        }
+        Command::Validate { scene } => return validate(&client, output, &scene).await,
+        Command::Explain { scene } => return explain(&client, output, &scene).await,
+        Command::Reset { id, initial } => {
+            let request = v1::ResetRequest { id, initial: initial.into() };
+            let state = client.reset_to(request).await?;
+            output.print(|| json::message("State", &state), || text::state(&state))?;
+        }
+        Command::Snapshot { id, file } => {
+            let snapshot = client.snapshot(&id).await?;
+            std::fs::write(&file, &snapshot)
+                .with_context(|| format!("cannot write {}", file.display()))?;
+            output.done(json!({ "plant": id, "bytes": snapshot.len() }))?;
+        }
+        Command::Restore { id, file } => {
+            let snapshot =
+                std::fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
+            let state = client.restore(id, snapshot).await?;
+            output.print(|| json::message("State", &state), || text::state(&state))?;
+        }
+        Command::Delete { what: Singular::Plant, name } => {
+            client.delete_plant(&name).await?;
+            output.done(json!({ "deleted": { "plant": name } }))?;
+        }
+        Command::Delete { what: Singular::Model, name } => {
+            client.delete_model(&name).await?;
+            output.done(json!({ "deleted": { "model": name } }))?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Where results go.
+#[derive(Clone, Copy)]
+struct Output {
+    json: bool,
+}
+
+impl Output {
+    /// Prints a result, flushed, so that a reader of a stream gets it at once.
+    fn print(
+        self,
+        json: impl FnOnce() -> Value,
+        text: impl FnOnce() -> String,
+    ) -> std::io::Result<()> {
+        let mut out = std::io::stdout().lock();
+        if self.json {
+            writeln!(out, "{}", json())?;
+        } else {
+            out.write_all(text().as_bytes())?;
+        }
+        out.flush()
+    }
+
+    /// Confirms what has no result of its own; people see that it went well by the silence.
+    fn done(self, json: Value) -> std::io::Result<()> {
+        self.print(|| json, String::new)
+    }
+}
+
+async fn list(client: &Client, output: Output, what: Option<Plural>) -> Result<()> {
+    let models = match what {
+        Some(Plural::Plants) => None,
+        _ => Some(client.list_models().await?),
+    };
+    let plants = match what {
+        Some(Plural::Models) => None,
+        _ => Some(client.list_plants().await?),
+    };
+    let as_json = || {
+        let mut object = serde_json::Map::new();
+        if let Some(models) = &models {
+            object.insert("models".to_owned(), json::messages("Model", models));
+        }
+        if let Some(plants) = &plants {
+            object.insert("plants".to_owned(), json::messages("PlantInfo", plants));
+        }
+        Value::Object(object)
+    };
+    let as_text = || {
+        let tables = [models.as_deref().map(text::models), plants.as_deref().map(text::plants)];
+        tables.into_iter().flatten().collect::<Vec<_>>().join("\n")
+    };
+    Ok(output.print(as_json, as_text)?)
+}
+
+async fn show_plant(client: &Client, output: Output, id: String) -> Result<()> {
+    let answer = client.get_plant(id).await?;
+    let as_text = || {
+        let plant = answer.plant.as_ref();
+        let state = plant.and_then(|p| p.state.as_ref());
+        [
+            plant.map(|p| text::plants(std::slice::from_ref(p))),
+            state.map(text::state),
+            answer.energy.as_ref().map(text::energy),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
+    };
+    Ok(output.print(|| json::message("GetPlantResponse", &answer), as_text)?)
+}
+
+async fn step(
+    client: &Client,
+    output: Output,
+    id: String,
+    rows: &[Vec<f64>],
+    count: Option<u32>,
+    all: bool,
+) -> Result<()> {
+    let cols = rows.first().map_or(0, Vec::len);
+    anyhow::ensure!(rows.iter().all(|row| row.len() == cols), "the inputs differ in length");
+    let given = rows.len() as u32;
+    let count = count.unwrap_or(given.max(1));
+    anyhow::ensure!(count >= given, "{given} inputs for {count} steps");
+    let request = v1::StepRequest {
+        id,
+        u: Some(v1::Matrix::from_rows(rows)),
+        hold: count - given,
+        all_states: all,
+    };
+    let answer = client.step(request).await?;
+    let as_text = || {
+        let states = answer.states.iter().map(text::state);
+        states.chain(answer.report.as_ref().map(text::report)).collect()
+    };
+    Ok(output.print(|| json::message("StepResponse", &answer), as_text)?)
+}
+
+async fn watch(
+    client: &Client,
+    output: Output,
+    mut request: v1::WatchRequest,
+    fields: &[Field],
+    weights: &Weights,
+    count: Option<u64>,
+) -> Result<()> {
+    let named = fields.iter().any(|f| matches!(f, Field::Linearization | Field::Gain));
+    let model = if named {
+        let plant = client.get_plant(&request.id).await?.plant.context("no plant in the answer")?;
+        client.get_model(plant.model).await?
+    } else {
+        v1::Model::default()
+    };
+    if fields.contains(&Field::Gain) {
+        request.weights = Some(weights.for_model(&model));
+    }
+    let mut messages = client.watch(request).await?;
+    let mut seen = 0;
+    while count.is_none_or(|count| seen < count) {
+        let next = tokio::select! {
+            next = messages.next() => next?,
+            _ = tokio::signal::ctrl_c() => return Ok(()),
+        };
+        let Some(message) = next else { break };
+        output.print(|| json::message("WatchResponse", &message), || watched(&message, &model))?;
+        seen += 1;
+    }
+    Ok(())
+}
+
+/// A message of a watch as text.
+fn watched(message: &v1::WatchResponse, model: &v1::Model) -> String {
+    let head = match &message.state {
+        Some(state) => text::state(state),
+        None => format!("step {}\n", message.step),
+    };
+    let lost = (message.dropped > 0).then(|| format!("  {} messages lost\n", message.dropped));
+    let failure = message.failure.as_ref().map(|f| format!("  {}: {}\n", f.reason, f.message));
+    let parts = [
+        Some(head),
+        message.report.as_ref().map(text::report),
+        message.energy.as_ref().map(text::energy),
+        message.linearization.as_ref().map(|l| text::linearization(l, model)),
+        message.gain.as_ref().map(|g| text::gain(g, model)),
+        failure,
+        lost,
+    ];
+    parts.into_iter().flatten().collect()
+}
+
+/// The model, the settings and the point that the command line names.
+async fn resolve(
+    client: &Client,
+    point: Point,
+    settings: Settings,
+) -> Result<(v1::Model, v1::PlantSettings, v1::Point)> {
+    let Some(id) = point.plant else {
+        let model = client.get_model(point.model.unwrap_or_default()).await?;
+        return Ok((model, settings.into(), plantd_client::operating_point(point.at)));
+    };
+    let plant = client.get_plant(id).await?.plant.context("no plant in the answer")?;
+    let model = client.get_model(plant.model).await?;
+    let here = v1::StateAndInput { state: plant.state, u: Vec::new() };
+    let point = v1::Point { source: Some(v1::point::Source::StateAndInput(here)) };
+    Ok((model, plant.settings.unwrap_or_default(), point))
+}
+
+async fn linearize(
+    client: &Client,
+    output: Output,
+    point: Point,
+    settings: Settings,
+) -> Result<()> {
+    let (model, settings, point) = resolve(client, point, settings).await?;
+    let request = v1::LinearizeRequest {
+        model: model.name.clone(),
+        settings: Some(settings),
+        point: Some(point),
+    };
+    let answer = client.linearize(request).await?;
+    let as_text = || {
+        let rank = answer.controllability_rank;
+        let order = 2 * model.coordinates.len();
+        let matrices = answer.linearization.as_ref().map(|l| text::linearization(l, &model));
+        format!("{}\ncontrollability rank: {rank} of {order}\n", matrices.unwrap_or_default())
+    };
+    Ok(output.print(|| json::message("LinearizeResponse", &answer), as_text)?)
+}
+
+async fn lqr(
+    client: &Client,
+    output: Output,
+    point: Point,
+    settings: Settings,
+    weights: &Weights,
+    full: bool,
+) -> Result<()> {
+    let (model, settings, point) = resolve(client, point, settings).await?;
+    let space = if full { v1::ConstraintHandling::Full } else { v1::ConstraintHandling::Manifold };
+    let request = v1::SolveLqrRequest {
+        model: model.name.clone(),
+        settings: Some(settings),
+        point: Some(point),
+        weights: Some(weights.for_model(&model)),
+        constraints: space.into(),
+    };
+    let answer = client.solve_lqr(request).await?;
+    let as_text = || {
+        let gain = answer.gain.as_ref().map(|g| text::gain(g, &model)).unwrap_or_default();
+        format!(
+            "{gain}\nspectral radius of the closed loop: {}\nRiccati residual: {}\n",
+            text::number(answer.spectral_radius),
+            text::number(answer.residual),
+        )
+    };
+    Ok(output.print(|| json::message("SolveLqrResponse", &answer), as_text)?)
+}
+
+async fn validate(client: &Client, output: Output, scene: &Path) -> Result<ExitCode> {
+    let answer = client.validate_scene(read_text(scene)?).await?;
+    output.print(
+        || json::message("ValidateSceneResponse", &answer),
+        || match &answer.model {
+            Some(model) if answer.problems.is_empty() => text::model(model),
+            _ => problems(&answer.problems),
+        },
+    )?;
+    Ok(verdict(&answer))
+}
+
+async fn explain(client: &Client, output: Output, scene: &str) -> Result<ExitCode> {
+    let path = Path::new(scene);
+    // A file goes before a model of the same name.
+    if !path.is_file() && scene != "-" {
+        let model = client.get_model(scene).await?;
+        output.print(|| json!({ "plan": model.plan }), || ended(&model.plan))?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let answer = client.validate_scene(read_text(path)?).await?;
+    match &answer.model {
+        Some(model) => output.print(|| json!({ "plan": model.plan }), || ended(&model.plan))?,
+        None => output.print(
+            || json::message("ValidateSceneResponse", &answer),
+            || problems(&answer.problems),
+        )?,
+    }
+    Ok(verdict(&answer))
+}
+
+fn verdict(answer: &v1::ValidateSceneResponse) -> ExitCode {
+    if answer.problems.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) }
+}
+
+fn problems(problems: &[v1::SceneProblem]) -> String {
+    problems.iter().map(|p| format!("{}: {}\n", p.path, p.message)).collect()
+}
+
+/// The text with a line end.
+fn ended(text: &str) -> String {
+    format!("{}\n", text.trim_end())
+}
+
+/// A file's text; `-` stands for standard input.
+fn read_text(path: &Path) -> Result<String> {
+    if path == Path::new("-") {
+        let mut text = String::new();
+        std::io::stdin().read_to_string(&mut text).context("cannot read standard input")?;
+        return Ok(text);
+    }
+    std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+}

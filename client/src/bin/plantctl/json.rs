@@ -1,0 +1,69 @@
+//! Messages of the contract as JSON, in the field names of the `.proto` files.
+
+use std::sync::LazyLock;
+
+use plantd_client::Error;
+use prost_reflect::{DescriptorPool, DynamicMessage, SerializeOptions};
+use serde_json::{Value, json};
+
+static CONTRACT: LazyLock<DescriptorPool> = LazyLock::new(|| {
+    DescriptorPool::decode(plantd_proto::FILE_DESCRIPTOR_SET).expect("the contract is well-formed")
+});
+
+/// A message as JSON; `name` is its name in the package, for example `PlantInfo`. Fields that have
+/// no value are there with their default, so that a script need not guess them.
+pub(crate) fn message(name: &str, message: &impl prost::Message) -> Value {
+    let descriptor = CONTRACT
+        .get_message_by_name(&format!("plantd.v1.{name}"))
+        .expect("the name of a message of the contract");
+    let bytes = message.encode_to_vec();
+    let dynamic = DynamicMessage::decode(descriptor, bytes.as_slice())
+        .expect("the bytes were encoded from the same contract");
+    let options = SerializeOptions::new()
+        .use_proto_field_name(true)
+        .skip_default_fields(false)
+        .stringify_64_bit_integers(false);
+    dynamic
+        .serialize_with_options(serde_json::value::Serializer, &options)
+        .expect("numbers and strings are JSON")
+}
+
+/// Messages of one kind as a JSON array.
+pub(crate) fn messages<M: prost::Message>(name: &str, all: &[M]) -> Value {
+    all.iter().map(|one| message(name, one)).collect()
+}
+
+/// An error as JSON.
+pub(crate) fn error(error: &anyhow::Error) -> Value {
+    let refusal = error.downcast_ref::<Error>().and_then(Error::refusal);
+    let Some(refusal) = refusal else {
+        return json!({ "error": { "message": format!("{error:#}") } });
+    };
+    let violations: Vec<Value> = refusal
+        .violations
+        .iter()
+        .map(|v| json!({ "field": v.field, "description": v.description }))
+        .collect();
+    json!({ "error": {
+        "code": refusal.code_name(),
+        "reason": refusal.reason,
+        "message": refusal.message,
+        "violations": violations,
+    } })
+}
+
+#[cfg(test)]
+mod tests {
+    use plantd_client::v1;
+
+    use super::*;
+
+    #[test]
+    fn a_message_keeps_its_field_names_and_types() {
+        let state = v1::State { step: 7, q: vec![0.5], ..Default::default() };
+        let value = message("State", &state);
+        assert_eq!(value["step"], 7);
+        assert_eq!(value["q"], json!([0.5]));
+        assert_eq!(value["multipliers"], json!([]));
+    }
+}

@@ -1,0 +1,44 @@
+//! `plantctl`: looks at, drives and asks a plantd server from a shell.
+
+mod args;
+mod commands;
+mod json;
+mod text;
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+use plantd_client::Error;
+
+/// The server refused, a stream broke, or a file could not be read or written.
+const FAILED: u8 = 1;
+/// Nobody answers at the address.
+const NO_SERVER: u8 = 3;
+
+#[tokio::main(flavor = "current_thread")]
+async fn main() -> ExitCode {
+    let args = args::Args::parse();
+    let as_json = args.json;
+    match commands::run(args).await {
+        Ok(code) => code,
+        // Whoever reads our output has seen enough (`plantctl watch ... | head`).
+        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            if as_json {
+                eprintln!("{}", json::error(&error));
+            } else {
+                eprintln!("plantctl: {error:#}");
+            }
+            match error.downcast_ref::<Error>() {
+                Some(Error::Connect { .. }) => ExitCode::from(NO_SERVER),
+                _ => ExitCode::from(FAILED),
+            }
+        }
+    }
+}
+
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error
+        .downcast_ref::<std::io::Error>()
+        .is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+}

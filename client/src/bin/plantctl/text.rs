@@ -1,0 +1,259 @@
+//! Tables and matrices for people.
+
+use std::fmt::Write as _;
+
+use plantd_client::{MatrixExt as _, v1};
+
+/// Most rows or columns of a matrix that are printed; beyond it the middle is left out.
+const MATRIX_SHOWN: usize = 12;
+
+/// A table with left-aligned columns, two spaces apart.
+pub(crate) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
+    let width = |col: usize| {
+        let cells = rows.iter().map(|row| row[col].chars().count());
+        cells.chain([head[col].chars().count()]).max().unwrap_or(0)
+    };
+    let widths: Vec<usize> = (0..head.len()).map(width).collect();
+    let mut text = String::new();
+    let head_row: Vec<String> = head.iter().map(|&cell| cell.to_owned()).collect();
+    for row in std::iter::once(&head_row).chain(rows) {
+        let mut line = String::new();
+        for (cell, width) in row.iter().zip(&widths) {
+            let _ = write!(line, "{cell:<width$}  ");
+        }
+        let _ = writeln!(text, "{}", line.trim_end());
+    }
+    text
+}
+
+/// A matrix under its title, with a name before each row and above each column.
+pub(crate) fn matrix(title: &str, matrix: &v1::Matrix, rows: &[String], cols: &[String]) -> String {
+    let shown_cols = shown(matrix.cols as usize);
+    let mut lines: Vec<Vec<String>> = Vec::new();
+    let head = |col: &Option<usize>| col.map_or("…".to_owned(), |c| label(cols, c));
+    lines.push(std::iter::once(String::new()).chain(shown_cols.iter().map(head)).collect());
+    for row in shown(matrix.rows as usize) {
+        let Some(row) = row else {
+            lines.push(vec!["…".to_owned(); shown_cols.len() + 1]);
+            continue;
+        };
+        let entry =
+            |col: &Option<usize>| col.map_or("…".to_owned(), |c| number(matrix.at(row, c)));
+        let name = std::iter::once(label(rows, row));
+        lines.push(name.chain(shown_cols.iter().map(entry)).collect());
+    }
+    let width = |col: usize| lines.iter().map(|line| line[col].chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..=shown_cols.len()).map(width).collect();
+    let mut text = format!("{title} ({} × {})\n", matrix.rows, matrix.cols);
+    for line in &lines {
+        let _ = write!(text, "  {:<width$}", line[0], width = widths[0]);
+        for (cell, width) in line[1..].iter().zip(&widths[1..]) {
+            let _ = write!(text, "  {cell:>width$}");
+        }
+        text.push('\n');
+    }
+    text
+}
+
+/// Indices to print, `None` standing for those left out.
+fn shown(count: usize) -> Vec<Option<usize>> {
+    if count <= MATRIX_SHOWN {
+        return (0..count).map(Some).collect();
+    }
+    let half = MATRIX_SHOWN / 2;
+    (0..half).map(Some).chain([None]).chain((count - half..count).map(Some)).collect()
+}
+
+fn label(names: &[String], index: usize) -> String {
+    names.get(index).cloned().unwrap_or_else(|| index.to_string())
+}
+
+/// A number with seven significant digits.
+pub(crate) fn number(x: f64) -> String {
+    let magnitude = x.abs();
+    if x == 0.0 {
+        "0".to_owned()
+    } else if (1e-4..1e7).contains(&magnitude) {
+        let before_point = magnitude.log10().floor() as i32 + 1;
+        format!("{x:.*}", (7 - before_point).clamp(0, 10) as usize)
+    } else {
+        format!("{x:.6e}")
+    }
+}
+
+/// Numbers, comma-separated.
+pub(crate) fn numbers(values: &[f64]) -> String {
+    values.iter().map(|&x| number(x)).collect::<Vec<_>>().join(", ")
+}
+
+/// Names of the entries of `x = (q, p, v)`.
+pub(crate) fn state_names(model: &v1::Model) -> Vec<String> {
+    let all = model.coordinates.iter().map(|c| c.name.clone());
+    let dynamic = model.coordinates.iter().filter(|c| !c.prescribed);
+    let prescribed = model.coordinates.iter().filter(|c| c.prescribed);
+    all.chain(dynamic.map(|c| format!("p({})", c.name)))
+        .chain(prescribed.map(|c| format!("v({})", c.name)))
+        .collect()
+}
+
+/// Names of the entries of `u`.
+pub(crate) fn input_names(model: &v1::Model) -> Vec<String> {
+    let prescribed = model.coordinates.iter().filter(|c| c.prescribed);
+    model.inputs.iter().cloned().chain(prescribed.map(|c| c.name.clone())).collect()
+}
+
+/// A model.
+pub(crate) fn model(model: &v1::Model) -> String {
+    let mut text = format!("{}: {}\n", model.name, model.description);
+    let origin = if model.builtin { "built in" } else { "uploaded" };
+    let _ = writeln!(text, "{origin}, time step {} s", number(model.time_step_s));
+    let rows: Vec<_> = model.coordinates.iter().map(coordinate).collect();
+    let _ = write!(text, "\n{}", table(&["coordinate", "kind", "unit", "initial"], &rows));
+    for (title, names) in [
+        ("inputs", &model.inputs),
+        ("constraints", &model.constraints),
+        ("operating points", &model.operating_points),
+    ] {
+        let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+        let _ = writeln!(text, "\n{title}: {names}");
+    }
+    text
+}
+
+fn coordinate(c: &v1::Coordinate) -> Vec<String> {
+    let kind = if c.prescribed { "prescribed" } else { "dynamic" };
+    let unit = match c.unit() {
+        v1::Unit::Metre => "m",
+        v1::Unit::Radian => "rad",
+        v1::Unit::Unspecified => "",
+    };
+    vec![c.name.clone(), kind.to_owned(), unit.to_owned(), number(c.initial)]
+}
+
+/// Models, one per row.
+pub(crate) fn models(models: &[v1::Model]) -> String {
+    let row = |m: &v1::Model| {
+        let prescribed = m.coordinates.iter().filter(|c| c.prescribed).count();
+        vec![
+            m.name.clone(),
+            (m.coordinates.len() - prescribed).to_string(),
+            prescribed.to_string(),
+            m.inputs.len().to_string(),
+            m.constraints.len().to_string(),
+            m.description.clone(),
+        ]
+    };
+    let head = ["model", "dynamic", "prescribed", "inputs", "constraints", "description"];
+    table(&head, &models.iter().map(row).collect::<Vec<_>>())
+}
+
+/// Plants, one per row.
+pub(crate) fn plants(plants: &[v1::PlantInfo]) -> String {
+    let row = |p: &v1::PlantInfo| {
+        let state = p.state.as_ref();
+        let dt = p.settings.as_ref().map_or(0.0, |s| s.time_step_s);
+        let driver = if p.driver.is_empty() { "-" } else { &p.driver };
+        let link = if p.link_open { "open" } else { "-" };
+        vec![
+            p.id.clone(),
+            p.model.clone(),
+            number(dt),
+            state.map_or(0, |s| s.step).to_string(),
+            number(state.map_or(0.0, |s| s.time_s)),
+            driver.to_owned(),
+            link.to_owned(),
+        ]
+    };
+    let head = ["plant", "model", "dt/s", "step", "time/s", "driver", "link"];
+    table(&head, &plants.iter().map(row).collect::<Vec<_>>())
+}
+
+/// A state; vectors that the model does not have are left out.
+pub(crate) fn state(state: &v1::State) -> String {
+    let mut text = format!("step {}, time {} s\n", state.step, number(state.time_s));
+    for (name, values) in
+        [("q", &state.q), ("p", &state.p), ("v", &state.v), ("multipliers", &state.multipliers)]
+    {
+        if !values.is_empty() {
+            let _ = writeln!(text, "  {name}: {}", numbers(values));
+        }
+    }
+    text
+}
+
+/// An energy.
+pub(crate) fn energy(energy: &v1::Energy) -> String {
+    let (kinetic, potential) = (energy.kinetic_j, energy.potential_j);
+    format!(
+        "  energy: {} J kinetic, {} J potential, {} J in all\n",
+        number(kinetic),
+        number(potential),
+        number(kinetic + potential)
+    )
+}
+
+/// A step report.
+pub(crate) fn report(report: &v1::StepReport) -> String {
+    format!(
+        "  solver: {} iterations, {} factorizations, residual {} round-offs\n",
+        report.iterations,
+        report.factorizations,
+        number(report.residual)
+    )
+}
+
+/// A and B of a linearization, and the multipliers' rows where there are constraints.
+pub(crate) fn linearization(linearization: &v1::Linearization, model: &v1::Model) -> String {
+    let (x, u) = (state_names(model), input_names(model));
+    let blocks = [
+        ("A = df/dx", &linearization.a, &x, &x),
+        ("B = df/du", &linearization.b, &x, &u),
+        ("C = dλ/dx", &linearization.multipliers_x, &model.constraints, &x),
+        ("D = dλ/du", &linearization.multipliers_u, &model.constraints, &u),
+    ];
+    let filled = blocks.into_iter().filter_map(|(title, block, rows, cols)| {
+        let block = block.as_ref().filter(|m| !m.data.is_empty())?;
+        Some(matrix(title, block, rows, cols))
+    });
+    filled.collect::<Vec<_>>().join("\n")
+}
+
+/// A feedback law.
+pub(crate) fn gain(gain: &v1::Gain, model: &v1::Model) -> String {
+    let (x, u) = (state_names(model), input_names(model));
+    let k = gain.k.as_ref().map_or(String::new(), |k| matrix("K", k, &u, &x));
+    format!("u = u_reference - K (x - x_reference)\n\n{k}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_keep_seven_digits() {
+        for (x, text) in [
+            (0.0, "0"),
+            (0.95333434, "0.9533343"),
+            (-12.5, "-12.50000"),
+            (0.000976, "0.0009760000"),
+            (1e-9, "1.000000e-9"),
+            (123456.0, "123456.0"),
+        ] {
+            assert_eq!(number(x), text);
+        }
+    }
+
+    #[test]
+    fn a_large_matrix_leaves_out_its_middle() {
+        let big = v1::Matrix { rows: 40, cols: 40, data: vec![1.0; 1600] };
+        let text = matrix("A", &big, &[], &[]);
+        assert!(text.starts_with("A (40 × 40)\n"));
+        assert_eq!(text.lines().count(), 2 + MATRIX_SHOWN + 1);
+    }
+
+    #[test]
+    fn columns_line_up() {
+        let rows = [vec!["a".to_owned(), "1".to_owned()], vec!["long".to_owned(), "2".to_owned()]];
+        assert_eq!(table(&["n", "v"], &rows), "n     v\na     1\nlong  2\n");
+    }
+}
