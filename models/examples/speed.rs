@@ -1,0 +1,129 @@
+//! Times steps and linearizations of the built-in scenes, beside the figures of trep, the paper's
+//! software, where there are some.
+//!
+//! `cargo run --release -p plantd-models --example speed`
+//!
+//! Each figure is the median over several passes of the mean CPU time over one pass of a moving plant,
+//! so compare ratios and rerun before quoting one. trep's figures were taken on a two-core AMD EPYC
+//! virtual machine.
+
+use std::error::Error;
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use plantd_models::{ForceSplit, Linearization, Model, Plant, Settings, Snapshot, builtin};
+
+const STEPS: usize = 200;
+const PASSES: usize = 25;
+
+/// Scene, time step in seconds, and trep's step and first derivatives in microseconds.
+const SCENES: &[(&str, f64, Option<(f64, f64)>)] = &[
+    ("pendulum", 0.1, Some((6.3, 0.86))),
+    ("double-pendulum", 0.01, None),
+    ("cart-pole", 0.01, None),
+    ("chain-8", 0.001, None),
+    ("chain-32", 0.001, None),
+    ("four-bar", 0.01, None),
+    ("scissor-8", 0.01, Some((536.0, 239.0))),
+    ("marionette", 0.01, Some((1317.0, 598.0))),
+];
+
+fn main() -> Result<(), Box<dyn Error>> {
+    println!(
+        "{:<16} {:>10} {:>14} {:>12} {:>12} {:>12}",
+        "scene", "step/µs", "+ linearize/µs", "iterations", "trep/step", "trep/linear."
+    );
+    for (name, time_step_s, trep) in SCENES {
+        let scene = builtin::scene(name).ok_or("no such scene")?;
+        let mut motion = Motion::new(Arc::new(Model::compile(&scene)?), *time_step_s)?;
+        let step = median(PASSES, || motion.pass(false))?;
+        let both = median(PASSES, || motion.pass(true))?;
+        let linearize = both - step;
+        let ratio = |trep: f64, own: f64| format!("{:.0}", trep / own);
+        let (step_ratio, linearize_ratio) =
+            trep.map_or_else(Default::default, |(s, l)| (ratio(s, step), ratio(l, linearize)));
+        println!(
+            "{name:<16} {step:>10.2} {linearize:>14.2} {:>12.2} {step_ratio:>12} {linearize_ratio:>12}",
+            motion.iterations as f64 / motion.steps as f64
+        );
+    }
+    Ok(())
+}
+
+/// A plant with the inputs that keep it moving.
+struct Motion {
+    plant: Plant,
+    start: Snapshot,
+    inputs: Vec<Vec<f64>>,
+    out: Linearization,
+    iterations: u64,
+    steps: u64,
+}
+
+impl Motion {
+    fn new(model: Arc<Model>, time_step_s: f64) -> Result<Self, Box<dyn Error>> {
+        let force_split = ForceSplit::Paper;
+        let settings = Settings { force_split, time_step_s, ..Settings::new(&model) };
+        let plant = Plant::new(Arc::clone(&model), settings)?;
+        let mut hold = vec![0.0; model.dimensions().input()];
+        plant.hold_input(&mut hold);
+        let lengths: Vec<(usize, f64)> = model.coordinates()[model.dimensions().dynamic..]
+            .iter()
+            .enumerate()
+            .filter_map(|(k, c)| Some((model.dimensions().inputs + k, swing(&c.name)?)))
+            .collect();
+        let inputs = (0..STEPS)
+            .map(|k| {
+                let mut u = hold.clone();
+                let time = k as f64 * settings.time_step_s;
+                for (index, amplitude) in &lengths {
+                    u[*index] += amplitude * (0.6 * PI * time).sin();
+                }
+                u
+            })
+            .collect();
+        let start = plant.snapshot();
+        let out = Linearization::new(&model);
+        Ok(Self { plant, start, inputs, out, iterations: 0, steps: 0 })
+    }
+
+    /// Mean time of a step in microseconds.
+    fn pass(&mut self, linearize: bool) -> Result<f64, Box<dyn Error>> {
+        self.plant.restore(&self.start)?;
+        let begin = cpu_time_s();
+        for u in &self.inputs {
+            let report = if linearize {
+                self.plant.step_and_linearize(u, &mut self.out)?
+            } else {
+                self.plant.step(u)?
+            };
+            self.iterations += u64::from(report.iterations);
+            self.steps += 1;
+        }
+        Ok((cpu_time_s() - begin) * 1e6 / self.inputs.len() as f64)
+    }
+}
+
+/// CPU time of this thread: other programs on the machine do not count.
+fn cpu_time_s() -> f64 {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
+}
+
+/// How far the string of that name is pulled and let go, m: the paper's reference motion.
+fn swing(name: &str) -> Option<f64> {
+    match name {
+        "left_leg_string_length" | "right_arm_string_length" => Some(-0.1),
+        "right_leg_string_length" | "left_arm_string_length" => Some(0.1),
+        _ => None,
+    }
+}
+
+fn median(
+    passes: usize,
+    mut pass: impl FnMut() -> Result<f64, Box<dyn Error>>,
+) -> Result<f64, Box<dyn Error>> {
+    let mut times = (0..passes).map(|_| pass()).collect::<Result<Vec<_>, _>>()?;
+    times.sort_by(f64::total_cmp);
+    Ok(times[passes / 2])
+}
