@@ -1,3 +1,4 @@
 //! plantd-tests
 
+pub mod links;
 pub mod server;

@@ -8,8 +8,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use iceoryx2::prelude::{
-    AttributeVerifier, Config, FileName, LogLevel, Node, NodeBuilder, NodeName,
-    SemanticString as _, ServiceName, SignalHandlingMode, ipc, set_log_level_from_env_or,
+    AttributeVerifier, CallbackProgression, Config, FileName, LogLevel, Node, NodeBuilder,
+    NodeName, SemanticString as _, ServiceName, SignalHandlingMode, ipc, set_log_level_from_env_or,
 };
 use iceoryx2::service::attribute::{AttributeKey, AttributeValue};
 use iceoryx2::service::builder::{event, publish_subscribe};
@@ -215,7 +215,31 @@ impl Domain {
         let node = catch_unwind(AssertUnwindSafe(|| builder.create::<ipc::Service>()))
             .map_err(|_| transport("joining the domain")("panic inside iceoryx2"))?
             .map_err(transport("joining the domain"))?;
-        Ok(LinkNode { node: Some(node), root: self.root.clone() })
+        Ok(LinkNode { node: Some(node), domain: self.clone() })
+    }
+
+    /// Removes what iceoryx2 keeps for a domain without members: the counter that its nodes are
+    /// numbered with. Whoever joins next begins a new one; numbers stay unique, because they also hold
+    /// process id and time.
+    fn remove_if_empty(&self) {
+        let mut is_empty = true;
+        let listed = Node::<ipc::Service>::list(&self.config, |_| {
+            is_empty = false;
+            CallbackProgression::Stop
+        });
+        let Ok(entries) = fs::read_dir(SHARED_MEMORY_DIRECTORY) else { return };
+        if listed.is_err() || !is_empty {
+            return;
+        }
+        let (prefix, suffix) = (self.prefix(), self.config.global.node.global_mgmt_suffix);
+        for entry in entries.flatten() {
+            let name = entry.file_name();
+            let name = name.as_encoded_bytes();
+            if name.starts_with(prefix.as_bytes()) && name.ends_with(suffix.as_bytes()) {
+                // Another member that leaves at the same time may have removed it.
+                let _ = fs::remove_file(entry.path());
+            }
+        }
     }
 }
 
@@ -235,7 +259,7 @@ pub(super) fn transport<E: std::fmt::Debug>(what: &'static str) -> impl Fn(E) ->
 pub struct LinkNode {
     /// Always there until the drop.
     node: Option<Node<ipc::Service>>,
-    root: PathBuf,
+    domain: Domain,
 }
 
 /// The two services of one direction of a link.
@@ -313,7 +337,8 @@ impl LinkNode {
         use publish_subscribe::PublishSubscribeOpenError as OpenError;
 
         let name = service_name(plant, direction)?;
-        let not_open = || DomainError::NotOpen { plant: plant.to_owned(), root: self.root.clone() };
+        let not_open =
+            || DomainError::NotOpen { plant: plant.to_owned(), root: self.domain.root.clone() };
         let channel = self
             .node()
             .service_builder(&name)
@@ -355,6 +380,7 @@ impl Drop for LinkNode {
         let node = self.node.take();
         // A node that panicked while it was dropped is cleaned up by the next member that comes.
         let _ = catch_unwind(AssertUnwindSafe(move || drop(node)));
+        self.domain.remove_if_empty();
     }
 }
 

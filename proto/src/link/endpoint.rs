@@ -8,6 +8,7 @@ use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections as _;
 use iceoryx2::prelude::{BackpressureStrategy, CallbackProgression, ipc};
 use iceoryx2::sample::Sample;
 use iceoryx2::service::port_factory::PortFactory as _;
@@ -168,6 +169,11 @@ impl Endpoint {
                 std::thread::yield_now();
             }
         }
+    }
+
+    /// Lets go of receivers that are no more, which sending does too.
+    pub fn update(&self) -> Result<(), DomainError> {
+        self.publisher.update_connections().map_err(transport("updating connections"))
     }
 
     /// Whether the sender of a message still belongs to the link. A dead one belongs to it until

@@ -224,12 +224,12 @@ numbered! {
         /// Singular Newton matrix at coordinate `detail_a`; the pivot is `detail_value` of the
         /// largest entry.
         Singular = 10,
-        /// Coordinate `detail_a` turned by `detail_value` rad, more than half a turn, in one step.
-        TooFast = 13,
         /// The plant was deleted.
         PlantDeleted = 11,
         /// The link was closed, or the server shuts down.
         LinkClosed = 12,
+        /// Coordinate `detail_a` turned by `detail_value` rad, more than half a turn, in one step.
+        TooFast = 13,
     }
 }
 

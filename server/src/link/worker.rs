@@ -99,11 +99,15 @@ impl Worker {
                 Ok(None) => Ok(()),
                 Err(error) => Err(error),
             };
+            let outcome = outcome.and_then(|()| {
+                if monotonic_ns() < self.next_check_ns {
+                    return Ok(());
+                }
+                self.check_driver();
+                self.endpoint.update()
+            });
             if let Err(error) = outcome {
                 self.note_transport_error(&error);
-            }
-            if monotonic_ns() >= self.next_check_ns {
-                self.check_driver();
             }
         }
     }

@@ -1,0 +1,183 @@
+//! Plants with an open shared-memory link, in this process and in others.
+
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use plantd_client::link::{LinkDriver, LinkError, LinkOptions, Wait};
+use plantd_models::{Model, Plant, Settings, builtin};
+use plantd_proto::link::{Domain, SHARED_MEMORY_DIRECTORY};
+use plantd_server::link::{LinkConfig, LinkHost};
+use plantd_server::metrics::Metrics;
+use plantd_server::session::Session;
+
+/// Longest wait for something that takes a fraction of a second.
+pub const PATIENCE: Duration = Duration::from_secs(10);
+
+/// Name of the plant of a [`LinkFixture`].
+pub const PLANT: &str = "plant";
+
+/// A plant of a built-in model, its session, and the host of its link.
+pub struct LinkFixture {
+    /// The session.
+    pub session: Arc<Session>,
+    /// Hosts the link; dropped before the directory.
+    pub host: LinkHost,
+    /// Holds the root path.
+    pub directory: tempfile::TempDir,
+}
+
+impl LinkFixture {
+    /// Opens the link of a new plant under a root path of its own.
+    pub fn new(model: &str) -> Result<Self> {
+        Self::with_config(model, |_| {})
+    }
+
+    /// The same, with another configuration.
+    pub fn with_config(model: &str, configure: impl FnOnce(&mut LinkConfig)) -> Result<Self> {
+        let directory = tempfile::Builder::new().prefix("plantd-").tempdir()?;
+        let mut config =
+            LinkConfig { root: directory.path().join("link"), ..LinkConfig::default() };
+        configure(&mut config);
+        let host = LinkHost::new(config)?;
+        let session = new_session(model)?;
+        host.open(Arc::clone(&session))?;
+        Ok(Self { session, host, directory })
+    }
+
+    /// Root path of the domain.
+    pub fn root(&self) -> PathBuf {
+        self.directory.path().join("link")
+    }
+
+    /// Options to connect.
+    pub fn options(&self) -> LinkOptions {
+        LinkOptions { root: self.root(), timeout: PATIENCE, ..LinkOptions::default() }
+    }
+
+    /// A connected driver.
+    pub fn connect(&self, wait: Wait) -> Result<LinkDriver, LinkError> {
+        LinkDriver::connect(PLANT, LinkOptions { wait, ..self.options() })
+    }
+}
+
+/// A session of a plant of a built-in model.
+pub fn new_session(model: &str) -> Result<Arc<Session>> {
+    let plant = new_plant(model)?;
+    Ok(Session::new(PLANT.to_owned(), model.to_owned(), plant, Arc::new(Metrics::default())))
+}
+
+/// A plant of a built-in model.
+pub fn new_plant(model: &str) -> Result<Plant> {
+    let scene = builtin::scene(model).context("no such model")?;
+    let model = Arc::new(Model::compile(&scene)?);
+    let settings = Settings::new(&model);
+    Ok(Plant::new(model, settings)?)
+}
+
+/// The `k`-th input of a deterministic sequence that moves every input and every prescribed
+/// coordinate about its position at the start.
+pub fn wiggle(plant: &Plant, k: u64, u: &mut [f64]) {
+    let inputs = plant.model().dimensions().inputs;
+    plant.hold_input(u);
+    for (i, value) in u.iter_mut().enumerate() {
+        let size = if i < inputs { 0.1 } else { 1e-3 };
+        *value += size * (0.7 * k as f64 + i as f64).sin();
+    }
+}
+
+/// The files of a domain: in its root path, and with its prefix in shared memory.
+pub fn files_of_domain(root: &Path) -> Result<Vec<PathBuf>> {
+    let mut files = Vec::new();
+    let mut directories = vec![root.to_owned()];
+    while let Some(directory) = directories.pop() {
+        for entry in std::fs::read_dir(directory)? {
+            let entry = entry?;
+            let list = if entry.file_type()?.is_dir() { &mut directories } else { &mut files };
+            list.push(entry.path());
+        }
+    }
+    let prefix = Domain::open(root)?.prefix();
+    for entry in std::fs::read_dir(SHARED_MEMORY_DIRECTORY)? {
+        let entry = entry?;
+        if entry.file_name().to_string_lossy().starts_with(&prefix) {
+            files.push(entry.path());
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// Waits until `is_so`, at most [`PATIENCE`].
+pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) -> Result<()> {
+    let deadline = Instant::now() + PATIENCE;
+    while !is_so() {
+        ensure!(Instant::now() < deadline, "waited in vain: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    Ok(())
+}
+
+/// A driver or a host in a process of its own; killed when dropped.
+pub struct ChildProcess {
+    child: Child,
+    output: BufReader<ChildStdout>,
+}
+
+impl ChildProcess {
+    /// Starts a program with these arguments besides the root path.
+    pub fn start(program: impl AsRef<Path>, root: &Path, arguments: &[&str]) -> Result<Self> {
+        let program = program.as_ref();
+        let mut child = Command::new(program)
+            .arg("--root")
+            .arg(root)
+            .args(arguments)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .with_context(|| format!("cannot start {}", program.display()))?;
+        let output = BufReader::new(child.stdout.take().context("no output")?);
+        Ok(Self { child, output })
+    }
+
+    /// Waits until the process prints this line.
+    pub fn wait_for_line(&mut self, expected: &str) -> Result<()> {
+        let mut line = String::new();
+        self.output.read_line(&mut line)?;
+        ensure!(line.trim_end() == expected, "the process printed `{}`", line.trim_end());
+        Ok(())
+    }
+
+    /// Process id.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Kills the process as `kill -9` does.
+    pub fn kill(&mut self) -> Result<()> {
+        self.child.kill()?;
+        self.child.wait()?;
+        Ok(())
+    }
+
+    /// Closes the standard input and waits until the process ends; whether it succeeded.
+    pub fn finish(&mut self) -> Result<bool> {
+        drop(self.child.stdin.take());
+        let mut status = None;
+        wait_until("the end of a process", || {
+            status = self.child.try_wait().ok().flatten();
+            status.is_some()
+        })?;
+        Ok(status.is_some_and(|status| status.success()))
+    }
+}
+
+impl Drop for ChildProcess {
+    fn drop(&mut self) {
+        // Fails only if the process has ended already.
+        let _ = self.kill();
+    }
+}
