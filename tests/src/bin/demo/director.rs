@@ -1,0 +1,152 @@
+//! The director: starts the server and the controllers, compares, plots, and clears the stage.
+
+use std::io::IsTerminal as _;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail, ensure};
+use indicatif::ProgressBar;
+use plantd_proto::link::{Domain, SHARED_MEMORY_DIRECTORY};
+use plantd_tests::server::{ServerProcess, binary};
+use tokio::signal::unix::{SignalKind, signal};
+
+use crate::controller::{Name, Process};
+use crate::report::Table;
+use crate::{latency, marionette, pendulum, plots, report};
+
+/// Shows everything; `false` if a number is off.
+pub(crate) fn run(output: &Path) -> Result<bool> {
+    let start = Instant::now();
+    std::fs::create_dir_all(output)
+        .with_context(|| format!("cannot make the folder {}", output.display()))?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(async {
+        let mut interruption = std::pin::pin!(interrupted()?);
+        let (mut server, memory) = start_server().await?;
+        // Whatever happens in between, the server is asked to leave and leaves nothing.
+        let shown = tokio::select! {
+            shown = show(&server, output) => shown,
+            () = &mut interruption => Err(anyhow::anyhow!("interrupted")),
+        };
+        let cleared = clear(&mut server, &memory);
+        let table = shown?;
+        cleared?;
+        println!();
+        println!(
+            "{} in {:.1} s; the server has ended and left nothing behind",
+            table.verdict(),
+            start.elapsed().as_secs_f64()
+        );
+        println!("plots and results: {}", output.display());
+        Ok(table.is_good())
+    })
+}
+
+async fn show(server: &ServerProcess, output: &Path) -> Result<Table> {
+    println!("plantd, process {}, at {}", server.pid(), server.address());
+    let mut table = Table::default();
+
+    let (pid, pendulum) = perform::<pendulum::Report>(Name::Pendulum, server.address()).await?;
+    report::pendulum(&mut table, pid, &pendulum);
+
+    let (pid, marionette) =
+        perform::<marionette::Report>(Name::Marionette, server.address()).await?;
+    report::marionette(&mut table, pid, &marionette);
+
+    let (pid, tcp) = perform::<latency::Report>(Name::Latency, server.address()).await?;
+    let (_, unix) = perform::<latency::Report>(Name::Latency, server.unix_address()).await?;
+    report::round_trips(
+        pid,
+        &[
+            ("pendulum, gRPC over TCP", &tcp.grpc),
+            ("pendulum, gRPC over a Unix socket", &unix.grpc),
+            ("pendulum, shared memory", &tcp.shared_memory),
+            ("pendulum with LQR, gRPC over TCP", &pendulum.round_trips),
+            ("marionette, shared memory", &marionette.round_trips),
+        ],
+    );
+    plots::draw(output, &pendulum, &marionette)?;
+    let results = serde_json::json!({
+        "pendulum": pendulum,
+        "marionette": marionette,
+        "round_trips": { "grpc_tcp": tcp.grpc, "grpc_unix": unix.grpc, "shared_memory": tcp.shared_memory },
+    });
+    std::fs::write(output.join("results.json"), serde_json::to_vec(&results)?)?;
+    Ok(table)
+}
+
+/// Runs one controller to its end; returns its process id and what it found.
+async fn perform<T: serde::de::DeserializeOwned>(name: Name, address: &str) -> Result<(u32, T)> {
+    let process = Process::start(name, address)?;
+    let pid = process.pid();
+    Ok((pid, process.result().await?))
+}
+
+/// Builds and starts a server whose shared memory is its own.
+async fn start_server() -> Result<(ServerProcess, SharedMemory)> {
+    let spinner = ProgressBar::new_spinner().with_message("building and starting plantd");
+    spinner.enable_steady_tick(Duration::from_millis(100));
+    if !std::io::stderr().is_terminal() {
+        eprintln!("building and starting plantd");
+    }
+    let started = tokio::task::spawn_blocking(|| {
+        binary("plantd")?;
+        let memory = SharedMemory::new()?;
+        let server = ServerProcess::start_with(|command| {
+            command.arg("--link-root").arg(memory.root.path());
+        })?;
+        Ok((server, memory))
+    })
+    .await?;
+    spinner.finish_and_clear();
+    started
+}
+
+/// The server's domain of shared memory.
+struct SharedMemory {
+    root: tempfile::TempDir,
+}
+
+impl SharedMemory {
+    fn new() -> Result<Self> {
+        Ok(Self { root: tempfile::Builder::new().prefix("plantd-demo-").tempdir()? })
+    }
+
+    /// Names of what is left of the domain.
+    fn residue(&self) -> Result<Vec<String>> {
+        let prefix = Domain::open(self.root.path())?.prefix();
+        let mut names = Vec::new();
+        for entry in std::fs::read_dir(SHARED_MEMORY_DIRECTORY)? {
+            let name = entry?.file_name().to_string_lossy().into_owned();
+            if name.starts_with(&prefix) {
+                names.push(name);
+            }
+        }
+        Ok(names)
+    }
+}
+
+/// Ends the server and looks whether anything of it is left.
+fn clear(server: &mut ServerProcess, memory: &SharedMemory) -> Result<()> {
+    let status = server.stop()?;
+    ensure!(status.success(), "the server ended with {status}:\n{}", server.log());
+    let residue = memory.residue()?;
+    if !residue.is_empty() {
+        bail!("the server left in {SHARED_MEMORY_DIRECTORY}: {}", residue.join(", "));
+    }
+    Ok(())
+}
+
+/// Ends when somebody wants this process to end.
+fn interrupted() -> Result<impl Future<Output = ()>> {
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut hangup = signal(SignalKind::hangup())?;
+    Ok(async move {
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+            _ = hangup.recv() => {}
+        }
+    })
+}

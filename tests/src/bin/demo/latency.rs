@@ -1,0 +1,112 @@
+//! Round trips: how long a controller waits from an input to the state after it.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result};
+use hdrhistogram::Histogram;
+use plantd_client::link::{LinkDriver, LinkOptions};
+use plantd_client::{Client, v1};
+use serde::{Deserialize, Serialize};
+
+use crate::controller::progress;
+
+/// Steps that are measured over each link.
+const STEPS: usize = 5_000;
+/// Steps ahead of them, for caches and connections to warm up.
+const WARM_UP: usize = 500;
+
+/// Round trips over one link, microseconds.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(crate) struct RoundTrips {
+    pub(crate) p50_us: f64,
+    pub(crate) p99_us: f64,
+    pub(crate) p999_us: f64,
+    pub(crate) steps: u64,
+}
+
+/// Collects round trips.
+pub(crate) struct Stopwatch {
+    histogram: Histogram<u64>,
+}
+
+impl Stopwatch {
+    pub(crate) fn new() -> Self {
+        let histogram = Histogram::new_with_bounds(1, 60_000_000_000, 3);
+        Self { histogram: histogram.expect("the bounds are in order") }
+    }
+    pub(crate) fn record(&mut self, round_trip: Duration) {
+        self.histogram.saturating_record(round_trip.as_nanos() as u64);
+    }
+    pub(crate) fn round_trips(&self) -> RoundTrips {
+        let us = |quantile| self.histogram.value_at_quantile(quantile) as f64 / 1e3;
+        RoundTrips {
+            p50_us: us(0.5),
+            p99_us: us(0.99),
+            p999_us: us(0.999),
+            steps: self.histogram.len(),
+        }
+    }
+}
+
+/// The pendulum, whose step takes next to no time, over both links.
+#[derive(Serialize, Deserialize)]
+pub(crate) struct Report {
+    pub(crate) grpc: RoundTrips,
+    pub(crate) shared_memory: RoundTrips,
+}
+
+pub(crate) async fn measure(client: &Client) -> Result<Report> {
+    let request = v1::CreatePlantRequest {
+        model: "pendulum".to_owned(),
+        open_link: true,
+        ..Default::default()
+    };
+    let plant = client.create_plant(request).await?;
+    let report = Report {
+        grpc: over_grpc(client, &plant.id).await?,
+        shared_memory: over_shared_memory(connect_link(client, &plant.id).await?)?,
+    };
+    client.delete_plant(plant.id).await?;
+    Ok(report)
+}
+
+async fn over_grpc(client: &Client, plant: &str) -> Result<RoundTrips> {
+    let mut driver = client.drive(plant).await?;
+    let mut stopwatch = Stopwatch::new();
+    for k in 0..WARM_UP + STEPS {
+        let start = Instant::now();
+        driver.step(&[0.0]).await?;
+        if k >= WARM_UP {
+            stopwatch.record(start.elapsed());
+        }
+        progress("round trips over gRPC", k + 1, WARM_UP + STEPS);
+    }
+    driver.close().await?;
+    Ok(stopwatch.round_trips())
+}
+
+fn over_shared_memory(mut driver: LinkDriver) -> Result<RoundTrips> {
+    let mut stopwatch = Stopwatch::new();
+    for k in 0..WARM_UP + STEPS {
+        let start = Instant::now();
+        driver.step(&[0.0])?;
+        if k >= WARM_UP {
+            stopwatch.record(start.elapsed());
+        }
+        progress("round trips over shared memory", k + 1, WARM_UP + STEPS);
+    }
+    Ok(stopwatch.round_trips())
+}
+
+/// Takes the lease of a plant over shared memory.
+pub(crate) async fn connect_link(client: &Client, plant: &str) -> Result<LinkDriver> {
+    let link = client.open_link(plant).await?;
+    let options = LinkOptions {
+        root: link.root_path.into(),
+        connect_timeout: Duration::from_secs(10),
+        timeout: Duration::from_secs(10),
+        ..Default::default()
+    };
+    LinkDriver::connect(plant, options)
+        .with_context(|| format!("cannot drive plant `{plant}` over shared memory"))
+}
