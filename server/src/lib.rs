@@ -1,7 +1,29 @@
 //! The plantd server: plant sessions and the services of `plantd.v1`.
+//!
+//! ```text
+//!  grpc/* (requests in, messages out)        link/* (shared memory)
+//!            |                                     |
+//!            +------------ session: one plant, one lease, many watchers
+//!            |                  |
+//!         workers          watch: latest frame wins, per watcher
+//! ```
+//!
+//! [`serve::run`] is the whole server; [`daemon`] makes a process of it.
 
+pub mod catalog;
+pub mod cli;
+pub mod config;
+pub mod convert;
+pub mod daemon;
+pub mod grpc;
+pub mod hub;
+pub mod limits;
 pub mod link;
+pub mod listen;
 pub mod metrics;
+pub mod metrics_http;
+pub mod serve;
 pub mod session;
 pub mod status;
 pub mod watch;
+pub mod workers;

@@ -1,2 +1,47 @@
 //! The `plantd` server binary.
-fn main() {}
+
+use std::time::Duration;
+
+use anyhow::{Context as _, Result};
+use clap::Parser as _;
+use plantd_server::cli::{Cli, Command, Settings};
+use plantd_server::daemon;
+use plantd_server::limits::Limits;
+
+/// Time for computations that nobody waits for any more to notice that the server has ended.
+const LEFTOVERS_MAX: Duration = Duration::from_secs(1);
+
+fn main() -> Result<()> {
+    match Cli::parse().command {
+        Command::Serve(settings) => serve(*settings),
+        Command::Limits(settings) => {
+            print_limits(&settings.resolve()?.limits);
+            Ok(())
+        }
+    }
+}
+
+fn serve(settings: Settings) -> Result<()> {
+    let print_config = settings.print_config;
+    let config = settings.resolve()?;
+    if print_config {
+        print!("{}", config.to_toml()?);
+        return Ok(());
+    }
+    daemon::start_log(&config.log)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(config.thread_count())
+        .enable_all()
+        .build()
+        .context("threads")?;
+    let outcome = runtime.block_on(daemon::serve(config));
+    runtime.shutdown_timeout(LEFTOVERS_MAX);
+    outcome
+}
+
+fn print_limits(limits: &Limits) {
+    println!("{:<24} {:>14}  MEANING", "LIMIT", "VALUE");
+    for limit in limits.table() {
+        println!("{:<24} {:>14}  {}", limit.name, limit.value, limit.meaning);
+    }
+}

@@ -13,6 +13,7 @@ use plantd_models::{
 };
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
+use crate::limits::LimitExceeded;
 use crate::metrics::Metrics;
 use crate::status::step_error_reason;
 use crate::watch::{Subscription, Watchers};
@@ -177,13 +178,18 @@ impl Session {
 
     /// Notes whether the shared-memory link is open.
     pub fn set_link_open(&self, open: bool) {
-        self.link_open.store(open, Ordering::Release);
+        match (self.link_open.swap(open, Ordering::AcqRel), open) {
+            (false, true) => self.metrics.link_opened(),
+            (true, false) => self.metrics.link_closed(),
+            _ => {}
+        }
     }
 
-    /// Ends the session: leases and streams of the plant fail from now on.
-    pub fn close(&self) {
-        self.is_closed.store(true, Ordering::Release);
+    /// Ends the session: leases and streams of the plant fail from now on. False when it had ended.
+    pub fn close(&self) -> bool {
+        let was_open = !self.is_closed.swap(true, Ordering::AcqRel);
         self.closed.cancel();
+        was_open
     }
 
     /// The plant was deleted.
@@ -206,12 +212,16 @@ impl Session {
     }
 
     /// Subscribes to every `every`-th state. Starts with the state as it is, if its step counts.
-    pub fn subscribe(self: &Arc<Self>, every: u64) -> Subscription {
+    pub fn subscribe(
+        self: &Arc<Self>,
+        every: u64,
+        watchers_max: u64,
+    ) -> Result<Subscription, LimitExceeded> {
         // Under the core's lock no step falls between the registration and the first frame.
         let core = self.core();
-        let subscription = Subscription::new(Arc::clone(self), every);
+        let subscription = Subscription::new(Arc::clone(self), every, watchers_max)?;
         subscription.offer(&core.plant, &core.report, &core.input);
-        subscription
+        Ok(subscription)
     }
 
     /// The watchers of the plant.

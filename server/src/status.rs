@@ -1,6 +1,245 @@
 //! The one place where errors become statuses.
+//!
+//! Every error status carries `google.rpc.ErrorInfo` with domain `plantd` and one of the reasons
+//! below; failures inside a stream carry the same code and reason in `plantd.v1.Failure`.
+//!
+//! | code | reason | further details | when |
+//! | --- | --- | --- | --- |
+//! | INVALID_ARGUMENT | `INVALID_FIELD` | BadRequest | a field is missing, malformed, of wrong size, not finite, or names an unknown coordinate or operating point |
+//! | INVALID_ARGUMENT | `INVALID_SCENE` | BadRequest, one entry per error of the scene | a scene does not compile |
+//! | INVALID_ARGUMENT | `INPUT_DIMENSION`, `INPUT_NOT_FINITE` | BadRequest | the input of a step |
+//! | INVALID_ARGUMENT | `OFF_CONSTRAINT`, `PROJECTION_FAILED` | BadRequest | an initial configuration cannot satisfy the constraints |
+//! | INVALID_ARGUMENT | `INVALID_SNAPSHOT`, `SNAPSHOT_MISMATCH` | BadRequest | damaged, or of another model or other settings |
+//! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
+//! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice |
+//! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED` | ResourceInfo | no such thing, or deleted meanwhile |
+//! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS` | ResourceInfo | the name is taken |
+//! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
+//! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
+//! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR` | PreconditionFailure; metadata `steps_taken` | the step has no solution; the plant stays at the last good state |
+//! | FAILED_PRECONDITION | `NOT_AN_EQUILIBRIUM` | PreconditionFailure; metadata `drift`, `coordinate` | the point of an infinite-horizon regulator moves |
+//! | FAILED_PRECONDITION | `NOT_STABILISABLE`, `NOT_DETECTABLE`, `RICCATI_NOT_CONVERGED`, `RICCATI_OVERFLOW`, `EIGENVALUES_NOT_FOUND` | PreconditionFailure | there is no such regulator |
+//! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
+//! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::limits`] |
+//! | UNAVAILABLE | `SHUTTING_DOWN` | | the server ends; try again |
+//! | UNAVAILABLE | `LINK_FAILED` | | shared memory could not be set up |
+//! | CANCELLED | `CANCELLED` | | the caller has gone away |
+//! | INTERNAL | `INTERNAL` | | a defect of the server |
 
-use plantd_models::StepError;
+use std::collections::HashMap;
+
+use plantd_models::control::{RiccatiError, WeightsError};
+use plantd_models::{InitialError, SceneError, SnapshotError, StepError};
+use plantd_proto::v1;
+use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt};
+
+use crate::limits::LimitExceeded;
+use crate::session::{DriveError, LeaseHeld};
+
+/// The domain of every `google.rpc.ErrorInfo`.
+pub const ERROR_DOMAIN: &str = "plantd";
+
+/// An error on its way to a client.
+#[derive(Clone, Debug)]
+pub struct Fault {
+    code: Code,
+    reason: &'static str,
+    message: String,
+    metadata: HashMap<String, String>,
+    details: ErrorDetails,
+}
+
+impl Fault {
+    /// A fault without further details.
+    pub fn new(code: Code, reason: &'static str, message: impl Into<String>) -> Self {
+        Self {
+            code,
+            reason,
+            message: message.into(),
+            metadata: HashMap::new(),
+            details: ErrorDetails::new(),
+        }
+    }
+
+    /// A bad field of the request.
+    pub fn field(field: impl Into<String>, description: impl Into<String>) -> Self {
+        Self::field_because("INVALID_FIELD", field, description)
+    }
+
+    fn field_because(
+        reason: &'static str,
+        field: impl Into<String>,
+        description: impl Into<String>,
+    ) -> Self {
+        let (field, description) = (field.into(), description.into());
+        let mut fault = Self::new(Code::InvalidArgument, reason, format!("{field}: {description}"));
+        fault.details.add_bad_request_violation(field, description);
+        fault
+    }
+
+    /// There is no such model.
+    pub fn model_not_found(name: &str) -> Self {
+        Self::resource(Code::NotFound, "MODEL_NOT_FOUND", "model", name, "there is no model")
+    }
+
+    /// There is no such plant.
+    pub fn plant_not_found(id: &str) -> Self {
+        Self::resource(Code::NotFound, "PLANT_NOT_FOUND", "plant", id, "there is no plant")
+    }
+
+    /// The plant was deleted while it was used.
+    pub fn plant_deleted(id: &str) -> Self {
+        Self::resource(Code::NotFound, "PLANT_DELETED", "plant", id, "deleted meanwhile: plant")
+    }
+
+    /// A model's name is taken.
+    pub fn model_exists(name: &str) -> Self {
+        Self::resource(
+            Code::AlreadyExists,
+            "MODEL_EXISTS",
+            "model",
+            name,
+            "there already is a model",
+        )
+    }
+
+    /// A plant's id is taken.
+    pub fn plant_exists(id: &str) -> Self {
+        Self::resource(Code::AlreadyExists, "PLANT_EXISTS", "plant", id, "there already is a plant")
+    }
+
+    fn resource(
+        code: Code,
+        reason: &'static str,
+        kind: &'static str,
+        name: &str,
+        sentence: &'static str,
+    ) -> Self {
+        let message = format!("{sentence} `{name}`");
+        let mut fault = Self::new(code, reason, message.clone());
+        fault.details.set_resource_info(kind, name, "", message);
+        fault
+    }
+
+    /// Something is not in the state that the call needs.
+    pub fn precondition(
+        reason: &'static str,
+        subject: impl Into<String>,
+        message: impl Into<String>,
+    ) -> Self {
+        let message = message.into();
+        let mut fault = Self::new(Code::FailedPrecondition, reason, message.clone());
+        fault.details.add_precondition_failure_violation(reason, subject, message);
+        fault
+    }
+
+    /// The server ends.
+    pub fn shutting_down() -> Self {
+        Self::new(Code::Unavailable, "SHUTTING_DOWN", "the server is shutting down")
+    }
+
+    /// A defect of the server.
+    pub fn internal(message: impl Into<String>) -> Self {
+        Self::new(Code::Internal, "INTERNAL", message)
+    }
+
+    /// Adds an entry to the metadata of `ErrorInfo`.
+    pub fn with(mut self, key: &str, value: impl ToString) -> Self {
+        self.metadata.insert(key.to_owned(), value.to_string());
+        self
+    }
+
+    /// The reason.
+    pub fn reason(&self) -> &'static str {
+        self.reason
+    }
+}
+
+impl From<Fault> for Status {
+    fn from(mut fault: Fault) -> Self {
+        fault.details.set_error_info(fault.reason, ERROR_DOMAIN, fault.metadata);
+        Self::with_error_details(fault.code, fault.message, fault.details)
+    }
+}
+
+impl From<Fault> for v1::Failure {
+    fn from(fault: Fault) -> Self {
+        Self { code: fault.code as i32, message: fault.message, reason: fault.reason.to_owned() }
+    }
+}
+
+impl From<SceneError> for Fault {
+    fn from(error: SceneError) -> Self {
+        let count = error.problems.len();
+        let first = error
+            .problems
+            .first()
+            .map(|problem| format!("{}: {}", problem.path, problem.message))
+            .unwrap_or_default();
+        let message = match count {
+            0 | 1 => format!("the scene has an error: {first}"),
+            _ => format!("the scene has {count} errors; the first: {first}"),
+        };
+        let mut fault = Self::new(Code::InvalidArgument, "INVALID_SCENE", message);
+        for problem in error.problems {
+            fault.details.add_bad_request_violation(problem.path, problem.message);
+        }
+        fault
+    }
+}
+
+impl From<LimitExceeded> for Fault {
+    fn from(error: LimitExceeded) -> Self {
+        let mut fault = Self::new(Code::ResourceExhausted, "LIMIT_EXCEEDED", error.to_string())
+            .with("limit", error.name)
+            .with("value", error.limit)
+            .with("actual", error.actual);
+        fault
+            .details
+            .add_quota_failure_violation(format!("limit:{}", error.name), error.to_string());
+        fault
+    }
+}
+
+impl From<LeaseHeld> for Fault {
+    fn from(error: LeaseHeld) -> Self {
+        Self::precondition("LEASE_HELD", "plant", error.to_string())
+            .with("driver", error.by.as_str())
+    }
+}
+
+impl Fault {
+    /// The fault of a refused state that stands in `field` of the request.
+    pub fn from_initial(error: InitialError, field: &str) -> Self {
+        let message = error.to_string();
+        match error {
+            InitialError::Dimension { name, .. } => Self::field(format!("{field}.{name}"), message),
+            InitialError::NotFinite { name, index, .. } => {
+                Self::field(format!("{field}.{name}[{index}]"), message)
+            }
+            InitialError::Unknown { .. } => Self::field(field, message),
+            InitialError::OffConstraint { constraint, .. } => {
+                Self::field_because("OFF_CONSTRAINT", field, message).with("constraint", constraint)
+            }
+            InitialError::Projection { constraint, .. } => {
+                Self::field_because("PROJECTION_FAILED", field, message)
+                    .with("constraint", constraint)
+            }
+            InitialError::Settings { name, .. } => Self::field(format!("settings.{name}"), message),
+        }
+    }
+}
+
+impl From<SnapshotError> for Fault {
+    fn from(error: SnapshotError) -> Self {
+        let reason = match error {
+            SnapshotError::Malformed(_) => "INVALID_SNAPSHOT",
+            SnapshotError::Mismatch(_) => "SNAPSHOT_MISMATCH",
+        };
+        Self::field_because(reason, "snapshot", error.to_string())
+    }
+}
 
 /// The reason of a failed step, as in `google.rpc.ErrorInfo`.
 pub fn step_error_reason(error: &StepError) -> &'static str {
@@ -9,7 +248,109 @@ pub fn step_error_reason(error: &StepError) -> &'static str {
         StepError::InputNotFinite { .. } => "INPUT_NOT_FINITE",
         StepError::NotConverged { .. } => "NOT_CONVERGED",
         StepError::NotFinite { .. } => "MOTION_NOT_FINITE",
-        StepError::Singular { .. } => "SINGULAR",
         StepError::TooFast { .. } => "TOO_FAST",
+        StepError::Singular { .. } => "SINGULAR",
+    }
+}
+
+impl From<StepError> for Fault {
+    fn from(error: StepError) -> Self {
+        let reason = step_error_reason(&error);
+        let message = error.to_string();
+        match error {
+            StepError::Dimension { .. } => Self::field_because(reason, "u", message),
+            StepError::InputNotFinite { index, .. } => {
+                Self::field_because(reason, format!("u[{index}]"), message)
+            }
+            StepError::NotConverged { .. }
+            | StepError::NotFinite { .. }
+            | StepError::TooFast { .. }
+            | StepError::Singular { .. } => Self::precondition(reason, "step", message),
+        }
+    }
+}
+
+impl Fault {
+    /// The fault of a lease's operation on the plant `id`.
+    pub fn from_drive(error: DriveError, id: &str) -> Self {
+        match error {
+            DriveError::Closed => Self::plant_deleted(id),
+            DriveError::Step(error) => error.into(),
+        }
+    }
+}
+
+impl From<WeightsError> for Fault {
+    fn from(error: WeightsError) -> Self {
+        let field = match &error {
+            WeightsError::Dimension { weight, .. }
+            | WeightsError::NotFinite { weight, .. }
+            | WeightsError::NotSymmetric { weight, .. }
+            | WeightsError::Negative { weight } => weight,
+            WeightsError::NotPositiveDefinite => "r",
+        };
+        Self::field_because("INVALID_WEIGHT", format!("weights.{field}"), error.to_string())
+    }
+}
+
+impl From<RiccatiError> for Fault {
+    fn from(error: RiccatiError) -> Self {
+        let reason = match error {
+            RiccatiError::NotStabilisable { .. } => "NOT_STABILISABLE",
+            RiccatiError::NotDetectable { .. } => "NOT_DETECTABLE",
+            RiccatiError::NotConverged { .. } => "RICCATI_NOT_CONVERGED",
+            RiccatiError::Overflow { .. } | RiccatiError::NotFinite { .. } => "RICCATI_OVERFLOW",
+            RiccatiError::Eigenvalues { .. } => "EIGENVALUES_NOT_FOUND",
+            // The server made the matrices, so a misfit among them is its own mistake.
+            RiccatiError::Dimension { .. } | RiccatiError::TangentCount { .. } => {
+                return Self::internal(error.to_string());
+            }
+        };
+        Self::precondition(reason, "regulator", error.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use plantd_models::Problem;
+    use tonic_types::StatusExt as _;
+
+    use super::*;
+
+    #[test]
+    fn every_problem_of_a_scene_is_a_violation() {
+        let problem = |path: &str| Problem { path: path.to_owned(), message: "bad".to_owned() };
+        let error =
+            SceneError { problems: vec![problem("frames[0].body.mass"), problem("gravity")] };
+        let status = Status::from(Fault::from(error));
+        assert_eq!(status.code(), Code::InvalidArgument);
+        let details = status.get_error_details();
+        let fields: Vec<_> = details
+            .bad_request()
+            .unwrap()
+            .field_violations
+            .iter()
+            .map(|violation| violation.field.as_str())
+            .collect();
+        assert_eq!(fields, ["frames[0].body.mass", "gravity"]);
+        let info = details.error_info().unwrap();
+        assert_eq!((info.reason.as_str(), info.domain.as_str()), ("INVALID_SCENE", "plantd"));
+    }
+
+    #[test]
+    fn a_limit_names_itself_and_its_value() {
+        let error = LimitExceeded::check("plants", 2, "plants", 3).unwrap_err();
+        let status = Status::from(Fault::from(error));
+        assert_eq!(status.code(), Code::ResourceExhausted);
+        let details = status.get_error_details();
+        assert_eq!(details.error_info().unwrap().metadata["limit"], "plants");
+        assert_eq!(details.quota_failure().unwrap().violations.len(), 1);
+    }
+
+    #[test]
+    fn failures_in_a_stream_carry_the_same_code_and_reason() {
+        let failure = v1::Failure::from(Fault::from(StepError::NotFinite { iterations: 3 }));
+        assert_eq!(failure.code, Code::FailedPrecondition as i32);
+        assert_eq!(failure.reason, "MOTION_NOT_FINITE");
     }
 }

@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use plantd_models::{Plant, State, StepReport};
 use tokio::sync::Notify;
 
+use crate::limits::LimitExceeded;
 use crate::session::Session;
 
 /// A state with the step that led to it.
@@ -63,10 +64,13 @@ impl Watchers {
         }
     }
 
-    fn add(&self, slot: Arc<Slot>) {
+    fn add(&self, slot: Arc<Slot>, watchers_max: u64) -> Result<(), LimitExceeded> {
         let mut slots = lock(&self.slots);
+        let (name, what) = ("watchers_per_plant", "watchers");
+        LimitExceeded::check(name, watchers_max, what, slots.len() + 1)?;
         slots.push(slot);
         self.count.store(slots.len(), Ordering::Release);
+        Ok(())
     }
 
     fn remove(&self, slot: &Arc<Slot>) {
@@ -115,12 +119,16 @@ pub struct Subscription {
 }
 
 impl Subscription {
-    pub(crate) fn new(session: Arc<Session>, every: u64) -> Self {
+    pub(crate) fn new(
+        session: Arc<Session>,
+        every: u64,
+        watchers_max: u64,
+    ) -> Result<Self, LimitExceeded> {
         let slot =
             Arc::new(Slot { every: every.max(1), cell: Mutex::default(), filled: Notify::new() });
-        session.watchers().add(Arc::clone(&slot));
+        session.watchers().add(Arc::clone(&slot), watchers_max)?;
         session.metrics().watcher_started();
-        Self { session, slot, frame: Frame::default(), dropped: 0 }
+        Ok(Self { session, slot, frame: Frame::default(), dropped: 0 })
     }
 
     pub(crate) fn offer(&self, plant: &Plant, report: &StepReport, input: &[f64]) {

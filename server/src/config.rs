@@ -1,0 +1,329 @@
+//! The configuration: defaults, then the file, then the environment, then flags; the last one wins.
+
+use std::fmt;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::time::Duration;
+
+use plantd_proto::link::Wait;
+use serde::{Deserialize, Serialize};
+
+use crate::limits::{LimitError, Limits};
+use crate::link::LinkConfig;
+
+/// Port of gRPC over TCP unless another one is given.
+pub const DEFAULT_PORT: u16 = 50051;
+
+/// Longest time that can be configured, s: a day.
+const DURATION_MAX_S: f64 = 86_400.0;
+
+/// Everything that can be configured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// gRPC over TCP: `address:port`, port 0 for any free one, or `off`.
+    pub grpc: Listen,
+    /// gRPC over a unix-domain socket at this path; not given means none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub unix: Option<PathBuf>,
+    /// Metrics at `http://address:port/metrics`, or `off`.
+    pub metrics: Listen,
+    /// Directory of scenes (`*.toml`, `*.json`) to load as models at the start.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scenes: Option<PathBuf>,
+    /// File to write the addresses into, as JSON, once the server serves.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ready_file: Option<PathBuf>,
+    /// Threads that serve connections; 0 means one for each processor.
+    pub threads: usize,
+    /// Workers for long computations; 0 means one for each processor.
+    pub workers: usize,
+    /// Time for open calls to end at shutdown before they are cut off, s.
+    pub shutdown_grace_s: f64,
+    /// Logging.
+    pub log: LogConfig,
+    /// Shared-memory links.
+    pub link: LinkSettings,
+    /// Limits.
+    pub limits: Limits,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            grpc: Listen::At(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT))),
+            unix: None,
+            metrics: Listen::Off,
+            scenes: None,
+            ready_file: None,
+            threads: 0,
+            workers: 0,
+            shutdown_grace_s: 5.0,
+            log: LogConfig::default(),
+            link: LinkSettings::default(),
+            limits: Limits::default(),
+        }
+    }
+}
+
+/// Where to listen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Listen {
+    /// Nowhere.
+    Off,
+    /// At this address.
+    At(SocketAddr),
+}
+
+/// Not an address.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("`{0}` is neither `off` nor an address like 127.0.0.1:50051 or [::]:50051")]
+pub struct ListenError(String);
+
+impl FromStr for Listen {
+    type Err = ListenError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "off" => Ok(Self::Off),
+            _ => text.parse().map(Self::At).map_err(|_| ListenError(text.to_owned())),
+        }
+    }
+}
+
+impl TryFrom<String> for Listen {
+    type Error = ListenError;
+
+    fn try_from(text: String) -> Result<Self, Self::Error> {
+        text.parse()
+    }
+}
+
+impl From<Listen> for String {
+    fn from(listen: Listen) -> Self {
+        listen.to_string()
+    }
+}
+
+impl fmt::Display for Listen {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Off => f.write_str("off"),
+            Self::At(address) => address.fmt(f),
+        }
+    }
+}
+
+/// Logging.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LogConfig {
+    /// What is logged, in the notation of `RUST_LOG`: `info`, `plantd_server=debug,info`.
+    pub filter: String,
+    /// How.
+    pub format: LogFormat,
+}
+
+impl Default for LogConfig {
+    fn default() -> Self {
+        Self { filter: "info".to_owned(), format: LogFormat::Text }
+    }
+}
+
+/// Notation of log lines.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum LogFormat {
+    /// For people.
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+/// Shared-memory links.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LinkSettings {
+    /// Links can be opened.
+    pub enabled: bool,
+    /// Root path of the iceoryx2 domain; not given means `$XDG_RUNTIME_DIR/plantd` or
+    /// `/tmp/plantd-UID`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub root: Option<PathBuf>,
+    /// How a link waits for the next input.
+    pub wait: LinkWaitMode,
+    /// Time for which `poll_then_sleep` polls after each answer, µs.
+    pub poll_us: u64,
+    /// A driver that sends nothing for this long loses the lease, s; 0 means never.
+    pub idle_timeout_s: f64,
+}
+
+impl Default for LinkSettings {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            root: None,
+            wait: LinkWaitMode::PollThenSleep,
+            poll_us: 50,
+            idle_timeout_s: 0.0,
+        }
+    }
+}
+
+/// How a link waits for the next input.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LinkWaitMode {
+    /// Polls for `poll_us` after each answer, then sleeps until the driver rings.
+    PollThenSleep,
+    /// Polls all the time: lowest latency, takes a processor for each open link.
+    Poll,
+}
+
+/// Why there is no configuration.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("configuration file `{path}`: {source}")]
+    Read {
+        /// Path.
+        path: PathBuf,
+        /// Cause.
+        source: std::io::Error,
+    },
+    /// The file is not a configuration.
+    #[error("configuration file `{path}`: {source}")]
+    Parse {
+        /// Path.
+        path: PathBuf,
+        /// Cause; names the key.
+        source: Box<toml::de::Error>,
+    },
+    /// A value is out of range.
+    #[error("{key} is {value}; it must lie between 0 and {max}")]
+    OutOfRange {
+        /// Key.
+        key: &'static str,
+        /// Value.
+        value: f64,
+        /// Largest value allowed.
+        max: f64,
+    },
+    /// A limit is unknown or out of range.
+    #[error(transparent)]
+    Limit(#[from] LimitError),
+    /// Nothing to serve on.
+    #[error("gRPC is off and there is no unix socket: the server could not be reached")]
+    Nowhere,
+}
+
+impl Config {
+    /// Reads a file in TOML. Unknown keys are errors.
+    pub fn from_file(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+        toml::from_str(&text)
+            .map_err(|source| ConfigError::Parse { path: path.to_owned(), source: source.into() })
+    }
+
+    /// Refuses values that are out of range.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        self.limits.check()?;
+        for (key, value) in [
+            ("shutdown_grace_s", self.shutdown_grace_s),
+            ("link.idle_timeout_s", self.link.idle_timeout_s),
+        ] {
+            if !(0.0..=DURATION_MAX_S).contains(&value) {
+                return Err(ConfigError::OutOfRange { key, value, max: DURATION_MAX_S });
+            }
+        }
+        if self.grpc == Listen::Off && self.unix.is_none() {
+            return Err(ConfigError::Nowhere);
+        }
+        Ok(())
+    }
+
+    /// Time for open calls to end at shutdown.
+    pub fn shutdown_grace(&self) -> Duration {
+        Duration::from_secs_f64(self.shutdown_grace_s)
+    }
+
+    /// Number of workers.
+    pub fn worker_count(&self) -> usize {
+        count_or_processors(self.workers)
+    }
+
+    /// Number of threads that serve connections.
+    pub fn thread_count(&self) -> usize {
+        count_or_processors(self.threads)
+    }
+
+    /// The configuration in TOML.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        toml::to_string(self)
+    }
+}
+
+fn count_or_processors(count: usize) -> usize {
+    match count {
+        0 => std::thread::available_parallelism().map_or(1, usize::from),
+        count => count,
+    }
+}
+
+impl LinkSettings {
+    /// What the links' host takes; none when links are off.
+    pub fn host_config(&self) -> Option<LinkConfig> {
+        if !self.enabled {
+            return None;
+        }
+        let mut config = LinkConfig::default();
+        if let Some(root) = &self.root {
+            config.root.clone_from(root);
+        }
+        config.wait = match self.wait {
+            LinkWaitMode::PollThenSleep => Wait::PollThenSleep(Duration::from_micros(self.poll_us)),
+            LinkWaitMode::Poll => Wait::Poll,
+        };
+        config.idle_timeout =
+            (self.idle_timeout_s > 0.0).then(|| Duration::from_secs_f64(self.idle_timeout_s));
+        Some(config)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_printed_can_be_read_back() {
+        let config = Config { unix: Some("/run/plantd.sock".into()), ..Config::default() };
+        let text = config.to_toml().unwrap();
+        assert_eq!(toml::from_str::<Config>(&text).unwrap(), config);
+    }
+
+    #[test]
+    fn unknown_keys_are_named() {
+        for (text, key) in [
+            ("gprc = \"off\"", "gprc"),
+            ("[limits]\nplant = 3", "plant"),
+            ("[link]\nwait = \"poll\"\nrooot = \"/\"", "rooot"),
+        ] {
+            let error = toml::from_str::<Config>(text).unwrap_err().to_string();
+            assert!(error.contains(key), "{error}");
+        }
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused() {
+        let config = |text| toml::from_str::<Config>(text).unwrap();
+        assert!(config("").check().is_ok());
+        assert!(config("shutdown_grace_s = nan").check().is_err());
+        assert!(config("grpc = \"off\"").check().is_err());
+        assert!(config("grpc = \"off\"\nunix = \"/s\"").check().is_ok());
+        assert!(config("[limits]\nconnections = 0").check().is_err());
+        assert!(toml::from_str::<Config>("grpc = \"localhost\"").is_err());
+    }
+}

@@ -1,0 +1,475 @@
+//! Between the messages of `plantd.v1` and the types of `plantd-models`, with every check on the way
+//! in.
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, DVector};
+use plantd_models::control::Weights;
+use plantd_models::{
+    Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model, Plant, Scene,
+    SceneError, Settings, Snapshot, State, StepReport,
+};
+use plantd_proto::v1;
+use v1::initial_state::Form as InitialForm;
+use v1::point::Source as PointSource;
+use v1::weight::Form as WeightForm;
+
+use crate::limits::{LimitExceeded, Limits};
+use crate::status::Fault;
+
+/// How a plant starts.
+#[derive(Clone, Debug)]
+pub enum Start {
+    /// From a description of the state.
+    Initial(Initial),
+    /// From a snapshot.
+    Snapshot(Snapshot),
+}
+
+/// Checks a name or an id: lower-case letters, digits and hyphens, 1 to 63 of them.
+pub fn check_name(field: &'static str, name: &str) -> Result<(), Fault> {
+    let is_allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+    if name.is_empty() || name.len() > 63 || !name.chars().all(is_allowed) {
+        return Err(Fault::field(
+            field,
+            "must be lower-case letters, digits and hyphens, 1 to 63 of them",
+        ));
+    }
+    Ok(())
+}
+
+/// A request's page: how many entries, and the name after which they start.
+pub fn page(size: i32, token: &str) -> Result<(usize, &str), Fault> {
+    const DEFAULT: usize = 100;
+    const MAX: usize = 1000;
+    if !token.is_empty() {
+        check_name("page_token", token)?;
+    }
+    match usize::try_from(size) {
+        Ok(0) => Ok((DEFAULT, token)),
+        Ok(size) => Ok((size.min(MAX), token)),
+        Err(_) => Err(Fault::field("page_size", "must not be negative")),
+    }
+}
+
+/// Reads a scene within the limits. A faulty scene is the inner error.
+pub fn scene(text: &str, format: i32, limits: &Limits) -> Result<Result<Scene, SceneError>, Fault> {
+    LimitExceeded::check("scene_bytes", limits.scene_bytes, "bytes of scene", text.len())?;
+    let scene = match v1::SceneFormat::try_from(format) {
+        Ok(v1::SceneFormat::Unspecified) => Scene::from_text(text),
+        Ok(v1::SceneFormat::Toml) => Scene::from_toml(text),
+        Ok(v1::SceneFormat::Json) => Scene::from_json(text),
+        Err(_) => return Err(Fault::field("format", format!("{format} is not a format"))),
+    };
+    let scene = match scene {
+        Ok(scene) => scene,
+        Err(error) => return Ok(Err(error)),
+    };
+    for (what, count) in [
+        ("frames", scene.frames.len()),
+        ("springs", scene.springs.len()),
+        ("inputs", scene.inputs.len()),
+        ("constraints", scene.constraints.len()),
+        ("coordinate settings", scene.coordinates.len()),
+        ("operating points", scene.operating_points.len()),
+    ] {
+        LimitExceeded::check("scene_items", limits.scene_items, what, count)?;
+    }
+    // Every coordinate belongs to a joint or to a setting, so this bounds them before compilation.
+    let joints = scene.frames.iter().filter(|frame| frame.joint.is_some()).count();
+    LimitExceeded::check("coordinates", limits.coordinates, "joints", joints)?;
+    Ok(Ok(scene))
+}
+
+/// Settings of a plant, with the model's defaults filled in.
+pub fn settings(
+    settings: Option<v1::PlantSettings>,
+    model: &Model,
+    limits: &Limits,
+) -> Result<Settings, Fault> {
+    let given = settings.unwrap_or_default();
+    let mut settings = Settings::new(model);
+    if given.time_step_s != 0.0 {
+        if !(given.time_step_s.is_finite() && given.time_step_s > 0.0) {
+            return Err(Fault::field(
+                "settings.time_step_s",
+                "must be finite and greater than zero",
+            ));
+        }
+        settings.time_step_s = given.time_step_s;
+    }
+    settings.force_split = match v1::ForceSplit::try_from(given.force_split) {
+        Ok(v1::ForceSplit::Unspecified | v1::ForceSplit::Symmetric) => ForceSplit::Symmetric,
+        Ok(v1::ForceSplit::Paper) => ForceSplit::Paper,
+        Err(_) => return Err(Fault::field("settings.force_split", "is not a force split")),
+    };
+    if given.max_iterations != 0 {
+        let (asked, limit) = (given.max_iterations as usize, limits.max_iterations);
+        LimitExceeded::check("max_iterations", limit, "iterations", asked)?;
+        settings.max_iterations = given.max_iterations;
+    }
+    Ok(settings)
+}
+
+/// Settings as a message.
+pub fn settings_message(settings: &Settings) -> v1::PlantSettings {
+    let force_split = match settings.force_split {
+        ForceSplit::Symmetric => v1::ForceSplit::Symmetric,
+        ForceSplit::Paper => v1::ForceSplit::Paper,
+    };
+    v1::PlantSettings {
+        time_step_s: settings.time_step_s,
+        force_split: force_split.into(),
+        max_iterations: settings.max_iterations,
+    }
+}
+
+/// How a plant starts; not given means the scene's initial configuration.
+pub fn start(initial: Option<v1::InitialState>, model: &Model) -> Result<Start, Fault> {
+    let initial = match initial.and_then(|initial| initial.form) {
+        None => Initial::Scene,
+        Some(InitialForm::Momentum(form)) => momentum(form.q, form.p, form.v, model),
+        Some(InitialForm::Velocity(form)) => Initial::Velocity { q: form.q, v: form.v },
+        Some(InitialForm::TwoConfigurations(form)) => {
+            Initial::TwoConfigurations { q0: form.q0, q1: form.q1 }
+        }
+        Some(InitialForm::Projection(form)) => Initial::Projection { q: form.q, hold: form.hold },
+        Some(InitialForm::OperatingPoint(name)) => Initial::OperatingPoint(name),
+        Some(InitialForm::Snapshot(bytes)) => {
+            return Ok(Start::Snapshot(Snapshot::from_bytes(&bytes)?));
+        }
+    };
+    Ok(Start::Initial(initial))
+}
+
+fn momentum(q: Vec<f64>, p: Vec<f64>, v: Vec<f64>, model: &Model) -> Initial {
+    let v = if v.is_empty() { vec![0.0; model.dimensions().prescribed] } else { v };
+    Initial::Momentum { q, p, v }
+}
+
+/// A plant in its initial state. `field` names the state in errors.
+pub fn plant(
+    model: &Arc<Model>,
+    settings: Settings,
+    start: &Start,
+    field: &str,
+) -> Result<Plant, Fault> {
+    let mut plant = Plant::new(Arc::clone(model), settings)
+        .map_err(|error| Fault::from_initial(error, field))?;
+    match start {
+        Start::Initial(Initial::Scene) => {}
+        Start::Initial(initial) => {
+            plant.initialize(initial).map_err(|error| Fault::from_initial(error, field))?;
+        }
+        Start::Snapshot(snapshot) => plant.restore(snapshot)?,
+    }
+    Ok(plant)
+}
+
+/// A plant at a point, and the input there.
+pub fn point(
+    point: Option<v1::Point>,
+    model: &Arc<Model>,
+    settings: Settings,
+) -> Result<(Plant, Vec<f64>), Fault> {
+    match point.and_then(|point| point.source) {
+        None => Err(Fault::field("point", "is missing")),
+        Some(PointSource::OperatingPoint(name)) => {
+            let field = "point.operating_point";
+            let input = model.operating_points().iter().find(|point| point.name == name);
+            let input = input.map(|point| point.u.clone()).ok_or_else(|| {
+                let kind = "operating point";
+                Fault::from_initial(InitialError::Unknown { kind, name: name.clone() }, field)
+            })?;
+            let start = Start::Initial(Initial::OperatingPoint(name));
+            Ok((plant(model, settings, &start, field)?, input))
+        }
+        Some(PointSource::StateAndInput(given)) => {
+            let field = "point.state_and_input.state";
+            let state = given.state.ok_or_else(|| Fault::field(field, "is missing"))?;
+            let start = Start::Initial(momentum(state.q, state.p, state.v, model));
+            let plant = plant(model, settings, &start, field)?;
+            let input = if given.u.is_empty() { hold_input(&plant) } else { given.u };
+            check_numbers("point.state_and_input.u", &input, model.dimensions().input())?;
+            Ok((plant, input))
+        }
+    }
+}
+
+/// The initial state and the inputs of a trajectory.
+pub fn trajectory(
+    trajectory: Option<v1::Trajectory>,
+    model: &Arc<Model>,
+    settings: Settings,
+    limits: &Limits,
+) -> Result<(Plant, Inputs), Fault> {
+    let trajectory = trajectory.ok_or_else(|| Fault::field("trajectory", "is missing"))?;
+    let start = match trajectory.initial {
+        None => Initial::Scene,
+        Some(state) => momentum(state.q, state.p, state.v, model),
+    };
+    let plant = plant(model, settings, &Start::Initial(start), "trajectory.initial")?;
+    let inputs = Inputs::new("trajectory.u", trajectory.u, model.dimensions().input())?;
+    LimitExceeded::check("horizon", limits.horizon, "steps", inputs.count())?;
+    Ok((plant, inputs))
+}
+
+/// The input that exerts no force and leaves prescribed coordinates where they are.
+pub fn hold_input(plant: &Plant) -> Vec<f64> {
+    let mut input = vec![0.0; plant.model().dimensions().input()];
+    plant.hold_input(&mut input);
+    input
+}
+
+/// A sequence of inputs.
+#[derive(Clone, Debug)]
+pub struct Inputs {
+    columns: usize,
+    count: usize,
+    numbers: Vec<f64>,
+}
+
+impl Inputs {
+    /// Checks a matrix whose rows are inputs of `columns` entries.
+    pub fn new(field: &str, u: Option<v1::Matrix>, columns: usize) -> Result<Self, Fault> {
+        let Some(u) = u else { return Ok(Self { columns, count: 0, numbers: Vec::new() }) };
+        check_shape(field, &u)?;
+        if u.rows > 0 && u.cols as usize != columns {
+            let problem = format!("has {} columns; {columns} are needed", u.cols);
+            return Err(Fault::field(format!("{field}.cols"), problem));
+        }
+        Ok(Self { columns, count: u.rows as usize, numbers: u.data })
+    }
+
+    /// Number of inputs.
+    pub fn count(&self) -> usize {
+        self.count
+    }
+
+    /// Input of step `k`.
+    pub fn get(&self, k: usize) -> &[f64] {
+        &self.numbers[k * self.columns..][..self.columns]
+    }
+
+    /// The last input.
+    pub fn last(&self) -> Option<&[f64]> {
+        self.count.checked_sub(1).map(|k| self.get(k))
+    }
+}
+
+fn check_shape(field: &str, matrix: &v1::Matrix) -> Result<(), Fault> {
+    let expected = u64::from(matrix.rows) * u64::from(matrix.cols);
+    if matrix.data.len() as u64 != expected {
+        return Err(Fault::field(
+            format!("{field}.data"),
+            format!(
+                "has {} entries; {} rows of {} are {expected}",
+                matrix.data.len(),
+                matrix.rows,
+                matrix.cols
+            ),
+        ));
+    }
+    check_finite(&format!("{field}.data"), &matrix.data)
+}
+
+/// Checks a vector's length, and that its entries are finite.
+fn check_numbers(field: &str, numbers: &[f64], expected: usize) -> Result<(), Fault> {
+    if numbers.len() != expected {
+        let problem = format!("has {} entries; {expected} are needed", numbers.len());
+        return Err(Fault::field(field, problem));
+    }
+    check_finite(field, numbers)
+}
+
+fn check_finite(field: &str, numbers: &[f64]) -> Result<(), Fault> {
+    match numbers.iter().position(|number| !number.is_finite()) {
+        Some(index) => {
+            Err(Fault::field(format!("{field}[{index}]"), format!("is {}", numbers[index])))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Weights of a regulator.
+pub fn weights(weights: Option<v1::LqrWeights>, model: &Model) -> Result<Weights, Fault> {
+    let weights = weights.ok_or_else(|| Fault::field("weights", "are missing"))?;
+    let d = model.dimensions();
+    let q = weight("weights.q", weights.q, d.state())?;
+    let r = weight("weights.r", weights.r, d.input())?;
+    let q_final = match weights.q_final {
+        Some(given) => Some(weight("weights.q_final", Some(given), d.state())?),
+        None => None,
+    };
+    Ok(Weights::new(q, r, q_final)?)
+}
+
+fn weight(field: &str, weight: Option<v1::Weight>, size: usize) -> Result<DMatrix<f64>, Fault> {
+    match weight.and_then(|weight| weight.form) {
+        None => Err(Fault::field(field, "is missing")),
+        Some(WeightForm::Diagonal(diagonal)) => {
+            check_numbers(&format!("{field}.diagonal"), &diagonal.values, size)?;
+            Ok(DMatrix::from_diagonal(&DVector::from_vec(diagonal.values)))
+        }
+        Some(WeightForm::Full(matrix)) => {
+            check_shape(&format!("{field}.full"), &matrix)?;
+            let (rows, cols) = (matrix.rows as usize, matrix.cols as usize);
+            if (rows, cols) != (size, size) {
+                let problem = format!("is {rows} x {cols}; {size} x {size} is needed");
+                return Err(Fault::field(format!("{field}.full"), problem));
+            }
+            Ok(DMatrix::from_row_slice(rows, cols, &matrix.data))
+        }
+    }
+}
+
+/// A matrix as a message.
+pub fn matrix(matrix: &DMatrix<f64>) -> v1::Matrix {
+    v1::Matrix {
+        rows: matrix.nrows() as u32,
+        cols: matrix.ncols() as u32,
+        data: matrix.transpose().as_slice().to_vec(),
+    }
+}
+
+/// The state of a plant as a message.
+pub fn plant_state(plant: &Plant) -> v1::State {
+    let step = plant.step_index();
+    v1::State {
+        step,
+        time_s: plant.time_s(),
+        q: plant.q().to_vec(),
+        p: plant.p().to_vec(),
+        v: plant.v().to_vec(),
+        multipliers: multipliers(step, plant.multipliers()),
+    }
+}
+
+/// A state as a message.
+pub fn state(state: &State, time_step_s: f64) -> v1::State {
+    v1::State {
+        step: state.step,
+        time_s: state.step as f64 * time_step_s,
+        q: state.q.clone(),
+        p: state.p.clone(),
+        v: state.v.clone(),
+        multipliers: multipliers(state.step, &state.multipliers),
+    }
+}
+
+/// There are none before the first step.
+fn multipliers(step: u64, multipliers: &[f64]) -> Vec<f64> {
+    if step == 0 { Vec::new() } else { multipliers.to_vec() }
+}
+
+/// `x = (q, p, v)` of a plant.
+pub fn x(plant: &Plant) -> Vec<f64> {
+    [plant.q(), plant.p(), plant.v()].concat()
+}
+
+/// A report as a message.
+pub fn report(report: &StepReport) -> v1::StepReport {
+    v1::StepReport {
+        iterations: report.iterations,
+        factorizations: report.factorizations,
+        residual: report.residual,
+        constraint_residual: report.constraint_residual,
+        reciprocal_condition: report.reciprocal_condition,
+    }
+}
+
+/// Numbers in the message of a linearization.
+pub fn linearization_numbers(d: Dimensions) -> usize {
+    (d.state() + d.constraints) * (d.state() + d.input())
+}
+
+/// Numbers in the message of a state.
+pub fn state_numbers(d: Dimensions) -> usize {
+    d.state() + d.constraints
+}
+
+/// An energy as a message.
+pub fn energy(energy: Energy) -> v1::Energy {
+    v1::Energy { kinetic_j: energy.kinetic_j, potential_j: energy.potential_j }
+}
+
+/// A linearization at `x[step]` as a message.
+pub fn linearization(step: u64, linearization: &Linearization) -> v1::Linearization {
+    v1::Linearization {
+        step,
+        a: Some(matrix(&linearization.a())),
+        b: Some(matrix(&linearization.b())),
+        multipliers_x: Some(matrix(&linearization.multipliers_x())),
+        multipliers_u: Some(matrix(&linearization.multipliers_u())),
+    }
+}
+
+/// A model as a message; `with_texts` adds the scene and the plan.
+pub fn model(name: &str, builtin: bool, model: &Model, with_texts: bool) -> v1::Model {
+    let scene = model.scene();
+    v1::Model {
+        name: name.to_owned(),
+        description: scene.description.clone(),
+        builtin,
+        coordinates: model.coordinates().iter().map(coordinate).collect(),
+        inputs: scene.inputs.iter().map(|input| input.name.clone()).collect(),
+        constraints: model.constraint_names().to_vec(),
+        operating_points: model.operating_points().iter().map(|p| p.name.clone()).collect(),
+        scene_toml: if with_texts { scene.to_toml() } else { String::new() },
+        plan: if with_texts { model.plan() } else { String::new() },
+        time_step_s: scene.time_step_s,
+    }
+}
+
+fn coordinate(coordinate: &plantd_models::Coordinate) -> v1::Coordinate {
+    let unit = if coordinate.is_angle { v1::Unit::Radian } else { v1::Unit::Metre };
+    v1::Coordinate {
+        name: coordinate.name.clone(),
+        prescribed: coordinate.kind == plantd_models::scene::CoordinateKind::Prescribed,
+        unit: unit.into(),
+        initial: coordinate.initial,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn matrix_of(rows: u32, cols: u32, data: Vec<f64>) -> v1::Matrix {
+        v1::Matrix { rows, cols, data }
+    }
+
+    #[test]
+    fn matrices_are_row_major() {
+        let m = DMatrix::from_row_slice(2, 3, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(matrix(&m), matrix_of(2, 3, vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0]));
+        let full =
+            v1::Weight { form: Some(WeightForm::Full(matrix_of(2, 2, vec![1.0, 2.0, 3.0, 4.0]))) };
+        assert_eq!(weight("q", Some(full), 2).unwrap()[(0, 1)], 2.0);
+    }
+
+    #[test]
+    fn shapes_that_lie_are_refused() {
+        for (matrix, field) in [
+            (matrix_of(u32::MAX, u32::MAX, vec![]), "u.data"),
+            (matrix_of(2, 2, vec![0.0; 3]), "u.data"),
+            (matrix_of(1, 3, vec![0.0; 3]), "u.cols"),
+            (matrix_of(1, 2, vec![0.0, f64::NAN]), "u.data[1]"),
+        ] {
+            let fault = Inputs::new("u", Some(matrix), 2).unwrap_err();
+            let status = tonic::Status::from(fault);
+            assert!(status.message().starts_with(field), "{}", status.message());
+        }
+    }
+
+    #[test]
+    fn names_and_pages() {
+        assert!(check_name("id", "a-1").is_ok());
+        for name in ["", "A", "a_b", &"a".repeat(64)] {
+            assert!(check_name("id", name).is_err(), "{name}");
+        }
+        assert_eq!(page(0, "").unwrap(), (100, ""));
+        assert_eq!(page(i32::MAX, "a").unwrap(), (1000, "a"));
+        assert!(page(-1, "").is_err());
+    }
+}

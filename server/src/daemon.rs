@@ -1,0 +1,90 @@
+//! What makes a server a well-behaved process: signals, log, ready file, service manager.
+
+use std::io::Write as _;
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use sd_notify::NotifyState;
+use tokio::signal::unix::{SignalKind, signal};
+use tracing_subscriber::EnvFilter;
+
+use crate::config::{Config, LogConfig, LogFormat};
+use crate::serve::{Addresses, run};
+
+/// Sets up logging to standard error.
+pub fn start_log(config: &LogConfig) -> Result<()> {
+    let filter = EnvFilter::try_new(&config.filter)
+        .with_context(|| format!("log filter `{}`", config.filter))?;
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match config.format {
+        LogFormat::Text => log.init(),
+        LogFormat::Json => log.json().init(),
+    }
+    Ok(())
+}
+
+/// Serves until SIGTERM or SIGINT.
+pub async fn serve(config: Config) -> Result<()> {
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let shutdown = async {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+        }
+        tracing::info!("shutting down");
+        notify(&[NotifyState::Stopping]);
+    };
+    let ready_file = config.ready_file.clone();
+    let on_ready = |addresses: &Addresses| {
+        tracing::info!(
+            grpc = addresses.grpc,
+            unix = addresses.unix,
+            metrics = addresses.metrics,
+            "serving"
+        );
+        if let Some(path) = &ready_file
+            && let Err(error) = write_ready_file(path, addresses)
+        {
+            tracing::error!(path = %path.display(), %error, "ready file not written");
+        }
+        notify(&[NotifyState::Ready]);
+    };
+    let watchdog = tokio::spawn(feed_watchdog());
+    let outcome = run(config, shutdown, on_ready).await;
+    watchdog.abort();
+    if let Some(path) = &ready_file {
+        // It says where a server is that is no longer there; nothing is lost if it stays.
+        let _ = std::fs::remove_file(path);
+    }
+    outcome
+}
+
+/// Writes the addresses beside the file and renames them into place, so that readers see all or
+/// nothing.
+fn write_ready_file(path: &Path, addresses: &Addresses) -> Result<()> {
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    let mut file = std::fs::File::create(&partial)?;
+    serde_json::to_writer(&mut file, addresses)?;
+    file.write_all(b"\n")?;
+    drop(file);
+    Ok(std::fs::rename(partial, path)?)
+}
+
+/// Tells the service manager, if there is one.
+fn notify(state: &[NotifyState<'_>]) {
+    if let Err(error) = sd_notify::notify(state) {
+        tracing::warn!(%error, "the service manager was not told");
+    }
+}
+
+/// Tells the service manager's watchdog that the runtime turns, twice in its period.
+async fn feed_watchdog() {
+    let Some(period) = sd_notify::watchdog_enabled() else { return };
+    let mut ticks = tokio::time::interval(period / 2);
+    loop {
+        ticks.tick().await;
+        notify(&[NotifyState::Watchdog]);
+    }
+}

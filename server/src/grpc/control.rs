@@ -1,0 +1,407 @@
+//! `plantd.v1.ControlService`. Everything is computed on workers, streams in portions: a slow reader
+//! holds no worker.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use futures::{StreamExt, stream};
+use nalgebra::DMatrix;
+use plantd_models::control::{self, Regulator, Sample, Tangent, Weights};
+use plantd_models::{Linearization, Model, Plant, Settings, State};
+use plantd_proto::v1;
+use tokio::sync::OwnedSemaphorePermit;
+use tonic::{Request, Response, Status};
+
+use super::Answers;
+use super::rollout;
+use crate::convert::{self, Inputs};
+use crate::hub::Hub;
+use crate::limits::LimitExceeded;
+use crate::status::Fault;
+use crate::workers::Abandoned;
+
+/// Numbers that one portion of a stream holds, about: 2 MB.
+const PORTION_NUMBERS: usize = 250_000;
+
+/// Acceleration, in m/s² or rad/s², below which a point counts as an equilibrium.
+const EQUILIBRIUM_DRIFT_MAX: f64 = 1e-4;
+
+/// The service.
+pub struct ControlService {
+    hub: Arc<Hub>,
+}
+
+impl ControlService {
+    /// The service on a hub.
+    pub fn new(hub: Arc<Hub>) -> Self {
+        Self { hub }
+    }
+}
+
+/// The model and the settings of a request.
+pub(super) fn model_and_settings(
+    hub: &Hub,
+    name: &str,
+    settings: Option<v1::PlantSettings>,
+) -> Result<(Arc<Model>, Settings), Fault> {
+    let model = hub.catalog.get(name)?.model;
+    let settings = convert::settings(settings, &model, &hub.limits)?;
+    Ok((model, settings))
+}
+
+/// Refuses matrices that no client would take.
+fn check_linearization(hub: &Hub, model: &Model) -> Result<(), Fault> {
+    let numbers = convert::linearization_numbers(model.dimensions());
+    let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
+    Ok(LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?)
+}
+
+/// The tangent space of the constraints at the plant's state, if it is to be used.
+fn tangent(plant: &mut Plant, constraints: Constraints) -> Option<Tangent> {
+    let d = plant.model().dimensions();
+    let is_needed = constraints == Constraints::Manifold && d.constraints > 0;
+    is_needed.then(|| Tangent::new(&plant.constraint_jacobian(), d.dynamic))
+}
+
+/// On which space a regulator is solved.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Constraints {
+    Manifold,
+    Full,
+}
+
+impl Constraints {
+    fn new(handling: i32) -> Result<Self, Fault> {
+        match v1::ConstraintHandling::try_from(handling) {
+            Ok(v1::ConstraintHandling::Unspecified | v1::ConstraintHandling::Manifold) => {
+                Ok(Self::Manifold)
+            }
+            Ok(v1::ConstraintHandling::Full) => Ok(Self::Full),
+            Err(_) => Err(Fault::field("constraints", format!("{handling} is no such space"))),
+        }
+    }
+}
+
+fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse, Fault> {
+    let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
+    check_linearization(hub, &model)?;
+    let (mut plant, u) = convert::point(request.point, &model, settings)?;
+    let state = convert::plant_state(&plant);
+    let mut linearization = Linearization::new(&model);
+    plant.step_and_linearize(&u, &mut linearization)?;
+    let rank = control::controllability_rank(&linearization.a(), &linearization.b());
+    Ok(v1::LinearizeResponse {
+        linearization: Some(convert::linearization(0, &linearization)),
+        next: Some(convert::plant_state(&plant)),
+        controllability_rank: u32::try_from(rank).unwrap_or(u32::MAX),
+        state: Some(state),
+        u,
+    })
+}
+
+fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResponse, Fault> {
+    let constraints = Constraints::new(request.constraints)?;
+    let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
+    check_linearization(hub, &model)?;
+    let (mut plant, u) = convert::point(request.point, &model, settings)?;
+    let weights = convert::weights(request.weights, &model)?;
+    check_equilibrium(plant.clone(), &u)?;
+    let mut linearization = Linearization::new(&model);
+    plant.linearize(&u, &mut linearization)?;
+    let (a, b) = (linearization.a(), linearization.b());
+    let Regulator { gain, value, spectral_radius, residual, iterations } =
+        match tangent(&mut plant, constraints) {
+            Some(tangent) => control::infinite_horizon_on_manifold(&a, &b, &tangent, &weights)?,
+            None => control::infinite_horizon(&a, &b, &weights)?,
+        };
+    Ok(v1::SolveLqrResponse {
+        gain: Some(v1::Gain {
+            step: 0,
+            k: Some(convert::matrix(&gain)),
+            x_reference: convert::x(&plant),
+            u_reference: u,
+        }),
+        value: Some(convert::matrix(&value)),
+        spectral_radius,
+        residual,
+        iterations,
+    })
+}
+
+/// Refuses a point that moves. Two steps: a momentum that does not belong to the point shows in the
+/// second at the latest.
+fn check_equilibrium(mut plant: Plant, u: &[f64]) -> Result<(), Fault> {
+    let time_step_s = plant.settings().time_step_s;
+    let mut q = plant.q().to_vec();
+    for _ in 0..2 {
+        plant.step(u)?;
+        let drifts = plant.q().iter().zip(&q).map(|(next, now)| (next - now).abs());
+        let worst = drifts.enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
+        let Some((index, distance)) = worst else { return Ok(()) };
+        let drift = distance / (time_step_s * time_step_s);
+        if drift > EQUILIBRIUM_DRIFT_MAX {
+            let coordinate = &plant.model().coordinates()[index].name;
+            let message = format!(
+                "the point is not an equilibrium: coordinate `{coordinate}` moves by {distance:e} \
+                 in a step of {time_step_s} s"
+            );
+            return Err(Fault::precondition("NOT_AN_EQUILIBRIUM", "point", message)
+                .with("coordinate", coordinate)
+                .with("drift", distance));
+        }
+        q.copy_from_slice(plant.q());
+    }
+    Ok(())
+}
+
+/// The linearizations of a trajectory, computed portion by portion.
+struct LinearizedTrajectory {
+    plant: Plant,
+    inputs: Inputs,
+    linearization: Linearization,
+    steps_taken: usize,
+    portion: usize,
+}
+
+impl LinearizedTrajectory {
+    fn new(hub: &Hub, request: v1::LinearizeTrajectoryRequest) -> Result<Self, Fault> {
+        let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
+        check_linearization(hub, &model)?;
+        let (plant, inputs) =
+            convert::trajectory(request.trajectory, &model, settings, &hub.limits)?;
+        let numbers = convert::linearization_numbers(model.dimensions()).max(1);
+        let portion = (PORTION_NUMBERS / numbers).max(1);
+        let linearization = Linearization::new(&model);
+        Ok(Self { plant, inputs, linearization, steps_taken: 0, portion })
+    }
+
+    /// The next portion; empty at the end. What precedes a failure comes first.
+    fn next(&mut self, abandoned: &Abandoned) -> Result<Portion, Fault> {
+        let mut portion = VecDeque::new();
+        while portion.len() < self.portion && self.steps_taken < self.inputs.count() {
+            abandoned.check()?;
+            let state = convert::plant_state(&self.plant);
+            let u = self.inputs.get(self.steps_taken);
+            if let Err(error) = self.plant.step_and_linearize(u, &mut self.linearization) {
+                let fault = Fault::from(error).with("steps_taken", self.steps_taken);
+                portion.push_back(Err(fault));
+                self.steps_taken = self.inputs.count();
+                break;
+            }
+            portion.push_back(Ok(v1::LinearizeTrajectoryResponse {
+                linearization: Some(convert::linearization(state.step, &self.linearization)),
+                state: Some(state),
+            }));
+            self.steps_taken += 1;
+        }
+        Ok(portion)
+    }
+}
+
+type Portion = VecDeque<Result<v1::LinearizeTrajectoryResponse, Fault>>;
+
+fn trajectory_stream(
+    hub: Arc<Hub>,
+    trajectory: LinearizedTrajectory,
+) -> Answers<v1::LinearizeTrajectoryResponse> {
+    let state = (Some(trajectory), VecDeque::new());
+    let portions = stream::unfold(state, move |(mut trajectory, mut ready)| {
+        let hub = Arc::clone(&hub);
+        async move {
+            if ready.is_empty() {
+                let mut source: LinearizedTrajectory = trajectory.take()?;
+                let job = move |abandoned: &Abandoned| {
+                    let portion = source.next(abandoned)?;
+                    Ok((source, portion))
+                };
+                match hub.workers.resume(job).await {
+                    Ok((source, portion)) => (trajectory, ready) = (Some(source), portion),
+                    Err(fault) => ready.push_back(Err(fault)),
+                }
+            }
+            let item = ready.pop_front()?;
+            Some((item.map_err(Status::from), (trajectory, ready)))
+        }
+    });
+    Box::pin(end_with(portions))
+}
+
+/// Ends a stream after its first error.
+fn end_with<T>(
+    items: impl stream::Stream<Item = Result<T, Status>>,
+) -> impl stream::Stream<Item = Result<T, Status>> {
+    items.scan(false, |has_failed, item| {
+        let item = if *has_failed { None } else { Some(item) };
+        *has_failed = matches!(item, Some(Err(_)));
+        futures::future::ready(item)
+    })
+}
+
+/// A solved regulator along a trajectory, delivered message by message.
+struct TrajectoryRegulator {
+    gains: std::vec::IntoIter<DMatrix<f64>>,
+    states: std::vec::IntoIter<State>,
+    inputs: Inputs,
+    next: usize,
+    /// Room in memory that the server grants.
+    _permit: OwnedSemaphorePermit,
+}
+
+impl TrajectoryRegulator {
+    fn solve(
+        hub: &Hub,
+        request: v1::SolveTrajectoryLqrRequest,
+        permit: OwnedSemaphorePermit,
+        abandoned: &Abandoned,
+    ) -> Result<Self, Fault> {
+        let constraints = Constraints::new(request.constraints)?;
+        let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
+        check_linearization(hub, &model)?;
+        let (plant, inputs) =
+            convert::trajectory(request.trajectory, &model, settings, &hub.limits)?;
+        check_memory(hub, &model, inputs.count())?;
+        let weights = convert::weights(request.weights, &model)?;
+        let path = Path::follow(plant, &inputs, constraints, abandoned)?;
+        let gains = path.solve(&weights)?;
+        Ok(Self {
+            gains: gains.into_iter(),
+            states: path.states.into_iter(),
+            inputs,
+            next: 0,
+            _permit: permit,
+        })
+    }
+}
+
+/// Refuses a trajectory whose matrices would need too much memory: A, B, the gain, and the tangent
+/// space twice.
+fn check_memory(hub: &Hub, model: &Model, steps: usize) -> Result<(), Fault> {
+    let d = model.dimensions();
+    let (nx, nu) = (d.state(), d.input());
+    let tangents = if d.constraints > 0 { 2 * nx * nx } else { 0 };
+    let numbers = (steps + 1).saturating_mul(nx * nx + 2 * nx * nu + tangents);
+    let (name, limit) = ("trajectory_numbers", hub.limits.trajectory_numbers);
+    Ok(LimitExceeded::check(name, limit, "numbers in the trajectory's matrices", numbers)?)
+}
+
+/// A reference motion with its linearizations.
+struct Path {
+    states: Vec<State>,
+    samples: Vec<Sample>,
+    tangents: Vec<Tangent>,
+}
+
+impl Path {
+    fn follow(
+        mut plant: Plant,
+        inputs: &Inputs,
+        constraints: Constraints,
+        abandoned: &Abandoned,
+    ) -> Result<Self, Fault> {
+        let mut linearization = Linearization::new(plant.model());
+        let mut path = Self { states: Vec::new(), samples: Vec::new(), tangents: Vec::new() };
+        for k in 0..inputs.count() {
+            abandoned.check()?;
+            path.note_state(&mut plant, constraints);
+            plant
+                .step_and_linearize(inputs.get(k), &mut linearization)
+                .map_err(|error| Fault::from(error).with("steps_taken", k))?;
+            path.samples.push(Sample { a: linearization.a(), b: linearization.b() });
+        }
+        path.note_state(&mut plant, constraints);
+        Ok(path)
+    }
+
+    fn note_state(&mut self, plant: &mut Plant, constraints: Constraints) {
+        self.states.push(plant.state());
+        self.tangents.extend(tangent(plant, constraints));
+    }
+
+    fn solve(&self, weights: &Weights) -> Result<Vec<DMatrix<f64>>, Fault> {
+        let solution = if self.tangents.is_empty() {
+            control::finite_horizon(&self.samples, weights)?
+        } else {
+            control::finite_horizon_on_manifold(&self.samples, &self.tangents, weights)?
+        };
+        Ok(solution.gains)
+    }
+}
+
+impl Iterator for TrajectoryRegulator {
+    type Item = v1::SolveTrajectoryLqrResponse;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let state = self.states.next()?;
+        let k = self.next;
+        self.next += 1;
+        let u = if k < self.inputs.count() { self.inputs.get(k).to_vec() } else { Vec::new() };
+        let gain = v1::Gain {
+            step: k as u64,
+            k: self.gains.next().map(|gain| convert::matrix(&gain)),
+            x_reference: state.x(),
+            u_reference: u,
+        };
+        Some(v1::SolveTrajectoryLqrResponse { gain: Some(gain) })
+    }
+}
+
+#[tonic::async_trait]
+impl v1::control_service_server::ControlService for ControlService {
+    type LinearizeTrajectoryStream = Answers<v1::LinearizeTrajectoryResponse>;
+    type SolveTrajectoryLqrStream = Answers<v1::SolveTrajectoryLqrResponse>;
+    type RolloutStream = Answers<v1::RolloutResponse>;
+
+    async fn linearize(
+        &self,
+        request: Request<v1::LinearizeRequest>,
+    ) -> Result<Response<v1::LinearizeResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| linearize(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn linearize_trajectory(
+        &self,
+        request: Request<v1::LinearizeTrajectoryRequest>,
+    ) -> Result<Response<Self::LinearizeTrajectoryStream>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| LinearizedTrajectory::new(&hub, request);
+        let trajectory = self.hub.workers.run(job).await?;
+        let answers = trajectory_stream(Arc::clone(&self.hub), trajectory);
+        Ok(Response::new(self.hub.until_ending(answers)))
+    }
+
+    async fn solve_lqr(
+        &self,
+        request: Request<v1::SolveLqrRequest>,
+    ) -> Result<Response<v1::SolveLqrResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| solve_lqr(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn solve_trajectory_lqr(
+        &self,
+        request: Request<v1::SolveTrajectoryLqrRequest>,
+    ) -> Result<Response<Self::SolveTrajectoryLqrStream>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let permit = hub.trajectory_permit()?;
+        let job = move |abandoned: &Abandoned| {
+            TrajectoryRegulator::solve(&hub, request, permit, abandoned)
+        };
+        let solution = self.hub.workers.run(job).await?;
+        let answers = Box::pin(stream::iter(solution.map(Ok)));
+        Ok(Response::new(self.hub.until_ending(answers)))
+    }
+
+    async fn rollout(
+        &self,
+        request: Request<v1::RolloutRequest>,
+    ) -> Result<Response<Self::RolloutStream>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| rollout::Rollout::new(&hub, request);
+        let rollout = self.hub.workers.run(job).await?;
+        let answers = rollout.run(self.hub.workers.clone());
+        Ok(Response::new(self.hub.until_ending(answers)))
+    }
+}

@@ -1,0 +1,42 @@
+//! The services of `plantd.v1`, one file each. They check requests and translate; what they do is
+//! done by sessions, the catalog and the workers.
+
+pub mod control;
+pub mod drive;
+pub mod model;
+pub mod observe;
+pub mod plant;
+mod rollout;
+pub mod watch;
+
+use std::pin::Pin;
+use std::time::Duration;
+
+use futures::Stream;
+use tonic::Status;
+
+/// A stream of answers.
+pub type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// Bytes of plants or models in one page of a list, at most: half of what clients take by default.
+const PAGE_BYTES_MAX: usize = 2 << 20;
+
+/// Cuts a page where it becomes too long for one message; true when something was cut off. At least
+/// one entry stays.
+fn cut_page<M: prost::Message>(entries: &mut Vec<M>) -> bool {
+    let mut bytes = 0;
+    let fits = entries
+        .iter()
+        .take_while(|entry| {
+            bytes += entry.encoded_len();
+            bytes <= PAGE_BYTES_MAX
+        })
+        .count();
+    let is_cut = fits < entries.len();
+    entries.truncate(fits.max(1));
+    is_cut
+}
+
+/// How often the server asks a silent client whether it is alive, and how long it may take to say so.
+pub(crate) const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(10);
+pub(crate) const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(5);

@@ -1,0 +1,275 @@
+//! `plantd.v1.PlantService`.
+
+use std::sync::Arc;
+
+use plantd_models::{Initial, Snapshot};
+use plantd_proto::v1;
+use tonic::{Request, Response, Status, Streaming};
+
+use super::drive::DriveStream;
+use super::{Answers, cut_page, watch};
+use crate::convert::{self, Inputs, Start};
+use crate::hub::Hub;
+use crate::limits::LimitExceeded;
+use crate::session::{DriverKind, Lease, Session};
+use crate::status::Fault;
+use crate::workers::Abandoned;
+
+/// Steps times coordinates up to which a Step call runs at once instead of on a worker: less work
+/// than the way to a worker and back is long for others to wait.
+const INLINE_WORK_MAX: usize = 256;
+
+/// The service.
+pub struct PlantService {
+    hub: Arc<Hub>,
+}
+
+impl PlantService {
+    /// The service on a hub.
+    pub fn new(hub: Arc<Hub>) -> Self {
+        Self { hub }
+    }
+
+    async fn create(&self, request: v1::CreatePlantRequest) -> Result<Arc<Session>, Fault> {
+        let v1::CreatePlantRequest { id, model, settings, initial, open_link } = request;
+        if !id.is_empty() {
+            convert::check_name("id", &id)?;
+        }
+        self.hub.check_new_plant(&id)?;
+        let hub = Arc::clone(&self.hub);
+        let job = move |_: &_| {
+            let entry = hub.catalog.get(&model)?;
+            let settings = convert::settings(settings, &entry.model, &hub.limits)?;
+            let start = convert::start(initial, &entry.model)?;
+            let plant = convert::plant(&entry.model, settings, &start, "initial")?;
+            hub.insert(id, entry.name, plant)
+        };
+        let session = self.hub.workers.run(job).await?;
+        if open_link && let Err(fault) = self.hub.open_link(Arc::clone(&session)).await {
+            self.hub.delete(session.id()).await?;
+            return Err(fault);
+        }
+        tracing::info!(plant = session.id(), model = session.model_name(), "plant created");
+        Ok(session)
+    }
+
+    async fn step(&self, request: v1::StepRequest) -> Result<v1::StepResponse, Fault> {
+        let session = self.hub.session(&request.id)?;
+        let dimensions = session.model().dimensions();
+        let inputs = Inputs::new("u", request.u, dimensions.input())?;
+        let plan = StepPlan {
+            steps: inputs.count().saturating_add(request.hold as usize),
+            inputs,
+            all_states: request.all_states,
+        };
+        if plan.steps == 0 {
+            return Err(Fault::field("u", "and `hold` are both empty: no step is asked for"));
+        }
+        let limits = &self.hub.limits;
+        LimitExceeded::check("steps_per_call", limits.steps_per_call, "steps", plan.steps)?;
+        if plan.all_states {
+            let numbers = plan.steps.saturating_mul(convert::state_numbers(dimensions));
+            let (name, limit) = ("reply_numbers", limits.reply_numbers);
+            LimitExceeded::check(name, limit, "numbers in all states", numbers)?;
+        }
+        let mut lease = session.acquire(DriverKind::Step)?;
+        if plan.steps.saturating_mul(dimensions.coordinates()) <= INLINE_WORK_MAX {
+            return plan.run(&mut lease, None);
+        }
+        let job = move |abandoned: &Abandoned| plan.run(&mut lease, Some(abandoned));
+        self.hub.workers.run(job).await
+    }
+
+    /// Puts a plant into another state under a lease of its own.
+    async fn put(
+        &self,
+        id: &str,
+        change: impl FnOnce(&mut Lease) -> Result<(), Fault> + Send + 'static,
+    ) -> Result<v1::State, Fault> {
+        let mut lease = self.hub.session(id)?.acquire(DriverKind::Step)?;
+        let job = move |_: &_| {
+            change(&mut lease)?;
+            Ok(lease.with_plant(convert::plant_state))
+        };
+        self.hub.workers.run(job).await
+    }
+}
+
+/// The steps of one Step call.
+struct StepPlan {
+    inputs: Inputs,
+    steps: usize,
+    all_states: bool,
+}
+
+impl StepPlan {
+    fn run(
+        &self,
+        lease: &mut Lease,
+        abandoned: Option<&Abandoned>,
+    ) -> Result<v1::StepResponse, Fault> {
+        let held = match self.inputs.last() {
+            Some(last) => last.to_vec(),
+            None => lease.with_plant(convert::hold_input),
+        };
+        let mut states = Vec::with_capacity(if self.all_states { self.steps } else { 1 });
+        let mut report = None;
+        for k in 0..self.steps {
+            if let Some(abandoned) = abandoned {
+                abandoned.check()?;
+            }
+            let u = if k < self.inputs.count() { self.inputs.get(k) } else { &held };
+            let taken = lease.step(u).map_err(|error| {
+                let session = lease.session();
+                Fault::from_drive(error, session.id()).with("steps_taken", k)
+            })?;
+            report = Some(convert::report(&taken));
+            if self.all_states {
+                states.push(lease.with_plant(convert::plant_state));
+            }
+        }
+        if !self.all_states {
+            states.push(lease.with_plant(convert::plant_state));
+        }
+        Ok(v1::StepResponse { states, report })
+    }
+}
+
+/// A plant as a message.
+pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
+    let settings = session.settings();
+    v1::PlantInfo {
+        id: session.id().to_owned(),
+        model: session.model_name().to_owned(),
+        settings: Some(convert::settings_message(settings)),
+        state: Some(convert::state(&session.state(), settings.time_step_s)),
+        driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
+        link_open: session.link_open(),
+    }
+}
+
+#[tonic::async_trait]
+impl v1::plant_service_server::PlantService for PlantService {
+    type DriveStream = DriveStream;
+    type WatchStream = Answers<v1::WatchResponse>;
+
+    async fn create_plant(
+        &self,
+        request: Request<v1::CreatePlantRequest>,
+    ) -> Result<Response<v1::CreatePlantResponse>, Status> {
+        let session = self.create(request.into_inner()).await?;
+        Ok(Response::new(v1::CreatePlantResponse { plant: Some(plant_info(&session)) }))
+    }
+
+    async fn get_plant(
+        &self,
+        request: Request<v1::GetPlantRequest>,
+    ) -> Result<Response<v1::GetPlantResponse>, Status> {
+        let session = self.hub.session(&request.into_inner().id)?;
+        let plant = plant_info(&session);
+        let energy = self.hub.workers.run(move |_| Ok(session.copy_plant().energy())).await?;
+        let energy = Some(convert::energy(energy));
+        Ok(Response::new(v1::GetPlantResponse { plant: Some(plant), energy }))
+    }
+
+    async fn list_plants(
+        &self,
+        request: Request<v1::ListPlantsRequest>,
+    ) -> Result<Response<v1::ListPlantsResponse>, Status> {
+        let request = request.into_inner();
+        let (size, after) = convert::page(request.page_size, &request.page_token)?;
+        let (sessions, has_more) = self.hub.page(after, size);
+        let mut plants: Vec<_> = sessions.iter().map(|session| plant_info(session)).collect();
+        let has_more = cut_page(&mut plants) || has_more;
+        let last = plants.last().filter(|_| has_more);
+        let next_page_token = last.map(|plant| plant.id.clone()).unwrap_or_default();
+        Ok(Response::new(v1::ListPlantsResponse { plants, next_page_token }))
+    }
+
+    async fn delete_plant(
+        &self,
+        request: Request<v1::DeletePlantRequest>,
+    ) -> Result<Response<v1::DeletePlantResponse>, Status> {
+        let id = request.into_inner().id;
+        self.hub.delete(&id).await?;
+        tracing::info!(plant = id, "plant deleted");
+        Ok(Response::new(v1::DeletePlantResponse {}))
+    }
+
+    async fn step(
+        &self,
+        request: Request<v1::StepRequest>,
+    ) -> Result<Response<v1::StepResponse>, Status> {
+        Ok(Response::new(self.step(request.into_inner()).await?))
+    }
+
+    async fn drive(
+        &self,
+        request: Request<Streaming<v1::DriveRequest>>,
+    ) -> Result<Response<Self::DriveStream>, Status> {
+        Ok(Response::new(DriveStream::new(Arc::clone(&self.hub), request.into_inner())))
+    }
+
+    async fn watch(
+        &self,
+        request: Request<v1::WatchRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
+        Ok(Response::new(watch::stream(&self.hub, request.into_inner())?))
+    }
+
+    async fn reset(
+        &self,
+        request: Request<v1::ResetRequest>,
+    ) -> Result<Response<v1::ResetResponse>, Status> {
+        let v1::ResetRequest { id, initial } = request.into_inner();
+        let model = Arc::clone(self.hub.session(&id)?.model());
+        let change = move |lease: &mut Lease| match initial {
+            None => Ok(lease.reset()?),
+            Some(initial) => match convert::start(Some(initial), &model)? {
+                Start::Snapshot(snapshot) => Ok(lease.restore(&snapshot)?),
+                Start::Initial(initial) => initialize(lease, &initial),
+            },
+        };
+        let state = Some(self.put(&id, change).await?);
+        Ok(Response::new(v1::ResetResponse { state }))
+    }
+
+    async fn snapshot(
+        &self,
+        request: Request<v1::SnapshotRequest>,
+    ) -> Result<Response<v1::SnapshotResponse>, Status> {
+        let session = self.hub.session(&request.into_inner().id)?;
+        let snapshot = session.snapshot().to_bytes();
+        Ok(Response::new(v1::SnapshotResponse { snapshot }))
+    }
+
+    async fn restore(
+        &self,
+        request: Request<v1::RestoreRequest>,
+    ) -> Result<Response<v1::RestoreResponse>, Status> {
+        let v1::RestoreRequest { id, snapshot } = request.into_inner();
+        let change = move |lease: &mut Lease| {
+            let snapshot = Snapshot::from_bytes(&snapshot)?;
+            Ok(lease.restore(&snapshot)?)
+        };
+        let state = Some(self.put(&id, change).await?);
+        Ok(Response::new(v1::RestoreResponse { state }))
+    }
+
+    async fn open_link(
+        &self,
+        request: Request<v1::OpenLinkRequest>,
+    ) -> Result<Response<v1::OpenLinkResponse>, Status> {
+        let session = self.hub.session(&request.into_inner().id)?;
+        let info = self.hub.open_link(session).await?;
+        Ok(Response::new(v1::OpenLinkResponse {
+            service: info.service,
+            root_path: info.root.to_string_lossy().into_owned(),
+            layout_version: info.layout_version,
+        }))
+    }
+}
+
+fn initialize(lease: &mut Lease, initial: &Initial) -> Result<(), Fault> {
+    lease.initialize(initial).map_err(|error| Fault::from_initial(error, "initial"))
+}

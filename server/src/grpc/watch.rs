@@ -1,0 +1,261 @@
+//! The stream of `PlantService.Watch`.
+//!
+//! The stream asks for the next frame when the transport has taken the last message, so a slow reader
+//! loses frames at the plant, where they are counted, and never holds more than one. Energies,
+//! linearizations and gains are computed on a worker, from a plant of the watcher's own.
+
+use std::collections::HashSet;
+use std::sync::Arc;
+
+use futures::stream;
+use plantd_models::control::{self, Tangent, Weights};
+use plantd_models::{Initial, Linearization, Plant, StepError};
+use plantd_proto::v1;
+use tonic::Status;
+use v1::WatchField;
+
+use super::Answers;
+use crate::convert;
+use crate::hub::Hub;
+use crate::limits::LimitExceeded;
+use crate::session::Session;
+use crate::status::Fault;
+use crate::watch::{Frame, Subscription};
+
+/// What a watcher has asked for.
+#[derive(Clone, Copy, Debug, Default)]
+struct Wanted {
+    state: bool,
+    report: bool,
+    energy: bool,
+    linearization: bool,
+    gain: bool,
+}
+
+impl Wanted {
+    fn new(fields: &[i32]) -> Result<Self, Fault> {
+        let mut wanted = Self::default();
+        for (index, field) in fields.iter().enumerate() {
+            match WatchField::try_from(*field) {
+                Ok(WatchField::State) => wanted.state = true,
+                Ok(WatchField::Report) => wanted.report = true,
+                Ok(WatchField::Energy) => wanted.energy = true,
+                Ok(WatchField::Linearization) => wanted.linearization = true,
+                Ok(WatchField::Gain) => wanted.gain = true,
+                Ok(WatchField::Unspecified) | Err(_) => {
+                    let problem = format!("{field} is nothing to watch");
+                    return Err(Fault::field(format!("fields[{index}]"), problem));
+                }
+            }
+        }
+        if fields.is_empty() {
+            return Err(Fault::field("fields", "are missing: at least one is needed"));
+        }
+        Ok(wanted)
+    }
+
+    fn needs_analysis(self) -> bool {
+        self.energy || self.linearization || self.gain
+    }
+}
+
+/// Opens the stream.
+pub(super) fn stream(
+    hub: &Arc<Hub>,
+    request: v1::WatchRequest,
+) -> Result<Answers<v1::WatchResponse>, Fault> {
+    let session = hub.session(&request.id)?;
+    let wanted = Wanted::new(&request.fields)?;
+    let mask = Mask::new(&request.coordinates, &session)?;
+    if wanted.linearization || wanted.gain {
+        let numbers = convert::linearization_numbers(session.model().dimensions());
+        let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
+        LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?;
+    }
+    let weights = match wanted.gain {
+        true => Some(Arc::new(convert::weights(request.weights, session.model())?)),
+        false => None,
+    };
+    let every = u64::from(request.every.max(1));
+    let watcher = Watcher {
+        subscription: session.subscribe(every, hub.limits.watchers_per_plant)?,
+        hub: Arc::clone(hub),
+        wanted,
+        mask,
+        weights,
+        analysis: None,
+    };
+    // After an error the state is gone, and with it the stream.
+    Ok(Box::pin(stream::unfold(Some(watcher), |watcher| async {
+        let mut watcher = watcher?;
+        match watcher.next().await {
+            Ok(response) => Some((Ok(response), Some(watcher))),
+            Err(fault) => Some((Err(Status::from(fault)), None)),
+        }
+    })))
+}
+
+struct Watcher {
+    hub: Arc<Hub>,
+    subscription: Subscription,
+    wanted: Wanted,
+    mask: Option<Mask>,
+    weights: Option<Arc<Weights>>,
+    analysis: Option<Box<Analysis>>,
+}
+
+impl Watcher {
+    async fn next(&mut self) -> Result<v1::WatchResponse, Fault> {
+        let session = Arc::clone(self.subscription.session());
+        let (frame, dropped) = tokio::select! {
+            biased;
+            () = self.hub.ending.cancelled() => return Err(Fault::shutting_down()),
+            () = session.closed() => return Err(Fault::plant_deleted(session.id())),
+            next = self.subscription.next() => next,
+        };
+        let mut response =
+            v1::WatchResponse { dropped, step: frame.state.step, ..Default::default() };
+        if self.wanted.report {
+            response.report = Some(convert::report(&frame.report));
+        }
+        if self.wanted.state {
+            let mut state = convert::state(&frame.state, session.settings().time_step_s);
+            if let Some(mask) = &self.mask {
+                mask.apply(&mut state);
+            }
+            response.state = Some(state);
+        }
+        if !self.wanted.needs_analysis() {
+            return Ok(response);
+        }
+        let (frame, wanted) = (frame.clone(), self.wanted);
+        let (analysis, weights) = (self.analysis.take(), self.weights.clone());
+        let job = move |_: &_| {
+            let mut analysis = match analysis {
+                Some(analysis) => analysis,
+                None => Box::new(Analysis::new(&session)),
+            };
+            analysis.fill(&mut response, &frame, wanted, weights.as_deref());
+            Ok((analysis, response))
+        };
+        let (analysis, response) = self.hub.workers.resume(job).await?;
+        self.analysis = Some(analysis);
+        Ok(response)
+    }
+}
+
+/// A watcher's own plant, on which it computes.
+struct Analysis {
+    plant: Plant,
+    linearization: Linearization,
+}
+
+impl Analysis {
+    fn new(session: &Session) -> Self {
+        Self { plant: session.copy_plant(), linearization: Linearization::new(session.model()) }
+    }
+
+    /// Computes what is wanted; what fails is reported in the message.
+    fn fill(
+        &mut self,
+        response: &mut v1::WatchResponse,
+        frame: &Frame,
+        wanted: Wanted,
+        weights: Option<&Weights>,
+    ) {
+        if let Err(fault) = self.try_fill(response, frame, wanted, weights) {
+            response.failure = Some(fault.into());
+        }
+    }
+
+    fn try_fill(
+        &mut self,
+        response: &mut v1::WatchResponse,
+        frame: &Frame,
+        wanted: Wanted,
+        weights: Option<&Weights>,
+    ) -> Result<(), Fault> {
+        let state = &frame.state;
+        let momentum =
+            Initial::Momentum { q: state.q.clone(), p: state.p.clone(), v: state.v.clone() };
+        self.plant.initialize(&momentum).map_err(|error| Fault::from_initial(error, "state"))?;
+        if wanted.energy {
+            response.energy = Some(convert::energy(self.plant.energy()));
+        }
+        if wanted.linearization || wanted.gain {
+            self.linearize(&frame.input)?;
+        }
+        if wanted.linearization {
+            response.linearization = Some(convert::linearization(state.step, &self.linearization));
+        }
+        if let Some(weights) = weights {
+            let k = self.gain(weights)?;
+            response.gain = Some(v1::Gain {
+                step: state.step,
+                k: Some(k),
+                x_reference: state.x(),
+                u_reference: frame.input.clone(),
+            });
+        }
+        Ok(())
+    }
+
+    fn linearize(&mut self, input: &[f64]) -> Result<(), StepError> {
+        self.plant.linearize(input, &mut self.linearization)?;
+        Ok(())
+    }
+
+    fn gain(&mut self, weights: &Weights) -> Result<v1::Matrix, Fault> {
+        let (a, b) = (self.linearization.a(), self.linearization.b());
+        let d = self.plant.model().dimensions();
+        let regulator = if d.constraints == 0 {
+            control::infinite_horizon(&a, &b, weights)?
+        } else {
+            let tangent = Tangent::new(&self.plant.constraint_jacobian(), d.dynamic);
+            control::infinite_horizon_on_manifold(&a, &b, &tangent, weights)?
+        };
+        Ok(convert::matrix(&regulator.gain))
+    }
+}
+
+/// The coordinates that a watcher wants, as indices into `q`, `p` and `v`.
+struct Mask {
+    q: Vec<usize>,
+    p: Vec<usize>,
+    v: Vec<usize>,
+}
+
+impl Mask {
+    /// None means all.
+    fn new(names: &[String], session: &Session) -> Result<Option<Self>, Fault> {
+        if names.is_empty() {
+            return Ok(None);
+        }
+        let model = session.model();
+        for (index, name) in names.iter().enumerate() {
+            if model.coordinate_index(name).is_none() {
+                let problem = format!("there is no coordinate `{name}`");
+                return Err(Fault::field(format!("coordinates[{index}]"), problem));
+            }
+        }
+        let names: HashSet<&str> = names.iter().map(String::as_str).collect();
+        let coordinates = model.coordinates().iter().enumerate();
+        let q: Vec<usize> = coordinates
+            .filter(|(_, coordinate)| names.contains(coordinate.name.as_str()))
+            .map(|(index, _)| index)
+            .collect();
+        let dynamic = model.dimensions().dynamic;
+        let (p, v) = q.iter().partition::<Vec<usize>, _>(|index| **index < dynamic);
+        let v = v.into_iter().map(|index| index - dynamic).collect();
+        Ok(Some(Self { q, p, v }))
+    }
+
+    fn apply(&self, state: &mut v1::State) {
+        fn pick(vector: &mut Vec<f64>, indices: &[usize]) {
+            *vector = indices.iter().map(|index| vector[*index]).collect();
+        }
+        pick(&mut state.q, &self.q);
+        pick(&mut state.p, &self.p);
+        pick(&mut state.v, &self.v);
+    }
+}

@@ -1,0 +1,190 @@
+//! What the services share: models, plants, workers, limits, metrics and the shared-memory links.
+
+use std::collections::BTreeMap;
+use std::collections::hash_map::RandomState;
+use std::hash::{BuildHasher, Hasher};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use futures::{StreamExt, future, stream};
+use plantd_models::Plant;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio_util::sync::CancellationToken;
+use tonic::Code;
+
+use crate::catalog::Catalog;
+use crate::grpc::Answers;
+use crate::limits::{LimitExceeded, Limits};
+use crate::link::{LinkError, LinkHost, LinkInfo};
+use crate::metrics::Metrics;
+use crate::session::Session;
+use crate::status::Fault;
+use crate::workers::Workers;
+
+/// Everything that belongs to one server.
+pub struct Hub {
+    /// Limits in force.
+    pub limits: Limits,
+    /// Metrics.
+    pub metrics: Arc<Metrics>,
+    /// Workers for long computations.
+    pub workers: Workers,
+    /// Models.
+    pub catalog: Catalog,
+    /// Permits to hold a trajectory regulator in memory.
+    pub trajectory_solves: Arc<Semaphore>,
+    /// Cancelled when the server begins to shut down: streams end.
+    pub ending: CancellationToken,
+    links: Option<Arc<LinkHost>>,
+    plants: Mutex<BTreeMap<String, Arc<Session>>>,
+}
+
+impl Hub {
+    /// A hub without plants.
+    pub fn new(limits: Limits, worker_count: usize, links: Option<LinkHost>) -> Self {
+        let metrics = Arc::new(Metrics::default());
+        Self {
+            workers: Workers::new(worker_count, limits.queued_jobs),
+            catalog: Catalog::new(limits.models, Arc::clone(&metrics)),
+            trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
+            ending: CancellationToken::new(),
+            links: links.map(Arc::new),
+            plants: Mutex::default(),
+            limits,
+            metrics,
+        }
+    }
+
+    /// The plant of that id.
+    pub fn session(&self, id: &str) -> Result<Arc<Session>, Fault> {
+        match self.plants().get(id) {
+            Some(session) if !session.is_closed() => Ok(Arc::clone(session)),
+            _ => Err(Fault::plant_not_found(id)),
+        }
+    }
+
+    /// Refuses a new plant that would not be kept, before work is done for it.
+    pub fn check_new_plant(&self, id: &str) -> Result<(), Fault> {
+        self.admit(&self.plants(), id)
+    }
+
+    fn admit(&self, plants: &BTreeMap<String, Arc<Session>>, id: &str) -> Result<(), Fault> {
+        if plants.contains_key(id) {
+            return Err(Fault::plant_exists(id));
+        }
+        Ok(LimitExceeded::check("plants", self.limits.plants, "plants", plants.len() + 1)?)
+    }
+
+    /// Keeps a plant under an id; an empty one means that the server chooses.
+    pub fn insert(
+        &self,
+        id: String,
+        model_name: String,
+        plant: Plant,
+    ) -> Result<Arc<Session>, Fault> {
+        let mut plants = self.plants();
+        let id = if id.is_empty() { free_id(&plants) } else { id };
+        self.admit(&plants, &id)?;
+        let session = Session::new(id.clone(), model_name, plant, Arc::clone(&self.metrics));
+        plants.insert(id, Arc::clone(&session));
+        self.metrics.set_plants(plants.len());
+        Ok(session)
+    }
+
+    /// Ends a plant. Its id is free again when everything that belonged to it is gone.
+    pub async fn delete(self: &Arc<Self>, id: &str) -> Result<(), Fault> {
+        let session = self.session(id)?;
+        if !session.close() {
+            return Err(Fault::plant_not_found(id));
+        }
+        let hub = Arc::clone(self);
+        // In a task of its own, so that it is finished even if the caller goes away.
+        let end = tokio::task::spawn_blocking(move || {
+            if let Some(links) = &hub.links {
+                links.close(session.id());
+            }
+            let mut plants = hub.plants();
+            plants.remove(session.id());
+            hub.metrics.set_plants(plants.len());
+        });
+        end.await.map_err(|error| Fault::internal(error.to_string()))
+    }
+
+    /// Up to `size` plants after the one with id `after`, and whether there are more.
+    pub fn page(&self, after: &str, size: usize) -> (Vec<Arc<Session>>, bool) {
+        let plants = self.plants();
+        let mut rest = plants
+            .iter()
+            .filter(|(id, session)| id.as_str() > after && !session.is_closed())
+            .map(|(_, session)| Arc::clone(session));
+        let page = rest.by_ref().take(size).collect();
+        let has_more = rest.next().is_some();
+        (page, has_more)
+    }
+
+    /// Opens the shared-memory link of a plant.
+    pub async fn open_link(&self, session: Arc<Session>) -> Result<LinkInfo, Fault> {
+        let Some(links) = self.links.clone() else {
+            return Err(Fault::precondition(
+                "LINK_DISABLED",
+                "server",
+                "this server runs without shared-memory links",
+            ));
+        };
+        let id = session.id().to_owned();
+        let opened = tokio::task::spawn_blocking(move || links.open(session))
+            .await
+            .map_err(|error| Fault::internal(error.to_string()))?;
+        opened.map_err(|error| match error {
+            LinkError::Closing { .. } => Fault::plant_deleted(&id),
+            LinkError::Domain(_) | LinkError::Thread(_) | LinkError::Failed { .. } => {
+                Fault::new(Code::Unavailable, "LINK_FAILED", error.to_string())
+            }
+        })
+    }
+
+    /// Room in memory for one more trajectory regulator.
+    pub fn trajectory_permit(&self) -> Result<OwnedSemaphorePermit, Fault> {
+        let (name, limit) = ("trajectory_solves", self.limits.trajectory_solves);
+        let (what, actual) = ("trajectory regulators at a time", limit + 1);
+        Arc::clone(&self.trajectory_solves)
+            .try_acquire_owned()
+            .map_err(|_| LimitExceeded { name, limit, what, actual }.into())
+    }
+
+    /// A stream that ends, unfinished, when the server begins to shut down.
+    pub fn until_ending<T: Send + 'static>(&self, answers: Answers<T>) -> Answers<T> {
+        let ending = self.ending.clone().cancelled_owned();
+        let farewell = stream::once(async { Err(Fault::shutting_down().into()) });
+        // `Some(None)` marks the end that came by itself.
+        let ended_by_itself = answers.map(Some).chain(stream::once(async { None }));
+        let interruptible = ended_by_itself.take_until(ending).chain(farewell.map(Some));
+        Box::pin(
+            interruptible
+                .take_while(|item| future::ready(item.is_some()))
+                .filter_map(future::ready),
+        )
+    }
+
+    /// Ends all streams, plants and links. Blocks for a fraction of a second.
+    pub fn shut_down(&self) {
+        self.ending.cancel();
+        if let Some(links) = &self.links {
+            links.shutdown();
+        }
+    }
+
+    fn plants(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Session>>> {
+        self.plants.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// An id that no plant has. Random, so that ids differ between runs of a server.
+fn free_id(plants: &BTreeMap<String, Arc<Session>>) -> String {
+    loop {
+        let random = RandomState::new().build_hasher().finish();
+        let id = format!("plant-{:08x}", random as u32);
+        if !plants.contains_key(&id) {
+            return id;
+        }
+    }
+}

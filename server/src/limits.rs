@@ -1,0 +1,193 @@
+//! The limits that the server enforces, in one table.
+//!
+//! A request beyond a limit is refused with RESOURCE_EXHAUSTED, reason `LIMIT_EXCEEDED`, and the
+//! limit's name in the error's details. `plantd limits` prints the table with the values in force.
+
+use serde::{Deserialize, Serialize};
+
+macro_rules! limits {
+    ($($(#[doc = $doc:literal])+ $name:ident = $default:literal in $low:literal ..= $high:literal;)+) => {
+        /// The limits. Each can be set in the configuration's `[limits]` table, and by
+        /// `--limit NAME=VALUE`.
+        #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct Limits {
+            $($(#[doc = $doc])+ pub $name: u64,)+
+        }
+
+        impl Default for Limits {
+            fn default() -> Self {
+                Self { $($name: $default,)+ }
+            }
+        }
+
+        impl Limits {
+            /// All limits with their values and meanings, in order.
+            pub fn table(&self) -> Vec<Limit> {
+                vec![$(Limit {
+                    name: stringify!($name),
+                    value: self.$name,
+                    low: $low,
+                    high: $high,
+                    meaning: concat!($($doc,)+).trim(),
+                },)+]
+            }
+
+            /// Sets a limit by name.
+            pub fn set(&mut self, name: &str, value: u64) -> Result<(), LimitError> {
+                match name {
+                    $(stringify!($name) => self.$name = value,)+
+                    _ => return Err(LimitError::Unknown { name: name.to_owned() }),
+                }
+                self.check()
+            }
+        }
+    };
+}
+
+limits! {
+    /// Connections at a time; more wait to be accepted.
+    connections = 1024 in 1..=1_000_000;
+    /// Streams and calls at a time on one connection; more wait in the client.
+    streams_per_connection = 256 in 1..=1_000_000;
+    /// Bytes of one message to the server.
+    message_bytes = 16_777_216 in 4096..=1_073_741_824;
+    /// Bytes of a scene.
+    scene_bytes = 4_194_304 in 64..=1_073_741_824;
+    /// Frames, springs, inputs, constraints, coordinate settings or operating points of a scene, each.
+    scene_items = 4096 in 1..=1_000_000;
+    /// Coordinates of a model.
+    coordinates = 1024 in 1..=65_536;
+    /// Uploaded models.
+    models = 256 in 0..=1_000_000;
+    /// Plants.
+    plants = 1024 in 0..=1_000_000;
+    /// Watch streams of one plant.
+    watchers_per_plant = 64 in 0..=1_000_000;
+    /// Newton iterations that a plant may ask for.
+    max_iterations = 1000 in 1..=1_000_000;
+    /// Steps of one Step call.
+    steps_per_call = 100_000 in 1..=1_000_000_000;
+    /// Steps of a trajectory, or of one rollout case.
+    horizon = 100_000 in 1..=1_000_000_000;
+    /// Cases of one Rollout call.
+    rollout_cases = 10_000 in 1..=1_000_000;
+    /// Numbers in one answer; 400 000 of them fit the 4 MiB that gRPC clients take by default.
+    reply_numbers = 400_000 in 1000..=100_000_000;
+    /// Numbers held for one trajectory regulator (8 bytes each).
+    trajectory_numbers = 32_000_000 in 1000..=10_000_000_000;
+    /// Trajectory regulators that may be held at a time.
+    trajectory_solves = 4 in 1..=1000;
+    /// Heavy computations that may wait for a worker.
+    queued_jobs = 256 in 1..=1_000_000;
+}
+
+/// One row of the table of limits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limit {
+    /// Name in the configuration.
+    pub name: &'static str,
+    /// Value in force.
+    pub value: u64,
+    /// Smallest value that can be set.
+    pub low: u64,
+    /// Largest value that can be set.
+    pub high: u64,
+    /// What it limits.
+    pub meaning: &'static str,
+}
+
+/// Why a limit could not be set.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum LimitError {
+    /// There is no limit of that name.
+    #[error("there is no limit `{name}`; `plantd limits` lists them")]
+    Unknown {
+        /// The name.
+        name: String,
+    },
+    /// The value is out of range.
+    #[error("limit `{name}` is {value}; it must lie between {low} and {high}")]
+    OutOfRange {
+        /// Name of the limit.
+        name: &'static str,
+        /// The value.
+        value: u64,
+        /// Smallest value allowed.
+        low: u64,
+        /// Largest value allowed.
+        high: u64,
+    },
+}
+
+/// A request went beyond a limit.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{actual} {what}; limit `{name}` is {limit}")]
+pub struct LimitExceeded {
+    /// Name of the limit.
+    pub name: &'static str,
+    /// Its value.
+    pub limit: u64,
+    /// What was counted, for example `steps`.
+    pub what: &'static str,
+    /// How much was asked for.
+    pub actual: u64,
+}
+
+impl LimitExceeded {
+    /// Refuses `actual` if it exceeds the limit.
+    pub fn check(
+        name: &'static str,
+        limit: u64,
+        what: &'static str,
+        actual: usize,
+    ) -> Result<(), Self> {
+        let actual = u64::try_from(actual).unwrap_or(u64::MAX);
+        if actual > limit { Err(Self { name, limit, what, actual }) } else { Ok(()) }
+    }
+}
+
+impl Limits {
+    /// Refuses values that are out of range.
+    pub fn check(&self) -> Result<(), LimitError> {
+        for Limit { name, value, low, high, .. } in self.table() {
+            if !(low..=high).contains(&value) {
+                return Err(LimitError::OutOfRange { name, value, low, high });
+            }
+        }
+        Ok(())
+    }
+
+    /// A limit as a size in memory.
+    pub fn size(value: u64) -> usize {
+        usize::try_from(value).unwrap_or(usize::MAX)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_in_range_and_every_limit_can_be_set_by_name() {
+        let mut limits = Limits::default();
+        limits.check().unwrap();
+        for limit in Limits::default().table() {
+            assert!(!limit.meaning.is_empty());
+            limits.set(limit.name, limit.high).unwrap();
+        }
+        assert!(limits.table().iter().all(|limit| limit.value == limit.high));
+    }
+
+    #[test]
+    fn wrong_names_and_values_are_refused() {
+        let mut limits = Limits::default();
+        assert_eq!(limits.set("plant", 1), Err(LimitError::Unknown { name: "plant".to_owned() }));
+        assert!(matches!(
+            limits.set("connections", 0),
+            Err(LimitError::OutOfRange { name: "connections", value: 0, .. })
+        ));
+        assert!(toml::from_str::<Limits>("plant = 1").is_err());
+        assert_eq!(toml::from_str::<Limits>("plants = 1").unwrap().plants, 1);
+    }
+}

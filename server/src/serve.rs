@@ -1,0 +1,250 @@
+//! Starts a server, keeps it, and ends it.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context as _, Result};
+use futures::future;
+use plantd_models::Model;
+use plantd_proto::{FILE_DESCRIPTOR_SET, v1};
+use serde::Serialize;
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Server;
+use tonic::transport::server::Router;
+use tonic_health::server::HealthReporter;
+use tonic_web::GrpcWebLayer;
+use tower::layer::util::{Identity, Stack};
+use v1::control_service_server::ControlServiceServer;
+use v1::model_service_server::ModelServiceServer;
+use v1::plant_service_server::PlantServiceServer;
+
+use crate::config::{Config, Listen};
+use crate::grpc::control::ControlService;
+use crate::grpc::model::ModelService;
+use crate::grpc::observe::ObserveLayer;
+use crate::grpc::plant::PlantService;
+use crate::grpc::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT};
+use crate::hub::Hub;
+use crate::limits::Limits;
+use crate::link::LinkHost;
+use crate::listen::{UnixSocket, admit, bind_tcp};
+use crate::metrics_http;
+
+/// Where a server can be reached.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Addresses {
+    /// gRPC over TCP, `http://address:port`.
+    pub grpc: Option<String>,
+    /// gRPC over a unix-domain socket, `unix:/path`.
+    pub unix: Option<String>,
+    /// Metrics, `http://address:port/metrics`.
+    pub metrics: Option<String>,
+    /// Root path of the shared-memory links.
+    pub link_root: Option<PathBuf>,
+    /// Id of the server's process.
+    pub pid: u32,
+}
+
+/// A server that listens.
+pub struct RunningServer {
+    hub: Arc<Hub>,
+    config: Config,
+    addresses: Addresses,
+    health: HealthReporter,
+    listeners: JoinSet<Result<(), tonic::transport::Error>>,
+    /// Cancelled when listeners stop accepting.
+    closing: CancellationToken,
+    metrics: Option<tokio::task::JoinHandle<()>>,
+    /// Removed from the file system when dropped.
+    unix: Option<UnixSocket>,
+}
+
+/// Serves until `shutdown` completes, then ends calls in good order, within the configured grace.
+pub async fn run(
+    config: Config,
+    shutdown: impl Future<Output = ()>,
+    on_ready: impl FnOnce(&Addresses),
+) -> Result<()> {
+    let mut server = RunningServer::start(config).await?;
+    on_ready(server.addresses());
+    tokio::select! {
+        () = shutdown => {}
+        error = server.listener_failed() => {
+            tracing::error!(%error, "a listener failed");
+            server.stop().await;
+            return Err(error);
+        }
+    }
+    server.stop().await;
+    Ok(())
+}
+
+impl RunningServer {
+    /// Starts to serve.
+    pub async fn start(config: Config) -> Result<Self> {
+        let links = config.link.host_config().map(LinkHost::new).transpose();
+        let links = links.context("shared-memory links (turn them off with `--link off`)")?;
+        let link_root = config.link.host_config().filter(|_| links.is_some()).map(|link| link.root);
+        let hub = Arc::new(Hub::new(config.limits.clone(), config.worker_count(), links));
+        if let Some(directory) = &config.scenes {
+            load_scenes(&hub, directory)?;
+        }
+        let (health, health_service) = tonic_health::server::health_reporter();
+        health.set_serving::<ModelServiceServer<ModelService>>().await;
+        health.set_serving::<PlantServiceServer<PlantService>>().await;
+        health.set_serving::<ControlServiceServer<ControlService>>().await;
+        let mut server = Self {
+            addresses: Addresses { link_root, pid: std::process::id(), ..Addresses::default() },
+            health,
+            listeners: JoinSet::new(),
+            closing: CancellationToken::new(),
+            metrics: None,
+            unix: None,
+            hub,
+            config,
+        };
+        let router = server.router()?.add_service(health_service);
+        server.listen(router).await?;
+        Ok(server)
+    }
+
+    /// Where it can be reached.
+    pub fn addresses(&self) -> &Addresses {
+        &self.addresses
+    }
+
+    /// What the services share.
+    pub fn hub(&self) -> &Arc<Hub> {
+        &self.hub
+    }
+
+    fn router(&self) -> Result<Router<Layers>> {
+        let hub = || Arc::clone(&self.hub);
+        let limits = &self.hub.limits;
+        let message_bytes = Limits::size(limits.message_bytes);
+        let reflection = tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+            .build_v1()?;
+        let streams = u32::try_from(limits.streams_per_connection).unwrap_or(u32::MAX);
+        Ok(Server::builder()
+            // gRPC-Web comes over HTTP/1.1.
+            .accept_http1(true)
+            .max_concurrent_streams(streams)
+            // A client whose machine is gone is found out; its lease ends.
+            .http2_keepalive_interval(Some(KEEP_ALIVE_INTERVAL))
+            .http2_keepalive_timeout(Some(KEEP_ALIVE_TIMEOUT))
+            .layer(GrpcWebLayer::new())
+            .layer(ObserveLayer::new(Arc::clone(&self.hub.metrics), limits.clone()))
+            .add_service(
+                ModelServiceServer::new(ModelService::new(hub()))
+                    .max_decoding_message_size(message_bytes),
+            )
+            .add_service(
+                PlantServiceServer::new(PlantService::new(hub()))
+                    .max_decoding_message_size(message_bytes),
+            )
+            .add_service(
+                ControlServiceServer::new(ControlService::new(hub()))
+                    .max_decoding_message_size(message_bytes),
+            )
+            .add_service(reflection))
+    }
+
+    async fn listen(&mut self, router: Router<Layers>) -> Result<()> {
+        let connections = Limits::size(self.hub.limits.connections).min(Semaphore::MAX_PERMITS);
+        let permits = Arc::new(Semaphore::new(connections));
+        if let Listen::At(address) = self.config.grpc {
+            let incoming = bind_tcp(address).with_context(|| format!("gRPC on {address}"))?;
+            self.addresses.grpc = Some(format!("http://{}", incoming.local_addr()?));
+            let incoming = admit(incoming, Arc::clone(&permits));
+            let closing = self.closing.clone().cancelled_owned();
+            self.listeners.spawn(router.clone().serve_with_incoming_shutdown(incoming, closing));
+        }
+        if let Some(path) = &self.config.unix {
+            let path = std::path::absolute(path)?;
+            let (socket, incoming) = UnixSocket::bind(&path)
+                .await
+                .with_context(|| format!("gRPC on socket {}", path.display()))?;
+            self.addresses.unix = Some(format!("unix:{}", socket.path().display()));
+            self.unix = Some(socket);
+            let incoming = admit(incoming, permits);
+            let closing = self.closing.clone().cancelled_owned();
+            self.listeners.spawn(router.serve_with_incoming_shutdown(incoming, closing));
+        }
+        if let Listen::At(address) = self.config.metrics {
+            let listener = TcpListener::bind(address)
+                .await
+                .with_context(|| format!("metrics on {address}"))?;
+            self.addresses.metrics = Some(format!("http://{}/metrics", listener.local_addr()?));
+            let metrics = Arc::clone(&self.hub.metrics);
+            self.metrics = Some(tokio::spawn(metrics_http::serve(listener, metrics)));
+        }
+        Ok(())
+    }
+
+    /// Completes when a listener ends although nobody asked it to.
+    async fn listener_failed(&mut self) -> anyhow::Error {
+        match self.listeners.join_next().await {
+            Some(Ok(Err(error))) => anyhow::Error::new(error),
+            Some(Err(error)) => anyhow::Error::new(error),
+            Some(Ok(Ok(()))) => anyhow::anyhow!("a listener ended"),
+            None => future::pending().await,
+        }
+    }
+
+    /// Ends: no new connections, streams end with UNAVAILABLE, calls may finish within the grace.
+    /// What is left then ends with the runtime.
+    pub async fn stop(mut self) {
+        self.health.set_not_serving::<ModelServiceServer<ModelService>>().await;
+        self.health.set_not_serving::<PlantServiceServer<PlantService>>().await;
+        self.health.set_not_serving::<ControlServiceServer<ControlService>>().await;
+        self.closing.cancel();
+        let hub = Arc::clone(&self.hub);
+        let links_closed = tokio::task::spawn_blocking(move || hub.shut_down());
+        let calls_ended = async { while self.listeners.join_next().await.is_some() {} };
+        let grace = self.config.shutdown_grace();
+        if tokio::time::timeout(grace, calls_ended).await.is_err() {
+            tracing::warn!("open calls are cut off after {} s", grace.as_secs_f64());
+            self.listeners.abort_all();
+        }
+        if let Err(error) = links_closed.await {
+            tracing::error!(%error, "shared-memory links were not closed");
+        }
+        if let Some(metrics) = &self.metrics {
+            metrics.abort();
+        }
+    }
+}
+
+type Layers = Stack<ObserveLayer, Stack<GrpcWebLayer, Identity>>;
+
+/// Loads every scene of a directory as a model under the scene's own name.
+fn load_scenes(hub: &Hub, directory: &Path) -> Result<()> {
+    let in_directory = || format!("scenes in {}", directory.display());
+    let mut paths = std::fs::read_dir(directory)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>())
+        .with_context(in_directory)?;
+    paths.retain(|path| path.extension().is_some_and(|kind| kind == "toml" || kind == "json"));
+    paths.sort();
+    for path in paths {
+        load_scene(hub, &path).with_context(|| format!("scene {}", path.display()))?;
+    }
+    Ok(())
+}
+
+fn load_scene(hub: &Hub, path: &Path) -> Result<()> {
+    let text = std::fs::read_to_string(path)?;
+    let scene = plantd_models::Scene::from_text(&text)?;
+    let model = Model::compile(&scene)?;
+    let name = model.scene().name.clone();
+    hub.catalog
+        .insert(&name, Arc::new(model))
+        .map_err(|fault| anyhow::anyhow!("{}", tonic::Status::from(fault).message()))?;
+    tracing::info!(model = name, "scene loaded");
+    Ok(())
+}
