@@ -21,7 +21,7 @@ pub type Message = Sample<ipc::Service, [f64], Header>;
 
 /// After this long a poller lets others run between two looks, ns: with more pollers than
 /// processors the one that is waited for would otherwise not run.
-const POLL_UNDISTURBED_NS: u64 = 20_000;
+const POLL_UNDISTURBED_NS: u64 = 5_000;
 
 /// How a side waits for what comes next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -32,6 +32,9 @@ const ROWS: &[(&str, &[&str], Wait)] = &[
     ("both sleep", &["--poll-us", "0"], Wait::PollThenSleep(Duration::ZERO)),
 ];
 
+/// Largest duration that is told from longer ones, ns.
+const LONGEST_NS: u64 = 10_000_000_000;
+
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
     println!("model {}, {} steps, microseconds", arguments.model, arguments.steps);
@@ -50,17 +53,21 @@ fn measure_in_process(arguments: &Arguments) -> Result<Histogram<u64>> {
     record(arguments.steps, || Ok(plant.step(&u).map(drop)?))
 }
 
-fn measure(arguments: &Arguments, host: &[&str], wait: Wait) -> Result<Histogram<u64>> {
+fn measure(arguments: &Arguments, host_waits: &[&str], wait: Wait) -> Result<Histogram<u64>> {
     let directory = tempfile::Builder::new().prefix("plantd-").tempdir()?;
     let root = directory.path().join("link");
     let program = std::env::current_exe()?.with_file_name("link_host");
-    let _host = start_host(&program, &root, &arguments.model, host)?;
+    let mut host = start_host(&program, &root, &arguments.model, host_waits)?;
     let mut driver =
         LinkDriver::connect(PLANT, LinkOptions { root, wait, ..LinkOptions::default() })?;
     let dimensions = driver.dimensions();
     let mut u = vec![0.0; dimensions.inputs];
     u.extend_from_slice(&driver.state().q[dimensions.dynamic..]);
-    record(arguments.steps, || Ok(driver.step(&u).map(drop)?))
+    let histogram = record(arguments.steps, || Ok(driver.step(&u).map(drop)?))?;
+    drop(driver);
+    // A host that is killed leaves shared memory behind, and its root path is about to go.
+    anyhow::ensure!(host.finish()?, "the host failed");
+    Ok(histogram)
 }
 
 fn start_host(program: &Path, root: &Path, model: &str, wait: &[&str]) -> Result<ChildProcess> {
@@ -71,7 +78,7 @@ fn start_host(program: &Path, root: &Path, model: &str, wait: &[&str]) -> Result
 
 /// Times each call, after some that warm up.
 fn record(steps: u64, mut step: impl FnMut() -> Result<()>) -> Result<Histogram<u64>> {
-    let mut histogram = Histogram::new(3)?;
+    let mut histogram = Histogram::new_with_max(LONGEST_NS, 3)?;
     for k in 0..steps + steps / 10 {
         let start = Instant::now();
         step()?;

@@ -50,6 +50,9 @@ _INPUT_LEN_USUAL = 64
 _CHECK_PERIOD_NS = 100_000_000
 _ATTACH_PERIOD_NS = 50_000_000
 _LOOK_PERIOD_S = 0.02
+# Python has no memory barrier: a little before the server falls asleep it is notified as well.
+_NOTIFY_MARGIN_NS = 10_000
+_SHARED_MEMORY = Path("/dev/shm")
 
 
 class Header(ctypes.Structure):
@@ -291,13 +294,15 @@ class LinkDriver:
                     raise
                 time.sleep(_LOOK_PERIOD_S)
 
+    def _prefix(self) -> str:
+        """Start of the name of every file of the domain."""
+        digest = _fnv1a(os.fsencode(self._root))
+        return f"plantd{LAYOUT_VERSION}_{(digest >> 32) ^ (digest & 0xFFFFFFFF):08x}_"
+
     def _config(self) -> iox2.config.Config:
-        root = os.fsencode(self._root)
-        digest = _fnv1a(root)
-        prefix = f"plantd{LAYOUT_VERSION}_{(digest >> 32) ^ (digest & 0xFFFFFFFF):08x}_"
         config = iox2.config.default()
-        config.global_cfg.root_path = iox2.Path.new(os.fsdecode(root))
-        config.global_cfg.prefix = iox2.FileName.new(prefix)
+        config.global_cfg.root_path = iox2.Path.new(str(self._root))
+        config.global_cfg.prefix = iox2.FileName.new(self._prefix())
         return config
 
     def _open_services(self, direction: str) -> tuple:
@@ -326,11 +331,14 @@ class LinkDriver:
             port.delete()
         del self._publisher, self._notifier, self._subscriber, self._listener
         del self._states, self._node
+        # The last one to leave removes the counter that numbers the members.
+        if not any((self._root / "nodes").glob("*.node_monitor")):
+            for counter in _SHARED_MEMORY.glob(f"{self._prefix()}*.global_mgmt"):
+                counter.unlink(missing_ok=True)
 
     def _send(self, kind: int, u: Sequence[float], peer_poll_end_ns: int) -> None:
         sample = self._publisher.loan_slice_uninit(len(u))
-        payload = ctypes.cast(sample.payload().as_ptr(), ctypes.POINTER(ctypes.c_double))
-        payload[: len(u)] = u
+        (ctypes.c_double * len(u)).from_address(sample.payload().as_ptr())[:] = u
         now_ns = time.monotonic_ns()
         header = sample.user_header().contents
         ctypes.memset(ctypes.addressof(header), 0, ctypes.sizeof(header))
@@ -347,7 +355,7 @@ class LinkDriver:
         header.kind = kind
         self._poll_end_ns = now_ns + self._poll_ns
         sample.assume_init().send()
-        if time.monotonic_ns() >= peer_poll_end_ns:
+        if time.monotonic_ns() + _NOTIFY_MARGIN_NS >= peer_poll_end_ns:
             self._notifier.notify()
 
     def _receive(self, deadline_ns: int) -> Optional[tuple[Header, list[float]]]:
@@ -358,8 +366,9 @@ class LinkDriver:
             if sample is not None:
                 try:
                     header = Header.from_buffer_copy(sample.user_header().contents)
-                    view = sample.payload().as_memory_view()
-                    return header, view.cast("B").cast("d").tolist()
+                    # The length of `sample.payload()` counts bytes in iceoryx2 0.10, not entries.
+                    entries = ctypes.c_double * sample.header.number_of_elements
+                    return header, list(entries.from_address(sample.payload_ptr))
                 finally:
                     sample.delete()
             if now_ns >= deadline_ns:
