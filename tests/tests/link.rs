@@ -11,9 +11,11 @@ use plantd_proto::link::{
     Code, Domain, DomainError, Endpoint, HEADER_FIELDS, Header, Holder, Kind, LAYOUT_VERSION,
     MAGIC, SCHEMA_HASH, monotonic_ns, random_instance,
 };
+use plantd_server::link::{LinkConfig, LinkError as HostError, LinkHost};
 use plantd_server::session::DriverKind;
 use plantd_tests::links::{
-    ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_domain, new_plant, wait_until, wiggle,
+    ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_domain, new_plant, new_session,
+    wait_until, wiggle,
 };
 
 /// Never polls: each answer comes by a notification.
@@ -341,6 +343,27 @@ fn connecting_waits_for_the_link_but_not_for_ever() {
     std::thread::sleep(Duration::from_millis(100));
     fixture.host.open(fixture.session.clone()).unwrap();
     assert_eq!(driver.join().unwrap().unwrap(), 1);
+}
+
+#[test]
+fn one_plant_id_under_one_root_path_belongs_to_one_server() {
+    let fixture = LinkFixture::new("pendulum").unwrap();
+    let root = fixture.root();
+    let other = LinkHost::new(LinkConfig { root, ..LinkConfig::default() }).unwrap();
+    let error = other.open(new_session("pendulum").unwrap()).unwrap_err();
+    assert!(matches!(error, HostError::Domain(DomainError::ServedElsewhere)), "{error}");
+    assert_eq!(fixture.connect(SLEEP).unwrap().step(&[0.0]).unwrap().step, 1);
+}
+
+#[test]
+fn a_link_has_room_for_eight_drivers_that_are_connected() {
+    let fixture = LinkFixture::new("pendulum").unwrap();
+    let node = Domain::open(&fixture.root()).unwrap().join("many").unwrap();
+    let connect = || Endpoint::driver(node.open_services(PLANT)?, 1, SLEEP);
+    let endpoints: Vec<Endpoint> = (0..8).map(|_| connect().unwrap()).collect();
+    assert!(matches!(connect().unwrap_err(), DomainError::TooManyDrivers));
+    drop(endpoints);
+    assert!(connect().is_ok());
 }
 
 #[test]

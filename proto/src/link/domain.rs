@@ -109,6 +109,12 @@ pub enum DomainError {
         /// Plant.
         plant: String,
     },
+    /// Another server has opened the link of a plant with this id.
+    #[error("another server has opened the link of this plant under the same root path")]
+    ServedElsewhere,
+    /// The link has no room for another driver.
+    #[error("as many drivers as the link has room for are connected to it already")]
+    TooManyDrivers,
     /// iceoryx2 failed.
     #[error("shared-memory link, {what}: {cause}")]
     Transport {
@@ -347,6 +353,7 @@ impl LinkNode {
             .open_with_attributes(&required_attributes()?)
             .map_err(|cause| match cause {
                 OpenError::DoesNotExist | OpenError::IsMarkedForDestruction => not_open(),
+                OpenError::ExceedsMaxNumberOfNodes => DomainError::TooManyDrivers,
                 OpenError::IncompatibleTypes | OpenError::IncompatibleAttributes => {
                     DomainError::OtherLayout { plant: plant.to_owned() }
                 }

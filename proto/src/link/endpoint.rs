@@ -4,7 +4,7 @@ use std::sync::atomic::{Ordering, fence};
 use std::time::Duration;
 
 use iceoryx2::identifiers::UniquePublisherId;
-use iceoryx2::port::listener::Listener;
+use iceoryx2::port::listener::{Listener, ListenerCreateError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -69,7 +69,7 @@ impl Endpoint {
         state_len: usize,
         wait: Wait,
     ) -> Result<Self, DomainError> {
-        Self::new(services.state, services.input, state_len, wait)
+        Self::new(services.state, services.input, state_len, wait, DomainError::ServedElsewhere)
     }
 
     /// A driver's side: sends inputs of at most `input_len` entries.
@@ -78,12 +78,22 @@ impl Endpoint {
         input_len: usize,
         wait: Wait,
     ) -> Result<Self, DomainError> {
-        Self::new(services.input, services.state, input_len, wait)
+        Self::new(services.input, services.state, input_len, wait, DomainError::TooManyDrivers)
     }
 
-    fn new(out: Direction, back: Direction, len: usize, wait: Wait) -> Result<Self, DomainError> {
+    /// `full` is the error when there is no room for one more on this side.
+    fn new(
+        out: Direction,
+        back: Direction,
+        len: usize,
+        wait: Wait,
+        full: DomainError,
+    ) -> Result<Self, DomainError> {
         // The receiving ports come first: an answer must find them.
-        let listener = back.bell.listener_builder().create().map_err(transport("a listener"))?;
+        let listener = back.bell.listener_builder().create().map_err(|cause| match cause {
+            ListenerCreateError::ExceedsMaxSupportedListeners => full,
+            cause => transport("a listener")(cause),
+        })?;
         let subscriber =
             back.channel.subscriber_builder().create().map_err(transport("a subscriber"))?;
         let notifier = out.bell.notifier_builder().create().map_err(transport("a notifier"))?;

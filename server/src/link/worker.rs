@@ -103,7 +103,10 @@ impl Worker {
                 if monotonic_ns() < self.next_check_ns {
                     return Ok(());
                 }
-                self.check_driver();
+                self.next_check_ns = monotonic_ns() + CHECK_PERIOD_NS;
+                if self.is_driver_silent() {
+                    self.check_driver();
+                }
                 self.endpoint.update()
             });
             if let Err(error) = outcome {
@@ -120,10 +123,15 @@ impl Worker {
         std::thread::sleep(PAUSE_AFTER_ERROR);
     }
 
-    /// Takes the lease back from a driver that died, left, or is idle for too long.
+    fn is_driver_silent(&self) -> bool {
+        let silent_ns = |driver: &Driver| monotonic_ns().saturating_sub(driver.last_heard_ns);
+        self.driver.as_ref().is_some_and(|driver| silent_ns(driver) > CHECK_PERIOD_NS)
+    }
+
+    /// Takes the lease back from a driver that died, left, or is idle for too long. Reads files: not
+    /// for a driver that is stepping.
     fn check_driver(&mut self) {
         let now_ns = monotonic_ns();
-        self.next_check_ns = now_ns + CHECK_PERIOD_NS;
         let Some(driver) = &self.driver else { return };
         let why = if !driver.is_alive(&self.endpoint) {
             "is gone"
