@@ -92,7 +92,10 @@ impl Workers {
             job(&abandoned)
         })
         .await
-        .unwrap_or_else(|error| Err(Fault::internal(format!("a computation broke off: {error}"))))
+        .unwrap_or_else(|error| {
+            tracing::error!(%error, "a computation broke off");
+            Err(Fault::internal("a computation broke off"))
+        })
     }
 }
 
