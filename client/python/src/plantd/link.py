@@ -2,11 +2,12 @@
 
     from plantd.link import LinkDriver
 
-    with LinkDriver("pendulum") as plant:
+    with LinkDriver("pendulum") as driver:
+        state = driver.state
         for _ in range(1000):
-            state = plant.step([-3.0 * plant.state.q[0] - plant.state.p[0]])
+            state = driver.step(gain(state))
 
-Needs the package ``iceoryx2`` (``pip install "plantd[link]"``), on Linux.
+Needs the package ``iceoryx2`` (``pip install "plantd[link]"``): Linux on x86-64.
 The layout and the conversation are described in ``client/c/plantd_link.h``.
 """
 
@@ -16,11 +17,13 @@ import ctypes
 import os
 import secrets
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Optional, Sequence
 
 import iceoryx2 as iox2
+import numpy as np
+
+from ._errors import PlantdError, StepError
+from ._types import Array, State, StepReport, Vector, vector
 
 LAYOUT_VERSION = 1
 MAGIC = int.from_bytes(b"plnt", "little")
@@ -45,6 +48,45 @@ ATTACHED, STATE, FAILURE, CLOSED = 16, 17, 18, 19
     CODE_TOO_FAST,
 ) = range(1, 14)
 
+# Codes and reasons are those of gRPC; the message takes the header `h`.
+_STEP_ERRORS = {
+    CODE_SEQUENCE: ("ABORTED", "SEQUENCE", "an input was lost; number {h.detail_a} was expected"),
+    CODE_DIMENSION: (
+        "INVALID_ARGUMENT",
+        "INPUT_DIMENSION",
+        "the input has {h.detail_b} entries; {h.detail_a} are needed",
+    ),
+    CODE_INPUT_NOT_FINITE: (
+        "INVALID_ARGUMENT",
+        "INPUT_NOT_FINITE",
+        "input {h.detail_a} is {h.detail_value}",
+    ),
+    CODE_NOT_CONVERGED: (
+        "FAILED_PRECONDITION",
+        "NOT_CONVERGED",
+        "no convergence after {h.iterations} iterations: residual is {h.residual:g} times round-off",
+    ),
+    CODE_NOT_FINITE: (
+        "FAILED_PRECONDITION",
+        "MOTION_NOT_FINITE",
+        "the motion left the finite numbers after {h.iterations} iterations",
+    ),
+    CODE_SINGULAR: (
+        "FAILED_PRECONDITION",
+        "SINGULAR",
+        "singular Newton matrix at coordinate {h.detail_a} (relative pivot {h.detail_value:g})",
+    ),
+    CODE_TOO_FAST: (
+        "FAILED_PRECONDITION",
+        "TOO_FAST",
+        "coordinate {h.detail_a} turned by {h.detail_value:.3f} rad in one step",
+    ),
+}
+_LINK_ERRORS = {
+    CODE_NOT_ATTACHED: ("ABORTED", "LEASE_LOST", "the server has taken the lease back"),
+    CODE_PLANT_DELETED: ("NOT_FOUND", "PLANT_DELETED", "the plant was deleted"),
+    CODE_LINK_CLOSED: ("UNAVAILABLE", "LINK_CLOSED", "the server has closed the link"),
+}
 _HOLDERS = {1: "a call of Step", 2: "a Drive stream", 3: "a driver over shared memory"}
 _INPUT_LEN_USUAL = 64
 _CHECK_PERIOD_NS = 100_000_000
@@ -53,6 +95,7 @@ _LOOK_PERIOD_S = 0.02
 # Python has no memory barrier: a little before the server falls asleep it is notified as well.
 _NOTIFY_MARGIN_NS = 10_000
 _SHARED_MEMORY = Path("/dev/shm")
+_NOTHING: Array = np.empty(0)
 
 
 class Header(ctypes.Structure):
@@ -112,61 +155,13 @@ def _schema_hash() -> int:
 SCHEMA_HASH = _schema_hash()
 
 
-class LinkError(Exception):
-    """The shared-memory link cannot be used, or iceoryx2 failed."""
+class LinkError(PlantdError):
+    """The link cannot be used, or can no longer be used; `reason` says why.
 
-
-class NotOpen(LinkError):
-    """The plant has no open link under this root path."""
-
-
-class LeaseHeld(LinkError):
-    """Somebody else drives the plant."""
-
-
-class Timeout(LinkError):
-    """No answer in time. A step may still be taken."""
-
-
-class ServerGone(LinkError):
-    """The server's process is no more."""
-
-
-class ServerRestarted(LinkError):
-    """Another server, or another opening of the link, answers: connect again."""
-
-
-class Closed(LinkError):
-    """The server has closed the link, or the plant was deleted."""
-
-
-class LeaseLost(LinkError):
-    """The server has taken the lease back: connect again."""
-
-
-class StepError(LinkError):
-    """A step failed. The plant is as it was, and the next step goes on from there."""
-
-    def __init__(self, code: int, message: str) -> None:
-        super().__init__(message)
-        self.code = code
-
-
-@dataclass(frozen=True)
-class State:
-    """A state of the plant."""
-
-    step: int
-    time_s: float
-    q: list[float]
-    p: list[float]
-    v: list[float]
-    multipliers: list[float]
-
-    @property
-    def x(self) -> list[float]:
-        """``q``, ``p`` and ``v`` in one list."""
-        return self.q + self.p + self.v
+    ``NOT_OPEN``: the plant has no open link. ``LEASE_HELD``: somebody else drives it. ``TIMEOUT``: no
+    answer in time; a step may still be taken. ``SERVER_GONE``, ``SERVER_RESTARTED``, ``LEASE_LOST``,
+    ``LINK_CLOSED``, ``PLANT_DELETED``: this connection has ended, make a new one.
+    """
 
 
 def default_root() -> Path:
@@ -184,8 +179,8 @@ class LinkDriver:
         self,
         plant: str,
         *,
-        root: Optional[os.PathLike[str] | str] = None,
-        poll_s: Optional[float] = 50e-6,
+        root: os.PathLike[str] | str | None = None,
+        poll_s: float | None = 50e-6,
         timeout_s: float = 1.0,
         connect_timeout_s: float = 1.0,
     ) -> None:
@@ -214,6 +209,18 @@ class LinkDriver:
         self.close()
 
     @property
+    def report(self) -> StepReport:
+        """What the solver did in the last step."""
+        h = self._last
+        return StepReport(
+            h.iterations,
+            h.factorizations,
+            h.residual,
+            h.constraint_residual,
+            h.reciprocal_condition,
+        )
+
+    @property
     def state(self) -> State:
         """The last state: of the last step, or of the time of the connection."""
         return self._state
@@ -228,14 +235,15 @@ class LinkDriver:
         """Time step of the plant, seconds."""
         return self._last.time_step_s
 
-    def step(self, u: Sequence[float]) -> State:
-        """Takes one step with the input ``u`` and returns the state after it."""
+    def step(self, u: Vector = ()) -> State:
+        """Takes one step with the input ``u`` (input forces, then next prescribed positions).
+
+        Raises `StepError` if the step failed: the plant is where it was and the driver goes on.
+        """
         if not self._is_open:
-            raise LinkError("the driver is closed")
-        if len(u) != self.input_len:
-            raise ValueError(f"the input has {len(u)} entries; {self.input_len} are needed")
+            raise _not_open("the driver is closed")
         self._sequence += 1
-        self._send(INPUT, u, self._server_poll_end_ns)
+        self._send(INPUT, vector(u), self._server_poll_end_ns)
         return self._wait_for_answer(_after(self._timeout_s))
 
     def close(self) -> None:
@@ -244,7 +252,7 @@ class LinkDriver:
             return
         self._is_open = False
         try:
-            self._send(DETACH, (), 0)
+            self._send(DETACH, _NOTHING, 0)
         finally:
             self._leave()
 
@@ -268,7 +276,7 @@ class LinkDriver:
         while True:
             try:
                 if not self._root.is_dir():
-                    raise NotOpen(f"there is no server under {self._root}")
+                    raise _not_open(f"there is no server under {self._root}")
                 self._node = (
                     iox2.NodeBuilder.new()
                     .name(iox2.NodeName.new("plantd-driver-python"))
@@ -289,8 +297,8 @@ class LinkDriver:
                     .create()
                 )
                 return
-            except NotOpen:
-                if time.monotonic_ns() >= deadline_ns:
+            except LinkError as error:
+                if error.reason != "NOT_OPEN" or time.monotonic_ns() >= deadline_ns:
                     raise
                 time.sleep(_LOOK_PERIOD_S)
 
@@ -322,8 +330,10 @@ class LinkDriver:
             bell = self._node.service_builder(name).event().open()
         except (iox2.PublishSubscribeOpenError, iox2.EventOpenError) as error:
             if "DoesNotExist" in str(error) or "MarkedForDestruction" in str(error):
-                raise NotOpen(f"plant `{self._plant}` has no open link under {self._root}") from error
-            raise LinkError(f"the link of plant `{self._plant}` cannot be opened: {error}") from error
+                message = f"plant `{self._plant}` has no open link under {self._root}"
+                raise _not_open(message) from error
+            message = f"the link of plant `{self._plant}` cannot be opened: {error}"
+            raise LinkError("UNAVAILABLE", message) from error
         return channel, bell
 
     def _leave(self) -> None:
@@ -336,9 +346,9 @@ class LinkDriver:
             for counter in _SHARED_MEMORY.glob(f"{self._prefix()}*.global_mgmt"):
                 counter.unlink(missing_ok=True)
 
-    def _send(self, kind: int, u: Sequence[float], peer_poll_end_ns: int) -> None:
+    def _send(self, kind: int, u: Array, peer_poll_end_ns: int) -> None:
         sample = self._publisher.loan_slice_uninit(len(u))
-        (ctypes.c_double * len(u)).from_address(sample.payload().as_ptr())[:] = u
+        ctypes.memmove(sample.payload().as_ptr(), u.ctypes.data, u.nbytes)
         now_ns = time.monotonic_ns()
         header = sample.user_header().contents
         ctypes.memset(ctypes.addressof(header), 0, ctypes.sizeof(header))
@@ -358,7 +368,7 @@ class LinkDriver:
         if time.monotonic_ns() + _NOTIFY_MARGIN_NS >= peer_poll_end_ns:
             self._notifier.notify()
 
-    def _receive(self, deadline_ns: int) -> Optional[tuple[Header, list[float]]]:
+    def _receive(self, deadline_ns: int) -> tuple[Header, Array] | None:
         """The next message, or nothing at the deadline: polls, then sleeps."""
         while True:
             now_ns = time.monotonic_ns()
@@ -368,7 +378,7 @@ class LinkDriver:
                     header = Header.from_buffer_copy(sample.user_header().contents)
                     # The length of `sample.payload()` counts bytes in iceoryx2 0.10, not entries.
                     entries = ctypes.c_double * sample.header.number_of_elements
-                    return header, list(entries.from_address(sample.payload_ptr))
+                    return header, np.array(entries.from_address(sample.payload_ptr))
                 finally:
                     sample.delete()
             if now_ns >= deadline_ns:
@@ -379,12 +389,12 @@ class LinkDriver:
     def _attach(self, deadline_ns: int) -> None:
         """Asks for the lease until the server answers."""
         while True:
-            self._send(ATTACH, (), 0)
+            self._send(ATTACH, _NOTHING, 0)
             repeat_ns = min(time.monotonic_ns() + _ATTACH_PERIOD_NS, deadline_ns)
             while (message := self._receive(repeat_ns)) is not None:
                 header, payload = message
                 if header.schema_hash != SCHEMA_HASH:
-                    raise LinkError("the server speaks another layout")
+                    raise LinkError("UNIMPLEMENTED", "the server speaks another layout")
                 if header.driver != self._driver:
                     continue
                 if header.kind != ATTACHED:
@@ -395,7 +405,7 @@ class LinkDriver:
                 self._note_state(header, payload)
                 return
             if time.monotonic_ns() >= deadline_ns:
-                raise Timeout("the server does not answer")
+                raise _timeout("the server does not answer")
             self._node.try_cleanup_dead_nodes()
 
     def _wait_for_answer(self, deadline_ns: int) -> State:
@@ -404,7 +414,8 @@ class LinkDriver:
             while (message := self._receive(check_ns)) is not None:
                 header, payload = message
                 if header.server != self._server:
-                    raise ServerRestarted("the server has restarted, or has reopened the link")
+                    message = "the server has restarted, or has reopened the link"
+                    raise LinkError("ABORTED", message, "SERVER_RESTARTED")
                 if header.kind == CLOSED:
                     raise _error(header)
                 if header.driver != self._driver or header.sequence != self._sequence:
@@ -414,7 +425,7 @@ class LinkDriver:
                 return self._note_state(header, payload)
             self._check_server()
             if time.monotonic_ns() >= deadline_ns:
-                raise Timeout(f"no answer from the server within {self._timeout_s} s")
+                raise _timeout(f"no answer from the server within {self._timeout_s} s")
 
     def _check_server(self) -> None:
         """Off the fast path: nothing has come for a while."""
@@ -422,17 +433,17 @@ class LinkDriver:
         is_dead = self._is_server_visible and _process_start(pid) != start
         self._node.try_cleanup_dead_nodes()
         if is_dead or self._states.dynamic_config.number_of_publishers == 0:
-            raise ServerGone(f"the server (process {pid}) is gone")
+            raise LinkError("UNAVAILABLE", f"the server (process {pid}) is gone", "SERVER_GONE")
 
-    def _note_state(self, header: Header, payload: list[float]) -> State:
+    def _note_state(self, header: Header, payload: Array) -> State:
         nd, nq = header.dynamic, header.dynamic + header.prescribed
         if len(payload) != 2 * nq + header.constraints:
-            raise LinkError("the server sent a state of the wrong length")
+            raise LinkError("INTERNAL", "the server sent a state of the wrong length")
         self._last = header
         self._server_poll_end_ns = header.stamp_ns + header.poll_ns
         self._state = State(
             step=header.step,
-            time_s=header.time_s,
+            time=header.time_s,
             q=payload[:nq],
             p=payload[nq : nq + nd],
             v=payload[nq + nd : 2 * nq],
@@ -453,7 +464,7 @@ def _after(seconds: float) -> int:
     return time.monotonic_ns() + round(seconds * 1e9)
 
 
-def _process_start(pid: int) -> Optional[int]:
+def _process_start(pid: int) -> int | None:
     """Start time of a live process, clock ticks since boot."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -462,28 +473,25 @@ def _process_start(pid: int) -> Optional[int]:
     return None if fields[0] in "ZXx" else int(fields[19])
 
 
-def _error(header: Header) -> LinkError:
+def _error(header: Header) -> PlantdError:
     """The error that a failure message speaks of."""
-    code, a, value = header.code, header.detail_a, header.detail_value
-    if code == CODE_LEASE_HELD:
-        who = _HOLDERS.get(a, "somebody else")
-        return LeaseHeld(f"the plant is driven by {who}" + (f" (process {header.detail_b})" if header.detail_b else ""))
-    if code == CODE_NOT_ATTACHED:
-        return LeaseLost("the server has taken the lease back")
-    if code == CODE_PLANT_DELETED:
-        return Closed("the plant was deleted")
-    if code == CODE_LINK_CLOSED:
-        return Closed("the server has closed the link")
-    messages = {
-        CODE_SEQUENCE: f"an input was lost on the way; number {a} was expected",
-        CODE_DIMENSION: f"the input has {header.detail_b} entries; {a} are needed",
-        CODE_INPUT_NOT_FINITE: f"input {a} is {value}",
-        CODE_NOT_CONVERGED: f"no convergence after {header.iterations} iterations: "
-        f"residual is {header.residual:g} times round-off",
-        CODE_NOT_FINITE: f"the motion left the finite numbers after {header.iterations} iterations",
-        CODE_SINGULAR: f"singular Newton matrix at coordinate {a} (pivot {value:g})",
-        CODE_TOO_FAST: f"coordinate {a} turned by {value:.3f} rad in one step",
-    }
-    if code in messages:
-        return StepError(code, messages[code])
-    return LinkError(f"the server refused a message (code {code})")
+    if header.code in _STEP_ERRORS:
+        code, reason, message = _STEP_ERRORS[header.code]
+        return StepError(code, message.format(h=header), reason)
+    if header.code in _LINK_ERRORS:
+        code, reason, message = _LINK_ERRORS[header.code]
+        return LinkError(code, message, reason)
+    if header.code == CODE_LEASE_HELD:
+        holder = _HOLDERS.get(header.detail_a, "somebody else")
+        process = f" (process {header.detail_b})" if header.detail_b else ""
+        message = f"the plant is driven by {holder}{process}"
+        return LinkError("FAILED_PRECONDITION", message, "LEASE_HELD")
+    return LinkError("INTERNAL", f"the server refused a message (code {header.code})")
+
+
+def _not_open(message: str) -> LinkError:
+    return LinkError("NOT_FOUND", message, "NOT_OPEN")
+
+
+def _timeout(message: str) -> LinkError:
+    return LinkError("DEADLINE_EXCEEDED", message, "TIMEOUT")

@@ -1,0 +1,99 @@
+"""The driver over shared memory against a real server."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import plantd
+
+pytest.importorskip("iceoryx2", reason="there is no iceoryx2 wheel for this platform")
+from plantd.link import LinkDriver, LinkError  # noqa: E402
+
+VICTIM = """
+import sys, time
+from plantd.link import LinkDriver
+driver = LinkDriver(sys.argv[1], root=sys.argv[2])
+driver.step([0.0])
+print("stepped", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def connect(client):
+    """Makes a plant with an open link; gives its id and what connects a driver to it."""
+
+    def connect(model, **options):
+        plant = client.create_plant(model, open_link=True).id
+        root = client.open_link(plant).root_path
+        return plant, lambda: LinkDriver(plant, root=root, connect_timeout_s=10, timeout_s=10, **options)
+
+    return connect
+
+
+@pytest.mark.parametrize("poll_s", [0.0, 50e-6, None])
+def test_shared_memory_and_grpc_give_the_same_bits(client, connect, poll_s):
+    for model in ["cart-pole", "marionette"]:
+        plant, driver = connect(model, poll_s=poll_s)
+        start = client.get_plant(plant).state
+        with driver() as link, client.drive(client.create_plant(model).id) as stream:
+            assert link.state.x.tobytes() == start.x.tobytes()
+            inputs = link.input_len - len(start.v)
+            for k in range(20):
+                u = np.concatenate((0.1 * np.sin(k + np.arange(inputs)), start.q[len(start.p) :]))
+                a, b = link.step(u), stream.step(u)
+                assert (a.step, a.time) == (b.step, b.time)
+                assert a.x.tobytes() == b.x.tobytes()
+                assert a.multipliers.tobytes() == b.multipliers.tobytes()
+            assert link.report == stream.report
+
+
+def test_failures_come_in_band_and_move_nothing(client, connect):
+    plant, driver = connect("pendulum")
+    with driver() as link:
+        for u, reason in [([math.nan], "INPUT_NOT_FINITE"), ([0.0, 0.0], "INPUT_DIMENSION")]:
+            with pytest.raises(plantd.StepError) as error:
+                link.step(u)
+            assert (error.value.code, error.value.reason) == ("INVALID_ARGUMENT", reason)
+        assert client.get_plant(plant).state.step == 0
+        assert link.step(0.1).step == 1
+
+
+def test_one_driver_at_a_time(client, connect):
+    plant, driver = connect("pendulum")
+    with driver():
+        with pytest.raises(LinkError, match="LEASE_HELD"):
+            driver()
+        with pytest.raises(plantd.PlantdError, match="LEASE_HELD"):
+            client.drive(plant)
+    with driver() as link:
+        assert link.step(0.0).step == 1
+
+
+def test_a_killed_driver_gives_way(client, connect):
+    plant, driver = connect("pendulum")
+    root = client.open_link(plant).root_path
+    victim = subprocess.Popen(
+        [sys.executable, "-c", VICTIM, plant, root], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert victim.stdout.readline() == "stepped\n"
+    finally:
+        victim.kill()
+        victim.wait()
+    with driver() as link:
+        assert link.step(0.0).step == 2
+
+
+def test_a_deleted_plant_says_so(client, connect):
+    plant, driver = connect("pendulum")
+    with driver() as link:
+        client.delete_plant(plant)
+        with pytest.raises(LinkError) as error:
+            link.step(0.0)
+    assert (error.value.code, error.value.reason) == ("NOT_FOUND", "PLANT_DELETED")
+    with pytest.raises(LinkError, match="NOT_OPEN"):
+        LinkDriver(plant, connect_timeout_s=0.05, root=link._root)
