@@ -1,4 +1,5 @@
-//! plantd-tests
+//! What the tests of plantd share: servers, links, reference data.
 
 pub mod links;
+pub mod reference;
 pub mod server;

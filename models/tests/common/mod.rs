@@ -1,0 +1,210 @@
+//! Mechanisms and helpers that the tests of motion share.
+#![allow(dead_code, reason = "each test program uses some of it")]
+
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use plantd_models::scene::{
+    Body, Coordinate, CoordinateKind, Frame, Input, Joint, Point, Rotation, Scene, Spring,
+};
+use plantd_models::{ForceSplit, Model, Plant, Settings, builtin};
+
+/// Both ways to split forces.
+pub(crate) const SPLITS: [ForceSplit; 2] = [ForceSplit::Symmetric, ForceSplit::Paper];
+
+/// A built-in scene.
+pub(crate) fn builtin(name: &str) -> Scene {
+    builtin::scene(name).unwrap_or_else(|| panic!("no scene {name}"))
+}
+
+/// A compiled scene.
+pub(crate) fn model(scene: &Scene) -> Arc<Model> {
+    Arc::new(Model::compile(scene).unwrap_or_else(|e| panic!("{}: {e}", scene.name)))
+}
+
+/// A plant at its scene's initial configuration.
+pub(crate) fn plant(scene: &Scene, change: impl FnOnce(&mut Settings)) -> Plant {
+    let model = model(scene);
+    let mut settings = Settings::new(&model);
+    change(&mut settings);
+    Plant::new(model, settings).unwrap_or_else(|e| panic!("{}: {e}", scene.name))
+}
+
+/// The input of step `k`: every force and prescribed position waves about its start.
+pub(crate) fn waving_input(plant: &Plant, k: u64) -> Vec<f64> {
+    let d = plant.model().dimensions();
+    let phase = |i: usize| (0.1 * k as f64 + i as f64).sin() - (i as f64).sin();
+    let forces = (0..d.inputs).map(|i| 0.5 * phase(i));
+    let prescribed = plant.model().coordinates()[d.dynamic..].iter().enumerate();
+    forces.chain(prescribed.map(|(i, c)| c.initial + 0.02 * phase(i))).collect()
+}
+
+/// Steps with [`waving_input`], so that nothing is at rest or symmetric any more.
+pub(crate) fn wave(plant: &mut Plant, steps: u64) {
+    for _ in 0..steps {
+        let k = plant.step_index();
+        let u = waving_input(plant, k + 1);
+        plant.step(&u).unwrap_or_else(|e| panic!("{} step {k}: {e}", plant.model().scene().name));
+    }
+}
+
+/// Numbers that look random, the same on every run (SplitMix64).
+pub(crate) struct Numbers(u64);
+
+impl Numbers {
+    /// The sequence of a seed.
+    pub(crate) fn new(seed: u64) -> Self {
+        Self(seed)
+    }
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+    /// Between `low` and `high`.
+    pub(crate) fn between(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * ((self.next() >> 11) as f64 / (1_u64 << 53) as f64)
+    }
+    /// Less than `n`.
+    pub(crate) fn below(&mut self, n: usize) -> usize {
+        (self.next() % n as u64) as usize
+    }
+    fn vector(&mut self, size: f64) -> [f64; 3] {
+        [0; 3].map(|_| self.between(-size, size))
+    }
+}
+
+/// A tree of random shape: oblique hinges and slides, full inertia tensors, springs along and across
+/// its branches, damping, forces, and now and then a prescribed joint.
+pub(crate) fn random_tree(seed: u64) -> Scene {
+    let mut random = Numbers::new(seed);
+    let mut scene = Scene {
+        format: 1,
+        name: format!("random-{seed}"),
+        description: String::new(),
+        time_step_s: 0.01,
+        gravity: random.vector(9.8),
+        damping: random.between(0.0, 0.3),
+        frames: Vec::new(),
+        coordinates: Vec::new(),
+        springs: Vec::new(),
+        inputs: Vec::new(),
+        constraints: Vec::new(),
+        operating_points: Vec::new(),
+    };
+    let joints = 2 + random.below(5);
+    for i in 0..joints {
+        let frame = random_frame(&mut random, i);
+        let prescribed = i > 0 && random.below(4) == 0;
+        scene.coordinates.push(Coordinate {
+            name: frame.name.clone(),
+            kind: if prescribed { CoordinateKind::Prescribed } else { CoordinateKind::Dynamic },
+            initial: random.between(-1.0, 1.0),
+            damping: None,
+        });
+        if !prescribed {
+            let (name, coordinate) = (format!("force{i}"), frame.name.clone());
+            scene.inputs.push(Input { name, coordinate, gain: random.between(0.5, 2.0) });
+        }
+        scene.frames.push(frame);
+    }
+    let (first, last) = (point(&mut random, 0), point(&mut random, joints - 1));
+    let (stiffness, rest_length) = (random.between(1.0, 30.0), random.between(0.0, 0.5));
+    scene.springs.push(Spring::TwoPoint { a: first, b: last.clone(), stiffness, rest_length });
+    let anchor = Point { frame: "world".to_owned(), at: random.vector(2.0) };
+    scene.springs.push(Spring::TwoPoint { a: anchor, b: last, stiffness, rest_length });
+    scene.springs.push(Spring::Coordinate {
+        coordinate: "joint0".to_owned(),
+        stiffness: random.between(0.0, 10.0),
+        rest: 0.3,
+    });
+    scene
+}
+
+fn point(random: &mut Numbers, joint: usize) -> Point {
+    Point { frame: format!("joint{joint}"), at: random.vector(1.0) }
+}
+
+fn random_frame(random: &mut Numbers, index: usize) -> Frame {
+    let parent = match random.below(index + 1) {
+        0 => "world".to_owned(),
+        i => format!("joint{}", i - 1),
+    };
+    let axis = random.vector(1.0);
+    let joint = if random.below(3) == 0 {
+        Joint::Prismatic { axis, coordinate: None }
+    } else {
+        Joint::Revolute { axis, coordinate: None }
+    };
+    // Moments of a box, then a shear small enough to keep them possible.
+    let [a, b, c] = [0; 3].map(|_| random.between(0.1, 0.3));
+    let [ab, ac, bc] = random.vector(0.02);
+    Frame {
+        name: format!("joint{index}"),
+        parent,
+        translation: random.vector(0.7),
+        rotation: Some(Rotation::Rpy(random.vector(PI))),
+        joint: Some(joint),
+        body: Some(Body {
+            mass: random.between(0.5, 2.0),
+            center_of_mass: random.vector(0.4),
+            inertia: vec![b + c, a + c, a + b, ab, ac, bc],
+        }),
+    }
+}
+
+/// A body that floats freely, with two arms; no gravity.
+pub(crate) fn floating() -> Scene {
+    Scene::from_toml(FLOATING).unwrap()
+}
+
+const FLOATING: &str = r#"
+format = 1
+name = "floating"
+
+[[frames]]
+name = "x"
+joint = { type = "prismatic", axis = [1.0, 0.0, 0.0] }
+[[frames]]
+name = "y"
+parent = "x"
+joint = { type = "prismatic", axis = [0.0, 1.0, 0.0] }
+[[frames]]
+name = "z"
+parent = "y"
+joint = { type = "prismatic", axis = [0.0, 0.0, 1.0] }
+[[frames]]
+name = "yaw"
+parent = "z"
+joint = { type = "revolute", axis = [0.0, 0.0, 1.0] }
+[[frames]]
+name = "pitch"
+parent = "yaw"
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+[[frames]]
+name = "hull"
+parent = "pitch"
+joint = { type = "revolute", axis = [1.0, 0.0, 0.0], coordinate = "roll" }
+body = { mass = 3.0, center_of_mass = [0.1, 0.0, 0.2], inertia = [0.3, 0.4, 0.5, 0.05, 0.0, 0.02] }
+[[frames]]
+name = "left"
+parent = "hull"
+translation = [0.0, 0.5, 0.0]
+joint = { type = "revolute", axis = [1.0, 0.0, 0.5] }
+body = { mass = 0.7, center_of_mass = [0.0, 0.4, 0.0], inertia = [0.02, 0.0, 0.02] }
+[[frames]]
+name = "right"
+parent = "hull"
+translation = [0.0, -0.5, 0.0]
+joint = { type = "revolute", axis = [0.2, 1.0, 0.5] }
+body = { mass = 0.9, center_of_mass = [0.3, -0.4, 0.0], inertia = [0.02, 0.01, 0.02] }
+
+[[springs]]
+type = "two_point"
+a = { frame = "left", at = [0.0, 0.8, 0.0] }
+b = { frame = "right", at = [0.0, -0.8, 0.0] }
+stiffness = 5.0
+rest_length = 1.0
+"#;
