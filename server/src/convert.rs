@@ -23,7 +23,7 @@ pub enum Start {
     /// From a description of the state.
     Initial(Initial),
     /// From a snapshot.
-    Snapshot(Snapshot),
+    Snapshot(Box<Snapshot>),
 }
 
 /// Checks a name or an id: lower-case letters, digits and hyphens, 1 to 63 of them.
@@ -136,7 +136,7 @@ pub fn start(initial: Option<v1::InitialState>, model: &Model) -> Result<Start, 
         Some(InitialForm::Projection(form)) => Initial::Projection { q: form.q, hold: form.hold },
         Some(InitialForm::OperatingPoint(name)) => Initial::OperatingPoint(name),
         Some(InitialForm::Snapshot(bytes)) => {
-            return Ok(Start::Snapshot(Snapshot::from_bytes(&bytes)?));
+            return Ok(Start::Snapshot(Box::new(Snapshot::from_bytes(&bytes)?)));
         }
     };
     Ok(Start::Initial(initial))

@@ -46,6 +46,12 @@ pub struct Fault {
     code: Code,
     reason: &'static str,
     message: String,
+    // Boxed: most results are good, and should not be moved about with room for this.
+    extra: Box<Extra>,
+}
+
+#[derive(Clone, Debug)]
+struct Extra {
     metadata: HashMap<String, String>,
     details: ErrorDetails,
 }
@@ -57,8 +63,7 @@ impl Fault {
             code,
             reason,
             message: message.into(),
-            metadata: HashMap::new(),
-            details: ErrorDetails::new(),
+            extra: Box::new(Extra { metadata: HashMap::new(), details: ErrorDetails::new() }),
         }
     }
 
@@ -74,7 +79,7 @@ impl Fault {
     ) -> Self {
         let (field, description) = (field.into(), description.into());
         let mut fault = Self::new(Code::InvalidArgument, reason, format!("{field}: {description}"));
-        fault.details.add_bad_request_violation(field, description);
+        fault.extra.details.add_bad_request_violation(field, description);
         fault
     }
 
@@ -118,7 +123,7 @@ impl Fault {
     ) -> Self {
         let message = format!("{sentence} `{name}`");
         let mut fault = Self::new(code, reason, message.clone());
-        fault.details.set_resource_info(kind, name, "", message);
+        fault.extra.details.set_resource_info(kind, name, "", message);
         fault
     }
 
@@ -130,7 +135,7 @@ impl Fault {
     ) -> Self {
         let message = message.into();
         let mut fault = Self::new(Code::FailedPrecondition, reason, message.clone());
-        fault.details.add_precondition_failure_violation(reason, subject, message);
+        fault.extra.details.add_precondition_failure_violation(reason, subject, message);
         fault
     }
 
@@ -146,7 +151,7 @@ impl Fault {
 
     /// Adds an entry to the metadata of `ErrorInfo`.
     pub fn with(mut self, key: &str, value: impl ToString) -> Self {
-        self.metadata.insert(key.to_owned(), value.to_string());
+        self.extra.metadata.insert(key.to_owned(), value.to_string());
         self
     }
 
@@ -157,9 +162,10 @@ impl Fault {
 }
 
 impl From<Fault> for Status {
-    fn from(mut fault: Fault) -> Self {
-        fault.details.set_error_info(fault.reason, ERROR_DOMAIN, fault.metadata);
-        Self::with_error_details(fault.code, fault.message, fault.details)
+    fn from(fault: Fault) -> Self {
+        let Extra { metadata, mut details } = *fault.extra;
+        details.set_error_info(fault.reason, ERROR_DOMAIN, metadata);
+        Self::with_error_details(fault.code, fault.message, details)
     }
 }
 
@@ -183,7 +189,7 @@ impl From<SceneError> for Fault {
         };
         let mut fault = Self::new(Code::InvalidArgument, "INVALID_SCENE", message);
         for problem in error.problems {
-            fault.details.add_bad_request_violation(problem.path, problem.message);
+            fault.extra.details.add_bad_request_violation(problem.path, problem.message);
         }
         fault
     }
@@ -196,6 +202,7 @@ impl From<LimitExceeded> for Fault {
             .with("value", error.limit)
             .with("actual", error.actual);
         fault
+            .extra
             .details
             .add_quota_failure_violation(format!("limit:{}", error.name), error.to_string());
         fault
