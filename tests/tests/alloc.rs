@@ -1,0 +1,90 @@
+//! After construction a plant's operations allocate nothing: a counting allocator watches them.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::sync::Arc;
+
+use plantd_models::{ForceSplit, Linearization, Model, Plant, Settings, builtin};
+
+/// Counts the allocations of each thread, so that tests in other threads do not disturb.
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes to the system's allocator with the caller's own arguments.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller keeps the contract.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller keeps the contract.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+    unsafe fn realloc(&self, memory: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count();
+        // SAFETY: the caller keeps the contract.
+        unsafe { System.realloc(memory, layout, size) }
+    }
+    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
+        // SAFETY: the caller keeps the contract.
+        unsafe { System.dealloc(memory, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+fn count() {
+    ALLOCATIONS.with(|allocations| allocations.set(allocations.get() + 1));
+}
+
+/// Allocations of this thread while `work` runs.
+fn allocations(work: impl FnOnce()) -> u64 {
+    let before = ALLOCATIONS.with(Cell::get);
+    work();
+    ALLOCATIONS.with(Cell::get) - before
+}
+
+const STEPS: usize = 100;
+
+/// Drives a plant with forces that differ from step to step, with and without linearization.
+fn drive(plant: &mut Plant, input: &mut [f64], out: &mut Linearization) {
+    let forces = plant.model().dimensions().inputs;
+    for k in 0..STEPS {
+        plant.hold_input(input);
+        input[..forces].iter_mut().for_each(|u| *u = 0.05 * (k as f64).sin());
+        plant.step(input).expect("a step succeeds");
+        plant.linearize(input, out).expect("a linearization succeeds");
+        plant.step_and_linearize(input, out).expect("both succeed together");
+    }
+}
+
+#[test]
+fn operations_of_a_plant_allocate_nothing() {
+    let families = ["chain-8", "chain-32", "scissor-8"];
+    for name in builtin::NAMES.iter().chain(&families) {
+        let scene = builtin::scene(name).expect("the scene is built in");
+        let model = Arc::new(Model::compile(&scene).expect("it compiles"));
+        for force_split in [ForceSplit::Symmetric, ForceSplit::Paper] {
+            let settings = Settings { force_split, ..Settings::new(&model) };
+            let mut plant = Plant::new(Arc::clone(&model), settings).expect("it starts");
+            let mut input = vec![0.0; model.dimensions().input()];
+            let mut out = Linearization::new(&model);
+            // The very first step counts too.
+            let count = allocations(|| drive(&mut plant, &mut input, &mut out));
+            assert_eq!(count, 0, "allocations of `{name}`, {force_split:?}");
+            assert_eq!(plant.step_index(), 2 * STEPS as u64, "`{name}` has moved");
+        }
+    }
+}
+
+#[test]
+fn the_counter_counts() {
+    let count = allocations(|| drop(std::hint::black_box(vec![1_u8; 16])));
+    assert_eq!(count, 1);
+}

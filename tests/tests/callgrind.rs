@@ -1,0 +1,277 @@
+//! Instruction counts, by callgrind: what a scene does not use costs nothing, and what a step costs
+//! does not grow unnoticed.
+//!
+//! Needs valgrind; without it these tests say so and pass.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
+
+use serde::{Deserialize, Serialize};
+
+/// Self cost by function, in instructions, of everything below the measured calls.
+struct Profile(BTreeMap<String, u64>);
+
+impl Profile {
+    fn total(&self) -> u64 {
+        self.0.values().sum()
+    }
+
+    /// Instructions of all functions whose name contains one of the patterns.
+    fn of(&self, patterns: &[&str]) -> u64 {
+        let matches = |name: &String| patterns.iter().any(|pattern| name.contains(pattern));
+        self.0.iter().filter(|(name, _)| matches(name)).map(|(_, cost)| cost).sum()
+    }
+}
+
+/// The stages that a plan leaves out, by the functions that do their work.
+const CONSTRAINTS: &[&str] =
+    &["plant::closure::", "plant::pivoted_lu::", "newton::fill_schur", "Workspace::find_responses"];
+const SPRINGS: &[&str] = &["plant::springs::add_gradient", "plant::springs::add_to_newton_matrix"];
+const DAMPING: &[&str] = &["plant::forces::add_damping"];
+const INPUTS: &[&str] = &["plant::forces::input_forces"];
+
+/// A pendulum without anything else.
+const BARE: &str = r#"
+format = 1
+name = "bare"
+gravity = [0.0, 0.0, -9.81]
+
+[[frames]]
+name = "rod"
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+body = { mass = 1.0, center_of_mass = [0.0, 0.0, -1.0] }
+
+[[coordinates]]
+name = "rod"
+initial = 0.5
+"#;
+
+/// What makes it a pendulum with a spring on its coordinate and one to the world.
+const SPRINGS_OF_SPRUNG: &str = r#"
+[[springs]]
+type = "coordinate"
+coordinate = "rod"
+stiffness = 2.0
+
+[[springs]]
+type = "two_point"
+a = { frame = "world", at = [1.0, 0.0, 0.0] }
+b = { frame = "rod", at = [0.0, 0.0, -1.0] }
+stiffness = 3.0
+rest_length = 0.5
+"#;
+
+#[test]
+fn a_scene_runs_no_code_of_what_it_does_not_have() {
+    let Some(valgrind) = valgrind() else { return };
+    let directory = tempfile::tempdir().expect("a temporary folder");
+    let write = |name: &str, text: &str| {
+        let path = directory.path().join(name);
+        std::fs::write(&path, text).expect("the scene is written");
+        path.into_os_string().into_string().expect("a path of text")
+    };
+    let bare = write("bare.toml", BARE);
+    let sprung = write("sprung.toml", &format!("{BARE}{SPRINGS_OF_SPRUNG}"));
+    // Scene; has it constraints, springs, damping, inputs?
+    let cases = [
+        (bare.as_str(), [false, false, false, false]),
+        (sprung.as_str(), [false, true, false, false]),
+        ("chain-8", [false, false, false, true]),
+        ("damped-pendulum", [false, false, true, true]),
+        ("four-bar", [true, false, false, true]),
+    ];
+    for (scene, has) in cases {
+        for operation in ["step", "linearize"] {
+            let profile = valgrind.profile(scene, operation, 10);
+            let stages = [
+                ("constraints", CONSTRAINTS),
+                ("springs", SPRINGS),
+                ("damping", DAMPING),
+                ("inputs", INPUTS),
+            ];
+            for ((stage, functions), has) in stages.into_iter().zip(has) {
+                let cost = profile.of(functions);
+                assert_eq!(cost > 0, has, "{scene}, {operation}: {cost} instructions of {stage}");
+            }
+        }
+    }
+}
+
+/// Instructions per call of each operation of a scene.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Counts {
+    step: u64,
+    linearize: u64,
+    step_and_linearize: u64,
+}
+
+/// The committed table. It holds for one compiler and one kind of processor: others say little about
+/// a change here.
+#[derive(Debug, Serialize, Deserialize)]
+struct Table {
+    conditions: Conditions,
+    scenes: BTreeMap<String, Counts>,
+}
+
+#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Conditions {
+    rustc: String,
+    processor: String,
+}
+
+impl Conditions {
+    fn here() -> Self {
+        let output = Command::new("rustc").arg("--version").output().expect("rustc runs");
+        let rustc = String::from_utf8_lossy(&output.stdout).trim().to_owned();
+        #[cfg(target_arch = "x86_64")]
+        let vectors = if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            " with AVX2 and FMA"
+        } else {
+            ""
+        };
+        #[cfg(not(target_arch = "x86_64"))]
+        let vectors = "";
+        Self { rustc, processor: format!("{}{vectors}", std::env::consts::ARCH) }
+    }
+}
+
+const SCENES: &[&str] =
+    &["pendulum", "double-pendulum", "chain-8", "chain-32", "four-bar", "scissor-8", "marionette"];
+/// Relative change that goes unnoticed.
+const TOLERANCE: f64 = 0.05;
+const CALLS: u64 = 50;
+const HEADER: &str = "\
+# Instructions per call, counted by callgrind: 50 calls from the initial configuration.
+# To renew: UPDATE_INSTRUCTIONS=1 cargo test -p plantd-tests --test callgrind
+
+";
+
+#[test]
+fn instructions_per_step_are_those_of_the_table() {
+    let Some(valgrind) = valgrind() else { return };
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("instructions.toml");
+    let update = std::env::var_os("UPDATE_INSTRUCTIONS").is_some();
+    let conditions = Conditions::here();
+    let count = |scene: &&str| ((*scene).to_owned(), valgrind.counts(scene));
+    if update {
+        let measured = Table { conditions, scenes: SCENES.iter().map(count).collect() };
+        let table = toml::to_string(&measured).expect("a table is text");
+        std::fs::write(path, format!("{HEADER}{table}")).expect("the table is written");
+        return;
+    }
+    let text = std::fs::read_to_string(path).expect("the table is there");
+    let committed: Table = toml::from_str(&text).expect("the table is TOML");
+    if committed.conditions != conditions {
+        eprintln!("skipped: the table is of {:?}, this is {conditions:?}", committed.conditions);
+        return;
+    }
+    assert!(SCENES.iter().eq(SCENES.iter().filter(|scene| committed.scenes.contains_key(**scene))));
+    let changes: Vec<String> = SCENES
+        .iter()
+        .flat_map(|scene| changes(scene, &committed.scenes[*scene], &valgrind.counts(scene)))
+        .collect();
+    assert!(
+        changes.is_empty(),
+        "instruction counts changed; if that is meant, run again with UPDATE_INSTRUCTIONS=1:\n{}",
+        changes.join("\n")
+    );
+}
+
+/// Describes the counts that differ by more than the tolerance.
+fn changes(scene: &str, then: &Counts, now: &Counts) -> Vec<String> {
+    let rows = [
+        ("step", then.step, now.step),
+        ("linearize", then.linearize, now.linearize),
+        ("step_and_linearize", then.step_and_linearize, now.step_and_linearize),
+    ];
+    let changed = |(operation, then, now): (&str, u64, u64)| {
+        let change = now as f64 / then as f64 - 1.0;
+        let percent = 100.0 * change;
+        let line = format!("{scene}, {operation}: {then} -> {now} ({percent:+.1} %)");
+        (change.abs() > TOLERANCE).then_some(line)
+    };
+    rows.into_iter().filter_map(changed).collect()
+}
+
+/// Valgrind with the program that it watches.
+struct Valgrind {
+    program: PathBuf,
+}
+
+/// None, and a message, if valgrind is not installed.
+fn valgrind() -> Option<Valgrind> {
+    let version = Command::new("valgrind").arg("--version").stdout(Stdio::null()).status();
+    if !version.is_ok_and(|status| status.success()) {
+        eprintln!("skipped: valgrind is not installed");
+        return None;
+    }
+    Some(Valgrind { program: step_count() })
+}
+
+/// The program, built as it is for use: optimised like the release.
+fn step_count() -> PathBuf {
+    static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+    let build = || {
+        let test = std::env::current_exe().expect("a test has a path");
+        let target = test.ancestors().nth(3).expect("the test is target/PROFILE/deps/NAME");
+        let status = Command::new(env!("CARGO"))
+            .args(["build", "--quiet", "--release", "--locked", "-p", "plantd-models"])
+            .args(["--example", "step_count", "--target-dir"])
+            .arg(target)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .status();
+        assert!(status.is_ok_and(|status| status.success()), "step_count does not build");
+        target.join("release/examples/step_count")
+    };
+    PROGRAM.get_or_init(build).clone()
+}
+
+impl Valgrind {
+    fn profile(&self, scene: &str, operation: &str, calls: u64) -> Profile {
+        let directory = tempfile::tempdir().expect("a temporary folder");
+        let file = directory.path().join("callgrind.out");
+        let output = Command::new("valgrind")
+            .args(["--tool=callgrind", "--toggle-collect=measured_call"])
+            .args(["--compress-strings=no", "--compress-pos=no"])
+            .arg(format!("--callgrind-out-file={}", file.display()))
+            .arg(&self.program)
+            .args([scene, operation, &calls.to_string()])
+            .output()
+            .expect("valgrind starts");
+        let messages = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{scene}, {operation}: {messages}");
+        parse(&std::fs::read_to_string(file).expect("callgrind writes its file"))
+    }
+
+    fn counts(&self, scene: &str) -> Counts {
+        let per_call = |operation| self.profile(scene, operation, CALLS).total() / CALLS;
+        Counts {
+            step: per_call("step"),
+            linearize: per_call("linearize"),
+            step_and_linearize: per_call("step-and-linearize"),
+        }
+    }
+}
+
+/// Reads the self cost of every function from a callgrind file with uncompressed names.
+fn parse(text: &str) -> Profile {
+    let mut costs = BTreeMap::new();
+    let mut function = "";
+    let mut is_call = false;
+    for line in text.lines() {
+        if let Some(name) = line.strip_prefix("fn=") {
+            function = name;
+        } else if line.starts_with("calls=") {
+            // The next line has the cost of the called function, which counts it itself.
+            is_call = true;
+        } else if line.starts_with(|c: char| c.is_ascii_digit()) {
+            let cost = line.split(' ').nth(1).and_then(|cost| cost.parse::<u64>().ok());
+            if !std::mem::take(&mut is_call) {
+                *costs.entry(function.to_owned()).or_default() += cost.unwrap_or(0);
+            }
+        }
+    }
+    Profile(costs)
+}
