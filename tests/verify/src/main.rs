@@ -30,6 +30,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "tests", quick: true, run: tests },
     Stage { name: "doctests", quick: false, run: doctests },
     Stage { name: "python", quick: false, run: python::test_client },
+    Stage { name: "demo", quick: false, run: demo },
 ];
 
 /// What the stages need to know.
@@ -130,13 +131,15 @@ fn build(context: &mut Context) -> Outcome {
 
 fn tests(context: &mut Context) -> Outcome {
     context.must_build()?;
-    if tools::has("cargo", &["nextest", "--version"]) {
-        run(&mut context.cargo(&["nextest", "run", "--workspace", "--locked"]))
+    let mut command = if tools::has("cargo", &["nextest", "--version"]) {
+        context.cargo(&["nextest", "run", "--workspace", "--locked"])
     } else {
         println!("cargo-nextest is not installed: cargo test runs the tests");
-        let targets = ["--lib", "--bins", "--tests", "--examples"];
-        run(context.cargo(&["test", "--workspace", "--locked", "--no-fail-fast"]).args(targets))
-    }
+        let mut command = context.cargo(&["test", "--workspace", "--locked", "--no-fail-fast"]);
+        command.args(["--lib", "--bins", "--tests", "--examples"]);
+        command
+    };
+    run(command.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 
 fn doctests(context: &mut Context) -> Outcome {
@@ -144,7 +147,21 @@ fn doctests(context: &mut Context) -> Outcome {
     run(&mut context.cargo(&["test", "--workspace", "--locked", "--doc"]))
 }
 
+/// Shows the demo, which compares its numbers with the paper's.
+fn demo(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    let binaries = context.binaries();
+    let mut command = Command::new(binaries.join("demo"));
+    command.arg("--output").arg(context.scratch().join("demo-output"));
+    run(command.current_dir(&context.root).env("PLANTD_BINARY_DIR", binaries))
+}
+
 impl Context {
+    /// Where the build stage leaves the binaries, which the tests need not build again.
+    fn binaries(&self) -> PathBuf {
+        self.target.join("debug")
+    }
+
     /// Refuses to go on after a failed build, whose errors say all there is to say.
     fn must_build(&self) -> Outcome {
         if self.broken { Err(Failure::Failed("the build failed".to_owned())) } else { Ok(()) }

@@ -26,7 +26,7 @@ pub(crate) fn test_client(context: &mut Context) -> Outcome {
     run(&mut install)?;
     let mut test = Command::new(environment.join("bin/python"));
     test.args(["-m", "pytest", "client/python/tests"]).current_dir(&context.root);
-    run(test.env("PLANTD", context.target.join("debug/plantd")))
+    run(test.env("PLANTD_SERVER", context.binaries().join("plantd")))
 }
 
 /// The environment's folder; creates the environment if it is not there.

@@ -1,0 +1,175 @@
+//! What `deploy/` says fits the server, and the systemd unit is sound and closed.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use plantd_server::config::{Config, Listen, LogFormat};
+use plantd_server::limits::Limits;
+use plantd_server::metrics::Metrics;
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn read(path: &str) -> String {
+    let path = root().join(path);
+    std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The annotated configuration with the keys that are commented out.
+fn full_configuration() -> String {
+    read("deploy/plantd.toml").replace("\n#scenes", "\nscenes").replace("\n#ready", "\nready")
+}
+
+/// Dotted names of all keys of a table.
+fn keys(table: &toml::Table, prefix: &str) -> Vec<String> {
+    let names = |(key, value): (&String, &toml::Value)| match value {
+        toml::Value::Table(inner) => keys(inner, &format!("{prefix}{key}.")),
+        _ => vec![format!("{prefix}{key}")],
+    };
+    let mut names: Vec<String> = table.iter().flat_map(names).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn the_annotated_configuration_is_valid() {
+    let config: Config = toml::from_str(&read("deploy/plantd.toml")).expect("it is read");
+    config.check().expect("it is in range");
+}
+
+#[test]
+fn the_annotated_configuration_has_every_key() {
+    let text = full_configuration();
+    // Read and written again, a configuration shows every key that is set: all of them must be.
+    let config: Config = toml::from_str(&text).expect("it is read");
+    assert!(config.unix.is_some() && config.scenes.is_some() && config.ready_file.is_some());
+    assert!(config.link.root.is_some());
+    let known: toml::Table = config.to_toml().expect("it is written").parse().expect("as TOML");
+    let annotated: toml::Table = text.parse().expect("it is TOML");
+    assert_eq!(keys(&annotated, ""), keys(&known, ""));
+}
+
+#[test]
+fn the_annotated_configuration_differs_from_the_defaults_only_where_it_says_so() {
+    let mut config: Config = toml::from_str(&read("deploy/plantd.toml")).expect("it is read");
+    assert_eq!(config.limits, Limits::default());
+    assert_ne!(config.metrics, Listen::Off);
+    config.metrics = Listen::Off;
+    config.unix = None;
+    config.link.root = None;
+    config.log.format = LogFormat::Text;
+    assert_eq!(config, Config::default());
+}
+
+#[test]
+fn the_readme_states_the_limits_in_force() {
+    let readme = read("README.md");
+    for limit in Limits::default().table() {
+        let row = format!("| `{}` | {} | {} |", limit.name, limit.value, limit.meaning);
+        assert!(readme.contains(&row), "README.md lacks the row\n{row}");
+    }
+}
+
+#[test]
+fn the_list_of_metrics_is_complete() {
+    let metrics = Metrics::default();
+    // A family without members is not written.
+    metrics.step_failed("NOT_CONVERGED");
+    metrics.rpc_ended("GetPlant", "OK");
+    let metrics = metrics.encode().expect("metrics are text");
+    let list = read("deploy/prometheus.yml");
+    let mut described: Vec<&str> =
+        list.lines().filter_map(|line| line.strip_prefix("# | `")?.split('`').next()).collect();
+    let mut registered: Vec<String> = metrics
+        .lines()
+        .filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' '))
+        // Counters are exposed with the suffix `_total`.
+        .map(
+            |(name, kind)| {
+                if kind == "counter" { format!("{name}_total") } else { name.to_owned() }
+            },
+        )
+        .collect();
+    described.sort_unstable();
+    registered.sort();
+    assert_eq!(described, registered);
+}
+
+#[test]
+fn ports_and_paths_agree() {
+    let config: Config = toml::from_str(&read("deploy/plantd.toml")).expect("it is read");
+    let port = |listen: Listen| match listen {
+        Listen::At(address) => address.port(),
+        Listen::Off => panic!("it listens"),
+    };
+    let container = read("deploy/Containerfile");
+    let (grpc, metrics) = (port(config.grpc), port(config.metrics));
+    assert!(container.contains(&format!("EXPOSE {grpc} {metrics}")));
+    assert!(read("deploy/prometheus.yml").contains(&format!("\"127.0.0.1:{metrics}\"")));
+    let unit = read("deploy/plantd.service");
+    let folder = unit.lines().find_map(|line| line.strip_prefix("RuntimeDirectory="));
+    let folder = Path::new("/run").join(folder.expect("the unit has a runtime folder"));
+    for path in [config.unix, config.link.root] {
+        assert!(path.expect("it is set").starts_with(&folder));
+    }
+    // What is cut off last must not be cut off by the service manager first.
+    let stop =
+        unit.lines().find_map(|line| line.strip_prefix("TimeoutStopSec=")?.strip_suffix('s'));
+    let stop: f64 = stop.expect("the unit bounds the stop").parse().expect("a number");
+    assert!(stop > config.shutdown_grace_s + 5.0);
+}
+
+#[test]
+fn the_container_is_built_from_what_is_here_and_not_run_by_root() {
+    let container = read("deploy/Containerfile");
+    let manifest: toml::Table = read("Cargo.toml").parse().expect("it is TOML");
+    let rust = manifest["workspace"]["package"]["rust-version"].as_str().expect("a version");
+    assert!(container.contains(&format!("rust:{rust}-")), "the container builds with {rust}");
+    assert!(container.lines().any(|line| line == "USER nonroot"));
+    assert!(container.contains("--shm-size"));
+    for line in container.lines().filter(|line| line.starts_with("COPY deploy/")) {
+        let source = line.split(' ').nth(1).expect("COPY has a source");
+        assert!(root().join(source).is_file(), "{source} is missing");
+    }
+}
+
+/// Runs systemd-analyze; none, and a message, if it is not installed.
+fn systemd_analyze(arguments: &[&str]) -> Option<(bool, String)> {
+    match Command::new("systemd-analyze").args(arguments).output() {
+        Ok(output) => {
+            let text = [output.stdout, output.stderr].concat();
+            Some((output.status.success(), String::from_utf8_lossy(&text).into_owned()))
+        }
+        Err(error) => {
+            eprintln!("skipped: systemd-analyze does not run: {error}");
+            None
+        }
+    }
+}
+
+#[test]
+fn the_systemd_unit_is_correct() {
+    // The command must exist for the check; any other one does.
+    let command = "ExecStart=/usr/local/bin/plantd serve ";
+    let unit = read("deploy/plantd.service");
+    assert!(unit.contains(command));
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("plantd.service");
+    std::fs::write(&path, unit.replace(command, "ExecStart=/bin/true ")).expect("it is written");
+    let path = path.to_str().expect("a path of text");
+    let Some((correct, messages)) = systemd_analyze(&["verify", path]) else { return };
+    assert!(correct, "{messages}");
+    assert!(!messages.contains("plantd.service:"), "{messages}");
+}
+
+#[test]
+fn the_systemd_unit_is_closed() {
+    // Of 100; a unit without any protection has 96.
+    const EXPOSURE_MAX: &str = "--threshold=20";
+    let path = root().join("deploy/plantd.service");
+    let path = path.to_str().expect("a path of text");
+    let arguments = ["security", "--offline=yes", "--no-pager", EXPOSURE_MAX, path];
+    let Some((closed, messages)) = systemd_analyze(&arguments) else { return };
+    assert!(closed, "{messages}");
+}
