@@ -8,7 +8,7 @@
 use std::error::Error;
 use std::sync::Arc;
 
-use plantd_models::{Linearization, Model, Plant, Scene, Settings, builtin};
+use plantd_models::{Linearization, Model, Plant, Scene, Settings, StepError, StepReport, builtin};
 
 /// A plant with all that its operations need.
 struct Measured {
@@ -54,9 +54,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             measured.plant.step(&measured.input)?;
         }
         measured.plant.hold_input(&mut measured.input);
-        if !measured_call(&mut measured) {
-            return Err("the step failed".into());
-        }
+        measured_call(&mut measured)?;
     }
     Ok(())
 }
@@ -64,12 +62,11 @@ fn main() -> Result<(), Box<dyn Error>> {
 // SAFETY: no other function of this program has this name.
 #[unsafe(no_mangle)]
 #[inline(never)]
-fn measured_call(measured: &mut Measured) -> bool {
+fn measured_call(measured: &mut Measured) -> Result<StepReport, StepError> {
     let Measured { plant, input, out, operation } = measured;
     match operation {
         Operation::Step => plant.step(input),
         Operation::Linearize => plant.linearize(input, out),
         Operation::StepAndLinearize => plant.step_and_linearize(input, out),
     }
-    .is_ok()
 }
