@@ -135,7 +135,8 @@ impl StepPlan {
     }
 }
 
-/// A plant as a message.
+/// A plant as a message. Waits for a step in progress, which is long on a large model: call it on a
+/// worker unless you hold the lease.
 pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
     let settings = session.settings();
     v1::PlantInfo {
@@ -166,10 +167,12 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<v1::GetPlantRequest>,
     ) -> Result<Response<v1::GetPlantResponse>, Status> {
         let session = self.hub.session(&request.into_inner().id)?;
-        let plant = plant_info(&session);
-        let energy = self.hub.workers.run(move |_| Ok(session.copy_plant().energy())).await?;
-        let energy = Some(convert::energy(energy));
-        Ok(Response::new(v1::GetPlantResponse { plant: Some(plant), energy }))
+        let job = move |_: &_| {
+            let plant = Some(plant_info(&session));
+            let energy = Some(convert::energy(session.copy_plant().energy()));
+            Ok(v1::GetPlantResponse { plant, energy })
+        };
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 
     async fn list_plants(
@@ -179,11 +182,14 @@ impl v1::plant_service_server::PlantService for PlantService {
         let request = request.into_inner();
         let (size, after) = convert::page(request.page_size, &request.page_token)?;
         let (sessions, has_more) = self.hub.page(after, size);
-        let mut plants: Vec<_> = sessions.iter().map(|session| plant_info(session)).collect();
-        let has_more = cut_page(&mut plants) || has_more;
-        let last = plants.last().filter(|_| has_more);
-        let next_page_token = last.map(|plant| plant.id.clone()).unwrap_or_default();
-        Ok(Response::new(v1::ListPlantsResponse { plants, next_page_token }))
+        let job = move |_: &_| {
+            let mut plants: Vec<_> = sessions.iter().map(|session| plant_info(session)).collect();
+            let has_more = cut_page(&mut plants) || has_more;
+            let last = plants.last().filter(|_| has_more);
+            let next_page_token = last.map(|plant| plant.id.clone()).unwrap_or_default();
+            Ok(v1::ListPlantsResponse { plants, next_page_token })
+        };
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 
     async fn delete_plant(
@@ -214,7 +220,9 @@ impl v1::plant_service_server::PlantService for PlantService {
         &self,
         request: Request<v1::WatchRequest>,
     ) -> Result<Response<Self::WatchStream>, Status> {
-        Ok(Response::new(watch::stream(&self.hub, request.into_inner())?))
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| watch::stream(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 
     async fn reset(
@@ -239,7 +247,8 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<v1::SnapshotRequest>,
     ) -> Result<Response<v1::SnapshotResponse>, Status> {
         let session = self.hub.session(&request.into_inner().id)?;
-        let snapshot = session.snapshot().to_bytes();
+        let job = move |_: &_| Ok(session.snapshot().to_bytes());
+        let snapshot = self.hub.workers.run(job).await?;
         Ok(Response::new(v1::SnapshotResponse { snapshot }))
     }
 
