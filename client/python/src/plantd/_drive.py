@@ -1,0 +1,74 @@
+"""Driving a plant: one message per step each way."""
+
+from __future__ import annotations
+
+import queue
+from typing import Any
+
+from plantd.v1 import plant_service_pb2 as pb
+from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
+
+from ._errors import PlantdError, from_failure, translate
+from ._types import Linearization, Plant, State, StepReport, Vector, vector
+
+
+class Driver:
+    """Holds the lease of a plant and steps it in lockstep. Use it in a ``with`` statement."""
+
+    def __init__(self, stub: PlantServiceStub, id: str, linearization: bool):
+        self._requests: queue.SimpleQueue[pb.DriveRequest | None] = queue.SimpleQueue()
+        self._requests.put(pb.DriveRequest(open=pb.DriveOpen(id=id, linearization=linearization)))
+        self._answers: Any = stub.Drive(iter(self._requests.get, None))
+        self._sequence = 0
+        #: What the solver did in the last step.
+        self.report: StepReport | None = None
+        #: Linearization of the last step, if the driver was opened with it.
+        self.linearization: Linearization | None = None
+        #: The plant as it was when the driver opened it.
+        self.plant = Plant._from(self._next().opened.plant)
+
+    @translate
+    def _next(self) -> pb.DriveResponse:
+        try:
+            return next(self._answers)
+        except StopIteration:
+            raise PlantdError("UNAVAILABLE", "the server closed the stream") from None
+
+    def step(self, u: Vector = ()) -> State:
+        """Takes one step with the input ``u`` (input forces, then next prescribed positions).
+
+        Raises `StepError` if the step failed: the plant is where it was and the driver goes on.
+        """
+        self._sequence += 1
+        input = pb.DriveInput(sequence=self._sequence, u=vector(u))
+        self._requests.put(pb.DriveRequest(input=input))
+        # An earlier answer belongs to a step that was interrupted, for example by Ctrl-C.
+        answer = self._next()
+        while getattr(answer, answer.WhichOneof("response")).sequence < self._sequence:
+            answer = self._next()
+        if answer.HasField("failure"):
+            raise from_failure(answer.failure.failure)
+        self.report = StepReport._from(answer.step.report)
+        if answer.step.HasField("linearization"):
+            self.linearization = Linearization._from(answer.step.linearization)
+        return State._from(answer.step.state)
+
+    def close(self) -> None:
+        """Gives the lease back and waits until the server has done so."""
+        self._requests.put(None)
+        try:
+            for _ in self._remaining():
+                pass
+        except PlantdError:
+            # The stream has ended in another way, and with it the lease.
+            pass
+
+    @translate
+    def _remaining(self) -> list[pb.DriveResponse]:
+        return list(self._answers)
+
+    def __enter__(self) -> Driver:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()

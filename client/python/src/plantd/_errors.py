@@ -1,0 +1,106 @@
+"""Errors, with the details that the server sends."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import grpc
+from google.rpc import error_details_pb2, status_pb2
+
+from plantd.v1 import common_pb2
+
+_DETAILS_KEY = "grpc-status-details-bin"
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One fault of a request."""
+
+    #: Path of the field, for example ``frames[3].body.mass`` in a scene.
+    field: str
+    #: What is wrong with it.
+    description: str
+
+
+class PlantdError(Exception):
+    """A call was refused or failed, or a stream ended with an error."""
+
+    def __init__(self, code: str, message: str, reason: str = "", violations: tuple[Violation, ...] = ()):
+        lines = [f"{code} ({reason}): {message}" if reason else f"{code}: {message}"]
+        lines += [
+            f"  {violation.field}: {violation.description}"
+            for violation in violations
+            if violation.description not in message
+        ]
+        super().__init__("\n".join(lines))
+        #: gRPC code, for example ``NOT_FOUND``.
+        self.code = code
+        #: A sentence that names the culprit.
+        self.message = message
+        #: Upper-case reason, for example ``LEASE_HELD``; empty if there is none.
+        self.reason = reason
+        #: The faults of the request.
+        self.violations = violations
+
+
+class StepError(PlantdError):
+    """A step was refused or failed; the plant is where it was and the driver goes on."""
+
+
+def from_failure(failure: common_pb2.Failure) -> StepError:
+    """The error of a step that failed in band."""
+    return StepError(_code_name(failure.code), failure.message, failure.reason)
+
+
+def from_rpc_error(error: grpc.RpcError) -> PlantdError:
+    """The error of a call."""
+    if not isinstance(error, grpc.Call):
+        return PlantdError("UNKNOWN", str(error))
+    reason, violations = "", ()
+    for key, value in error.trailing_metadata() or ():
+        if key == _DETAILS_KEY:
+            reason, violations = _details(value)
+    return PlantdError(error.code().name, error.details() or "", reason, violations)
+
+
+def _details(value: bytes) -> tuple[str, tuple[Violation, ...]]:
+    reason, violations = "", []
+    for detail in status_pb2.Status.FromString(value).details:
+        info, request = error_details_pb2.ErrorInfo(), error_details_pb2.BadRequest()
+        if detail.Unpack(info):
+            reason = info.reason
+        elif detail.Unpack(request):
+            violations += [Violation(v.field, v.description) for v in request.field_violations]
+    return reason, tuple(violations)
+
+
+def _code_name(number: int) -> str:
+    for code in grpc.StatusCode:
+        if code.value[0] == number:
+            return code.name
+    return "UNKNOWN"
+
+
+@contextmanager
+def translated() -> Iterator[None]:
+    """Raises gRPC's errors as this package's."""
+    try:
+        yield
+    except grpc.RpcError as error:
+        raise from_rpc_error(error) from None
+
+
+def translate(function: _Function) -> _Function:
+    """The same for a whole function."""
+
+    @functools.wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        with translated():
+            return function(*args, **kwargs)
+
+    return wrapper  # type: ignore[return-value]
