@@ -13,7 +13,7 @@ use plantd_client::Client;
 /// Longest wait for a server to come up or to go down.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A running server. Dropping it kills the process and removes its files.
+/// A running server. Dropping it ends the process, by force if need be, and removes its files.
 #[derive(Debug)]
 pub struct ServerProcess {
     child: Child,
@@ -115,7 +115,11 @@ impl ServerProcess {
     pub fn stop(&mut self) -> Result<ExitStatus> {
         let pid = rustix::process::Pid::from_child(&self.child);
         rustix::process::kill_process(pid, rustix::process::Signal::TERM)?;
-        let deadline = Instant::now() + PATIENCE;
+        self.wait(PATIENCE)
+    }
+
+    fn wait(&mut self, patience: Duration) -> Result<ExitStatus> {
+        let deadline = Instant::now() + patience;
         loop {
             if let Some(status) = self.child.try_wait()? {
                 return Ok(status);
@@ -143,9 +147,11 @@ impl ServerProcess {
 
 impl Drop for ServerProcess {
     fn drop(&mut self) {
-        // Fails only if the process has ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        // A server that may say goodbye leaves no shared memory behind; one that hangs may not.
+        if !matches!(self.child.try_wait(), Ok(Some(_))) && self.stop().is_err() {
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
         if std::thread::panicking() {
             eprintln!("---- log of the server ----\n{}", self.log());
         }

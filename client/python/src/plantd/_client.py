@@ -15,7 +15,7 @@ from plantd.v1.model_service_pb2_grpc import ModelServiceStub
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
 from ._drive import Driver
-from ._errors import translate, translated
+from ._errors import PlantdError, translate, translated
 from ._types import (
     Array,
     Energy,
@@ -40,11 +40,15 @@ Field = Literal["state", "report", "energy", "linearization", "gain"]
 #: Answers hold no more than a request asked for; this only stops a runaway peer.
 _MAX_RECEIVE_BYTES = 256 << 20
 
+#: Longest wait for a connection.
+_CONNECT_SECONDS = 5.0
+
 
 def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
     """Connects to ``http://host:port``, ``host:port`` or ``unix:/path``.
 
-    ``timeout`` in seconds limits the connection and each call that is not a stream.
+    A server that is just starting is waited for, 5 seconds at most. ``timeout`` in seconds limits
+    each call that is not a stream.
     """
     return Client(address, timeout=timeout)
 
@@ -61,6 +65,11 @@ class Client:
             # Without it gRPC sends the path as the authority, which HTTP/2 servers refuse.
             options.append(("grpc.default_authority", "localhost"))
         self._channel = grpc.insecure_channel(address.removeprefix("http://"), options)
+        try:
+            grpc.channel_ready_future(self._channel).result(timeout=_CONNECT_SECONDS)
+        except grpc.FutureTimeoutError:
+            self._channel.close()
+            raise PlantdError("UNAVAILABLE", f"no server at {address}") from None
         self._timeout = timeout
         self.models = ModelServiceStub(self._channel)
         self.plants = PlantServiceStub(self._channel)
@@ -78,8 +87,7 @@ class Client:
 
     @translate
     def _call(self, method: Any, request: Any) -> Any:
-        # A server that is just starting is waited for, as long as the timeout allows.
-        return method(request, timeout=self._timeout, wait_for_ready=True)
+        return method(request, timeout=self._timeout)
 
     # ---- models ----
 
@@ -151,7 +159,8 @@ class Client:
 
     def list_plants(self) -> list[Plant]:
         """All plants, by id."""
-        plants, token = [], ""
+        plants: list[Plant] = []
+        token = ""
         while True:
             request = plant_service_pb2.ListPlantsRequest(page_token=token)
             page = self._call(self.plants.ListPlants, request)

@@ -61,7 +61,8 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
     """The error of a call."""
     if not isinstance(error, grpc.Call):
         return PlantdError("UNKNOWN", str(error))
-    reason, violations = "", ()
+    reason = ""
+    violations: tuple[Violation, ...] = ()
     for key, value in error.trailing_metadata() or ():
         if key == _DETAILS_KEY:
             reason, violations = _details(value)

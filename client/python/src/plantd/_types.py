@@ -105,8 +105,8 @@ class Linearization:
 
     @classmethod
     def _from(cls, m: common_pb2.Linearization, **extra: Any) -> Linearization:
-        blocks = map(matrix, (m.a, m.b, m.multipliers_x, m.multipliers_u))
-        return cls(m.step, *blocks, **extra)
+        c, d = matrix(m.multipliers_x), matrix(m.multipliers_u)
+        return cls(m.step, matrix(m.a), matrix(m.b), c, d, **extra)
 
 
 @dataclass(frozen=True, eq=False)

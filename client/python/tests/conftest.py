@@ -1,0 +1,50 @@
+"""Starts the server that `PLANTD_SERVER` names."""
+
+import json
+import os
+import subprocess
+import time
+
+import pytest
+
+import plantd
+
+
+@pytest.fixture(scope="session")
+def addresses(tmp_path_factory):
+    """Addresses of a running server: ``grpc`` and ``unix``."""
+    binary = os.environ.get("PLANTD_SERVER")
+    if not binary:
+        pytest.exit("PLANTD_SERVER must name the plantd binary", returncode=2)
+    folder = tmp_path_factory.mktemp("server")
+    ready, log = folder / "ready.json", folder / "log"
+    arguments = ["serve", "--grpc", "127.0.0.1:0", "--unix", str(folder / "plantd.sock")]
+    with log.open("w") as output:
+        server = subprocess.Popen(
+            [binary, *arguments, "--ready-file", str(ready)],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+        )
+    try:
+        deadline = time.monotonic() + 30
+        while not ready.exists():
+            assert server.poll() is None and time.monotonic() < deadline, log.read_text()
+            time.sleep(0.01)
+        yield json.loads(ready.read_text())
+    finally:
+        server.terminate()
+        try:
+            server.wait(timeout=30)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            server.wait()
+
+
+@pytest.fixture(params=["grpc", "unix"])
+def client(addresses, request):
+    """A client, over TCP and over the Unix-domain socket."""
+    with plantd.connect(addresses[request.param]) as client:
+        yield client
+        for plant in client.list_plants():
+            client.delete_plant(plant.id)

@@ -1,0 +1,179 @@
+"""The client against a real server."""
+
+import math
+import threading
+
+import numpy as np
+import pytest
+
+import plantd
+from plantd.v1 import common_pb2, control_service_pb2
+
+SCENE = """
+format = 1
+name = "py-slider"
+
+[[frames]]
+name = "block"
+joint = { type = "prismatic", axis = [1.0, 0.0, 0.0] }
+body = { mass = 2.0 }
+
+[[inputs]]
+name = "push"
+coordinate = "block"
+"""
+
+
+def test_lqr_balances_the_pendulum(client):
+    gain = client.solve_lqr("pendulum", at="upright", q=[100, 1], r=[1])
+    assert gain.spectral_radius < 1
+    plant = client.create_plant("pendulum", q=math.pi - 0.2)
+    state = plant.state
+    with client.drive(plant.id) as driver:
+        for k in range(100):
+            state = driver.step(gain(state))
+            assert state.step == k + 1
+        assert driver.report.iterations > 0
+    assert abs(state.q[0] - math.pi) < 1e-9
+
+
+def test_every_way_to_step_gives_the_same_bits(client):
+    inputs = np.sin(0.1 * np.arange(50)).reshape(-1, 1)
+    driven = client.create_plant("cart-pole").id
+    with client.drive(driven, linearization=True) as driver:
+        states = [driver.step(u) for u in inputs]
+        last = driver.linearization
+    stepped = client.step(client.create_plant("cart-pole").id, inputs)
+    assert [s.x.tobytes() for s in states] == [s.x.tobytes() for s in stepped]
+    initial = client.create_plant("cart-pole").state
+    along = list(client.linearize_trajectory("cart-pole", initial, inputs))
+    assert len(along) == 50
+    assert along[-1].a.tobytes() == last.a.tobytes()
+
+
+def test_linearization_at_a_point(client):
+    here = client.linearize("cart-pole", at="upright")
+    assert here.a.shape == (4, 4) and here.b.shape == (4, 1) and here.c.shape == (0, 4)
+    assert here.controllability_rank == 4
+    again = client.linearize("cart-pole", state=here.state, u=here.u)
+    assert again.a.tobytes() == here.a.tobytes()
+
+
+def test_gains_along_a_trajectory(client):
+    initial = client.create_plant("cart-pole").state
+    u = np.zeros((20, 1))
+    gains = list(client.solve_trajectory_lqr("cart-pole", initial, u, q=np.eye(4), r=np.eye(1)))
+    assert len(gains) == 21 and gains[0].k.shape == (1, 4)
+    assert np.array_equal(gains[0](initial), [0.0])
+
+
+def test_snapshot_restore_and_reset(client):
+    plant = client.create_plant("double-pendulum", q=[0.5, -0.5])
+    client.step(plant.id, hold=10)
+    snapshot = client.snapshot(plant.id)
+    ahead = client.step(plant.id, hold=10)[-1]
+    assert client.restore(plant.id, snapshot).step == 10
+    assert client.step(plant.id, hold=10)[-1].x.tobytes() == ahead.x.tobytes()
+    assert client.reset(plant.id).x.tobytes() == plant.state.x.tobytes()
+    assert client.reset(plant.id, q=[0.1, 0.2], v=[0, 0]).q.tolist() == [0.1, 0.2]
+
+
+def test_watch(client):
+    plant = client.create_plant("pendulum").id
+    stop = threading.Event()
+
+    def drive():
+        with client.drive(plant) as driver:
+            while not stop.is_set():
+                driver.step(0.1)
+
+    driving = threading.Thread(target=drive)
+    driving.start()
+    try:
+        steps = []
+        for message in client.watch(plant, ["state", "energy"], every=2):
+            assert message.report is None and message.energy.total < 0
+            assert message.state.step == message.step
+            steps.append(message.step)
+            if len(steps) == 5:
+                break
+    finally:
+        stop.set()
+        driving.join(30)
+    assert all(step % 2 == 0 for step in steps) and sorted(set(steps)) == steps
+
+
+def test_rollout(client):
+    cases = [
+        control_service_pb2.RolloutCase(
+            initial=common_pb2.InitialState(
+                velocity=common_pb2.InitialState.Velocity(q=[0.1 * k], v=[0.0])
+            ),
+            hold=10,
+        )
+        for k in range(4)
+    ]
+    ends = sorted(client.rollout("pendulum", cases), key=lambda end: end.case)
+    assert [end.case for end in ends] == [0, 1, 2, 3]
+    assert all(not end.failure and end.states[-1].step == 10 for end in ends)
+
+
+def test_models(client):
+    assert "marionette" in [model.name for model in client.list_models()]
+    assert client.validate_scene(SCENE) == []
+    client.create_model(SCENE)
+    try:
+        assert client.get_model("py-slider").inputs == ["push"]
+    finally:
+        client.delete_model("py-slider")
+
+
+def test_a_bad_scene_names_all_its_errors(client):
+    bad = SCENE.replace("2.0", "-2.0").replace('coordinate = "block"', 'coordinate = "brick"')
+    with pytest.raises(plantd.PlantdError) as caught:
+        client.create_model(bad)
+    assert (caught.value.code, caught.value.reason) == ("INVALID_ARGUMENT", "INVALID_SCENE")
+    fields = {violation.field for violation in caught.value.violations}
+    assert fields == {"frames[0].body.mass", "inputs[0].coordinate"}
+    assert {problem.path for problem in client.validate_scene(bad)} == fields
+
+
+def test_a_bad_input_leaves_the_driver_going(client):
+    plant = client.create_plant("pendulum")
+    with client.drive(plant.id) as driver:
+        for u, reason in [([], "INPUT_DIMENSION"), ([math.nan], "INPUT_NOT_FINITE")]:
+            with pytest.raises(plantd.StepError) as caught:
+                driver.step(u)
+            assert caught.value.reason == reason
+        assert driver.step(0.0).step == 1
+
+
+def test_a_second_driver_and_a_deleted_plant(client):
+    plant = client.create_plant("pendulum").id
+    with client.drive(plant) as driver:
+        with pytest.raises(plantd.PlantdError) as caught:
+            client.drive(plant)
+        assert caught.value.reason == "LEASE_HELD"
+        client.delete_plant(plant)
+        with pytest.raises(plantd.PlantdError) as caught:
+            driver.step(0.0)
+        assert caught.value.reason == "PLANT_DELETED"
+    with pytest.raises(plantd.PlantdError) as caught:
+        client.get_plant(plant)
+    assert (caught.value.code, caught.value.reason) == ("NOT_FOUND", "PLANT_NOT_FOUND")
+
+
+def test_the_lease_is_free_after_the_with_statement(client):
+    plant = client.create_plant("pendulum").id
+    for k in range(20):
+        with client.drive(plant) as driver:
+            assert driver.step(0.0).step == k + 1
+
+
+def test_arguments_that_contradict_each_other(client):
+    with pytest.raises(ValueError):
+        client.create_plant("pendulum", at="upright", q=[0.0])
+    with pytest.raises(ValueError):
+        client.create_plant("pendulum", v=[0.0])
+    with pytest.raises(ValueError):
+        client.solve_lqr("pendulum", q=np.zeros((2, 2, 2)), r=[1])

@@ -1,0 +1,49 @@
+"""The examples run, and close their loops in fewer than 30 lines."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import plantd
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def run(name, *arguments):
+    command = [sys.executable, str(EXAMPLES / name), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+
+
+def test_pendulum_lqr(addresses):
+    last = run("pendulum_lqr.py", addresses["grpc"]).splitlines()[-1]
+    assert abs(float(last.split()[-2])) < 1e-3
+
+
+def test_marionette(addresses):
+    assert len(run("marionette.py", addresses["unix"]).splitlines()) == 10
+
+
+def test_watch(addresses):
+    with plantd.connect(addresses["grpc"]) as client:
+        plant = client.create_plant("pendulum").id
+        command = [sys.executable, str(EXAMPLES / "watch.py"), plant, addresses["grpc"]]
+        watch = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        # A guard against a watch that says nothing.
+        guard = threading.Timer(60, watch.kill)
+        guard.start()
+        line = []
+        reader = threading.Thread(target=lambda: line.append(watch.stdout.readline()))
+        reader.start()
+        with client.drive(plant) as driver:
+            while reader.is_alive():
+                driver.step(0.0)
+        guard.cancel()
+        client.delete_plant(plant)
+        watch.wait(60)
+        assert " J " in line[0]
+
+
+def test_examples_are_short():
+    for file in EXAMPLES.glob("*.py"):
+        assert len(file.read_text().splitlines()) < 30, file.name

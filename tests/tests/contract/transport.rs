@@ -1,0 +1,133 @@
+//! Ways in and out: Unix-domain socket, gRPC-Web, reflection, health, shutdown.
+
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use plantd_client::{Client, Code, Error, v1};
+use tonic_health::pb::{HealthCheckRequest, health_check_response, health_client::HealthClient};
+use tonic_reflection::pb::v1::{
+    ServerReflectionRequest, server_reflection_client::ServerReflectionClient,
+    server_reflection_request::MessageRequest, server_reflection_response::MessageResponse,
+};
+
+use crate::support::*;
+
+const SERVICES: [&str; 3] =
+    ["plantd.v1.ModelService", "plantd.v1.PlantService", "plantd.v1.ControlService"];
+
+#[tokio::test]
+async fn the_unix_socket_leads_to_the_same_plants() {
+    let (server, over_tcp) = server().await;
+    let over_unix = Client::connect(server.unix_address()).await.unwrap();
+    let id = plant(&over_unix, "pendulum").await.id;
+    let mut driver = over_unix.drive(&id).await.unwrap();
+    let state = driver.step(&[0.1]).await.unwrap().state.unwrap();
+    let seen = over_tcp.get_plant(&id).await.unwrap().plant.unwrap().state.unwrap();
+    assert_eq!(bits(&seen), bits(&state));
+}
+
+#[tokio::test]
+async fn health_is_reported_for_each_service() {
+    let (_server, client) = server().await;
+    let mut health = HealthClient::new(client.channel());
+    for service in SERVICES.into_iter().chain([""]) {
+        let request = HealthCheckRequest { service: service.to_owned() };
+        let answer = health.check(request).await.unwrap().into_inner();
+        assert_eq!(answer.status(), health_check_response::ServingStatus::Serving, "{service}");
+    }
+    let request = HealthCheckRequest { service: "plantd.v1.Nothing".to_owned() };
+    assert_eq!(health.check(request).await.unwrap_err().code(), Code::NotFound);
+}
+
+#[tokio::test]
+async fn reflection_lists_and_describes_the_services() {
+    let (_server, client) = server().await;
+    let mut reflection = ServerReflectionClient::new(client.channel());
+    let mut ask = async |message_request| {
+        let request =
+            ServerReflectionRequest { host: String::new(), message_request: Some(message_request) };
+        let stream = reflection.server_reflection_info(tokio_stream::iter([request])).await;
+        let answer = soon(stream.unwrap().into_inner().message()).await.unwrap().unwrap();
+        answer.message_response.unwrap()
+    };
+    let MessageResponse::ListServicesResponse(list) =
+        ask(MessageRequest::ListServices(String::new())).await
+    else {
+        panic!("not a list of services")
+    };
+    let names: Vec<_> = list.service.iter().map(|service| service.name.as_str()).collect();
+    for service in SERVICES {
+        assert!(names.contains(&service), "no {service} among {names:?}");
+        let symbol = MessageRequest::FileContainingSymbol(service.to_owned());
+        let MessageResponse::FileDescriptorResponse(files) = ask(symbol).await else {
+            panic!("{service} is not described")
+        };
+        assert!(!files.file_descriptor_proto.is_empty());
+    }
+}
+
+/// A browser's request: HTTP/1.1, a frame of a length and a message, trailers in the body.
+#[tokio::test(flavor = "multi_thread")]
+async fn grpc_web_is_served_over_http_1() {
+    let (server, _client) = server().await;
+    // GetModelRequest { name: "pendulum" }: field 1, length 8.
+    let message = [b"\x0a\x08".as_slice(), b"pendulum"].concat();
+    let (head, body) = post_grpc_web(server.address(), "ModelService/GetModel", &message);
+    assert!(head.starts_with("HTTP/1.1 200"), "{head}");
+    assert!(head.to_lowercase().contains("application/grpc-web+proto"), "{head}");
+    let text = String::from_utf8_lossy(&body);
+    assert!(text.contains("pendulum") && text.contains("theta") && text.contains("grpc-status:0"));
+
+    let message = [b"\x0a\x04".as_slice(), b"none"].concat();
+    let (head, body) = post_grpc_web(server.address(), "ModelService/GetModel", &message);
+    let answer = format!("{head}{}", String::from_utf8_lossy(&body)).replace(": ", ":");
+    assert!(answer.contains("grpc-status:5"), "{answer}");
+}
+
+fn post_grpc_web(address: &str, method: &str, message: &[u8]) -> (String, Vec<u8>) {
+    let host = address.strip_prefix("http://").unwrap();
+    let mut stream = TcpStream::connect(host).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+    let length = message.len() as u32;
+    let request = format!(
+        "POST /plantd.v1.{method} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\
+         Content-Type: application/grpc-web+proto\r\nX-Grpc-Web: 1\r\n\
+         Content-Length: {}\r\n\r\n",
+        5 + length
+    );
+    stream.write_all(request.as_bytes()).unwrap();
+    stream.write_all(&[&[0], length.to_be_bytes().as_slice(), message].concat()).unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let end = answer.windows(4).position(|w| w == b"\r\n\r\n").expect("a head");
+    let body = answer.split_off(end + 4);
+    (String::from_utf8(answer).unwrap(), body)
+}
+
+#[tokio::test]
+async fn a_shutdown_ends_open_streams_and_the_process() {
+    let (mut server, client) = server().await;
+    let id = plant(&client, "pendulum").await.id;
+    let request = v1::WatchRequest {
+        id: id.clone(),
+        fields: vec![v1::WatchField::State.into()],
+        ..Default::default()
+    };
+    let mut watch = client.watch(request).await.unwrap();
+    let mut driver = client.drive(&id).await.unwrap();
+    driver.step(&[0.0]).await.unwrap();
+
+    let stopped = tokio::task::spawn_blocking(move || server.stop());
+    let end: Error = loop {
+        match soon(watch.next()).await {
+            Ok(Some(_)) => {}
+            Ok(None) => panic!("a watch that ends as if the plant were done"),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!((end.code(), end.reason()), (Some(Code::Unavailable), "SHUTTING_DOWN"));
+    let end = soon(driver.step(&[0.0])).await.unwrap_err();
+    assert_eq!((end.code(), end.reason()), (Some(Code::Unavailable), "SHUTTING_DOWN"));
+    assert!(soon(stopped).await.unwrap().unwrap().success());
+}

@@ -1,0 +1,199 @@
+//! The `plantctl` command against a real server: output, exit codes, and where messages go.
+
+use std::io::Write as _;
+use std::process::{Command, Output, Stdio};
+
+use plantd_tests::server::{ServerProcess, binary};
+use serde_json::Value;
+
+const SCENE: &str = r#"
+format = 1
+name = "slider"
+
+[[frames]]
+name = "block"
+joint = { type = "prismatic", axis = [1.0, 0.0, 0.0] }
+body = { mass = 2.0 }
+
+[[inputs]]
+name = "push"
+coordinate = "block"
+"#;
+
+fn plantctl(address: &str, arguments: &[&str]) -> Command {
+    let mut command = Command::new(binary("plantctl").unwrap());
+    command.env("PLANTD_ADDRESS", address).args(arguments).stdin(Stdio::null());
+    command
+}
+
+fn run(server: &ServerProcess, arguments: &[&str]) -> Output {
+    plantctl(server.address(), arguments).output().unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+/// The output of a command that must succeed in silence on standard error.
+#[track_caller]
+fn text(server: &ServerProcess, arguments: &[&str]) -> String {
+    let output = run(server, arguments);
+    assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
+    assert_eq!(stderr(&output), "");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// The same with `--json`, parsed.
+#[track_caller]
+fn json(server: &ServerProcess, arguments: &[&str]) -> Value {
+    let arguments = [arguments, &["--json"]].concat();
+    serde_json::from_str(&text(server, &arguments)).unwrap()
+}
+
+#[test]
+fn a_plant_from_its_creation_to_its_end() {
+    let server = ServerProcess::start().unwrap();
+    let created = json(&server, &["create", "pendulum", "--id", "p1", "--q", "-0.5", "--v", "1"]);
+    assert_eq!((&created["id"], &created["state"]["q"][0]), (&"p1".into(), &(-0.5).into()));
+
+    let one = json(&server, &["step", "p1", "--u", "-0.1", "--u", "0.2", "--count", "5", "--all"]);
+    let steps: Vec<_> = one["states"].as_array().unwrap().iter().map(|s| &s["step"]).collect();
+    assert_eq!(steps, [1, 2, 3, 4, 5]);
+    assert!(one["report"]["iterations"].as_u64().unwrap() > 0);
+
+    let snapshot = server.directory().join("snapshot");
+    let snapshot = snapshot.to_str().unwrap();
+    json(&server, &["snapshot", "p1", snapshot]);
+    let ahead = json(&server, &["step", "p1", "--count", "3"]);
+    assert_eq!(json(&server, &["restore", "p1", snapshot])["step"], 5);
+    assert_eq!(json(&server, &["step", "p1", "--count", "3"])["states"], ahead["states"]);
+
+    let shown = json(&server, &["show", "plant", "p1"]);
+    assert_eq!(shown["plant"]["state"], ahead["states"][0]);
+    assert!(shown["energy"]["kinetic_j"].as_f64().unwrap() > 0.0);
+    assert_eq!(json(&server, &["reset", "p1"])["step"], 0);
+    assert_eq!(json(&server, &["reset", "p1", "--at", "upright"])["p"][0], 0.0);
+
+    let listed = json(&server, &["list"]);
+    assert_eq!(listed["plants"][0]["id"], "p1");
+    assert!(listed["models"].as_array().unwrap().len() >= plantd_models::builtin::NAMES.len());
+    json(&server, &["delete", "plant", "p1"]);
+    assert_eq!(json(&server, &["list", "plants"])["plants"], Value::Array(Vec::new()));
+}
+
+#[test]
+fn linearizations_and_gains_are_printed_for_people_and_for_programs() {
+    let server = ServerProcess::start().unwrap();
+    let at = ["cart-pole", "--at", "upright"];
+    let answer = json(&server, &[&["linearize"], at.as_slice()].concat());
+    assert_eq!(answer["linearization"]["a"]["rows"], 4);
+    assert_eq!(answer["linearization"]["b"]["data"].as_array().unwrap().len(), 4);
+    assert_eq!(answer["controllability_rank"], 4);
+    let shown = text(&server, &[&["linearize"], at.as_slice()].concat());
+    for part in ["A = df/dx (4 × 4)", "B = df/du (4 × 1)", "p(theta)", "force", "rank: 4 of 4"] {
+        assert!(shown.contains(part), "no `{part}` in\n{shown}");
+    }
+
+    let weights = ["--q", "100,1,1,1", "--r", "0.1"];
+    let answer = json(&server, &[&["lqr"], at.as_slice(), &weights].concat());
+    assert_eq!(answer["gain"]["k"]["cols"], 4);
+    assert!(answer["spectral_radius"].as_f64().unwrap() < 1.0);
+    let shown = text(&server, &[&["lqr"], at.as_slice(), &weights].concat());
+    assert!(shown.contains("K (1 × 4)") && shown.contains("spectral radius"), "{shown}");
+
+    json(&server, &["create", "cart-pole", "--id", "cart"]);
+    let here = json(&server, &["linearize", "--plant", "cart"]);
+    assert_eq!(here["state"]["q"][1], 0.7);
+}
+
+#[test]
+fn scenes_are_checked_explained_and_uploaded() {
+    let server = ServerProcess::start().unwrap();
+    let good = server.directory().join("slider.toml");
+    let bad = server.directory().join("bad.toml");
+    std::fs::write(&good, SCENE).unwrap();
+    std::fs::write(&bad, SCENE.replace("mass = 2.0", "mass = -2.0").replace("push", "")).unwrap();
+    let (good, bad) = (good.to_str().unwrap(), bad.to_str().unwrap());
+
+    assert_eq!(json(&server, &["validate", good])["model"]["name"], "slider");
+    let output = run(&server, &["validate", bad]);
+    assert_eq!(output.status.code(), Some(1));
+    let problems = String::from_utf8(output.stdout).unwrap();
+    for path in ["frames[0].body.mass: ", "inputs[0].name: "] {
+        assert!(problems.contains(path), "no `{path}` in\n{problems}");
+    }
+    let plan = text(&server, &["explain", good]);
+    json(&server, &["upload", good]);
+    assert_eq!(text(&server, &["explain", "slider"]), plan);
+    assert!(text(&server, &["show", "model", "slider"]).contains("block"));
+
+    let mut child = plantctl(server.address(), &["validate", "-"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    child.stdin.take().unwrap().write_all(SCENE.as_bytes()).unwrap();
+    assert!(child.wait_with_output().unwrap().status.success());
+    json(&server, &["delete", "model", "slider"]);
+}
+
+#[test]
+fn a_watch_prints_one_object_per_step() {
+    let server = ServerProcess::start().unwrap();
+    json(&server, &["create", "pendulum", "--id", "p"]);
+    let arguments = ["watch", "p", "--fields", "state,energy", "--count", "1", "--json"];
+    let watch = plantctl(server.address(), &arguments).stdout(Stdio::piped()).spawn().unwrap();
+    // Steps until the watch, which takes its time to start, has seen one.
+    let watch = std::thread::spawn(|| watch.wait_with_output().unwrap());
+    for _ in 0..1000 {
+        json(&server, &["step", "p"]);
+        if watch.is_finished() {
+            break;
+        }
+    }
+    let output = watch.join().unwrap();
+    let lines = String::from_utf8(output.stdout).unwrap();
+    let message: Value = serde_json::from_str(lines.trim()).unwrap();
+    assert_eq!(message["state"]["step"], message["step"]);
+    assert!(message["energy"]["potential_j"].is_f64());
+}
+
+#[test]
+fn refusals_go_to_standard_error_with_their_exit_code() {
+    let server = ServerProcess::start().unwrap();
+    let output = run(&server, &["show", "plant", "nobody"]);
+    assert_eq!((output.status.code(), output.stdout.as_slice()), (Some(1), [].as_slice()));
+    assert!(stderr(&output).contains("NOT_FOUND (PLANT_NOT_FOUND)"), "{}", stderr(&output));
+
+    let output = run(&server, &["create", "pendulum", "--q", "1,2", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    let error: Value = serde_json::from_str(&stderr(&output)).unwrap();
+    assert_eq!(error["error"]["code"], "INVALID_ARGUMENT");
+    assert_eq!(error["error"]["violations"][0]["field"], "initial.q");
+
+    assert_eq!(run(&server, &["dance"]).status.code(), Some(2));
+    assert_eq!(run(&server, &["step", "p", "--u", "one"]).status.code(), Some(2));
+
+    // Bound and dropped: a port that nobody listens on.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let nowhere = plantctl(&format!("http://127.0.0.1:{port}"), &["list"]).output().unwrap();
+    assert_eq!(nowhere.status.code(), Some(3));
+    assert!(stderr(&nowhere).contains("refused"), "{}", stderr(&nowhere));
+}
+
+#[test]
+fn the_address_may_be_a_unix_socket_and_the_flag_wins() {
+    let server = ServerProcess::start().unwrap();
+    let arguments = ["list", "plants", "--json", "--address", server.unix_address()];
+    let output = plantctl("http://127.0.0.1:1", &arguments).output().unwrap();
+    assert!(output.status.success(), "{}", stderr(&output));
+}
+
+#[test]
+fn help_begins_with_examples() {
+    let output = plantctl("unix:/nowhere", &["--help"]).output().unwrap();
+    let help = String::from_utf8(output.stdout).unwrap();
+    let position = |part: &str| help.find(part).unwrap_or_else(|| panic!("no `{part}`"));
+    assert!(position("Examples:") < position("Usage:"));
+    assert!(position("Usage:") < position("Exit codes:"));
+}
