@@ -13,6 +13,15 @@ pub const DEFAULT_ADDRESS: &str = "http://127.0.0.1:50051";
 /// this only stops a runaway peer: the linearization of 512 coordinates takes 50 MiB.
 pub const MAX_RECEIVE_BYTES: usize = 256 << 20;
 
+/// Bytes that the server may send ahead on one stream. Small, so that a watcher that pauses finds
+/// little that is stale when it goes on.
+const STREAM_WINDOW_BYTES: u32 = 64 << 10;
+
+/// Bytes that the server may send ahead on all streams of a connection. The HTTP/2 library closes a
+/// connection on which the unread small frames cost more memory than half of this, at 256 bytes a
+/// frame; a stream window full of the smallest states costs a third of a MiB.
+const CONNECTION_WINDOW_BYTES: u32 = 64 << 20;
+
 /// Limits of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConnectOptions {
@@ -35,6 +44,8 @@ pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<C
         .connect_timeout(options.connect_timeout)
         // Without it a round trip waits for the peer's delayed acknowledgement, 40 ms.
         .tcp_nodelay(true)
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
         .tcp_keepalive(Some(Duration::from_secs(30)))
         .http2_keep_alive_interval(Duration::from_secs(30))
         .user_agent(concat!("plantd-client/", env!("CARGO_PKG_VERSION")))

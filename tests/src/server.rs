@@ -53,6 +53,8 @@ impl ServerProcess {
         command
             .arg("serve")
             .args(["--grpc", "127.0.0.1:0", "--metrics", "127.0.0.1:0"])
+            // A test that ends does not answer the server's farewell on its idle connections.
+            .args(["--shutdown-grace-s", "0.2"])
             .arg("--unix")
             .arg(directory.path().join("plantd.sock"))
             .arg("--ready-file")
@@ -187,11 +189,12 @@ fn build() -> Result<PathBuf> {
     };
     let target = directory.parent().context("the target directory has no parent")?;
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    // The whole workspace, so that features, and with them the built dependencies, are those of the
-    // running program.
+    // With the binaries of this package as well, so that Cargo sees the same dependencies as for the
+    // running program and builds none of them a second time.
     let output = Command::new(cargo)
         .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .args(["build", "--quiet", "--workspace", "--bin", "plantd", "--bin", "plantctl"])
+        .args(["build", "--quiet", "--bins"])
+        .args(["-p", "plantd-server", "-p", "plantd-client", "-p", env!("CARGO_PKG_NAME")])
         .args(["--profile", profile, "--target-dir"])
         .arg(target)
         .output()

@@ -72,7 +72,8 @@ fn a_plant_from_its_creation_to_its_end() {
     assert_eq!(shown["plant"]["state"], ahead["states"][0]);
     assert!(shown["energy"]["kinetic_j"].as_f64().unwrap() > 0.0);
     assert_eq!(json(&server, &["reset", "p1"])["step"], 0);
-    assert_eq!(json(&server, &["reset", "p1", "--at", "upright"])["p"][0], 0.0);
+    let upright = json(&server, &["reset", "p1", "--at", "upright"]);
+    assert_eq!(upright["q"][0], std::f64::consts::PI);
 
     let listed = json(&server, &["list"]);
     assert_eq!(listed["plants"][0]["id"], "p1");

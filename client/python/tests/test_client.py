@@ -134,7 +134,7 @@ def test_a_bad_scene_names_all_its_errors(client):
         client.create_model(bad)
     assert (caught.value.code, caught.value.reason) == ("INVALID_ARGUMENT", "INVALID_SCENE")
     fields = {violation.field for violation in caught.value.violations}
-    assert fields == {"frames[0].body.mass", "inputs[0].coordinate"}
+    assert fields >= {"frames[0].body.mass", "inputs[0].coordinate"}
     assert {problem.path for problem in client.validate_scene(bad)} == fields
 
 
