@@ -17,7 +17,9 @@ const STEPS: usize = 200;
 const PASSES: usize = 25;
 
 /// Scene, time step in seconds, and trep's step and first derivatives in microseconds.
-const SCENES: &[(&str, f64, Option<(f64, f64)>)] = &[
+type Row = (&'static str, f64, Option<(f64, f64)>);
+
+const SCENES: &[Row] = &[
     ("pendulum", 0.1, Some((6.3, 0.86))),
     ("double-pendulum", 0.01, None),
     ("cart-pole", 0.01, None),

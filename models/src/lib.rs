@@ -13,6 +13,9 @@
 //! Murphey, "Structured Linearization of Discrete Mechanical Systems for Analysis and Optimal
 //! Control" (IEEE T-ASE 12(1), 2015). Units are SI, angles are radians.
 
+// The mechanics does not log.
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod builtin;
 mod compile;
 pub mod control;

@@ -220,7 +220,7 @@ fn wrong_shapes_and_numbers_are_refused() {
         RiccatiError::NotFinite { matrix: "A", sample: 1 }
     );
     assert_eq!(
-        finite_horizon_on_manifold(&[good.clone()], &[], &weights).unwrap_err(),
+        finite_horizon_on_manifold(std::slice::from_ref(&good), &[], &weights).unwrap_err(),
         RiccatiError::TangentCount { samples: 1, actual: 0 }
     );
     let explosive = Sample { a: DMatrix::identity(2, 2) * 1e120, b: DMatrix::zeros(2, 1) };
