@@ -24,8 +24,10 @@ pub(crate) enum Name {
     Pendulum,
     /// The marionette: time-varying LQR along a motion, over shared memory.
     Marionette,
-    /// Round trips of one pendulum over each link.
-    Latency,
+    /// Round trips of a pendulum over gRPC.
+    GrpcLatency,
+    /// Round trips of a pendulum over shared memory.
+    LinkLatency,
 }
 
 /// A line that a controller prints.
@@ -57,7 +59,8 @@ pub(crate) fn run(name: Name, address: &str) -> Result<()> {
         match name {
             Name::Pendulum => to_value(pendulum::control(&client).await?),
             Name::Marionette => to_value(marionette::control(&client).await?),
-            Name::Latency => to_value(latency::measure(&client).await?),
+            Name::GrpcLatency => to_value(latency::over_grpc(&client).await?),
+            Name::LinkLatency => to_value(latency::over_shared_memory(&client).await?),
         }
     })?;
     emit(&Event::Result(result));

@@ -1,7 +1,7 @@
 //! The director: starts the server and the controllers, compares, plots, and clears the stage.
 
 use std::io::IsTerminal as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
@@ -11,8 +11,9 @@ use plantd_tests::server::{ServerProcess, binary};
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::controller::{Name, Process};
+use crate::latency::RoundTrips;
 use crate::report::Table;
-use crate::{latency, marionette, pendulum, plots, report};
+use crate::{marionette, pendulum, plots, report};
 
 /// Shows everything; `false` if a number is off.
 pub(crate) fn run(output: &Path) -> Result<bool> {
@@ -53,14 +54,15 @@ async fn show(server: &ServerProcess, output: &Path) -> Result<Table> {
         perform::<marionette::Report>(Name::Marionette, server.address()).await?;
     report::marionette(&mut table, pid, &marionette);
 
-    let (pid, tcp) = perform::<latency::Report>(Name::Latency, server.address()).await?;
-    let (_, unix) = perform::<latency::Report>(Name::Latency, server.unix_address()).await?;
+    let (tcp_pid, tcp) = perform::<RoundTrips>(Name::GrpcLatency, server.address()).await?;
+    let (unix_pid, unix) = perform::<RoundTrips>(Name::GrpcLatency, server.unix_address()).await?;
+    let (link_pid, link) = perform::<RoundTrips>(Name::LinkLatency, server.address()).await?;
     report::round_trips(
-        pid,
+        [tcp_pid, unix_pid, link_pid],
         &[
-            ("pendulum, gRPC over TCP", &tcp.grpc),
-            ("pendulum, gRPC over a Unix socket", &unix.grpc),
-            ("pendulum, shared memory", &tcp.shared_memory),
+            ("pendulum, gRPC over TCP", &tcp),
+            ("pendulum, gRPC over a Unix socket", &unix),
+            ("pendulum, shared memory", &link),
             ("pendulum with LQR, gRPC over TCP", &pendulum.round_trips),
             ("marionette, shared memory", &marionette.round_trips),
         ],
@@ -69,7 +71,7 @@ async fn show(server: &ServerProcess, output: &Path) -> Result<Table> {
     let results = serde_json::json!({
         "pendulum": pendulum,
         "marionette": marionette,
-        "round_trips": { "grpc_tcp": tcp.grpc, "grpc_unix": unix.grpc, "shared_memory": tcp.shared_memory },
+        "round_trips": { "grpc_tcp": tcp, "grpc_unix": unix, "shared_memory": link },
     });
     std::fs::write(output.join("results.json"), serde_json::to_vec(&results)?)?;
     Ok(table)
@@ -93,7 +95,7 @@ async fn start_server() -> Result<(ServerProcess, SharedMemory)> {
         binary("plantd")?;
         let memory = SharedMemory::new()?;
         let server = ServerProcess::start_with(|command| {
-            command.arg("--link-root").arg(memory.root.path());
+            command.arg("--link-root").arg(memory.root());
         })?;
         Ok((server, memory))
     })
@@ -104,17 +106,22 @@ async fn start_server() -> Result<(ServerProcess, SharedMemory)> {
 
 /// The server's domain of shared memory.
 struct SharedMemory {
-    root: tempfile::TempDir,
+    directory: tempfile::TempDir,
 }
 
 impl SharedMemory {
     fn new() -> Result<Self> {
-        Ok(Self { root: tempfile::Builder::new().prefix("plantd-demo-").tempdir()? })
+        Ok(Self { directory: tempfile::Builder::new().prefix("plantd-demo-").tempdir()? })
+    }
+
+    /// Made by the server, closed to other users.
+    fn root(&self) -> PathBuf {
+        self.directory.path().join("link")
     }
 
     /// Names of what is left of the domain.
     fn residue(&self) -> Result<Vec<String>> {
-        let prefix = Domain::open(self.root.path())?.prefix();
+        let prefix = Domain::open(&self.root())?.prefix();
         let mut names = Vec::new();
         for entry in std::fs::read_dir(SHARED_MEMORY_DIRECTORY)? {
             let name = entry?.file_name().to_string_lossy().into_owned();

@@ -48,30 +48,10 @@ impl Stopwatch {
     }
 }
 
-/// The pendulum, whose step takes next to no time, over both links.
-#[derive(Serialize, Deserialize)]
-pub(crate) struct Report {
-    pub(crate) grpc: RoundTrips,
-    pub(crate) shared_memory: RoundTrips,
-}
-
-pub(crate) async fn measure(client: &Client) -> Result<Report> {
-    let request = v1::CreatePlantRequest {
-        model: "pendulum".to_owned(),
-        open_link: true,
-        ..Default::default()
-    };
-    let plant = client.create_plant(request).await?;
-    let report = Report {
-        grpc: over_grpc(client, &plant.id).await?,
-        shared_memory: over_shared_memory(connect_link(client, &plant.id).await?)?,
-    };
-    client.delete_plant(plant.id).await?;
-    Ok(report)
-}
-
-async fn over_grpc(client: &Client, plant: &str) -> Result<RoundTrips> {
-    let mut driver = client.drive(plant).await?;
+/// Steps a pendulum, whose step takes next to no time, over gRPC.
+pub(crate) async fn over_grpc(client: &Client) -> Result<RoundTrips> {
+    let plant = pendulum(client).await?;
+    let mut driver = client.drive(&plant).await?;
     let mut stopwatch = Stopwatch::new();
     for k in 0..WARM_UP + STEPS {
         let start = Instant::now();
@@ -82,10 +62,14 @@ async fn over_grpc(client: &Client, plant: &str) -> Result<RoundTrips> {
         progress("round trips over gRPC", k + 1, WARM_UP + STEPS);
     }
     driver.close().await?;
+    client.delete_plant(plant).await?;
     Ok(stopwatch.round_trips())
 }
 
-fn over_shared_memory(mut driver: LinkDriver) -> Result<RoundTrips> {
+/// The same over shared memory.
+pub(crate) async fn over_shared_memory(client: &Client) -> Result<RoundTrips> {
+    let plant = pendulum(client).await?;
+    let mut driver = connect_link(client, &plant).await?;
     let mut stopwatch = Stopwatch::new();
     for k in 0..WARM_UP + STEPS {
         let start = Instant::now();
@@ -93,9 +77,17 @@ fn over_shared_memory(mut driver: LinkDriver) -> Result<RoundTrips> {
         if k >= WARM_UP {
             stopwatch.record(start.elapsed());
         }
-        progress("round trips over shared memory", k + 1, WARM_UP + STEPS);
+        progress("round trips, shared memory", k + 1, WARM_UP + STEPS);
     }
+    drop(driver);
+    client.delete_plant(plant).await?;
     Ok(stopwatch.round_trips())
+}
+
+/// A new pendulum; its id.
+async fn pendulum(client: &Client) -> Result<String> {
+    let request = v1::CreatePlantRequest { model: "pendulum".to_owned(), ..Default::default() };
+    Ok(client.create_plant(request).await?.id)
 }
 
 /// Takes the lease of a plant over shared memory.

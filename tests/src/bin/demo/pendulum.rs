@@ -18,7 +18,7 @@ const STEPS: usize = 600;
 /// Initial offset from upright, rad.
 pub(crate) const OFFSET_RAD: f64 = 0.4;
 /// The push: torque, N·m, and the steps during which it acts.
-pub(crate) const PUSH_N_M: f64 = 4.0;
+pub(crate) const PUSH_N_M: f64 = 10.0;
 const PUSH_STEPS: std::ops::Range<usize> = 300..320;
 
 /// What the controller found.

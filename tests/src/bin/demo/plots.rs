@@ -9,6 +9,8 @@ use plotters::prelude::*;
 use crate::{marionette, pendulum};
 
 const SIZE: (u32, u32) = (860, 440);
+/// Angles shown of the pendulum, rad.
+const PENDULUM_RANGE: std::ops::Range<f64> = -0.1..0.7;
 /// Open loop, closed loop, reference: told apart also without colours.
 const OPEN: RGBColor = RGBColor(204, 85, 0);
 const CLOSED: RGBColor = RGBColor(0, 90, 160);
@@ -38,7 +40,7 @@ pub(crate) fn draw(
     let range = bounds(&lines);
     Plot {
         title: "Marionette: distance from the reference motion",
-        ordinate: "‖q − q_ref‖ of 22 coordinates",
+        ordinate: "|q − q_ref| of 22 coordinates",
         time_step_s: marionette::TIME_STEP_S,
         end_s,
     }
@@ -67,17 +69,23 @@ pub(crate) fn draw(
         &lines,
     )?;
 
-    let lines = [
-        line("without feedback", &pendulum.unregulated, OPEN, 2),
-        line("LQR", &pendulum.regulated, CLOSED, 2),
-    ];
+    // Until it leaves the plot: from there on it turns over and over.
+    let end = pendulum.unregulated.iter().position(|angle| angle.abs() > PENDULUM_RANGE.end);
+    let falling = &pendulum.unregulated[..end.unwrap_or(pendulum.unregulated.len())];
+    let lines =
+        [line("without feedback", falling, OPEN, 2), line("LQR", &pendulum.regulated, CLOSED, 2)];
     Plot {
         title: "Pendulum: regulated upright, pushed at 3 s",
         ordinate: "θ − π, rad",
         time_step_s: pendulum::TIME_STEP_S,
         end_s: pendulum::TIME_STEP_S * pendulum.regulated.len() as f64,
     }
-    .draw(&folder.join("pendulum.svg"), -0.6..0.8, &|y| format!("{y:.1}"), &lines)
+    .draw(
+        &folder.join("pendulum.svg"),
+        PENDULUM_RANGE,
+        &|y| unsigned_zero(format!("{y:.1}")),
+        &lines,
+    )
 }
 
 struct Plot<'a> {
@@ -126,6 +134,7 @@ impl Plot<'_> {
             .configure_mesh()
             .x_desc("time, s")
             .y_desc(self.ordinate)
+            .x_label_formatter(&|x| format!("{x:.0}"))
             .y_label_formatter(&|y| label(y))
             .label_style(("sans-serif", 14))
             .axis_desc_style(("sans-serif", 15))
@@ -149,6 +158,11 @@ impl Plot<'_> {
         area.present()?;
         Ok(())
     }
+}
+
+/// Ticks miss zero by round-off.
+fn unsigned_zero(label: String) -> String {
+    if label == "-0.0" { "0.0".to_owned() } else { label }
 }
 
 fn bounds(lines: &[Line<'_>]) -> std::ops::Range<f64> {

@@ -35,7 +35,15 @@ impl Table {
     fn compare(&mut self, name: &str, here: f64, paper: f64, tolerance: f64) {
         let difference = (here / paper - 1.0).abs();
         let mark = self.mark(difference <= tolerance);
-        println!("   {name:38}{here:>22.15}{paper:>22.15}{difference:>11.0e} {mark}");
+        let difference =
+            if difference == 0.0 { "0".to_owned() } else { format!("{difference:.0e}") };
+        println!("   {name:38}{here:>22.15}{paper:>22.15}{difference:>11} {mark}");
+    }
+
+    /// A count beside the one that it must equal.
+    fn compare_count(&mut self, name: &str, here: u32, paper: u32) {
+        let mark = self.mark(here == paper);
+        println!("   {name:38}{here:>22}{paper:>22}{:>11} {mark}", "");
     }
 
     /// A statement that must hold.
@@ -55,13 +63,14 @@ impl Table {
     }
 }
 
-fn section(title: &str, pid: u32) {
+fn section(title: &str, pids: &[u32]) {
+    let pids: Vec<_> = pids.iter().map(u32::to_string).collect();
     println!();
-    println!("{title} (controller: process {pid})");
+    println!("{title} (by process {})", pids.join(", "));
 }
 
 pub(crate) fn pendulum(table: &mut Table, pid: u32, report: &pendulum::Report) {
-    section("1  The paper's pendulum, over gRPC", pid);
+    section("1  The paper's pendulum, over gRPC", &[pid]);
     table.header();
     // One step of 0.1 s from θ = 0.2, p = 0.5 with torque 0.8. The paper prints six to eight digits;
     // these are its reference implementation's.
@@ -78,8 +87,7 @@ pub(crate) fn pendulum(table: &mut Table, pid: u32, report: &pendulum::Report) {
     for (name, here, paper) in paper {
         table.compare(name, here, paper, 1e-12);
     }
-    let rank = report.controllability_rank;
-    table.compare("controllability rank", f64::from(rank), 2.0, 0.0);
+    table.compare_count("controllability rank", report.controllability_rank, 2);
 
     println!();
     let gain: Vec<_> = report.gain.iter().map(|k| format!("{k:.4}")).collect();
@@ -100,7 +108,7 @@ pub(crate) fn pendulum(table: &mut Table, pid: u32, report: &pendulum::Report) {
 }
 
 pub(crate) fn marionette(table: &mut Table, pid: u32, report: &marionette::Report) {
-    section("2  The marionette, over shared memory", pid);
+    section("2  The marionette, over shared memory", &[pid]);
     println!(
         "   {} dynamic and {} prescribed coordinates, {} constraints, {} states; step {} s, {:.0} s",
         report.dynamic,
@@ -127,8 +135,8 @@ pub(crate) fn marionette(table: &mut Table, pid: u32, report: &marionette::Repor
     );
 }
 
-pub(crate) fn round_trips(pid: u32, links: &[(&str, &RoundTrips)]) {
-    section("3  Round trips, µs: input out, step, state back", pid);
+pub(crate) fn round_trips(pids: [u32; 3], links: &[(&str, &RoundTrips)]) {
+    section("3  Round trips, µs: input out, step, state back", &pids);
     println!("   {:38}{:>12}{:>12}{:>12}{:>12}", "", "p50", "p99", "p99.9", "steps");
     for (name, RoundTrips { p50_us, p99_us, p999_us, steps }) in links {
         println!("   {name:38}{p50_us:>12.1}{p99_us:>12.1}{p999_us:>12.1}{steps:>12}");
