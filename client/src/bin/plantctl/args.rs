@@ -110,7 +110,7 @@ pub(crate) enum Command {
         #[command(flatten)]
         weights: Weights,
     },
-    /// Linearizes the discrete map of a model: dx[k+1] = A dx[k] + B du[k].
+    /// Linearizes the discrete map of a model: `dx[k+1] = A dx[k] + B du[k]`.
     Linearize {
         #[command(flatten)]
         point: Point,
