@@ -223,7 +223,7 @@ impl Layout {
             }
         }
         for constraint in &scene.constraints {
-            let (a, b) = ends(constraint);
+            let (a, b) = constraint.points();
             mark(|n| &mut n.closure, a);
             mark(|n| &mut n.closure, b);
         }
@@ -299,7 +299,7 @@ impl Layout {
     ) -> (Vec<Constraint>, Vec<String>) {
         let (mut constraints, mut names) = (Vec::new(), Vec::new());
         for constraint in &scene.constraints {
-            let (a, b) = ends(constraint);
+            let (a, b) = constraint.points();
             let points = self.point_pair(a, b, tree, index);
             match constraint {
                 scene::Constraint::Distance { name, length, .. } => {
@@ -342,22 +342,15 @@ impl Layout {
     }
 }
 
-fn ends(constraint: &scene::Constraint) -> (&scene::Point, &scene::Point) {
-    match constraint {
-        scene::Constraint::Distance { a, b, .. } | scene::Constraint::PointToPoint { a, b, .. } => {
-            (a, b)
-        }
-    }
-}
-
 /// Kind, axis and coordinate name of a frame's joint, if it moves.
 fn moving(frame: &scene::Frame) -> Option<(JointKind, Vec3, &str)> {
-    let (kind, axis, coordinate) = match frame.joint.as_ref()? {
-        scene::Joint::Fixed {} => return None,
-        scene::Joint::Revolute { axis, coordinate } => (JointKind::Revolute, axis, coordinate),
-        scene::Joint::Prismatic { axis, coordinate } => (JointKind::Prismatic, axis, coordinate),
+    let joint = frame.joint.as_ref()?;
+    let (axis, _) = joint.motion()?;
+    let kind = match joint {
+        scene::Joint::Prismatic { .. } => JointKind::Prismatic,
+        scene::Joint::Revolute { .. } | scene::Joint::Fixed {} => JointKind::Revolute,
     };
-    Some((kind, Vec3(*axis), coordinate.as_deref().unwrap_or(&frame.name)))
+    Some((kind, Vec3(*axis), frame.coordinate()?))
 }
 
 fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {

@@ -6,7 +6,7 @@
 //! | code | reason | further details | when |
 //! | --- | --- | --- | --- |
 //! | INVALID_ARGUMENT | `INVALID_FIELD` | BadRequest | a field is missing, malformed, of wrong size, not finite, or names an unknown coordinate or operating point |
-//! | INVALID_ARGUMENT | `INVALID_SCENE` | BadRequest, one entry per error of the scene | a scene does not compile |
+//! | INVALID_ARGUMENT | `INVALID_SCENE` | BadRequest, one entry per error of the scene while they fit a trailer | a scene does not compile |
 //! | INVALID_ARGUMENT | `INPUT_DIMENSION`, `INPUT_NOT_FINITE` | BadRequest | the input of a step |
 //! | INVALID_ARGUMENT | `OFF_CONSTRAINT`, `PROJECTION_FAILED` | BadRequest | an initial configuration cannot satisfy the constraints |
 //! | INVALID_ARGUMENT | `INVALID_SNAPSHOT`, `SNAPSHOT_MISMATCH` | BadRequest | damaged, or of another model or other settings |
@@ -37,6 +37,12 @@ use tonic_types::{ErrorDetails, StatusExt};
 use crate::limits::LimitExceeded;
 use crate::session::{DriveError, LeaseHeld};
 
+/// Longest text of one message, name or description, bytes. Statuses travel in trailers, of which
+/// clients accept about 8 KiB.
+const MAX_TEXT_BYTES: usize = 400;
+/// Longest text of all errors of a scene together, bytes.
+const MAX_PROBLEM_BYTES: usize = 3000;
+
 /// The domain of every `google.rpc.ErrorInfo`.
 pub const ERROR_DOMAIN: &str = "plantd";
 
@@ -62,7 +68,7 @@ impl Fault {
         Self {
             code,
             reason,
-            message: message.into(),
+            message: shortened(message),
             extra: Box::new(Extra { metadata: HashMap::new(), details: ErrorDetails::new() }),
         }
     }
@@ -77,7 +83,7 @@ impl Fault {
         field: impl Into<String>,
         description: impl Into<String>,
     ) -> Self {
-        let (field, description) = (field.into(), description.into());
+        let (field, description) = (shortened(field), shortened(description));
         let mut fault = Self::new(Code::InvalidArgument, reason, format!("{field}: {description}"));
         fault.extra.details.add_bad_request_violation(field, description);
         fault
@@ -121,7 +127,8 @@ impl Fault {
         name: &str,
         sentence: &'static str,
     ) -> Self {
-        let message = format!("{sentence} `{name}`");
+        let name = shortened(name);
+        let message = shortened(format!("{sentence} `{name}`"));
         let mut fault = Self::new(code, reason, message.clone());
         fault.extra.details.set_resource_info(kind, name, "", message);
         fault
@@ -133,8 +140,9 @@ impl Fault {
         subject: impl Into<String>,
         message: impl Into<String>,
     ) -> Self {
-        let message = message.into();
+        let message = shortened(message);
         let mut fault = Self::new(Code::FailedPrecondition, reason, message.clone());
+        let subject = shortened(subject);
         fault.extra.details.add_precondition_failure_violation(reason, subject, message);
         fault
     }
@@ -151,7 +159,7 @@ impl Fault {
 
     /// Adds an entry to the metadata of `ErrorInfo`.
     pub fn with(mut self, key: &str, value: impl ToString) -> Self {
-        self.extra.metadata.insert(key.to_owned(), value.to_string());
+        self.extra.metadata.insert(key.to_owned(), shortened(value.to_string()));
         self
     }
 
@@ -159,6 +167,16 @@ impl Fault {
     pub fn reason(&self) -> &'static str {
         self.reason
     }
+}
+
+/// The text, cut to [`MAX_TEXT_BYTES`].
+fn shortened(text: impl Into<String>) -> String {
+    let mut text = text.into();
+    if text.len() > MAX_TEXT_BYTES {
+        text.truncate(text.floor_char_boundary(MAX_TEXT_BYTES - 3));
+        text.push_str("...");
+    }
+    text
 }
 
 impl From<Fault> for Status {
@@ -188,8 +206,16 @@ impl From<SceneError> for Fault {
             _ => format!("the scene has {count} errors; the first: {first}"),
         };
         let mut fault = Self::new(Code::InvalidArgument, "INVALID_SCENE", message);
-        for problem in error.problems {
-            fault.extra.details.add_bad_request_violation(problem.path, problem.message);
+        let mut bytes = 0;
+        for (index, problem) in error.problems.into_iter().enumerate() {
+            let (path, message) = (shortened(problem.path), shortened(problem.message));
+            bytes += path.len() + message.len();
+            if bytes > MAX_PROBLEM_BYTES && index > 0 {
+                let rest = format!("{} more; ValidateScene lists all", count - index);
+                fault.extra.details.add_bad_request_violation("...", rest);
+                break;
+            }
+            fault.extra.details.add_bad_request_violation(path, message);
         }
         fault
     }
@@ -342,6 +368,24 @@ mod tests {
         assert_eq!(fields, ["frames[0].body.mass", "gravity"]);
         let info = details.error_info().unwrap();
         assert_eq!((info.reason.as_str(), info.domain.as_str()), ("INVALID_SCENE", "plantd"));
+    }
+
+    #[test]
+    fn statuses_stay_small_whatever_the_request_says() {
+        let problem = |i| Problem { path: format!("frames[{i}]"), message: "x".repeat(1000) };
+        let faults = [
+            Fault::from(SceneError { problems: (0..5000).map(problem).collect() }),
+            Fault::model_not_found(&"ü".repeat(1_000_000)),
+            Fault::field("f".repeat(100_000), "d".repeat(100_000)),
+        ];
+        for fault in faults {
+            let status = Status::from(fault);
+            assert!(status.message().len() + status.details().len() < 5500);
+        }
+        let problems = (0..5000).map(problem).collect();
+        let details = Status::from(Fault::from(SceneError { problems })).get_error_details();
+        let last = details.bad_request().unwrap().field_violations.last().unwrap().clone();
+        assert_eq!(last.description, "4993 more; ValidateScene lists all");
     }
 
     #[test]
