@@ -1,5 +1,6 @@
 //! Controllers: what they have in common, and how the director runs them.
 
+use std::path::Path;
 use std::process::{ExitStatus, Stdio};
 use std::time::Duration;
 
@@ -78,11 +79,11 @@ pub(crate) struct Process {
 }
 
 impl Process {
-    /// Starts a controller against the server at `address`.
-    pub(crate) fn start(name: Name, address: &str) -> Result<Self> {
+    /// Starts a controller, a subcommand of `program`, against the server at `address`.
+    pub(crate) fn start(program: &Path, name: Name, address: &str) -> Result<Self> {
         let value = name.to_possible_value().expect("every controller has a name");
         let name = format!("controller {}", value.get_name());
-        let child = Command::new(std::env::current_exe()?)
+        let child = Command::new(program)
             .args(["controller", value.get_name(), "--address", address])
             .stdin(Stdio::null())
             .stdout(Stdio::piped())

@@ -17,16 +17,18 @@ use crate::{marionette, pendulum, plots, report};
 
 /// Shows everything; `false` if a number is off.
 pub(crate) fn run(output: &Path) -> Result<bool> {
-    let start = Instant::now();
+    // Asked for first: building the server may put another file in this program's place.
+    let program = std::env::current_exe()?;
     std::fs::create_dir_all(output)
         .with_context(|| format!("cannot make the folder {}", output.display()))?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(async {
         let mut interruption = std::pin::pin!(interrupted()?);
         let (mut server, memory) = start_server().await?;
+        let start = Instant::now();
         // Whatever happens in between, the server is asked to leave and leaves nothing.
         let shown = tokio::select! {
-            shown = show(&server, output) => shown,
+            shown = show(&program, &server, output) => shown,
             () = &mut interruption => Err(anyhow::anyhow!("interrupted")),
         };
         let cleared = clear(&mut server, &memory);
@@ -43,20 +45,24 @@ pub(crate) fn run(output: &Path) -> Result<bool> {
     })
 }
 
-async fn show(server: &ServerProcess, output: &Path) -> Result<Table> {
+async fn show(program: &Path, server: &ServerProcess, output: &Path) -> Result<Table> {
     println!("plantd, process {}, at {}", server.pid(), server.address());
     let mut table = Table::default();
 
-    let (pid, pendulum) = perform::<pendulum::Report>(Name::Pendulum, server.address()).await?;
+    let (pid, pendulum) =
+        perform::<pendulum::Report>(program, Name::Pendulum, server.address()).await?;
     report::pendulum(&mut table, pid, &pendulum);
 
     let (pid, marionette) =
-        perform::<marionette::Report>(Name::Marionette, server.address()).await?;
+        perform::<marionette::Report>(program, Name::Marionette, server.address()).await?;
     report::marionette(&mut table, pid, &marionette);
 
-    let (tcp_pid, tcp) = perform::<RoundTrips>(Name::GrpcLatency, server.address()).await?;
-    let (unix_pid, unix) = perform::<RoundTrips>(Name::GrpcLatency, server.unix_address()).await?;
-    let (link_pid, link) = perform::<RoundTrips>(Name::LinkLatency, server.address()).await?;
+    let (tcp_pid, tcp) =
+        perform::<RoundTrips>(program, Name::GrpcLatency, server.address()).await?;
+    let (unix_pid, unix) =
+        perform::<RoundTrips>(program, Name::GrpcLatency, server.unix_address()).await?;
+    let (link_pid, link) =
+        perform::<RoundTrips>(program, Name::LinkLatency, server.address()).await?;
     report::round_trips(
         [tcp_pid, unix_pid, link_pid],
         &[
@@ -78,8 +84,12 @@ async fn show(server: &ServerProcess, output: &Path) -> Result<Table> {
 }
 
 /// Runs one controller to its end; returns its process id and what it found.
-async fn perform<T: serde::de::DeserializeOwned>(name: Name, address: &str) -> Result<(u32, T)> {
-    let process = Process::start(name, address)?;
+async fn perform<T: serde::de::DeserializeOwned>(
+    program: &Path,
+    name: Name,
+    address: &str,
+) -> Result<(u32, T)> {
+    let process = Process::start(program, name, address)?;
     let pid = process.pid();
     Ok((pid, process.result().await?))
 }
