@@ -8,12 +8,20 @@ use crate::model::{
     Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions, MixedPair, Model,
     OperatingPoint, Pair, PathJoint, PointPair, PointSpring,
 };
-use crate::scene::{self, CoordinateKind, Length, Scene, Spring};
+use crate::scene::{self, CoordinateKind, Length, Scene, SceneError, Spring};
 use crate::spatial::{Mat3, Sym3, Vec3};
 use crate::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 
+impl Model {
+    /// Compiles a scene. All errors of the scene are reported at once.
+    pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
+        let problems = scene.validate();
+        if problems.is_empty() { Ok(compile(scene)) } else { Err(SceneError { problems }) }
+    }
+}
+
 /// Compiles a scene that has been validated.
-pub(crate) fn compile(scene: &Scene) -> Model {
+fn compile(scene: &Scene) -> Model {
     let layout = Layout::new(scene);
     let needs = layout.needs(scene);
     let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &needs.dynamics);

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::elimination::Elimination;
-use crate::scene::{CoordinateKind, Scene, SceneError};
+use crate::scene::{CoordinateKind, Scene};
 use crate::spatial::Vec3;
 use crate::tree::{Attachment, JointKind, Tree};
 
@@ -164,16 +164,6 @@ pub struct OperatingPoint {
 }
 
 impl Model {
-    /// Compiles a scene. All errors of the scene are reported at once.
-    pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
-        let problems = scene.validate();
-        if problems.is_empty() {
-            Ok(crate::compile::compile(scene))
-        } else {
-            Err(SceneError { problems })
-        }
-    }
-
     /// The scene it was compiled from.
     pub fn scene(&self) -> &Scene {
         &self.scene
