@@ -174,10 +174,10 @@ async fn every_way_to_linearize_gives_the_same_matrices() {
     assert_eq!(along.len(), 3);
 
     let mut driver = client.drive_linearized(&plant.id).await.unwrap();
-    for k in 0..3 {
+    for (k, expected) in along.iter().enumerate() {
         let step = driver.step(&u).await.unwrap();
         let driven = step.linearization.unwrap();
-        assert_eq!(along[k].linearization.as_ref(), Some(&driven));
+        assert_eq!(expected.linearization.as_ref(), Some(&driven));
         if k == 0 {
             assert_eq!(at_point.linearization.as_ref(), Some(&driven));
             assert_eq!(at_point.next.as_ref().unwrap().q, step.state.unwrap().q);
