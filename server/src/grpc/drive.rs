@@ -11,6 +11,7 @@ use std::task::{Context, Poll};
 use futures::Stream;
 use plantd_models::Linearization;
 use plantd_proto::v1;
+use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio_util::sync::WaitForCancellationFutureOwned;
 use tonic::{Code, Status, Streaming};
 use v1::drive_request::Request as Message;
@@ -26,6 +27,8 @@ use crate::status::Fault;
 
 /// Answers in a row after which the stream lets others on its thread run.
 const BURST_MAX: u32 = 32;
+/// Steps of larger models may take milliseconds, and run beside the other tasks of their thread.
+const INLINE_COORDINATES_MAX: usize = 64;
 
 /// The answers of one Drive stream.
 pub struct DriveStream {
@@ -88,6 +91,14 @@ impl DriveStream {
     }
 }
 
+/// Runs a long computation on this thread, while the runtime moves its other tasks to another one.
+fn beside_other_tasks<R>(compute: impl FnOnce() -> R) -> R {
+    match Handle::current().runtime_flavor() {
+        RuntimeFlavor::MultiThread => tokio::task::block_in_place(compute),
+        _ => compute(),
+    }
+}
+
 fn protocol(message: &str) -> Fault {
     Fault::new(Code::InvalidArgument, "PROTOCOL", message)
 }
@@ -109,10 +120,13 @@ impl Driving {
     /// A step; its own failures are answers, those of the stream are errors.
     fn step(&mut self, input: v1::DriveInput) -> Result<Answer, Fault> {
         let v1::DriveInput { sequence, u } = input;
-        let outcome = match &mut self.linearization {
-            None => self.lease.step(&u),
-            Some(out) => self.lease.step_and_linearize(&u, out),
+        let (lease, linearization) = (&mut self.lease, &mut self.linearization);
+        let is_short = lease.session().model().dimensions().coordinates() <= INLINE_COORDINATES_MAX;
+        let mut advance = || match linearization {
+            None => lease.step(&u),
+            Some(out) => lease.step_and_linearize(&u, out),
         };
+        let outcome = if is_short { advance() } else { beside_other_tasks(advance) };
         let report = match outcome {
             Ok(report) => report,
             Err(DriveError::Step(error)) => {
