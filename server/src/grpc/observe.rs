@@ -8,7 +8,7 @@ use std::task::{Context, Poll};
 
 use futures::future::BoxFuture;
 use http_body::{Body as HttpBody, Frame, SizeHint};
-use plantd_proto::FILE_DESCRIPTOR_SET;
+use plantd_proto::{FILE_DESCRIPTOR_SET, code_name};
 use prost::Message as _;
 use prost_types::FileDescriptorSet;
 use tonic::body::Body;
@@ -37,28 +37,6 @@ static METHODS: LazyLock<HashSet<String>> = LazyLock::new(|| {
 
 fn method_label(path: &str) -> &'static str {
     METHODS.get(path).map_or("other", |path| path.as_str())
-}
-
-fn code_label(code: Code) -> &'static str {
-    match code {
-        Code::Ok => "OK",
-        Code::Cancelled => "CANCELLED",
-        Code::Unknown => "UNKNOWN",
-        Code::InvalidArgument => "INVALID_ARGUMENT",
-        Code::DeadlineExceeded => "DEADLINE_EXCEEDED",
-        Code::NotFound => "NOT_FOUND",
-        Code::AlreadyExists => "ALREADY_EXISTS",
-        Code::PermissionDenied => "PERMISSION_DENIED",
-        Code::ResourceExhausted => "RESOURCE_EXHAUSTED",
-        Code::FailedPrecondition => "FAILED_PRECONDITION",
-        Code::Aborted => "ABORTED",
-        Code::OutOfRange => "OUT_OF_RANGE",
-        Code::Unimplemented => "UNIMPLEMENTED",
-        Code::Internal => "INTERNAL",
-        Code::Unavailable => "UNAVAILABLE",
-        Code::DataLoss => "DATA_LOSS",
-        Code::Unauthenticated => "UNAUTHENTICATED",
-    }
 }
 
 /// Turns tonic's refusal of an oversized message into the server's own.
@@ -159,7 +137,7 @@ impl Drop for Call {
     fn drop(&mut self) {
         // Without a status the client went away first.
         let code = self.code.unwrap_or(Code::Cancelled);
-        self.metrics.rpc_ended(self.method, code_label(code));
+        self.metrics.rpc_ended(self.method, code_name(code));
     }
 }
 
