@@ -51,6 +51,11 @@ impl Closure {
         }
     }
 
+    /// Takes over how round-off of the coordinates changes the values, until the next Jacobian.
+    pub(crate) fn expect_round_off_of(&mut self, other: &Self) {
+        self.coordinate_round_off.copy_from_slice(&other.coordinate_round_off);
+    }
+
     /// Jacobian at the configuration of the last [`Closure::evaluate`].
     #[inline(never)]
     pub(crate) fn differentiate(&mut self, model: &Model, q: &[f64]) {

@@ -275,7 +275,7 @@ impl Plant {
     /// p[k+1] = p + h (L_q + f) − Dh(q[k])ᵀ λ
     /// ```
     ///
-    /// Two to four residual evaluations of O(n) and one factorization for a smooth state. A step
+    /// Two to four residual evaluations of O(n) and one factorization for a smooth motion. A step
     /// that fails leaves the plant as it was.
     pub fn step(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
         let report = self.solve(u)?;

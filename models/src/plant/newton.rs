@@ -110,7 +110,7 @@ impl Workspace {
         }
     }
 
-    /// Solves one step from `motion`; the solution stays in the workspace.
+    /// Solves one step from `state`; the solution stays in the workspace.
     pub(crate) fn solve(
         &mut self,
         model: &Model,
@@ -130,7 +130,7 @@ impl Workspace {
         self.iterate(model, settings, state, true)
     }
 
-    /// What does not change within a step: prescribed state, input forces, constraints at the start.
+    /// What does not change within a step: prescribed motion, input forces, constraints at the start.
     fn prepare(&mut self, model: &Model, settings: &Settings, state: &PreciseState, u: &[f64]) {
         let d = model.dimensions;
         let (inputs, next) = u.split_at(d.inputs);
@@ -144,7 +144,11 @@ impl Workspace {
             forces::input_forces(&model.inputs, inputs, &mut self.input_force);
             self.force.copy_from_slice(&self.input_force);
         }
-        self.prepare_start(model, &state.q);
+        if d.constraints > 0 {
+            self.prepare_start(model, &state.q);
+            // Until the end has a Jacobian of this step: nothing of the last may decide on this one.
+            self.end.expect_round_off_of(&self.start);
+        }
     }
 
     /// Constraints at the start of the step, kept from the end of the last one where possible.
