@@ -140,6 +140,7 @@ impl Layout {
                 rotation: placement.rotation.times(&turned),
                 translation: placement.translation,
                 coordinate: usize::MAX,
+                orientation: usize::MAX,
                 body: Body::default(),
                 subtree_mass: 0.0,
                 anchor: false,

@@ -22,6 +22,8 @@ pub mod control;
 mod elimination;
 mod model;
 mod plant;
+#[allow(dead_code, reason = "derivatives of second order use all of it")]
+mod scalar;
 pub mod scene;
 mod spatial;
 mod tree;

@@ -7,12 +7,19 @@ use crate::spatial::{Mat3, Sym3, Vec3};
 pub(crate) const WORLD: usize = usize::MAX;
 
 /// Kind of a moving joint.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(dead_code, reason = "no scene makes the last two yet")]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum JointKind {
     /// Turns about its z axis.
     Revolute,
     /// Slides along its z axis.
     Prismatic,
+    /// Turns about its z axis and slides along it, by so many metres a radian.
+    Screw(f64),
+    /// Turns about all axes. A ball joint is three entries in a row, numbered 0, 1, 2, with the pose of
+    /// the whole joint, turned so that the z axis of entry `a` is the joint's own axis `a`. Their
+    /// velocities are the components of the angular velocity in the joint's own axes.
+    Ball(usize),
 }
 
 /// A moving joint with everything that is fixed to it.
@@ -28,6 +35,8 @@ pub(crate) struct Joint {
     pub(crate) translation: Vec3,
     /// Index of the coordinate.
     pub(crate) coordinate: usize,
+    /// Index of the orientation of a ball joint.
+    pub(crate) orientation: usize,
     /// Bodies fixed to the joint, lumped, in the joint's frame.
     pub(crate) body: Body,
     /// Mass of the joint's subtree.
@@ -67,6 +76,8 @@ pub(crate) enum Rotational {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Tree {
     pub(crate) joints: Vec<Joint>,
+    /// Some joint is neither revolute nor prismatic.
+    pub(crate) has_other_joints: bool,
 }
 
 impl Tree {
@@ -81,7 +92,10 @@ impl Tree {
             let root = if parent == WORLD { joints.len() } else { joints[parent].root };
             joints.push(Joint { parent, root, ..joint.clone() });
         }
-        let mut tree = Self { joints };
+        let simple =
+            |joint: &Joint| matches!(joint.kind, JointKind::Revolute | JointKind::Prismatic);
+        let has_other_joints = !joints.iter().all(simple);
+        let mut tree = Self { joints, has_other_joints };
         tree.place_anchors();
         (tree, index)
     }
@@ -95,6 +109,16 @@ impl Tree {
         }
         path.reverse();
         path
+    }
+
+    /// Whether two joints are axes of one ball joint.
+    #[inline]
+    pub(crate) fn one_ball(&self, i: usize, j: usize) -> bool {
+        let first = |joint: usize| match self.joints[joint].kind {
+            JointKind::Ball(axis) => Some(joint - axis),
+            _ => None,
+        };
+        self.has_other_joints && first(i).is_some() && first(i) == first(j)
     }
 
     fn place_anchors(&mut self) {

@@ -10,31 +10,32 @@ use crate::model::Pair;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::tree_lu::TreeLu;
+use crate::scalar::Scalar;
 use crate::spatial::{Force, Inertia, Motion, Sym3, Vec3};
 use crate::tree::{Rotational, Tree, WORLD};
 
 /// Generators of the second derivatives.
 #[derive(Clone, Debug)]
-pub(crate) struct Curvature {
-    tensor: Vec<Sym3>,
+pub(crate) struct Curvature<S = f64> {
+    tensor: Vec<Sym3<S>>,
     /// `F`.
-    pub(crate) force: Vec<Force>,
+    pub(crate) force: Vec<Force<S>>,
     /// `P`.
-    pub(crate) rate: Vec<Force>,
+    pub(crate) rate: Vec<Force<S>>,
 }
 
 /// Second derivatives of `L` for one pair of joints.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct SecondDerivatives {
-    pub(crate) qq: f64,
+pub(crate) struct SecondDerivatives<S = f64> {
+    pub(crate) qq: S,
     /// `∂²L/∂v_ancestor ∂q_descendant`.
-    pub(crate) v_above_q_below: f64,
+    pub(crate) v_above_q_below: S,
     /// `∂²L/∂q_ancestor ∂v_descendant`.
-    pub(crate) q_above_v_below: f64,
-    pub(crate) vv: f64,
+    pub(crate) q_above_v_below: S,
+    pub(crate) vv: S,
 }
 
-impl Curvature {
+impl<S: Scalar> Curvature<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();
         Self {
@@ -46,7 +47,7 @@ impl Curvature {
 
     /// Computes the generators from poses and momenta of the same configuration and velocity.
     #[inline(never)]
-    pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses, momenta: &Momenta) {
+    pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
         for (i, joint) in tree.joints.iter().enumerate() {
             let rotation = &poses.rotation[i];
             let spin = match &joint.body.inertia {
@@ -55,10 +56,12 @@ impl Curvature {
                     continue;
                 }
                 Rotational::Point => Sym3::default(),
-                Rotational::Isotropic(i) => Sym3 { xx: *i, yy: *i, zz: *i, ..Sym3::default() },
-                Rotational::Full(tensor) => tensor.rotated(rotation),
+                Rotational::Isotropic(i) => {
+                    Sym3::lift(Sym3 { xx: *i, yy: *i, zz: *i, ..Sym3::default() })
+                }
+                Rotational::Full(tensor) => Sym3::lift(*tensor).rotated(rotation),
             };
-            let center = poses.position[i] + rotation.apply(joint.body.center);
+            let center = poses.position[i] + rotation.apply(Vec3::lift(joint.body.center));
             self.tensor[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
         }
         for (i, joint) in tree.joints.iter().enumerate().rev() {
@@ -72,9 +75,8 @@ impl Curvature {
             };
             let axis = momenta.axis[i];
             self.force[i] = composite.momentum(axis);
-            self.rate[i] = axis
-                .cross_force(momenta.momentum[i])
-                .add_scaled(1.0, composite.momentum(momenta.axis_rate[i]));
+            self.rate[i] =
+                axis.cross_force(momenta.momentum[i]).add(composite.momentum(momenta.axis_rate[i]));
         }
     }
 
@@ -82,14 +84,14 @@ impl Curvature {
     #[inline(always)]
     pub(crate) fn pair(
         &self,
-        momenta: &Momenta,
+        momenta: &Momenta<S>,
         gravity: Option<Vec3>,
         ancestor: usize,
         descendant: usize,
-    ) -> SecondDerivatives {
+    ) -> SecondDerivatives<S> {
         let (axis, axis_rate) = (momenta.axis[ancestor], momenta.axis_rate[ancestor]);
         let (force, rate) = (self.force[descendant], self.rate[descendant]);
-        let weight = gravity.map_or(0.0, |g| axis.w.dot(force.f.cross(g)));
+        let weight = gravity.map_or(S::ZERO, |g| axis.w.dot(force.f.cross(Vec3::lift(g))));
         SecondDerivatives {
             qq: axis_rate.dot(rate) + weight,
             v_above_q_below: axis.dot(rate),
@@ -97,7 +99,9 @@ impl Curvature {
             vv: axis.dot(force),
         }
     }
+}
 
+impl Curvature {
     /// Writes the Jacobian of the residual by the increment, without springs and forces:
     /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
     ///

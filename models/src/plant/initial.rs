@@ -195,9 +195,9 @@ impl Plant {
     fn check_constraints(&mut self, q: &[f64]) -> Result<(), InitialError> {
         let closure = &mut self.workspace.end;
         self.workspace.end_is_exact = false;
-        closure.evaluate(&self.model, q);
+        closure.evaluate(&self.model, q, &self.workspace.orientations_start);
         closure.differentiate(&self.model, q);
-        closure.evaluate(&self.model, q);
+        closure.evaluate(&self.model, q, &self.workspace.orientations_start);
         for (c, (value, round_off)) in closure.value.iter().zip(&closure.round_off).enumerate() {
             if !(value.abs() <= round_off / f64::EPSILON * CONSTRAINT_TOLERANCE) {
                 let constraint = self.model.constraint_names[c].clone();
@@ -215,7 +215,7 @@ impl Plant {
         let mut normal = PivotedLu::new(nc, 0);
         let mut best = f64::INFINITY;
         for _ in 0..PROJECTION_ITERATIONS {
-            closure.evaluate(model, &q);
+            closure.evaluate(model, &q, &[]);
             closure.differentiate(model, &q);
             let violation = closure.violation();
             if violation <= 1.0 || (violation <= 1e3 && violation >= 0.5 * best) {
@@ -307,7 +307,7 @@ impl Workspace {
 
     /// Gradient of the Lagrangian without springs at any configuration and velocity.
     fn gradient_at(&mut self, model: &Model, q: &[f64], velocity: &[f64]) {
-        self.poses.evaluate(&model.dynamics, q);
+        self.poses.evaluate(&model.dynamics, q, &self.orientations_start);
         self.momenta.gradient(
             &model.dynamics,
             &self.poses,

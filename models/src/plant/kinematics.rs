@@ -1,20 +1,21 @@
 //! Poses of the joints at a configuration.
 
+use crate::scalar::Scalar;
 use crate::spatial::{Mat3, Vec3};
 use crate::tree::{Attachment, JointKind, Tree, WORLD};
 
 /// Poses of the joints of a tree, each position measured from the origin of its own tree.
 #[derive(Clone, Debug)]
-pub(crate) struct Poses {
-    pub(crate) rotation: Vec<Mat3>,
-    pub(crate) position: Vec<Vec3>,
+pub(crate) struct Poses<S = f64> {
+    pub(crate) rotation: Vec<Mat3<S>>,
+    pub(crate) position: Vec<Vec3<S>>,
     /// World position of the origin of the tree rooted at a joint; meaningful for roots.
-    pub(crate) origin: Vec<Vec3>,
+    pub(crate) origin: Vec<Vec3<S>>,
     /// Position of a joint relative to its parent.
-    edge: Vec<Vec3>,
+    edge: Vec<Vec3<S>>,
 }
 
-impl Poses {
+impl<S: Scalar> Poses<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();
         Self {
@@ -27,28 +28,48 @@ impl Poses {
 
     /// World-axes direction of the axis of a joint.
     #[inline(always)]
-    pub(crate) fn axis(&self, joint: usize) -> Vec3 {
+    pub(crate) fn axis(&self, joint: usize) -> Vec3<S> {
         self.rotation[joint].0[2]
     }
 
-    /// Poses at the configuration `q`: one pass from the roots to the leaves, about 50 flops and one
-    /// sine and cosine for each joint.
-    pub(crate) fn evaluate(&mut self, tree: &Tree, q: &[f64]) {
+    /// Poses at the configuration `q`, with the orientations of ball joints: one pass from the roots to
+    /// the leaves, about 50 flops and one sine and cosine for each joint.
+    pub(crate) fn evaluate(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
+        if tree.has_other_joints {
+            self.walk::<true>(tree, q, orientations);
+        } else {
+            self.walk::<false>(tree, q, orientations);
+        }
+    }
+
+    /// `OTHER`: some joint is neither revolute nor prismatic.
+    #[inline(always)]
+    fn walk<const OTHER: bool>(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
         for (i, joint) in tree.joints.iter().enumerate() {
             let (turned, mut edge) = if joint.parent == WORLD {
-                self.origin[i] = joint.translation;
-                (joint.rotation, Vec3::ZERO)
+                self.origin[i] = Vec3::lift(joint.translation);
+                (Mat3::lift(joint.rotation), Vec3::ZERO)
             } else {
                 let parent = &self.rotation[joint.parent];
-                (parent.times(&joint.rotation), parent.apply(joint.translation))
+                let offset = parent.apply(Vec3::lift(joint.translation));
+                (parent.times(&Mat3::lift(joint.rotation)), offset)
             };
             let Mat3([x, y, z]) = turned;
             match joint.kind {
                 JointKind::Revolute => {
-                    let (s, c) = q[joint.coordinate].sin_cos();
-                    self.rotation[i] = Mat3([x * c + y * s, y * c - x * s, z]);
+                    self.rotation[i] = turned_about_z(&turned, q[joint.coordinate])
                 }
-                JointKind::Prismatic => {
+                JointKind::Screw(pitch) if OTHER => {
+                    self.rotation[i] = turned_about_z(&turned, q[joint.coordinate]);
+                    edge += z * (q[joint.coordinate] * pitch);
+                }
+                JointKind::Ball(0) if OTHER => {
+                    let Mat3([x, y, z]) = turned.times(&orientations[joint.orientation]);
+                    self.rotation[i] = Mat3([y, z, x]);
+                }
+                // The entry before has turned already.
+                JointKind::Ball(_) if OTHER => self.rotation[i] = Mat3([y, z, x]),
+                _ => {
                     self.rotation[i] = turned;
                     edge += z * q[joint.coordinate];
                 }
@@ -76,12 +97,13 @@ impl Poses {
 
     /// A point relative to the origin of its tree, and that origin.
     #[inline]
-    pub(crate) fn point(&self, tree: &Tree, at: &Attachment) -> (Vec3, Vec3) {
+    pub(crate) fn point(&self, tree: &Tree, at: &Attachment) -> (Vec3<S>, Vec3<S>) {
+        let point = Vec3::lift(at.point);
         if at.joint == WORLD {
-            (at.point, Vec3::ZERO)
+            (point, Vec3::ZERO)
         } else {
             (
-                self.position[at.joint] + self.rotation[at.joint].apply(at.point),
+                self.position[at.joint] + self.rotation[at.joint].apply(point),
                 self.origin[tree.joints[at.joint].root],
             )
         }
@@ -90,10 +112,42 @@ impl Poses {
     /// Derivative of a point carried by a joint by the joint's coordinate; `point` is relative to the
     /// origin of the joint's tree.
     #[inline]
-    pub(crate) fn point_gradient(&self, tree: &Tree, joint: usize, point: Vec3) -> Vec3 {
+    pub(crate) fn point_gradient(&self, tree: &Tree, joint: usize, point: Vec3<S>) -> Vec3<S> {
+        let axis = self.axis(joint);
         match tree.joints[joint].kind {
-            JointKind::Revolute => self.axis(joint).cross(point - self.position[joint]),
-            JointKind::Prismatic => self.axis(joint),
+            JointKind::Prismatic => axis,
+            JointKind::Revolute | JointKind::Ball(_) => axis.cross(point - self.position[joint]),
+            JointKind::Screw(pitch) => {
+                axis.cross(point - self.position[joint]) + axis.scaled(pitch)
+            }
         }
     }
+
+    /// How the gradient by joint `row` of a vector that both joints carry changes with joint `column`,
+    /// one of them above the other: the axis of the upper one turns what the lower one moves. Within a
+    /// ball joint the axes turn with it.
+    #[inline]
+    pub(crate) fn turned_gradient(
+        &self,
+        tree: &Tree,
+        (row, row_gradient): (usize, Vec3<S>),
+        (column, column_gradient): (usize, Vec3<S>),
+    ) -> Vec3<S> {
+        let (turning, turned) = if row < column && !tree.one_ball(row, column) {
+            (row, column_gradient)
+        } else {
+            (column, row_gradient)
+        };
+        match tree.joints[turning].kind {
+            JointKind::Prismatic => Vec3::ZERO,
+            _ => self.axis(turning).cross(turned),
+        }
+    }
+}
+
+#[inline(always)]
+fn turned_about_z<S: Scalar>(frame: &Mat3<S>, angle: S) -> Mat3<S> {
+    let Mat3([x, y, z]) = *frame;
+    let (s, c) = angle.sin_cos();
+    Mat3([x * c + y * s, y * c - x * s, z])
 }

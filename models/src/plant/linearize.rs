@@ -269,9 +269,6 @@ impl Plant {
                 if i < nd {
                     add(i, j, value);
                 }
-                if j < nd && i != j {
-                    add(j, i, value);
-                }
             },
         );
     }

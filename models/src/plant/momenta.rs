@@ -8,24 +8,26 @@
 //! ```
 
 use crate::plant::kinematics::Poses;
-use crate::spatial::{Force, Motion, Vec3};
+use crate::scalar::Scalar;
+use crate::spatial::{Force, Motion, Sym3, Vec3};
 use crate::tree::{Body, JointKind, Rotational, Tree, WORLD};
 
 /// Twists and momenta of the joints of a tree.
 #[derive(Clone, Debug)]
-pub(crate) struct Momenta {
+pub(crate) struct Momenta<S = f64> {
     /// Joint axes `J` as twists.
-    pub(crate) axis: Vec<Motion>,
+    pub(crate) axis: Vec<Motion<S>>,
     /// Their rates `J̇`.
-    pub(crate) axis_rate: Vec<Motion>,
-    twist: Vec<Motion>,
+    pub(crate) axis_rate: Vec<Motion<S>>,
+    /// Twists `V`.
+    pub(crate) twist: Vec<Motion<S>>,
     /// Momentum `H` of each subtree.
-    pub(crate) momentum: Vec<Force>,
+    pub(crate) momentum: Vec<Force<S>>,
     /// First moment of mass of each subtree.
-    pub(crate) moment: Vec<Vec3>,
+    pub(crate) moment: Vec<Vec3<S>>,
 }
 
-impl Momenta {
+impl<S: Scalar> Momenta<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();
         Self {
@@ -41,72 +43,95 @@ impl Momenta {
     pub(crate) fn gradient(
         &mut self,
         tree: &Tree,
-        poses: &Poses,
-        velocity: &[f64],
+        poses: &Poses<S>,
+        velocity: &[S],
         gravity: Option<Vec3>,
-        l_q: &mut [f64],
-        l_v: &mut [f64],
+        l_q: &mut [S],
+        l_v: &mut [S],
     ) {
-        self.forward(tree, poses, velocity);
+        if tree.has_other_joints {
+            self.forward::<true>(tree, poses, velocity);
+        } else {
+            self.forward::<false>(tree, poses, velocity);
+        }
         for (i, joint) in tree.joints.iter().enumerate().rev() {
             let (momentum, moment) = (self.momentum[i], self.moment[i]);
             if joint.parent != WORLD {
                 let parent = joint.parent;
-                self.momentum[parent] = self.momentum[parent].add_scaled(1.0, momentum);
+                self.momentum[parent] = self.momentum[parent].add(momentum);
                 self.moment[parent] += moment;
             }
             if let Some(l_v) = l_v.get_mut(joint.coordinate) {
                 let axis = self.axis[i];
                 *l_v = axis.dot(momentum);
                 l_q[joint.coordinate] = self.axis_rate[i].dot(momentum)
-                    + gravity.map_or(0.0, |g| {
-                        axis.dot(Force { n: moment.cross(g), f: g * joint.subtree_mass })
+                    + gravity.map_or(S::ZERO, |g| {
+                        let (g, mass) = (Vec3::lift(g), joint.subtree_mass);
+                        axis.dot(Force { n: moment.cross(g), f: g.scaled(mass) })
                     });
             }
         }
     }
 
-    fn forward(&mut self, tree: &Tree, poses: &Poses, velocity: &[f64]) {
+    /// `OTHER`: some joint is neither revolute nor prismatic.
+    #[inline(always)]
+    fn forward<const OTHER: bool>(&mut self, tree: &Tree, poses: &Poses<S>, velocity: &[S]) {
         for (i, joint) in tree.joints.iter().enumerate() {
             let direction = poses.axis(i);
+            let turning = |v| Motion { w: direction, v };
             let axis = match joint.kind {
-                JointKind::Revolute => {
-                    Motion { w: direction, v: poses.position[i].cross(direction) }
+                JointKind::Revolute => turning(poses.position[i].cross(direction)),
+                JointKind::Ball(_) if OTHER => turning(poses.position[i].cross(direction)),
+                JointKind::Screw(pitch) if OTHER => {
+                    turning(poses.position[i].cross(direction) + direction.scaled(pitch))
                 }
-                JointKind::Prismatic => Motion { w: Vec3::ZERO, v: direction },
+                _ => Motion { w: Vec3::ZERO, v: direction },
             };
-            let parent =
-                if joint.parent == WORLD { Motion::default() } else { self.twist[joint.parent] };
+            let twist_of =
+                |joint| if joint == WORLD { Motion::default() } else { self.twist[joint] };
+            let parent = twist_of(joint.parent);
             let twist = parent.add_scaled(velocity[joint.coordinate], axis);
+            self.axis_rate[i] = match joint.kind {
+                // The axes of a ball are carried by what the whole joint hangs from.
+                JointKind::Ball(entry) if OTHER => {
+                    twist_of(tree.joints[i - entry].parent).cross(axis)
+                }
+                _ => parent.cross(axis),
+            };
             self.axis[i] = axis;
-            self.axis_rate[i] = parent.cross(axis);
             self.twist[i] = twist;
             (self.momentum[i], self.moment[i]) = body_momentum(&joint.body, poses, i, twist);
         }
     }
 
     /// Twice the kinetic energy, `Σ v_i J_i·H_i`, of the last [`Momenta::gradient`].
-    pub(crate) fn twice_kinetic_energy(&self, tree: &Tree, velocity: &[f64]) -> f64 {
-        let joints = tree.joints.iter().enumerate();
-        joints
-            .map(|(i, joint)| velocity[joint.coordinate] * self.axis[i].dot(self.momentum[i]))
-            .sum()
+    pub(crate) fn twice_kinetic_energy(&self, tree: &Tree, velocity: &[S]) -> S {
+        let mut sum = S::ZERO;
+        for (i, joint) in tree.joints.iter().enumerate() {
+            sum += velocity[joint.coordinate] * self.axis[i].dot(self.momentum[i]);
+        }
+        sum
     }
 }
 
 /// Momentum and first moment of mass of one body.
 #[inline(always)]
-fn body_momentum(body: &Body, poses: &Poses, joint: usize, twist: Motion) -> (Force, Vec3) {
+fn body_momentum<S: Scalar>(
+    body: &Body,
+    poses: &Poses<S>,
+    joint: usize,
+    twist: Motion<S>,
+) -> (Force<S>, Vec3<S>) {
     let rotation = &poses.rotation[joint];
     let spin = match &body.inertia {
         Rotational::None => return (Force::default(), Vec3::ZERO),
         Rotational::Point => Vec3::ZERO,
-        Rotational::Isotropic(i) => twist.w * *i,
+        Rotational::Isotropic(i) => twist.w.scaled(*i),
         Rotational::Full(tensor) => {
-            rotation.apply(tensor.apply(rotation.apply_transposed(twist.w)))
+            rotation.apply(Sym3::lift(*tensor).apply(rotation.apply_transposed(twist.w)))
         }
     };
-    let center = poses.position[joint] + rotation.apply(body.center);
-    let linear = (twist.v + twist.w.cross(center)) * body.mass;
-    (Force { n: center.cross(linear) + spin, f: linear }, center * body.mass)
+    let center = poses.position[joint] + rotation.apply(Vec3::lift(body.center));
+    let linear = (twist.v + twist.w.cross(center)).scaled(body.mass);
+    (Force { n: center.cross(linear) + spin, f: linear }, center.scaled(body.mass))
 }

@@ -19,6 +19,7 @@ use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{Term, padded};
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, springs};
+use crate::spatial::Mat3;
 
 /// A residual this small, in units of round-off, is as good as zero.
 const CONVERGED: f64 = 4.0;
@@ -42,6 +43,10 @@ pub(crate) struct Workspace {
     pub(crate) q_mid: Vec<f64>,
     /// Configuration at the end.
     pub(crate) q_end: Vec<f64>,
+    /// Orientations of ball joints at the start, the midpoint and the end.
+    pub(crate) orientations_start: Vec<Mat3>,
+    pub(crate) orientations_mid: Vec<Mat3>,
+    pub(crate) orientations_end: Vec<Mat3>,
     /// Velocity over the step.
     pub(crate) velocity: Vec<f64>,
     pub(crate) l_q: Vec<f64>,
@@ -86,6 +91,9 @@ impl Workspace {
             impulse: zeros(nd),
             q_mid: zeros(n),
             q_end: zeros(n),
+            orientations_start: Vec::new(),
+            orientations_mid: Vec::new(),
+            orientations_end: Vec::new(),
             velocity: zeros(n),
             l_q: zeros(nd),
             l_v: zeros(nd),
@@ -154,7 +162,7 @@ impl Workspace {
     /// Constraints at the start of the step, kept from the end of the last one where possible.
     pub(crate) fn prepare_start(&mut self, model: &Model, q: &[f64]) {
         if model.dimensions.constraints > 0 && !self.start_is_valid {
-            self.start.evaluate(model, q);
+            self.start.evaluate(model, q, &self.orientations_start);
             self.start.differentiate(model, q);
             self.start_is_valid = true;
         }
@@ -273,7 +281,7 @@ impl Workspace {
 
     /// Gradient of the Lagrangian and forces at the midpoint.
     pub(crate) fn evaluate_lagrangian(&mut self, model: &Model) {
-        self.poses.evaluate(&model.dynamics, &self.q_mid);
+        self.poses.evaluate(&model.dynamics, &self.q_mid, &self.orientations_mid);
         self.momenta.gradient(
             &model.dynamics,
             &self.poses,
@@ -304,7 +312,7 @@ impl Workspace {
         }
         self.place_end(state);
         self.end_is_exact = false;
-        self.end.evaluate(model, &self.q_end);
+        self.end.evaluate(model, &self.q_end, &self.orientations_end);
         self.end.violation()
     }
 
@@ -438,7 +446,7 @@ impl Workspace {
     pub(crate) fn finish_end(&mut self, model: &Model, state: &PreciseState) {
         if model.dimensions.constraints > 0 && !self.end_is_exact {
             self.place_end(state);
-            self.end.evaluate(model, &self.q_end);
+            self.end.evaluate(model, &self.q_end, &self.orientations_end);
             self.end.differentiate(model, &self.q_end);
             self.end_is_exact = true;
         }

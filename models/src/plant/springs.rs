@@ -4,15 +4,16 @@ use crate::elimination::Elimination;
 use crate::model::{CoordinateSpring, PathJoint, PointPair, PointSpring};
 use crate::plant::kinematics::Poses;
 use crate::plant::tree_lu::TreeLu;
+use crate::scalar::Scalar;
 use crate::spatial::Vec3;
-use crate::tree::{JointKind, Tree};
+use crate::tree::Tree;
 
 /// `a − b` in world axes, and both points relative to the origins of their trees.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Separation {
-    pub(crate) difference: Vec3,
-    pub(crate) a: Vec3,
-    pub(crate) b: Vec3,
+pub(crate) struct Separation<S = f64> {
+    pub(crate) difference: Vec3<S>,
+    pub(crate) a: Vec3<S>,
+    pub(crate) b: Vec3<S>,
     /// Magnitude of what was subtracted, for round-off estimates.
     pub(crate) magnitude: f64,
 }
@@ -20,7 +21,7 @@ pub(crate) struct Separation {
 impl PointPair {
     /// The separation of the points. Origins cancel exactly within one tree.
     #[inline]
-    pub(crate) fn separation(&self, tree: &Tree, poses: &Poses) -> Separation {
+    pub(crate) fn separation<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>) -> Separation<S> {
         let (a, origin_a) = poses.point(tree, &self.a);
         let (b, origin_b) = poses.point(tree, &self.b);
         let origins = origin_a - origin_b;
@@ -28,15 +29,25 @@ impl PointPair {
             difference: (a - b) + origins,
             a,
             b,
-            magnitude: a.norm() + b.norm() + origins.norm(),
+            magnitude: size(a) + size(b) + size(origins),
         }
     }
+}
+
+/// Length of the real part.
+fn size<S: Scalar>(v: Vec3<S>) -> f64 {
+    Vec3(v.0.map(S::value)).norm()
 }
 
 impl PathJoint {
     /// Derivative of the difference `a − b` by the joint's coordinate.
     #[inline]
-    pub(crate) fn gradient(&self, tree: &Tree, poses: &Poses, at: &Separation) -> Vec3 {
+    pub(crate) fn gradient<S: Scalar>(
+        &self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        at: &Separation<S>,
+    ) -> Vec3<S> {
         if self.carries_a {
             poses.point_gradient(tree, self.joint, at.a)
         } else {
@@ -44,62 +55,64 @@ impl PathJoint {
         }
     }
 
-    /// Second derivative of the difference by this joint's coordinate and that of `below`, which
-    /// comes later on the path: nested axes, `w × ∂`, on one branch, zero across branches.
+    /// Derivative of this joint's `gradient` by the coordinate of another: nested axes on one branch,
+    /// zero across branches.
     #[inline]
-    pub(crate) fn second(
+    pub(crate) fn second<S: Scalar>(
         &self,
+        gradient: Vec3<S>,
         tree: &Tree,
-        poses: &Poses,
-        below: &PathJoint,
-        gradient_below: Vec3,
-    ) -> Vec3 {
-        if self.carries_a != below.carries_a || tree.joints[self.joint].kind == JointKind::Prismatic
-        {
-            Vec3::ZERO
+        poses: &Poses<S>,
+        (column, column_gradient): (&PathJoint, Vec3<S>),
+    ) -> Vec3<S> {
+        if self.carries_a == column.carries_a {
+            poses.turned_gradient(tree, (self.joint, gradient), (column.joint, column_gradient))
         } else {
-            poses.axis(self.joint).cross(gradient_below)
+            Vec3::ZERO
         }
     }
 }
 
 /// A two-point spring at one configuration.
-struct Stretched {
-    at: Separation,
+struct Stretched<S> {
+    at: Separation<S>,
     /// Direction from `b` to `a`; zero where the points coincide.
-    direction: Vec3,
+    direction: Vec3<S>,
     /// `dV/dl`.
-    tension: f64,
+    tension: S,
     /// `dV/dl / l`, the stiffness across the direction; finite at zero length, where the direction is
     /// undefined and a spring with a rest length pulls nowhere.
-    across: f64,
+    across: S,
 }
 
-fn stretched(spring: &PointSpring, tree: &Tree, poses: &Poses) -> Stretched {
+fn stretched<S: Scalar>(spring: &PointSpring, tree: &Tree, poses: &Poses<S>) -> Stretched<S> {
     let at = spring.ends.separation(tree, poses);
-    let length = at.difference.norm();
-    let direction = if length > 0.0 { at.difference * (1.0 / length) } else { Vec3::ZERO };
-    let tension = spring.stiffness * (length - spring.rest_length);
-    let across = if spring.rest_length == 0.0 || length == 0.0 {
-        spring.stiffness
-    } else {
-        tension / length
-    };
+    let stiffness = S::constant(spring.stiffness);
+    let square = at.difference.dot(at.difference);
+    if square.value() == 0.0 {
+        let tension = S::constant(-spring.stiffness * spring.rest_length);
+        return Stretched { at, direction: Vec3::ZERO, tension, across: stiffness };
+    }
+    let length = square.sqrt();
+    let inverse = length.recip();
+    let direction = at.difference * inverse;
+    let tension = (length - spring.rest_length) * spring.stiffness;
+    let across = if spring.rest_length == 0.0 { stiffness } else { tension * inverse };
     Stretched { at, direction, tension, across }
 }
 
 /// Adds `−V_q` to `l_q` (dynamic coordinates).
 #[inline(never)]
-pub(crate) fn add_gradient(
+pub(crate) fn add_gradient<S: Scalar>(
     coordinate_springs: &[CoordinateSpring],
     point_springs: &[PointSpring],
     tree: &Tree,
-    poses: &Poses,
-    q: &[f64],
-    l_q: &mut [f64],
+    poses: &Poses<S>,
+    q: &[S],
+    l_q: &mut [S],
 ) {
     for spring in coordinate_springs {
-        l_q[spring.coordinate] -= spring.stiffness * (q[spring.coordinate] - spring.rest);
+        l_q[spring.coordinate] -= (q[spring.coordinate] - spring.rest) * spring.stiffness;
     }
     for spring in point_springs {
         let s = stretched(spring, tree, poses);
@@ -133,26 +146,26 @@ pub(crate) fn potential(
     coordinate + point
 }
 
-/// Calls `entry(i, j, V_ij)` once for each pair of coordinates of each two-point spring, `i` not
-/// below `j` on the path.
-pub(crate) fn for_each_second_derivative(
+/// Calls `entry(i, j, V_ij)` for each ordered pair of coordinates of each two-point spring.
+pub(crate) fn for_each_second_derivative<S: Scalar>(
     springs: &[PointSpring],
     tree: &Tree,
-    poses: &Poses,
-    mut entry: impl FnMut(usize, usize, f64),
+    poses: &Poses<S>,
+    mut entry: impl FnMut(usize, usize, S),
 ) {
     for spring in springs {
         let s = stretched(spring, tree, poses);
-        let along = spring.stiffness - s.across;
-        for (k, below) in spring.ends.path.iter().enumerate() {
-            let gradient = below.gradient(tree, poses, &s.at);
-            for above in &spring.ends.path[..=k] {
-                let other = above.gradient(tree, poses, &s.at);
-                let second = above.second(tree, poses, below, gradient);
-                let value = along * s.direction.dot(gradient) * s.direction.dot(other)
-                    + s.across * gradient.dot(other)
+        let along = S::constant(spring.stiffness) - s.across;
+        let path = &spring.ends.path;
+        for row in path {
+            let row_gradient = row.gradient(tree, poses, &s.at);
+            for column in path {
+                let gradient = column.gradient(tree, poses, &s.at);
+                let second = row.second(row_gradient, tree, poses, (column, gradient));
+                let value = along * s.direction.dot(gradient) * s.direction.dot(row_gradient)
+                    + s.across * gradient.dot(row_gradient)
                     + s.tension * s.direction.dot(second);
-                entry(above.coordinate, below.coordinate, value);
+                entry(row.coordinate, column.coordinate, value);
             }
         }
     }
@@ -176,13 +189,7 @@ pub(crate) fn add_to_newton_matrix(
     for_each_second_derivative(point_springs, tree, poses, |i, j, value| {
         let dynamic = elimination.len();
         if i < dynamic && j < dynamic {
-            let slot = elimination.slot(i.max(j), i.min(j));
-            let value = -0.25 * step * value;
-            match slot {
-                Some(slot) if i == j => matrix.add_to_diagonal(slot, value),
-                Some(slot) => matrix.add_symmetric(slot, value),
-                None => debug_assert!(false, "a spring couples coordinates {i} and {j}"),
-            }
+            matrix.add(elimination, i, j, -0.25 * step * value);
         }
     });
 }

@@ -44,10 +44,15 @@ impl TreeLu {
         self.upper[slot] += value;
     }
 
-    /// Adds to both entries of a pair.
-    pub(crate) fn add_symmetric(&mut self, slot: usize, value: f64) {
-        self.upper[slot] += value;
-        self.lower[slot] += value;
+    /// Adds to the entry of two coupled rows, which may be one.
+    #[inline]
+    pub(crate) fn add(&mut self, elimination: &Elimination, row: usize, column: usize, value: f64) {
+        let slot = elimination.slot(row.max(column), row.min(column));
+        debug_assert!(slot.is_some(), "{row} and {column} are not coupled");
+        if let Some(slot) = slot {
+            let triangle = if row <= column { &mut self.upper } else { &mut self.lower };
+            triangle[slot] += value;
+        }
     }
 
     /// Factors in place, from the last row to the first.
