@@ -26,6 +26,8 @@ mod plant;
 mod scalar;
 pub mod scene;
 mod spatial;
+#[allow(dead_code, reason = "springs and signals will use it")]
+mod spline;
 mod tree;
 
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};

@@ -8,8 +8,8 @@ mod text;
 mod validate;
 
 pub use limits::{
-    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_FRAMES, MAX_INPUTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS,
-    MAX_SPRINGS, MAX_TEXT_BYTES,
+    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_FRAMES, MAX_INPUTS, MAX_KNOTS, MAX_NAME_BYTES,
+    MAX_OPERATING_POINTS, MAX_SPRINGS, MAX_TEXT_BYTES,
 };
 
 use schemars::JsonSchema;
@@ -213,6 +213,25 @@ pub enum Spring {
         #[serde(default)]
         rest: f64,
     },
+}
+
+/// A knot of a spline, which is piecewise quintic with continuous value, slope and curvature.
+///
+/// A slope that is not given is replaced by continuity of the third derivative, a curvature by
+/// continuity of the fourth. Before the first and after the last knot the spline is quadratic.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Knot {
+    /// Position; greater than that of the knot before.
+    pub x: f64,
+    /// Value.
+    pub value: f64,
+    /// First derivative.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub slope: Option<f64>,
+    /// Second derivative.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub curvature: Option<f64>,
 }
 
 /// A generalized force `gain · u` on one dynamic coordinate.

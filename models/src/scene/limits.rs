@@ -14,5 +14,7 @@ pub const MAX_SPRINGS: usize = 4096;
 pub const MAX_INPUTS: usize = 1024;
 /// Most constraint equations.
 pub const MAX_CONSTRAINTS: usize = 1024;
+/// Most knots of a spline.
+pub const MAX_KNOTS: usize = 4096;
 /// Most operating points.
 pub const MAX_OPERATING_POINTS: usize = 256;

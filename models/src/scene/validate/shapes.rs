@@ -1,9 +1,10 @@
-//! Axes, rotations and bodies.
+//! Axes, rotations, bodies and splines.
 
 use nalgebra::{Matrix3, Vector3, Vector4};
 
 use super::Check;
-use crate::scene::{Body, Rotation};
+use crate::scene::{Body, Knot, MAX_KNOTS, Rotation};
+use crate::spline::Spline;
 
 /// How far a quaternion or a rotation matrix may be from orthonormal: what seven digits leave.
 const ORTHONORMAL_TOLERANCE: f64 = 1e-6;
@@ -87,6 +88,29 @@ impl Check<'_> {
             let message =
                 format!("no body has these principal moments: {shown:?} violate a + b ≥ c");
             self.report(path, message);
+        }
+    }
+    /// That the knots make a spline.
+    #[allow(dead_code, reason = "springs and signals will use it")]
+    pub(super) fn knots(&mut self, path: String, knots: &[Knot]) {
+        let before = self.problems.len();
+        if knots.len() < 2 || knots.len() > MAX_KNOTS {
+            let message = format!("has {} knots; must have 2 to {MAX_KNOTS}", knots.len());
+            self.report(path, message);
+            return;
+        }
+        for (i, knot) in knots.iter().enumerate() {
+            let path = format!("{path}[{i}]");
+            let increases = i == 0 || !(knot.x <= knots[i - 1].x) || !knot.x.is_finite();
+            if self.finite(format!("{path}.x"), knot.x) && !increases {
+                self.report(format!("{path}.x"), "is not greater than that of the knot before");
+            }
+            self.finite(format!("{path}.value"), knot.value);
+            self.finite(format!("{path}.slope"), knot.slope.unwrap_or_default());
+            self.finite(format!("{path}.curvature"), knot.curvature.unwrap_or_default());
+        }
+        if self.problems.len() == before && Spline::new(knots).is_none() {
+            self.report(path, "do not determine a spline; give a slope or a curvature, or space the knots further apart");
         }
     }
 }
