@@ -8,6 +8,7 @@ use crate::model::{
     Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions, MixedPair, Model,
     OperatingPoint, Pair, PathJoint, PointPair, PointSpring,
 };
+use crate::plant::conditioning::Conditioning;
 use crate::scene::{self, CoordinateKind, Length, Scene, SceneError, Spring};
 use crate::spatial::{Mat3, Sym3, Vec3};
 use crate::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
@@ -39,7 +40,8 @@ fn compile(scene: &Scene) -> Model {
         .map(|c| settings(scene, &c.name).and_then(|s| s.damping).unwrap_or(scene.damping))
         .collect();
     let gravity = Vec3(scene.gravity);
-    Model {
+    let mut model = Model {
+        conditioning: Conditioning::default(),
         dimensions: Dimensions {
             dynamic,
             prescribed: layout.coordinates.len() - dynamic,
@@ -62,7 +64,9 @@ fn compile(scene: &Scene) -> Model {
         mixed_pairs,
         coordinates: layout.coordinates,
         scene: scene.clone(),
-    }
+    };
+    model.conditioning = Conditioning::new(&model);
+    model
 }
 
 fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::elimination::Elimination;
+use crate::plant::conditioning::Conditioning;
 use crate::scene::{CoordinateKind, Scene};
 use crate::spatial::Vec3;
 use crate::tree::{Attachment, JointKind, Tree};
@@ -34,6 +35,8 @@ pub struct Model {
     pub(crate) pairs: Vec<Pair>,
     /// Ancestor and descendant pairs of which exactly one is prescribed.
     pub(crate) mixed_pairs: Vec<MixedPair>,
+    /// What pivots are compared with.
+    pub(crate) conditioning: Conditioning,
 }
 
 /// Two dynamic joints on one path to the root, or one joint twice.

@@ -283,6 +283,8 @@ pub fn step_error_reason(error: &StepError) -> &'static str {
         StepError::NotFinite { .. } => "MOTION_NOT_FINITE",
         StepError::TooFast { .. } => "TOO_FAST",
         StepError::Singular { .. } => "SINGULAR",
+        StepError::SingularConstraints { .. } => "SINGULAR_CONSTRAINTS",
+        StepError::InconsistentConstraints { .. } => "INCONSISTENT_CONSTRAINTS",
     }
 }
 
@@ -298,7 +300,11 @@ impl From<StepError> for Fault {
             StepError::NotConverged { .. }
             | StepError::NotFinite { .. }
             | StepError::TooFast { .. }
-            | StepError::Singular { .. } => Self::precondition(reason, "step", message),
+            | StepError::Singular { .. }
+            | StepError::SingularConstraints { .. }
+            | StepError::InconsistentConstraints { .. } => {
+                Self::precondition(reason, "step", message)
+            }
         }
     }
 }

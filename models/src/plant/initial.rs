@@ -212,7 +212,7 @@ impl Plant {
         let model = &self.model;
         let (n, nc) = (q.len(), model.dimensions.constraints);
         let mut closure = Closure::new(model);
-        let mut normal = PivotedLu::new(nc, 0);
+        let mut normal = PivotedLu::new(&model.conditioning.weight, 0);
         let mut best = f64::INFINITY;
         for _ in 0..PROJECTION_ITERATIONS {
             closure.evaluate(model, &q, &[]);
@@ -336,7 +336,7 @@ impl Workspace {
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         self.matrix.clear();
         self.curvature.fill_mass_matrix(&model.pairs, &self.momenta, &mut self.matrix);
-        self.matrix.factor(&model.elimination);
+        self.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.iter_mut().enumerate() {
             *r = state.p[i] - self.l_v[i];
         }
@@ -353,6 +353,7 @@ impl Workspace {
         self.prepare_start(model, &state.q);
         self.find_responses(model);
         fill_schur(model, &self.start, &self.responses, &mut self.schur);
+        self.schur.factor();
         let rows = self.start.jacobian.chunks(n);
         for (rate, row) in self.constraint_residual.iter_mut().zip(rows) {
             let velocity = self.residual.iter().chain(&state.v);

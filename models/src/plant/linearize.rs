@@ -173,7 +173,7 @@ impl Plant {
         );
         if d.constraints > 0 {
             workspace.finish_end(&self.model, &self.state);
-            workspace.factor_schur(&self.model);
+            workspace.factor_schur(&self.model, &self.settings)?;
             self.solve_multipliers(out);
         }
         for x in &mut out.increment {

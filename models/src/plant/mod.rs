@@ -2,9 +2,10 @@
 //!
 //! The files in the order in which a step runs: [`initial`], [`kinematics`], [`momenta`],
 //! [`springs`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`], [`pivoted_lu`],
-//! [`newton`], [`linearize`]; then [`snapshot`].
+//! [`newton`], [`conditioning`], [`linearize`]; then [`snapshot`].
 
 mod closure;
+pub(crate) mod conditioning;
 mod curvature;
 mod forces;
 mod initial;
@@ -38,15 +39,18 @@ pub struct Settings {
     pub force_split: ForceSplit,
     /// Corrections before a step is given up.
     pub max_iterations: u32,
+    /// A reciprocal condition estimate below this is an error; greater than zero.
+    pub singular_below: f64,
 }
 
 impl Settings {
-    /// The model's time step, symmetric split, 40 iterations.
+    /// The model's time step, symmetric split, 40 iterations, singular below 1e-14.
     pub fn new(model: &Model) -> Self {
         Self {
             time_step_s: model.scene().time_step_s,
             force_split: ForceSplit::default(),
             max_iterations: 40,
+            singular_below: 1e-14,
         }
     }
 }
@@ -104,8 +108,17 @@ pub struct StepReport {
     pub residual: f64,
     /// Final constraint violation in units of its own round-off.
     pub constraint_residual: f64,
-    /// Smallest pivot of the Newton matrix relative to its largest entry.
+    /// Estimate of the reciprocal condition of the Newton matrix `M[k+1]`, at most 1: its smallest
+    /// pivot, each relative to the larger of its diagonal entry and the inertia that its coordinate
+    /// has at most, over `h`. Of the last factorization; 1 before the first.
     pub reciprocal_condition: f64,
+    /// Estimate of the reciprocal condition of `Dh(q[k+1]) M[k+1]⁻¹ Dh(q[k])ᵀ`, at most 1: its
+    /// smallest pivot that does not belong to a redundant equation, relative to the largest, each
+    /// equation scaled by the steepest that it gets. Of the last factorization; 1 before the first
+    /// and without constraints.
+    pub constraint_reciprocal_condition: f64,
+    /// Equations of constraints that depend on others.
+    pub redundant_constraints: u32,
 }
 
 /// Why a step failed. The plant is as it was.
@@ -157,14 +170,48 @@ pub enum StepError {
     },
     /// The Newton matrix is singular.
     #[error(
-        "singular Newton matrix at coordinate `{coordinate}` (pivot {pivot:e} of the largest entry)"
+        "singular Newton matrix at coordinate `{coordinate}` (pivot {pivot:e} of what it can be)"
     )]
     Singular {
         /// Coordinate of the vanishing pivot.
         coordinate: String,
-        /// The pivot relative to the largest entry.
+        /// The pivot, as in [`StepReport::reciprocal_condition`].
         pivot: f64,
     },
+    /// Constraints lost their independence: `Dh(q[k+1]) M⁻¹ Dh(q[k])ᵀ` is singular, beyond equations
+    /// that are redundant everywhere.
+    #[error(
+        "singular configuration of the constraints {} (reciprocal condition {reciprocal_condition:e})",
+        quoted(constraints)
+    )]
+    SingularConstraints {
+        /// Names of the equations concerned.
+        constraints: Vec<String>,
+        /// The estimate.
+        reciprocal_condition: f64,
+    },
+    /// Constraints that depend on each other contradict each other.
+    #[error(
+        "the constraints {} contradict each other: the best configuration violates them by {violation:e}",
+        quoted(constraints)
+    )]
+    InconsistentConstraints {
+        /// Names of the equations that stay violated.
+        constraints: Vec<String>,
+        /// Largest value `h(q)` at the best configuration found.
+        violation: f64,
+    },
+}
+
+/// Names in a sentence; the first few of many.
+fn quoted(names: &[String]) -> String {
+    const SHOWN: usize = 8;
+    let mut text =
+        names.iter().take(SHOWN).map(|n| format!("`{n}`")).collect::<Vec<_>>().join(", ");
+    if names.len() > SHOWN {
+        text.push_str(&format!(" and {} more", names.len() - SHOWN));
+    }
+    text
 }
 
 /// Kinetic and potential energy, J.
@@ -245,6 +292,7 @@ impl Plant {
         };
         positive("time_step_s", settings.time_step_s)?;
         positive("max_iterations", f64::from(settings.max_iterations))?;
+        positive("singular_below", settings.singular_below)?;
         let mut plant = Self {
             state: PreciseState::new(&model),
             workspace: Workspace::new(&model),
@@ -294,8 +342,9 @@ impl Plant {
         u: &[f64],
         out: &mut Linearization,
     ) -> Result<StepReport, StepError> {
-        let report = self.solve(u)?;
+        let mut report = self.solve(u)?;
         self.linearize_solution(out)?;
+        self.workspace.estimates.write(&mut report);
         Ok(report)
     }
 

@@ -17,7 +17,7 @@ use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{Term, padded};
-use crate::plant::tree_lu::{SmallestPivot, TreeLu};
+use crate::plant::tree_lu::TreeLu;
 use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, springs};
 use crate::spatial::Mat3;
 
@@ -29,8 +29,6 @@ const FLOOR: f64 = 1e4;
 const CHORD_FLOOR: f64 = 1e2;
 /// A residual that falls slower than this asks for a new Jacobian.
 const SLOW: f64 = 0.2;
-/// A pivot below this fraction of the largest entry is zero.
-const SINGULAR: f64 = 1e-14;
 
 /// All memory that a step and its linearization need.
 #[derive(Clone, Debug)]
@@ -78,6 +76,25 @@ pub(crate) struct Workspace {
     /// `h L_qq`, for the linearization, row-major.
     pub(crate) stiffness: Vec<f64>,
     pub(crate) terms: Vec<Term>,
+    pub(crate) estimates: Estimates,
+}
+
+/// Reciprocal condition estimates of the last factorization.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Estimates {
+    matrix: f64,
+    constraints: f64,
+    redundant: u32,
+}
+
+impl Estimates {
+    const NONE: Self = Self { matrix: 1.0, constraints: 1.0, redundant: 0 };
+
+    pub(crate) fn write(&self, report: &mut StepReport) {
+        report.reciprocal_condition = self.matrix;
+        report.constraint_reciprocal_condition = self.constraints;
+        report.redundant_constraints = self.redundant;
+    }
 }
 
 impl Workspace {
@@ -110,11 +127,12 @@ impl Workspace {
             end: Closure::new(model),
             end_is_exact: false,
             responses: zeros(nd * padded(nc)),
-            schur: PivotedLu::new(nc, padded(2 * n)),
+            schur: PivotedLu::new(&model.conditioning.weight, padded(2 * n)),
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),
             stiffness: zeros(nd * nd),
             terms: Vec::with_capacity(nd.max(nc)),
+            estimates: Estimates::NONE,
         }
     }
 
@@ -136,6 +154,7 @@ impl Workspace {
         }
         self.ballistic(model, settings, state);
         self.iterate(model, settings, state, true)
+            .map_err(|error| model.explain(error, state, &self.q_end))
     }
 
     /// What does not change within a step: prescribed motion, input forces, constraints at the start.
@@ -218,7 +237,7 @@ impl Workspace {
         state: &PreciseState,
         always_factor: bool,
     ) -> Result<StepReport, StepError> {
-        let mut report = StepReport { reciprocal_condition: 1.0, ..StepReport::default() };
+        let mut report = StepReport::default();
         let mut previous = f64::INFINITY;
         let mut fresh = false;
         while report.iterations < settings.max_iterations {
@@ -230,7 +249,7 @@ impl Workspace {
                 return Err(StepError::NotFinite { iterations: report.iterations });
             }
             if report.iterations == 1 && size <= CONVERGED {
-                return self.accept(model, settings).map(|()| report);
+                return self.accept(model, settings, report);
             }
             let floor = if fresh { FLOOR } else { CHORD_FLOOR };
             let at_floor = size <= floor && size > 0.5 * previous;
@@ -238,13 +257,12 @@ impl Workspace {
             fresh =
                 !converged && (always_factor || previous.is_infinite() || size > SLOW * previous);
             if fresh {
-                let pivot = self.factor(model, settings)?;
-                report.reciprocal_condition = pivot.relative;
+                self.factor(model, settings)?;
                 report.factorizations += 1;
             }
             self.correct(model);
             if converged {
-                return self.accept(model, settings).map(|()| report);
+                return self.accept(model, settings, report);
             }
             previous = size;
         }
@@ -323,13 +341,13 @@ impl Workspace {
     }
 
     /// Factors `K` and `S` at the last evaluation.
-    fn factor(&mut self, model: &Model, settings: &Settings) -> Result<SmallestPivot, StepError> {
-        let pivot = self.factor_newton_matrix(model, settings)?;
+    fn factor(&mut self, model: &Model, settings: &Settings) -> Result<(), StepError> {
+        self.factor_newton_matrix(model, settings)?;
         if model.dimensions.constraints > 0 {
             self.end.differentiate(model, &self.q_end);
-            self.factor_schur(model);
+            self.factor_schur(model, settings)?;
         }
-        Ok(pivot)
+        Ok(())
     }
 
     /// Factors `K` at the last evaluation.
@@ -337,7 +355,7 @@ impl Workspace {
         &mut self,
         model: &Model,
         settings: &Settings,
-    ) -> Result<SmallestPivot, StepError> {
+    ) -> Result<(), StepError> {
         let h = settings.time_step_s;
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         if !model.point_springs.is_empty() {
@@ -365,19 +383,32 @@ impl Workspace {
             let slot = model.elimination.offsets[i + 1] - 1;
             self.matrix.add_to_diagonal(slot, -settings.force_split.at_start() * c);
         }
-        let pivot = self.matrix.factor(&model.elimination);
-        if pivot.relative >= SINGULAR || model.dimensions.dynamic == 0 {
-            Ok(pivot)
-        } else {
-            let coordinate = model.coordinates[pivot.row].name.clone();
-            Err(StepError::Singular { coordinate, pivot: pivot.relative })
+        let pivot = self.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0 / h);
+        self.estimates.matrix = pivot.relative;
+        if pivot.relative >= settings.singular_below {
+            return Ok(());
         }
+        let coordinate = model.coordinates[pivot.row].name.clone();
+        Err(StepError::Singular { coordinate, pivot: pivot.relative })
     }
 
     /// Factors `S = A1 K⁻¹ A0ᵀ` with the Jacobians in `start` and `end`.
-    pub(crate) fn factor_schur(&mut self, model: &Model) {
+    pub(crate) fn factor_schur(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+    ) -> Result<(), StepError> {
         self.find_responses(model);
         fill_schur(model, &self.end, &self.responses, &mut self.schur);
+        self.schur.factor();
+        let rank = model.constraint_rank();
+        self.estimates.constraints = self.schur.reciprocal_condition(rank, settings.time_step_s);
+        self.estimates.redundant = self.schur.deficiency() as u32;
+        if self.estimates.constraints >= settings.singular_below {
+            return Ok(());
+        }
+        fill_schur(model, &self.end, &self.responses, &mut self.schur);
+        Err(model.singular_constraints(&self.schur.matrix, self.estimates.constraints))
     }
 
     /// Solves for the responses `K⁻¹ A0ᵀ` with the matrix that is factored.
@@ -426,7 +457,12 @@ impl Workspace {
     }
 
     /// Checks the solution, and finds its impulse.
-    fn accept(&mut self, model: &Model, settings: &Settings) -> Result<(), StepError> {
+    fn accept(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        mut report: StepReport,
+    ) -> Result<StepReport, StepError> {
         for (coordinate, x) in model.coordinates.iter().zip(&self.increment) {
             if coordinate.is_angle && x.abs() > std::f64::consts::PI {
                 let coordinate = coordinate.name.clone();
@@ -437,9 +473,14 @@ impl Workspace {
             *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
         }
         if model.dimensions.constraints > 0 {
+            if report.factorizations > 0 {
+                // The extrapolated guess has the least norm of other configurations.
+                self.schur.remove_null(&mut self.multipliers);
+            }
             self.start.subtract_impulses(model, &self.multipliers, &mut self.impulse);
         }
-        Ok(())
+        self.estimates.write(&mut report);
+        Ok(report)
     }
 
     /// Constraints with Jacobian at the solution, for the linearization and the next step.
@@ -453,7 +494,7 @@ impl Workspace {
     }
 }
 
-/// Factors `A X` for the constraint Jacobian `A` of `closure` and `X`, row-major, nd by padded nc.
+/// Writes `A X` for the constraint Jacobian `A` of `closure` and `X`, row-major, nd by padded nc.
 pub(crate) fn fill_schur(model: &Model, closure: &Closure, x: &[f64], schur: &mut PivotedLu) {
     let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
     let stride = padded(nc);
@@ -469,7 +510,6 @@ pub(crate) fn fill_schur(model: &Model, closure: &Closure, x: &[f64], schur: &mu
             }
         }
     }
-    schur.factor();
 }
 
 impl Model {

@@ -1,12 +1,11 @@
 //! Dense LU with complete pivoting, for the small Schur complement of the constraints.
 //!
-//! Rows that depend on others (redundant constraints) show as vanishing pivots: they are left out,
-//! and their multipliers are zero.
+//! Rows that depend on others (redundant constraints) show as vanishing pivots and are left out. Of
+//! all solutions the one of least norm is taken: what a solution has along the null space of the
+//! matrix is removed. A matrix of full rank pays nothing for that.
 
+use crate::plant::conditioning::DEPENDENT;
 use crate::plant::rows::{Term, add_rows};
-
-/// Pivots below this fraction of the largest count as zero.
-const RANK_TOLERANCE: f64 = 1e-11;
 
 /// A square matrix, row-major, and its factorization in place.
 #[derive(Clone, Debug)]
@@ -18,6 +17,11 @@ pub(crate) struct PivotedLu {
     columns: Vec<usize>,
     scale: Vec<f64>,
     inverse_pivot: Vec<f64>,
+    /// Largest entry of what was left out.
+    rest: f64,
+    /// Orthonormal basis of the null space, one row per vector.
+    null: Vec<f64>,
+    null_vectors: usize,
     /// A permuted right-hand side.
     scratch: Vec<f64>,
     terms: Vec<Term>,
@@ -25,35 +29,40 @@ pub(crate) struct PivotedLu {
 
 impl PivotedLu {
     /// Room for a matrix and for right-hand sides of up to `stride` columns (whole blocks).
-    pub(crate) fn new(order: usize, stride: usize) -> Self {
+    ///
+    /// Rows and columns are multiplied by `scale` before they are factored; those of which it is zero
+    /// are left out.
+    pub(crate) fn new(scale: &[f64], stride: usize) -> Self {
+        let order = scale.len();
         Self {
             matrix: vec![0.0; order * order],
             order,
             rank: 0,
             rows: vec![0; order],
             columns: vec![0; order],
-            scale: vec![1.0; order],
+            scale: scale.to_vec(),
             inverse_pivot: vec![0.0; order],
+            rest: 0.0,
+            null: vec![0.0; order * order],
+            null_vectors: 0,
             scratch: vec![0.0; order * stride.max(1)],
             terms: Vec::with_capacity(order),
         }
     }
 
-    /// Factors what stands in `matrix`, scaled to a unit diagonal first.
+    /// Factors what stands in `matrix`.
     pub(crate) fn factor(&mut self) {
         let n = self.order;
         for i in 0..n {
-            let diagonal = self.matrix[i * n + i].abs();
-            self.scale[i] = if diagonal > 0.0 { diagonal.sqrt().recip() } else { 1.0 };
             self.rows[i] = i;
             self.columns[i] = i;
-        }
-        for i in 0..n {
             for j in 0..n {
                 self.matrix[i * n + j] *= self.scale[i] * self.scale[j];
             }
         }
         self.rank = n;
+        self.null_vectors = 0;
+        self.rest = 0.0;
         let mut first = 0.0;
         for k in 0..n {
             let (row, column, pivot) = self.largest_from(k);
@@ -61,8 +70,10 @@ impl PivotedLu {
                 first = pivot;
             }
             // Written so that a NaN ends the factorization too.
-            if !(pivot > RANK_TOLERANCE * first) {
+            if !(pivot > DEPENDENT * first) {
                 self.rank = k;
+                self.rest = pivot;
+                self.find_null();
                 return;
             }
             self.swap(k, row, column);
@@ -75,6 +86,63 @@ impl PivotedLu {
                     self.matrix[i * n + j] -= factor * self.matrix[k * n + j];
                 }
             }
+        }
+    }
+
+    /// Rows that were left out.
+    pub(crate) fn deficiency(&self) -> usize {
+        self.order - self.rank
+    }
+
+    /// The smallest of the first `expected` pivots (of all that are not zero, if these are more)
+    /// relative to the largest pivot or to `unit`; 1 without any.
+    pub(crate) fn reciprocal_condition(&self, expected: usize, unit: f64) -> f64 {
+        let pivot =
+            |k: usize| if k < self.rank { self.inverse_pivot[k].abs().recip() } else { self.rest };
+        match expected.max(self.rank).checked_sub(1) {
+            Some(last) => (pivot(last) / pivot(0).max(unit)).clamp(0.0, 1.0),
+            None => 1.0,
+        }
+    }
+
+    /// Finds the null space: with `P` the order of the columns and `U = [U1 U2]`, the vectors
+    /// `P [−U1⁻¹ U2; 1]`, scaled back and made orthonormal.
+    #[cold]
+    fn find_null(&mut self) {
+        let (n, rank) = (self.order, self.rank);
+        for free in rank..n {
+            if self.scale[self.columns[free]] == 0.0 {
+                continue;
+            }
+            let z = &mut self.scratch[..n];
+            z.fill(0.0);
+            z[free] = 1.0;
+            for k in (0..rank).rev() {
+                let row = &self.matrix[k * n..][..n];
+                let sum: f64 = (k + 1..rank).map(|j| row[j] * z[j]).sum();
+                z[k] = -(sum + row[free]) * self.inverse_pivot[k];
+            }
+            let (found, vector) = self.null.split_at_mut(self.null_vectors * n);
+            let vector = &mut vector[..n];
+            for (z, column) in z.iter().zip(&self.columns) {
+                vector[*column] = z * self.scale[*column];
+            }
+            // Twice is enough.
+            for _ in 0..2 {
+                for other in found.chunks_exact(n) {
+                    subtract_part(vector, other);
+                }
+            }
+            let length = vector.iter().map(|x| x * x).sum::<f64>().sqrt();
+            vector.iter_mut().for_each(|x| *x /= length);
+            self.null_vectors += 1;
+        }
+    }
+
+    /// Takes from `x` what it has along the null space, which leaves the solution of least norm.
+    pub(crate) fn remove_null(&self, x: &mut [f64]) {
+        for vector in self.null.chunks_exact(self.order.max(1)).take(self.null_vectors) {
+            subtract_part(x, vector);
         }
     }
 
@@ -104,7 +172,7 @@ impl PivotedLu {
         }
     }
 
-    /// Solves in place; multipliers of redundant rows are zero.
+    /// Solves in place, with least norm.
     pub(crate) fn solve(&mut self, x: &mut [f64]) {
         let (n, rank) = (self.order, self.rank);
         for k in 0..rank {
@@ -127,6 +195,7 @@ impl PivotedLu {
             let target = self.columns[k];
             x[target] = self.scratch[k] * self.scale[target];
         }
+        self.remove_null(x);
     }
 
     /// The same for a row-major right-hand side; `stride` is whole blocks.
@@ -162,7 +231,27 @@ impl PivotedLu {
                 *t = entry * self.scale[target];
             }
         }
+        self.remove_null_rows(x, stride);
     }
+
+    fn remove_null_rows(&mut self, x: &mut [f64], stride: usize) {
+        for vector in self.null.chunks_exact(self.order.max(1)).take(self.null_vectors) {
+            let along = &mut self.scratch[..stride];
+            along.fill(0.0);
+            self.terms.clear();
+            self.terms.extend(vector.iter().enumerate().map(|(c, part)| (*part, c)));
+            add_rows(along, x, stride, &self.terms);
+            for (row, part) in x.chunks_exact_mut(stride).zip(vector) {
+                add_rows(row, along, stride, &[(-part, 0)]);
+            }
+        }
+    }
+}
+
+/// `x −= n (nᵀ x)` for a vector `n` of length one.
+fn subtract_part(x: &mut [f64], n: &[f64]) {
+    let part: f64 = x.iter().zip(n).map(|(x, n)| x * n).sum();
+    x.iter_mut().zip(n).for_each(|(x, n)| *x -= part * n);
 }
 
 #[cfg(test)]
@@ -171,8 +260,8 @@ mod tests {
 
     use super::*;
 
-    fn filled(dense: &DMatrix<f64>) -> PivotedLu {
-        let mut lu = PivotedLu::new(dense.nrows(), 8);
+    fn filled(dense: &DMatrix<f64>, scale: &[f64]) -> PivotedLu {
+        let mut lu = PivotedLu::new(scale, 8);
         lu.matrix.copy_from_slice(dense.transpose().as_slice());
         lu.factor();
         lu
@@ -180,35 +269,61 @@ mod tests {
 
     #[test]
     fn badly_scaled_rows_do_not_count_as_redundant() {
-        let scale = DMatrix::from_diagonal(&DVector::from_vec(vec![1e6, 1.0, 1e-7]));
+        let lengths = [1e6, 1.0, 1e-7];
+        let scale = DMatrix::from_diagonal(&DVector::from_row_slice(&lengths));
         let core = DMatrix::from_row_slice(3, 3, &[2.0, 0.3, -0.4, 0.1, 3.0, 0.2, 0.5, -0.6, 4.0]);
         let dense = &scale * core * &scale;
         let x = DVector::from_vec(vec![1e-6, -2.0, 3e7]);
         let mut solution = (&dense * &x).as_slice().to_vec();
-        let mut lu = filled(&dense);
+        let mut lu = filled(&dense, &lengths.map(f64::recip));
         lu.solve(&mut solution);
-        assert_eq!(lu.rank, 3);
+        assert_eq!(lu.deficiency(), 0);
         assert!((DVector::from_vec(solution).component_div(&x).add_scalar(-1.0)).amax() < 1e-12);
+        let smallest = lu.reciprocal_condition(3, 1.0);
+        assert!((0.3..1.0).contains(&smallest), "{smallest}");
+    }
+
+    /// Rows of rank 2 among five: the third is the sum of the first two, the fourth is noise, the
+    /// fifth twice the second.
+    fn redundant() -> DMatrix<f64> {
+        let rows = [
+            [1.0, 0.2, 0.0, 0.4],
+            [0.0, 1.0, 0.5, 0.0],
+            [1.0, 1.2, 0.5, 0.4],
+            [1e-17, -1e-17, 0.0, 1e-17],
+            [0.0, 2.0, 1.0, 0.0],
+        ];
+        DMatrix::from_fn(5, 4, |i, j| rows[i][j])
     }
 
     #[test]
-    fn a_consistent_redundant_system_is_solved() {
-        // The third row is the sum of the others.
-        let a = DMatrix::from_row_slice(
-            3,
-            4,
-            &[1.0, 0.2, 0.0, 0.4, 0.0, 1.0, 0.5, 0.0, 1.0, 1.2, 0.5, 0.4],
-        );
-        let dense = &a * a.transpose();
-        let b = &dense * DVector::from_vec(vec![1.0, 2.0, -1.0]);
-        let mut lu = filled(&dense);
+    fn a_consistent_redundant_system_is_solved_with_least_norm() {
+        let a = redundant();
+        // Not symmetric, as in a step, with the null space of the rows of `a` on the right.
+        let turned = DMatrix::from_fn(5, 4, |i, j| a[(i, j)] * (1.0 + 0.1 * j as f64));
+        let dense = turned * a.transpose();
+        let b = &dense * DVector::from_vec(vec![1.0, 2.0, -1.0, 0.0, 0.5]);
+        let mut lu = filled(&dense, &[1.0, 1.0, 1.0, 0.0, 1.0]);
         let mut single = b.as_slice().to_vec();
         lu.solve(&mut single);
-        assert_eq!(lu.rank, 2);
+        assert_eq!(lu.deficiency(), 3);
         assert!((&dense * DVector::from_vec(single.clone()) - &b).amax() < 1e-12);
-        let mut rows = vec![0.0; 3 * 8];
-        (0..3).for_each(|i| rows[i * 8 + 5] = b[i]);
+        let least = dense.svd(true, true).solve(&b, 1e-10).unwrap();
+        assert!((DVector::from_vec(single.clone()) - least).amax() < 1e-12);
+        let mut rows = vec![0.0; 5 * 8];
+        (0..5).for_each(|i| rows[i * 8 + 5] = b[i]);
         lu.solve_rows(&mut rows, 8);
-        (0..3).for_each(|i| assert!((rows[i * 8 + 5] - single[i]).abs() < 1e-14));
+        (0..5).for_each(|i| assert!((rows[i * 8 + 5] - single[i]).abs() < 1e-14));
+    }
+
+    #[test]
+    fn only_pivots_that_should_be_there_count() {
+        let a = redundant();
+        let lu = filled(&(&a * a.transpose()), &[1.0, 1.0, 1.0, 0.0, 1.0]);
+        assert!(lu.reciprocal_condition(2, 1.0) > 0.05);
+        assert!(lu.reciprocal_condition(3, 1.0) < 1e-14);
+        assert!(lu.reciprocal_condition(2, 1e6) < 1e-5);
+        assert_eq!(filled(&DMatrix::zeros(0, 0), &[]).reciprocal_condition(0, 1.0), 1.0);
+        assert_eq!(filled(&DMatrix::zeros(1, 1), &[1.0]).reciprocal_condition(1, 1.0), 0.0);
     }
 }

@@ -1,14 +1,14 @@
 //! Snapshots: everything that a plant needs to go on bit for bit.
 //!
 //! Encoding, little-endian: magic `PLNTSNAP`, version (u32), model digest (u64), time step (f64 bits),
-//! force split (u8), iteration limit (u32), nd, nk, nc (u32 each), step (u64), history (u8), the
+//! force split (u8), iteration limit (u32), singular threshold (f64 bits), nd, nk, nc (u32 each), step (u64), history (u8), the
 //! numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
 use crate::compile::fnv1a;
 use crate::plant::{ForceSplit, Plant, PreciseState, Settings};
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Everything a plant needs to go on bit for bit.
 #[derive(Clone, Debug, PartialEq)]
@@ -94,6 +94,7 @@ impl Snapshot {
             ForceSplit::Paper => 1,
         });
         bytes.extend(self.settings.max_iterations.to_le_bytes());
+        bytes.extend(self.settings.singular_below.to_le_bytes());
         for size in [state.p.len(), state.v.len(), state.multipliers.len()] {
             bytes.extend((size as u32).to_le_bytes());
         }
@@ -130,6 +131,7 @@ impl Snapshot {
                 _ => return Err(malformed("unknown force split")),
             },
             max_iterations: u32::from_le_bytes(reader.take()?),
+            singular_below: f64::from_le_bytes(reader.take()?),
         };
         let mut size = || Ok(u32::from_le_bytes(reader.take()?) as usize);
         let (nd, nk, nc) = (size()?, size()?, size()?);

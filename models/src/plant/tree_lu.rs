@@ -12,6 +12,8 @@ pub(crate) struct TreeLu {
     /// `lower[slot] = K[row, ancestor]`.
     pub(crate) lower: Vec<f64>,
     inverse_pivot: Vec<f64>,
+    /// What each pivot is compared with.
+    reference: Vec<f64>,
     terms: Vec<Term>,
 }
 
@@ -19,7 +21,7 @@ pub(crate) struct TreeLu {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct SmallestPivot {
     pub(crate) row: usize,
-    /// Relative to the largest entry of the matrix.
+    /// Relative to its reference, at most 1.
     pub(crate) relative: f64,
 }
 
@@ -29,6 +31,7 @@ impl TreeLu {
             upper: vec![0.0; elimination.entries()],
             lower: vec![0.0; elimination.entries()],
             inverse_pivot: vec![0.0; elimination.len()],
+            reference: vec![0.0; elimination.len()],
             terms: Vec::with_capacity(elimination.len()),
         }
     }
@@ -55,15 +58,21 @@ impl TreeLu {
         }
     }
 
-    /// Factors in place, from the last row to the first.
+    /// Factors in place, from the last row to the first. Each pivot is compared with the larger of
+    /// its diagonal entry and `scale · factor` of its row.
     #[inline(never)]
-    pub(crate) fn factor(&mut self, elimination: &Elimination) -> SmallestPivot {
-        let largest = self
-            .upper
-            .iter()
-            .chain(&self.lower)
-            .fold(f64::MIN_POSITIVE, |largest, entry| largest.max(entry.abs()));
-        let mut smallest = SmallestPivot { row: 0, relative: f64::INFINITY };
+    pub(crate) fn factor(
+        &mut self,
+        elimination: &Elimination,
+        scale: &[f64],
+        factor: f64,
+    ) -> SmallestPivot {
+        for ((reference, end), scale) in
+            self.reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
+        {
+            *reference = self.upper[end - 1].abs().max(scale * factor);
+        }
+        let mut smallest = SmallestPivot { row: 0, relative: 1.0 };
         for k in (0..elimination.len()).rev() {
             let start = elimination.offsets[k];
             let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
@@ -71,9 +80,9 @@ impl TreeLu {
             let (upper_above, upper_row) = self.upper.split_at_mut(start);
             let (lower_above, lower_row) = self.lower.split_at_mut(start);
             let pivot = upper_row[depth];
-            let relative = pivot.abs() / largest;
-            // Written so that a NaN counts as the smallest.
-            if !(relative >= smallest.relative) {
+            // A NaN counts as zero.
+            let relative = (pivot.abs() / self.reference[k]).max(0.0);
+            if relative < smallest.relative {
                 smallest = SmallestPivot { row: k, relative };
             }
             let inverse = 1.0 / pivot;
@@ -189,7 +198,7 @@ mod tests {
         let (mut lu, dense) = matrix(&elimination);
         let b = DVector::from_fn(elimination.len(), |i, _| (i as f64).cos());
         let mut x = b.as_slice().to_vec();
-        assert!(lu.factor(&elimination).relative > 0.1);
+        assert!(lu.factor(&elimination, &[0.0; 8], 1.0).relative > 0.1);
         lu.solve(&elimination, &mut x);
         assert!((dense * DVector::from_vec(x) - b).amax() < 1e-14);
     }
@@ -198,7 +207,7 @@ mod tests {
     fn rows_are_solved_like_single_columns() {
         let elimination = elimination();
         let (mut lu, _) = matrix(&elimination);
-        lu.factor(&elimination);
+        lu.factor(&elimination, &[0.0; 8], 1.0);
         let (n, stride) = (elimination.len(), 24);
         let mut rows: Vec<f64> = (0..n * stride).map(|i| (i as f64).sin()).collect();
         for column in 0..stride {
@@ -225,7 +234,7 @@ mod tests {
         let root = elimination.offsets[7] - 1;
         (lu.upper[diagonal], lu.upper[coupling], lu.lower[coupling], lu.upper[root]) =
             (2.0, 2.0, 2.0, 2.0);
-        let smallest = lu.factor(&elimination);
+        let smallest = lu.factor(&elimination, &[0.0; 8], 1.0);
         assert_eq!((smallest.row, smallest.relative), (6, 0.0));
     }
 
@@ -234,6 +243,6 @@ mod tests {
         let elimination = elimination();
         let (mut lu, _) = matrix(&elimination);
         lu.upper[elimination.offsets[5] - 1] = f64::NAN;
-        assert!(!(lu.factor(&elimination).relative >= 0.0));
+        assert_eq!(lu.factor(&elimination, &[0.0; 8], 1.0).relative, 0.0);
     }
 }

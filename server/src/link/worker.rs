@@ -315,6 +315,10 @@ impl Failure {
             StepError::Singular { ref coordinate, pivot } => {
                 Self { a: index_of(coordinate), value: pivot, ..Self::new(Code::Singular) }
             }
+            // The link has no room for names: gRPC tells them.
+            StepError::SingularConstraints { .. } | StepError::InconsistentConstraints { .. } => {
+                Self::new(Code::NotConverged)
+            }
             StepError::TooFast { ref coordinate, increment } => {
                 Self { a: index_of(coordinate), value: increment, ..Self::new(Code::TooFast) }
             }

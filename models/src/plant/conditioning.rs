@@ -1,0 +1,294 @@
+//! How far a step is from a singularity: what pivots are measured against, and what to say when a
+//! step fails.
+//!
+//! Pivots are compared with numbers that follow from the scene alone, so that neither units nor a
+//! configuration decide what counts as zero:
+//!
+//! - a pivot of the Newton matrix with the largest inertia that its coordinate can have in any
+//!   configuration (or with its own diagonal entry, where springs make that larger);
+//! - a pivot of `S = Dh(q[k+1]) K⁻¹ Dh(q[k])ᵀ` with the steepest that its constraint gets over a
+//!   sample of configurations.
+//!
+//! **Redundant or singular?** Equations that depend on others at the scene's initial configuration
+//! are redundant: they get least-norm multipliers and are counted. Where fewer equations are
+//! independent than there, the configuration is singular. A step that cannot be solved there names
+//! the constraints that lost their independence.
+
+use nalgebra::{DMatrix, DVector, SVD};
+
+use crate::Model;
+use crate::plant::closure::Closure;
+use crate::plant::{PreciseState, StepError};
+use crate::tree::{JointKind, Rotational, WORLD};
+
+/// Configurations over which the steepness of a constraint is sampled.
+const SAMPLES: usize = 8;
+/// A constraint less steep than this fraction of the steepest is moved by no dynamic coordinate.
+const FLAT: f64 = 1e-13;
+/// Square of the distance from the others, relative to a row of full steepness, below which a row
+/// depends on them.
+pub(crate) const DEPENDENT: f64 = 1e-11;
+/// A step that fails where the constraints' estimate is below this fails because of it.
+const SUSPECT: f64 = 1e-4;
+/// Corrections before it is believed that constraints contradict each other.
+const RECONCILIATIONS: usize = 100;
+
+/// References for pivots, and the independent equations.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Conditioning {
+    /// Largest inertia of each dynamic coordinate, kg or kg·m²; zero where it moves none.
+    pub(crate) inertia: Vec<f64>,
+    /// One over the largest gradient of each equation in the metric of `inertia`; zero where no
+    /// dynamic coordinate moves it.
+    pub(crate) weight: Vec<f64>,
+    /// Equations that are independent at the scene's initial configuration, in their order.
+    pub(crate) independent: Vec<usize>,
+}
+
+impl Conditioning {
+    pub(crate) fn new(model: &Model) -> Self {
+        let inertia = inertia(model);
+        let mut found = Self { inertia, ..Self::default() };
+        if model.dimensions.constraints > 0 {
+            found.weight = found.weights(model);
+            let mut q: Vec<f64> = model.coordinates.iter().map(|c| c.initial).collect();
+            found.independent = independent(&found.rows(model, &mut Closure::new(model), &mut q));
+        }
+        found
+    }
+
+    /// Dynamic columns of `Dh(q)`, each row with its weight and each column by the root of its
+    /// inertia: the rows of full steepness have length one.
+    fn rows(&self, model: &Model, closure: &mut Closure, q: &[f64]) -> DMatrix<f64> {
+        closure.evaluate(model, q, &[]);
+        closure.differentiate(model, q);
+        let d = model.dimensions;
+        DMatrix::from_fn(d.constraints, d.dynamic, |c, j| {
+            let weight = self.weight.get(c).copied().unwrap_or(1.0);
+            weight * closure.jacobian[c * d.coordinates() + j] / self.inertia_of(j).sqrt()
+        })
+    }
+
+    /// Inertia of a coordinate; the largest one stands in where it moves none.
+    fn inertia_of(&self, j: usize) -> f64 {
+        let own = self.inertia[j];
+        if own > 0.0 {
+            return own;
+        }
+        let largest = self.inertia.iter().fold(0.0_f64, |a, b| a.max(*b));
+        if largest > 0.0 { largest } else { 1.0 }
+    }
+
+    fn weights(&self, model: &Model) -> Vec<f64> {
+        let mut closure = Closure::new(model);
+        let mut steepest = vec![0.0_f64; model.dimensions.constraints];
+        for sample in 0..=SAMPLES {
+            let q: Vec<f64> = model
+                .coordinates
+                .iter()
+                .enumerate()
+                .map(|(i, c)| {
+                    if sample == 0 || !c.is_angle || i >= model.dimensions.dynamic {
+                        return c.initial;
+                    }
+                    // Multiples of the golden ratio spread evenly over the circle.
+                    let turns = (sample * (i + 1)) as f64 * 0.618_033_988_749_894_9;
+                    c.initial + std::f64::consts::TAU * turns.fract()
+                })
+                .collect();
+            let rows = self.rows(model, &mut closure, &q);
+            for (steepest, row) in steepest.iter_mut().zip(rows.row_iter()) {
+                *steepest = steepest.max(row.norm());
+            }
+        }
+        let largest = steepest.iter().fold(0.0_f64, |a, b| a.max(*b));
+        steepest.iter().map(|s| if *s > FLAT * largest { 1.0 / s } else { 0.0 }).collect()
+    }
+}
+
+/// The largest inertia that each dynamic coordinate can have: every body of its subtree stretched
+/// out as far as the joints between allow.
+fn inertia(model: &Model) -> Vec<f64> {
+    let mut inertia = vec![0.0; model.dimensions.dynamic];
+    let joints = &model.dynamics.joints;
+    for (b, carrier) in joints.iter().enumerate() {
+        let body = &carrier.body;
+        let largest_moment = match body.inertia {
+            Rotational::None => continue,
+            Rotational::Point => 0.0,
+            Rotational::Isotropic(moment) => moment,
+            // No principal moment exceeds the sum of the other two.
+            Rotational::Full(tensor) => 0.5 * (tensor.xx + tensor.yy + tensor.zz),
+        };
+        let (mut reach, mut at) = (body.center.norm(), b);
+        while at != WORLD {
+            let joint = &joints[at];
+            if let Some(inertia) = inertia.get_mut(joint.coordinate) {
+                *inertia += match joint.kind {
+                    JointKind::Prismatic => body.mass,
+                    JointKind::Revolute | JointKind::Ball(_) => {
+                        body.mass * reach * reach + largest_moment
+                    }
+                    JointKind::Screw(pitch) => {
+                        body.mass * (reach * reach + pitch * pitch) + largest_moment
+                    }
+                };
+            }
+            reach += joint.translation.norm();
+            if joint.kind == JointKind::Prismatic {
+                reach += model.coordinates[joint.coordinate].initial.abs();
+            }
+            at = joint.parent;
+        }
+    }
+    inertia
+}
+
+/// Rows that do not depend on rows before them.
+fn independent(rows: &DMatrix<f64>) -> Vec<usize> {
+    let mut basis: Vec<DVector<f64>> = Vec::new();
+    let mut independent = Vec::new();
+    for (c, row) in rows.row_iter().enumerate() {
+        let mut rest = row.transpose();
+        // Twice is enough.
+        for _ in 0..2 {
+            for b in &basis {
+                rest.axpy(-b.dot(&rest), b, 1.0);
+            }
+        }
+        let length = rest.norm();
+        if length * length > DEPENDENT {
+            basis.push(rest / length);
+            independent.push(c);
+        }
+    }
+    independent
+}
+
+impl Model {
+    /// Equations of constraints that are independent at the scene's initial configuration.
+    pub(crate) fn constraint_rank(&self) -> usize {
+        self.conditioning.independent.len()
+    }
+
+    /// Names of the equations that depend on equations before them at `q`.
+    #[allow(dead_code, reason = "what reports them comes next")]
+    pub(crate) fn redundant_equations(&self, closure: &mut Closure, q: &[f64]) -> Vec<String> {
+        let independent = independent(&self.conditioning.rows(self, closure, q));
+        let names = self.constraint_names.iter().enumerate();
+        names.filter(|(c, _)| !independent.contains(c)).map(|(_, name)| name.clone()).collect()
+    }
+
+    /// Names of the equations that take part in the near-singularity of `matrix`, the rows and
+    /// columns of which belong to the independent equations.
+    fn names_of_singular(&self, matrix: DMatrix<f64>) -> Vec<String> {
+        let svd = SVD::new(matrix, true, false);
+        let (Some(u), Some(smallest)) =
+            (svd.u, svd.singular_values.iter().copied().reduce(f64::min))
+        else {
+            return Vec::new();
+        };
+        let cut = (10.0 * smallest).max(1e-3 * SUSPECT * svd.singular_values.max());
+        let mut takes_part = vec![false; self.constraint_rank()];
+        for (k, _) in svd.singular_values.iter().enumerate().filter(|(_, s)| **s <= cut) {
+            for (c, part) in u.column(k).iter().enumerate() {
+                takes_part[c] |= part.abs() > 0.1;
+            }
+        }
+        let independent = self.conditioning.independent.iter().zip(takes_part);
+        independent.filter(|(_, is)| *is).map(|(c, _)| self.constraint_names[*c].clone()).collect()
+    }
+
+    /// The error of a singular `S`, row-major as it was factored: `names` come from its smallest
+    /// singular values.
+    pub(crate) fn singular_constraints(
+        &self,
+        schur: &[f64],
+        reciprocal_condition: f64,
+    ) -> StepError {
+        let nc = self.dimensions.constraints;
+        let (chosen, weight) = (&self.conditioning.independent, &self.conditioning.weight);
+        let matrix = DMatrix::from_fn(chosen.len(), chosen.len(), |i, j| {
+            let (i, j) = (chosen[i], chosen[j]);
+            weight[i] * schur[i * nc + j] * weight[j]
+        });
+        let constraints = if matrix.iter().all(|x| x.is_finite()) {
+            self.names_of_singular(matrix)
+        } else {
+            Vec::new()
+        };
+        StepError::SingularConstraints { constraints, reciprocal_condition }
+    }
+
+    /// Why a step from `state` to the prescribed positions in `q_end` could not be solved, where the
+    /// constraints are the reason.
+    pub(crate) fn explain(
+        &self,
+        error: StepError,
+        state: &PreciseState,
+        q_end: &[f64],
+    ) -> StepError {
+        let unsolved =
+            matches!(error, StepError::NotConverged { .. } | StepError::NotFinite { .. });
+        if !unsolved || self.dimensions.constraints == 0 {
+            return error;
+        }
+        let mut closure = Closure::new(self);
+        let rows = self.conditioning.rows(self, &mut closure, &state.q);
+        let rows = rows.select_rows(&self.conditioning.independent);
+        let gram = &rows * rows.transpose();
+        let singular_values = gram.clone().singular_values();
+        if !singular_values.is_empty() {
+            let reciprocal_condition = singular_values.min() / singular_values.max().max(1.0);
+            if reciprocal_condition < SUSPECT {
+                let constraints = self.names_of_singular(gram);
+                return StepError::SingularConstraints { constraints, reciprocal_condition };
+            }
+        }
+        self.contradiction(&mut closure, state, q_end).unwrap_or(error)
+    }
+
+    /// Looks for a configuration near the state that satisfies the constraints at the prescribed
+    /// positions of the end; the error if the best one violates them.
+    fn contradiction(
+        &self,
+        closure: &mut Closure,
+        state: &PreciseState,
+        q_end: &[f64],
+    ) -> Option<StepError> {
+        let d = self.dimensions;
+        let mut q = state.q.clone();
+        q[d.dynamic..].copy_from_slice(&q_end[d.dynamic..]);
+        for _ in 0..RECONCILIATIONS {
+            let rows = self.conditioning.rows(self, closure, &q);
+            closure.evaluate(self, &q, &[]);
+            let weight = &self.conditioning.weight;
+            let value = DVector::from_fn(d.constraints, |c, _| {
+                // What nothing moves keeps its size.
+                closure.value[c] * if weight[c] > 0.0 { weight[c] } else { 1.0 }
+            });
+            if closure.violation() <= 1e4 {
+                return None;
+            }
+            let correction = SVD::new(rows, true, true).solve(&value, DEPENDENT.sqrt()).ok()?;
+            let mut longest = 0.0_f64;
+            for (j, x) in correction.iter().enumerate() {
+                let x = x / self.conditioning.inertia_of(j).sqrt();
+                longest = longest.max(x.abs());
+                q[j] -= x;
+            }
+            if !longest.is_finite() {
+                return None;
+            }
+            if longest < 1e-9 {
+                let relative = |c: usize| (closure.value[c] / closure.round_off[c]).abs();
+                let names = self.constraint_names.iter().enumerate();
+                let constraints =
+                    names.filter(|(c, _)| relative(*c) > 1e4).map(|(_, n)| n.clone()).collect();
+                let violation = closure.value.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
+                return Some(StepError::InconsistentConstraints { constraints, violation });
+            }
+        }
+        None
+    }
+}
