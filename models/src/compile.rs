@@ -9,7 +9,7 @@ use crate::model::{
     OperatingPoint, Pair, PathJoint, PointPair, PointSpring,
 };
 use crate::plant::conditioning::Conditioning;
-use crate::scene::{self, CoordinateKind, Length, Scene, SceneError, Spring};
+use crate::scene::{self, CoordinateKind, Length, Motion, Scene, SceneError, Spring};
 use crate::spatial::{Mat3, Sym3, Vec3};
 use crate::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 
@@ -63,6 +63,7 @@ fn compile(scene: &Scene) -> Model {
         pairs,
         mixed_pairs,
         coordinates: layout.coordinates,
+        orientations: layout.orientations,
         scene: scene.clone(),
     };
     model.conditioning = Conditioning::new(&model);
@@ -88,6 +89,8 @@ struct Layout {
     coordinates: Vec<Coordinate>,
     dynamic: usize,
     index: BTreeMap<String, usize>,
+    /// First coordinate of each orientation.
+    orientations: Vec<usize>,
 }
 
 /// Which joints which walk needs.
@@ -109,6 +112,7 @@ impl Layout {
             coordinates: Vec::new(),
             dynamic: 0,
             index: BTreeMap::new(),
+            orientations: Vec::new(),
         };
         let mut names = Vec::new();
         let mut stack: Vec<&scene::Frame> =
@@ -130,8 +134,11 @@ impl Layout {
             rotation: parent.rotation.times(&rotation(frame.rotation.as_ref())),
             translation: parent.translation + parent.rotation.apply(Vec3(frame.translation)),
         };
-        if let Some((kind, axis, name)) = moving(frame) {
-            let turned = Mat3::with_z_along(axis * (1.0 / axis.norm()));
+        for (name, motion) in frame.motions() {
+            let (kind, turned) = joint(&motion);
+            if motion == Motion::Ball(0) {
+                self.orientations.push(usize::MAX);
+            }
             let index = self.joints.len();
             self.joints.push(Joint {
                 parent: placement.joint,
@@ -144,12 +151,12 @@ impl Layout {
                 rotation: placement.rotation.times(&turned),
                 translation: placement.translation,
                 coordinate: usize::MAX,
-                orientation: usize::MAX,
+                orientation: self.orientations.len().wrapping_sub(1),
                 body: Body::default(),
                 subtree_mass: 0.0,
                 anchor: false,
             });
-            names.push(name.to_owned());
+            names.push(name);
             placement =
                 Placement { joint: index, rotation: turned.transpose(), translation: Vec3::ZERO };
         }
@@ -176,6 +183,9 @@ impl Layout {
         self.index = order.iter().cloned().enumerate().map(|(i, name)| (name, i)).collect();
         for (joint, name) in self.joints.iter_mut().zip(joint_names) {
             joint.coordinate = self.index[name];
+            if joint.kind == JointKind::Ball(0) {
+                self.orientations[joint.orientation] = joint.coordinate;
+            }
         }
         self.coordinates = order
             .into_iter()
@@ -187,7 +197,7 @@ impl Layout {
                     } else {
                         CoordinateKind::Dynamic
                     },
-                    is_angle: joint.is_some_and(|j| self.joints[j].kind == JointKind::Revolute),
+                    is_angle: joint.is_some_and(|j| self.joints[j].kind != JointKind::Prismatic),
                     initial: settings(scene, &name).map_or(0.0, |c| c.initial),
                     name,
                 }
@@ -355,15 +365,18 @@ impl Layout {
     }
 }
 
-/// Kind, axis and coordinate name of a frame's joint, if it moves.
-fn moving(frame: &scene::Frame) -> Option<(JointKind, Vec3, &str)> {
-    let joint = frame.joint.as_ref()?;
-    let (axis, _) = joint.motion()?;
-    let kind = match joint {
-        scene::Joint::Prismatic { .. } => JointKind::Prismatic,
-        scene::Joint::Revolute { .. } | scene::Joint::Fixed {} => JointKind::Revolute,
+/// The joint of one motion, and the rotation that takes its axis to z.
+fn joint(motion: &Motion) -> (JointKind, Mat3) {
+    let turned = |axis: &[f64; 3]| {
+        let axis = Vec3(*axis);
+        Mat3::with_z_along(axis * (1.0 / axis.norm()))
     };
-    Some((kind, Vec3(*axis), frame.coordinate()?))
+    match motion {
+        Motion::Revolute(axis) => (JointKind::Revolute, turned(axis)),
+        Motion::Prismatic(axis) => (JointKind::Prismatic, turned(axis)),
+        Motion::Screw(axis, pitch) => (JointKind::Screw(*pitch), turned(axis)),
+        Motion::Ball(axis) => (JointKind::Ball(*axis), Mat3::IDENTITY),
+    }
 }
 
 fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {

@@ -22,6 +22,7 @@ pub mod control;
 mod elimination;
 mod model;
 mod plant;
+mod rotation;
 #[allow(dead_code, reason = "derivatives of second order use all of it")]
 mod scalar;
 pub mod scene;

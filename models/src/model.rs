@@ -14,6 +14,8 @@ pub struct Model {
     pub(crate) scene: Scene,
     pub(crate) dimensions: Dimensions,
     pub(crate) coordinates: Vec<Coordinate>,
+    /// First of the three coordinates of each orientation (ball joint).
+    pub(crate) orientations: Vec<usize>,
     pub(crate) constraint_names: Vec<String>,
     pub(crate) operating_points: Vec<OperatingPoint>,
     pub(crate) digest: u64,

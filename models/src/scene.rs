@@ -131,6 +131,62 @@ pub enum Joint {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         coordinate: Option<String>,
     },
+    /// Turns about an axis through the frame's origin and slides along it at once.
+    Screw {
+        /// Axis in the frame; need not have unit length.
+        axis: [f64; 3],
+        /// Advance, m/rad; negative for a left-handed thread.
+        pitch: f64,
+        /// Coordinate, rad; the frame's name if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+    },
+    /// Turns about two axes through the frame's origin, one after the other (Cardan joint): the first
+    /// is fixed in the parent, the second is carried by the first.
+    Universal {
+        /// Axes in the frame, not parallel.
+        axes: [[f64; 3]; 2],
+        /// Stem of the coordinates `<stem>_1`, `<stem>_2`, rad; the frame's name if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+    },
+    /// Turns freely about the frame's origin: an orientation in SO(3), without singularities.
+    ///
+    /// Its coordinates are the components of the rotation vector (axis times angle, at most half a
+    /// turn), its velocities and momenta those in the frame's own axes.
+    Ball {
+        /// Stem of the coordinates `<stem>_rx`, `<stem>_ry`, `<stem>_rz`, rad; the frame's name if not
+        /// given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+    },
+    /// Moves freely: three slides along the axes of the frame at zero, then a ball joint.
+    Free {
+        /// Stem of the coordinates `<stem>_x`, `<stem>_y`, `<stem>_z`, m, and `<stem>_rx`,
+        /// `<stem>_ry`, `<stem>_rz`, rad; the frame's name if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+    },
+}
+
+/// One degree of freedom of a joint.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Motion {
+    /// Turns about an axis.
+    Revolute([f64; 3]),
+    /// Slides along an axis.
+    Prismatic([f64; 3]),
+    /// Turns about an axis and advances along it, m/rad.
+    Screw([f64; 3], f64),
+    /// Component 0, 1 or 2 of an orientation.
+    Ball(usize),
+}
+
+impl Motion {
+    /// Whether its coordinate is an angle, rad.
+    pub fn is_angle(&self) -> bool {
+        !matches!(self, Self::Prismatic(_))
+    }
 }
 
 /// A rigid body.
@@ -343,23 +399,37 @@ impl std::fmt::Display for Problem {
     }
 }
 
-impl Joint {
-    /// Axis, and the coordinate's name if the joint gives one; none for a fixed joint.
-    pub fn motion(&self) -> Option<(&[f64; 3], Option<&str>)> {
-        match self {
-            Self::Fixed {} => None,
-            Self::Revolute { axis, coordinate } | Self::Prismatic { axis, coordinate } => {
-                Some((axis, coordinate.as_deref()))
+impl Frame {
+    /// What its joint can do, one entry for each coordinate, with the coordinate's name.
+    pub fn motions(&self) -> Vec<(String, Motion)> {
+        const AXES: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let stem = |name: &Option<String>| name.as_ref().unwrap_or(&self.name).clone();
+        let named = |name: &Option<String>, motions: &[(&str, Motion)]| {
+            motions.iter().map(|(suffix, m)| (stem(name) + suffix, *m)).collect()
+        };
+        let turns = [("_rx", Motion::Ball(0)), ("_ry", Motion::Ball(1)), ("_rz", Motion::Ball(2))];
+        match &self.joint {
+            None | Some(Joint::Fixed {}) => Vec::new(),
+            Some(Joint::Revolute { axis, coordinate }) => {
+                vec![(stem(coordinate), Motion::Revolute(*axis))]
+            }
+            Some(Joint::Prismatic { axis, coordinate }) => {
+                vec![(stem(coordinate), Motion::Prismatic(*axis))]
+            }
+            Some(Joint::Screw { axis, pitch, coordinate }) => {
+                vec![(stem(coordinate), Motion::Screw(*axis, *pitch))]
+            }
+            Some(Joint::Universal { axes: [first, second], coordinate }) => named(
+                coordinate,
+                &[("_1", Motion::Revolute(*first)), ("_2", Motion::Revolute(*second))],
+            ),
+            Some(Joint::Ball { coordinate }) => named(coordinate, &turns),
+            Some(Joint::Free { coordinate }) => {
+                let [x, y, z] = AXES.map(Motion::Prismatic);
+                let slides = [("_x", x), ("_y", y), ("_z", z)];
+                named(coordinate, &[slides, turns].concat())
             }
         }
-    }
-}
-
-impl Frame {
-    /// Name of the coordinate that its joint moves by; none without a moving joint.
-    pub fn coordinate(&self) -> Option<&str> {
-        let (_, name) = self.joint.as_ref()?.motion()?;
-        Some(name.unwrap_or(&self.name))
     }
 }
 

@@ -7,7 +7,6 @@ use crate::spatial::{Mat3, Sym3, Vec3};
 pub(crate) const WORLD: usize = usize::MAX;
 
 /// Kind of a moving joint.
-#[allow(dead_code, reason = "no scene makes the last two yet")]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum JointKind {
     /// Turns about its z axis.
@@ -35,7 +34,7 @@ pub(crate) struct Joint {
     pub(crate) translation: Vec3,
     /// Index of the coordinate.
     pub(crate) coordinate: usize,
-    /// Index of the orientation of a ball joint.
+    /// Index of the orientation of a ball joint; meaningless for others.
     pub(crate) orientation: usize,
     /// Bodies fixed to the joint, lumped, in the joint's frame.
     pub(crate) body: Body,

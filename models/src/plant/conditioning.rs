@@ -17,6 +17,7 @@
 use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::Model;
+use crate::plant::balls::orientations;
 use crate::plant::closure::Closure;
 use crate::plant::{PreciseState, StepError};
 use crate::tree::{JointKind, Rotational, WORLD};
@@ -60,7 +61,7 @@ impl Conditioning {
     /// Dynamic columns of `Dh(q)`, each row with its weight and each column by the root of its
     /// inertia: the rows of full steepness have length one.
     fn rows(&self, model: &Model, closure: &mut Closure, q: &[f64]) -> DMatrix<f64> {
-        closure.evaluate(model, q, &[]);
+        closure.evaluate(model, q, &orientations(model, q));
         closure.differentiate(model, q);
         let d = model.dimensions;
         DMatrix::from_fn(d.constraints, d.dynamic, |c, j| {

@@ -2,11 +2,14 @@
 //! velocity and energy that belong to a state.
 
 use crate::Model;
+use crate::plant::balls::{orientations, rotation_vector};
 use crate::plant::closure::Closure;
 use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::padded;
 use crate::plant::{Energy, Plant, PreciseState, forces, springs};
+use crate::rotation;
+use crate::spatial::Vec3;
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
 const CONSTRAINT_TOLERANCE: f64 = 1e-6;
@@ -150,7 +153,8 @@ impl Plant {
                 state.q = checked("q", q, n)?;
                 let v = checked("v", v, n)?;
                 state.v.copy_from_slice(&v[nd..]);
-                state.p = self.workspace.momentum_of(&self.model, &state.q, &v);
+                state.orient(&self.model);
+                state.p = self.workspace.momentum_of(&self.model, &state, &v);
             }
             Initial::TwoConfigurations { q0, q1 } => {
                 let q0 = checked("q0", q0, n)?;
@@ -170,23 +174,44 @@ impl Plant {
                 state.q = self.project(guess, &moves)?;
             }
         }
+        state.orient(&self.model);
         Ok(state)
     }
 
     /// `D2 Ld(q0, q1) + F⁺ = L_v + ½h L_q + (1 − a) h f`.
     fn momentum_between(&mut self, q0: &[f64], q1: &[f64], inputs: &[f64]) -> Vec<f64> {
         let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
+        let change = self.model.difference(q0, q1);
         for i in 0..q0.len() {
-            workspace.q_mid[i] = 0.5 * (q0[i] + q1[i]);
-            workspace.velocity[i] = (q1[i] - q0[i]) / h;
+            workspace.q_mid[i] = q0[i] + 0.5 * change[i];
+            workspace.velocity[i] = change[i] / h;
+        }
+        let turns = self.model.orientations.iter().map(|&i| rotation_vector(&change, i));
+        let orientations = orientations(&self.model, q0);
+        for (o, turn) in turns.enumerate() {
+            workspace.turns[o] = turn;
+            workspace.orientations_mid[o] = orientations[o].times(&rotation::exp(turn * 0.5));
         }
         forces::input_forces(&self.model.inputs, inputs, &mut workspace.input_force);
         workspace.force.copy_from_slice(&workspace.input_force);
         workspace.evaluate_lagrangian(&self.model);
         let at_end = (1.0 - self.settings.force_split.at_start()) * h;
-        let momentum = (0..workspace.l_v.len())
-            .map(|i| workspace.l_v[i] + 0.5 * h * workspace.l_q[i] + at_end * workspace.force[i])
-            .collect();
+        let torque = |i: usize| 0.5 * h * workspace.l_q[i] + at_end * workspace.force[i];
+        let mut momentum: Vec<f64> =
+            (0..workspace.l_v.len()).map(|i| workspace.l_v[i] + torque(i)).collect();
+        for (o, &i) in self.model.orientations.iter().enumerate() {
+            if let Some(momentum) = momentum.get_mut(i..i + 3) {
+                let turn = workspace.turns[o];
+                let carried = rotation::momentum_at_start(turn)
+                    .apply_transposed(rotation_vector(&workspace.l_v, i));
+                let torque = rotation::torque_at_start(turn).apply_transposed(Vec3([
+                    torque(i),
+                    torque(i + 1),
+                    torque(i + 2),
+                ]));
+                momentum.copy_from_slice(&(carried + torque).0);
+            }
+        }
         workspace.input_force.fill(0.0);
         workspace.force.fill(0.0);
         momentum
@@ -195,9 +220,10 @@ impl Plant {
     fn check_constraints(&mut self, q: &[f64]) -> Result<(), InitialError> {
         let closure = &mut self.workspace.end;
         self.workspace.end_is_exact = false;
-        closure.evaluate(&self.model, q, &self.workspace.orientations_start);
+        let orientations = orientations(&self.model, q);
+        closure.evaluate(&self.model, q, &orientations);
         closure.differentiate(&self.model, q);
-        closure.evaluate(&self.model, q, &self.workspace.orientations_start);
+        closure.evaluate(&self.model, q, &orientations);
         for (c, (value, round_off)) in closure.value.iter().zip(&closure.round_off).enumerate() {
             if !(value.abs() <= round_off / f64::EPSILON * CONSTRAINT_TOLERANCE) {
                 let constraint = self.model.constraint_names[c].clone();
@@ -215,7 +241,7 @@ impl Plant {
         let mut normal = PivotedLu::new(&model.conditioning.weight, 0);
         let mut best = f64::INFINITY;
         for _ in 0..PROJECTION_ITERATIONS {
-            closure.evaluate(model, &q, &[]);
+            closure.evaluate(model, &q, &orientations(model, &q));
             closure.differentiate(model, &q);
             let violation = closure.violation();
             if violation <= 1.0 || (violation <= 1e3 && violation >= 0.5 * best) {
@@ -239,9 +265,8 @@ impl Plant {
                 .collect();
             let longest = correction.iter().fold(0.0, |m: f64, c| m.max(c.abs()));
             let scale = if longest > PROJECTION_STEP { PROJECTION_STEP / longest } else { 1.0 };
-            for (q, correction) in q.iter_mut().zip(&correction) {
-                *q -= scale * correction;
-            }
+            let change: Vec<f64> = correction.iter().map(|c| -scale * c).collect();
+            q = model.retract(&q, &change);
         }
         let relative = |c: &usize| (closure.value[*c] / closure.round_off[*c]).abs();
         let worst = (0..nc).max_by(|a, b| relative(a).total_cmp(&relative(b))).unwrap_or_default();
@@ -264,7 +289,7 @@ impl Plant {
         let velocity = self.velocity();
         let model = &self.model;
         let workspace = &mut self.workspace;
-        workspace.gradient_at(model, &self.state.q, &velocity);
+        workspace.gradient_at(model, &self.state, &velocity);
         let tree = &model.dynamics;
         let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
         let weight: f64 = roots
@@ -306,8 +331,11 @@ impl Workspace {
     }
 
     /// Gradient of the Lagrangian without springs at any configuration and velocity.
-    fn gradient_at(&mut self, model: &Model, q: &[f64], velocity: &[f64]) {
-        self.poses.evaluate(&model.dynamics, q, &self.orientations_start);
+    fn gradient_at(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) {
+        for (matrix, orientation) in self.orientations_start.iter_mut().zip(&state.orientations) {
+            *matrix = orientation.matrix();
+        }
+        self.poses.evaluate(&model.dynamics, &state.q, &self.orientations_start);
         self.momenta.gradient(
             &model.dynamics,
             &self.poses,
@@ -319,8 +347,8 @@ impl Workspace {
     }
 
     /// `p = M(q) q̇` on the dynamic rows.
-    fn momentum_of(&mut self, model: &Model, q: &[f64], velocity: &[f64]) -> Vec<f64> {
-        self.gradient_at(model, q, velocity);
+    fn momentum_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Vec<f64> {
+        self.gradient_at(model, state, velocity);
         self.l_v.clone()
     }
 
@@ -331,7 +359,7 @@ impl Workspace {
         self.velocity[..d.dynamic].fill(0.0);
         self.velocity[d.dynamic..].copy_from_slice(&state.v);
         let velocity = std::mem::take(&mut self.velocity);
-        self.gradient_at(model, &state.q, &velocity);
+        self.gradient_at(model, state, &velocity);
         self.velocity = velocity;
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         self.matrix.clear();
@@ -350,7 +378,7 @@ impl Workspace {
     fn project_velocity(&mut self, model: &Model, state: &PreciseState) {
         let n = model.dimensions.coordinates();
         let stride = padded(model.dimensions.constraints);
-        self.prepare_start(model, &state.q);
+        self.prepare_start(model, state);
         self.find_responses(model);
         fill_schur(model, &self.start, &self.responses, &mut self.schur);
         self.schur.factor();

@@ -4,6 +4,7 @@
 //! [`springs`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`], [`pivoted_lu`],
 //! [`newton`], [`conditioning`], [`linearize`]; then [`snapshot`].
 
+mod balls;
 mod closure;
 pub(crate) mod conditioning;
 mod curvature;
@@ -24,6 +25,8 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::Model;
+use crate::rotation::Quaternion;
+use balls::rotation_vector;
 use newton::Workspace;
 
 pub use initial::{Initial, InitialError};
@@ -234,6 +237,8 @@ pub(crate) struct PreciseState {
     /// What `p` lost to rounding.
     pub(crate) p_low: Vec<f64>,
     pub(crate) v: Vec<f64>,
+    /// Orientations of ball joints; `q` has their rotation vectors.
+    pub(crate) orientations: Vec<Quaternion>,
     pub(crate) multipliers: Vec<f64>,
     /// Increments of the last three steps, latest first.
     pub(crate) increments: [Vec<f64>; 3],
@@ -244,7 +249,7 @@ pub(crate) struct PreciseState {
 }
 
 impl PreciseState {
-    fn zeros(nd: usize, nk: usize, nc: usize) -> Self {
+    fn zeros(nd: usize, nk: usize, nc: usize, orientations: usize) -> Self {
         let history = |n: usize| [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
         Self {
             step: 0,
@@ -253,6 +258,7 @@ impl PreciseState {
             p: vec![0.0; nd],
             p_low: vec![0.0; nd],
             v: vec![0.0; nk],
+            orientations: vec![Quaternion::default(); orientations],
             multipliers: vec![0.0; nc],
             increments: history(nd),
             impulses: history(nc),
@@ -260,11 +266,22 @@ impl PreciseState {
         }
     }
 
+    /// Takes the orientations from `q`.
+    fn orient(&mut self, model: &Model) {
+        for (orientation, &i) in self.orientations.iter_mut().zip(&model.orientations) {
+            *orientation = Quaternion::exp(rotation_vector(&self.q, i));
+            self.q[i..i + 3].copy_from_slice(&orientation.log().0);
+        }
+    }
+
     /// At rest in the initial configuration of the scene.
     fn new(model: &Model) -> Self {
         let d = model.dimensions();
+        let no = model.orientations.len();
         let q = model.coordinates().iter().map(|c| c.initial).collect();
-        Self { q, ..Self::zeros(d.dynamic, d.prescribed, d.constraints) }
+        let mut state = Self { q, ..Self::zeros(d.dynamic, d.prescribed, d.constraints, no) };
+        state.orient(model);
+        state
     }
 }
 
@@ -418,7 +435,7 @@ impl Plant {
 
     /// Constraint Jacobian `Dh` at the current configuration, nc by nd + nk (allocates).
     pub fn constraint_jacobian(&mut self) -> DMatrix<f64> {
-        self.workspace.prepare_start(&self.model, &self.state.q);
+        self.workspace.prepare_start(&self.model, &self.state);
         let d = self.model.dimensions;
         DMatrix::from_row_slice(d.constraints, d.coordinates(), &self.workspace.start.jacobian)
     }
@@ -456,6 +473,9 @@ impl Plant {
             (state.p[i], state.p_low[i]) = (p, low);
         }
         state.q[nd..].copy_from_slice(&workspace.q_end[nd..]);
+        if !self.model.orientations.is_empty() {
+            workspace.turn(&self.model, state);
+        }
         state.v.copy_from_slice(&workspace.velocity[nd..]);
         state.multipliers.copy_from_slice(&workspace.multipliers);
         state.increments.rotate_right(1);

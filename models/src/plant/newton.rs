@@ -19,7 +19,7 @@ use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{Term, padded};
 use crate::plant::tree_lu::TreeLu;
 use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, springs};
-use crate::spatial::Mat3;
+use crate::spatial::{Mat3, Vec3};
 
 /// A residual this small, in units of round-off, is as good as zero.
 const CONVERGED: f64 = 4.0;
@@ -45,6 +45,8 @@ pub(crate) struct Workspace {
     pub(crate) orientations_start: Vec<Mat3>,
     pub(crate) orientations_mid: Vec<Mat3>,
     pub(crate) orientations_end: Vec<Mat3>,
+    /// How ball joints turn over the step, in their own axes.
+    pub(crate) turns: Vec<Vec3>,
     /// Velocity over the step.
     pub(crate) velocity: Vec<f64>,
     pub(crate) l_q: Vec<f64>,
@@ -101,6 +103,7 @@ impl Workspace {
     pub(crate) fn new(model: &Model) -> Self {
         let d = model.dimensions;
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
+        let no = model.orientations.len();
         let zeros = |len: usize| vec![0.0; len];
         Self {
             increment: zeros(nd),
@@ -108,9 +111,10 @@ impl Workspace {
             impulse: zeros(nd),
             q_mid: zeros(n),
             q_end: zeros(n),
-            orientations_start: Vec::new(),
-            orientations_mid: Vec::new(),
-            orientations_end: Vec::new(),
+            orientations_start: vec![Mat3::IDENTITY; no],
+            orientations_mid: vec![Mat3::IDENTITY; no],
+            orientations_end: vec![Mat3::IDENTITY; no],
+            turns: vec![Vec3::ZERO; no],
             velocity: zeros(n),
             l_q: zeros(nd),
             l_v: zeros(nd),
@@ -167,22 +171,28 @@ impl Workspace {
             self.velocity[i] = (next - state.q[i]) / settings.time_step_s;
             self.q_end[i] = *next;
         }
+        if !model.orientations.is_empty() {
+            self.prepare_orientations(model, settings, state);
+        }
         if d.inputs > 0 {
             forces::input_forces(&model.inputs, inputs, &mut self.input_force);
             self.force.copy_from_slice(&self.input_force);
         }
         if d.constraints > 0 {
-            self.prepare_start(model, &state.q);
+            self.prepare_start(model, state);
             // Until the end has a Jacobian of this step: nothing of the last may decide on this one.
             self.end.expect_round_off_of(&self.start);
         }
     }
 
     /// Constraints at the start of the step, kept from the end of the last one where possible.
-    pub(crate) fn prepare_start(&mut self, model: &Model, q: &[f64]) {
+    pub(crate) fn prepare_start(&mut self, model: &Model, state: &PreciseState) {
         if model.dimensions.constraints > 0 && !self.start_is_valid {
-            self.start.evaluate(model, q, &self.orientations_start);
-            self.start.differentiate(model, q);
+            for (matrix, q) in self.orientations_start.iter_mut().zip(&state.orientations) {
+                *matrix = q.matrix();
+            }
+            self.start.evaluate(model, &state.q, &self.orientations_start);
+            self.start.differentiate(model, &state.q);
             self.start_is_valid = true;
         }
     }
@@ -226,6 +236,9 @@ impl Workspace {
         // The velocity was found with the prescribed velocities of the last step, not of this one.
         for i in model.dimensions.dynamic..self.velocity.len() {
             self.velocity[i] = (self.q_end[i] - state.q[i]) / settings.time_step_s;
+        }
+        if !model.orientations.is_empty() {
+            self.prepare_orientations(model, settings, state);
         }
     }
 
@@ -277,6 +290,9 @@ impl Workspace {
             self.q_mid[i] = state.q[i] + (state.q_low[i] + 0.5 * x);
             self.velocity[i] = x * inverse;
         }
+        if !model.orientations.is_empty() {
+            self.turn_to_midpoint(model);
+        }
         self.evaluate_lagrangian(model);
         let weight = settings.force_split.at_start() * h;
         let mut round_off = f64::MIN_POSITIVE;
@@ -289,6 +305,9 @@ impl Workspace {
                 + half_q.abs() * (1.0 + self.q_mid[i].abs())
                 + force.abs();
             round_off = larger(round_off, magnitude);
+        }
+        if !model.orientations.is_empty() {
+            self.turn_residual(model, settings, state);
         }
         if model.dimensions.constraints > 0 {
             self.start.subtract_impulses(model, &self.multipliers, &mut self.residual);
@@ -328,15 +347,18 @@ impl Workspace {
         if model.dimensions.constraints == 0 {
             return 0.0;
         }
-        self.place_end(state);
+        self.place_end(model, state);
         self.end_is_exact = false;
         self.end.evaluate(model, &self.q_end, &self.orientations_end);
         self.end.violation()
     }
 
-    fn place_end(&mut self, state: &PreciseState) {
+    fn place_end(&mut self, model: &Model, state: &PreciseState) {
         for (i, x) in self.increment.iter().enumerate() {
             self.q_end[i] = state.q[i] + (state.q_low[i] + x);
+        }
+        if !model.orientations.is_empty() {
+            self.turn_to_end(model);
         }
     }
 
@@ -472,6 +494,9 @@ impl Workspace {
         for (i, impulse) in self.impulse.iter_mut().enumerate() {
             *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
         }
+        if !model.orientations.is_empty() {
+            self.turn_impulse(model, settings);
+        }
         if model.dimensions.constraints > 0 {
             if report.factorizations > 0 {
                 // The extrapolated guess has the least norm of other configurations.
@@ -486,7 +511,7 @@ impl Workspace {
     /// Constraints with Jacobian at the solution, for the linearization and the next step.
     pub(crate) fn finish_end(&mut self, model: &Model, state: &PreciseState) {
         if model.dimensions.constraints > 0 && !self.end_is_exact {
-            self.place_end(state);
+            self.place_end(model, state);
             self.end.evaluate(model, &self.q_end, &self.orientations_end);
             self.end.differentiate(model, &self.q_end);
             self.end_is_exact = true;

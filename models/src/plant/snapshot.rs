@@ -1,11 +1,13 @@
 //! Snapshots: everything that a plant needs to go on bit for bit.
 //!
 //! Encoding, little-endian: magic `PLNTSNAP`, version (u32), model digest (u64), time step (f64 bits),
-//! force split (u8), iteration limit (u32), singular threshold (f64 bits), nd, nk, nc (u32 each), step (u64), history (u8), the
+//! force split (u8), iteration limit (u32), singular threshold (f64 bits), nd, nk, nc, number of
+//! orientations (u32 each), step (u64), history (u8), the
 //! numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
 use crate::compile::fnv1a;
 use crate::plant::{ForceSplit, Plant, PreciseState, Settings};
+use crate::rotation::Quaternion;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
 const VERSION: u32 = 2;
@@ -45,6 +47,7 @@ impl Plant {
             a.q.len() == b.q.len()
                 && a.p.len() == b.p.len()
                 && a.multipliers.len() == b.multipliers.len()
+                && a.orientations.len() == b.orientations.len()
         };
         if snapshot.model_digest != self.model.digest() || !same_sizes(&snapshot.state, &self.state)
         {
@@ -95,13 +98,18 @@ impl Snapshot {
         });
         bytes.extend(self.settings.max_iterations.to_le_bytes());
         bytes.extend(self.settings.singular_below.to_le_bytes());
-        for size in [state.p.len(), state.v.len(), state.multipliers.len()] {
+        let sizes =
+            [state.p.len(), state.v.len(), state.multipliers.len(), state.orientations.len()];
+        for size in sizes {
             bytes.extend((size as u32).to_le_bytes());
         }
         bytes.extend(state.step.to_le_bytes());
         bytes.push(state.history);
         for vector in state.vectors() {
             bytes.extend(vector.iter().flat_map(|value| value.to_le_bytes()));
+        }
+        for Quaternion(components) in &state.orientations {
+            bytes.extend(components.iter().flat_map(|value| value.to_le_bytes()));
         }
         bytes.extend(fnv1a(&bytes).to_le_bytes());
         bytes
@@ -134,23 +142,24 @@ impl Snapshot {
             singular_below: f64::from_le_bytes(reader.take()?),
         };
         let mut size = || Ok(u32::from_le_bytes(reader.take()?) as usize);
-        let (nd, nk, nc) = (size()?, size()?, size()?);
+        let (nd, nk, nc, no) = (size()?, size()?, size()?, size()?);
         let step = u64::from_le_bytes(reader.take()?);
         let [history] = reader.take()?;
-        let numbers = 7 * nd + 2 * nk + 4 * nc;
+        let numbers = 7 * nd + 2 * nk + 4 * nc + 4 * no;
         if reader.0.len() != 8 * numbers || history > 3 {
             return Err(malformed("sizes do not match"));
         }
-        let mut state = PreciseState::zeros(nd, nk, nc);
+        let mut state = PreciseState::zeros(nd, nk, nc, no);
         (state.step, state.history) = (step, history);
-        for vector in state.vectors() {
-            for value in vector {
-                *value = f64::from_le_bytes(reader.take()?);
-                if !value.is_finite() {
-                    return Err(malformed("a number is not finite"));
-                }
+        let mut orientations = std::mem::take(&mut state.orientations);
+        let vectors = state.vectors().into_iter().flatten();
+        for value in vectors.chain(orientations.iter_mut().flat_map(|q| &mut q.0)) {
+            *value = f64::from_le_bytes(reader.take()?);
+            if !value.is_finite() {
+                return Err(malformed("a number is not finite"));
             }
         }
+        state.orientations = orientations;
         Ok(Self { model_digest, settings, state })
     }
 }

@@ -108,7 +108,7 @@ mod tests {
                 "line 5 column 17",
             ),
             (
-                &format!("{good}joint = {{ type = \"ball\" }}"),
+                &format!("{good}joint = {{ type = \"bowl\" }}"),
                 "frames[0].joint.type",
                 "unknown variant",
             ),

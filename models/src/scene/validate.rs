@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 use super::{
     Constraint, CoordinateKind, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_FRAMES, MAX_INPUTS,
-    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_SPRINGS, Problem, Scene,
+    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_SPRINGS, Motion, Problem, Scene,
 };
 
 impl Scene {
@@ -44,10 +44,10 @@ struct Check<'a> {
     parents: Vec<Option<usize>>,
     /// Whether names and parents form a tree, so that ancestors may be walked.
     is_tree: bool,
-    /// The first frame that each coordinate moves.
-    movers: BTreeMap<&'a str, usize>,
+    /// The first frame that each coordinate moves, and how.
+    movers: BTreeMap<String, (usize, Motion)>,
     /// Kind of every coordinate that a joint or an entry of `coordinates` names.
-    kinds: BTreeMap<&'a str, CoordinateKind>,
+    kinds: BTreeMap<String, CoordinateKind>,
 }
 
 impl<'a> Check<'a> {
@@ -69,7 +69,7 @@ impl<'a> Check<'a> {
 
     fn limits(&mut self) {
         let scene = self.scene;
-        let joints = scene.frames.iter().filter(|f| f.coordinate().is_some()).count();
+        let joints: usize = scene.frames.iter().map(|f| f.motions().len()).sum();
         let equations: usize = scene.constraints.iter().map(Constraint::equations).sum();
         for (path, count, most) in [
             ("frames", scene.frames.len(), MAX_FRAMES),
@@ -112,17 +112,21 @@ impl<'a> Check<'a> {
 
     /// The syntax of a name, and that `seen` does not have it yet.
     fn name(&mut self, path: String, name: &'a str, seen: &mut BTreeMap<&'a str, usize>) {
+        self.spelling(path.clone(), name);
+        if let Some(first) = seen.get(name) {
+            self.report(path, format!("`{name}` is also the name of number {first}"));
+        } else {
+            seen.insert(name, seen.len());
+        }
+    }
+
+    fn spelling(&mut self, path: String, name: &str) {
         let is_plain = |b: u8| b.is_ascii_alphanumeric() || b == b'-' || b == b'_';
         if name.is_empty() || name.len() > MAX_NAME_BYTES || !name.bytes().all(is_plain) {
             let message = format!(
                 "must be 1 to {MAX_NAME_BYTES} ASCII letters, digits, hyphens and underscores"
             );
-            self.report(path.clone(), message);
-        }
-        if let Some(first) = seen.get(name) {
-            self.report(path, format!("`{name}` is also the name of number {first}"));
-        } else {
-            seen.insert(name, seen.len());
+            self.report(path, message);
         }
     }
 

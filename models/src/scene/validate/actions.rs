@@ -29,6 +29,7 @@ impl Check<'_> {
                     self.not_negative(format!("{path}.stiffness"), *stiffness);
                     self.finite(format!("{path}.rest"), *rest);
                     self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
+                    self.not_of_an_orientation(format!("{path}.coordinate"), coordinate);
                 }
             }
         }
@@ -94,10 +95,11 @@ impl Check<'_> {
         let above_b: BTreeSet<_> = self.upward(b).collect();
         let mut motion = RelativeMotion::default();
         for &frame in above_a.symmetric_difference(&above_b) {
-            let Some(name) = self.scene.frames[frame].coordinate() else { continue };
-            match self.kinds.get(name) {
-                Some(CoordinateKind::Prescribed) => motion.prescribed = true,
-                _ => motion.dynamic = true,
+            for (name, _) in self.scene.frames[frame].motions() {
+                match self.kinds.get(&name) {
+                    Some(CoordinateKind::Prescribed) => motion.prescribed = true,
+                    _ => motion.dynamic = true,
+                }
             }
         }
         motion

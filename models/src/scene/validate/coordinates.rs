@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::Check;
-use crate::scene::{Constraint, CoordinateKind, Joint, Length};
+use crate::scene::{Constraint, CoordinateKind, Length, Motion};
 
 impl<'a> Check<'a> {
     pub(super) fn coordinates(&mut self) {
@@ -65,8 +65,7 @@ impl<'a> Check<'a> {
             }
             Some(CoordinateKind::Prescribed) => {}
         }
-        let joint = self.movers.get(name).and_then(|&i| self.scene.frames[i].joint.as_ref());
-        if matches!(joint, Some(Joint::Revolute { .. })) {
+        if self.movers.get(name).is_some_and(|(_, motion)| motion.is_angle()) {
             self.report(path, format!("coordinate `{name}` is an angle"));
         }
     }
@@ -82,6 +81,15 @@ impl<'a> Check<'a> {
                 );
             }
             Some(CoordinateKind::Dynamic) => {}
+        }
+    }
+
+    /// That a coordinate means something alone: a component of an orientation does not.
+    pub(super) fn not_of_an_orientation(&mut self, path: String, name: &str) {
+        if let Some((frame, Motion::Ball(_))) = self.movers.get(name) {
+            let frame = &self.scene.frames[*frame].name;
+            let message = format!("`{name}` is a component of the orientation of frame `{frame}`");
+            self.report(path, message);
         }
     }
 

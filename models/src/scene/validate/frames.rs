@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::Check;
-use crate::scene::{CoordinateKind, Joint};
+use crate::scene::{CoordinateKind, Joint, Motion};
 
 impl Check<'_> {
     pub(super) fn frames(&mut self) {
@@ -14,6 +14,7 @@ impl Check<'_> {
         }
         self.movers();
         self.kinds();
+        self.orientations();
         if self.is_tree {
             self.inertia_beyond_joints();
         }
@@ -85,8 +86,18 @@ impl Check<'_> {
         if let Some(rotation) = &frame.rotation {
             self.rotation(&format!("{path}.rotation"), rotation);
         }
-        if let Some((axis, _)) = frame.joint.as_ref().and_then(Joint::motion) {
-            self.axis(&format!("{path}.joint.axis"), axis);
+        match &frame.joint {
+            None | Some(Joint::Fixed {} | Joint::Ball { .. } | Joint::Free { .. }) => {}
+            Some(Joint::Revolute { axis, .. } | Joint::Prismatic { axis, .. }) => {
+                self.axis(&format!("{path}.joint.axis"), axis);
+            }
+            Some(Joint::Screw { axis, pitch, .. }) => {
+                self.axis(&format!("{path}.joint.axis"), axis);
+                self.finite(format!("{path}.joint.pitch"), *pitch);
+            }
+            Some(Joint::Universal { axes, .. }) => {
+                self.universal_axes(&format!("{path}.joint.axes"), axes);
+            }
         }
         if let Some(body) = &frame.body {
             self.body(&format!("{path}.body"), body);
@@ -96,19 +107,21 @@ impl Check<'_> {
     /// Finds which joint each coordinate moves; one coordinate moves one joint.
     fn movers(&mut self) {
         for (i, frame) in self.scene.frames.iter().enumerate() {
-            let Some(name) = frame.coordinate() else { continue };
-            let path = if name == frame.name {
-                format!("frames[{i}].joint")
-            } else {
-                format!("frames[{i}].joint.coordinate")
-            };
-            if let Some(&first) = self.movers.get(name) {
-                let other = &self.scene.frames[first].name;
-                self.report(path, format!("coordinate `{name}` already moves frame `{other}`"));
-            } else {
-                self.movers.insert(name, i);
-                if name != frame.name {
-                    self.name(path, name, &mut BTreeMap::new());
+            for (name, motion) in frame.motions() {
+                let path = if name == frame.name {
+                    format!("frames[{i}].joint")
+                } else {
+                    format!("frames[{i}].joint.coordinate")
+                };
+                if let Some(&(first, _)) = self.movers.get(&name) {
+                    let other = &self.scene.frames[first].name;
+                    let message = format!("coordinate `{name}` already moves frame `{other}`");
+                    self.report(path, message);
+                } else {
+                    if name != frame.name {
+                        self.spelling(path, &name);
+                    }
+                    self.movers.insert(name, (i, motion));
                 }
             }
         }
@@ -116,10 +129,31 @@ impl Check<'_> {
 
     fn kinds(&mut self) {
         for name in self.movers.keys() {
-            self.kinds.insert(name, CoordinateKind::Dynamic);
+            self.kinds.insert(name.clone(), CoordinateKind::Dynamic);
         }
         for coordinate in &self.scene.coordinates {
-            self.kinds.insert(&coordinate.name, coordinate.kind);
+            self.kinds.insert(coordinate.name.clone(), coordinate.kind);
+        }
+    }
+
+    /// That the components of an orientation are all dynamic, or all prescribed and listed in a row.
+    fn orientations(&mut self) {
+        let prescribed: Vec<&str> = (self.scene.coordinates.iter())
+            .filter(|c| c.kind == CoordinateKind::Prescribed)
+            .map(|c| c.name.as_str())
+            .collect();
+        for (i, frame) in self.scene.frames.iter().enumerate() {
+            let motions = frame.motions();
+            let turns = motions.iter().filter(|(_, m)| matches!(m, Motion::Ball(_)));
+            let names: Vec<&str> = turns.map(|(name, _)| name.as_str()).collect();
+            let listed = names.iter().filter(|name| prescribed.contains(name)).count();
+            if listed > 0 && !prescribed.windows(3).any(|row| row == names) {
+                let message = format!(
+                    "an orientation is prescribed as a whole: list {} in a row",
+                    names.join(", ")
+                );
+                self.report(format!("frames[{i}].joint"), message);
+            }
         }
     }
 
@@ -132,15 +166,17 @@ impl Check<'_> {
             frames[i].body.as_ref().is_some_and(|b| b.inertia.iter().any(|&x| x != 0.0))
         });
         for (i, frame) in frames.iter().enumerate() {
-            let Some(name) = frame.coordinate() else { continue };
-            if self.kinds.get(name) != Some(&CoordinateKind::Dynamic) {
-                continue;
-            }
-            let slides = matches!(frame.joint, Some(Joint::Prismatic { .. }));
-            if !has_mass[i] && (slides || !has_inertia[i]) {
-                let what = if slides { "mass" } else { "mass or inertia" };
-                let message = format!("dynamic coordinate `{name}` moves nothing that has {what}");
-                self.report(format!("frames[{i}].joint"), message);
+            for (name, motion) in frame.motions() {
+                if self.kinds.get(&name) != Some(&CoordinateKind::Dynamic) {
+                    continue;
+                }
+                let slides = !motion.is_angle();
+                if !has_mass[i] && (slides || !has_inertia[i]) {
+                    let what = if slides { "mass" } else { "mass or inertia" };
+                    let message =
+                        format!("dynamic coordinate `{name}` moves nothing that has {what}");
+                    self.report(format!("frames[{i}].joint"), message);
+                }
             }
         }
     }

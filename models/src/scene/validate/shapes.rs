@@ -8,6 +8,8 @@ use crate::spline::Spline;
 
 /// How far a quaternion or a rotation matrix may be from orthonormal: what seven digits leave.
 const ORTHONORMAL_TOLERANCE: f64 = 1e-6;
+/// Axes that differ by less than this angle, rad, count as parallel.
+const PARALLEL: f64 = 1e-6;
 /// How far moments of inertia may be from possible ones, relative to the largest.
 const INERTIA_TOLERANCE: f64 = 1e-9;
 /// Axes outside of this range of lengths are taken for mistakes; their squares stay normal numbers.
@@ -21,6 +23,17 @@ impl Check<'_> {
         let length = Vector3::from(*axis).norm();
         if !AXIS_LENGTHS.contains(&length) {
             self.report(path, format!("has length {length}; it must have a direction"));
+        }
+    }
+
+    pub(super) fn universal_axes(&mut self, path: &str, axes: &[[f64; 3]; 2]) {
+        let before = self.problems.len();
+        for (i, axis) in axes.iter().enumerate() {
+            self.axis(&format!("{path}[{i}]"), axis);
+        }
+        let [a, b] = axes.map(|axis| Vector3::from(axis).normalize());
+        if self.problems.len() == before && a.cross(&b).norm() < PARALLEL {
+            self.report(path, "are parallel");
         }
     }
 

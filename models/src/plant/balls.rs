@@ -1,0 +1,175 @@
+//! Ball joints: orientations in place of coordinates.
+//!
+//! A ball joint turns in one step by `R[k+1] = R[k] exp(ξ)`, is at the midpoint at `R[k] exp(ξ/2)`, and
+//! its velocity is `ξ/h`. With the momentum `m = L_v` and the torque `τ = L_q` of the midpoint, in its
+//! own axes,
+//!
+//! ```text
+//! p[k]   = N⁻ m − T⁻ (½h τ + a h f) + Dh(q[k])ᵀ λ
+//! p[k+1] = N⁺ m + T⁺ (½h τ + (1 − a) h f)
+//! ```
+//!
+//! which is what the equations of the other coordinates are with `N = T = 1`. Nothing is singular but
+//! a whole turn in one step. See [`crate::rotation`] for the maps.
+
+use crate::Model;
+use crate::plant::PreciseState;
+use crate::plant::Settings;
+use crate::plant::newton::Workspace;
+use crate::rotation::{self, Quaternion};
+use crate::spatial::{Mat3, Vec3};
+
+/// The three numbers of `q` that begin at `i`.
+pub(crate) fn rotation_vector(q: &[f64], i: usize) -> Vec3 {
+    Vec3([q[i], q[i + 1], q[i + 2]])
+}
+
+/// Orientations of all ball joints at `q`.
+pub(crate) fn orientations(model: &Model, q: &[f64]) -> Vec<Mat3> {
+    let matrix = |&i: &usize| Quaternion::exp(rotation_vector(q, i)).matrix();
+    model.orientations.iter().map(matrix).collect()
+}
+
+impl Model {
+    /// The configuration that lies `change` beyond `q`: sums, and for ball joints the rotation vector of
+    /// `exp(q) exp(change)`.
+    ///
+    /// # Panics
+    ///
+    /// If a length is not nd + nk.
+    pub fn retract(&self, q: &[f64], change: &[f64]) -> Vec<f64> {
+        let n = self.dimensions.coordinates();
+        assert!(q.len() == n && change.len() == n, "a configuration has {n} coordinates");
+        let mut moved: Vec<f64> = q.iter().zip(change).map(|(q, change)| q + change).collect();
+        for &i in &self.orientations {
+            let turned = Quaternion::exp(rotation_vector(q, i))
+                .times(Quaternion::exp(rotation_vector(change, i)));
+            moved[i..i + 3].copy_from_slice(&turned.log().0);
+        }
+        moved
+    }
+
+    /// What [`Model::retract`] takes from `reference` to `q`: differences, and for ball joints the
+    /// rotation vector of `exp(reference)⁻¹ exp(q)`. A feedback `u = u_ref − K (x ⊖ x_ref)` needs it.
+    ///
+    /// # Panics
+    ///
+    /// If a length is not nd + nk.
+    pub fn difference(&self, reference: &[f64], q: &[f64]) -> Vec<f64> {
+        let n = self.dimensions.coordinates();
+        assert!(q.len() == n && reference.len() == n, "a configuration has {n} coordinates");
+        let mut change: Vec<f64> = q.iter().zip(reference).map(|(q, r)| q - r).collect();
+        for &i in &self.orientations {
+            let turned = Quaternion::exp(rotation_vector(reference, i))
+                .inverse()
+                .times(Quaternion::exp(rotation_vector(q, i)));
+            change[i..i + 3].copy_from_slice(&turned.log().0);
+        }
+        change
+    }
+}
+
+impl Workspace {
+    /// Starts at the orientations of the state, and finds how prescribed ones turn.
+    pub(crate) fn prepare_orientations(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            self.orientations_start[o] = state.orientations[o].matrix();
+            if i >= model.dimensions.dynamic {
+                let end = Quaternion::exp(rotation_vector(&self.q_end, i));
+                let turn = state.orientations[o].inverse().times(end).log();
+                self.turns[o] = turn;
+                self.orientations_mid[o] =
+                    self.orientations_start[o].times(&rotation::exp(turn * 0.5));
+                self.orientations_end[o] = end.matrix();
+                let velocity = turn * (1.0 / settings.time_step_s);
+                self.velocity[i..i + 3].copy_from_slice(&velocity.0);
+            }
+        }
+    }
+
+    /// Moves ball joints to the midpoint of the increment.
+    pub(crate) fn turn_to_midpoint(&mut self, model: &Model) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i < model.dimensions.dynamic {
+                let turn = rotation_vector(&self.increment, i);
+                self.turns[o] = turn;
+                self.orientations_mid[o] =
+                    self.orientations_start[o].times(&rotation::exp(turn * 0.5));
+            }
+        }
+    }
+
+    /// Moves ball joints to the end of the increment.
+    pub(crate) fn turn_to_end(&mut self, model: &Model) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i < model.dimensions.dynamic {
+                let turn = rotation_vector(&self.increment, i);
+                self.orientations_end[o] = self.orientations_start[o].times(&rotation::exp(turn));
+            }
+        }
+    }
+
+    /// The residual of ball joints, `p − N⁻ m + T⁻ (½h τ + a h f)`.
+    pub(crate) fn turn_residual(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) {
+        let h = settings.time_step_s;
+        let weight = settings.force_split.at_start() * h;
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i >= model.dimensions.dynamic {
+                continue;
+            }
+            let turn = self.turns[o];
+            let momentum = rotation_vector(&self.l_v, i);
+            let torque = rotation_vector(&self.l_q, i) * (0.5 * h)
+                + rotation_vector(&self.force, i) * weight;
+            let momentum = rotation::momentum_at_start(turn).apply(momentum);
+            let torque = rotation::torque_at_start(turn).apply(torque);
+            for a in 0..3 {
+                self.residual[i + a] =
+                    ((state.p[i + a] - momentum[a]) + torque[a]) + state.p_low[i + a];
+            }
+        }
+    }
+
+    /// The change of the momentum of ball joints beyond `h (τ + f)`: `−ξ × m + (2a − 1) h (T⁻ − 1) f`.
+    pub(crate) fn turn_impulse(&mut self, model: &Model, settings: &Settings) {
+        let h = settings.time_step_s;
+        let skew = (2.0 * settings.force_split.at_start() - 1.0) * h;
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i >= model.dimensions.dynamic {
+                continue;
+            }
+            let turn = self.turns[o];
+            let carried = rotation_vector(&self.l_v, i).cross(turn);
+            let force = rotation_vector(&self.force, i);
+            let split = (rotation::torque_at_start(turn).apply(force) - force) * skew;
+            for a in 0..3 {
+                self.impulse[i + a] += carried[a] + split[a];
+            }
+        }
+    }
+
+    /// Moves the orientations of a state to the end of the step.
+    pub(crate) fn turn(&self, model: &Model, state: &mut PreciseState) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            let orientation = &mut state.orientations[o];
+            if i < model.dimensions.dynamic {
+                *orientation =
+                    orientation.times(Quaternion::exp(rotation_vector(&self.increment, i)));
+                state.q[i..i + 3].copy_from_slice(&orientation.log().0);
+                state.q_low[i..i + 3].fill(0.0);
+            } else {
+                *orientation = Quaternion::exp(rotation_vector(&self.q_end, i));
+            }
+        }
+    }
+}
