@@ -18,6 +18,7 @@
 
 pub mod builtin;
 mod compile;
+mod continuous;
 pub mod control;
 mod elimination;
 mod model;
@@ -31,9 +32,12 @@ mod spatial;
 mod spline;
 mod tree;
 
+pub use continuous::{
+    Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,
+};
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
 pub use plant::{
-    Energy, ForceSplit, Initial, InitialError, Linearization, Plant, Settings, Snapshot,
-    SnapshotError, State, StepError, StepReport,
+    Contraction, Energy, ForceSplit, Initial, InitialError, Linearization, Plant, SecondOrder,
+    Settings, Snapshot, SnapshotError, State, StepError, StepReport, TooLarge,
 };
 pub use scene::{Problem, Scene, SceneError};

@@ -2,18 +2,8 @@
 
 mod common;
 
-use common::{SPLITS, builtin, floating, plant, random_tree, wave, waving_input};
+use common::{SPLITS, STENCIL, builtin, floating, plant, random_tree, wave, waving_input};
 use plantd_models::{ForceSplit, Initial, Linearization, Plant, Scene, State};
-
-/// Weights at −3, −2, −1, 1, 2, 3 steps: error δ⁶.
-const STENCIL: [(f64, f64); 6] = [
-    (-3.0, -1.0 / 60.0),
-    (-2.0, 3.0 / 20.0),
-    (-1.0, -3.0 / 4.0),
-    (1.0, 3.0 / 4.0),
-    (2.0, -3.0 / 20.0),
-    (3.0, 1.0 / 60.0),
-];
 
 /// Of the differences, relative to the largest entry of a block: what their own round-off leaves.
 const TOLERANCE: f64 = 1e-8;

@@ -52,8 +52,8 @@ impl Conditioning {
         let mut found = Self { inertia, ..Self::default() };
         if model.dimensions.constraints > 0 {
             found.weight = found.weights(model);
-            let mut q: Vec<f64> = model.coordinates.iter().map(|c| c.initial).collect();
-            found.independent = independent(&found.rows(model, &mut Closure::new(model), &mut q));
+            let q: Vec<f64> = model.coordinates.iter().map(|c| c.initial).collect();
+            found.independent = independent(&found.rows(model, &mut Closure::new(model), &q));
         }
         found
     }

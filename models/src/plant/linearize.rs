@@ -129,6 +129,21 @@ impl Linearization {
         })
     }
 
+    /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, inputs, k)`.
+    pub(crate) fn write_tangent(&self, stride: usize, out: &mut [f64]) {
+        let (n, next) = (self.nd + self.nk, self.next_columns());
+        let ni = self.inputs.len();
+        let rows = self.increment.chunks_exact(self.stride);
+        let rows = rows.chain(self.multipliers.chunks_exact(self.stride));
+        for (row, out) in rows.zip(out.chunks_exact_mut(stride)) {
+            out[..next].copy_from_slice(&row[..next]);
+            for (out, &(coordinate, gain)) in out[next..].iter_mut().zip(&self.inputs) {
+                *out = self.input_impulses(gain).0 * row[n + coordinate];
+            }
+            out[next + ni..][..self.nk].copy_from_slice(&row[next..][..self.nk]);
+        }
+    }
+
     /// Impulse of a unit input at the start of the step, and over the whole of it.
     fn input_impulses(&self, gain: f64) -> (f64, f64) {
         let impulse = self.time_step_s * gain;

@@ -2,10 +2,11 @@
 //!
 //! The files in the order in which a step runs: [`initial`], [`kinematics`], [`momenta`],
 //! [`springs`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`], [`pivoted_lu`],
-//! [`newton`], [`conditioning`], [`linearize`]; then [`snapshot`].
+//! [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then [`snapshot`].
 
 mod balls;
-mod closure;
+pub(crate) mod blocks;
+pub(crate) mod closure;
 pub(crate) mod conditioning;
 mod curvature;
 mod forces;
@@ -14,11 +15,12 @@ mod kinematics;
 mod linearize;
 mod momenta;
 mod newton;
-mod pivoted_lu;
-mod rows;
+pub(crate) mod pivoted_lu;
+pub(crate) mod rows;
+mod second_order;
 mod snapshot;
 mod springs;
-mod tree_lu;
+pub(crate) mod tree_lu;
 
 use std::sync::Arc;
 
@@ -31,6 +33,7 @@ use newton::Workspace;
 
 pub use initial::{Initial, InitialError};
 pub use linearize::Linearization;
+pub use second_order::{Contraction, SecondOrder, TooLarge};
 pub use snapshot::{Snapshot, SnapshotError};
 
 /// How a plant is stepped.

@@ -198,6 +198,40 @@ impl PivotedLu {
         self.remove_null(x);
     }
 
+    /// Solves with the transposed matrix in place, by the transpose of what [`Self::solve`] does.
+    pub(crate) fn solve_transposed(&mut self, x: &mut [f64]) {
+        let (n, rank) = (self.order, self.rank);
+        self.remove_null(x);
+        for k in 0..rank {
+            let column = self.columns[k];
+            let mut value = x[column] * self.scale[column];
+            for j in 0..k {
+                value -= self.matrix[j * n + k] * self.scratch[j];
+            }
+            self.scratch[k] = value * self.inverse_pivot[k];
+        }
+        for k in (0..rank).rev() {
+            let mut value = self.scratch[k];
+            for j in k + 1..rank {
+                value -= self.matrix[j * n + k] * self.scratch[j];
+            }
+            self.scratch[k] = value;
+        }
+        self.scratch[rank..n].fill(0.0);
+        for k in 0..n {
+            let target = self.rows[k];
+            x[target] = self.scratch[k] * self.scale[target];
+        }
+    }
+
+    /// Makes room for right-hand sides of more columns (whole blocks).
+    pub(crate) fn reserve(&mut self, stride: usize) {
+        let needed = self.order * stride;
+        if self.scratch.len() < needed {
+            self.scratch.resize(needed, 0.0);
+        }
+    }
+
     /// The same for a row-major right-hand side; `stride` is whole blocks.
     pub(crate) fn solve_rows(&mut self, x: &mut [f64], stride: usize) {
         let (n, rank) = (self.order, self.rank);
@@ -294,6 +328,25 @@ mod tests {
             [0.0, 2.0, 1.0, 0.0],
         ];
         DMatrix::from_fn(5, 4, |i, j| rows[i][j])
+    }
+
+    #[test]
+    fn transposed_solutions_are_adjoint() {
+        let regular = DMatrix::from_fn(5, 5, |i, j| {
+            (if i == j { 3.0 } else { 0.0 }) + ((3 * i + 5 * j) as f64).sin()
+        });
+        let a = redundant();
+        let turned = DMatrix::from_fn(5, 4, |i, j| a[(i, j)] * (1.0 + 0.1 * j as f64));
+        let dense = turned * a.transpose();
+        for (dense, scale) in [(&regular, [1.0; 5]), (&dense, [1.0, 1.0, 1.0, 0.0, 1.0])] {
+            let mut lu = filled(dense, &scale);
+            let (mut x, mut y) = ([1.0, -2.0, 0.5, 0.7, 0.2], [0.3, 0.7, -1.1, 0.9, -0.4]);
+            let (b, c) = (x, y);
+            lu.solve(&mut x);
+            lu.solve_transposed(&mut y);
+            let dot = |a: [f64; 5], b: [f64; 5]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            assert!((dot(x, c) - dot(b, y)).abs() < 1e-13);
+        }
     }
 
     #[test]

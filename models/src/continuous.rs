@@ -1,0 +1,601 @@
+//! Continuous-time dynamics of a model with first and second derivatives, to compare with those of
+//! its discrete map.
+//!
+//! With `q = (q_d, q_k)`, the Lagrangian `L`, generalized forces `f`, constraints `h(q) = 0`, and `a`
+//! the accelerations of all coordinates, the equations for the dynamic accelerations and multipliers are
+//!
+//! ```text
+//! 0 = D L_v − L_q − f + Dhᵀ λ        (dynamic rows)
+//! 0 = Dh a + D²h(v, v)
+//! ```
+//!
+//! where `D` is the derivative along the motion, `dq = v`, `dv = a`: the dual part of the momenta when
+//! they are evaluated in [`Dual`] numbers seeded with it. One derivative more, in the parameters
+//! `θ = (q, v, inputs, prescribed accelerations)`:
+//!
+//! ```text
+//! by q   D L_vq − L_qq − f_q + Σ λ D²h        D² Dh
+//! by v   D L_vv + L_vq − L_qv − f_v           2 D Dh
+//! by a   L_vv                                 Dh
+//! ```
+//!
+//! and second derivatives are the dual parts of these along the tangent of each parameter.
+
+use std::sync::Arc;
+
+use nalgebra::DMatrix;
+
+use crate::Model;
+use crate::plant::blocks::Blocks;
+use crate::plant::closure::Closure;
+use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::rows::padded;
+use crate::plant::tree_lu::TreeLu;
+use crate::scalar::{Dual, Scalar};
+use crate::spatial::Mat3;
+
+/// A pivot of the mass matrix below this fraction of the largest inertia of its coordinate is zero.
+const SINGULAR: f64 = 1e-14;
+/// Constraint accelerations may miss by this much, relative to what is summed up.
+const INCONSISTENT: f64 = 1e-8;
+/// Second derivatives with more numbers than this are refused: 1 GiB.
+const ENTRIES_MAX: usize = 1 << 27;
+
+/// Where to evaluate.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ContinuousPoint {
+    /// Configuration, nd + nk.
+    pub q: Vec<f64>,
+    /// Velocity, nd + nk.
+    pub v: Vec<f64>,
+    /// Inputs, ni.
+    pub inputs: Vec<f64>,
+    /// Accelerations of prescribed coordinates, nk.
+    pub prescribed_acceleration: Vec<f64>,
+}
+
+/// The motion that follows.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Accelerations {
+    /// Of the dynamic coordinates, nd.
+    pub acceleration: Vec<f64>,
+    /// Constraint forces, nc; those of the discrete map are `h` times as large.
+    pub multipliers: Vec<f64>,
+}
+
+/// Value and first derivatives.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ContinuousLinearization {
+    /// The value.
+    pub value: Accelerations,
+    /// Rows: accelerations (nd), multipliers (nc). Columns: `q` (nd + nk), `v` (nd + nk), inputs (ni),
+    /// prescribed accelerations (nk).
+    pub jacobian: DMatrix<f64>,
+}
+
+/// Why there are no accelerations.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ContinuousError {
+    /// A vector has the wrong length.
+    #[error("{name} has {actual} entries; {expected} are needed")]
+    Dimension {
+        /// Which vector.
+        name: &'static str,
+        /// Entries it must have.
+        expected: usize,
+        /// Entries it has.
+        actual: usize,
+    },
+    /// A number is NaN or infinite.
+    #[error("{name}[{index}] is {value}")]
+    NotFinite {
+        /// Which vector.
+        name: &'static str,
+        /// Index of the entry.
+        index: usize,
+        /// The entry.
+        value: f64,
+    },
+    /// The numbers given are too large to compute with.
+    #[error("the accelerations leave the finite numbers")]
+    Overflow,
+    /// The mass matrix is singular.
+    #[error(
+        "singular mass matrix at coordinate `{coordinate}` (pivot {pivot:e} of its largest inertia)"
+    )]
+    SingularMass {
+        /// Coordinate of the vanishing pivot.
+        coordinate: String,
+        /// The pivot relative to the largest inertia that the coordinate can have.
+        pivot: f64,
+    },
+    /// No accelerations satisfy the constraints: they are singular at this configuration.
+    #[error(
+        "singular constraints: no accelerations satisfy `{constraint}` (missed by {residual:e})"
+    )]
+    SingularConstraints {
+        /// The constraint equation that is missed by most.
+        constraint: String,
+        /// By how much its second time derivative is missed.
+        residual: f64,
+    },
+    /// The second derivatives would be too large.
+    #[error("second derivatives have {entries} entries, more than {ENTRIES_MAX}")]
+    TooLarge {
+        /// Numbers they would hold.
+        entries: usize,
+    },
+}
+
+/// The continuous-time dynamics of a model, with its workspace.
+///
+/// Neither the configuration is checked against the constraints nor the velocity against their
+/// derivative: accelerations keep whatever violation there is at its rate.
+#[derive(Clone, Debug)]
+pub struct Continuous {
+    model: Arc<Model>,
+    equations: Equations<f64>,
+    /// The same in dual numbers, from the first second-order linearization on.
+    varied: Option<Box<Equations<Dual>>>,
+    mass: TreeLu,
+    /// `M⁻¹ A_dᵀ`, row-major, nd by padded nc.
+    responses: Vec<f64>,
+    schur: PivotedLu,
+    value: Accelerations,
+    /// Right-hand sides and solutions, nd + nc rows over the parameters.
+    tangent: Vec<f64>,
+}
+
+impl Continuous {
+    /// The dynamics of a model.
+    pub fn new(model: Arc<Model>) -> Self {
+        let layout = Layout::new(&model);
+        let Layout { nd, nc, .. } = layout;
+        let stride = layout.stride();
+        Self {
+            equations: Equations::new(&model),
+            varied: None,
+            mass: TreeLu::new(&model.elimination),
+            responses: vec![0.0; nd * padded(nc)],
+            schur: PivotedLu::new(&model.conditioning.weight, stride),
+            value: Accelerations { acceleration: vec![0.0; nd], multipliers: vec![0.0; nc] },
+            tangent: vec![0.0; (nd + nc) * stride],
+            model,
+        }
+    }
+
+    /// The model.
+    pub fn model(&self) -> &Arc<Model> {
+        &self.model
+    }
+
+    /// Accelerations of the dynamic coordinates and constraint forces.
+    ///
+    /// ```text
+    /// M_dd a_d + … = L_q + f − Dh_dᵀ λ        Dh a + D²h(v, v) = 0
+    /// ```
+    ///
+    /// Of redundant constraints, the multipliers are those of least norm.
+    pub fn evaluate(&mut self, point: &ContinuousPoint) -> Result<Accelerations, ContinuousError> {
+        self.solve(point)?;
+        Ok(self.value.clone())
+    }
+
+    /// The same with first derivatives, exact. Their cost is that of one evaluation of the derivative
+    /// blocks in dual numbers and O(N nd·depth) for `N` parameters.
+    pub fn linearize(
+        &mut self,
+        point: &ContinuousPoint,
+    ) -> Result<ContinuousLinearization, ContinuousError> {
+        self.solve(point)?;
+        self.differentiate();
+        let layout = self.equations.layout;
+        let (rows, stride) = (layout.nd + layout.nc, layout.stride());
+        let jacobian =
+            DMatrix::from_fn(rows, layout.parameters(), |i, b| self.tangent[i * stride + b]);
+        Ok(ContinuousLinearization { value: self.value.clone(), jacobian })
+    }
+
+    /// Second derivatives: for each acceleration, then for each multiplier, a symmetric matrix over the
+    /// parameters `(q, v, inputs, prescribed accelerations)`. Costs O(N) first derivatives in dual
+    /// numbers.
+    pub fn second_order(
+        &mut self,
+        point: &ContinuousPoint,
+    ) -> Result<Vec<DMatrix<f64>>, ContinuousError> {
+        let layout = self.equations.layout;
+        let (size, rows, stride) = (layout.parameters(), layout.nd + layout.nc, layout.stride());
+        let entries = rows * size * size;
+        if entries > ENTRIES_MAX {
+            return Err(ContinuousError::TooLarge { entries });
+        }
+        self.solve(point)?;
+        self.differentiate();
+        let mut varied =
+            self.varied.take().unwrap_or_else(|| Box::new(Equations::new(&self.model)));
+        let mut out = vec![DMatrix::zeros(size, size); rows];
+        let mut second = vec![0.0; rows * stride];
+        for a in 0..size {
+            varied.seed(&self.equations, a, &self.tangent);
+            varied.evaluate(&self.model);
+            for (i, row) in second.chunks_exact_mut(stride).enumerate() {
+                let block = &varied.jacobian[i * layout.columns()..][..layout.columns()];
+                let (by_parameters, by_unknowns) = block.split_at(size);
+                row.iter_mut().zip(by_parameters).for_each(|(entry, by)| *entry = by.eps);
+                for (by, tangent) in by_unknowns.iter().zip(self.tangent.chunks_exact(stride)) {
+                    if by.eps != 0.0 {
+                        row.iter_mut().zip(tangent).for_each(|(entry, t)| *entry += by.eps * t);
+                    }
+                }
+            }
+            self.solve_rows(&mut second);
+            for (out, row) in out.iter_mut().zip(second.chunks_exact(stride)) {
+                for b in 0..=a {
+                    (out[(a, b)], out[(b, a)]) = (row[b], row[b]);
+                }
+            }
+        }
+        self.varied = Some(varied);
+        Ok(out)
+    }
+
+    /// Finds accelerations and multipliers, and keeps the factors of the equations.
+    fn solve(&mut self, point: &ContinuousPoint) -> Result<(), ContinuousError> {
+        let model = &*self.model;
+        let equations = &mut self.equations;
+        equations.place(point)?;
+        let Layout { nd, nc, .. } = equations.layout;
+        equations.evaluate(model);
+        self.factor()?;
+
+        // The equations are linear in the unknowns, which are still zero.
+        let width = padded(1);
+        let mut unknowns = vec![0.0; (nd + nc) * width];
+        for (row, residual) in unknowns.chunks_exact_mut(width).zip(&self.equations.residual) {
+            row[0] = *residual;
+        }
+        self.solve_rows_of(&mut unknowns, width);
+        let (accelerations, multipliers) = unknowns.split_at(nd * width);
+        let first = |rows: &[f64]| rows.iter().step_by(width).copied().collect();
+        self.value =
+            Accelerations { acceleration: first(accelerations), multipliers: first(multipliers) };
+        self.check_solution()?;
+        let Accelerations { acceleration, multipliers } = &self.value;
+        self.equations.acceleration[..nd].copy_from_slice(acceleration);
+        self.equations.multipliers.copy_from_slice(multipliers);
+        Ok(())
+    }
+
+    /// The constraints' accelerations vanish, and everything is finite.
+    fn check_solution(&self) -> Result<(), ContinuousError> {
+        let (equations, layout) = (&self.equations, self.equations.layout);
+        let Accelerations { acceleration, multipliers } = &self.value;
+        if !acceleration.iter().chain(multipliers).all(|x| x.is_finite()) {
+            return Err(ContinuousError::Overflow);
+        }
+        for (c, bias) in equations.residual[layout.nd..].iter().enumerate() {
+            let row = &equations.motion.jacobian[c * layout.n()..][..layout.nd];
+            let terms = row.iter().zip(acceleration).map(|(entry, a)| entry.re.re * a);
+            let (mut residual, mut scale) = (*bias, bias.abs());
+            terms.for_each(|term| {
+                residual += term;
+                scale += term.abs();
+            });
+            if residual.abs() > INCONSISTENT * scale {
+                let constraint = self.model.constraint_names[c].clone();
+                return Err(ContinuousError::SingularConstraints { constraint, residual });
+            }
+        }
+        Ok(())
+    }
+
+    /// Derivatives of the unknowns by the parameters, into `tangent`.
+    fn differentiate(&mut self) {
+        let layout = self.equations.layout;
+        let stride = layout.stride();
+        self.equations.evaluate(&self.model);
+        let mut tangent = std::mem::take(&mut self.tangent);
+        let blocks = self.equations.jacobian.chunks_exact(layout.columns().max(1));
+        for (row, block) in tangent.chunks_exact_mut(stride.max(1)).zip(blocks) {
+            row[..layout.parameters()].copy_from_slice(&block[..layout.parameters()]);
+        }
+        self.solve_rows(&mut tangent);
+        self.tangent = tangent;
+    }
+
+    /// Factors the mass matrix and `S = A_d M⁻¹ A_dᵀ`.
+    fn factor(&mut self) -> Result<(), ContinuousError> {
+        let model = &*self.model;
+        let Layout { nd, nc, .. } = self.equations.layout;
+        let n = self.equations.layout.n();
+        let elimination = &model.elimination;
+        for row in 0..nd {
+            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
+                let entry = elimination.ancestors[slot] * n + row;
+                let entry = self.equations.blocks.l_vv[entry].re;
+                (self.mass.upper[slot], self.mass.lower[slot]) = (entry, entry);
+            }
+        }
+        let pivot = self.mass.factor(elimination, &model.conditioning.inertia, 1.0);
+        if pivot.relative < SINGULAR {
+            let coordinate = model.coordinates[pivot.row].name.clone();
+            return Err(ContinuousError::SingularMass { coordinate, pivot: pivot.relative });
+        }
+        if nc > 0 {
+            let width = padded(nc);
+            let jacobian = &self.equations.motion.jacobian;
+            for i in 0..nd {
+                for c in 0..nc {
+                    self.responses[i * width + c] = jacobian[c * n + i].re.re;
+                }
+            }
+            self.mass.solve_rows(elimination, &mut self.responses, width, width);
+            for c in 0..nc {
+                let target = &mut self.schur.matrix[c * nc..][..nc];
+                target.fill(0.0);
+                for (entry, responses) in
+                    jacobian[c * n..][..nd].iter().zip(self.responses.chunks_exact(width))
+                {
+                    target.iter_mut().zip(responses).for_each(|(t, r)| *t += entry.re.re * r);
+                }
+            }
+            self.schur.factor();
+        }
+        Ok(())
+    }
+
+    fn solve_rows(&mut self, rows: &mut [f64]) {
+        self.solve_rows_of(rows, self.equations.layout.stride());
+    }
+
+    /// Solves `M a + A_dᵀ λ = −r1`, `A_d a = −r2` in place; rows `(r1, r2)` become `(a, λ)`.
+    fn solve_rows_of(&mut self, rows: &mut [f64], stride: usize) {
+        let model = &*self.model;
+        let Layout { nd, nc, .. } = self.equations.layout;
+        let n = self.equations.layout.n();
+        let (first, second) = rows.split_at_mut(nd * stride);
+        self.mass.solve_rows(&model.elimination, first, stride, stride);
+        // S λ = r2 − A_d M⁻¹ r1, a = −M⁻¹ r1 − M⁻¹ A_dᵀ λ.
+        if nc > 0 {
+            for (c, target) in second.chunks_exact_mut(stride).enumerate() {
+                let jacobian = &self.equations.motion.jacobian[c * n..][..nd];
+                for (entry, row) in jacobian.iter().zip(first.chunks_exact(stride)) {
+                    let entry = entry.re.re;
+                    target.iter_mut().zip(row).for_each(|(t, r)| *t -= entry * r);
+                }
+            }
+            self.schur.solve_rows(second, stride);
+        }
+        for (i, row) in first.chunks_exact_mut(stride).enumerate() {
+            row.iter_mut().for_each(|entry| *entry = -*entry);
+            let responses = &self.responses[i * padded(nc)..][..nc];
+            for (response, lambda) in responses.iter().zip(second.chunks_exact(stride)) {
+                row.iter_mut().zip(lambda).for_each(|(entry, l)| *entry -= response * l);
+            }
+        }
+    }
+}
+
+/// Sizes; the parameters are `(q, v, inputs, prescribed accelerations)`, after their columns come those
+/// of the unknowns.
+#[derive(Clone, Copy, Debug)]
+struct Layout {
+    nd: usize,
+    nk: usize,
+    ni: usize,
+    nc: usize,
+}
+
+impl Layout {
+    fn new(model: &Model) -> Self {
+        let d = model.dimensions;
+        Self { nd: d.dynamic, nk: d.prescribed, ni: d.inputs, nc: d.constraints }
+    }
+
+    fn n(&self) -> usize {
+        self.nd + self.nk
+    }
+
+    fn parameters(&self) -> usize {
+        2 * self.n() + self.ni + self.nk
+    }
+
+    fn stride(&self) -> usize {
+        padded(self.parameters().max(1))
+    }
+
+    /// Columns of the equations' Jacobian.
+    fn columns(&self) -> usize {
+        self.parameters() + self.nd + self.nc
+    }
+
+    /// Column of the acceleration of a coordinate.
+    fn acceleration(&self, coordinate: usize) -> usize {
+        if coordinate < self.nd {
+            self.parameters() + coordinate
+        } else {
+            2 * self.n() + self.ni + coordinate - self.nd
+        }
+    }
+}
+
+/// The equations of motion and constraint accelerations at a point, with their first derivatives.
+#[derive(Clone, Debug)]
+struct Equations<S> {
+    layout: Layout,
+    q: Vec<S>,
+    v: Vec<S>,
+    inputs: Vec<S>,
+    /// Of all coordinates.
+    acceleration: Vec<S>,
+    multipliers: Vec<S>,
+    /// Along the motion.
+    blocks: Blocks<Dual<S>>,
+    /// At the configuration, for second derivatives.
+    closure: Closure<S>,
+    /// Along the motion, twice.
+    motion: Closure<Dual<Dual<S>>>,
+    hessian: Vec<S>,
+    along_q: Vec<Dual<S>>,
+    along_v: Vec<Dual<S>>,
+    constant_inputs: Vec<Dual<S>>,
+    along_twice: Vec<Dual<Dual<S>>>,
+    orientations: Vec<Mat3<S>>,
+    orientations_along: Vec<Mat3<Dual<S>>>,
+    orientations_twice: Vec<Mat3<Dual<Dual<S>>>>,
+    /// nd + nc.
+    residual: Vec<S>,
+    /// nd + nc rows, [`Layout::columns`] columns.
+    jacobian: Vec<S>,
+}
+
+impl<S: Scalar> Equations<S> {
+    fn new(model: &Model) -> Self {
+        let layout = Layout::new(model);
+        let (n, rows) = (layout.n(), layout.nd + layout.nc);
+        let no = model.orientations.len();
+        let zeros = |len: usize| vec![S::ZERO; len];
+        Self {
+            layout,
+            q: zeros(n),
+            v: zeros(n),
+            inputs: zeros(layout.ni),
+            acceleration: zeros(n),
+            multipliers: zeros(layout.nc),
+            blocks: Blocks::new(model),
+            closure: Closure::new(model),
+            motion: Closure::new(model),
+            hessian: zeros(if layout.nc > 0 { n * n } else { 0 }),
+            along_q: vec![Dual::ZERO; n],
+            along_v: vec![Dual::ZERO; n],
+            constant_inputs: vec![Dual::ZERO; layout.ni],
+            along_twice: vec![Dual::ZERO; n],
+            orientations: vec![Mat3::IDENTITY; no],
+            orientations_along: vec![Mat3::IDENTITY; no],
+            orientations_twice: vec![Mat3::IDENTITY; no],
+            residual: zeros(rows),
+            jacobian: zeros(rows * layout.columns()),
+        }
+    }
+
+    fn evaluate(&mut self, model: &Model) {
+        for i in 0..self.q.len() {
+            let (q, v, a) = (self.q[i], self.v[i], self.acceleration[i]);
+            self.along_q[i] = Dual::new(q, v);
+            self.along_v[i] = Dual::new(v, a);
+            self.along_twice[i] = Dual::new(Dual::new(q, v), Dual::new(v, a));
+        }
+        for (along, input) in self.constant_inputs.iter_mut().zip(&self.inputs) {
+            *along = Dual::new(*input, S::ZERO);
+        }
+        let at = (&self.along_q[..], &self.orientations_along[..]);
+        self.blocks.evaluate(model, at, &self.along_v, &self.constant_inputs);
+        if self.layout.nc > 0 {
+            self.motion.evaluate(model, &self.along_twice, &self.orientations_twice);
+            self.motion.differentiate(model, &self.along_twice);
+            self.closure.evaluate(model, &self.q, &self.orientations);
+            self.closure.hessian(model, &self.multipliers, &mut self.hessian);
+        }
+        self.fill_dynamics();
+        self.fill_constraints();
+    }
+
+    /// Rows of the dynamic coordinates.
+    fn fill_dynamics(&mut self) {
+        let (layout, blocks) = (self.layout, &self.blocks);
+        let Layout { nd, ni, nc, .. } = layout;
+        let n = layout.n();
+        for i in 0..nd {
+            let row = &mut self.jacobian[i * layout.columns()..][..layout.columns()];
+            for j in 0..n {
+                let (entry, mirrored) = (i * n + j, j * n + i);
+                let l_vq = blocks.l_qv[mirrored];
+                row[j] = l_vq.eps - blocks.l_qq[entry].re - blocks.f_q[entry].re;
+                if nc > 0 {
+                    row[j] += self.hessian[entry];
+                }
+                row[n + j] =
+                    blocks.l_vv[entry].eps + l_vq.re - blocks.l_qv[entry].re - blocks.f_v[entry].re;
+                row[layout.acceleration(j)] = blocks.l_vv[entry].re;
+            }
+            for j in 0..ni {
+                row[2 * n + j] = -blocks.f_u[i * ni + j].re;
+            }
+            let mut residual = blocks.l_v[i].eps - blocks.l_q[i].re - blocks.force[i].re;
+            for c in 0..nc {
+                let entry = self.motion.jacobian[c * n + i].re.re;
+                row[layout.parameters() + nd + c] = entry;
+                residual += entry * self.multipliers[c];
+            }
+            self.residual[i] = residual;
+        }
+    }
+
+    /// Rows of the constraints.
+    fn fill_constraints(&mut self) {
+        let layout = self.layout;
+        let n = layout.n();
+        for c in 0..layout.nc {
+            let row = &mut self.jacobian[(layout.nd + c) * layout.columns()..][..layout.columns()];
+            for j in 0..n {
+                let entry = self.motion.jacobian[c * n + j];
+                row[j] = entry.eps.eps;
+                row[n + j] = entry.re.eps * 2.0;
+                row[layout.acceleration(j)] = entry.re.re;
+            }
+            self.residual[layout.nd + c] = self.motion.value[c].eps.eps;
+        }
+    }
+}
+
+impl Equations<f64> {
+    /// Takes a point over, with unknowns zero.
+    fn place(&mut self, point: &ContinuousPoint) -> Result<(), ContinuousError> {
+        let Layout { nd, .. } = self.layout;
+        let (dynamic, prescribed) = self.acceleration.split_at_mut(nd);
+        dynamic.fill(0.0);
+        self.multipliers.fill(0.0);
+        take("q", &point.q, &mut self.q)?;
+        take("v", &point.v, &mut self.v)?;
+        take("inputs", &point.inputs, &mut self.inputs)?;
+        take("prescribed_acceleration", &point.prescribed_acceleration, prescribed)
+    }
+}
+
+impl Equations<Dual> {
+    /// The point of `at`, moving along the tangent of parameter `a`.
+    fn seed(&mut self, at: &Equations<f64>, a: usize, tangent: &[f64]) {
+        let layout = self.layout;
+        let (n, stride) = (layout.n(), layout.stride());
+        let unit = |is: bool| if is { 1.0 } else { 0.0 };
+        for i in 0..n {
+            self.q[i] = Dual::new(at.q[i], unit(a == i));
+            self.v[i] = Dual::new(at.v[i], unit(a == n + i));
+            let moved = if i < layout.nd {
+                tangent[i * stride + a]
+            } else {
+                unit(a == layout.acceleration(i))
+            };
+            self.acceleration[i] = Dual::new(at.acceleration[i], moved);
+        }
+        for i in 0..layout.ni {
+            self.inputs[i] = Dual::new(at.inputs[i], unit(a == 2 * n + i));
+        }
+        for c in 0..layout.nc {
+            let moved = tangent[(layout.nd + c) * stride + a];
+            self.multipliers[c] = Dual::new(at.multipliers[c], moved);
+        }
+    }
+}
+
+fn take(name: &'static str, from: &[f64], to: &mut [f64]) -> Result<(), ContinuousError> {
+    if from.len() != to.len() {
+        let (expected, actual) = (to.len(), from.len());
+        return Err(ContinuousError::Dimension { name, expected, actual });
+    }
+    if let Some(index) = from.iter().position(|value| !value.is_finite()) {
+        return Err(ContinuousError::NotFinite { name, index, value: from[index] });
+    }
+    to.copy_from_slice(from);
+    Ok(())
+}

@@ -1,0 +1,335 @@
+//! First-order derivative blocks of a step's equations as dense matrices, for any scalar.
+//!
+//! Evaluated with [`Dual`] numbers they give the second-order linearization: the
+//! blocks are first derivatives, their dual parts are derivatives of these along a direction. The
+//! first-order linearization itself is [`linearize`](super::linearize), which knows the sparsity.
+
+use crate::Model;
+use crate::plant::closure::Closure;
+use crate::plant::curvature::Curvature;
+use crate::plant::kinematics::Poses;
+use crate::plant::momenta::Momenta;
+use crate::plant::rows::Term;
+use crate::plant::{Settings, springs};
+use crate::scalar::{Dual, Scalar};
+use crate::spatial::Mat3;
+use crate::tree::WORLD;
+
+/// Gradient and second derivatives of the Lagrangian, springs included, and forces with their first
+/// derivatives, at one configuration and velocity.
+///
+/// Matrices are row-major; `n` coordinates, `nd` of them dynamic, `ni` inputs.
+#[derive(Clone, Debug)]
+pub(crate) struct Blocks<S = f64> {
+    pub(crate) poses: Poses<S>,
+    pub(crate) momenta: Momenta<S>,
+    curvature: Curvature<S>,
+    /// `∂L/∂q`, nd.
+    pub(crate) l_q: Vec<S>,
+    /// `∂L/∂v`, nd.
+    pub(crate) l_v: Vec<S>,
+    /// Generalized force `f`, nd.
+    pub(crate) force: Vec<S>,
+    /// `∂²L/∂q∂q`, n by n.
+    pub(crate) l_qq: Vec<S>,
+    /// `∂²L/∂q∂v`, n by n: rows by `q`, columns by `v`; its transpose is `L_vq`.
+    pub(crate) l_qv: Vec<S>,
+    /// `∂²L/∂v∂v`, n by n.
+    pub(crate) l_vv: Vec<S>,
+    /// `∂f/∂q`, nd by n.
+    pub(crate) f_q: Vec<S>,
+    /// `∂f/∂v`, nd by n.
+    pub(crate) f_v: Vec<S>,
+    /// `∂f/∂u`, nd by ni.
+    pub(crate) f_u: Vec<S>,
+    /// Ancestor and descendant of each pair of joints on one path to the root, a joint with itself
+    /// included, and their coordinates.
+    pairs: Vec<[usize; 4]>,
+}
+
+impl<S: Scalar> Blocks<S> {
+    pub(crate) fn new(model: &Model) -> Self {
+        let (n, nd, ni) =
+            (model.dimensions.coordinates(), model.dimensions.dynamic, model.dimensions.inputs);
+        let zeros = |len: usize| vec![S::ZERO; len];
+        let joints = &model.dynamics.joints;
+        let mut pairs = Vec::new();
+        for (descendant, joint) in joints.iter().enumerate() {
+            let mut ancestor = descendant;
+            while ancestor != WORLD {
+                let above = &joints[ancestor];
+                pairs.push([ancestor, descendant, above.coordinate, joint.coordinate]);
+                ancestor = above.parent;
+            }
+        }
+        Self {
+            poses: Poses::new(&model.dynamics),
+            momenta: Momenta::new(&model.dynamics),
+            curvature: Curvature::new(&model.dynamics),
+            l_q: zeros(nd),
+            l_v: zeros(nd),
+            force: zeros(nd),
+            l_qq: zeros(n * n),
+            l_qv: zeros(n * n),
+            l_vv: zeros(n * n),
+            f_q: zeros(nd * n),
+            f_v: zeros(nd * n),
+            f_u: zeros(nd * ni),
+            pairs,
+        }
+    }
+
+    /// Rows and columns of dynamic rows that may differ from zero.
+    fn pattern(&self, model: &Model) -> Vec<(usize, usize)> {
+        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
+        if !model.point_springs.is_empty() {
+            return (0..nd * n).map(|entry| (entry / n, entry % n)).collect();
+        }
+        let on_paths = self.pairs.iter().flat_map(|&[_, _, i, j]| [(i, j), (j, i)]);
+        let mut pattern: Vec<_> =
+            on_paths.chain((0..nd).map(|i| (i, i))).filter(|(i, _)| *i < nd).collect();
+        pattern.sort_unstable();
+        pattern.dedup();
+        pattern
+    }
+
+    /// Evaluates everything at a configuration, with the orientations of ball joints, and a velocity.
+    pub(crate) fn evaluate(
+        &mut self,
+        model: &Model,
+        (q, orientations): (&[S], &[Mat3<S>]),
+        velocity: &[S],
+        inputs: &[S],
+    ) {
+        self.poses.evaluate(&model.dynamics, q, orientations);
+        self.momenta.gradient(
+            &model.dynamics,
+            &self.poses,
+            velocity,
+            model.gravity,
+            &mut self.l_q,
+            &mut self.l_v,
+        );
+        if model.has_springs() {
+            springs::add_gradient(
+                &model.coordinate_springs,
+                &model.point_springs,
+                &model.dynamics,
+                &self.poses,
+                q,
+                &mut self.l_q,
+            );
+        }
+        self.evaluate_forces(model, velocity, inputs);
+        self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
+        let n = model.dimensions.coordinates();
+        self.l_qq.fill(S::ZERO);
+        for &[above, below, i, j] in &self.pairs {
+            let second = self.curvature.pair(&self.momenta, model.gravity, above, below);
+            self.l_qq[i * n + j] = second.qq;
+            self.l_qq[j * n + i] = second.qq;
+            self.l_qv[i * n + j] = second.q_above_v_below;
+            self.l_qv[j * n + i] = second.v_above_q_below;
+            self.l_vv[i * n + j] = second.vv;
+            self.l_vv[j * n + i] = second.vv;
+        }
+        for spring in &model.coordinate_springs {
+            self.l_qq[spring.coordinate * (n + 1)] -= S::constant(spring.stiffness);
+        }
+        springs::for_each_second_derivative(
+            &model.point_springs,
+            &model.dynamics,
+            &self.poses,
+            |i, j, value| self.l_qq[i * n + j] -= value,
+        );
+    }
+
+    /// Forces and their derivatives; poses and momenta are those of the last [`Self::evaluate`].
+    fn evaluate_forces(&mut self, model: &Model, velocity: &[S], inputs: &[S]) {
+        let (n, ni) = (model.dimensions.coordinates(), model.dimensions.inputs);
+        self.force.fill(S::ZERO);
+        for (i, c) in model.damping.iter().enumerate() {
+            self.force[i] -= velocity[i] * *c;
+            self.f_v[i * (n + 1)] = S::constant(-c);
+        }
+        for (j, (coordinate, gain)) in model.inputs.iter().enumerate() {
+            self.force[*coordinate] += inputs[j] * *gain;
+            self.f_u[coordinate * ni + j] = S::constant(*gain);
+        }
+    }
+}
+
+/// The blocks of one step's equations, row-major.
+///
+/// A column is a coordinate at the start of the step (`q[k]`, with the increment of a dynamic
+/// coordinate kept), or what is next: the increment `x` of a dynamic coordinate, the next position of a
+/// prescribed one. With `a` the weight of `F⁻` and `H = Σ λ D²h(q[k])`,
+///
+/// ```text
+/// C_q = ½h L_qq − L_vq + a h f_q        C_v = ½h L_qv − L_vv + a h f_v
+/// M_q = h (L_qq + f_q)                  M_v = h (L_qv + f_v)
+///
+/// column              of the residual r1     of p[k+1]
+/// start, dynamic      C_q − H                M_q − H
+/// start, prescribed   ½C_q − C_v/h − H       ½M_q − M_v/h − H
+/// next                ½C_q + C_v/h           ½M_q + M_v/h
+/// inputs              a h f_u                h f_u
+/// ```
+#[derive(Clone, Debug)]
+pub(crate) struct StepBlocks<S = f64> {
+    /// At the midpoint.
+    pub(crate) mid: Blocks<S>,
+    /// Constraints at `q[k]` and at `q[k+1]`, with their Jacobians.
+    pub(crate) start: Closure<S>,
+    pub(crate) end: Closure<S>,
+    /// `H`, n by n; empty without constraints.
+    pub(crate) hessian: Vec<S>,
+    /// Where to evaluate: configuration at the start, n.
+    pub(crate) q_start: Vec<S>,
+    /// Increments of dynamic coordinates, next positions of prescribed ones.
+    pub(crate) next: Vec<S>,
+    pub(crate) multipliers: Vec<S>,
+    pub(crate) inputs: Vec<S>,
+    pub(crate) q_mid: Vec<S>,
+    pub(crate) velocity: Vec<S>,
+    q_end: Vec<S>,
+    /// Orientations of ball joints at the start, the midpoint, the end.
+    pub(crate) orientations: [Vec<Mat3<S>>; 3],
+    /// nd by n.
+    pub(crate) residual_start: Vec<S>,
+    /// nd by n.
+    pub(crate) residual_next: Vec<S>,
+    /// nd by ni.
+    pub(crate) residual_inputs: Vec<S>,
+    /// nd by n.
+    pub(crate) momentum_start: Vec<S>,
+    /// nd by n.
+    pub(crate) momentum_next: Vec<S>,
+    /// nd by ni.
+    pub(crate) momentum_inputs: Vec<S>,
+    /// Rows and columns of the blocks that may differ from zero.
+    pattern: Vec<(usize, usize)>,
+}
+
+impl<S: Scalar> StepBlocks<S> {
+    pub(crate) fn new(model: &Model) -> Self {
+        let d = model.dimensions;
+        let (n, nd, ni, nc) = (d.coordinates(), d.dynamic, d.inputs, d.constraints);
+        let zeros = |len: usize| vec![S::ZERO; len];
+        let mid = Blocks::new(model);
+        let pattern = mid.pattern(model);
+        Self {
+            mid,
+            start: Closure::new(model),
+            end: Closure::new(model),
+            hessian: zeros(if nc > 0 { n * n } else { 0 }),
+            q_start: zeros(n),
+            next: zeros(n),
+            multipliers: zeros(nc),
+            inputs: zeros(ni),
+            q_mid: zeros(n),
+            velocity: zeros(n),
+            q_end: zeros(n),
+            orientations: [0; 3].map(|_| vec![Mat3::IDENTITY; model.orientations.len()]),
+            residual_start: zeros(nd * n),
+            residual_next: zeros(nd * n),
+            residual_inputs: zeros(nd * ni),
+            momentum_start: zeros(nd * n),
+            momentum_next: zeros(nd * n),
+            momentum_inputs: zeros(nd * ni),
+            pattern,
+        }
+    }
+
+    /// Midpoint, velocity and end that belong to the start and what is next.
+    pub(crate) fn place_midpoint(&mut self, model: &Model, h: f64) {
+        let nd = model.dimensions.dynamic;
+        for (i, (start, next)) in self.q_start.iter().zip(&self.next).enumerate() {
+            let (moved, end) =
+                if i < nd { (*next, *start + *next) } else { (*next - *start, *next) };
+            self.q_mid[i] = *start + moved * 0.5;
+            self.velocity[i] = moved * (1.0 / h);
+            self.q_end[i] = end;
+        }
+    }
+
+    /// Evaluates all blocks at `q_start`, `next`, `multipliers`, `inputs`.
+    pub(crate) fn evaluate(&mut self, model: &Model, settings: &Settings) {
+        self.place_midpoint(model, settings.time_step_s);
+        self.evaluate_mid(model);
+        self.assemble(model, settings);
+        if model.dimensions.constraints > 0 {
+            self.evaluate_start(model);
+            self.end.evaluate(model, &self.q_end, &self.orientations[2]);
+            self.end.differentiate(model, &self.q_end);
+            let rows = model.dimensions.dynamic * model.dimensions.coordinates();
+            for (block, h) in self.residual_start.iter_mut().zip(&self.hessian[..rows]) {
+                *block -= *h;
+            }
+            for (block, h) in self.momentum_start.iter_mut().zip(&self.hessian[..rows]) {
+                *block -= *h;
+            }
+        }
+    }
+
+    /// Evaluates what stands at the midpoint.
+    pub(crate) fn evaluate_mid(&mut self, model: &Model) {
+        let at = (&self.q_mid[..], &self.orientations[1][..]);
+        self.mid.evaluate(model, at, &self.velocity, &self.inputs);
+    }
+
+    /// Evaluates constraints and `H` at `q_start`, `multipliers`.
+    pub(crate) fn evaluate_start(&mut self, model: &Model) {
+        self.start.evaluate(model, &self.q_start, &self.orientations[0]);
+        self.start.differentiate(model, &self.q_start);
+        self.start.hessian(model, &self.multipliers, &mut self.hessian);
+    }
+
+    /// Writes the blocks without constraints.
+    fn assemble(&mut self, model: &Model, settings: &Settings) {
+        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
+        let h = settings.time_step_s;
+        let split = h * settings.force_split.at_start();
+        let (mid, inverse) = (&self.mid, 1.0 / h);
+        if model.dimensions.constraints > 0 {
+            self.residual_start.fill(S::ZERO);
+            self.momentum_start.fill(S::ZERO);
+        }
+        for &(i, j) in &self.pattern {
+            let (entry, mirrored) = (i * n + j, j * n + i);
+            let (l_qq, l_qv) = (mid.l_qq[entry], mid.l_qv[entry]);
+            let (f_q, f_v) = (mid.f_q[entry], mid.f_v[entry]);
+            let c_q = l_qq * (0.5 * h) - mid.l_qv[mirrored] + f_q * split;
+            let c_v = l_qv * (0.5 * h) - mid.l_vv[entry] + f_v * split;
+            let m_q = (l_qq + f_q) * h;
+            let m_v = (l_qv + f_v) * h;
+            let (half_c, slope_c) = (c_q * 0.5, c_v * inverse);
+            let (half_m, slope_m) = (m_q * 0.5, m_v * inverse);
+            self.residual_next[entry] = half_c + slope_c;
+            self.momentum_next[entry] = half_m + slope_m;
+            (self.residual_start[entry], self.momentum_start[entry]) =
+                if j < nd { (c_q, m_q) } else { (half_c - slope_c, half_m - slope_m) };
+        }
+        for (entry, f_u) in mid.f_u.iter().enumerate() {
+            self.residual_inputs[entry] = *f_u * split;
+            self.momentum_inputs[entry] = *f_u * h;
+        }
+    }
+}
+
+impl StepBlocks<Dual> {
+    /// What multiplies `x'` (nd) and `λ'` (nc) in row `i` of the change of a block by what is next: its
+    /// entries that are not zero.
+    pub(crate) fn terms(&self, i: usize, next: &[Dual], terms: &mut Vec<Term>) {
+        let (n, nd) = (self.q_start.len(), self.mid.l_q.len());
+        let by_increment = next[i * n..][..nd].iter().map(|entry| entry.eps);
+        let impulses = (0..self.multipliers.len()).map(|c| -self.start.jacobian[c * n + i].eps);
+        terms.clear();
+        terms.extend(non_zero(by_increment.chain(impulses)));
+    }
+}
+
+/// The entries that are not zero, with their indices.
+pub(crate) fn non_zero(entries: impl Iterator<Item = f64>) -> impl Iterator<Item = Term> {
+    entries.enumerate().filter(|(_, entry)| *entry != 0.0).map(|(i, entry)| (entry, i))
+}
