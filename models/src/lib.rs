@@ -37,7 +37,8 @@ pub use continuous::{
 };
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
 pub use plant::{
-    Contraction, Energy, ForceSplit, Initial, InitialError, Linearization, Plant, SecondOrder,
-    Settings, Snapshot, SnapshotError, State, StepError, StepReport, TooLarge,
+    Contraction, Diagnostics, Energy, Equilibrium, ForceSplit, Initial, InitialError,
+    Linearization, Plant, SecondOrder, Settings, SettleError, SettleRequest, Snapshot,
+    SnapshotError, State, StepError, StepReport, TooLarge,
 };
 pub use scene::{Problem, Scene, SceneError};

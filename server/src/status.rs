@@ -259,6 +259,7 @@ impl Fault {
                 Self::field_because("PROJECTION_FAILED", field, message)
                     .with("constraint", constraint)
             }
+            InitialError::Settle(_) => Self::field_because("NOT_SETTLED", field, message),
             InitialError::Settings { name, .. } => Self::field(format!("settings.{name}"), message),
         }
     }

@@ -60,7 +60,7 @@ impl Conditioning {
 
     /// Dynamic columns of `Dh(q)`, each row with its weight and each column by the root of its
     /// inertia: the rows of full steepness have length one.
-    fn rows(&self, model: &Model, closure: &mut Closure, q: &[f64]) -> DMatrix<f64> {
+    pub(crate) fn rows(&self, model: &Model, closure: &mut Closure, q: &[f64]) -> DMatrix<f64> {
         closure.evaluate(model, q, &orientations(model, q));
         closure.differentiate(model, q);
         let d = model.dimensions;
@@ -71,7 +71,7 @@ impl Conditioning {
     }
 
     /// Inertia of a coordinate; the largest one stands in where it moves none.
-    fn inertia_of(&self, j: usize) -> f64 {
+    pub(crate) fn inertia_of(&self, j: usize) -> f64 {
         let own = self.inertia[j];
         if own > 0.0 {
             return own;
@@ -173,9 +173,8 @@ impl Model {
     }
 
     /// Names of the equations that depend on equations before them at `q`.
-    #[allow(dead_code, reason = "what reports them comes next")]
-    pub(crate) fn redundant_equations(&self, closure: &mut Closure, q: &[f64]) -> Vec<String> {
-        let independent = independent(&self.conditioning.rows(self, closure, q));
+    pub(crate) fn redundant_equations(&self, q: &[f64]) -> Vec<String> {
+        let independent = independent(&self.conditioning.rows(self, &mut Closure::new(self), q));
         let names = self.constraint_names.iter().enumerate();
         names.filter(|(c, _)| !independent.contains(c)).map(|(_, name)| name.clone()).collect()
     }

@@ -7,7 +7,7 @@ use crate::plant::closure::Closure;
 use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::padded;
-use crate::plant::{Energy, Plant, PreciseState, forces, springs};
+use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, forces, springs};
 use crate::rotation;
 use crate::spatial::Vec3;
 
@@ -48,6 +48,15 @@ pub enum Initial {
         q0: Vec<f64>,
         /// At the start.
         q1: Vec<f64>,
+    },
+    /// The equilibrium that [`Plant::settle`] finds from a guess, at rest with its inputs.
+    Equilibrium {
+        /// The guess.
+        q: Vec<f64>,
+        /// Coordinates that keep their value.
+        hold: Vec<String>,
+        /// Constant inputs; none means zero.
+        inputs: Vec<f64>,
     },
     /// A guess that Newton's method projects onto the constraints; named coordinates and prescribed
     /// ones keep their value. The plant starts there at rest.
@@ -108,6 +117,9 @@ pub enum InitialError {
         /// Its value `h(q)`.
         violation: f64,
     },
+    /// No equilibrium was found.
+    #[error(transparent)]
+    Settle(#[from] SettleError),
     /// A time step or an iteration limit is out of range.
     #[error("{name} is {value}; it must be finite and greater than zero")]
     Settings {
@@ -162,6 +174,12 @@ impl Plant {
                 state.p = self.momentum_between(&q0, &state.q, &[]);
                 state.v.copy_from_slice(&self.workspace.velocity[nd..]);
             }
+            Initial::Equilibrium { q, hold, inputs } => {
+                let (q, hold, inputs) = (q.clone(), hold.clone(), inputs.clone());
+                let rest = self.settle(&SettleRequest { q, hold, inputs })?;
+                state.p = self.momentum_between(&rest.q, &rest.q, &rest.inputs);
+                state.q = rest.q;
+            }
             Initial::Projection { q, hold } => {
                 let guess = checked("q", q, n)?;
                 let mut moves: Vec<bool> = (0..n).map(|i| i < nd).collect();
@@ -178,8 +196,8 @@ impl Plant {
         Ok(state)
     }
 
-    /// `D2 Ld(q0, q1) + F⁺ = L_v + ½h L_q + (1 − a) h f`.
-    fn momentum_between(&mut self, q0: &[f64], q1: &[f64], inputs: &[f64]) -> Vec<f64> {
+    /// Lagrangian and forces at the midpoint of a step from `q0` to `q1`.
+    pub(crate) fn evaluate_between(&mut self, q0: &[f64], q1: &[f64], inputs: &[f64]) {
         let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
         let change = self.model.difference(q0, q1);
         for i in 0..q0.len() {
@@ -195,6 +213,12 @@ impl Plant {
         forces::input_forces(&self.model.inputs, inputs, &mut workspace.input_force);
         workspace.force.copy_from_slice(&workspace.input_force);
         workspace.evaluate_lagrangian(&self.model);
+    }
+
+    /// `D2 Ld(q0, q1) + F⁺ = L_v + ½h L_q + (1 − a) h f`.
+    fn momentum_between(&mut self, q0: &[f64], q1: &[f64], inputs: &[f64]) -> Vec<f64> {
+        self.evaluate_between(q0, q1, inputs);
+        let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
         let at_end = (1.0 - self.settings.force_split.at_start()) * h;
         let torque = |i: usize| 0.5 * h * workspace.l_q[i] + at_end * workspace.force[i];
         let mut momentum: Vec<f64> =
@@ -290,25 +314,9 @@ impl Plant {
         let model = &self.model;
         let workspace = &mut self.workspace;
         workspace.gradient_at(model, &self.state, &velocity);
-        let tree = &model.dynamics;
-        let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
-        let weight: f64 = roots
-            .map(|(i, root)| {
-                let moment =
-                    workspace.momenta.moment[i] + workspace.poses.origin[i] * root.subtree_mass;
-                model.gravity.map_or(0.0, |g| g.dot(moment))
-            })
-            .sum();
-        let springs = springs::potential(
-            &model.coordinate_springs,
-            &model.point_springs,
-            tree,
-            &workspace.poses,
-            &self.state.q,
-        );
         Energy {
-            kinetic_j: 0.5 * workspace.momenta.twice_kinetic_energy(tree, &velocity),
-            potential_j: springs - weight,
+            kinetic_j: 0.5 * workspace.momenta.twice_kinetic_energy(&model.dynamics, &velocity),
+            potential_j: workspace.potential_energy(model, &self.state.q),
         }
     }
 }
@@ -331,7 +339,7 @@ impl Workspace {
     }
 
     /// Gradient of the Lagrangian without springs at any configuration and velocity.
-    fn gradient_at(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) {
+    pub(crate) fn gradient_at(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) {
         for (matrix, orientation) in self.orientations_start.iter_mut().zip(&state.orientations) {
             *matrix = orientation.matrix();
         }
@@ -346,14 +354,35 @@ impl Workspace {
         );
     }
 
+    /// Potential energy of gravity and springs, with poses and momenta evaluated at `q`.
+    pub(crate) fn potential_energy(&self, model: &Model, q: &[f64]) -> f64 {
+        let tree = &model.dynamics;
+        let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
+        let weight: f64 = roots
+            .map(|(i, root)| {
+                let moment = self.momenta.moment[i] + self.poses.origin[i] * root.subtree_mass;
+                model.gravity.map_or(0.0, |g| g.dot(moment))
+            })
+            .sum();
+        let springs = springs::potential(
+            &model.coordinate_springs,
+            &model.point_springs,
+            tree,
+            &self.poses,
+            q,
+        );
+        springs - weight
+    }
+
     /// `p = M(q) q̇` on the dynamic rows.
     fn momentum_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Vec<f64> {
         self.gradient_at(model, state, velocity);
         self.l_v.clone()
     }
 
-    /// Finds the velocity of the dynamic coordinates that belongs to a state, into `residual`.
-    pub(crate) fn find_velocity(&mut self, model: &Model, state: &PreciseState) {
+    /// Finds the velocity of the dynamic coordinates that belongs to a state, into `residual`; returns
+    /// the reciprocal condition estimate of the mass matrix.
+    pub(crate) fn find_velocity(&mut self, model: &Model, state: &PreciseState) -> f64 {
         let d = model.dimensions;
         // With only the prescribed coordinates moving, `L_v` is their share of the momentum.
         self.velocity[..d.dynamic].fill(0.0);
@@ -364,7 +393,7 @@ impl Workspace {
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         self.matrix.clear();
         self.curvature.fill_mass_matrix(&model.pairs, &self.momenta, &mut self.matrix);
-        self.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
+        let pivot = self.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.iter_mut().enumerate() {
             *r = state.p[i] - self.l_v[i];
         }
@@ -372,6 +401,7 @@ impl Workspace {
         if d.constraints > 0 {
             self.project_velocity(model, state);
         }
+        pivot.relative
     }
 
     /// Takes the part of the velocity away that violates `Dh q̇ = 0`.

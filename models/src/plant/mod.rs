@@ -2,13 +2,15 @@
 //!
 //! The files in the order in which a step runs: [`initial`], [`kinematics`], [`momenta`],
 //! [`springs`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`], [`pivoted_lu`],
-//! [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then [`snapshot`].
+//! [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then [`diagnose`],
+//! [`settle`], [`snapshot`].
 
 mod balls;
 pub(crate) mod blocks;
 pub(crate) mod closure;
 pub(crate) mod conditioning;
 mod curvature;
+mod diagnose;
 mod forces;
 mod initial;
 mod kinematics;
@@ -18,6 +20,7 @@ mod newton;
 pub(crate) mod pivoted_lu;
 pub(crate) mod rows;
 mod second_order;
+mod settle;
 mod snapshot;
 mod springs;
 pub(crate) mod tree_lu;
@@ -31,9 +34,11 @@ use crate::rotation::Quaternion;
 use balls::rotation_vector;
 use newton::Workspace;
 
+pub use diagnose::Diagnostics;
 pub use initial::{Initial, InitialError};
 pub use linearize::Linearization;
 pub use second_order::{Contraction, SecondOrder, TooLarge};
+pub use settle::{Equilibrium, SettleError, SettleRequest};
 pub use snapshot::{Snapshot, SnapshotError};
 
 /// How a plant is stepped.

@@ -252,7 +252,7 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
         let mut previous = f64::INFINITY;
-        let mut fresh = false;
+        let (mut fresh, mut idle) = (false, false);
         while report.iterations < settings.max_iterations {
             report.iterations += 1;
             report.residual = self.evaluate(model, settings, state);
@@ -265,7 +265,10 @@ impl Workspace {
                 return self.accept(model, settings, report);
             }
             let floor = if fresh { FLOOR } else { CHORD_FLOOR };
-            let at_floor = size <= floor && size > 0.5 * previous;
+            let stagnates = size > 0.5 * previous;
+            // Where forces balance, a unit of round-off of a coordinate outweighs the residual's own.
+            let is_idle = idle && report.constraint_residual <= FLOOR;
+            let at_floor = stagnates && (size <= floor || is_idle);
             let converged = size <= CONVERGED || at_floor;
             fresh =
                 !converged && (always_factor || previous.is_infinite() || size > SLOW * previous);
@@ -277,6 +280,7 @@ impl Workspace {
             if converged {
                 return self.accept(model, settings, report);
             }
+            idle = self.is_round_off_of_coordinates();
             previous = size;
         }
         Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
@@ -372,12 +376,8 @@ impl Workspace {
         Ok(())
     }
 
-    /// Factors `K` at the last evaluation.
-    pub(crate) fn factor_newton_matrix(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-    ) -> Result<(), StepError> {
+    /// Fills `K` at the last evaluation.
+    pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         if !model.point_springs.is_empty() {
@@ -405,7 +405,17 @@ impl Workspace {
             let slot = model.elimination.offsets[i + 1] - 1;
             self.matrix.add_to_diagonal(slot, -settings.force_split.at_start() * c);
         }
-        let pivot = self.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0 / h);
+    }
+
+    /// Factors `K` at the last evaluation.
+    pub(crate) fn factor_newton_matrix(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+    ) -> Result<(), StepError> {
+        self.fill_newton_matrix(model, settings);
+        let inertia = &model.conditioning.inertia;
+        let pivot = self.matrix.factor(&model.elimination, inertia, 1.0 / settings.time_step_s);
         self.estimates.matrix = pivot.relative;
         if pivot.relative >= settings.singular_below {
             return Ok(());
@@ -476,6 +486,12 @@ impl Workspace {
         for (x, r) in self.increment.iter_mut().zip(&self.residual) {
             *x -= r;
         }
+    }
+
+    /// Whether the last correction is no more than the round-off of the coordinates.
+    fn is_round_off_of_coordinates(&self) -> bool {
+        let mut corrections = self.residual.iter().zip(&self.q_mid);
+        corrections.all(|(x, q)| x.abs() <= 2.0 * f64::EPSILON * q.abs())
     }
 
     /// Checks the solution, and finds its impulse.

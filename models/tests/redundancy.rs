@@ -1,0 +1,335 @@
+//! Constraints that say again what others say: the motion stays, multipliers have least norm.
+
+mod common;
+
+use common::{SPLITS, builtin, model, plant, wave, waving_input};
+use nalgebra::{DMatrix, DVector};
+use plantd_models::scene::{Axis, Constraint};
+use plantd_models::{Initial, Linearization, Plant, Scene, StepError};
+
+/// The four-bar with its pin stated twice.
+fn doubled() -> Scene {
+    let mut scene = builtin("four-bar");
+    let Constraint::PointToPoint { a, b, axes, .. } = scene.constraints[0].clone() else {
+        panic!()
+    };
+    let name = "pin_again".to_owned();
+    scene.constraints.push(Constraint::PointToPoint { name, a, b, axes });
+    scene
+}
+
+/// The four-bar with its pin stated in three axes, one of them across the plane of motion; turned
+/// out of the coordinate planes or not.
+fn out_of_plane(turned: bool) -> Scene {
+    let mut scene = builtin("four-bar");
+    let Constraint::PointToPoint { axes, .. } = &mut scene.constraints[0] else { panic!() };
+    *axes = vec![Axis::X, Axis::Y, Axis::Z];
+    if turned {
+        // A quarter turn leaves cosines of 6e-17, an oblique turn nothing that is small.
+        for angle in [std::f64::consts::FRAC_PI_2, 0.7] {
+            let mut axis = plantd_models::scene::Frame {
+                name: format!("turned{}", scene.frames.len()),
+                parent: "world".to_owned(),
+                translation: [0.0; 3],
+                rotation: Some(plantd_models::scene::Rotation::Rpy([0.0, 0.0, angle])),
+                joint: None,
+                body: None,
+            };
+            let name = axis.name.clone();
+            for frame in scene.frames.iter_mut().filter(|f| f.parent == "world") {
+                frame.parent.clone_from(&name);
+            }
+            axis.parent = "world".to_owned();
+            scene.frames.push(axis);
+        }
+    }
+    scene
+}
+
+/// The same mechanism turned about the vertical, without the redundant equation.
+fn plain(redundant: &Scene) -> Scene {
+    let mut scene = redundant.clone();
+    scene.constraints.truncate(1);
+    let Constraint::PointToPoint { axes, .. } = &mut scene.constraints[0] else { panic!() };
+    *axes = vec![Axis::X, Axis::Z];
+    scene
+}
+
+fn linearization(plant: &mut Plant, u: &[f64]) -> Linearization {
+    let mut out = Linearization::new(&plant.model().clone());
+    plant.linearize(u, &mut out).unwrap();
+    out
+}
+
+#[test]
+fn motion_and_linearization_are_those_without_redundant_equations() {
+    for (redundant, count) in [(doubled(), 2), (out_of_plane(false), 1), (out_of_plane(true), 1)] {
+        for split in SPLITS {
+            let mut one = plant(&plain(&redundant), |s| s.force_split = split);
+            let mut two = plant(&redundant, |s| s.force_split = split);
+            for k in 0..100 {
+                let u = waving_input(&one, k);
+                assert_eq!(one.step(&u).unwrap().redundant_constraints, 0);
+                let report = two.step(&u).unwrap();
+                assert_eq!(report.redundant_constraints, count);
+                assert!(report.constraint_reciprocal_condition > 1e-3, "{report:?}");
+            }
+            for (x, y) in one.q().iter().zip(two.q()).chain(one.p().iter().zip(two.p())) {
+                assert!((x - y).abs() < 1e-10, "{x} instead of {y}");
+            }
+            let u = waving_input(&one, 101);
+            let (first, second) = (linearization(&mut one, &u), linearization(&mut two, &u));
+            let scale = first.a().amax();
+            assert!((first.a() - second.a()).amax() < 1e-9 * scale, "A");
+            assert!((first.b() - second.b()).amax() < 1e-9 * scale, "B");
+        }
+    }
+}
+
+/// `Dhᵀ λ` is the same impulse as without redundant equations, and no shorter `λ` gives it.
+#[test]
+fn multipliers_have_least_norm() {
+    for redundant in [doubled(), out_of_plane(false), out_of_plane(true)] {
+        let mut one = plant(&plain(&redundant), |_| ());
+        let mut two = plant(&redundant, |_| ());
+        wave(&mut one, 30);
+        wave(&mut two, 30);
+        let dh = [one.constraint_jacobian(), two.constraint_jacobian()];
+        wave(&mut one, 1);
+        wave(&mut two, 1);
+        let impulse = dh[0].transpose() * DVector::from_column_slice(one.multipliers());
+        let least = dh[1].transpose().svd(true, true).solve(&impulse, 1e-9).unwrap();
+        for (lambda, least) in two.multipliers().iter().zip(least.iter()) {
+            assert!((lambda - least).abs() < 1e-11, "{lambda} instead of {least}");
+        }
+    }
+}
+
+/// Equations that are stated twice share what one of them carries, in derivatives too.
+#[test]
+fn doubled_equations_share_evenly() {
+    let mut one = plant(&builtin("four-bar"), |_| ());
+    let mut two = plant(&doubled(), |_| ());
+    wave(&mut one, 20);
+    wave(&mut two, 20);
+    let lambda = two.multipliers();
+    for c in 0..2 {
+        assert!((lambda[c] - 0.5 * one.multipliers()[c]).abs() < 1e-11);
+        assert!((lambda[c] - lambda[c + 2]).abs() < 1e-14);
+    }
+    let u = waving_input(&one, 21);
+    let (first, second) = (linearization(&mut one, &u), linearization(&mut two, &u));
+    let parts = [
+        (first.multipliers_x(), second.multipliers_x()),
+        (first.multipliers_u(), second.multipliers_u()),
+    ];
+    for (whole, halves) in parts {
+        let scale = whole.amax();
+        for share in [halves.rows(0, 2), halves.rows(2, 2)] {
+            assert!((0.5 * &whole - share).amax() < 1e-9 * scale);
+        }
+    }
+}
+
+/// A slab that may sink and tilt on four legs.
+fn table(load_at: [f64; 2]) -> Scene {
+    let [x, y] = load_at;
+    let mut text = format!(
+        r#"
+format = 1
+name = "table"
+gravity = [0.0, 0.0, -10.0]
+[[frames]]
+name = "height"
+joint = {{ type = "prismatic", axis = [0.0, 0.0, 1.0] }}
+[[frames]]
+name = "pitch"
+parent = "height"
+joint = {{ type = "revolute", axis = [0.0, 1.0, 0.0] }}
+[[frames]]
+name = "slab"
+parent = "pitch"
+joint = {{ type = "revolute", axis = [1.0, 0.0, 0.0] }}
+body = {{ mass = 3.0, inertia = [0.4, 0.5, 0.9] }}
+[[frames]]
+name = "load"
+parent = "slab"
+translation = [{x}, {y}, 0.1]
+body = {{ mass = 1.0 }}
+"#
+    );
+    for (leg, [x, y]) in LEGS.iter().enumerate() {
+        text.push_str(&format!(
+            r#"
+[[constraints]]
+type = "point_to_point"
+name = "leg{leg}"
+a = {{ frame = "slab", at = [{x}, {y}, -0.7] }}
+b = {{ frame = "world", at = [{x}, {y}, -0.7] }}
+axes = ["z"]
+"#
+        ));
+    }
+    Scene::from_toml(&text).unwrap()
+}
+
+const LEGS: [[f64; 2]; 4] = [[0.5, 0.3], [-0.5, 0.3], [-0.5, -0.3], [0.5, -0.3]];
+
+#[test]
+fn a_table_stands_on_four_legs() {
+    for load in [[0.0, 0.0], [0.2, 0.1], [-0.4, 0.25]] {
+        let mut plant = plant(&table(load), |_| ());
+        for _ in 0..50 {
+            let report = plant.step(&[]).unwrap();
+            assert_eq!(report.redundant_constraints, 1);
+        }
+        assert!(plant.q().iter().all(|q| q.abs() < 1e-14), "{:?}", plant.q());
+        // Least norm is the plane of forces that balances weight and moments.
+        let weight = [30.0 + 10.0, 10.0 * load[0], 10.0 * load[1]];
+        let h = plant.settings().time_step_s;
+        for (leg, [x, y]) in LEGS.iter().enumerate() {
+            let expected =
+                weight[0] / 4.0 + weight[1] * x / (4.0 * 0.25) + weight[2] * y / (4.0 * 0.09);
+            // What the constraint takes away from the forces that pull down.
+            let force = -plant.multipliers()[leg] / h;
+            assert!((force - expected).abs() < 1e-9, "leg {leg}: {force} N instead of {expected}");
+        }
+        let diagnosis = plant.diagnose();
+        assert_eq!(diagnosis.redundant_constraints, ["leg3.z"]);
+        assert_eq!((diagnosis.degrees_of_freedom, diagnosis.constraint_rank), (0, 3));
+    }
+}
+
+/// Two strings from one point to one bob, whose lengths are prescribed.
+const STRINGS: &str = r#"
+format = 1
+name = "strings"
+gravity = [0.0, 0.0, -10.0]
+[[frames]]
+name = "x"
+joint = { type = "prismatic", axis = [1.0, 0.0, 0.0] }
+[[frames]]
+name = "z"
+parent = "x"
+joint = { type = "prismatic", axis = [0.0, 0.0, 1.0] }
+body = { mass = 1.0 }
+[[coordinates]]
+name = "x"
+initial = 0.6
+[[coordinates]]
+name = "z"
+initial = -0.8
+[[coordinates]]
+name = "first"
+kind = "prescribed"
+initial = 1.0
+[[coordinates]]
+name = "second"
+kind = "prescribed"
+initial = 1.0
+[[constraints]]
+type = "distance"
+name = "one"
+a = { frame = "world" }
+b = { frame = "z" }
+length = "first"
+[[constraints]]
+type = "distance"
+name = "two"
+a = { frame = "world" }
+b = { frame = "z" }
+length = "second"
+"#;
+
+#[test]
+fn constraints_that_contradict_each_other_are_named() {
+    let mut plant = plant(&Scene::from_toml(STRINGS).unwrap(), |_| ());
+    for k in 0..20 {
+        let length = 1.0 + 0.001 * f64::from(k);
+        let report = plant.step(&[length, length]).unwrap();
+        assert_eq!(report.redundant_constraints, 1);
+    }
+    let before = plant.state();
+    for (first, second) in [(1.02, 1.03), (1.02, 1.02 + 1e-7)] {
+        match plant.step(&[first, second]).unwrap_err() {
+            StepError::InconsistentConstraints { constraints, violation } => {
+                assert_eq!(constraints, ["one", "two"]);
+                // The best length is between the two.
+                let half = 0.5 * (second * second - first * first).abs();
+                assert!((violation - half).abs() < 1e-3 * half, "{violation} instead of {half}");
+            }
+            error => panic!("{error}"),
+        }
+        assert_eq!(plant.state(), before);
+    }
+    plant.step(&[1.02, 1.02]).unwrap();
+}
+
+/// A projection is not disturbed by equations that say the same, and says where they do not.
+#[test]
+fn projections_and_velocities_with_redundant_equations() {
+    for redundant in [doubled(), out_of_plane(true)] {
+        let mut one = plant(&plain(&redundant), |_| ());
+        let mut two = plant(&redundant, |_| ());
+        let guess = vec![-1.0, 0.4, -0.5];
+        for plant in [&mut one, &mut two] {
+            plant.initialize(&Initial::Projection { q: guess.clone(), hold: vec![] }).unwrap();
+            let q = plant.q().to_vec();
+            plant.initialize(&Initial::Velocity { q, v: vec![1.0, -2.0, 0.5] }).unwrap();
+        }
+        let (v, w) = (one.velocity(), two.velocity());
+        for (x, y) in one.q().iter().zip(two.q()).chain(v.iter().zip(&w)) {
+            assert!((x - y).abs() < 1e-12, "{x} and {y}");
+        }
+        assert!((two.constraint_jacobian() * DVector::from_vec(w)).amax() < 1e-13);
+    }
+}
+
+/// Units do not make equations redundant: a mechanism of millimetres and grams, and one of
+/// kilometres and tonnes.
+#[test]
+fn scale_is_not_redundancy() {
+    let mut scene = builtin("four-bar");
+    for (length, mass) in [(1e-3, 1e-3), (1e3, 1e6)] {
+        let mut scaled = scene.clone();
+        for frame in &mut scaled.frames {
+            frame.translation.iter_mut().for_each(|x| *x *= length);
+            let body = frame.body.as_mut().unwrap();
+            body.mass *= mass;
+            body.center_of_mass.iter_mut().for_each(|x| *x *= length);
+            body.inertia.iter_mut().for_each(|x| *x *= mass * length * length);
+        }
+        let Constraint::PointToPoint { a, b, .. } = &mut scaled.constraints[0] else { panic!() };
+        a.at.iter_mut().chain(&mut b.at).for_each(|x| *x *= length);
+        scaled.gravity.iter_mut().for_each(|g| *g *= length);
+        scaled.inputs.clear();
+        scene.inputs.clear();
+        let (mut small, mut large) = (plant(&scaled, |_| ()), plant(&scene, |_| ()));
+        for _ in 0..50 {
+            let (a, b) = (small.step(&[]).unwrap(), large.step(&[]).unwrap());
+            assert_eq!((a.redundant_constraints, b.redundant_constraints), (0, 0));
+            if a.factorizations > 0 && b.factorizations > 0 {
+                let ratio = a.constraint_reciprocal_condition / b.constraint_reciprocal_condition;
+                assert!((ratio - 1.0).abs() < 1e-6, "{ratio}");
+                let ratio = a.reciprocal_condition / b.reciprocal_condition;
+                assert!((ratio - 1.0).abs() < 1e-6, "{ratio}");
+            }
+        }
+        for (x, y) in small.q().iter().zip(large.q()) {
+            assert!((x - y).abs() < 1e-9, "{x} and {y}");
+        }
+    }
+}
+
+#[test]
+fn regular_scenes_have_no_redundant_equations() {
+    for name in plantd_models::builtin::NAMES {
+        let mut plant = plant(&builtin(name), |_| ());
+        let d = model(&builtin(name)).dimensions();
+        let diagnosis = plant.diagnose();
+        assert_eq!(diagnosis.redundant_constraints, [""; 0], "{name}");
+        assert_eq!(diagnosis.degrees_of_freedom, d.dynamic - d.constraints, "{name}");
+        let dh: DMatrix<f64> = plant.constraint_jacobian().columns(0, d.dynamic).into_owned();
+        assert_eq!(dh.rank(1e-9), d.constraints, "{name}");
+    }
+}

@@ -1,0 +1,258 @@
+//! Equilibria: what settles is at rest, and a minimum.
+
+mod common;
+
+use std::f64::consts::PI;
+
+use common::{Numbers, builtin, floating, plant, random_tree};
+use plantd_models::scene::{Constraint, Spring};
+use plantd_models::{Equilibrium, Initial, InitialError, Plant, Scene, SettleError, SettleRequest};
+
+fn settle(plant: &Plant, q: &[f64], hold: &[&str]) -> Result<Equilibrium, SettleError> {
+    let hold = hold.iter().map(|name| (*name).to_owned()).collect();
+    plant.settle(&SettleRequest { q: q.to_vec(), hold, inputs: vec![] })
+}
+
+/// Potential energy less the work of inputs, near `q` on the constraints.
+fn energy_near(plant: &mut Plant, q: Vec<f64>, u: &[f64]) -> (Vec<f64>, f64) {
+    if plant.model().dimensions().constraints > 0 {
+        plant.initialize(&Initial::Projection { q, hold: vec![] }).unwrap();
+    } else {
+        let v = vec![0.0; q.len()];
+        plant.initialize(&Initial::Velocity { q, v }).unwrap();
+    }
+    let energy = plant.energy();
+    let model = plant.model().clone();
+    let inputs = model.scene().inputs.iter().zip(u);
+    let work: f64 = inputs
+        .map(|(input, u)| {
+            let index = model.coordinate_index(&input.coordinate).unwrap();
+            input.gain * u * plant.q()[index]
+        })
+        .sum();
+    (plant.q().to_vec(), energy.potential_j - work)
+}
+
+/// Small displacements along the constraints cost energy, of second order.
+fn assert_minimum(scene: &Scene, rest: &Equilibrium) {
+    let mut plant = plant(scene, |_| ());
+    let n = plant.model().dimensions().dynamic;
+    let (_, least) = energy_near(&mut plant, rest.q.clone(), &rest.inputs);
+    let mut random = Numbers::new(7);
+    for _ in 0..40 {
+        let mut q = rest.q.clone();
+        q[..n].iter_mut().for_each(|q| *q += random.between(-1e-2, 1e-2));
+        let (at, energy) = energy_near(&mut plant, q, &rest.inputs);
+        let distance: f64 = at.iter().zip(&rest.q).map(|(a, b)| (a - b) * (a - b)).sum();
+        let least_gain = 0.4 * rest.smallest_stiffness.min(1e6) * distance;
+        assert!(
+            energy - least > least_gain.min(0.0) + 0.5 * least_gain - 1e-12 * least.abs().max(1.0),
+            "{}: {} after {distance:e}, stiffness {}",
+            scene.name,
+            energy - least,
+            rest.smallest_stiffness
+        );
+    }
+}
+
+/// A plant put there stays.
+fn assert_rest(scene: &Scene, q: &[f64], hold: &[&str], inputs: &[f64]) -> Vec<f64> {
+    let mut plant = plant(scene, |_| ());
+    let hold = hold.iter().map(|name| (*name).to_owned()).collect();
+    let initial = Initial::Equilibrium { q: q.to_vec(), hold, inputs: inputs.to_vec() };
+    plant.initialize(&initial).unwrap();
+    let start = plant.state();
+    let mut u = vec![0.0; plant.model().dimensions().input()];
+    plant.hold_input(&mut u);
+    u[..inputs.len()].copy_from_slice(inputs);
+    for _ in 0..100 {
+        plant.step(&u).unwrap();
+    }
+    let scale = 1.0 + start.p.iter().fold(0.0_f64, |a, p| a.max(p.abs()));
+    for (x, y) in plant.q().iter().zip(&start.q) {
+        assert!((x - y).abs() < 1e-11, "{}: {x} was {y}", scene.name);
+    }
+    for (x, y) in plant.p().iter().zip(&start.p) {
+        assert!((x - y).abs() < 1e-11 * scale, "{}: {x} was {y}", scene.name);
+    }
+    assert!(plant.velocity().iter().all(|v| v.abs() < 1e-9), "{:?}", plant.velocity());
+    start.q
+}
+
+#[test]
+fn pendulums_hang() {
+    for (name, guess) in [
+        ("pendulum", vec![1.0]),
+        ("pendulum", vec![PI]),
+        ("double-pendulum", vec![0.8, -0.5]),
+        ("double-pendulum", vec![PI, 0.0]),
+        ("double-pendulum", vec![PI - 1e-3, 1e-3]),
+        ("double-pendulum", vec![0.0, PI]),
+        ("chain-4", vec![PI, 0.1, 0.0, -0.1]),
+        ("spherical-pendulum", vec![2.0, 1.0]),
+    ] {
+        let scene = builtin(name);
+        let rest = settle(&plant(&scene, |_| ()), &guess, &[]).unwrap();
+        println!("{name} {rest:?}");
+        assert!(rest.stable && rest.smallest_stiffness > 0.0, "{name}: {rest:?}");
+        assert!(rest.residual < 1e-13, "{name}: {rest:?}");
+        if name != "spherical-pendulum" {
+            // Hanging, up to full turns.
+            let mut angle: f64 = 0.0;
+            for q in &rest.q {
+                angle += q;
+                assert!(angle.sin().abs() < 1e-12 && angle.cos() > 0.0, "{name}: {:?}", rest.q);
+            }
+        }
+        assert_minimum(&scene, &rest);
+        assert_rest(&scene, &guess, &[], &[]);
+    }
+}
+
+#[test]
+fn builtin_mechanisms_settle() {
+    for (name, hold) in
+        [("four-bar", vec![]), ("marionette", vec![]), ("scissor-4", vec!["slider"])]
+    {
+        let scene = builtin(name);
+        let plant = plant(&scene, |_| ());
+        let guess = plant.q().to_vec();
+        let rest = settle(&plant, &guess, &hold).unwrap();
+        println!("{name} {rest:?}");
+        assert!(rest.stable, "{name}: {rest:?}");
+        assert!(rest.residual < 1e-9, "{name}: {rest:?}");
+        if hold.is_empty() {
+            assert_minimum(&scene, &rest);
+            assert_rest(&scene, &guess, &hold, &[]);
+        }
+    }
+    let scene = builtin("scissor-4");
+    let plant = plant(&scene, |_| ());
+    println!("{:?}", settle(&plant, plant.q(), &[]));
+}
+
+/// A torque holds a pendulum where `m g l sin θ = u`.
+#[test]
+fn constant_inputs_do_work() {
+    let scene = builtin("pendulum");
+    let plant = plant(&scene, |_| ());
+    let body = scene.frames[0].body.clone().unwrap();
+    let moment = body.mass * body.center_of_mass[2].abs() * scene.gravity[2].abs();
+    let input = 0.4 * moment / scene.inputs[0].gain;
+    let request = SettleRequest { q: vec![0.0], hold: vec![], inputs: vec![input] };
+    let rest = plant.settle(&request).unwrap();
+    assert!((rest.q[0].sin() - 0.4).abs() < 1e-13 && rest.q[0].abs() < 1.0, "{rest:?}");
+    assert!((rest.smallest_stiffness / (moment * rest.q[0].cos()) - 1.0).abs() < 1e-12);
+    assert_minimum(&scene, &rest);
+    assert_rest(&scene, &[0.0], &[], &[input]);
+    // A torque that gravity cannot balance turns it on and on.
+    let request = SettleRequest { inputs: vec![1.5 * moment / scene.inputs[0].gain], ..request };
+    let error = plant.settle(&request).unwrap_err();
+    assert!(matches!(error, SettleError::Unbounded { .. }), "{error}");
+}
+
+#[test]
+fn what_falls_has_no_equilibrium() {
+    let mut scene = floating();
+    scene.gravity = [0.0, 0.0, -9.8];
+    let plant = plant(&scene, |_| ());
+    let error = settle(&plant, plant.q(), &[]).unwrap_err();
+    assert_eq!(error, SettleError::Unbounded { coordinate: "z".to_owned() });
+    // Held, its arms come to rest.
+    settle(&plant, plant.q(), &["x", "y", "z", "yaw"]).unwrap();
+}
+
+#[test]
+fn requests_that_make_no_sense() {
+    let plant = plant(&builtin("four-bar"), |_| ());
+    let q = plant.q().to_vec();
+    let error = settle(&plant, &q[1..], &[]).unwrap_err();
+    assert_eq!(error, SettleError::Dimension { name: "q", expected: 3, actual: 2 });
+    let error = settle(&plant, &[f64::NAN, 0.0, 0.0], &[]).unwrap_err();
+    assert!(matches!(error, SettleError::NotFinite { name: "q", index: 0, .. }));
+    let error = settle(&plant, &q, &["nobody"]).unwrap_err();
+    assert_eq!(error, SettleError::Unknown { name: "nobody".to_owned() });
+    let request = SettleRequest { q, hold: vec![], inputs: vec![1.0, 2.0] };
+    let error = plant.settle(&request).unwrap_err();
+    assert_eq!(error, SettleError::Dimension { name: "inputs", expected: 1, actual: 2 });
+    // A crank that points away from a rocker held far off cannot be reached.
+    let error = settle(&plant, &[PI / 2.0, 0.0, -PI / 2.0], &["crank", "rocker"]).unwrap_err();
+    assert!(matches!(error, SettleError::Constraints { .. }), "{error}");
+    let mut plant = plant;
+    let initial = Initial::Equilibrium { q: vec![], hold: vec![], inputs: vec![] };
+    let error = plant.initialize(&initial).unwrap_err();
+    assert!(matches!(error, InitialError::Settle(SettleError::Dimension { .. })), "{error}");
+}
+
+/// Trees of random shape, with springs across.
+#[test]
+fn random_trees_settle() {
+    for seed in 0..24 {
+        let mut scene = random_tree(seed);
+        // Springs hold what would fall.
+        for frame in scene.frames.clone() {
+            if let Some(coordinate) = frame.coordinate() {
+                let prescribed = scene.coordinates.iter().any(|c| {
+                    c.name == coordinate
+                        && c.kind == plantd_models::scene::CoordinateKind::Prescribed
+                });
+                if !prescribed {
+                    let coordinate = coordinate.to_owned();
+                    scene.springs.push(Spring::Coordinate {
+                        coordinate,
+                        stiffness: 3.0,
+                        rest: 0.1,
+                    });
+                }
+            }
+        }
+        let plant = plant(&scene, |_| ());
+        let rest =
+            settle(&plant, plant.q(), &[]).unwrap_or_else(|error| panic!("seed {seed}: {error}"));
+        assert!(rest.residual < 1e-11, "seed {seed}: {rest:?}");
+        assert!(rest.stable, "seed {seed}: {rest:?}");
+        assert_minimum(&scene, &rest);
+        assert_rest(&scene, plant.q(), &[], &[]);
+    }
+}
+
+/// Held coordinates keep their value to the bit.
+#[test]
+fn held_coordinates_stay() {
+    let plant = plant(&builtin("double-pendulum"), |_| ());
+    let rest = settle(&plant, &[0.3, 0.9], &["theta1"]);
+    println!("{:?} {:?}", plant.model().coordinates(), rest);
+    let name = plant.model().coordinates()[0].name.clone();
+    let rest = settle(&plant, &[0.3, 0.9], &[&name]).unwrap();
+    assert_eq!(rest.q[0], 0.3);
+    assert!((rest.q[0] + rest.q[1]).sin().abs() < 1e-12);
+}
+
+/// Constraint forces of a hanging four-bar balance its weight: with redundant equations too.
+#[test]
+fn constraint_forces_balance() {
+    let scene = builtin("four-bar");
+    let mut doubled = scene.clone();
+    let Constraint::PointToPoint { a, b, axes, .. } = scene.constraints[0].clone() else {
+        panic!()
+    };
+    let name = "again".to_owned();
+    doubled.constraints.push(Constraint::PointToPoint { name, a, b, axes });
+    let forces = [scene, doubled].map(|scene| {
+        let mut plant = plant(&scene, |_| ());
+        let rest = settle(&plant, plant.q(), &[]).unwrap();
+        // What a step says at rest.
+        let q = rest.q.clone();
+        plant.initialize(&Initial::Equilibrium { q, hold: vec![], inputs: vec![] }).unwrap();
+        plant.step(&[0.0]).unwrap();
+        let h = plant.settings().time_step_s;
+        for (force, lambda) in rest.constraint_forces.iter().zip(plant.multipliers()) {
+            assert!((force - lambda / h).abs() < 1e-9, "{force} and {}", lambda / h);
+        }
+        rest.constraint_forces
+    });
+    for c in 0..2 {
+        assert!((forces[0][c] - forces[1][c] - forces[1][c + 2]).abs() < 1e-10);
+        assert!((forces[1][c] - forces[1][c + 2]).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,307 @@
+//! Singularities, section VI of the paper: where the Newton matrix or the constraints lose rank.
+
+mod common;
+
+use std::f64::consts::{FRAC_PI_2, PI};
+
+use common::{Numbers, builtin, plant, wave};
+use nalgebra::{DMatrix, Matrix2};
+use plantd_models::{Initial, Linearization, Plant, Scene, StepError};
+
+const MASS: f64 = 1.3;
+const LENGTH: f64 = 0.7;
+const GRAVITY: f64 = 9.81;
+
+/// The paper's spherical pendulum: azimuth about the vertical, then polar angle from hanging.
+fn spherical_pendulum() -> Scene {
+    Scene::from_toml(&format!(
+        r#"
+format = 1
+name = "spherical"
+gravity = [0.0, 0.0, -{GRAVITY}]
+[[frames]]
+name = "azimuth"
+joint = {{ type = "revolute", axis = [0.0, 0.0, 1.0] }}
+[[frames]]
+name = "polar"
+parent = "azimuth"
+joint = {{ type = "revolute", axis = [0.0, 1.0, 0.0] }}
+body = {{ mass = {MASS}, center_of_mass = [0.0, 0.0, -{LENGTH}] }}
+[[coordinates]]
+name = "polar"
+initial = 1.0
+"#
+    ))
+    .unwrap()
+}
+
+/// `M[k+1]` of the spherical pendulum in closed form, with `φ` the azimuth and `θ` the polar angle.
+fn closed_form(q0: [f64; 2], q1: [f64; 2], dt: f64) -> Matrix2<f64> {
+    let (turn, sum) = (q1[0] - q0[0], q0[1] + q1[1]);
+    let (sin, cos) = (0.5 * sum).sin_cos();
+    let inertia = MASS * LENGTH * LENGTH / dt;
+    let coupling = 0.5 * inertia * sum.sin() * turn;
+    let polar = -inertia
+        * (1.0 - 0.25 * sum.cos() * turn * turn + dt * dt * GRAVITY / (4.0 * LENGTH) * cos);
+    Matrix2::new(-inertia * sin * sin, -coupling, coupling, polar)
+}
+
+/// `det M = (m r²/dt)² sin²((θ0+θ1)/2) [1 + ¼(2 + cos(θ0+θ1)) Δφ² + dt² g/(4r) cos((θ0+θ1)/2)]`.
+fn bracket(q0: [f64; 2], q1: [f64; 2], dt: f64) -> f64 {
+    let (turn, sum) = (q1[0] - q0[0], q0[1] + q1[1]);
+    1.0 + 0.25 * (2.0 + sum.cos()) * turn * turn
+        + dt * dt * GRAVITY / (4.0 * LENGTH) * (0.5 * sum).cos()
+}
+
+fn at_step(scene: &Scene, time_step_s: f64) -> Plant {
+    plant(scene, |s| s.time_step_s = time_step_s)
+}
+
+#[test]
+fn newton_matrix_of_the_spherical_pendulum_is_the_papers() {
+    let mut random = Numbers::new(1);
+    for dt in [0.001, 0.01, 0.3, 0.6, 1.5] {
+        let mut plant = at_step(&spherical_pendulum(), dt);
+        for _ in 0..50 {
+            let [q0, q1] = [0; 2].map(|_| [0; 2].map(|_| random.between(-PI, PI)));
+            let found = plant.newton_matrix(&q0, &q1);
+            let expected = closed_form(q0, q1, dt);
+            let scale = expected.amax();
+            for (x, y) in found.iter().zip(expected.iter()) {
+                assert!((x - y).abs() < 1e-13 * scale, "{found} instead of {expected}");
+            }
+            let sin = (0.5 * (q0[1] + q1[1])).sin();
+            let determinant =
+                (MASS * LENGTH * LENGTH / dt).powi(2) * sin * sin * bracket(q0, q1, dt);
+            assert!((found.determinant() - determinant).abs() < 1e-12 * scale * scale);
+        }
+    }
+}
+
+/// The bracket has no zero for `dt < 2 √(r/g)`, whatever the turn about the vertical, and has one
+/// above: upright, without turn.
+#[test]
+fn the_bound_on_the_time_step() {
+    let bound = 2.0 * (LENGTH / GRAVITY).sqrt();
+    let sign = |dt: f64, polar: f64, turn: f64| {
+        let mut plant = at_step(&spherical_pendulum(), dt);
+        let matrix = plant.newton_matrix(&[-0.5 * turn, polar - 0.1], &[0.5 * turn, polar + 0.1]);
+        let sin_squared = polar.sin().powi(2);
+        matrix.determinant() / sin_squared / (MASS * LENGTH * LENGTH / dt).powi(2)
+    };
+    for k in 1..40 {
+        let polar = PI * f64::from(k) / 40.0;
+        for turn in [0.0, 0.01, 0.5, 2.0, 5.0] {
+            assert!(sign(0.999 * bound, polar, turn) > 0.0, "{polar} {turn}");
+        }
+    }
+    assert!(sign(1.01 * bound, 0.999 * PI, 0.0) < 0.0);
+    // A turn about the vertical only helps.
+    assert!(sign(1.01 * bound, 0.999 * PI, 0.5) > 0.0);
+    // Where it vanishes.
+    let mut plant = at_step(&spherical_pendulum(), bound);
+    let matrix = plant.newton_matrix(&[0.3, PI - 0.1], &[0.3, PI + 0.1]);
+    let inertia = MASS * LENGTH * LENGTH / bound;
+    assert!(matrix[(1, 1)].abs() < 1e-14 * inertia, "{matrix}");
+}
+
+/// Consecutive configurations that mirror each other about a pole have their midpoint on it.
+#[test]
+fn symmetric_consecutive_configurations_are_singular() {
+    let dt = 0.01;
+    let mut plant = at_step(&spherical_pendulum(), dt);
+    let inertia = MASS * LENGTH * LENGTH / dt;
+    // About the lower pole, across it, and about the upper one; gravity acts on the polar angle
+    // alone and vanishes at the poles.
+    for (center, swing) in [(0.0, 0.0), (0.0, 0.1), (0.0, 1e-3), (PI, 0.2), (-PI, 0.05)] {
+        let matrix = plant.newton_matrix(&[0.3, center - swing], &[0.4, center + swing]);
+        assert!(matrix.determinant().abs() < 1e-25 * inertia * inertia);
+        let momentum = Initial::Momentum {
+            q: vec![0.3, center - swing],
+            p: vec![0.0, inertia * 2.0 * swing],
+            v: vec![],
+        };
+        plant.initialize(&momentum).unwrap();
+        let before = plant.state();
+        let mut out = Linearization::new(&plant.model().clone());
+        let mut errors = vec![plant.linearize(&[], &mut out).unwrap_err()];
+        if swing > 0.0 {
+            // At rest a step has nothing to solve.
+            errors.push(plant.step(&[]).unwrap_err());
+        }
+        for error in errors {
+            match error {
+                StepError::Singular { coordinate, pivot } => {
+                    assert_eq!(coordinate, "azimuth");
+                    assert!(pivot < 1e-14, "{pivot}");
+                }
+                error => panic!("{error}"),
+            }
+        }
+        assert_eq!(plant.state(), before);
+        // A little off, it is regular, and the estimate is the square of the distance.
+        let off = 1e-3;
+        plant
+            .initialize(&Initial::Momentum {
+                q: vec![0.3, center - swing + off],
+                p: vec![0.0, inertia * 2.0 * swing],
+                v: vec![],
+            })
+            .unwrap();
+        let estimate = plant.linearize(&[], &mut out).unwrap().reciprocal_condition;
+        assert!(estimate > 0.5 * off * off && estimate < 2.0 * off * off, "{estimate}");
+    }
+}
+
+/// The built-in spherical pendulum has its poles where the second hinge turns the rod into the axis
+/// of the first.
+#[test]
+fn the_builtin_spherical_pendulum_is_singular_at_its_pole() {
+    let mut plant = plant(&builtin("spherical-pendulum"), |_| ());
+    let estimates: Vec<f64> = [0.3, 1.0, 1.5, FRAC_PI_2]
+        .map(|pitch| {
+            plant.initialize(&Initial::Velocity { q: vec![0.2, pitch], v: vec![0.0; 2] }).unwrap();
+            plant.diagnose().mass_matrix_reciprocal_condition
+        })
+        .into();
+    for (estimate, pitch) in estimates.iter().zip([0.3_f64, 1.0, 1.5, FRAC_PI_2]) {
+        assert!((estimate - pitch.cos().powi(2)).abs() < 1e-15, "{estimate} at {pitch}");
+    }
+}
+
+/// A point on a plane, held at a distance from the origin; without gravity.
+fn planar_pendulum() -> Scene {
+    Scene::from_toml(&format!(
+        r#"
+format = 1
+name = "planar"
+[[frames]]
+name = "x"
+joint = {{ type = "prismatic", axis = [1.0, 0.0, 0.0] }}
+[[frames]]
+name = "y"
+parent = "x"
+joint = {{ type = "prismatic", axis = [0.0, 1.0, 0.0] }}
+body = {{ mass = {MASS} }}
+[[coordinates]]
+name = "x"
+initial = {LENGTH}
+[[constraints]]
+type = "distance"
+name = "rod"
+a = {{ frame = "y" }}
+b = {{ frame = "world" }}
+length = {LENGTH}
+"#
+    ))
+    .unwrap()
+}
+
+/// `M = −(m/dt) 1` and `Dh(q1) M⁻¹ Dh(q0)ᵀ = −(4 dt/m)(x1 x0 + y1 y0)`.
+#[test]
+fn planar_pendulum_in_cartesian_coordinates() {
+    let dt = 0.05;
+    let mut plant = at_step(&planar_pendulum(), dt);
+    let at = |angle: f64| vec![LENGTH * angle.cos(), LENGTH * angle.sin()];
+    let mut jacobian = |q: &[f64]| {
+        plant.initialize(&Initial::Velocity { q: q.to_vec(), v: vec![0.0; 2] }).unwrap();
+        plant.constraint_jacobian()
+    };
+    for turn in [0.0, 0.3, 1.0, 1.57, FRAC_PI_2, 1.58, 2.0, 3.0] {
+        let (q0, q1) = (at(0.4), at(0.4 + turn));
+        let (d0, d1) = (jacobian(&q0), jacobian(&q1));
+        let matrix = at_step(&planar_pendulum(), dt).newton_matrix(&q0, &q1);
+        let expected = DMatrix::identity(2, 2) * (-MASS / dt);
+        assert!((&matrix - expected).amax() < 1e-14 * MASS / dt);
+        let schur = (d1 * matrix.try_inverse().unwrap() * d0.transpose())[(0, 0)];
+        let closed = -4.0 * dt / MASS * LENGTH * LENGTH * turn.cos();
+        assert!((schur - closed).abs() < 1e-15, "{schur} instead of {closed}");
+        assert_eq!(schur < -1e-15, turn < FRAC_PI_2, "the sign changes at a quarter turn only");
+    }
+}
+
+/// A step with momentum across the rod turns by `asin(dt v/l)`: from a quarter turn on there is
+/// nothing to turn to.
+#[test]
+fn a_quarter_turn_in_one_step_is_singular() {
+    let dt = 0.05;
+    let swing = |speed: f64, singular_below: f64| {
+        let mut plant = plant(&planar_pendulum(), |s| {
+            s.time_step_s = dt;
+            s.singular_below = singular_below;
+        });
+        let p = vec![0.0, MASS * speed];
+        plant.initialize(&Initial::Momentum { q: vec![LENGTH, 0.0], p, v: vec![] }).unwrap();
+        let result = plant.step(&[]);
+        (plant, result)
+    };
+    for turn in [0.1_f64, 0.8, 1.4, 1.55] {
+        let (mut plant, report) = swing(LENGTH / dt * turn.sin(), 1e-14);
+        let found = plant.q()[1].atan2(plant.q()[0]);
+        assert!((found - turn).abs() < 1e-9, "{found} instead of {turn}");
+        // Estimates are those of the factorization, at most an iteration back.
+        let estimate = report.unwrap().constraint_reciprocal_condition;
+        assert!((estimate / turn.cos() - 1.0).abs() < 1.0, "{estimate} at {turn}");
+        let mut out = Linearization::new(&plant.model().clone());
+        let report = plant.linearize(&[], &mut out).unwrap();
+        assert!(report.constraint_reciprocal_condition > 0.0);
+    }
+    // Exactly a quarter turn: the two solutions of a step meet.
+    let (_, result) = swing(LENGTH / dt, 1e-6);
+    match result.unwrap_err() {
+        StepError::SingularConstraints { constraints, reciprocal_condition } => {
+            assert_eq!(constraints, ["rod"]);
+            assert!(reciprocal_condition < 1e-6);
+        }
+        error => panic!("{error}"),
+    }
+    // Beyond there is none.
+    let (_, result) = swing(1.01 * LENGTH / dt, 1e-14);
+    println!("{:?}", result);
+    assert!(result.is_err());
+}
+
+/// A scissor that opens under gravity comes to hang as one line, where the conditions that its
+/// pivots put on heights vanish.
+#[test]
+fn a_scissor_that_settles_on_a_singular_point_names_its_constraints() {
+    for name in ["scissor-1", "scissor-2", "scissor-4"] {
+        let scene = Scene { damping: 3.0, ..builtin(name) };
+        let mut plant = plant(&scene, |_| ());
+        let mut estimate: f64 = 1.0;
+        let error = (0..20_000).find_map(|k| match plant.step(&[0.0]) {
+            Ok(report) => {
+                estimate = estimate.min(report.constraint_reciprocal_condition);
+                if k % 500 == 0 {
+                    println!("{k} {:?} {:?}", plant.q(), report);
+                }
+                None
+            }
+            Err(error) => Some(error),
+        });
+        println!("{name} {} {:?} {estimate:e} {:?}", plant.step_index(), error, plant.q());
+    }
+}
+
+/// The threshold decides what counts as singular.
+#[test]
+fn thresholds_turn_estimates_into_errors() {
+    let mut regular = plant(&builtin("four-bar"), |_| ());
+    let u = [0.3];
+    let report = regular.step(&u).unwrap();
+    let (matrix, constraints) =
+        (report.reciprocal_condition, report.constraint_reciprocal_condition);
+    assert!(matrix > 0.0 && matrix < 1.0 && constraints > 0.0 && constraints <= 1.0);
+    let with = |threshold: f64| {
+        plant(&builtin("four-bar"), |s| s.singular_below = threshold).step(&u).map(|_| ())
+    };
+    assert_eq!(with(0.99 * matrix.min(constraints)), Ok(()));
+    if matrix < constraints {
+        assert!(matches!(with(1.01 * matrix), Err(StepError::Singular { .. })));
+    } else {
+        let error = with(1.01 * constraints);
+        assert!(matches!(error, Err(StepError::SingularConstraints { .. })), "{error:?}");
+    }
+    let mut marionette = plant(&builtin("marionette"), |_| ());
+    wave(&mut marionette, 20);
+}
