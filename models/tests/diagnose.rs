@@ -10,8 +10,8 @@ fn close(x: [f64; 3], y: [f64; 3], tolerance: f64) -> bool {
 }
 
 /// A floating body in general motion; no gravity, no damping.
-fn in_motion() -> Plant {
-    let mut plant = plant(&floating(), |s| s.time_step_s = 0.02);
+fn in_motion(time_step_s: f64) -> Plant {
+    let mut plant = plant(&floating(), |s| s.time_step_s = time_step_s);
     let q = plant.q().to_vec();
     let v = (0..q.len()).map(|i| 0.8 * (1.0 + i as f64).sin()).collect();
     plant.initialize(&Initial::Velocity { q, v }).unwrap();
@@ -23,7 +23,7 @@ fn in_motion() -> Plant {
 /// follow to the order of the method.
 #[test]
 fn momenta_of_a_floating_body() {
-    let mut plant = in_motion();
+    let mut plant = in_motion(0.02);
     let start = plant.diagnose();
     assert!(start.angular_momentum.iter().all(|l| l.abs() > 0.05), "{start:?}");
     assert!((start.mass_kg - 4.6).abs() < 1e-14);
@@ -44,7 +44,7 @@ fn momenta_of_a_floating_body() {
 /// Total momentum is mass times the velocity of the centre of mass, which goes straight on.
 #[test]
 fn the_center_of_mass_moves_with_the_momentum() {
-    let mut plant = in_motion();
+    let mut plant = in_motion(0.002);
     let h = plant.settings().time_step_s;
     let mut before = plant.diagnose();
     for _ in 0..200 {
@@ -53,7 +53,7 @@ fn the_center_of_mass_moves_with_the_momentum() {
         for i in 0..3 {
             let speed = (now.center_of_mass[i] - before.center_of_mass[i]) / h;
             let expected = now.linear_momentum[i] / now.mass_kg;
-            assert!((speed - expected).abs() < 2e-3, "{speed} instead of {expected}");
+            assert!((speed - expected).abs() < 1e-4, "{speed} instead of {expected}");
         }
         before = now;
     }
@@ -64,17 +64,16 @@ fn the_center_of_mass_moves_with_the_momentum() {
 fn a_pendulum_in_closed_form() {
     let mut plant = plant(&builtin("pendulum"), |_| ());
     let body = plant.model().scene().frames[0].body.clone().unwrap();
-    let (mass, length) = (body.mass, body.center_of_mass[2].abs());
+    let (mass, length) = (body.mass, body.center_of_mass[1].abs());
     let (angle, rate) = (0.7_f64, 1.3);
     plant.initialize(&Initial::Velocity { q: vec![angle], v: vec![rate] }).unwrap();
     let found = plant.diagnose();
-    // Turning about y by the right hand takes −z towards −x.
     let (sin, cos) = angle.sin_cos();
-    let center = [-length * sin, 0.0, -length * cos];
-    let velocity = [-length * rate * cos, 0.0, length * rate * sin];
+    let center = [length * sin, -length * cos, 0.0];
+    let velocity = [length * rate * cos, length * rate * sin, 0.0];
     assert!(close(found.center_of_mass, center, 1e-15), "{found:?}");
     assert!(close(found.linear_momentum, velocity.map(|v| mass * v), 1e-14), "{found:?}");
-    assert!(close(found.angular_momentum, [0.0, mass * length * length * rate, 0.0], 1e-14));
+    assert!(close(found.angular_momentum, [0.0, 0.0, mass * length * length * rate], 1e-14));
     assert_eq!((found.degrees_of_freedom, found.constraint_rank), (1, 0));
     assert!((found.mass_matrix_reciprocal_condition - 1.0).abs() < 1e-15);
 }

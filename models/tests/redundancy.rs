@@ -329,6 +329,9 @@ fn regular_scenes_have_no_redundant_equations() {
         let diagnosis = plant.diagnose();
         assert_eq!(diagnosis.redundant_constraints, [""; 0], "{name}");
         assert_eq!(diagnosis.degrees_of_freedom, d.dynamic - d.constraints, "{name}");
+        if d.constraints == 0 {
+            continue;
+        }
         let dh: DMatrix<f64> = plant.constraint_jacobian().columns(0, d.dynamic).into_owned();
         assert_eq!(dh.rank(1e-9), d.constraints, "{name}");
     }

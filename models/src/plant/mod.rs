@@ -121,12 +121,12 @@ pub struct StepReport {
     pub constraint_residual: f64,
     /// Estimate of the reciprocal condition of the Newton matrix `M[k+1]`, at most 1: its smallest
     /// pivot, each relative to the larger of its diagonal entry and the inertia that its coordinate
-    /// has at most, over `h`. Of the last factorization; 1 before the first.
+    /// has at most, over `h`. Of the last factorization of the step.
     pub reciprocal_condition: f64,
     /// Estimate of the reciprocal condition of `Dh(q[k+1]) M[k+1]⁻¹ Dh(q[k])ᵀ`, at most 1: its
     /// smallest pivot that does not belong to a redundant equation, relative to the largest, each
-    /// equation scaled by the steepest that it gets. Of the last factorization; 1 before the first
-    /// and without constraints.
+    /// equation scaled by the steepest that it gets. Of the last factorization of the step; 1 without
+    /// constraints.
     pub constraint_reciprocal_condition: f64,
     /// Equations of constraints that depend on others.
     pub redundant_constraints: u32,

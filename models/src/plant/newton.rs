@@ -262,6 +262,9 @@ impl Workspace {
                 return Err(StepError::NotFinite { iterations: report.iterations });
             }
             if report.iterations == 1 && size <= CONVERGED {
+                // Nothing to correct, but what is singular shall not pass for solved.
+                self.factor(model, settings)?;
+                report.factorizations += 1;
                 return self.accept(model, settings, report);
             }
             let floor = if fresh { FLOOR } else { CHORD_FLOOR };
@@ -514,10 +517,8 @@ impl Workspace {
             self.turn_impulse(model, settings);
         }
         if model.dimensions.constraints > 0 {
-            if report.factorizations > 0 {
-                // The extrapolated guess has the least norm of other configurations.
-                self.schur.remove_null(&mut self.multipliers);
-            }
+            // The extrapolated guess has the least norm of other configurations.
+            self.schur.remove_null(&mut self.multipliers);
             self.start.subtract_impulses(model, &self.multipliers, &mut self.impulse);
         }
         self.estimates.write(&mut report);
