@@ -5,7 +5,7 @@ mod common;
 use std::f64::consts::PI;
 
 use common::{Numbers, builtin, floating, plant, random_tree};
-use plantd_models::scene::{Constraint, Spring};
+use plantd_models::scene::{Constraint, Coordinate, CoordinateKind, Spring};
 use plantd_models::{Equilibrium, Initial, InitialError, Plant, Scene, SettleError, SettleRequest};
 
 fn settle(plant: &Plant, q: &[f64], hold: &[&str]) -> Result<Equilibrium, SettleError> {
@@ -192,22 +192,13 @@ fn random_trees_settle() {
     for seed in 0..24 {
         let mut scene = random_tree(seed);
         // Springs hold what would fall.
-        for frame in scene.frames.clone() {
-            if let Some(coordinate) = frame.coordinate() {
-                let prescribed = scene.coordinates.iter().any(|c| {
-                    c.name == coordinate
-                        && c.kind == plantd_models::scene::CoordinateKind::Prescribed
-                });
-                if !prescribed {
-                    let coordinate = coordinate.to_owned();
-                    scene.springs.push(Spring::Coordinate {
-                        coordinate,
-                        stiffness: 3.0,
-                        rest: 0.1,
-                    });
-                }
-            }
-        }
+        let dynamic = scene.coordinates.iter().filter(|c| c.kind == CoordinateKind::Dynamic);
+        let spring = |coordinate: &Coordinate| Spring::Coordinate {
+            coordinate: coordinate.name.clone(),
+            stiffness: 3.0,
+            rest: 0.1,
+        };
+        scene.springs.extend(dynamic.map(spring).collect::<Vec<_>>());
         let plant = plant(&scene, |_| ());
         let rest =
             settle(&plant, plant.q(), &[]).unwrap_or_else(|error| panic!("seed {seed}: {error}"));
