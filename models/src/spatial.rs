@@ -106,6 +106,18 @@ impl<S: Scalar> Mat3<S> {
         Vec3([S::ZERO, S::ZERO, S::ONE]),
     ]);
 
+    pub(crate) const ZERO: Self = Self([Vec3::ZERO; 3]);
+
+    /// `self * s`.
+    pub(crate) fn scaled(&self, s: S) -> Self {
+        Self([self.0[0] * s, self.0[1] * s, self.0[2] * s])
+    }
+
+    /// `self − o`.
+    pub(crate) fn minus(&self, o: &Self) -> Self {
+        Self([self.0[0] - o.0[0], self.0[1] - o.0[1], self.0[2] - o.0[2]])
+    }
+
     /// A constant matrix.
     #[inline(always)]
     pub(crate) fn lift(m: Mat3) -> Self {

@@ -99,6 +99,24 @@ impl<S: Scalar> Curvature<S> {
             vv: axis.dot(force),
         }
     }
+
+    /// For two axes of one ball joint, `∂τ_row/∂ζ_column` and `∂τ_row/∂v_column = ∂m_column/∂ζ_row`.
+    /// The axes turn with the joint: what [`Curvature::pair`] says holds for different joints only.
+    pub(crate) fn within_ball(
+        &self,
+        momenta: &Momenta<S>,
+        gravity: Option<Vec3>,
+        row: usize,
+        column: usize,
+    ) -> (S, S) {
+        let weight = gravity.map_or(S::ZERO, |g| {
+            momenta.axis[column].w.dot(self.force[row].f.cross(Vec3::lift(g)))
+        });
+        (
+            momenta.axis_rate[column].dot(self.rate[row]) + weight,
+            momenta.axis_rate[row].dot(self.force[column]),
+        )
+    }
 }
 
 impl Curvature {
