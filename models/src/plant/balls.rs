@@ -15,6 +15,7 @@
 use crate::Model;
 use crate::plant::PreciseState;
 use crate::plant::Settings;
+use crate::plant::blocks::StepBlocks;
 use crate::plant::newton::Workspace;
 use crate::rotation::{self, Quaternion};
 use crate::scalar::{Dual, Scalar};
@@ -67,6 +68,25 @@ impl Model {
             change[i..i + 3].copy_from_slice(&turned.log().0);
         }
         change
+    }
+}
+
+/// Writes where a step starts and what is next.
+fn place(
+    blocks: &mut StepBlocks,
+    model: &Model,
+    increment: &[f64],
+    q_end: &[f64],
+    (orientations, turns): (&[Mat3], &[Vec3]),
+) {
+    let nd = model.dimensions.dynamic;
+    blocks.orientations[0].copy_from_slice(orientations);
+    blocks.next[..nd].copy_from_slice(increment);
+    blocks.next[nd..].copy_from_slice(&q_end[nd..]);
+    for (&i, turn) in model.orientations.iter().zip(turns) {
+        if i >= nd {
+            blocks.next[i..i + 3].copy_from_slice(&turn.0);
+        }
     }
 }
 
@@ -123,7 +143,12 @@ impl<S: Scalar> Turning<S> {
     }
 
     /// Change of `T⁻ torque − N⁻ momentum` along each axis of `ξ`, and of `(T⁻ − 1) force`.
-    pub(crate) fn by_turn(&self, torque: Vec3<S>, momentum: Vec3<S>, force: Vec3<S>) -> [[Vec3<S>; 3]; 2] {
+    pub(crate) fn by_turn(
+        &self,
+        torque: Vec3<S>,
+        momentum: Vec3<S>,
+        force: Vec3<S>,
+    ) -> [[Vec3<S>; 3]; 2] {
         let lift = |v: Vec3<S>| Vec3(v.0.map(|x| Dual::new(x, S::ZERO)));
         let change = |v: Vec3<Dual<S>>| Vec3(v.0.map(|x| x.eps));
         let along = |axis: usize| {
@@ -180,6 +205,50 @@ impl Workspace {
             if i < model.dimensions.dynamic {
                 let turn = rotation_vector(&self.increment, i);
                 self.orientations_end[o] = self.orientations_start[o].times(&rotation::exp(turn));
+            }
+        }
+    }
+
+    /// Evaluates the derivatives of the step at the increment, with multipliers and ends.
+    pub(crate) fn evaluate_turned(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) {
+        let Some(blocks) = &mut self.turned else { return };
+        blocks.q_start.copy_from_slice(&state.q);
+        blocks.multipliers.copy_from_slice(&self.multipliers);
+        place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
+        blocks.evaluate(model, settings);
+    }
+
+    /// Writes the Jacobian of the residual by the increment.
+    pub(crate) fn fill_turned_newton_matrix(&mut self, model: &Model, settings: &Settings) {
+        let Some(blocks) = &mut self.turned else { return };
+        place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
+        blocks.place_midpoint(model, settings.time_step_s);
+        blocks.q_mid.copy_from_slice(&self.q_mid);
+        blocks.evaluate_mid(model);
+        blocks.assemble(model, settings);
+        let (n, elimination) = (model.dimensions.coordinates(), &model.elimination);
+        for row in 0..model.dimensions.dynamic {
+            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
+                let ancestor = elimination.ancestors[slot];
+                self.matrix.upper[slot] = blocks.residual_next[ancestor * n + row];
+                self.matrix.lower[slot] = blocks.residual_next[row * n + ancestor];
+            }
+        }
+    }
+
+    /// Turns the constraint Jacobian at the end into one by the increment.
+    pub(crate) fn turn_end_jacobian(&mut self, model: &Model) {
+        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
+        for &i in model.orientations.iter().filter(|i| **i < nd) {
+            let to_end = rotation::dexp(rotation_vector(&self.increment, i));
+            for row in self.end.jacobian.chunks_exact_mut(n) {
+                let turned = to_end.apply_transposed(rotation_vector(row, i));
+                row[i..i + 3].copy_from_slice(&turned.0);
             }
         }
     }

@@ -5,15 +5,17 @@
 //! first-order linearization itself is [`linearize`](super::linearize), which knows the sparsity.
 
 use crate::Model;
+use crate::plant::balls::Turning;
 use crate::plant::closure::Closure;
 use crate::plant::curvature::Curvature;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::rows::Term;
 use crate::plant::{Settings, springs};
+use crate::rotation;
 use crate::scalar::{Dual, Scalar};
-use crate::spatial::Mat3;
-use crate::tree::WORLD;
+use crate::spatial::{Mat3, Vec3};
+use crate::tree::{JointKind, WORLD};
 
 /// Gradient and second derivatives of the Lagrangian, springs included, and forces with their first
 /// derivatives, at one configuration and velocity.
@@ -45,6 +47,8 @@ pub(crate) struct Blocks<S = f64> {
     /// Ancestor and descendant of each pair of joints on one path to the root, a joint with itself
     /// included, and their coordinates.
     pairs: Vec<[usize; 4]>,
+    /// First joints of ball joints.
+    balls: Vec<usize>,
 }
 
 impl<S: Scalar> Blocks<S> {
@@ -62,7 +66,9 @@ impl<S: Scalar> Blocks<S> {
                 ancestor = above.parent;
             }
         }
+        let is_first = |&j: &usize| joints[j].kind == JointKind::Ball(0);
         Self {
+            balls: (0..joints.len()).filter(is_first).collect(),
             poses: Poses::new(&model.dynamics),
             momenta: Momenta::new(&model.dynamics),
             curvature: Curvature::new(&model.dynamics),
@@ -133,6 +139,15 @@ impl<S: Scalar> Blocks<S> {
             self.l_vv[i * n + j] = second.vv;
             self.l_vv[j * n + i] = second.vv;
         }
+        for &first in &self.balls {
+            for (row, column) in (0..9).map(|entry| (first + entry / 3, first + entry % 3)) {
+                let (qq, qv) =
+                    self.curvature.within_ball(&self.momenta, model.gravity, row, column);
+                let at = |joint: usize| model.dynamics.joints[joint].coordinate;
+                self.l_qq[at(row) * n + at(column)] = qq;
+                self.l_qv[at(row) * n + at(column)] = qv;
+            }
+        }
         for spring in &model.coordinate_springs {
             self.l_qq[spring.coordinate * (n + 1)] -= S::constant(spring.stiffness);
         }
@@ -175,6 +190,9 @@ impl<S: Scalar> Blocks<S> {
 /// next                ½C_q + C_v/h           ½M_q + M_v/h
 /// inputs              a h f_u                h f_u
 /// ```
+///
+/// Ball joints weigh their rows and columns with the maps of their [`Turning`]; what is next of a
+/// prescribed one is how it turns, too.
 #[derive(Clone, Debug)]
 pub(crate) struct StepBlocks<S = f64> {
     /// At the midpoint.
@@ -186,7 +204,7 @@ pub(crate) struct StepBlocks<S = f64> {
     pub(crate) hessian: Vec<S>,
     /// Where to evaluate: configuration at the start, n.
     pub(crate) q_start: Vec<S>,
-    /// Increments of dynamic coordinates, next positions of prescribed ones.
+    /// Increments of dynamic coordinates and of all ball joints, next positions of prescribed ones.
     pub(crate) next: Vec<S>,
     pub(crate) multipliers: Vec<S>,
     pub(crate) inputs: Vec<S>,
@@ -209,12 +227,29 @@ pub(crate) struct StepBlocks<S = f64> {
     pub(crate) momentum_inputs: Vec<S>,
     /// Rows and columns of the blocks that may differ from zero.
     pattern: Vec<(usize, usize)>,
+    /// Maps of the ball joints.
+    pub(crate) turnings: Vec<Turning<S>>,
+    /// With ball joints: `Dh(q[k+1])` by the start and by what is next, nc by n.
+    end_by_start: Vec<S>,
+    end_by_next: Vec<S>,
+    /// With ball joints: torque, momentum and force by the start and by what is next, for up to three
+    /// rows, n each.
+    turned_rows: Vec<[Slopes<S>; 2]>,
+}
+
+/// Derivatives of torque `τ = L_q`, momentum `m = L_v` and force `f` of one coordinate.
+#[derive(Clone, Copy, Debug, Default)]
+struct Slopes<S> {
+    torque: S,
+    momentum: S,
+    force: S,
 }
 
 impl<S: Scalar> StepBlocks<S> {
     pub(crate) fn new(model: &Model) -> Self {
         let d = model.dimensions;
         let (n, nd, ni, nc) = (d.coordinates(), d.dynamic, d.inputs, d.constraints);
+        let no = model.orientations.len();
         let zeros = |len: usize| vec![S::ZERO; len];
         let mid = Blocks::new(model);
         let pattern = mid.pattern(model);
@@ -230,7 +265,7 @@ impl<S: Scalar> StepBlocks<S> {
             q_mid: zeros(n),
             velocity: zeros(n),
             q_end: zeros(n),
-            orientations: [0; 3].map(|_| vec![Mat3::IDENTITY; model.orientations.len()]),
+            orientations: [0; 3].map(|_| vec![Mat3::IDENTITY; no]),
             residual_start: zeros(nd * n),
             residual_next: zeros(nd * n),
             residual_inputs: zeros(nd * ni),
@@ -238,6 +273,19 @@ impl<S: Scalar> StepBlocks<S> {
             momentum_next: zeros(nd * n),
             momentum_inputs: zeros(nd * ni),
             pattern,
+            turnings: Vec::with_capacity(no),
+            end_by_start: zeros(if no > 0 { nc * n } else { 0 }),
+            end_by_next: zeros(if no > 0 { nc * n } else { 0 }),
+            turned_rows: vec![Default::default(); if no > 0 { 3 * n } else { 0 }],
+        }
+    }
+
+    /// `Dh(q[k+1])` by the start, with the increment of dynamic coordinates kept, and by what is next.
+    pub(crate) fn end_jacobians(&self) -> [&[S]; 2] {
+        if self.orientations[0].is_empty() {
+            [&self.end.jacobian, &self.end.jacobian]
+        } else {
+            [&self.end_by_start, &self.end_by_next]
         }
     }
 
@@ -251,6 +299,15 @@ impl<S: Scalar> StepBlocks<S> {
             self.velocity[i] = moved * (1.0 / h);
             self.q_end[i] = end;
         }
+        self.turnings.clear();
+        for (o, &i) in model.orientations.iter().enumerate() {
+            let turn = Vec3([self.next[i], self.next[i + 1], self.next[i + 2]]);
+            self.velocity[i..i + 3].copy_from_slice(&turn.scaled(1.0 / h).0);
+            let start = self.orientations[0][o];
+            self.orientations[1][o] = start.times(&rotation::exp(turn.scaled(0.5)));
+            self.orientations[2][o] = start.times(&rotation::exp(turn));
+            self.turnings.push(Turning::new(model, i, turn, h));
+        }
     }
 
     /// Evaluates all blocks at `q_start`, `next`, `multipliers`, `inputs`.
@@ -262,6 +319,9 @@ impl<S: Scalar> StepBlocks<S> {
             self.evaluate_start(model);
             self.end.evaluate(model, &self.q_end, &self.orientations[2]);
             self.end.differentiate(model, &self.q_end);
+            if !self.turnings.is_empty() {
+                self.turn_end(model);
+            }
             let rows = model.dimensions.dynamic * model.dimensions.coordinates();
             for (block, h) in self.residual_start.iter_mut().zip(&self.hessian[..rows]) {
                 *block -= *h;
@@ -286,7 +346,7 @@ impl<S: Scalar> StepBlocks<S> {
     }
 
     /// Writes the blocks without constraints.
-    fn assemble(&mut self, model: &Model, settings: &Settings) {
+    pub(crate) fn assemble(&mut self, model: &Model, settings: &Settings) {
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
         let h = settings.time_step_s;
         let split = h * settings.force_split.at_start();
@@ -313,6 +373,160 @@ impl<S: Scalar> StepBlocks<S> {
         for (entry, f_u) in mid.f_u.iter().enumerate() {
             self.residual_inputs[entry] = *f_u * split;
             self.momentum_inputs[entry] = *f_u * h;
+        }
+        if !self.turnings.is_empty() {
+            self.assemble_turned(model, settings);
+        }
+    }
+
+    /// Writes the rows and columns of ball joints.
+    fn assemble_turned(&mut self, model: &Model, settings: &Settings) {
+        let (n, nd, ni) =
+            (model.dimensions.coordinates(), model.dimensions.dynamic, model.dimensions.inputs);
+        let h = settings.time_step_s;
+        let split = h * settings.force_split.at_start();
+        let skew = 2.0 * split - h;
+        let ball_at = |i: usize| self.turnings.iter().position(|t| t.coordinate == i);
+        let mut i = 0;
+        while i < nd {
+            let ball = ball_at(i);
+            let rows = if ball.is_some() { 3 } else { 1 };
+            for row in 0..rows {
+                turn_columns(
+                    &self.mid,
+                    &self.turnings,
+                    nd,
+                    h,
+                    i + row,
+                    &mut self.turned_rows[row * n..][..n],
+                );
+            }
+            let Some(ball) = ball else {
+                for t in &self.turnings {
+                    for j in t.coordinate..t.coordinate + 3 {
+                        let [start, next] = self.turned_rows[j];
+                        let residual =
+                            |s: Slopes<S>| s.torque * (0.5 * h) - s.momentum + s.force * split;
+                        let momentum = |s: Slopes<S>| (s.torque + s.force) * h;
+                        self.residual_start[i * n + j] = residual(start);
+                        self.residual_next[i * n + j] = residual(next);
+                        self.momentum_start[i * n + j] = momentum(start);
+                        self.momentum_next[i * n + j] = momentum(next);
+                    }
+                }
+                i += 1;
+                continue;
+            };
+            let turning = self.turnings[ball];
+            let weighed = |torque: Vec3<S>, momentum: Vec3<S>, force: Vec3<S>| {
+                let impulse = torque.scaled(0.5 * h) + force.scaled(split);
+                let residual = turning.torque.apply(impulse) - turning.momentum.apply(momentum);
+                let split_force = (turning.torque.apply(force) - force).scaled(skew);
+                let change =
+                    (torque + force).scaled(h) + momentum.cross(turning.turn) + split_force;
+                (residual, change)
+            };
+            for j in 0..n {
+                for (which, (residual, momentum)) in [
+                    (&mut self.residual_start, &mut self.momentum_start),
+                    (&mut self.residual_next, &mut self.momentum_next),
+                ]
+                .into_iter()
+                .enumerate()
+                {
+                    let s = [0, 1, 2].map(|a| self.turned_rows[a * n + j][which]);
+                    let (r, p) = weighed(
+                        Vec3(s.map(|s| s.torque)),
+                        Vec3(s.map(|s| s.momentum)),
+                        Vec3(s.map(|s| s.force)),
+                    );
+                    for a in 0..3 {
+                        residual[(i + a) * n + j] = r[a];
+                        momentum[(i + a) * n + j] = p[a];
+                    }
+                }
+            }
+            // The maps turn with the joint's own increment.
+            let three = |v: &[S]| Vec3([v[i], v[i + 1], v[i + 2]]);
+            let (torque, momentum, force) =
+                (three(&self.mid.l_q), three(&self.mid.l_v), three(&self.mid.force));
+            let impulse = torque.scaled(0.5 * h) + force.scaled(split);
+            let [residuals, forces] = turning.by_turn(impulse, momentum, force);
+            for b in 0..3 {
+                let mut axis = Vec3::ZERO;
+                axis.0[b] = S::ONE;
+                let change = momentum.cross(axis) + forces[b].scaled(skew);
+                for a in 0..3 {
+                    self.residual_next[(i + a) * n + i + b] += residuals[b][a];
+                    self.momentum_next[(i + a) * n + i + b] += change[a];
+                }
+            }
+            for j in 0..ni {
+                let f_u = Vec3([0, 1, 2].map(|a| self.mid.f_u[(i + a) * ni + j]));
+                let (residual, momentum) = weighed(Vec3::ZERO, Vec3::ZERO, f_u);
+                for a in 0..3 {
+                    self.residual_inputs[(i + a) * ni + j] = residual[a];
+                    self.momentum_inputs[(i + a) * ni + j] = momentum[a];
+                }
+            }
+            i += 3;
+        }
+    }
+
+    /// The constraint Jacobian at the end by the start and by what is next.
+    fn turn_end(&mut self, model: &Model) {
+        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
+        self.end_by_start.copy_from_slice(&self.end.jacobian);
+        self.end_by_next.copy_from_slice(&self.end.jacobian);
+        for t in self.turnings.iter().filter(|t| t.coordinate < nd) {
+            let range = t.coordinate..t.coordinate + 3;
+            let rows = self.end.jacobian.chunks_exact(n);
+            let turned =
+                self.end_by_start.chunks_exact_mut(n).zip(self.end_by_next.chunks_exact_mut(n));
+            for (row, (by_start, by_next)) in rows.zip(turned) {
+                let gradient = Vec3([0, 1, 2].map(|a| row[t.coordinate + a]));
+                by_start[range.clone()].copy_from_slice(&t.carried.apply_transposed(gradient).0);
+                by_next[range.clone()].copy_from_slice(&t.to_end.apply_transposed(gradient).0);
+            }
+        }
+    }
+}
+
+/// Derivatives of torque, momentum and force of coordinate `row` by the start and by what is next.
+fn turn_columns<S: Scalar>(
+    mid: &Blocks<S>,
+    turnings: &[Turning<S>],
+    nd: usize,
+    h: f64,
+    row: usize,
+    out: &mut [[Slopes<S>; 2]],
+) {
+    let n = out.len();
+    for (j, out) in out.iter_mut().enumerate() {
+        let (entry, mirrored) = (row * n + j, j * n + row);
+        let slopes = |position: f64, velocity: f64| Slopes {
+            torque: mid.l_qq[entry] * position + mid.l_qv[entry] * velocity,
+            momentum: mid.l_qv[mirrored] * position + mid.l_vv[entry] * velocity,
+            force: mid.f_q[entry] * position + mid.f_v[entry] * velocity,
+        };
+        let start = if j < nd { slopes(1.0, 0.0) } else { slopes(0.5, -1.0 / h) };
+        *out = [start, slopes(0.5, 1.0 / h)];
+    }
+    for t in turnings {
+        let c = t.coordinate;
+        let in_row = |m: &[S]| Vec3([0, 1, 2].map(|b| m[row * n + c + b]));
+        let in_column = Vec3([0, 1, 2].map(|b| mid.l_qv[(c + b) * n + row]));
+        let by_position = [in_row(&mid.l_qq), in_column, in_row(&mid.f_q)];
+        let by_velocity = [in_row(&mid.l_qv), in_row(&mid.l_vv), in_row(&mid.f_v)];
+        for (which, (position, velocity)) in [t.by_start, t.by_next].into_iter().enumerate() {
+            let [torque, momentum, force] = [0, 1, 2].map(|k| {
+                position.apply_transposed(by_position[k])
+                    + velocity.apply_transposed(by_velocity[k])
+            });
+            for b in 0..3 {
+                out[c + b][which] =
+                    Slopes { torque: torque[b], momentum: momentum[b], force: force[b] };
+            }
         }
     }
 }

@@ -23,8 +23,11 @@
 use nalgebra::DMatrix;
 
 use crate::Model;
+use crate::plant::balls::Turning;
+use crate::plant::newton::Workspace;
 use crate::plant::rows::{add_rows, padded};
 use crate::plant::{Plant, StepError, springs};
+use crate::spatial::{Mat3, Vec3};
 
 /// The exact first-order linearization of one step, preallocated.
 #[derive(Clone, Debug)]
@@ -43,6 +46,8 @@ pub struct Linearization {
     momentum: Vec<f64>,
     /// `λ'`, row-major, nc rows.
     multipliers: Vec<f64>,
+    /// How ball joints turn in the step.
+    turnings: Vec<Turning>,
 }
 
 impl Linearization {
@@ -60,6 +65,7 @@ impl Linearization {
             increment: vec![0.0; d.dynamic * stride],
             momentum: vec![0.0; d.dynamic * stride],
             multipliers: vec![0.0; d.constraints * stride],
+            turnings: Vec::with_capacity(model.orientations.len()),
         }
     }
 
@@ -77,6 +83,20 @@ impl Linearization {
         }
         for k in 0..nk {
             a[(n + nd + k, nd + k)] = -1.0 / self.time_step_s;
+        }
+        for t in &self.turnings {
+            let i = t.coordinate;
+            if i < nd {
+                a[(i, i)] -= 1.0;
+                a[(i + 1, i + 1)] -= 1.0;
+                a[(i + 2, i + 2)] -= 1.0;
+                turn_rows(&t.to_end, i, &mut a);
+                add_block(&t.carried, (i, i), &mut a);
+            } else {
+                let v = n + i;
+                a.view_mut((v, i), (3, 3)).fill(0.0);
+                add_block(&t.momentum.transpose().scaled(-1.0 / self.time_step_s), (v, i), &mut a);
+            }
         }
         a
     }
@@ -102,6 +122,16 @@ impl Linearization {
             }
             b[(nd + k, ni + k)] = 1.0;
             b[(n + nd + k, ni + k)] = 1.0 / self.time_step_s;
+        }
+        for t in &self.turnings {
+            let i = t.coordinate;
+            if i < nd {
+                turn_rows(&t.to_end, i, &mut b);
+            } else {
+                let at = (n + i, ni + i - nd);
+                b.view_mut(at, (3, 3)).fill(0.0);
+                add_block(&t.momentum.scaled(1.0 / self.time_step_s), at, &mut b);
+            }
         }
         b
     }
@@ -160,6 +190,50 @@ impl Linearization {
     }
 }
 
+/// Multiplies three rows, beginning at `i`, by a matrix.
+fn turn_rows(by: &Mat3, i: usize, matrix: &mut DMatrix<f64>) {
+    for column in matrix.column_iter_mut() {
+        let mut column = column;
+        let turned = by.apply(Vec3([column[i], column[i + 1], column[i + 2]]));
+        column.rows_mut(i, 3).copy_from_slice(&turned.0);
+    }
+}
+
+/// Adds a 3 by 3 block.
+fn add_block(block: &Mat3, (row, column): (usize, usize), matrix: &mut DMatrix<f64>) {
+    for (b, entries) in block.0.iter().enumerate() {
+        for a in 0..3 {
+            matrix[(row + a, column + b)] += entries[a];
+        }
+    }
+}
+
+impl Workspace {
+    /// Takes the derivatives with ball joints.
+    fn take_turned(&mut self, out: &mut Linearization) {
+        let Some(blocks) = &self.turned else { return };
+        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
+        let (n, next) = (nd + nk, out.next_columns());
+        out.turnings.extend_from_slice(&blocks.turnings);
+        for i in 0..nd {
+            let row = i * n..(i + 1) * n;
+            let (increment, momentum) = (
+                &mut out.increment[i * stride..][..stride],
+                &mut out.momentum[i * stride..][..stride],
+            );
+            increment[..n].copy_from_slice(&blocks.residual_start[row.clone()]);
+            increment[next..][..nk].copy_from_slice(&blocks.residual_next[row.clone()][nd..]);
+            momentum[nd..n].copy_from_slice(&blocks.momentum_start[row.clone()][nd..]);
+            momentum[next..][..nk].copy_from_slice(&blocks.momentum_next[row.clone()][nd..]);
+            increment[n + i] = 1.0;
+            momentum[n + i] = 1.0;
+            self.stiffness[i * nd..][..nd]
+                .copy_from_slice(&blocks.momentum_start[row.clone()][..nd]);
+            self.end_slopes[i * nd..][..nd].copy_from_slice(&blocks.momentum_next[row][..nd]);
+        }
+    }
+}
+
 impl Plant {
     /// Linearizes at the solution in the workspace.
     pub(crate) fn linearize_solution(&mut self, out: &mut Linearization) -> Result<(), StepError> {
@@ -178,7 +252,9 @@ impl Plant {
         self.fill_right_hand_sides(out);
         let workspace = &mut self.workspace;
         // Without inertia or springs on prescribed joints, the columns of `k` in r1' are zero.
-        let moving = !self.model.mixed_pairs.is_empty() || !self.model.point_springs.is_empty();
+        let moving = !self.model.mixed_pairs.is_empty()
+            || !self.model.point_springs.is_empty()
+            || !self.model.orientations.is_empty();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
         workspace.matrix.solve_rows(
             &self.model.elimination,
@@ -205,6 +281,12 @@ impl Plant {
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
         out.increment.fill(0.0);
         out.momentum.fill(0.0);
+        out.turnings.clear();
+        if !model.orientations.is_empty() {
+            workspace.evaluate_turned(model, &self.settings, &self.state);
+            workspace.take_turned(out);
+            return;
+        }
         workspace.stiffness.fill(0.0);
         workspace.end_slopes.fill(0.0);
         for pair in &model.pairs {
@@ -316,9 +398,13 @@ impl Plant {
         let next = out.next_columns();
         for (c, constraint) in model.constraints.iter().enumerate() {
             let jacobian = &workspace.end.jacobian[c * n..][..n];
+            let by_start = match &workspace.turned {
+                None => jacobian,
+                Some(blocks) => &blocks.end_jacobians()[0][c * n..][..n],
+            };
             let target = &mut out.multipliers[c * stride..][..stride];
             target.fill(0.0);
-            target.iter_mut().zip(&jacobian[..nd]).for_each(|(t, entry)| *t = -entry);
+            target.iter_mut().zip(&by_start[..nd]).for_each(|(t, entry)| *t = -entry);
             target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
             let dynamic = constraint.points.path.iter().map(|joint| joint.coordinate);
             workspace.terms.clear();
@@ -339,8 +425,10 @@ impl Plant {
         let (model, workspace) = (&self.model, &mut self.workspace);
         let d = model.dimensions;
         let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
-        for (i, c) in model.damping.iter().enumerate() {
-            workspace.end_slopes[i * nd + i] -= c;
+        if model.orientations.is_empty() {
+            for (i, c) in model.damping.iter().enumerate() {
+                workspace.end_slopes[i * nd + i] -= c;
+            }
         }
         for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
             let stiffness = &workspace.stiffness[i * nd..][..nd];

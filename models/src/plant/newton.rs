@@ -11,6 +11,7 @@
 //! measured in units of its own round-off; the solver stops where arithmetic does.
 
 use crate::Model;
+use crate::plant::blocks::StepBlocks;
 use crate::plant::closure::{Closure, larger};
 use crate::plant::curvature::Curvature;
 use crate::plant::kinematics::Poses;
@@ -47,6 +48,8 @@ pub(crate) struct Workspace {
     pub(crate) orientations_end: Vec<Mat3>,
     /// How ball joints turn over the step, in their own axes.
     pub(crate) turns: Vec<Vec3>,
+    /// Derivatives with ball joints; none without.
+    pub(crate) turned: Option<Box<StepBlocks>>,
     /// Velocity over the step.
     pub(crate) velocity: Vec<f64>,
     pub(crate) l_q: Vec<f64>,
@@ -115,6 +118,7 @@ impl Workspace {
             orientations_mid: vec![Mat3::IDENTITY; no],
             orientations_end: vec![Mat3::IDENTITY; no],
             turns: vec![Vec3::ZERO; no],
+            turned: (no > 0).then(|| Box::new(StepBlocks::new(model))),
             velocity: zeros(n),
             l_q: zeros(nd),
             l_v: zeros(nd),
@@ -199,6 +203,8 @@ impl Workspace {
 
     /// The end of this step is the start of the next.
     pub(crate) fn move_on(&mut self) {
+        // With ball joints the Jacobian at the end is one by the increment.
+        self.end_is_exact &= self.turns.is_empty();
         if self.end_is_exact {
             std::mem::swap(&mut self.start, &mut self.end);
         }
@@ -374,6 +380,9 @@ impl Workspace {
         self.factor_newton_matrix(model, settings)?;
         if model.dimensions.constraints > 0 {
             self.end.differentiate(model, &self.q_end);
+            if !model.orientations.is_empty() {
+                self.turn_end_jacobian(model);
+            }
             self.factor_schur(model, settings)?;
         }
         Ok(())
@@ -381,6 +390,10 @@ impl Workspace {
 
     /// Fills `K` at the last evaluation.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
+        if !model.orientations.is_empty() {
+            self.fill_turned_newton_matrix(model, settings);
+            return;
+        }
         let h = settings.time_step_s;
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         if !model.point_springs.is_empty() {
@@ -531,6 +544,9 @@ impl Workspace {
             self.place_end(model, state);
             self.end.evaluate(model, &self.q_end, &self.orientations_end);
             self.end.differentiate(model, &self.q_end);
+            if !model.orientations.is_empty() {
+                self.turn_end_jacobian(model);
+            }
             self.end_is_exact = true;
         }
     }

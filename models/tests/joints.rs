@@ -1,0 +1,199 @@
+//! Joints beyond hinges and slides: closed forms, conservation, derivatives on the manifold.
+
+mod common;
+
+use common::{SPLITS, builtin, plant, wave, waving_input};
+use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
+use plantd_models::{ForceSplit, Initial, Linearization, Plant, Scene, State};
+
+fn element(name: &str) -> Scene {
+    let path = format!("{}/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+    Scene::from_toml(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+/// Sixth-order central difference of a function with values `q`, `p`, `λ`.
+fn slope(delta: f64, mut along: impl FnMut(f64) -> Vec<f64>) -> Vec<f64> {
+    let stencil = [(1.0, 3.0 / 4.0), (2.0, -3.0 / 20.0), (3.0, 1.0 / 60.0)];
+    let mut sum = Vec::new();
+    for (k, weight) in stencil {
+        let (ahead, behind) = (along(k * delta), along(-k * delta));
+        sum.resize(ahead.len(), 0.0);
+        for ((sum, a), b) in sum.iter_mut().zip(ahead).zip(behind) {
+            *sum += weight / delta * (a - b);
+        }
+    }
+    sum
+}
+
+/// The linearization of a step against differences on the manifold.
+fn check_derivatives(scene: &Scene, split: ForceSplit) {
+    let mut plant = plant(scene, |s| s.force_split = split);
+    wave(&mut plant, 20);
+    let model = plant.model().clone();
+    let (d, x, u) = (model.dimensions(), plant.state(), waving_input(&plant, 23));
+    let mut out = Linearization::new(&model);
+    plant.linearize(&u, &mut out).unwrap();
+    let next = |plant: &mut Plant, x: &State, u: &[f64]| {
+        let initial = Initial::Momentum { q: x.q.clone(), p: x.p.clone(), v: x.v.clone() };
+        plant.initialize(&initial).unwrap();
+        plant.step(u).unwrap();
+        plant.state()
+    };
+    let nominal = next(&mut plant, &x, &u);
+    let result = |plant: &mut Plant, x: &State, u: &[f64]| {
+        let end = next(plant, x, u);
+        [model.difference(&nominal.q, &end.q), end.p, end.v, end.multipliers].concat()
+    };
+    let stack = |x: DMatrix<f64>, multipliers: DMatrix<f64>| {
+        let mut rows = x.resize_vertically(d.state() + d.constraints, 0.0);
+        rows.rows_mut(d.state(), d.constraints).copy_from(&multipliers);
+        rows
+    };
+    let (by_x, by_u) =
+        (stack(out.a(), out.multipliers_x()), stack(out.b(), out.multipliers_u()));
+    let n = d.coordinates();
+    for column in 0..d.state() + d.input() {
+        let (predicted, delta) = if column < d.state() {
+            let mobility = by_x.view((0, column), (n, 1)).amax();
+            (by_x.column(column), if column < n { 1e-3 } else { (2e-3 / mobility).min(0.1) })
+        } else {
+            let column = column - d.state();
+            let mobility = by_u.view((0, column), (n, 1)).amax();
+            (by_u.column(column), if column < d.inputs { (2e-3 / mobility).min(0.1) } else { 1e-3 })
+        };
+        let found = slope(delta, |s| {
+            let (mut x, mut u) = (x.clone(), u.clone());
+            if column < n {
+                let mut change = vec![0.0; n];
+                change[column] = s;
+                x.q = model.retract(&x.q, &change);
+            } else if column < d.state() {
+                let (p, v) = (&mut x.p, &mut x.v);
+                *p.iter_mut().chain(v).nth(column - n).unwrap() += s;
+            } else if column < d.state() + d.inputs {
+                u[column - d.state()] += s;
+            } else {
+                let mut end = x.q.clone();
+                end[d.dynamic..].copy_from_slice(&u[d.inputs..]);
+                let mut change = vec![0.0; n];
+                change[d.dynamic + column - d.state() - d.inputs] = s;
+                u[d.inputs..].copy_from_slice(&model.retract(&end, &change)[d.dynamic..]);
+            }
+            result(&mut plant, &x, &u)
+        });
+        let scale = found.iter().fold(1e-3_f64, |a, x| a.max(x.abs()));
+        for (row, (p, f)) in predicted.iter().zip(&found).enumerate() {
+            assert!(
+                (p - f).abs() < 1e-8 * scale,
+                "{} {split:?}: [{row}, {column}] is {p}, differences {f}",
+                scene.name
+            );
+        }
+    }
+}
+
+#[test]
+fn derivatives_on_the_manifold() {
+    for name in ["screw", "universal", "ball", "free"] {
+        for split in SPLITS {
+            check_derivatives(&element(name), split);
+        }
+    }
+    check_derivatives(&builtin("spherical-pendulum"), ForceSplit::Symmetric);
+}
+
+/// `(I + m p²) q̈ = −m g p`: gravity drives a nut down its thread.
+#[test]
+fn a_nut_runs_down_its_thread() {
+    let mut scene = element("screw");
+    scene.coordinates[0].damping = None;
+    let mut plant = plant(&scene, |_| {});
+    let (mass, pitch, inertia) = (0.4, 0.02, 3e-4 + 0.4 * 0.01 * 0.01);
+    let acceleration = -mass * 9.81 * pitch / (inertia + mass * pitch * pitch);
+    for k in 1..=200 {
+        plant.step(&[]).unwrap();
+        let t = 0.01 * f64::from(k);
+        let exact = 0.5 * acceleration * t * t;
+        assert!((plant.q()[0] - exact).abs() < 1e-12 * exact.abs().max(1.0), "{k}");
+    }
+}
+
+#[test]
+fn a_universal_joint_is_two_hinges() {
+    let text = element("universal").to_toml();
+    let scene = Scene::from_toml(&text).unwrap();
+    let hinges = Scene::from_toml(
+        &text
+            .replace("[frames.joint]\ntype = \"universal\"", "[frames.joint]\ntype = \"revolute\"")
+            .replace("axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]", "axis = [0.0, 1.0, 0.0]\ncoordinate = \"bob_2\"")
+            .replace("name = \"bob\"\n", "name = \"bob\"\nparent = \"yoke\"\n")
+            .replacen(
+                "[[frames]]",
+                "[[frames]]\nname = \"yoke\"\njoint = { type = \"revolute\", axis = [1.0, 0.0, 0.0], coordinate = \"bob_1\" }\n\n[[frames]]",
+                1,
+            ),
+    )
+    .unwrap();
+    let (mut a, mut b) = (plant(&scene, |_| {}), plant(&hinges, |_| {}));
+    for _ in 0..200 {
+        a.step(&[]).unwrap();
+        b.step(&[]).unwrap();
+        assert_eq!(a.q(), b.q());
+    }
+}
+
+/// A ball joint and three hinges with massless yokes are two charts of one body: the same motion to
+/// second order in the time step.
+#[test]
+fn a_ball_joint_moves_like_three_hinges() {
+    let ball = element("ball");
+    let mut hinges = ball.clone();
+    let body = hinges.frames[0].body.take();
+    hinges.frames.clear();
+    for (i, (name, parent)) in [("z", "world"), ("y", "z"), ("x", "y")].iter().enumerate() {
+        let mut axis = [0.0; 3];
+        axis[2 - i] = 1.0;
+        hinges.frames.push(plantd_models::scene::Frame {
+            name: (*name).to_owned(),
+            parent: (*parent).to_owned(),
+            translation: [0.0; 3],
+            rotation: None,
+            joint: Some(plantd_models::scene::Joint::Revolute { axis, coordinate: None }),
+            body: if i == 2 { body.clone() } else { None },
+        });
+    }
+    hinges.coordinates.clear();
+    hinges.inputs.clear();
+    let angles = [0.3, -0.4, 0.7];
+    let orientation = |q: &[f64]| {
+        let turn = |axis: Vector3<f64>, angle: f64| *Rotation3::new(axis * angle).matrix();
+        turn(Vector3::z(), q[0]) * turn(Vector3::y(), q[1]) * turn(Vector3::x(), q[2])
+    };
+    // Angular velocity in the body for rates of the angles.
+    let rates = [2.0, -1.0, 30.0];
+    let spin = {
+        let [_, y, x] = angles;
+        let (x_turn, y_turn) = (Rotation3::new(Vector3::x() * x), Rotation3::new(Vector3::y() * y));
+        Vector3::x() * rates[2]
+            + x_turn.inverse() * (Vector3::y() * rates[1])
+            + (y_turn * x_turn).inverse() * (Vector3::z() * rates[0])
+    };
+    let start = Rotation3::from_matrix_unchecked(orientation(&angles)).scaled_axis();
+    let error = |h: f64| {
+        let (mut a, mut b) =
+            (plant(&ball, |s| s.time_step_s = h), plant(&hinges, |s| s.time_step_s = h));
+        a.initialize(&Initial::Velocity { q: start.as_slice().to_vec(), v: spin.as_slice().to_vec() })
+            .unwrap();
+        b.initialize(&Initial::Velocity { q: angles.to_vec(), v: rates.to_vec() }).unwrap();
+        let steps = (0.2 / h).round() as usize;
+        for _ in 0..steps {
+            a.step(&[0.0]).unwrap();
+            b.step(&[]).unwrap();
+        }
+        let turned: Matrix3<f64> =
+            *Rotation3::new(Vector3::from_row_slice(a.q())).matrix();
+        (turned - orientation(b.q())).amax()
+    };
+    let (coarse, fine) = (error(4e-4), error(2e-4));
+    assert!(coarse < 1e-3 && (3.8..4.2).contains(&(coarse / fine)), "{coarse:e} {fine:e}");
+}
