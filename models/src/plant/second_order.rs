@@ -25,11 +25,15 @@
 use nalgebra::DMatrix;
 
 use crate::Model;
+use crate::plant::balls::{Turning, rotation_vector};
 use crate::plant::blocks::{StepBlocks, non_zero};
 use crate::plant::linearize::Linearization;
+use crate::plant::newton::Workspace;
 use crate::plant::rows::{Term, add_rows, padded};
 use crate::plant::{Plant, StepError, StepReport};
+use crate::rotation;
 use crate::scalar::Dual;
+use crate::spatial::{Mat3, Vec3};
 
 /// Full tensors with more numbers than this are refused: 1 GiB.
 const ENTRIES_MAX: usize = 1 << 27;
@@ -326,7 +330,11 @@ impl Plant {
         assert_layout(&self.model, &out.scratch);
         first.write_tangent(out.scratch.layout.stride, &mut out.scratch.tangent);
         self.find_adjoint(weights_x, weights_multipliers, out);
-        self.contract_gradients(u, out);
+        if self.model.orientations.is_empty() {
+            self.contract_gradients(u, out);
+        } else {
+            self.contract_directions(u, weights_x, out);
+        }
         out.finish();
         Ok(report)
     }
@@ -348,10 +356,11 @@ impl Plant {
         let rows = (2 * nd + nc) * stride;
         for (a, block) in tensor.chunks_exact_mut(rows).enumerate() {
             scratch.seed(a, &self.state.q, u, &workspace.increment, &workspace.multipliers);
+            scratch.seed_orientations(a, model, workspace);
             scratch.blocks.evaluate(model, &self.settings);
             let Scratch { layout, blocks, tangent, terms, .. } = scratch;
-            // Columns beyond `a` follow from symmetry.
-            let columns = padded(a + 1);
+            // Columns beyond `a` follow from symmetry, which ball joints reach only in the end.
+            let columns = if blocks.turnings.is_empty() { padded(a + 1) } else { stride };
             let (solved, momentum) = block.split_at_mut((nd + nc) * stride);
             let (residual, closing) = solved.split_at_mut(nd * stride);
 
@@ -372,10 +381,11 @@ impl Plant {
             }
             for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
                 let row = &mut row[..columns];
-                let jacobian = &blocks.end.jacobian[c * n..][..n];
-                layout.place_end(row, jacobian);
+                let [by_start, by_next] =
+                    blocks.end_jacobians().map(|jacobian| &jacobian[c * n..][..n]);
+                layout.place_end(row, by_start, by_next);
                 terms.clear();
-                terms.extend(non_zero(jacobian[..nd].iter().map(|entry| entry.eps)));
+                terms.extend(non_zero(by_next[..nd].iter().map(|entry| entry.eps)));
                 add_rows(row, tangent, stride, terms);
             }
 
@@ -409,6 +419,12 @@ impl Plant {
                 terms.extend(non_zero(slopes.chain(impulses)));
                 add_rows(&mut row[..columns], solved, stride, terms);
             }
+            for t in blocks.turnings.iter().filter(|t| t.coordinate < nd) {
+                layout.turn_rows(t, tangent, solved);
+            }
+        }
+        if !model.orientations.is_empty() {
+            symmetrise(tensor, rows, stride);
         }
     }
 
@@ -420,6 +436,11 @@ impl Plant {
         let z_p = &z[n..n + nd];
         let (first, second) = out.adjoint.split_at_mut(nd);
         first.copy_from_slice(&z[..nd]);
+        for &i in model.orientations.iter().filter(|i| **i < nd) {
+            let to_end = rotation::dexp(rotation_vector(&workspace.increment, i));
+            let turned = to_end.apply_transposed(rotation_vector(z, i));
+            first[i..i + 3].copy_from_slice(&turned.0);
+        }
         for (row, z) in workspace.end_slopes.chunks_exact(nd.max(1)).zip(z_p) {
             first.iter_mut().zip(row).for_each(|(entry, slope)| *entry += slope * z);
         }
@@ -445,6 +466,76 @@ impl Plant {
             out.alpha[i] = h * (0.5 * mu + z);
             out.beta[i] = -mu;
             out.impulse[i] = mu + z;
+        }
+    }
+
+    /// The sum with ball joints, whose tangent spaces do not commute: one evaluation of all blocks for
+    /// each parameter.
+    fn contract_directions(&mut self, u: &[f64], z: &[f64], out: &mut Contraction) {
+        let (model, workspace) = (&*self.model, &mut self.workspace);
+        let Contraction { scratch, adjoint, impulse, cofactor, sum, product, .. } = out;
+        let Layout { nd, nc, ni, stride, .. } = scratch.layout;
+        let (n, inputs, next) =
+            (scratch.layout.n(), scratch.layout.inputs(), scratch.layout.next());
+        sum.fill(0.0);
+        // What `x'` and `λ'` are multiplied with.
+        let by_unknown = &mut cofactor[..nd + nc];
+        for (a, row) in product.chunks_exact_mut(stride).enumerate() {
+            scratch.seed(a, &self.state.q, u, &workspace.increment, &workspace.multipliers);
+            scratch.seed_orientations(a, model, workspace);
+            scratch.blocks.evaluate(model, &self.settings);
+            let Scratch { blocks, tangent, terms, .. } = &mut *scratch;
+            row.fill(0.0);
+            by_unknown.fill(0.0);
+            let mut add_next = |row: &mut [f64], j: usize, value: f64| {
+                if j < nd {
+                    by_unknown[j] += value;
+                } else {
+                    row[next + j - nd] += value;
+                }
+            };
+            for i in 0..nd {
+                let (mu, z_p) = (adjoint[i], impulse[i] - adjoint[i]);
+                for j in 0..n {
+                    let at = i * n + j;
+                    row[j] +=
+                        mu * blocks.residual_start[at].eps + z_p * blocks.momentum_start[at].eps;
+                    let value =
+                        mu * blocks.residual_next[at].eps + z_p * blocks.momentum_next[at].eps;
+                    add_next(row, j, value);
+                }
+                for j in 0..ni {
+                    let at = i * ni + j;
+                    row[inputs + j] +=
+                        mu * blocks.residual_inputs[at].eps + z_p * blocks.momentum_inputs[at].eps;
+                }
+            }
+            let [by_start, by_next] = blocks.end_jacobians();
+            for (c, mu) in adjoint[nd..].iter().enumerate() {
+                for j in 0..n {
+                    if j < nd {
+                        row[j] += mu * by_start[c * n + j].eps;
+                    }
+                    add_next(row, j, mu * by_next[c * n + j].eps);
+                }
+            }
+            for t in blocks.turnings.iter().filter(|t| t.coordinate < nd) {
+                for (b, i) in (t.coordinate..t.coordinate + 3).enumerate() {
+                    for k in 0..3 {
+                        let z = z[t.coordinate + k];
+                        row[i] += z * t.carried.0[b][k].eps;
+                        add_next(row, i, z * t.to_end.0[b][k].eps);
+                    }
+                }
+            }
+            for c in 0..nc {
+                let turned = (0..nd).map(|i| impulse[i] * blocks.start.jacobian[c * n + i].eps);
+                by_unknown[nd + c] = -turned.sum::<f64>();
+            }
+            terms.clear();
+            terms.extend(non_zero(by_unknown.iter().copied()));
+            add_rows(row, tangent, stride, terms);
+            row.iter_mut().for_each(|entry| *entry *= 0.5);
         }
     }
 
@@ -559,10 +650,45 @@ impl Layout {
     }
 
     /// The same for a row of the constraint Jacobian at the end: a shift of the start moves both ends.
-    fn place_end(&self, row: &mut [f64], jacobian: &[Dual]) {
+    fn place_end(&self, row: &mut [f64], by_start: &[Dual], by_next: &[Dual]) {
         row.fill(0.0);
-        put(row, 0, &jacobian[..self.nd]);
-        put(row, self.next(), &jacobian[self.nd..]);
+        put(row, 0, &by_start[..self.nd]);
+        put(row, self.next(), &by_next[self.nd..]);
+    }
+
+    /// From `ξ''` of a ball joint to the second derivative of how its end turns, `dexp₋ξ ξ' + exp(−ξ) η`
+    /// once more along the direction of the duals.
+    fn turn_rows(&self, t: &Turning<Dual>, tangent: &[f64], rows: &mut [f64]) {
+        let (i, stride) = (t.coordinate, self.stride);
+        let entry = |m: &Mat3<Dual>, a: usize, b: usize| m.0[b][a];
+        for column in 0..stride {
+            let at = |b: usize| (i + b) * stride + column;
+            let second = [0, 1, 2].map(|b| rows[at(b)]);
+            for a in 0..3 {
+                let turned = (0..3).map(|b| {
+                    let to_end = entry(&t.to_end, a, b);
+                    to_end.re * second[b] + to_end.eps * tangent[at(b)]
+                });
+                rows[at(a)] = turned.sum();
+                if (i..i + 3).contains(&column) {
+                    rows[at(a)] += entry(&t.carried, a, column - i).eps;
+                }
+            }
+        }
+    }
+}
+
+/// Replaces the derivative along `a` of the tangent `b` by its mean with that along `b` of the tangent
+/// `a`: the second derivative in the chart `exp` of each ball joint. Their difference is a commutator.
+fn symmetrise(tensor: &mut [f64], rows: usize, stride: usize) {
+    let parameters = tensor.len() / rows;
+    for a in 0..parameters {
+        for b in 0..a {
+            for row in 0..rows / stride {
+                let lower = a * rows + row * stride + b;
+                tensor[lower] = 0.5 * (tensor[lower] + tensor[b * rows + row * stride + a]);
+            }
+        }
     }
 }
 
@@ -605,6 +731,33 @@ impl Scratch {
         }
         for (i, value) in u[..ni].iter().enumerate() {
             self.blocks.inputs[i] = Dual::new(*value, unit(a == inputs + i));
+        }
+    }
+}
+
+impl Scratch {
+    /// Places the ball joints at the solution, with the tangent of parameter `a`.
+    fn seed_orientations(&mut self, a: usize, model: &Model, workspace: &Workspace) {
+        let next = self.layout.next();
+        for (o, &i) in model.orientations.iter().enumerate() {
+            let axis = |first: usize| {
+                let mut axis = Vec3::ZERO;
+                if (first..first + 3).contains(&a) {
+                    axis.0[a - first] = 1.0;
+                }
+                axis
+            };
+            let (start, by_start) = (workspace.orientations_start[o], axis(i));
+            let along = |v: Vec3, rate: Vec3| Vec3([0, 1, 2].map(|k| Dual::new(v[k], rate[k])));
+            let rate = [0, 1, 2].map(|k| start.apply(by_start.cross(Mat3::IDENTITY.0[k])));
+            self.blocks.orientations[0][o] = Mat3([0, 1, 2].map(|k| along(start.0[k], rate[k])));
+            if i >= self.layout.nd {
+                let turn = workspace.turns[o];
+                let momentum = rotation::momentum_at_start(turn);
+                let rate = momentum.apply(axis(next + i - self.layout.nd))
+                    - momentum.apply_transposed(by_start);
+                self.blocks.next[i..i + 3].copy_from_slice(&along(turn, rate).0);
+            }
         }
     }
 }
