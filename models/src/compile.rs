@@ -9,15 +9,32 @@ use crate::model::{
     OperatingPoint, Pair, PathJoint, PointPair, PointSpring,
 };
 use crate::plant::conditioning::Conditioning;
-use crate::scene::{self, CoordinateKind, Length, Motion, Scene, SceneError, Spring};
+use crate::scene::{self, CoordinateKind, Length, Motion, Problem, Scene, SceneError, Spring};
 use crate::spatial::{Mat3, Sym3, Vec3};
 use crate::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.
     pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
-        let problems = scene.validate();
-        if problems.is_empty() { Ok(compile(scene)) } else { Err(SceneError { problems }) }
+        let problems = scene.problems();
+        if !problems.is_empty() {
+            return Err(SceneError { problems });
+        }
+        let model = compile(scene);
+        match model.always_singular() {
+            None => Ok(model),
+            Some(coordinate) => {
+                let moves = |frame: &scene::Frame| {
+                    frame.motions().iter().any(|(name, _)| name == coordinate)
+                };
+                let frame = scene.frames.iter().position(moves).unwrap_or_default();
+                let path = format!("frames[{frame}].joint");
+                let message = format!(
+                    "nothing resists coordinate `{coordinate}` in any configuration: no inertia, spring or damping that other coordinates do not meet too"
+                );
+                Err(SceneError { problems: vec![Problem { path, message }] })
+            }
+        }
     }
 }
 

@@ -305,3 +305,47 @@ fn thresholds_turn_estimates_into_errors() {
     let mut marionette = plant(&builtin("marionette"), |_| ());
     wave(&mut marionette, 20);
 }
+
+/// A pendulum whose rod may turn about itself, with its bob and damping.
+fn spinning(bob_at: f64, inertia: f64, damping: f64) -> Result<(), String> {
+    let text = format!(
+        r#"
+format = 1
+name = "spinning"
+gravity = [0.0, 0.0, -9.81]
+[[frames]]
+name = "swing"
+joint = {{ type = "revolute", axis = [0.0, 1.0, 0.0] }}
+[[frames]]
+name = "rod"
+parent = "swing"
+joint = {{ type = "revolute", axis = [0.0, 0.0, 1.0], coordinate = "spin" }}
+body = {{ mass = 1.0, center_of_mass = [{bob_at}, 0.0, -0.8], inertia = [0.1, 0.1, {inertia}] }}
+[[coordinates]]
+name = "spin"
+damping = {damping}
+"#
+    );
+    let scene = Scene::from_toml(&text).unwrap();
+    match plantd_models::Model::compile(&scene) {
+        Ok(_) => {
+            let mut plant = plant(&scene, |_| ());
+            plant.step(&[]).map(|_| ()).map_err(|error| error.to_string())
+        }
+        Err(error) => {
+            assert_eq!(scene.validate(), error.problems);
+            assert_eq!(error.problems[0].path, "frames[1].joint");
+            Err(error.problems[0].message.clone())
+        }
+    }
+}
+
+/// What can never move is refused with the scene; what resists, by whatever means, is not.
+#[test]
+fn mass_on_the_axis_of_its_hinge_is_refused() {
+    let message = spinning(0.0, 0.0, 0.0).unwrap_err();
+    assert!(message.contains("nothing resists coordinate `spin`"), "{message}");
+    for (bob_at, inertia, damping) in [(1e-3, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 0.1)] {
+        assert_eq!(spinning(bob_at, inertia, damping), Ok(()));
+    }
+}

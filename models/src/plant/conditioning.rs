@@ -14,12 +14,15 @@
 //! independent than there, the configuration is singular. A step that cannot be solved there names
 //! the constraints that lost their independence.
 
+use std::f64::consts::TAU;
+
 use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::Model;
 use crate::plant::balls::orientations;
 use crate::plant::closure::Closure;
-use crate::plant::{PreciseState, StepError};
+use crate::plant::newton::Workspace;
+use crate::plant::{PreciseState, Settings, StepError};
 use crate::tree::{JointKind, Rotational, WORLD};
 
 /// Configurations over which the steepness of a constraint is sampled.
@@ -83,20 +86,8 @@ impl Conditioning {
     fn weights(&self, model: &Model) -> Vec<f64> {
         let mut closure = Closure::new(model);
         let mut steepest = vec![0.0_f64; model.dimensions.constraints];
-        for sample in 0..=SAMPLES {
-            let q: Vec<f64> = model
-                .coordinates
-                .iter()
-                .enumerate()
-                .map(|(i, c)| {
-                    if sample == 0 || !c.is_angle || i >= model.dimensions.dynamic {
-                        return c.initial;
-                    }
-                    // Multiples of the golden ratio spread evenly over the circle.
-                    let turns = (sample * (i + 1)) as f64 * 0.618_033_988_749_894_9;
-                    c.initial + std::f64::consts::TAU * turns.fract()
-                })
-                .collect();
+        for k in 0..=SAMPLES {
+            let q = sample(model, k, 0.0);
             let rows = self.rows(model, &mut closure, &q);
             for (steepest, row) in steepest.iter_mut().zip(rows.row_iter()) {
                 *steepest = steepest.max(row.norm());
@@ -105,6 +96,18 @@ impl Conditioning {
         let largest = steepest.iter().fold(0.0_f64, |a, b| a.max(*b));
         steepest.iter().map(|s| if *s > FLAT * largest { 1.0 / s } else { 0.0 }).collect()
     }
+}
+
+/// The initial configuration, and after it configurations that differ from it in all angles and, by
+/// up to `slide`, in all lengths of the dynamic coordinates.
+fn sample(model: &Model, k: usize, slide: f64) -> Vec<f64> {
+    let mut q: Vec<f64> = model.coordinates.iter().map(|c| c.initial).collect();
+    for (i, c) in model.coordinates[..model.dimensions.dynamic].iter().enumerate() {
+        // Multiples of the golden ratio spread evenly.
+        let fraction = ((k * (i + 1)) as f64 * 0.618_033_988_749_894_9).fract();
+        q[i] += fraction * if c.is_angle { TAU } else { slide };
+    }
+    q
 }
 
 /// The largest inertia that each dynamic coordinate can have: every body of its subtree stretched
@@ -170,6 +173,25 @@ impl Model {
     /// Equations of constraints that are independent at the scene's initial configuration.
     pub(crate) fn constraint_rank(&self) -> usize {
         self.conditioning.independent.len()
+    }
+
+    /// A coordinate at which the Newton matrix is singular in every configuration, at rest: nothing
+    /// resists it, for example because all that it turns lies on its axis.
+    pub(crate) fn always_singular(&self) -> Option<&str> {
+        let settings = Settings::new(self);
+        let mut workspace = Workspace::new(self);
+        let mut culprit = None;
+        // Configurations where something is singular by chance are rare.
+        for k in (0..=SAMPLES).rev() {
+            workspace.q_mid = sample(self, k, 1.0);
+            workspace.orientations_mid = orientations(self, &workspace.q_mid);
+            workspace.evaluate_lagrangian(self);
+            match workspace.factor_newton_matrix(self, &settings) {
+                Err(StepError::Singular { coordinate, .. }) => culprit = Some(coordinate),
+                _ => return None,
+            }
+        }
+        self.coordinates.iter().find(|c| Some(&c.name) == culprit.as_ref()).map(|c| c.name.as_str())
     }
 
     /// Names of the equations that depend on equations before them at `q`.

@@ -4,6 +4,8 @@
 use crate::Model;
 use crate::plant::balls::{orientations, rotation_vector};
 use crate::plant::closure::Closure;
+use crate::plant::kinematics::Poses;
+use crate::plant::momenta::Momenta;
 use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::padded;
@@ -316,9 +318,29 @@ impl Plant {
         workspace.gradient_at(model, &self.state, &velocity);
         Energy {
             kinetic_j: 0.5 * workspace.momenta.twice_kinetic_energy(&model.dynamics, &velocity),
-            potential_j: workspace.potential_energy(model, &self.state.q),
+            potential_j: potential_energy(
+                model,
+                &workspace.poses,
+                &workspace.momenta,
+                &self.state.q,
+            ),
         }
     }
+}
+
+/// Potential energy of gravity and springs, with poses and momenta evaluated at `q`.
+pub(crate) fn potential_energy(model: &Model, poses: &Poses, momenta: &Momenta, q: &[f64]) -> f64 {
+    let tree = &model.dynamics;
+    let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
+    let weight: f64 = roots
+        .map(|(i, root)| {
+            let moment = momenta.moment[i] + poses.origin[i] * root.subtree_mass;
+            model.gravity.map_or(0.0, |g| g.dot(moment))
+        })
+        .sum();
+    let springs =
+        springs::potential(&model.coordinate_springs, &model.point_springs, tree, poses, q);
+    springs - weight
 }
 
 fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f64>, InitialError> {
@@ -352,26 +374,6 @@ impl Workspace {
             &mut self.l_q,
             &mut self.l_v,
         );
-    }
-
-    /// Potential energy of gravity and springs, with poses and momenta evaluated at `q`.
-    pub(crate) fn potential_energy(&self, model: &Model, q: &[f64]) -> f64 {
-        let tree = &model.dynamics;
-        let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
-        let weight: f64 = roots
-            .map(|(i, root)| {
-                let moment = self.momenta.moment[i] + self.poses.origin[i] * root.subtree_mass;
-                model.gravity.map_or(0.0, |g| g.dot(moment))
-            })
-            .sum();
-        let springs = springs::potential(
-            &model.coordinate_springs,
-            &model.point_springs,
-            tree,
-            &self.poses,
-            q,
-        );
-        springs - weight
     }
 
     /// `p = M(q) q̇` on the dynamic rows.

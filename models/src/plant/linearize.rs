@@ -137,6 +137,10 @@ impl Linearization {
     }
 
     /// `∂λ/∂x`, nc by `2 nd + 2 nk`.
+    ///
+    /// With redundant constraints it is the derivative of least norm: `Dh(q[k])ᵀ λ'` is the derivative
+    /// of the constraints' impulse; what `λ` itself, which has least norm at every state, changes by
+    /// along combinations of equations that exert no force is left out.
     pub fn multipliers_x(&self) -> DMatrix<f64> {
         let state_columns = self.next_columns();
         let rows = self.constraints();
@@ -145,7 +149,7 @@ impl Linearization {
         })
     }
 
-    /// `∂λ/∂u`, nc by `ni + nk`.
+    /// `∂λ/∂u`, nc by `ni + nk`; see [`Linearization::multipliers_x`].
     pub fn multipliers_u(&self) -> DMatrix<f64> {
         let ni = self.inputs.len();
         DMatrix::from_fn(self.constraints(), ni + self.nk, |c, j| {

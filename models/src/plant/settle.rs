@@ -5,7 +5,7 @@
 //! `A = Dh(q)` and `Z` a basis of the directions that `A` leaves free,
 //!
 //! ```text
-//! Aᵀ μ = −g  (least squares)       H = V_qq + Σ μ D²h       Zᵀ H Z = Q Λ Qᵀ
+//! Aᵀ μ = −g  (least squares)       H = V_qq − f_q + Σ μ D²h       Zᵀ H Z = Q Λ Qᵀ
 //! dq = −Z Q |Λ|⁻¹ Qᵀ Zᵀ g           q ← project(q + α dq)
 //! ```
 //!
@@ -17,10 +17,11 @@ use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::Model;
 use crate::control::tangent_basis;
+use crate::plant::Plant;
 use crate::plant::balls::orientations;
+use crate::plant::blocks::Blocks;
 use crate::plant::closure::Closure;
-use crate::plant::newton::Workspace;
-use crate::plant::{Plant, forces, springs};
+use crate::plant::initial::potential_energy;
 
 /// Iterations before the search is given up.
 const MAX_ITERATIONS: u32 = 300;
@@ -146,19 +147,10 @@ fn retract(model: &Model, q: &[f64], increment: &DVector<f64>) -> Vec<f64> {
     model.retract(q, &change)
 }
 
-impl Workspace {
-    /// Puts the midpoint to a configuration, without velocity.
-    fn stand_at(&mut self, model: &Model, q: &[f64]) {
-        self.q_mid.copy_from_slice(q);
-        self.velocity.fill(0.0);
-        self.orientations_mid = orientations(model, q);
-    }
-}
-
 /// A search in progress.
 struct Search<'a> {
     model: &'a Model,
-    workspace: Workspace,
+    blocks: Blocks,
     closure: Closure,
     inputs: Vec<f64>,
     /// Whether each dynamic coordinate may move.
@@ -204,8 +196,8 @@ impl<'a> Search<'a> {
                 *moves = false;
             }
         }
-        let workspace = plant.workspace.clone();
-        Ok(Self { model, workspace, closure: Closure::new(model), inputs, moves })
+        let (blocks, closure) = (Blocks::new(model), Closure::new(model));
+        Ok(Self { model, blocks, closure, inputs, moves })
     }
 
     fn run(&mut self, guess: &[f64]) -> Result<Equilibrium, SettleError> {
@@ -274,17 +266,14 @@ impl<'a> Search<'a> {
 
     /// Everything of first order at a configuration.
     fn point(&mut self, q: Vec<f64>) -> Point {
-        let (model, workspace) = (self.model, &mut self.workspace);
-        let nd = model.dimensions.dynamic;
-        workspace.stand_at(model, &q);
-        forces::input_forces(&model.inputs, &self.inputs, &mut workspace.input_force);
-        workspace.force.copy_from_slice(&workspace.input_force);
-        workspace.evaluate_lagrangian(model);
-        let force = DVector::from_column_slice(&workspace.force);
+        let (model, nd) = (self.model, self.model.dimensions.dynamic);
+        self.evaluate(&q);
+        let blocks = &self.blocks;
+        let force = DVector::from_column_slice(&blocks.force);
         let gradient = DVector::from_fn(nd, |i, _| {
-            if self.moves[i] { -(workspace.l_q[i] + workspace.force[i]) } else { 0.0 }
+            if self.moves[i] { -(blocks.l_q[i] + blocks.force[i]) } else { 0.0 }
         });
-        let potential = workspace.potential_energy(model, &q);
+        let potential = potential_energy(model, &blocks.poses, &blocks.momenta, &q);
         let mut rows = model.conditioning.rows(model, &mut self.closure, &q);
         for (j, _) in self.moves.iter().enumerate().filter(|(_, moves)| !**moves) {
             rows.column_mut(j).fill(0.0);
@@ -299,36 +288,21 @@ impl<'a> Search<'a> {
         Point { q, potential, force, gradient, rows, forces, unbalanced }
     }
 
-    /// `V_qq + Σ μ D²h` of the dynamic coordinates at the point evaluated last.
+    /// Everything that does not come from constraints, at rest.
+    fn evaluate(&mut self, q: &[f64]) {
+        let (model, at_rest) = (self.model, vec![0.0; q.len()]);
+        self.blocks.evaluate(model, (q, &orientations(model, q)), &at_rest, &self.inputs);
+    }
+
+    /// `V_qq − f_q + Σ μ D²h` of the dynamic coordinates, its symmetric part.
     fn stiffness(&mut self, point: &Point) -> DMatrix<f64> {
-        // The line search has been elsewhere.
         let (model, n) = (self.model, point.q.len());
         let nd = model.dimensions.dynamic;
-        let workspace = &mut self.workspace;
-        workspace.stand_at(model, &point.q);
-        workspace.evaluate_lagrangian(model);
-        workspace.curvature.evaluate(&model.dynamics, &workspace.poses, &workspace.momenta);
-        let mut stiffness = DMatrix::zeros(nd, nd);
-        for pair in &model.pairs {
-            let (i, j) = (pair.row as usize, pair.column as usize);
-            let (above, below) = (pair.ancestor as usize, pair.descendant as usize);
-            let second = workspace.curvature.pair(&workspace.momenta, model.gravity, above, below);
-            stiffness[(i, j)] = -second.qq;
-            stiffness[(j, i)] = -second.qq;
-        }
-        for spring in &model.coordinate_springs {
-            stiffness[(spring.coordinate, spring.coordinate)] += spring.stiffness;
-        }
-        springs::for_each_second_derivative(
-            &model.point_springs,
-            &model.dynamics,
-            &workspace.poses,
-            |i, j, value| {
-                if i < nd && j < nd {
-                    stiffness[(i, j)] += value;
-                }
-            },
-        );
+        // The line search has been elsewhere.
+        self.evaluate(&point.q);
+        let blocks = &self.blocks;
+        let mut stiffness =
+            DMatrix::from_fn(nd, nd, |i, j| -(blocks.l_qq[i * n + j] + blocks.f_q[i * n + j]));
         if model.dimensions.constraints > 0 {
             let mut hessian = vec![0.0; n * n];
             model.conditioning.rows(model, &mut self.closure, &point.q);

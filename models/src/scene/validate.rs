@@ -14,9 +14,16 @@ use super::{
     MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_SPRINGS, Motion, Problem, Scene,
 };
 
+use crate::Model;
+
 impl Scene {
     /// Everything that is wrong with the scene; empty when it will compile.
     pub fn validate(&self) -> Vec<Problem> {
+        Model::compile(self).map_or_else(|error| error.problems, |_| Vec::new())
+    }
+
+    /// Everything that is wrong with what the scene says, before it is compiled.
+    pub(crate) fn problems(&self) -> Vec<Problem> {
         let mut check = Check::new(self);
         check.limits();
         if !check.problems.is_empty() {

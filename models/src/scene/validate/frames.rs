@@ -158,7 +158,8 @@ impl Check<'_> {
     }
 
     /// A dynamic coordinate must move something that resists: mass for a slide, mass or inertia for
-    /// a hinge. A mass on the axis of a hinge passes here; a step reports it as singular.
+    /// a hinge. A mass on the axis of a hinge passes here; what is singular in every configuration is
+    /// found once the scene is compiled.
     fn inertia_beyond_joints(&mut self) {
         let frames = &self.scene.frames;
         let has_mass = self.ancestors_of(|i| frames[i].body.as_ref().is_some_and(|b| b.mass > 0.0));
