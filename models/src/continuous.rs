@@ -26,13 +26,15 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::Model;
+use crate::plant::balls::orientations;
 use crate::plant::blocks::Blocks;
 use crate::plant::closure::Closure;
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::padded;
 use crate::plant::tree_lu::TreeLu;
+use crate::rotation;
 use crate::scalar::{Dual, Scalar};
-use crate::spatial::Mat3;
+use crate::spatial::{Mat3, Vec3};
 
 /// A pivot of the mass matrix below this fraction of the largest inertia of its coordinate is zero.
 const SINGULAR: f64 = 1e-14;
@@ -216,7 +218,7 @@ impl Continuous {
         let mut out = vec![DMatrix::zeros(size, size); rows];
         let mut second = vec![0.0; rows * stride];
         for a in 0..size {
-            varied.seed(&self.equations, a, &self.tangent);
+            varied.seed(&self.model, &self.equations, a, &self.tangent);
             varied.evaluate(&self.model);
             for (i, row) in second.chunks_exact_mut(stride).enumerate() {
                 let block = &varied.jacobian[i * layout.columns()..][..layout.columns()];
@@ -230,10 +232,14 @@ impl Continuous {
             }
             self.solve_rows(&mut second);
             for (out, row) in out.iter_mut().zip(second.chunks_exact(stride)) {
-                for b in 0..=a {
-                    (out[(a, b)], out[(b, a)]) = (row[b], row[b]);
+                for b in 0..size {
+                    out[(a, b)] = row[b];
                 }
             }
+        }
+        // Derivatives along the axes of a ball joint differ by a commutator from those in its chart.
+        for out in &mut out {
+            *out = (&*out + out.transpose()) * 0.5;
         }
         self.varied = Some(varied);
         Ok(out)
@@ -243,7 +249,7 @@ impl Continuous {
     fn solve(&mut self, point: &ContinuousPoint) -> Result<(), ContinuousError> {
         let model = &*self.model;
         let equations = &mut self.equations;
-        equations.place(point)?;
+        equations.place(model, point)?;
         let Layout { nd, nc, .. } = equations.layout;
         equations.evaluate(model);
         self.factor()?;
@@ -485,6 +491,14 @@ impl<S: Scalar> Equations<S> {
             self.along_v[i] = Dual::new(v, a);
             self.along_twice[i] = Dual::new(Dual::new(q, v), Dual::new(v, a));
         }
+        for (o, &i) in model.orientations.iter().enumerate() {
+            let still = self.orientations[o];
+            let (spin, change) = (three(&self.v, i), three(&self.acceleration, i));
+            let along = pairs(Vec3::ZERO, spin);
+            self.orientations_along[o] = at_rest(&still).times(&rotation::exp(along));
+            let twice = pairs(along, pairs(spin, change));
+            self.orientations_twice[o] = at_rest(&at_rest(&still)).times(&rotation::exp(twice));
+        }
         for (along, input) in self.constant_inputs.iter_mut().zip(&self.inputs) {
             *along = Dual::new(*input, S::ZERO);
         }
@@ -498,6 +512,67 @@ impl<S: Scalar> Equations<S> {
         }
         self.fill_dynamics();
         self.fill_constraints();
+        if !model.orientations.is_empty() {
+            self.turn(model);
+        }
+    }
+
+    /// What ball joints add. Their momenta `m` are in turning axes, and derivatives along their axes do
+    /// not commute: with the axes `X_a`, the angular velocity `ω` and the angular acceleration `α`,
+    ///
+    /// ```text
+    /// rows         ω × m
+    /// by q, L      (e_j × ω)·X m
+    /// by q, h      2 (e_j × ω)·D X h + (e_j × α + (e_j × ω) × ω)·X h
+    /// by v, h      (e_j × ω)·X h
+    /// ```
+    fn turn(&mut self, model: &Model) {
+        let layout = self.layout;
+        let Layout { nd, nc, .. } = layout;
+        let (n, columns) = (layout.n(), layout.columns());
+        for &i in &model.orientations {
+            let (spin, change) = (three(&self.v, i), three(&self.acceleration, i));
+            for b in 0..3 {
+                let mut axis = Vec3::ZERO;
+                axis.0[b] = S::ONE;
+                let turned = axis.cross(spin);
+                let twice = axis.cross(change) + turned.cross(spin);
+                for row in 0..nd {
+                    let along = Vec3([0, 1, 2].map(|l| self.blocks.l_qv[(i + l) * n + row].re));
+                    self.jacobian[row * columns + i + b] += turned.dot(along);
+                }
+                for c in 0..nc {
+                    let gradient = [0, 1, 2].map(|l| self.motion.jacobian[c * n + i + l]);
+                    let (still, along) =
+                        (Vec3(gradient.map(|x| x.re.re)), Vec3(gradient.map(|x| x.re.eps)));
+                    let row = &mut self.jacobian[(nd + c) * columns..][..columns];
+                    row[i + b] += turned.dot(along) * 2.0 + twice.dot(still);
+                    row[n + i + b] += turned.dot(still);
+                }
+            }
+            if i >= nd {
+                continue;
+            }
+            let rows = |values: [S; 3]| spin.cross(Vec3(values));
+            let momentum = [0, 1, 2].map(|a| self.blocks.l_v[i + a].re);
+            let carried = rows(momentum);
+            for a in 0..3 {
+                self.residual[i + a] += carried[a];
+            }
+            for j in 0..n {
+                let by_q = rows([0, 1, 2].map(|a| self.blocks.l_qv[j * n + i + a].re));
+                let mut by_v = rows([0, 1, 2].map(|a| self.blocks.l_vv[j * n + i + a].re));
+                if (i..i + 3).contains(&j) {
+                    let mut axis = Vec3::ZERO;
+                    axis.0[j - i] = S::ONE;
+                    by_v += axis.cross(Vec3(momentum));
+                }
+                for a in 0..3 {
+                    self.jacobian[(i + a) * columns + j] += by_q[a];
+                    self.jacobian[(i + a) * columns + n + j] += by_v[a];
+                }
+            }
+        }
     }
 
     /// Rows of the dynamic coordinates.
@@ -550,12 +625,13 @@ impl<S: Scalar> Equations<S> {
 
 impl Equations<f64> {
     /// Takes a point over, with unknowns zero.
-    fn place(&mut self, point: &ContinuousPoint) -> Result<(), ContinuousError> {
+    fn place(&mut self, model: &Model, point: &ContinuousPoint) -> Result<(), ContinuousError> {
         let Layout { nd, .. } = self.layout;
         let (dynamic, prescribed) = self.acceleration.split_at_mut(nd);
         dynamic.fill(0.0);
         self.multipliers.fill(0.0);
         take("q", &point.q, &mut self.q)?;
+        self.orientations = orientations(model, &self.q);
         take("v", &point.v, &mut self.v)?;
         take("inputs", &point.inputs, &mut self.inputs)?;
         take("prescribed_acceleration", &point.prescribed_acceleration, prescribed)
@@ -564,10 +640,14 @@ impl Equations<f64> {
 
 impl Equations<Dual> {
     /// The point of `at`, moving along the tangent of parameter `a`.
-    fn seed(&mut self, at: &Equations<f64>, a: usize, tangent: &[f64]) {
+    fn seed(&mut self, model: &Model, at: &Equations<f64>, a: usize, tangent: &[f64]) {
         let layout = self.layout;
         let (n, stride) = (layout.n(), layout.stride());
         let unit = |is: bool| if is { 1.0 } else { 0.0 };
+        for (o, &i) in model.orientations.iter().enumerate() {
+            let turn = Vec3([0, 1, 2].map(|b| Dual::new(0.0, unit(a == i + b))));
+            self.orientations[o] = at_rest(&at.orientations[o]).times(&rotation::exp(turn));
+        }
         for i in 0..n {
             self.q[i] = Dual::new(at.q[i], unit(a == i));
             self.v[i] = Dual::new(at.v[i], unit(a == n + i));
@@ -586,6 +666,19 @@ impl Equations<Dual> {
             self.multipliers[c] = Dual::new(at.multipliers[c], moved);
         }
     }
+}
+
+/// The three numbers that begin at `i`.
+fn three<S: Scalar>(values: &[S], i: usize) -> Vec3<S> {
+    Vec3([values[i], values[i + 1], values[i + 2]])
+}
+
+fn pairs<S: Scalar>(re: Vec3<S>, eps: Vec3<S>) -> Vec3<Dual<S>> {
+    Vec3([0, 1, 2].map(|k| Dual::new(re[k], eps[k])))
+}
+
+fn at_rest<S: Scalar>(m: &Mat3<S>) -> Mat3<Dual<S>> {
+    Mat3(m.0.map(|column| pairs(column, Vec3::ZERO)))
 }
 
 fn take(name: &'static str, from: &[f64], to: &mut [f64]) -> Result<(), ContinuousError> {

@@ -5,7 +5,8 @@ mod common;
 use common::{SPLITS, builtin, plant, wave, waving_input};
 use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
 use plantd_models::{
-    Contraction, ForceSplit, Initial, Linearization, Plant, Scene, SecondOrder, State,
+    Continuous, ContinuousPoint, Contraction, ForceSplit, Initial, Linearization, Plant, Scene,
+    SecondOrder, State,
 };
 
 fn element(name: &str) -> Scene {
@@ -302,6 +303,85 @@ fn second_derivatives_on_the_manifold() {
     for name in ["screw", "universal", "free"] {
         for split in SPLITS {
             check_second_order(&element(name), split);
+        }
+    }
+}
+
+/// Euler's equation of a top about its fixed point, `I ω̇ + ω × I ω = c × m Rᵀ g`.
+#[test]
+fn a_top_obeys_eulers_equation() {
+    let scene = element("ball");
+    let model = std::sync::Arc::new(plantd_models::Model::compile(&scene).unwrap());
+    let (mass, center) = (0.3, Vector3::new(0.0, 0.0, 0.05));
+    let inertia = Matrix3::from_diagonal(&Vector3::new(4e-4, 4e-4, 2e-4))
+        + (Matrix3::identity() * center.dot(&center) - center * center.transpose()) * mass;
+    let (turn, spin) = (Vector3::new(0.4, -0.9, 0.3), Vector3::new(3.0, -5.0, 60.0));
+    let torque = Vector3::new(0.0, 0.0, 0.02);
+    let gravity = Rotation3::new(turn).inverse() * Vector3::new(0.0, 0.0, -9.81);
+    let moment = center.cross(&(gravity * mass)) + torque - spin.cross(&(inertia * spin));
+    let expected = inertia.try_inverse().unwrap() * moment;
+    let found = Continuous::new(model)
+        .evaluate(&ContinuousPoint {
+            q: turn.as_slice().to_vec(),
+            v: spin.as_slice().to_vec(),
+            inputs: vec![torque[2]],
+            prescribed_acceleration: Vec::new(),
+        })
+        .unwrap();
+    let found = Vector3::from_row_slice(&found.acceleration);
+    assert!((found - expected).norm() < 1e-12 * expected.norm(), "{found} {expected}");
+}
+
+/// First and second derivatives of the continuous dynamics against differences on the manifold.
+#[test]
+fn continuous_derivatives_on_the_manifold() {
+    for name in ["screw", "universal", "ball", "free"] {
+        let scene = element(name);
+        let model = std::sync::Arc::new(plantd_models::Model::compile(&scene).unwrap());
+        let (d, mut dynamics) = (model.dimensions(), Continuous::new(model.clone()));
+        let n = d.coordinates();
+        let at = ContinuousPoint {
+            q: (0..n).map(|i| 0.4 + 0.3 * (i as f64).sin()).collect(),
+            v: (0..n).map(|i| 0.8 * (i as f64 + 0.7).cos()).collect(),
+            inputs: (0..d.inputs).map(|i| 1e-3 * (i as f64 + 1.0)).collect(),
+            prescribed_acceleration: vec![0.3; d.prescribed],
+        };
+        let moved = |a: usize, s: f64| {
+            let mut at = at.clone();
+            if a < n {
+                let mut change = vec![0.0; n];
+                change[a] = s;
+                at.q = model.retract(&at.q, &change);
+            } else {
+                let parts = [&mut at.v, &mut at.inputs, &mut at.prescribed_acceleration];
+                *parts.into_iter().flatten().nth(a - n).unwrap() += s;
+            }
+            at
+        };
+        let first = dynamics.linearize(&at).unwrap().jacobian;
+        let second = dynamics.second_order(&at).unwrap();
+        let (outputs, size) = first.shape();
+        let mut along = Vec::new();
+        for a in 0..size {
+            let found = slope(1e-2, |s| {
+                let value = dynamics.evaluate(&moved(a, s)).unwrap();
+                [value.acceleration, value.multipliers].concat()
+            });
+            for (i, f) in found.iter().enumerate() {
+                let scale = first.row(i).amax().max(1e-3);
+                assert!((f - first[(i, a)]).abs() < 1e-8 * scale, "{name} [{i}, {a}]: {f}");
+            }
+            along.push(slope(1e-2, |s| {
+                dynamics.linearize(&moved(a, s)).unwrap().jacobian.as_slice().to_vec()
+            }));
+        }
+        for (i, tensor) in second.iter().enumerate() {
+            let scale = tensor.amax().max(1e-2);
+            for (a, b) in (0..size * size).map(|e| (e / size, e % size)) {
+                let mean = 0.5 * (along[a][b * outputs + i] + along[b][a * outputs + i]);
+                let error = (mean - tensor[(a, b)]).abs();
+                assert!(error < 1e-7 * scale, "{name} [{i}] by {a}, {b}: {mean} {error:e}");
+            }
         }
     }
 }

@@ -5,7 +5,7 @@
 //! [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then [`diagnose`],
 //! [`settle`], [`snapshot`].
 
-mod balls;
+pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod closure;
 pub(crate) mod conditioning;
