@@ -138,7 +138,54 @@ pub struct Golden {
     pub energy_state: Vec<f64>,
     /// First derivatives of some steps.
     pub linearization: Vec<LinearizationRecord>,
+    /// Second derivatives of some of these steps.
+    #[serde(default)]
+    pub second_order: Vec<SecondOrderRecord>,
+    /// Continuous-time dynamics at one point.
+    pub continuous: Option<ContinuousRecord>,
 }
+
+/// Second derivatives of one step.
+#[derive(Debug, Deserialize)]
+pub struct SecondOrderRecord {
+    /// The step.
+    pub k: usize,
+    /// Full tensors like `q2_dq1dp1`, or the weights `z` of a contraction with its blocks.
+    #[serde(flatten)]
+    pub arrays: Arrays,
+}
+
+/// Continuous-time dynamics with their derivatives; `f` are the accelerations.
+#[derive(Debug, Deserialize)]
+#[allow(missing_docs)] // The names are those of the equations.
+pub struct ContinuousRecord {
+    pub q: Vec<f64>,
+    pub dq: Vec<f64>,
+    pub u: Vec<f64>,
+    pub ddqk: Vec<f64>,
+    pub f: Vec<f64>,
+    /// Of the opposite sign.
+    pub lambda_: Vec<f64>,
+    /// First derivatives like `f_ddq`, second derivatives like `f_ddqdq`.
+    #[serde(flatten)]
+    pub arrays: Arrays,
+}
+
+/// Arrays by name, beside notes on how they were made.
+#[derive(Debug, Deserialize)]
+#[serde(transparent)]
+pub struct Arrays(serde_json::Map<String, serde_json::Value>);
+
+impl Arrays {
+    /// An array of that name and kind, if there is one.
+    pub fn get<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>> {
+        let value = self.0.get(name).cloned();
+        value.map(serde_json::from_value).transpose().with_context(|| name.to_owned())
+    }
+}
+
+/// An array with three indices: first variable, second variable, output.
+pub type Tensor = Vec<Vec<Vec<f64>>>;
 
 /// First derivatives of one step; rows are outputs, columns are variables.
 #[derive(Debug, Deserialize)]

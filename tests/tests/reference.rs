@@ -1,19 +1,30 @@
-//! Trajectories and first derivatives of the reference mechanisms, with the paper's force split.
+//! Trajectories, first and second derivatives of the reference mechanisms, with the paper's force
+//! split, and their continuous-time dynamics.
 
 use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use nalgebra::DMatrix;
 use plantd_models::scene::Input;
-use plantd_models::{ForceSplit, Initial, Linearization, Model, Plant, Scene, Settings, builtin};
+use plantd_models::{
+    Continuous, ContinuousPoint, Contraction, ForceSplit, Initial, Linearization, Model, Plant,
+    Scene, SecondOrder, Settings, builtin,
+};
 use plantd_tests::reference::{
-    Golden, LinearizationRecord, Mechanism, Order, PaperStep, Rows, golden, mechanism, read,
+    ContinuousRecord, Golden, LinearizationRecord, Mechanism, Order, PaperStep, Rows,
+    SecondOrderRecord, Tensor, golden, mechanism, read,
 };
 
 /// Of q, p and multipliers, relative to the largest value of the trajectory.
 const TRAJECTORY_TOLERANCE: f64 = 1e-9;
 /// Of each block of first derivatives, relative to its largest entry.
 const DERIVATIVE_TOLERANCE: f64 = 1e-8;
+/// Of each block of second derivatives, relative to its largest entry.
+const SECOND_TOLERANCE: f64 = 1e-7;
+/// Of second derivatives that vanish.
+const ROUND_OFF: f64 = 1e-16;
+/// Of each block of continuous-time dynamics, relative to its largest entry.
+const CONTINUOUS_TOLERANCE: f64 = 1e-8;
 
 /// One reference mechanism, and the scene that has to move like it.
 struct Case {
@@ -57,8 +68,18 @@ impl Case {
         for record in std::mem::take(&mut self.golden.linearization) {
             self.linearization(&record)
                 .with_context(|| format!("linearization at {}", record.k))?;
+            let second = self.golden.second_order.iter().position(|second| second.k == record.k);
+            if let Some(second) = second {
+                let second = self.golden.second_order.swap_remove(second);
+                self.second_order(&record, &second)
+                    .with_context(|| format!("second order at {}", record.k))?;
+            }
         }
-        Ok(())
+        ensure!(self.golden.second_order.is_empty(), "second order of another step");
+        match self.golden.continuous.take() {
+            Some(record) => self.continuous(&record).context("continuous dynamics"),
+            None => Ok(()),
+        }
     }
 
     fn trajectory(&mut self) -> Result<()> {
@@ -125,6 +146,189 @@ impl Case {
         let scale = TRAJECTORY_TOLERANCE * largest(&record.lambda1).max(1e-3);
         close("λ", plant.multipliers(), &record.lambda1, scale)
     }
+}
+
+/// Variables or outputs of the reference: their indices in the model.
+type Indices = Vec<usize>;
+
+impl Case {
+    /// Second derivatives, full or contracted.
+    fn second_order(&mut self, at: &LinearizationRecord, record: &SecondOrderRecord) -> Result<()> {
+        let Self { golden, order, plant, .. } = self;
+        let model = plant.model().clone();
+        let d = model.dimensions();
+        plant.initialize(&Initial::Momentum {
+            q: order.coordinates(&at.q1),
+            p: order.dynamic(&at.p1),
+            v: golden.kin_velocity_v[at.k].clone(),
+        })?;
+        let u = [&at.u1[..], &at.k2].concat();
+        let mut first = Linearization::new(&model);
+        let mut second = SecondOrder::new(&model)?;
+        plant.linearize_second_order(&u, &mut first, &mut second)?;
+        let tensors: Vec<DMatrix<f64>> = (0..d.state())
+            .map(|i| whole(&second.xx(i), &second.xu(i), &second.uu(i)))
+            .chain((0..d.constraints).map(|c| {
+                let xx = second.multiplier_xx(c);
+                whole(&xx, &second.multiplier_xu(c), &second.multiplier_uu(c))
+            }))
+            .collect();
+
+        let (n, state) = (d.coordinates(), d.state());
+        let coordinates = order.indices.clone();
+        let momenta: Indices = order.indices[..d.dynamic].iter().map(|i| n + i).collect();
+        if let Some(z) = record.arrays.get::<Vec<f64>>("z")? {
+            let velocities = n + d.dynamic..state;
+            let x: Indices = coordinates.into_iter().chain(momenta).chain(velocities).collect();
+            let inputs: Indices = (state..state + d.input()).collect();
+            let mut weights = vec![0.0; state];
+            x.iter().zip(&z).for_each(|(i, z)| weights[*i] = *z);
+            let mut out = Contraction::new(&model);
+            let none = vec![0.0; d.constraints];
+            plant.contract_second_order(&u, &weights, &none, &mut first, &mut out)?;
+            let contracted = whole(&out.xx, &out.xu, &out.uu);
+            let mut sum = DMatrix::zeros(contracted.nrows(), contracted.ncols());
+            tensors.iter().zip(&weights).for_each(|(tensor, weight)| sum += tensor * *weight);
+            let blocks = [("fdxdx", &x, &x), ("fdxdu", &x, &inputs), ("fdudu", &inputs, &inputs)];
+            for (name, rows, columns) in blocks {
+                let expected: Rows = record.arrays.get(name)?.context(name)?;
+                compare_block(name, &contracted, rows, columns, &expected)?;
+                compare_block(name, &sum, rows, columns, &expected)?;
+            }
+            return Ok(());
+        }
+        let variables = [
+            ("q1", coordinates.clone()),
+            ("p1", momenta.clone()),
+            ("u1", (state..state + d.inputs).collect()),
+            ("k2", (state + d.inputs..state + d.input()).collect()),
+        ];
+        let outputs = [
+            ("q2", coordinates[..d.dynamic].to_vec()),
+            ("p2", momenta),
+            ("lambda1", (state..state + d.constraints).collect()),
+        ];
+        for (output, rows) in &outputs {
+            for (i, (first, first_indices)) in variables.iter().enumerate() {
+                for (second, second_indices) in &variables[i..] {
+                    let name = format!("{output}_d{first}d{second}");
+                    let expected: Tensor = record.arrays.get(&name)?.context(name.clone())?;
+                    let by = [first_indices, second_indices];
+                    compare_tensor(&name, &tensors, rows, by, &expected, SECOND_TOLERANCE)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Accelerations, multipliers, and their derivatives.
+    fn continuous(&self, record: &ContinuousRecord) -> Result<()> {
+        let (order, model) = (&self.order, self.plant.model());
+        let d = model.dimensions();
+        let (n, nd) = (d.coordinates(), d.dynamic);
+        let mut continuous = Continuous::new(model.clone());
+        let point = ContinuousPoint {
+            q: order.coordinates(&record.q),
+            v: order.coordinates(&record.dq),
+            inputs: record.u.clone(),
+            prescribed_acceleration: record.ddqk.clone(),
+        };
+        let linear = continuous.linearize(&point)?;
+        let second: Vec<_> = continuous
+            .second_order(&point)?
+            .into_iter()
+            .enumerate()
+            .map(|(row, tensor)| if row < nd { tensor } else { -tensor })
+            .collect();
+        let f = order.dynamic(&record.f);
+        close("f", &linear.value.acceleration, &f, CONTINUOUS_TOLERANCE * largest(&f))?;
+        let lambda: Vec<_> = linear.value.multipliers.iter().map(|lambda| -lambda).collect();
+        close("λ", &lambda, &record.lambda_, CONTINUOUS_TOLERANCE * largest(&record.lambda_))?;
+
+        let variables: [(&str, Indices); 4] = [
+            ("dq", order.indices.clone()),
+            ("ddq", order.indices.iter().map(|i| n + i).collect()),
+            ("dddk", (2 * n + d.inputs..2 * n + d.input()).collect()),
+            ("du", (2 * n..2 * n + d.inputs).collect()),
+        ];
+        let outputs = [
+            ("f", order.indices[..nd].to_vec(), 1.0),
+            ("lambda", (nd..nd + d.constraints).collect(), -1.0),
+        ];
+        for (output, rows, sign) in &outputs {
+            for (first, first_indices) in &variables {
+                let name = format!("{output}_{first}");
+                let expected: Rows = record.arrays.get(&name)?.context(name.clone())?;
+                let jacobian = &linear.jacobian * *sign;
+                let scale = largest_of(&expected);
+                for (row, expected) in rows.iter().zip(&expected) {
+                    let found: Vec<_> =
+                        first_indices.iter().map(|column| jacobian[(*row, *column)]).collect();
+                    close(&name, &found, expected, CONTINUOUS_TOLERANCE * scale)?;
+                }
+                for (second_name, second_indices) in &variables {
+                    let name = format!("{output}_{first}{second_name}");
+                    // Large models have none, and small ones one of each two mixed orders.
+                    let Some(expected) = record.arrays.get::<Tensor>(&name)? else { continue };
+                    let by = [first_indices, second_indices];
+                    compare_tensor(&name, &second, rows, by, &expected, CONTINUOUS_TOLERANCE)?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Second derivatives by `(x, u)`.
+fn whole(xx: &DMatrix<f64>, xu: &DMatrix<f64>, uu: &DMatrix<f64>) -> DMatrix<f64> {
+    let (state, input) = xu.shape();
+    DMatrix::from_fn(state + input, state + input, |a, b| match (a < state, b < state) {
+        (true, true) => xx[(a, b)],
+        (true, false) => xu[(a, b - state)],
+        (false, true) => xu[(b, a - state)],
+        (false, false) => uu[(a - state, b - state)],
+    })
+}
+
+fn largest_of(rows: &Rows) -> f64 {
+    rows.iter().map(|row| largest(row)).fold(0.0, f64::max)
+}
+
+fn compare_block(
+    what: &str,
+    found: &DMatrix<f64>,
+    rows: &[usize],
+    columns: &[usize],
+    expected: &Rows,
+) -> Result<()> {
+    ensure!(expected.len() == rows.len(), "{what}: {} rows", expected.len());
+    let tolerance = SECOND_TOLERANCE * largest_of(expected) + ROUND_OFF;
+    for (row, expected) in rows.iter().zip(expected) {
+        let found: Vec<_> = columns.iter().map(|column| found[(*row, *column)]).collect();
+        close(&format!("{what}, row {row}"), &found, expected, tolerance)?;
+    }
+    Ok(())
+}
+
+/// A block of second derivatives, `expected[first][second][output]`.
+fn compare_tensor(
+    what: &str,
+    found: &[DMatrix<f64>],
+    outputs: &[usize],
+    [first, second]: [&Indices; 2],
+    expected: &Tensor,
+    tolerance: f64,
+) -> Result<()> {
+    ensure!(expected.len() == first.len(), "{what}: {} matrices", expected.len());
+    let tolerance = tolerance * expected.iter().map(largest_of).fold(0.0, f64::max) + ROUND_OFF;
+    for (a, expected) in first.iter().zip(expected) {
+        ensure!(expected.len() == second.len(), "{what}: {} rows", expected.len());
+        for (b, expected) in second.iter().zip(expected) {
+            let found: Vec<_> = outputs.iter().map(|output| found[*output][(*a, *b)]).collect();
+            close(&format!("{what} by {a} and {b}"), &found, expected, tolerance)?;
+        }
+    }
+    Ok(())
 }
 
 /// Blocks of `A` and `B` against those of the reference.
