@@ -5,12 +5,14 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::elimination::Elimination;
 use crate::model::{
-    Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions, MixedPair, Model,
-    OperatingPoint, Pair, PathJoint, PointPair, PointSpring,
+    Alignment, Carries, Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions,
+    Length, MixedPair, Model, OperatingPoint, Pair, PathJoint, PathSpring, PointPair, PointSpring,
+    Polynomial, Potentials, Product, SplineSpring, Vector,
 };
 use crate::plant::conditioning::Conditioning;
-use crate::scene::{self, CoordinateKind, Length, Motion, Problem, Scene, SceneError, Spring};
+use crate::scene::{self, CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
 use crate::spatial::{Mat3, Sym3, Vec3};
+use crate::spline::Spline;
 use crate::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 
 impl Model {
@@ -46,10 +48,10 @@ fn compile(scene: &Scene) -> Model {
     let (closure, in_closure) = Tree::pruned(&layout.joints, &needs.closure);
     let dynamic = layout.dynamic;
 
-    let point_springs = layout.point_springs(scene, &dynamics, &in_dynamics);
-    let (constraints, constraint_names) = layout.constraints(scene, &closure, &in_closure);
+    let potentials = layout.potentials(scene, &dynamics, &in_dynamics);
+    let equations = layout.equations(scene, &closure, &in_closure);
 
-    let elimination = Elimination::new(&couplings(dynamic, &dynamics, &point_springs));
+    let elimination = Elimination::new(&couplings(dynamic, &dynamics, &potentials));
     let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
 
     let damping: Vec<f64> = layout.coordinates[..dynamic]
@@ -63,17 +65,17 @@ fn compile(scene: &Scene) -> Model {
             dynamic,
             prescribed: layout.coordinates.len() - dynamic,
             inputs: scene.inputs.len(),
-            constraints: constraints.len(),
+            constraints: equations.constraints.len(),
         },
         operating_points: layout.operating_points(scene),
         digest: digest(scene),
         gravity: (gravity != Vec3::ZERO).then_some(gravity),
         damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },
         inputs: scene.inputs.iter().map(|i| (layout.index[&i.coordinate], i.gain)).collect(),
-        coordinate_springs: layout.coordinate_springs(scene),
-        point_springs,
-        constraints,
-        constraint_names,
+        potentials,
+        constraints: equations.constraints,
+        constraint_names: equations.names,
+        alignments: equations.alignments,
         dynamics,
         closure,
         elimination,
@@ -233,11 +235,18 @@ impl Layout {
     }
 
     fn attachment(&self, point: &scene::Point) -> Attachment {
-        let frame = self.frames[&point.frame];
-        Attachment {
-            joint: frame.joint,
-            point: frame.translation + frame.rotation.apply(Vec3(point.at)),
-        }
+        self.fixed(&point.frame, point.at)
+    }
+
+    /// A point fixed in a frame.
+    fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
+        let frame = self.frames[frame];
+        Attachment { joint: frame.joint, point: frame.translation + frame.rotation.apply(Vec3(at)) }
+    }
+
+    /// A direction fixed in a frame, in the frame of the joint that carries it.
+    fn direction(&self, frame: &str, direction: Vec3) -> Vec3 {
+        self.frames[frame].rotation.apply(direction)
     }
 
     /// A joint is needed where it, or a joint below it, carries what the walk evaluates.
@@ -250,22 +259,27 @@ impl Layout {
                 .collect(),
             closure: vec![false; self.joints.len()],
         };
-        let mut mark = |walk: fn(&mut Needs) -> &mut Vec<bool>, point: &scene::Point| {
-            let joint = self.attachment(point).joint;
+        let mark = |needed: &mut Vec<bool>, frame: &str| {
+            let joint = self.frames[frame].joint;
             if joint != WORLD {
-                walk(&mut needs)[joint] = true;
+                needed[joint] = true;
             }
         };
         for spring in &scene.springs {
-            if let Spring::TwoPoint { a, b, .. } = spring {
-                mark(|n| &mut n.dynamics, a);
-                mark(|n| &mut n.dynamics, b);
+            match spring {
+                Spring::TwoPoint { a, b, .. } => {
+                    mark(&mut needs.dynamics, &a.frame);
+                    mark(&mut needs.dynamics, &b.frame);
+                }
+                Spring::Path { points, .. } => {
+                    points.iter().for_each(|point| mark(&mut needs.dynamics, &point.frame));
+                }
+                Spring::Coordinate { .. } | Spring::Spline { .. } => {}
             }
         }
         for constraint in &scene.constraints {
-            let (a, b) = constraint.points();
-            mark(|n| &mut n.closure, a);
-            mark(|n| &mut n.closure, b);
+            let frames = constraint.frames();
+            frames.into_iter().for_each(|frame| mark(&mut needs.closure, frame));
         }
         for i in (0..self.joints.len()).rev() {
             let parent = self.joints[i].parent;
@@ -277,89 +291,121 @@ impl Layout {
         needs
     }
 
-    fn point_pair(
-        &self,
-        a: &scene::Point,
-        b: &scene::Point,
-        tree: &Tree,
-        index: &[usize],
-    ) -> PointPair {
-        let resolve = |point| {
-            let at = self.attachment(point);
-            let joint = if at.joint == WORLD { WORLD } else { index[at.joint] };
-            Attachment { joint, ..at }
-        };
-        let (a, b) = (resolve(a), resolve(b));
-        let (path_a, path_b) = (tree.path(a.joint), tree.path(b.joint));
-        let common = path_a.iter().zip(&path_b).take_while(|(x, y)| x == y).count();
-        let entry = |joint: usize, carries_a| PathJoint {
-            joint,
-            coordinate: tree.joints[joint].coordinate,
-            carries_a,
-        };
-        let path = path_a[common..]
-            .iter()
-            .map(|&joint| entry(joint, true))
-            .chain(path_b[common..].iter().map(|&joint| entry(joint, false)))
-            .collect();
-        PointPair { a, b, path }
-    }
-
-    fn point_springs(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Vec<PointSpring> {
-        let two_point = |spring: &Spring| match spring {
-            Spring::TwoPoint { a, b, stiffness, rest_length } => Some(PointSpring {
-                ends: self.point_pair(a, b, tree, index),
-                stiffness: *stiffness,
-                rest_length: *rest_length,
-            }),
-            Spring::Coordinate { .. } => None,
-        };
-        scene.springs.iter().filter_map(two_point).collect()
-    }
-
-    /// Springs of prescribed coordinates do no work on dynamic ones and are dropped.
-    fn coordinate_springs(&self, scene: &Scene) -> Vec<CoordinateSpring> {
-        let coordinate = |spring: &Spring| match spring {
-            Spring::Coordinate { coordinate, stiffness, rest } => Some(CoordinateSpring {
-                coordinate: self.index[coordinate],
-                stiffness: *stiffness,
-                rest: *rest,
-            }),
-            Spring::TwoPoint { .. } => None,
-        };
-        let springs = scene.springs.iter().filter_map(coordinate);
-        springs.filter(|s| s.coordinate < self.dynamic).collect()
-    }
-
-    fn constraints(
-        &self,
-        scene: &Scene,
-        tree: &Tree,
-        index: &[usize],
-    ) -> (Vec<Constraint>, Vec<String>) {
-        let (mut constraints, mut names) = (Vec::new(), Vec::new());
-        for constraint in &scene.constraints {
-            let (a, b) = constraint.points();
-            let points = self.point_pair(a, b, tree, index);
-            match constraint {
-                scene::Constraint::Distance { name, length, .. } => {
-                    let kind = match length {
-                        Length::Fixed(length) => ConstraintKind::Distance(*length),
-                        Length::Coordinate(c) => ConstraintKind::DrivenDistance(self.index[c]),
-                    };
-                    constraints.push(Constraint { points, kind });
-                    names.push(name.clone());
+    fn potentials(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Potentials {
+        let places = Places { layout: self, tree, index };
+        let mut potentials = Potentials::default();
+        for spring in &scene.springs {
+            match spring {
+                Spring::TwoPoint { a, b, stiffness, rest_length } => {
+                    potentials.point_springs.push(PointSpring {
+                        ends: places.between(self.attachment(a), self.attachment(b)),
+                        stiffness: *stiffness,
+                        rest_length: *rest_length,
+                    });
                 }
-                scene::Constraint::PointToPoint { name, axes, .. } => {
-                    for axis in axes {
-                        let kind = ConstraintKind::Axis(*axis as usize);
-                        constraints.push(Constraint { points: points.clone(), kind });
-                        names.push(format!("{name}.{}", ["x", "y", "z"][*axis as usize]));
-                    }
+                Spring::Coordinate { coordinate, stiffness, rest } => {
+                    potentials.coordinate_springs.push(CoordinateSpring {
+                        coordinate: self.index[coordinate],
+                        stiffness: *stiffness,
+                        rest: *rest,
+                    });
+                }
+                Spring::Spline { coordinate, knots } => {
+                    // Validation has found that the knots determine a spline.
+                    potentials.spline_springs.extend(
+                        Spline::new(knots).map(|force| SplineSpring {
+                            coordinate: self.index[coordinate],
+                            force,
+                        }),
+                    );
+                }
+                Spring::Path { points, stiffness, rest_length } => {
+                    potentials.path_springs.push(PathSpring {
+                        segments: places.segments(points),
+                        stiffness: *stiffness,
+                        rest_length: *rest_length,
+                    });
                 }
             }
         }
-        (constraints, names)
+        potentials.any = potentials.count() > 0;
+        potentials.couple_branches =
+            !potentials.point_springs.is_empty() || !potentials.path_springs.is_empty();
+        potentials
+    }
+
+    fn equations(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Equations {
+        let places = Places { layout: self, tree, index };
+        let mut equations = Equations { dynamic: self.dynamic, ..Equations::default() };
+        for constraint in &scene.constraints {
+            let name = constraint.name();
+            match constraint {
+                scene::Constraint::Distance { a, b, length, .. } => {
+                    let points = places.between(self.attachment(a), self.attachment(b));
+                    let kind = ConstraintKind::Distance(points, self.length(length));
+                    equations.push(name.to_owned(), kind);
+                }
+                scene::Constraint::PointToPoint { a, b, axes, .. } => {
+                    let points = places.between_in_world(self.attachment(a), self.attachment(b));
+                    for &axis in axes {
+                        let axis = axis as usize;
+                        let product = Product {
+                            points: points.clone(),
+                            u: Vector::Difference,
+                            w: Vector::World(Mat3::IDENTITY.0[axis]),
+                        };
+                        equations.push(format!("{name}.{}", AXES[axis]), product.into());
+                    }
+                }
+                scene::Constraint::PointOnPlane { plane, point, .. } => {
+                    let normal = Vec3(plane.normal);
+                    let normal = self.direction(&plane.frame, normal * (1.0 / normal.norm()));
+                    let a = self.fixed(&plane.frame, plane.at);
+                    let product = Product {
+                        points: places.between(a, self.attachment(point)),
+                        u: Vector::Difference,
+                        w: Vector::WithA(normal),
+                    };
+                    equations.push(name.to_owned(), product.into());
+                }
+                scene::Constraint::Orientation { a, b, .. } => {
+                    equations.align(name, a, b, &places);
+                }
+                scene::Constraint::Weld { a, b, .. } => {
+                    let points = places.between(self.fixed(a, [0.0; 3]), self.fixed(b, [0.0; 3]));
+                    for (letter, axis) in AXES.iter().zip(Mat3::IDENTITY.0) {
+                        let product = Product {
+                            points: points.clone(),
+                            u: Vector::Difference,
+                            w: Vector::WithA(self.direction(a, axis)),
+                        };
+                        equations.push(format!("{name}.{letter}"), product.into());
+                    }
+                    equations.align(name, a, b, &places);
+                }
+                scene::Constraint::Coupling { terms, constant, .. } => {
+                    let terms = terms.iter().map(|term| Polynomial {
+                        coordinate: self.index[&term.coordinate],
+                        coefficients: term.coefficients.clone(),
+                    });
+                    let kind = ConstraintKind::Coupling(terms.collect(), *constant);
+                    equations.push(name.to_owned(), kind);
+                }
+                scene::Constraint::PathLength { points, length, .. } => {
+                    let kind =
+                        ConstraintKind::PathLength(places.segments(points), self.length(length));
+                    equations.push(name.to_owned(), kind);
+                }
+            }
+        }
+        equations
+    }
+
+    fn length(&self, length: &scene::Length) -> Length {
+        match length {
+            scene::Length::Fixed(length) => Length::Fixed(*length),
+            scene::Length::Coordinate(name) => Length::Driven(self.index[name]),
+        }
     }
 
     fn operating_points(&self, scene: &Scene) -> Vec<OperatingPoint> {
@@ -380,6 +426,113 @@ impl Layout {
         }
         points
     }
+}
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+
+/// Points of the scene in a pruned tree.
+struct Places<'a> {
+    layout: &'a Layout,
+    tree: &'a Tree,
+    /// From joints of the layout to those of the tree.
+    index: &'a [usize],
+}
+
+impl Places<'_> {
+    /// Two points; joints that carry both drop out.
+    fn between(&self, a: Attachment, b: Attachment) -> PointPair {
+        let mut pair = self.between_in_world(a, b);
+        pair.path.retain(|joint| joint.carries != Carries::Both);
+        pair
+    }
+
+    /// Two points; joints that carry both drop out if they do not turn.
+    fn between_in_world(&self, a: Attachment, b: Attachment) -> PointPair {
+        let resolve = |at: Attachment| {
+            let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
+            Attachment { joint, ..at }
+        };
+        let (a, b) = (resolve(a), resolve(b));
+        let (path_a, path_b) = (self.tree.path(a.joint), self.tree.path(b.joint));
+        let common = path_a.iter().zip(&path_b).take_while(|(x, y)| x == y).count();
+        let entry = |carries| {
+            let joints = &self.tree.joints;
+            move |&joint: &usize| PathJoint { joint, coordinate: joints[joint].coordinate, carries }
+        };
+        let turns = |joint: &&usize| self.tree.joints[**joint].kind != JointKind::Prismatic;
+        let path = path_a[..common]
+            .iter()
+            .filter(turns)
+            .map(entry(Carries::Both))
+            .chain(path_a[common..].iter().map(entry(Carries::A)))
+            .chain(path_b[common..].iter().map(entry(Carries::B)))
+            .collect();
+        PointPair { a, b, path }
+    }
+
+    /// The segments of a path from point to point.
+    fn segments(&self, points: &[scene::Point]) -> Vec<PointPair> {
+        let ends = points.windows(2);
+        ends.map(|ends| {
+            self.between(self.layout.attachment(&ends[0]), self.layout.attachment(&ends[1]))
+        })
+        .collect()
+    }
+}
+
+/// The constraint equations so far.
+#[derive(Default)]
+struct Equations {
+    dynamic: usize,
+    constraints: Vec<Constraint>,
+    names: Vec<String>,
+    alignments: Vec<Alignment>,
+}
+
+impl Equations {
+    fn push(&mut self, name: String, kind: ConstraintKind) {
+        let all: Vec<usize> = match &kind {
+            ConstraintKind::Distance(points, _) => coordinates_of(points).collect(),
+            ConstraintKind::Product(product) => coordinates_of(&product.points).collect(),
+            ConstraintKind::PathLength(segments, _) => {
+                segments.iter().flat_map(coordinates_of).collect()
+            }
+            ConstraintKind::Coupling(terms, _) => terms.iter().map(|t| t.coordinate).collect(),
+        };
+        let mut seen = BTreeSet::new();
+        let (mut coordinates, prescribed): (Vec<usize>, Vec<usize>) =
+            all.into_iter().filter(|c| seen.insert(*c)).partition(|c| *c < self.dynamic);
+        let dynamic = coordinates.len();
+        coordinates.extend(prescribed);
+        self.constraints.push(Constraint { kind, coordinates, dynamic });
+        self.names.push(name);
+    }
+
+    /// `y_a·z_b`, `z_a·x_b`, `x_a·y_b`: what a small turn of frame `b` about x, y, z changes.
+    fn align(&mut self, name: &str, a: &str, b: &str, places: &Places<'_>) {
+        let layout = places.layout;
+        let points = places.between(layout.fixed(a, [0.0; 3]), layout.fixed(b, [0.0; 3]));
+        let product = |i: usize, j: usize| Product {
+            points: points.clone(),
+            u: Vector::WithA(layout.direction(a, Mat3::IDENTITY.0[i])),
+            w: Vector::WithB(layout.direction(b, Mat3::IDENTITY.0[j])),
+        };
+        for (letter, (i, j)) in AXES.iter().zip([(1, 2), (2, 0), (0, 1)]) {
+            self.push(format!("{name}.r{letter}"), product(i, j).into());
+        }
+        let axes = [0, 1, 2].map(|i| product(i, i));
+        self.alignments.push(Alignment { name: name.to_owned(), axes });
+    }
+}
+
+impl From<Product> for ConstraintKind {
+    fn from(product: Product) -> Self {
+        Self::Product(product)
+    }
+}
+
+fn coordinates_of(points: &PointPair) -> impl Iterator<Item = usize> {
+    points.path.iter().map(|joint| joint.coordinate)
 }
 
 /// The joint of one motion, and the rotation that takes its axis to z.
@@ -482,7 +635,7 @@ fn classified(mass: f64, tensor: Sym3) -> Rotational {
 }
 
 /// Which dynamic coordinates each one is coupled with, among those before it.
-fn couplings(dynamic: usize, tree: &Tree, springs: &[PointSpring]) -> Vec<BTreeSet<usize>> {
+fn couplings(dynamic: usize, tree: &Tree, potentials: &Potentials) -> Vec<BTreeSet<usize>> {
     let mut couplings = vec![BTreeSet::new(); dynamic];
     let mut couple = |coordinates: &[usize]| {
         for (k, &later) in coordinates.iter().enumerate() {
@@ -497,9 +650,12 @@ fn couplings(dynamic: usize, tree: &Tree, springs: &[PointSpring]) -> Vec<BTreeS
         let path = path.iter().map(|&j| tree.joints[j].coordinate).filter(dynamic_only);
         couple(&path.collect::<Vec<_>>());
     }
-    for spring in springs {
-        let path = spring.ends.path.iter().map(|p| p.coordinate).filter(dynamic_only);
-        couple(&path.collect::<Vec<_>>());
+    for spring in &potentials.point_springs {
+        couple(&coordinates_of(&spring.ends).filter(dynamic_only).collect::<Vec<_>>());
+    }
+    for spring in &potentials.path_springs {
+        let path: BTreeSet<_> = spring.segments.iter().flat_map(coordinates_of).collect();
+        couple(&path.into_iter().filter(dynamic_only).collect::<Vec<_>>());
     }
     couplings
 }

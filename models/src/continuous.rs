@@ -508,7 +508,7 @@ impl<S: Scalar> Equations<S> {
             self.motion.evaluate(model, &self.along_twice, &self.orientations_twice);
             self.motion.differentiate(model, &self.along_twice);
             self.closure.evaluate(model, &self.q, &self.orientations);
-            self.closure.hessian(model, &self.multipliers, &mut self.hessian);
+            self.closure.hessian(model, &self.q, &self.multipliers, &mut self.hessian);
         }
         self.fill_dynamics();
         self.fill_constraints();

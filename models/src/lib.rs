@@ -28,7 +28,6 @@ mod rotation;
 mod scalar;
 pub mod scene;
 mod spatial;
-#[allow(dead_code, reason = "springs and signals will use it")]
 mod spline;
 mod tree;
 

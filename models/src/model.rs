@@ -6,6 +6,7 @@ use crate::elimination::Elimination;
 use crate::plant::conditioning::Conditioning;
 use crate::scene::{CoordinateKind, Scene};
 use crate::spatial::Vec3;
+use crate::spline::Spline;
 use crate::tree::{Attachment, JointKind, Tree};
 
 /// A compiled scene: immutable, shared by all plants made from it.
@@ -27,11 +28,11 @@ pub struct Model {
     pub(crate) damping: Vec<f64>,
     /// Coordinate and gain of each input.
     pub(crate) inputs: Vec<(usize, f64)>,
-    pub(crate) coordinate_springs: Vec<CoordinateSpring>,
-    pub(crate) point_springs: Vec<PointSpring>,
+    pub(crate) potentials: Potentials,
     /// Joints that points of constraints depend on: what a step walks at its ends.
     pub(crate) closure: Tree,
     pub(crate) constraints: Vec<Constraint>,
+    pub(crate) alignments: Vec<Alignment>,
     pub(crate) elimination: Elimination,
     /// Ancestor and descendant pairs of dynamic coordinates, with their place in the factorization.
     pub(crate) pairs: Vec<Pair>,
@@ -63,6 +64,33 @@ pub(crate) struct MixedPair {
     pub(crate) descendant: usize,
 }
 
+/// The springs, by kind.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Potentials {
+    pub(crate) coordinate_springs: Vec<CoordinateSpring>,
+    pub(crate) point_springs: Vec<PointSpring>,
+    pub(crate) spline_springs: Vec<SplineSpring>,
+    pub(crate) path_springs: Vec<PathSpring>,
+    /// There is one at all.
+    pub(crate) any: bool,
+    /// Some spring may couple coordinates that are not on one path to the root, or prescribed ones.
+    pub(crate) couple_branches: bool,
+}
+
+impl Potentials {
+    /// Some spring is neither of a coordinate nor of two points.
+    pub(crate) fn has_other_springs(&self) -> bool {
+        !self.spline_springs.is_empty() || !self.path_springs.is_empty()
+    }
+
+    pub(crate) fn count(&self) -> usize {
+        self.coordinate_springs.len()
+            + self.point_springs.len()
+            + self.spline_springs.len()
+            + self.path_springs.len()
+    }
+}
+
 /// `V = ½ k (q − rest)²`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CoordinateSpring {
@@ -79,13 +107,29 @@ pub(crate) struct PointSpring {
     pub(crate) rest_length: f64,
 }
 
+/// `V = −∫ force dq`.
+#[derive(Clone, Debug)]
+pub(crate) struct SplineSpring {
+    pub(crate) coordinate: usize,
+    pub(crate) force: Spline,
+}
+
+/// `V = ½ k (L − rest)²`, `L` the sum of the lengths of the segments.
+#[derive(Clone, Debug)]
+pub(crate) struct PathSpring {
+    pub(crate) segments: Vec<PointPair>,
+    pub(crate) stiffness: f64,
+    pub(crate) rest_length: f64,
+}
+
 /// Two points and the joints that move one against the other.
 #[derive(Clone, Debug)]
 pub(crate) struct PointPair {
     pub(crate) a: Attachment,
     pub(crate) b: Attachment,
-    /// Joints on the path between the points, ancestors before descendants; joints that carry both
-    /// points drop out, because they do not change the distance.
+    /// Joints on the path between the points, ancestors before descendants. Joints that carry both
+    /// points change neither their distance nor anything else that turns with both bodies, and drop
+    /// out; where a world axis is involved, those of them that turn come first.
     pub(crate) path: Vec<PathJoint>,
 }
 
@@ -94,26 +138,91 @@ pub(crate) struct PointPair {
 pub(crate) struct PathJoint {
     pub(crate) joint: usize,
     pub(crate) coordinate: usize,
-    /// The joint carries `a` (otherwise `b`).
-    pub(crate) carries_a: bool,
+    pub(crate) carries: Carries,
+}
+
+/// Which of two points a joint carries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Carries {
+    A,
+    B,
+    Both,
 }
 
 /// One constraint equation.
 #[derive(Clone, Debug)]
 pub(crate) struct Constraint {
-    pub(crate) points: PointPair,
     pub(crate) kind: ConstraintKind,
+    /// Coordinates that it depends on, but for a prescribed length; dynamic ones first.
+    pub(crate) coordinates: Vec<usize>,
+    /// How many of them are dynamic.
+    pub(crate) dynamic: usize,
 }
 
-/// What a constraint equation says of `d = a − b`.
-#[derive(Clone, Copy, Debug)]
+impl Constraint {
+    /// Dynamic coordinates that the equation depends on.
+    #[inline(always)]
+    pub(crate) fn dynamic_coordinates(&self) -> &[usize] {
+        &self.coordinates[..self.dynamic]
+    }
+}
+
+/// What a constraint equation says.
+#[derive(Clone, Debug)]
 pub(crate) enum ConstraintKind {
     /// `|d|² − length² = 0`.
-    Distance(f64),
-    /// The same, with a prescribed coordinate as length.
-    DrivenDistance(usize),
-    /// `d · axis = 0`; the axis is a world axis.
-    Axis(usize),
+    Distance(PointPair, Length),
+    /// `u · w = 0`.
+    Product(Product),
+    /// `Σ |d_s| − length = 0` over the segments of a path.
+    PathLength(Vec<PointPair>, Length),
+    /// `Σ_j Σ_k c_jk q_j^k + constant = 0`.
+    Coupling(Vec<Polynomial>, f64),
+}
+
+/// A length.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Length {
+    Fixed(f64),
+    /// A prescribed coordinate.
+    Driven(usize),
+}
+
+/// The scalar product of two vectors that belong to two points and the bodies that carry them.
+#[derive(Clone, Debug)]
+pub(crate) struct Product {
+    pub(crate) points: PointPair,
+    pub(crate) u: Vector,
+    pub(crate) w: Vector,
+}
+
+/// A vector that belongs to two points.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Vector {
+    /// `a − b`.
+    Difference,
+    /// Fixed in the frame of the joint that carries `a`.
+    WithA(Vec3),
+    /// Fixed in the frame of the joint that carries `b`.
+    WithB(Vec3),
+    /// Fixed in the world.
+    World(Vec3),
+}
+
+/// `Σ_k c_k q^k`, powers from 1.
+#[derive(Clone, Debug)]
+pub(crate) struct Polynomial {
+    pub(crate) coordinate: usize,
+    pub(crate) coefficients: Vec<f64>,
+}
+
+/// Two frames that constraints keep aligned.
+#[derive(Clone, Debug)]
+pub(crate) struct Alignment {
+    /// Name of the constraint.
+    pub(crate) name: String,
+    /// `x_a·x_b, y_a·y_b, z_a·z_b`.
+    pub(crate) axes: [Product; 3],
 }
 
 /// Sizes of a model.
@@ -238,15 +347,29 @@ impl Model {
             "gravity       {}",
             if self.gravity.is_some() { "uniform" } else { "none (skipped)" }
         ));
-        let springs = self.coordinate_springs.len() + self.point_springs.len();
-        line(format!("springs       {springs}{}", skipped(springs > 0)));
+        let springs = self.potentials.count();
+        line(format!(
+            "springs       {springs}: {} coordinate, {} two-point, {} spline, {} path{}",
+            self.potentials.coordinate_springs.len(),
+            self.potentials.point_springs.len(),
+            self.potentials.spline_springs.len(),
+            self.potentials.path_springs.len(),
+            skipped(springs > 0)
+        ));
         let damped = self.damping.iter().filter(|c| **c != 0.0).count();
         line(format!("damping       {damped} coordinates{}", skipped(damped > 0)));
         line(format!("inputs        {}{}", d.inputs, skipped(d.inputs > 0)));
+        let equations = |is: fn(&ConstraintKind) -> bool| {
+            self.constraints.iter().filter(|constraint| is(&constraint.kind)).count()
+        };
         line(format!(
-            "constraints   {} equations over {} joints{}",
+            "constraints   {} equations over {} joints: {} distance, {} product, {} path, {} coupling{}",
             d.constraints,
             self.closure.joints.len(),
+            equations(|kind| matches!(kind, ConstraintKind::Distance(..))),
+            equations(|kind| matches!(kind, ConstraintKind::Product(_))),
+            equations(|kind| matches!(kind, ConstraintKind::PathLength(..))),
+            equations(|kind| matches!(kind, ConstraintKind::Coupling(..))),
             skipped(d.constraints > 0)
         ));
         plan

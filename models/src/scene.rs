@@ -8,8 +8,8 @@ mod text;
 mod validate;
 
 pub use limits::{
-    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_FRAMES, MAX_INPUTS, MAX_KNOTS, MAX_NAME_BYTES,
-    MAX_OPERATING_POINTS, MAX_SPRINGS, MAX_TEXT_BYTES,
+    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FRAMES, MAX_INPUTS, MAX_KNOTS,
+    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER, MAX_SPRINGS, MAX_TEXT_BYTES,
 };
 
 use schemars::JsonSchema;
@@ -243,7 +243,7 @@ pub struct Point {
     pub at: [f64; 3],
 }
 
-/// A linear spring.
+/// A spring.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Spring {
@@ -268,6 +268,24 @@ pub enum Spring {
         /// m or rad.
         #[serde(default)]
         rest: f64,
+    },
+    /// Generalized force `spline(q)` on a coordinate: `V = −∫ spline dq`, zero at the first knot.
+    Spline {
+        /// Coordinate.
+        coordinate: String,
+        /// Force over position, N over m or N·m over rad.
+        knots: Vec<Knot>,
+    },
+    /// `V = ½ stiffness (length − rest_length)²` with the length of a path from point to point: an
+    /// elastic cord through eyes, a tape measure.
+    Path {
+        /// Two or more points, in the order of the path.
+        points: Vec<Point>,
+        /// N/m.
+        stiffness: f64,
+        /// m.
+        #[serde(default)]
+        rest_length: f64,
     },
 }
 
@@ -333,9 +351,80 @@ pub enum Constraint {
         /// One to three different axes.
         axes: Vec<Axis>,
     },
+    /// `h = n·(a − b)` with the normal `n` and point `a` of a plane and a point `b`.
+    PointOnPlane {
+        /// Name, unique among constraints.
+        name: String,
+        /// The plane.
+        plane: Plane,
+        /// The point.
+        point: Point,
+    },
+    /// Two frames keep the same orientation: `h = (y_a·z_b, z_a·x_b, x_a·y_b)` with their axes.
+    Orientation {
+        /// Name, unique among constraints.
+        name: String,
+        /// One frame, or `world`.
+        a: String,
+        /// Other frame.
+        b: String,
+    },
+    /// Two frames coincide: `h = (o_a − o_b)·(x_a, y_a, z_a)` with their origins, and as
+    /// `orientation`.
+    Weld {
+        /// Name, unique among constraints.
+        name: String,
+        /// One frame, or `world`.
+        a: String,
+        /// Other frame.
+        b: String,
+    },
+    /// `h = Σ_j Σ_k coefficients_jk q_j^k + constant`, powers `k` from 1.
+    Coupling {
+        /// Name, unique among constraints.
+        name: String,
+        /// One or more terms, each of another coordinate.
+        terms: Vec<CouplingTerm>,
+        /// m or rad, as the coefficients make it.
+        #[serde(default)]
+        constant: f64,
+    },
+    /// `h = Σ |d_s| − length` over the segments `d_s` of a path from point to point: a rope over
+    /// pulleys, a tape measure.
+    PathLength {
+        /// Name, unique among constraints.
+        name: String,
+        /// Two or more points, in the order of the path.
+        points: Vec<Point>,
+        /// Length.
+        length: Length,
+    },
 }
 
-/// Length of a distance constraint.
+/// A plane fixed in a frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Plane {
+    /// Frame name, or `world`.
+    pub frame: String,
+    /// A point of the plane in the frame, m.
+    #[serde(default, skip_serializing_if = "is_zero3")]
+    pub at: [f64; 3],
+    /// Normal in the frame; need not have unit length.
+    pub normal: [f64; 3],
+}
+
+/// A polynomial of one coordinate in a coupling.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CouplingTerm {
+    /// Coordinate, dynamic or prescribed.
+    pub coordinate: String,
+    /// Factors of `q`, `q²`, `q³` and so on.
+    pub coefficients: Vec<f64>,
+}
+
+/// Length of a distance or of a path.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields, untagged)]
 pub enum Length {
@@ -437,20 +526,47 @@ impl Constraint {
     /// Name.
     pub fn name(&self) -> &str {
         match self {
-            Self::Distance { name, .. } | Self::PointToPoint { name, .. } => name,
+            Self::Distance { name, .. }
+            | Self::PointToPoint { name, .. }
+            | Self::PointOnPlane { name, .. }
+            | Self::Orientation { name, .. }
+            | Self::Weld { name, .. }
+            | Self::Coupling { name, .. }
+            | Self::PathLength { name, .. } => name,
         }
     }
     /// Number of its equations.
     pub fn equations(&self) -> usize {
         match self {
-            Self::Distance { .. } => 1,
+            Self::Distance { .. }
+            | Self::PointOnPlane { .. }
+            | Self::Coupling { .. }
+            | Self::PathLength { .. } => 1,
             Self::PointToPoint { axes, .. } => axes.len(),
+            Self::Orientation { .. } => 3,
+            Self::Weld { .. } => 6,
         }
     }
-    /// Its two points.
-    pub fn points(&self) -> (&Point, &Point) {
+    /// Frames of its points, axes and planes; a frame may come more than once.
+    pub fn frames(&self) -> Vec<&str> {
         match self {
-            Self::Distance { a, b, .. } | Self::PointToPoint { a, b, .. } => (a, b),
+            Self::Distance { a, b, .. } | Self::PointToPoint { a, b, .. } => {
+                vec![&a.frame, &b.frame]
+            }
+            Self::PointOnPlane { plane, point, .. } => vec![&plane.frame, &point.frame],
+            Self::Orientation { a, b, .. } | Self::Weld { a, b, .. } => vec![a, b],
+            Self::Coupling { .. } => Vec::new(),
+            Self::PathLength { points, .. } => {
+                points.iter().map(|point| point.frame.as_str()).collect()
+            }
+        }
+    }
+    /// Name of the prescribed coordinate that is its length, if any.
+    pub fn length_coordinate(&self) -> Option<&str> {
+        match self {
+            Self::Distance { length: Length::Coordinate(name), .. }
+            | Self::PathLength { length: Length::Coordinate(name), .. } => Some(name),
+            _ => None,
         }
     }
 }

@@ -8,7 +8,7 @@
 //! | INVALID_ARGUMENT | `INVALID_FIELD` | BadRequest | a field is missing, malformed, of wrong size, not finite, or names an unknown coordinate or operating point |
 //! | INVALID_ARGUMENT | `INVALID_SCENE` | BadRequest, one entry per error of the scene while they fit a trailer | a scene does not compile |
 //! | INVALID_ARGUMENT | `INPUT_DIMENSION`, `INPUT_NOT_FINITE` | BadRequest | the input of a step |
-//! | INVALID_ARGUMENT | `OFF_CONSTRAINT`, `PROJECTION_FAILED` | BadRequest | an initial configuration cannot satisfy the constraints |
+//! | INVALID_ARGUMENT | `OFF_CONSTRAINT`, `DEGENERATE`, `PROJECTION_FAILED` | BadRequest | an initial configuration cannot satisfy the constraints |
 //! | INVALID_ARGUMENT | `INVALID_SNAPSHOT`, `SNAPSHOT_MISMATCH` | BadRequest | damaged, or of another model or other settings |
 //! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice |
@@ -254,6 +254,9 @@ impl Fault {
             InitialError::Unknown { .. } => Self::field(field, message),
             InitialError::OffConstraint { constraint, .. } => {
                 Self::field_because("OFF_CONSTRAINT", field, message).with("constraint", constraint)
+            }
+            InitialError::Degenerate { constraint, .. } => {
+                Self::field_because("DEGENERATE", field, message).with("constraint", constraint)
             }
             InitialError::Projection { constraint, .. } => {
                 Self::field_because("PROJECTION_FAILED", field, message)

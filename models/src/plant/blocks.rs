@@ -11,7 +11,7 @@ use crate::plant::curvature::Curvature;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::rows::Term;
-use crate::plant::{Settings, springs};
+use crate::plant::{Settings, potentials};
 use crate::rotation;
 use crate::scalar::{Dual, Scalar};
 use crate::spatial::{Mat3, Vec3};
@@ -88,7 +88,7 @@ impl<S: Scalar> Blocks<S> {
     /// Rows and columns of dynamic rows that may differ from zero.
     fn pattern(&self, model: &Model) -> Vec<(usize, usize)> {
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
-        if !model.point_springs.is_empty() {
+        if model.potentials.couple_branches {
             return (0..nd * n).map(|entry| (entry / n, entry % n)).collect();
         }
         let on_paths = self.pairs.iter().flat_map(|&[_, _, i, j]| [(i, j), (j, i)]);
@@ -116,10 +116,9 @@ impl<S: Scalar> Blocks<S> {
             &mut self.l_q,
             &mut self.l_v,
         );
-        if model.has_springs() {
-            springs::add_gradient(
-                &model.coordinate_springs,
-                &model.point_springs,
+        if model.potentials.any {
+            potentials::add_gradient(
+                &model.potentials,
                 &model.dynamics,
                 &self.poses,
                 q,
@@ -148,13 +147,11 @@ impl<S: Scalar> Blocks<S> {
                 self.l_qv[at(row) * n + at(column)] = qv;
             }
         }
-        for spring in &model.coordinate_springs {
-            self.l_qq[spring.coordinate * (n + 1)] -= S::constant(spring.stiffness);
-        }
-        springs::for_each_second_derivative(
-            &model.point_springs,
+        potentials::for_each_second_derivative(
+            &model.potentials,
             &model.dynamics,
             &self.poses,
+            q,
             |i, j, value| self.l_qq[i * n + j] -= value,
         );
     }
@@ -342,7 +339,7 @@ impl<S: Scalar> StepBlocks<S> {
     pub(crate) fn evaluate_start(&mut self, model: &Model) {
         self.start.evaluate(model, &self.q_start, &self.orientations[0]);
         self.start.differentiate(model, &self.q_start);
-        self.start.hessian(model, &self.multipliers, &mut self.hessian);
+        self.start.hessian(model, &self.q_start, &self.multipliers, &mut self.hessian);
     }
 
     /// Writes the blocks without constraints.

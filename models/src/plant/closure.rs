@@ -1,14 +1,21 @@
 //! Constraints at one end of a step: values, Jacobian and second derivatives.
 //!
-//! With `d = a − b` for the two points of a constraint:
-//! distance `h = |d|² − l²`, `h_i = 2 d·d_i`, `h_ij = 2 (d_i·d_j + d·d_ij)`;
-//! point to point `h = d·e`, `h_i = d_i·e`, `h_ij = d_ij·e`.
+//! ```text
+//! distance  h = |d|² − l²            h_i = 2 d·d_i          h_ij = 2 (d_i·d_j + d·d_ij)
+//! product   h = u·w                  see [`ProductAt`]
+//! path      h = Σ |d_s| − l          see [`Distance`]
+//! coupling  h = Σ c_jk q_j^k + c     h_j = Σ k c_jk q_j^(k−1)
+//! ```
+//!
+//! with the vector `d` between two points and a length `l`, fixed or a prescribed coordinate. Point to
+//! point, point on plane and orientation are products of vectors between points and directions.
 
-use crate::model::{Constraint, ConstraintKind, Model};
+use crate::model::{Alignment, Constraint, ConstraintKind, Length, Model, PointPair, Polynomial};
 use crate::plant::kinematics::Poses;
-use crate::plant::springs::Separation;
+use crate::plant::vectors::{Distance, ProductAt};
 use crate::scalar::Scalar;
-use crate::spatial::{Mat3, Vec3};
+use crate::spatial::Mat3;
+use crate::tree::Tree;
 
 /// The constraints at a configuration.
 #[derive(Clone, Debug)]
@@ -41,12 +48,7 @@ impl<S: Scalar> Closure<S> {
     pub(crate) fn evaluate(&mut self, model: &Model, q: &[S], orientations: &[Mat3<S>]) {
         self.poses.evaluate(&model.closure, q, orientations);
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let at = constraint.points.separation(&model.closure, &self.poses);
-            let (value, magnitude) = match constraint.kind {
-                ConstraintKind::Distance(length) => distance(&at, S::constant(length)),
-                ConstraintKind::DrivenDistance(coordinate) => distance(&at, q[coordinate]),
-                ConstraintKind::Axis(axis) => (at.difference[axis], at.magnitude),
-            };
+            let (value, magnitude) = constraint.value(&model.closure, &self.poses, q);
             self.value[c] = value;
             self.round_off[c] = f64::EPSILON * magnitude + self.coordinate_round_off[c];
         }
@@ -62,25 +64,13 @@ impl<S: Scalar> Closure<S> {
     pub(crate) fn differentiate(&mut self, model: &Model, q: &[S]) {
         let n = model.dimensions.coordinates();
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let at = constraint.points.separation(&model.closure, &self.poses);
             let row = &mut self.jacobian[c * n..][..n];
-            let weight = constraint.weight(&at);
-            for joint in &constraint.points.path {
-                row[joint.coordinate] = S::ZERO;
+            for &i in &constraint.coordinates {
+                row[i] = S::ZERO;
             }
-            if let ConstraintKind::DrivenDistance(length) = constraint.kind {
-                row[length] = q[length] * -2.0;
-            }
-            for joint in &constraint.points.path {
-                let gradient = joint.gradient(&model.closure, &self.poses, &at);
-                row[joint.coordinate] += weight.dot(gradient);
-            }
-            let moved: f64 = constraint
-                .points
-                .path
-                .iter()
-                .map(|joint| (row[joint.coordinate] * q[joint.coordinate]).value().abs())
-                .sum();
+            constraint.differentiate(&model.closure, &self.poses, q, row);
+            let moved: f64 =
+                constraint.coordinates.iter().map(|&i| (row[i] * q[i]).value().abs()).sum();
             self.coordinate_round_off[c] = f64::EPSILON * moved;
         }
     }
@@ -100,67 +90,269 @@ impl<S: Scalar> Closure<S> {
         let n = model.dimensions.coordinates();
         for (c, constraint) in model.constraints.iter().enumerate() {
             let (row, lambda) = (&self.jacobian[c * n..][..n], multipliers[c]);
-            for joint in &constraint.points.path {
-                if let Some(entry) = out.get_mut(joint.coordinate) {
-                    *entry -= row[joint.coordinate] * lambda;
-                }
+            for &i in constraint.dynamic_coordinates() {
+                out[i] -= row[i] * lambda;
             }
         }
     }
 
-    /// Writes `Σ_c λ_c D²h_c`, rows and columns over all coordinates, row-major.
+    /// Writes `Σ_c λ_c D²h_c` at `q`, rows and columns over all coordinates, row-major.
     #[inline(never)]
-    pub(crate) fn hessian(&self, model: &Model, multipliers: &[S], out: &mut [S]) {
+    pub(crate) fn hessian(&self, model: &Model, q: &[S], multipliers: &[S], out: &mut [S]) {
         let n = model.dimensions.coordinates();
-        let (tree, poses) = (&model.closure, &self.poses);
         out.fill(S::ZERO);
         for (constraint, &lambda) in model.constraints.iter().zip(multipliers) {
-            let at = constraint.points.separation(tree, poses);
-            let weight = constraint.weight(&at);
-            let squared = !matches!(constraint.kind, ConstraintKind::Axis(_));
-            for row in &constraint.points.path {
-                let row_gradient = row.gradient(tree, poses, &at);
-                for column in &constraint.points.path {
-                    let gradient = column.gradient(tree, poses, &at);
-                    let second = row.second(row_gradient, tree, poses, (column, gradient));
-                    let mut value = weight.dot(second);
-                    if squared {
-                        value += gradient.dot(row_gradient) * 2.0;
-                    }
-                    out[row.coordinate * n + column.coordinate] += lambda * value;
-                }
-            }
-            if let ConstraintKind::DrivenDistance(length) = constraint.kind {
-                out[length * n + length] -= lambda * 2.0;
-            }
+            constraint.for_each_second_derivative(&model.closure, &self.poses, q, |i, j, value| {
+                out[i * n + j] += lambda * value;
+            });
         }
     }
 }
 
 impl Constraint {
-    /// Derivative of the value by the difference of the points.
-    fn weight<S: Scalar>(&self, at: &Separation<S>) -> Vec3<S> {
-        match self.kind {
-            ConstraintKind::Distance(_) | ConstraintKind::DrivenDistance(_) => {
-                at.difference.scaled(2.0)
+    /// Value, and the magnitude of what was added for it.
+    #[inline]
+    fn value<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S]) -> (S, f64) {
+        if let ConstraintKind::Distance(points, length) = &self.kind {
+            distance(points, tree, poses, length.at(q))
+        } else {
+            self.other_value(tree, poses, q)
+        }
+    }
+
+    #[inline(never)]
+    fn other_value<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S]) -> (S, f64) {
+        match &self.kind {
+            ConstraintKind::Distance(points, length) => distance(points, tree, poses, length.at(q)),
+            ConstraintKind::Product(product) => {
+                let at = ProductAt::new(product, tree, poses);
+                (at.value(), at.magnitude())
             }
-            ConstraintKind::Axis(axis) => {
-                let mut direction = Vec3::ZERO;
-                direction.0[axis] = S::ONE;
-                direction
+            ConstraintKind::PathLength(segments, length) => {
+                let length = length.at(q);
+                let (mut value, mut magnitude) = (-length, length.value());
+                for segment in segments {
+                    let segment = Distance::new(segment, tree, poses);
+                    value += segment.length;
+                    magnitude += segment.magnitude();
+                }
+                (value, magnitude)
+            }
+            ConstraintKind::Coupling(terms, constant) => {
+                let (mut value, mut magnitude) = (S::constant(*constant), constant.abs());
+                for term in terms {
+                    let term = term.value(q);
+                    value += term;
+                    magnitude += term.value().abs();
+                }
+                (value, magnitude)
             }
         }
     }
+
+    /// Writes the derivatives into a row of the Jacobian, whose other entries are zero.
+    #[inline]
+    fn differentiate<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S], row: &mut [S]) {
+        if let ConstraintKind::Distance(points, length) = &self.kind {
+            if let Length::Driven(length) = *length {
+                row[length] = q[length] * -2.0;
+            }
+            let at = points.separation(tree, poses);
+            let weight = at.difference.scaled(2.0);
+            for joint in &points.path {
+                row[joint.coordinate] += weight.dot(joint.gradient(tree, poses, &at));
+            }
+        } else {
+            self.differentiate_other(tree, poses, q, row);
+        }
+    }
+
+    #[inline(never)]
+    fn differentiate_other<S: Scalar>(
+        &self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        q: &[S],
+        row: &mut [S],
+    ) {
+        match &self.kind {
+            ConstraintKind::Distance(..) => {}
+            ConstraintKind::Product(product) => {
+                ProductAt::new(product, tree, poses)
+                    .for_each_derivative(|i, slope| row[i] += slope);
+            }
+            ConstraintKind::PathLength(segments, length) => {
+                if let Length::Driven(length) = *length {
+                    row[length] = -S::ONE;
+                }
+                for segment in segments {
+                    Distance::new(segment, tree, poses)
+                        .for_each_derivative(|i, slope| row[i] += slope);
+                }
+            }
+            ConstraintKind::Coupling(terms, _) => {
+                for term in terms {
+                    row[term.coordinate] += term.slope(q);
+                }
+            }
+        }
+    }
+
+    /// Calls `entry(i, j, h_ij)` for ordered pairs of coordinates; a pair may come more than once, and
+    /// its values add.
+    pub(crate) fn for_each_second_derivative<S: Scalar>(
+        &self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        q: &[S],
+        mut entry: impl FnMut(usize, usize, S),
+    ) {
+        match &self.kind {
+            ConstraintKind::Distance(points, length) => {
+                let at = points.separation(tree, poses);
+                for row in &points.path {
+                    let row_gradient = row.gradient(tree, poses, &at);
+                    for column in &points.path {
+                        let gradient = column.gradient(tree, poses, &at);
+                        let second = row.second(row_gradient, tree, poses, (column, gradient));
+                        let half = gradient.dot(row_gradient) + at.difference.dot(second);
+                        entry(row.coordinate, column.coordinate, half * 2.0);
+                    }
+                }
+                if let Length::Driven(length) = *length {
+                    entry(length, length, S::constant(-2.0));
+                }
+            }
+            ConstraintKind::Product(product) => {
+                ProductAt::new(product, tree, poses).for_each_second_derivative(entry);
+            }
+            ConstraintKind::PathLength(segments, _) => {
+                for segment in segments {
+                    Distance::new(segment, tree, poses).for_each_second_derivative(&mut entry);
+                }
+            }
+            ConstraintKind::Coupling(terms, _) => {
+                for term in terms {
+                    entry(term.coordinate, term.coordinate, term.curvature(q));
+                }
+            }
+        }
+    }
+
+    /// Whether a segment of its path has no length, and so no direction.
+    pub(crate) fn has_empty_segment(&self, tree: &Tree, poses: &Poses) -> bool {
+        let ConstraintKind::PathLength(segments, _) = &self.kind else { return false };
+        segments.iter().any(|segment| {
+            let segment = Distance::new(segment, tree, poses);
+            segment.length <= f64::EPSILON * segment.magnitude()
+        })
+    }
 }
 
-fn distance<S: Scalar>(at: &Separation<S>, length: S) -> (S, f64) {
+impl Alignment {
+    /// Trace of the rotation between the frames.
+    pub(crate) fn trace(&self, tree: &Tree, poses: &Poses) -> f64 {
+        self.axes.iter().map(|axis| ProductAt::new(axis, tree, poses).value()).sum()
+    }
+}
+
+/// `|d|² − l²`, and its magnitude.
+#[inline(always)]
+fn distance<S: Scalar>(points: &PointPair, tree: &Tree, poses: &Poses<S>, length: S) -> (S, f64) {
+    let at = points.separation(tree, poses);
     let square = at.difference.dot(at.difference);
     let squared_length = length * length;
     let round_off = 2.0 * square.value().sqrt() * at.magnitude + squared_length.value();
     (square - squared_length, round_off)
 }
 
+impl Length {
+    #[inline(always)]
+    fn at<S: Scalar>(self, q: &[S]) -> S {
+        match self {
+            Self::Fixed(length) => S::constant(length),
+            Self::Driven(coordinate) => q[coordinate],
+        }
+    }
+}
+
+impl Polynomial {
+    fn value<S: Scalar>(&self, q: &[S]) -> S {
+        let q = q[self.coordinate];
+        self.coefficients.iter().rev().fold(S::ZERO, |sum, c| (sum + *c) * q)
+    }
+
+    fn slope<S: Scalar>(&self, q: &[S]) -> S {
+        let q = q[self.coordinate];
+        let terms = self.coefficients.iter().enumerate().rev();
+        terms.fold(S::ZERO, |sum, (k, c)| sum * q + c * (k + 1) as f64)
+    }
+
+    fn curvature<S: Scalar>(&self, q: &[S]) -> S {
+        let q = q[self.coordinate];
+        let terms = self.coefficients.iter().enumerate().skip(1).rev();
+        terms.fold(S::ZERO, |sum, (k, c)| sum * q + c * (k * (k + 1)) as f64)
+    }
+}
+
 /// The larger of two numbers; a NaN wins, so that it is never taken for converged.
 pub(crate) fn larger(a: f64, b: f64) -> f64 {
     if b > a || b.is_nan() { b } else { a }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plant::samples;
+    use crate::scalar::Dual;
+
+    fn closure<S: Scalar>(model: &Model, q: &[S]) -> Closure<S> {
+        let mut closure = Closure::new(model);
+        closure.evaluate(model, q, &[]);
+        closure.differentiate(model, q);
+        closure
+    }
+
+    fn hessian<S: Scalar>(model: &Model, q: &[S], multipliers: &[S]) -> Vec<S> {
+        let mut out = vec![S::ZERO; q.len() * q.len()];
+        closure(model, q).hessian(model, q, multipliers, &mut out);
+        out
+    }
+
+    #[test]
+    fn derivatives_agree_with_differences_and_dual_numbers() {
+        for model in samples::models().iter().filter(|model| !model.constraints.is_empty()) {
+            let (name, d) = (&model.scene.name, model.dimensions);
+            let n = d.coordinates();
+            let multipliers: Vec<f64> =
+                (0..d.constraints).map(|c| (1.3 * c as f64 + 0.5).cos()).collect();
+            for sample in 0..3 {
+                let (q, direction) = samples::configuration(model, sample);
+                let (at, curvature) = (closure(model, &q), hessian(model, &q, &multipliers));
+                for j in 0..n {
+                    let unit = samples::unit(n, j);
+                    let found = samples::slope(&q, &unit, |q| closure(model, q).value);
+                    let column: Vec<f64> = at.jacobian.iter().skip(j).step_by(n).copied().collect();
+                    samples::assert_close(&format!("{name} h_{j}"), &column, &found);
+                    let found = samples::slope(&q, &unit, |q| {
+                        let jacobian = closure(model, q).jacobian;
+                        let pull = |i| {
+                            let rows = jacobian.iter().skip(i).step_by(n);
+                            rows.zip(&multipliers).map(|(entry, lambda)| entry * lambda).sum()
+                        };
+                        (0..n).map(pull).collect()
+                    });
+                    let column: Vec<f64> = curvature.iter().skip(j).step_by(n).copied().collect();
+                    samples::assert_close(&format!("{name} h_i{j}"), &column, &found);
+                }
+                let dual = samples::along(&q, &direction);
+                let lifted: Vec<Dual> = multipliers.iter().map(|x| Dual::constant(*x)).collect();
+                let along = |values: Vec<Dual>| values.iter().map(|x| x.eps).collect::<Vec<_>>();
+                let found = samples::slope(&q, &direction, |q| hessian(model, q, &multipliers));
+                samples::assert_close(name, &along(hessian(model, &dual, &lifted)), &found);
+                let found = samples::slope(&q, &direction, |q| closure(model, q).jacobian);
+                samples::assert_close(name, &along(closure(model, &dual).jacobian), &found);
+            }
+        }
+    }
 }

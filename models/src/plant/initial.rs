@@ -9,12 +9,15 @@ use crate::plant::momenta::Momenta;
 use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::padded;
-use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, forces, springs};
+use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, forces, potentials};
 use crate::rotation;
 use crate::spatial::Vec3;
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
 const CONSTRAINT_TOLERANCE: f64 = 1e-6;
+/// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
+/// half turns about an axis and for cyclic exchanges of the axes, it is −1 or 0.
+const ALIGNED: f64 = 2.0;
 /// Corrections before a projection onto the constraints is given up.
 const PROJECTION_ITERATIONS: usize = 100;
 /// A projection moves no coordinate by more than this in one correction, m or rad.
@@ -108,6 +111,14 @@ pub enum InitialError {
         constraint: String,
         /// Its value `h(q)`.
         violation: f64,
+    },
+    /// The configuration satisfies a constraint in a way in which it must not be used.
+    #[error("constraint `{constraint}`: {what}")]
+    Degenerate {
+        /// Name of the constraint.
+        constraint: String,
+        /// What is wrong.
+        what: &'static str,
     },
     /// The projection found no configuration that satisfies the constraints.
     #[error(
@@ -256,6 +267,20 @@ impl Plant {
                 return Err(InitialError::OffConstraint { constraint, violation: *value });
             }
         }
+        let (model, poses) = (&self.model, &closure.poses);
+        for (constraint, name) in model.constraints.iter().zip(&model.constraint_names) {
+            if constraint.has_empty_segment(&model.closure, poses) {
+                let what = "a segment of its path has no length, and so no direction";
+                return Err(InitialError::Degenerate { constraint: name.clone(), what });
+            }
+        }
+        for alignment in &model.alignments {
+            if alignment.trace(&model.closure, poses) < ALIGNED {
+                let what = "its frames are aligned by other axes than their own; turn one of them";
+                let constraint = alignment.name.clone();
+                return Err(InitialError::Degenerate { constraint, what });
+            }
+        }
         Ok(())
     }
 
@@ -338,9 +363,7 @@ pub(crate) fn potential_energy(model: &Model, poses: &Poses, momenta: &Momenta, 
             model.gravity.map_or(0.0, |g| g.dot(moment))
         })
         .sum();
-    let springs =
-        springs::potential(&model.coordinate_springs, &model.point_springs, tree, poses, q);
-    springs - weight
+    potentials::potential(&model.potentials, tree, poses, q) - weight
 }
 
 fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f64>, InitialError> {

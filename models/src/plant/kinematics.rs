@@ -123,6 +123,15 @@ impl<S: Scalar> Poses<S> {
         }
     }
 
+    /// Derivative of a free vector carried by a joint by the joint's coordinate.
+    #[inline]
+    pub(crate) fn turned(&self, tree: &Tree, joint: usize, vector: Vec3<S>) -> Vec3<S> {
+        match tree.joints[joint].kind {
+            JointKind::Prismatic => Vec3::ZERO,
+            _ => self.axis(joint).cross(vector),
+        }
+    }
+
     /// How the gradient by joint `row` of a vector that both joints carry changes with joint `column`,
     /// one of them above the other: the axis of the upper one turns what the lower one moves. Within a
     /// ball joint the axes turn with it.
@@ -138,10 +147,7 @@ impl<S: Scalar> Poses<S> {
         } else {
             (column, row_gradient)
         };
-        match tree.joints[turning].kind {
-            JointKind::Prismatic => Vec3::ZERO,
-            _ => self.axis(turning).cross(turned),
-        }
+        self.turned(tree, turning, turned)
     }
 }
 

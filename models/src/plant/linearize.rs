@@ -26,7 +26,7 @@ use crate::Model;
 use crate::plant::balls::Turning;
 use crate::plant::newton::Workspace;
 use crate::plant::rows::{add_rows, padded};
-use crate::plant::{Plant, StepError, springs};
+use crate::plant::{Plant, StepError, potentials};
 use crate::spatial::{Mat3, Vec3};
 
 /// The exact first-order linearization of one step, preallocated.
@@ -257,7 +257,7 @@ impl Plant {
         let workspace = &mut self.workspace;
         // Without inertia or springs on prescribed joints, the columns of `k` in r1' are zero.
         let moving = !self.model.mixed_pairs.is_empty()
-            || !self.model.point_springs.is_empty()
+            || self.model.potentials.couple_branches
             || !self.model.orientations.is_empty();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
         workspace.matrix.solve_rows(
@@ -343,6 +343,9 @@ impl Plant {
 
     /// Springs add `−V_qq` to `L_qq`.
     fn add_springs(&mut self, out: &mut Linearization) {
+        if !self.model.potentials.any {
+            return;
+        }
         let (model, workspace) = (&self.model, &mut self.workspace);
         let h = self.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
@@ -359,13 +362,11 @@ impl Plant {
                 }
             }
         };
-        for spring in &model.coordinate_springs {
-            add(spring.coordinate, spring.coordinate, spring.stiffness);
-        }
-        springs::for_each_second_derivative(
-            &model.point_springs,
+        potentials::for_each_second_derivative(
+            &model.potentials,
             &model.dynamics,
             &workspace.poses,
+            &workspace.q_mid,
             |i, j, value| {
                 if i < nd {
                     add(i, j, value);
@@ -380,7 +381,12 @@ impl Plant {
             return;
         }
         let (model, workspace) = (&self.model, &mut self.workspace);
-        workspace.start.hessian(model, &workspace.multipliers, &mut workspace.constraint_hessian);
+        workspace.start.hessian(
+            model,
+            &self.state.q,
+            &workspace.multipliers,
+            &mut workspace.constraint_hessian,
+        );
         let n = model.dimensions.coordinates();
         for i in 0..out.nd {
             let row = &workspace.constraint_hessian[i * n..][..n];
@@ -410,9 +416,9 @@ impl Plant {
             target.fill(0.0);
             target.iter_mut().zip(&by_start[..nd]).for_each(|(t, entry)| *t = -entry);
             target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
-            let dynamic = constraint.points.path.iter().map(|joint| joint.coordinate);
+            let dynamic = constraint.dynamic_coordinates().iter();
             workspace.terms.clear();
-            workspace.terms.extend(dynamic.filter(|i| *i < nd).map(|i| (jacobian[i], i)));
+            workspace.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
             add_rows(target, &out.increment, stride, &workspace.terms);
         }
         workspace.schur.solve_rows(&mut out.multipliers, stride);
@@ -443,8 +449,7 @@ impl Plant {
             add_rows(target, &out.increment, stride, &workspace.terms);
         }
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let dynamic = constraint.points.path.iter().map(|joint| joint.coordinate);
-            for i in dynamic.filter(|i| *i < nd) {
+            for &i in constraint.dynamic_coordinates() {
                 let entry = workspace.start.jacobian[c * n + i];
                 let target = &mut out.momentum[i * stride..][..stride];
                 add_rows(target, &out.multipliers, stride, &[(-entry, c)]);

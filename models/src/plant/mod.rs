@@ -1,9 +1,9 @@
 //! Plants: a model with a state and a workspace.
 //!
 //! The files in the order in which a step runs: [`initial`], [`kinematics`], [`momenta`],
-//! [`springs`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`], [`pivoted_lu`],
-//! [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then [`diagnose`],
-//! [`settle`], [`snapshot`].
+//! [`vectors`], [`potentials`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`],
+//! [`pivoted_lu`], [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then
+//! [`diagnose`], [`settle`], [`snapshot`].
 
 pub(crate) mod balls;
 pub(crate) mod blocks;
@@ -18,12 +18,15 @@ mod linearize;
 mod momenta;
 mod newton;
 pub(crate) mod pivoted_lu;
+pub(crate) mod potentials;
 pub(crate) mod rows;
+#[cfg(test)]
+mod samples;
 mod second_order;
 mod settle;
 mod snapshot;
-mod springs;
 pub(crate) mod tree_lu;
+mod vectors;
 
 use std::sync::Arc;
 

@@ -19,7 +19,7 @@ use crate::plant::momenta::Momenta;
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{Term, padded};
 use crate::plant::tree_lu::TreeLu;
-use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, springs};
+use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
 
 /// A residual this small, in units of round-off, is as good as zero.
@@ -340,10 +340,9 @@ impl Workspace {
             &mut self.l_q,
             &mut self.l_v,
         );
-        if model.has_springs() {
-            springs::add_gradient(
-                &model.coordinate_springs,
-                &model.point_springs,
+        if model.potentials.any {
+            potentials::add_gradient(
+                &model.potentials,
                 &model.dynamics,
                 &self.poses,
                 &self.q_mid,
@@ -396,7 +395,7 @@ impl Workspace {
         }
         let h = settings.time_step_s;
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
-        if !model.point_springs.is_empty() {
+        if model.potentials.couple_branches {
             self.matrix.clear();
         }
         self.curvature.fill_newton_matrix(
@@ -406,12 +405,12 @@ impl Workspace {
             h,
             &mut self.matrix,
         );
-        if model.has_springs() {
-            springs::add_to_newton_matrix(
-                &model.coordinate_springs,
-                &model.point_springs,
+        if model.potentials.any {
+            potentials::add_to_newton_matrix(
+                &model.potentials,
                 &model.dynamics,
                 &self.poses,
+                &self.q_mid,
                 h,
                 &model.elimination,
                 &mut self.matrix,
@@ -480,10 +479,8 @@ impl Workspace {
             for (c, constraint) in model.constraints.iter().enumerate() {
                 let row = &self.end.jacobian[c * n..][..n];
                 let mut value = -self.end.value[c];
-                for joint in &constraint.points.path {
-                    if let Some(r) = self.residual.get(joint.coordinate) {
-                        value += row[joint.coordinate] * r;
-                    }
+                for &i in constraint.dynamic_coordinates() {
+                    value += row[i] * self.residual[i];
                 }
                 self.constraint_residual[c] = value;
             }
@@ -559,19 +556,11 @@ pub(crate) fn fill_schur(model: &Model, closure: &Closure, x: &[f64], schur: &mu
     for (c, constraint) in model.constraints.iter().enumerate() {
         let target = &mut schur.matrix[c * nc..][..nc];
         target.fill(0.0);
-        for joint in &constraint.points.path {
-            if joint.coordinate < model.dimensions.dynamic {
-                let entry = closure.jacobian[c * n + joint.coordinate];
-                for (t, x) in target.iter_mut().zip(&x[joint.coordinate * stride..]) {
-                    *t += entry * x;
-                }
+        for &i in constraint.dynamic_coordinates() {
+            let entry = closure.jacobian[c * n + i];
+            for (t, x) in target.iter_mut().zip(&x[i * stride..]) {
+                *t += entry * x;
             }
         }
-    }
-}
-
-impl Model {
-    pub(crate) fn has_springs(&self) -> bool {
-        !self.coordinate_springs.is_empty() || !self.point_springs.is_empty()
     }
 }

@@ -562,7 +562,7 @@ impl Plant {
                 *dual = Dual::new(*lambda, 0.0);
             }
             blocks.evaluate_start(model);
-            workspace.end.hessian(model, &adjoint[nd..], end_hessian);
+            workspace.end.hessian(model, &workspace.q_end, &adjoint[nd..], end_hessian);
         }
 
         // Second derivatives by the start and by what is next: `x` or `k`.

@@ -306,7 +306,7 @@ impl<'a> Search<'a> {
         if model.dimensions.constraints > 0 {
             let mut hessian = vec![0.0; n * n];
             model.conditioning.rows(model, &mut self.closure, &point.q);
-            self.closure.hessian(model, &point.forces, &mut hessian);
+            self.closure.hessian(model, &point.q, &point.forces, &mut hessian);
             for i in 0..nd {
                 for j in 0..nd {
                     stiffness[(i, j)] += hessian[i * n + j];

@@ -16,5 +16,11 @@ pub const MAX_INPUTS: usize = 1024;
 pub const MAX_CONSTRAINTS: usize = 1024;
 /// Most knots of a spline.
 pub const MAX_KNOTS: usize = 4096;
+/// Most points of all paths together.
+pub const MAX_PATH_POINTS: usize = 4096;
+/// Most terms of all couplings together.
+pub const MAX_COUPLING_TERMS: usize = 4096;
+/// Highest power of a coupling.
+pub const MAX_POWER: usize = 16;
 /// Most operating points.
 pub const MAX_OPERATING_POINTS: usize = 256;

@@ -10,8 +10,9 @@ mod tests;
 use std::collections::BTreeMap;
 
 use super::{
-    Constraint, CoordinateKind, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_FRAMES, MAX_INPUTS,
-    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_SPRINGS, Motion, Problem, Scene,
+    Constraint, CoordinateKind, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FRAMES,
+    MAX_INPUTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_SPRINGS, Motion,
+    Problem, Scene, Spring,
 };
 
 use crate::Model;
@@ -78,18 +79,37 @@ impl<'a> Check<'a> {
         let scene = self.scene;
         let joints: usize = scene.frames.iter().map(|f| f.motions().len()).sum();
         let equations: usize = scene.constraints.iter().map(Constraint::equations).sum();
-        for (path, count, most) in [
-            ("frames", scene.frames.len(), MAX_FRAMES),
-            ("frames", joints, MAX_COORDINATES),
-            ("coordinates", scene.coordinates.len(), MAX_COORDINATES),
-            ("springs", scene.springs.len(), MAX_SPRINGS),
-            ("inputs", scene.inputs.len(), MAX_INPUTS),
-            ("constraints", scene.constraints.len().max(equations), MAX_CONSTRAINTS),
-            ("operating_points", scene.operating_points.len(), MAX_OPERATING_POINTS),
+        let spring_points = scene.springs.iter().map(|spring| match spring {
+            Spring::Path { points, .. } => points.len(),
+            _ => 0,
+        });
+        let constraint_points = scene.constraints.iter().map(|constraint| match constraint {
+            Constraint::PathLength { points, .. } => points.len(),
+            _ => 0,
+        });
+        let terms = scene.constraints.iter().map(|constraint| match constraint {
+            Constraint::Coupling { terms, .. } => terms.len(),
+            _ => 0,
+        });
+        let equations = scene.constraints.len().max(equations);
+        for (path, what, count, most) in [
+            ("frames", "frames", scene.frames.len(), MAX_FRAMES),
+            ("frames", "joints", joints, MAX_COORDINATES),
+            ("coordinates", "coordinates", scene.coordinates.len(), MAX_COORDINATES),
+            ("springs", "springs", scene.springs.len(), MAX_SPRINGS),
+            ("springs", "points of paths", spring_points.sum(), MAX_PATH_POINTS),
+            ("inputs", "inputs", scene.inputs.len(), MAX_INPUTS),
+            ("constraints", "constraints", equations, MAX_CONSTRAINTS),
+            ("constraints", "points of paths", constraint_points.sum(), MAX_PATH_POINTS),
+            ("constraints", "terms of couplings", terms.sum(), MAX_COUPLING_TERMS),
+            (
+                "operating_points",
+                "operating_points",
+                scene.operating_points.len(),
+                MAX_OPERATING_POINTS,
+            ),
         ] {
             if count > most {
-                let what =
-                    if path == "frames" && most == MAX_COORDINATES { "joints" } else { path };
                 self.report(path, format!("{count} {what}; at most {most} are allowed"));
             }
         }

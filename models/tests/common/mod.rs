@@ -1,6 +1,8 @@
 //! Mechanisms and helpers that the tests of motion share.
 #![allow(dead_code, reason = "each test program uses some of it")]
 
+pub(crate) mod linearization;
+
 use std::f64::consts::PI;
 use std::sync::Arc;
 

@@ -1,11 +1,16 @@
-//! Springs and constraints: what acts between points.
+//! Springs and constraints: what acts between points, frames and coordinates.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::Check;
-use crate::scene::{Axis, Constraint, CoordinateKind, Length, Point, Spring};
+use crate::scene::{
+    Axis, Constraint, CoordinateKind, CouplingTerm, Length, MAX_POWER, Motion, Plane, Point, Spring,
+};
 
-/// What moves two points relative to each other.
+/// A frame; the world has no index.
+type Carrier = Option<usize>;
+
+/// What moves points or frames relative to each other.
 #[derive(Default)]
 struct RelativeMotion {
     dynamic: bool,
@@ -31,6 +36,19 @@ impl Check<'_> {
                     self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
                     self.not_of_an_orientation(format!("{path}.coordinate"), coordinate);
                 }
+                Spring::Spline { coordinate, knots } => {
+                    self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
+                    self.not_of_an_orientation(format!("{path}.coordinate"), coordinate);
+                    self.knots(format!("{path}.knots"), knots);
+                }
+                Spring::Path { points, stiffness, rest_length } => {
+                    self.not_negative(format!("{path}.stiffness"), *stiffness);
+                    self.not_negative(format!("{path}.rest_length"), *rest_length);
+                    let motion = self.along(&format!("{path}.points"), points);
+                    if motion.is_some_and(|m| !m.dynamic && !m.prescribed) {
+                        self.report(path, "its points do not move relative to each other");
+                    }
+                }
             }
         }
     }
@@ -40,16 +58,42 @@ impl Check<'_> {
         for (i, constraint) in self.scene.constraints.iter().enumerate() {
             let path = format!("constraints[{i}]");
             self.name(format!("{path}.name"), constraint.name(), &mut seen);
-            let (a, b) = constraint.points();
-            if self.between(&path, a, b).is_some_and(|motion| !motion.dynamic) {
-                let message = "no dynamic coordinate moves its points relative to each other";
-                self.report(path.clone(), message);
-            }
-            match constraint {
-                Constraint::Distance { length, .. } => {
-                    self.length(format!("{path}.length"), length)
+            let motion = match constraint {
+                Constraint::Distance { a, b, length, .. } => {
+                    let motion = self.between(&path, a, b);
+                    self.length(format!("{path}.length"), length);
+                    motion
                 }
-                Constraint::PointToPoint { axes, .. } => self.axes(format!("{path}.axes"), axes),
+                Constraint::PointToPoint { a, b, axes, .. } => {
+                    let motion = self.between(&path, a, b);
+                    self.axes(format!("{path}.axes"), axes);
+                    motion
+                }
+                Constraint::PointOnPlane { plane, point, .. } => self.plane(&path, plane, point),
+                Constraint::Orientation { a, b, .. } => self.aligned(&path, a, b, true),
+                Constraint::Weld { a, b, .. } => self.aligned(&path, a, b, false),
+                Constraint::Coupling { terms, constant, .. } => {
+                    self.finite(format!("{path}.constant"), *constant);
+                    self.terms(&format!("{path}.terms"), terms)
+                }
+                Constraint::PathLength { points, length, .. } => {
+                    let motion = self.along(&format!("{path}.points"), points);
+                    self.length(format!("{path}.length"), length);
+                    motion
+                }
+            };
+            if motion.is_some_and(|motion| !motion.dynamic) {
+                let message = match constraint {
+                    Constraint::Coupling { .. } => "couples no dynamic coordinate",
+                    Constraint::Orientation { .. } => {
+                        "no dynamic coordinate turns its frames relative to each other"
+                    }
+                    Constraint::Weld { .. } => {
+                        "no dynamic coordinate moves its frames relative to each other"
+                    }
+                    _ => "no dynamic coordinate moves its points relative to each other",
+                };
+                self.report(path, message);
             }
         }
     }
@@ -68,45 +112,135 @@ impl Check<'_> {
         }
     }
 
+    fn plane(&mut self, path: &str, plane: &Plane, point: &Point) -> Option<RelativeMotion> {
+        self.finite_all(&format!("{path}.plane.at"), &plane.at);
+        self.axis(&format!("{path}.plane.normal"), &plane.normal);
+        let a = self.carrier(format!("{path}.plane.frame"), &plane.frame);
+        let b = self.point(&format!("{path}.point"), point);
+        self.relative_motion(&[a?, b?], |_| true)
+    }
+
+    /// Two frames that a constraint aligns; with `turning`, slides do not count as motion.
+    fn aligned(&mut self, path: &str, a: &str, b: &str, turning: bool) -> Option<RelativeMotion> {
+        let a = self.carrier(format!("{path}.a"), a);
+        let b = self.carrier(format!("{path}.b"), b);
+        self.relative_motion(&[a?, b?], |motion| !turning || motion.is_angle())
+    }
+
+    fn terms(&mut self, path: &str, terms: &[CouplingTerm]) -> Option<RelativeMotion> {
+        let mut motion = RelativeMotion::default();
+        let mut seen = BTreeSet::new();
+        let mut known = true;
+        if terms.is_empty() {
+            self.report(path, "is empty");
+            return None;
+        }
+        for (i, term) in terms.iter().enumerate() {
+            let (path, name) = (format!("{path}[{i}]"), term.coordinate.as_str());
+            match self.kinds.get(name) {
+                Some(CoordinateKind::Dynamic) => motion.dynamic = true,
+                Some(CoordinateKind::Prescribed) => motion.prescribed = true,
+                None => {
+                    known = false;
+                    self.report(
+                        format!("{path}.coordinate"),
+                        format!("there is no coordinate `{name}`"),
+                    );
+                }
+            }
+            self.not_of_an_orientation(format!("{path}.coordinate"), name);
+            if !seen.insert(name) {
+                let message = format!("coordinate `{name}` has a term already");
+                self.report(format!("{path}.coordinate"), message);
+            }
+            let path = format!("{path}.coefficients");
+            if !self.finite_all(&path, &term.coefficients) {
+                continue;
+            }
+            if term.coefficients.len() > MAX_POWER {
+                let message =
+                    format!("has {} entries; at most {MAX_POWER}", term.coefficients.len());
+                self.report(path, message);
+            } else if term.coefficients.iter().all(|c| *c == 0.0) {
+                self.report(path, "are all zero");
+            }
+        }
+        known.then_some(motion)
+    }
+
     /// Checks two points; tells what moves them relative to each other if both frames exist.
     fn between(&mut self, path: &str, a: &Point, b: &Point) -> Option<RelativeMotion> {
         let a = self.point(&format!("{path}.a"), a);
         let b = self.point(&format!("{path}.b"), b);
-        let (a, b) = (a?, b?);
-        self.is_tree.then(|| self.relative_motion(a, b))
+        self.relative_motion(&[a?, b?], |_| true)
     }
 
-    /// Checks a point and finds its frame; the world has no index.
-    fn point(&mut self, path: &str, point: &Point) -> Option<Option<usize>> {
+    /// Checks the points of a path; tells what moves them relative to each other.
+    fn along(&mut self, path: &str, points: &[Point]) -> Option<RelativeMotion> {
+        if points.len() < 2 {
+            self.report(path, "must be two or more points");
+            return None;
+        }
+        for (i, ends) in points.windows(2).enumerate() {
+            if ends[0] == ends[1] {
+                self.report(format!("{path}[{}]", i + 1), "is the point before it");
+            }
+        }
+        let carriers: Vec<_> = points
+            .iter()
+            .enumerate()
+            .map(|(i, point)| self.point(&format!("{path}[{i}]"), point))
+            .collect();
+        let carriers: Vec<Carrier> = carriers.into_iter().collect::<Option<_>>()?;
+        self.relative_motion(&carriers, |_| true)
+    }
+
+    /// Checks a point and finds its frame.
+    fn point(&mut self, path: &str, point: &Point) -> Option<Carrier> {
         self.finite_all(&format!("{path}.at"), &point.at);
-        if point.frame == "world" {
+        self.carrier(format!("{path}.frame"), &point.frame)
+    }
+
+    /// Finds a frame.
+    fn carrier(&mut self, path: String, name: &str) -> Option<Carrier> {
+        if name == "world" {
             return Some(None);
         }
-        let frame = self.frames.get(point.frame.as_str()).copied();
+        let frame = self.frames.get(name).copied();
         if frame.is_none() {
-            self.report(format!("{path}.frame"), format!("there is no frame `{}`", point.frame));
+            self.report(path, format!("there is no frame `{name}`"));
         }
         frame.map(Some)
     }
 
-    /// Joints on the path between two frames; those above both move both alike.
-    fn relative_motion(&self, a: Option<usize>, b: Option<usize>) -> RelativeMotion {
-        let above_a: BTreeSet<_> = self.upward(a).collect();
-        let above_b: BTreeSet<_> = self.upward(b).collect();
+    /// What of the motions that count is between frames: joints that carry some of them, but not all.
+    fn relative_motion(
+        &self,
+        carriers: &[Carrier],
+        counts: impl Fn(&Motion) -> bool,
+    ) -> Option<RelativeMotion> {
+        if !self.is_tree {
+            return None;
+        }
+        let mut carried: BTreeMap<usize, usize> = BTreeMap::new();
+        for &carrier in carriers {
+            for frame in std::iter::successors(carrier, |&i| self.parents[i]) {
+                *carried.entry(frame).or_default() += 1;
+            }
+        }
         let mut motion = RelativeMotion::default();
-        for &frame in above_a.symmetric_difference(&above_b) {
-            for (name, _) in self.scene.frames[frame].motions() {
+        for (frame, count) in carried {
+            if count == carriers.len() {
+                continue;
+            }
+            for (name, of_joint) in self.scene.frames[frame].motions() {
                 match self.kinds.get(&name) {
+                    _ if !counts(&of_joint) => {}
                     Some(CoordinateKind::Prescribed) => motion.prescribed = true,
                     _ => motion.dynamic = true,
                 }
             }
         }
-        motion
-    }
-
-    /// A frame and its ancestors.
-    fn upward(&self, frame: Option<usize>) -> impl Iterator<Item = usize> {
-        std::iter::successors(frame, |&i| self.parents[i])
+        Some(motion)
     }
 }

@@ -3,11 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::Check;
-use crate::scene::{Constraint, CoordinateKind, Length, Motion};
+use crate::scene::{Constraint, CoordinateKind, Motion};
 
 impl<'a> Check<'a> {
     pub(super) fn coordinates(&mut self) {
         let lengths = self.length_coordinates();
+        let coupled = self.coupled_coordinates();
         let mut seen = BTreeMap::new();
         for (i, coordinate) in self.scene.coordinates.iter().enumerate() {
             let path = format!("coordinates[{i}]");
@@ -28,12 +29,13 @@ impl<'a> Check<'a> {
                     );
                 }
             }
-            let used = self.movers.contains_key(name) || (prescribed && lengths.contains(name));
+            let follows = lengths.contains(name) || coupled.contains(name);
+            let used = self.movers.contains_key(name) || (prescribed && follows);
             if !used {
-                let message = if lengths.contains(name) {
-                    format!("no joint moves by `{name}`; a length must be prescribed")
+                let message = if follows {
+                    format!("no joint moves by `{name}`; what is not a joint's must be prescribed")
                 } else {
-                    format!("no joint moves by `{name}` and no length follows it")
+                    format!("no joint moves by `{name}` and no constraint follows it")
                 };
                 self.report(format!("{path}.name"), message);
             }
@@ -42,11 +44,16 @@ impl<'a> Check<'a> {
 
     /// Coordinates that are lengths of constraints.
     fn length_coordinates(&self) -> BTreeSet<&'a str> {
-        let lengths = self.scene.constraints.iter().filter_map(|constraint| match constraint {
-            Constraint::Distance { length: Length::Coordinate(name), .. } => Some(name.as_str()),
+        self.scene.constraints.iter().filter_map(Constraint::length_coordinate).collect()
+    }
+
+    /// Coordinates of couplings.
+    fn coupled_coordinates(&self) -> BTreeSet<&'a str> {
+        let terms = self.scene.constraints.iter().filter_map(|constraint| match constraint {
+            Constraint::Coupling { terms, .. } => Some(terms),
             _ => None,
         });
-        lengths.collect()
+        terms.flatten().map(|term| term.coordinate.as_str()).collect()
     }
 
     /// That a length names a prescribed coordinate, which is not an angle.

@@ -104,7 +104,6 @@ impl Check<'_> {
         }
     }
     /// That the knots make a spline.
-    #[allow(dead_code, reason = "springs and signals will use it")]
     pub(super) fn knots(&mut self, path: String, knots: &[Knot]) {
         let before = self.problems.len();
         if knots.len() < 2 || knots.len() > MAX_KNOTS {

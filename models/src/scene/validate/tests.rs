@@ -78,8 +78,13 @@ inputs = { torque = 1.0 }
 
 /// Replaces `from`, which must occur once, by `to`; tells if the problems are not at `expected`.
 fn check(from: &str, to: &str, expected: &[&str]) -> Option<String> {
-    assert_eq!(GOOD.matches(from).count(), 1, "`{from}` must occur once");
-    let scene = Scene::from_toml(&GOOD.replace(from, to)).unwrap_or_else(|e| panic!("`{to}`: {e}"));
+    check_in(GOOD, from, to, expected)
+}
+
+/// The same in another good scene.
+fn check_in(good: &str, from: &str, to: &str, expected: &[&str]) -> Option<String> {
+    assert_eq!(good.matches(from).count(), 1, "`{from}` must occur once");
+    let scene = Scene::from_toml(&good.replace(from, to)).unwrap_or_else(|e| panic!("`{to}`: {e}"));
     let problems = scene.validate();
     let paths: Vec<_> = problems.iter().map(|p| p.path.as_str()).collect();
     let wrong = paths != expected || problems.iter().any(|p| p.message.is_empty());
@@ -274,6 +279,133 @@ fn faults_are_found_where_they_are() {
     let wrong: Vec<_> =
         cases.iter().filter_map(|(from, to, expected)| check(from, to, expected)).collect();
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// The scene of an element.
+fn element(name: &str) -> String {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    std::fs::read_to_string(format!("{folder}/{name}.toml")).unwrap()
+}
+
+#[test]
+fn faults_of_elements_are_found_where_they_are() {
+    let cases: &[(&str, &str, &str, &[&str])] = &[
+        // Splines.
+        ("spline-spring", "\"lever\"\nknots", "\"level\"\nknots", &["springs[0].coordinate"]),
+        (
+            "spline-spring",
+            "x = 0.0, value = 0.0",
+            "x = -0.4, value = nan",
+            &["springs[0].knots[2].x", "springs[0].knots[2].value"],
+        ),
+        ("spline-spring", "curvature = 0.0", "curvature = inf", &["springs[0].knots[2].curvature"]),
+        ("spline-spring", "x = 0.6", "x = nan", &["springs[0].knots[4].x"]),
+        (
+            "spline-spring",
+            "x = 0.6, value = -0.5",
+            "x = 0.4000000000000001, value = 1e300",
+            &["springs[0].knots"],
+        ),
+        // Paths.
+        (
+            "path-spring",
+            "stiffness = 20.0\nrest_length = 0.8",
+            "stiffness = -20.0\nrest_length = -0.8",
+            &["springs[0].stiffness", "springs[0].rest_length"],
+        ),
+        (
+            "path-spring",
+            "{ frame = \"distal\", at = [0.3, 0.0, 0.05] }",
+            "{ frame = \"nail\", at = [nan, 0.0, 0.05] }",
+            &["springs[0].points[3].at[0]", "springs[0].points[3].frame"],
+        ),
+        (
+            "path-spring",
+            "{ frame = \"distal\", at = [0.3, 0.0, 0.05] }",
+            "{ frame = \"distal\", at = [0.1, 0.02, 0.06] }",
+            &["springs[0].points[3]"],
+        ),
+        ("path-length", "length = 3.0", "length = 0.0", &["constraints[0].length"]),
+        ("path-length", "length = 3.0", "length = \"weight\"", &["constraints[0].length"]),
+        (
+            "path-length",
+            "    { frame = \"weight\" },\n    { frame = \"world\" },\n    { frame = \"world\", at = [1.0, 0.0, 0.0] },\n",
+            "",
+            &["constraints[0].points"],
+        ),
+        // Planes.
+        (
+            "point-on-plane",
+            "normal = [0.0, 2.0, 0.0]",
+            "normal = [0.0, 0.0, 0.0]",
+            &["constraints[0].plane.normal"],
+        ),
+        (
+            "point-on-plane",
+            "plane = { frame = \"door\"",
+            "plane = { frame = \"arm\", at = [nan, 0.0, 0.0]",
+            &["constraints[0].plane.at[0]", "constraints[0]"],
+        ),
+        (
+            "point-on-plane",
+            "point = { frame = \"arm\"",
+            "point = { frame = \"leg\"",
+            &["constraints[0].point.frame"],
+        ),
+        // Frames.
+        ("orientation", "a = \"bob\"", "a = \"wheel\"", &["constraints[0]"]),
+        ("orientation", "b = \"wheel\"", "b = \"well\"", &["constraints[0].b"]),
+        ("weld", "a = \"tip\"", "a = \"top\"", &["constraints[0].a"]),
+        (
+            "weld",
+            "type = \"weld\"\nname = \"seam\"\na = \"tip\"\nb = \"bob\"",
+            "type = \"orientation\"\nname = \"seam\"\na = \"world\"\nb = \"z\"",
+            &["constraints[0]"],
+        ),
+        // Couplings.
+        (
+            "coupling",
+            "{ coordinate = \"wheel\", coefficients = [3.0] }",
+            "{ coordinate = \"pinion\", coefficients = [] }",
+            &["constraints[0].terms[1].coordinate", "constraints[0].terms[1].coefficients"],
+        ),
+        (
+            "coupling",
+            "{ coordinate = \"wheel\", coefficients = [3.0] }",
+            "{ coordinate = \"well\", coefficients = [nan] }",
+            &["constraints[0].terms[1].coordinate", "constraints[0].terms[1].coefficients[0]"],
+        ),
+        ("coupling", "constant = -0.1", "constant = inf", &["constraints[1].constant"]),
+        ("hoist", "{ coordinate = \"fan\", coefficients = [1.0, 0.1] },", "", &["constraints[1]"]),
+        (
+            "hoist",
+            "name = \"motor\"\nkind = \"prescribed\"",
+            "name = \"motor\"",
+            &["coordinates[3].name"],
+        ),
+    ];
+    let faults = cases.iter();
+    let wrong = faults
+        .filter_map(|(name, from, to, expected)| check_in(&element(name), from, to, expected));
+    let wrong: Vec<_> = wrong.collect();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn paths_couplings_and_splines_have_limits() {
+    let mut scene = Scene::from_toml(&element("path-length")).unwrap();
+    let Constraint::PathLength { points, .. } = &mut scene.constraints[0] else { panic!() };
+    *points = points.iter().cycle().take(MAX_PATH_POINTS + 1).cloned().collect();
+    assert!(scene.validate()[0].message.contains("points of paths"));
+    let mut scene = Scene::from_toml(&element("coupling")).unwrap();
+    let Constraint::Coupling { terms, .. } = &mut scene.constraints[0] else { panic!() };
+    let term = terms[0].clone();
+    *terms = vec![term; MAX_COUPLING_TERMS + 1];
+    assert!(scene.validate()[0].message.contains("terms of couplings"));
+    let mut scene = Scene::from_toml(&element("spline-spring")).unwrap();
+    let Spring::Spline { knots, .. } = &mut scene.springs[0] else { panic!() };
+    *knots = vec![knots[0]; crate::scene::MAX_KNOTS + 1];
+    assert_eq!(scene.validate()[0].path, "springs[0].knots");
 }
 
 #[test]

@@ -1,0 +1,154 @@
+//! The linearization of a step against sixth-order central differences of the step itself.
+
+use plantd_models::{ForceSplit, Initial, Linearization, Plant, Scene, State};
+
+use super::{SPLITS, STENCIL, plant, wave, waving_input};
+
+/// Of the differences, relative to the largest entry of a block: what their own round-off leaves.
+const TOLERANCE: f64 = 1e-8;
+
+/// A step's result: `q`, `p`, and multipliers.
+fn step(plant: &mut Plant, x: &State, u: &[f64]) -> [Vec<f64>; 3] {
+    let initial = Initial::Momentum { q: x.q.clone(), p: x.p.clone(), v: x.v.clone() };
+    plant.initialize(&initial).unwrap();
+    plant.step(u).unwrap();
+    [plant.q().to_vec(), plant.p().to_vec(), plant.multipliers().to_vec()]
+}
+
+/// Derivative at 0 of what `along` makes of a displacement.
+fn slope(delta: f64, mut along: impl FnMut(f64) -> [Vec<f64>; 3]) -> [Vec<f64>; 3] {
+    let mut sum: [Vec<f64>; 3] = Default::default();
+    for (offset, weight) in STENCIL {
+        for (sum, value) in sum.iter_mut().zip(along(offset * delta)) {
+            sum.resize(value.len(), 0.0);
+            sum.iter_mut().zip(value).for_each(|(s, x)| *s += weight / delta * x);
+        }
+    }
+    sum
+}
+
+/// One linearization, and what is compared with it.
+struct Check {
+    plant: Plant,
+    x: State,
+    u: Vec<f64>,
+    out: Linearization,
+    name: String,
+}
+
+impl Check {
+    /// About a state in full motion.
+    fn new(scene: &Scene, split: ForceSplit) -> Self {
+        let mut plant = plant(scene, |s| s.force_split = split);
+        wave(&mut plant, 20);
+        let x = plant.state();
+        let u = waving_input(&plant, 23);
+        let mut out = Linearization::new(&plant.model().clone());
+        plant.linearize(&u, &mut out).unwrap();
+        assert_eq!(plant.state(), x, "linearize must stay");
+        Self { plant, x, u, out, name: format!("{}, {split:?}", scene.name) }
+    }
+
+    /// What the linearization says: the same three vectors for a displacement of `x` and `u`.
+    fn predicted(&self, dx: &[f64], du: &[f64]) -> [Vec<f64>; 3] {
+        let d = self.plant.model().dimensions();
+        let (dx, du) =
+            (nalgebra::DVector::from_row_slice(dx), nalgebra::DVector::from_row_slice(du));
+        let x = self.out.a() * &dx + self.out.b() * &du;
+        let multipliers = self.out.multipliers_x() * dx + self.out.multipliers_u() * du;
+        let n = d.coordinates();
+        let rows = |range: std::ops::Range<usize>| x.as_slice()[range].to_vec();
+        [rows(0..n), rows(n..n + d.dynamic), multipliers.as_slice().to_vec()]
+    }
+
+    /// What the round-off of a step is in differences: a small part of the steepest slope.
+    fn noise(&self) -> [f64; 3] {
+        let d = self.plant.model().dimensions();
+        let (a, b, n) = (self.out.a(), self.out.b(), d.coordinates());
+        let rows = |from, count| a.rows(from, count).amax().max(b.rows(from, count).amax());
+        let multipliers = self.out.multipliers_x().amax().max(self.out.multipliers_u().amax());
+        [rows(0, n), rows(n, d.dynamic), multipliers].map(|slope| 1e-11 + 1e-12 * slope)
+    }
+
+    fn compare(&self, what: &str, found: [Vec<f64>; 3], predicted: [Vec<f64>; 3], tolerance: f64) {
+        let noise = self.noise();
+        for (((part, found), predicted), noise) in
+            ["q", "p", "λ"].iter().zip(found).zip(predicted).zip(noise)
+        {
+            let scale = found.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
+            for (i, (x, y)) in predicted.iter().zip(&found).enumerate() {
+                let error = (x - y).abs();
+                let allowed = tolerance * scale + noise;
+                let name = &self.name;
+                assert!(error <= allowed, "{name}: ∂{part}[{i}]/∂{what} is {x}, differences {y}");
+            }
+        }
+    }
+
+    /// Every column; those of `q` only where displaced configurations are allowed.
+    fn columns(&mut self) {
+        let d = self.plant.model().dimensions();
+        let n = d.coordinates();
+        let first = if d.constraints == 0 { 0 } else { n };
+        for column in first..d.state() {
+            // A momentum is changed by what moves coordinates by two thousandths, whatever the masses.
+            let mobility = self.out.a().view((0, column), (n, 1)).amax();
+            let delta = if column < n { 1e-3 } else { (2e-3 / mobility).min(0.1) };
+            let found = slope(delta, |s| {
+                let mut x = self.x.clone();
+                let parts = [&mut x.q[..], &mut x.p, &mut x.v];
+                *parts.into_iter().flatten().nth(column).unwrap() += s;
+                step(&mut self.plant, &x, &self.u)
+            });
+            let mut dx = vec![0.0; d.state()];
+            dx[column] = 1.0;
+            let predicted = self.predicted(&dx, &vec![0.0; d.input()]);
+            self.compare(&format!("x[{column}]"), found, predicted, TOLERANCE);
+        }
+        for column in 0..d.input() {
+            let delta = if column < d.inputs { 1e-1 } else { 1e-3 };
+            let found = slope(delta, |s| {
+                let mut u = self.u.clone();
+                u[column] += s;
+                step(&mut self.plant, &self.x, &u)
+            });
+            let mut du = vec![0.0; d.input()];
+            du[column] = 1.0;
+            let predicted = self.predicted(&vec![0.0; d.state()], &du);
+            self.compare(&format!("u[{column}]"), found, predicted, TOLERANCE);
+        }
+    }
+
+    /// Along curves on the constraint manifold, whose own slope is found by the same differences.
+    fn manifold(&mut self) {
+        let d = self.plant.model().dimensions();
+        for direction in 0..d.coordinates() {
+            let on_manifold = |check: &mut Self, s: f64| {
+                let mut q = check.x.q.clone();
+                q[direction] += s;
+                check.plant.initialize(&Initial::Projection { q, hold: Vec::new() }).unwrap();
+                State { q: check.plant.q().to_vec(), ..check.x.clone() }
+            };
+            let [dq, ..] = slope(1e-3, |s| [on_manifold(self, s).q, Vec::new(), Vec::new()]);
+            let found = slope(1e-3, |s| {
+                let x = on_manifold(self, s);
+                step(&mut self.plant, &x, &self.u.clone())
+            });
+            let mut dx = dq;
+            dx.resize(d.state(), 0.0);
+            let predicted = self.predicted(&dx, &vec![0.0; d.input()]);
+            self.compare(&format!("direction {direction}"), found, predicted, 10.0 * TOLERANCE);
+        }
+    }
+}
+
+/// Checks every column, for both ways to split forces.
+pub(crate) fn check(scene: &Scene) {
+    for split in SPLITS {
+        let mut check = Check::new(scene, split);
+        check.columns();
+        if check.plant.model().dimensions().constraints > 0 {
+            check.manifold();
+        }
+    }
+}

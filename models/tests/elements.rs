@@ -1,0 +1,356 @@
+//! Every element: its scene in `scenes/elements`, its section in `scenes/ELEMENTS.md`, derivatives,
+//! conservation, and closed forms.
+
+mod common;
+
+use std::path::Path;
+
+use common::{linearization, plant, wave};
+use nalgebra::DMatrix;
+use plantd_models::scene::{CoordinateKind, Frame, Joint};
+use plantd_models::{Initial, InitialError, Linearization, Plant, Scene};
+
+const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+const PAGE: &str = include_str!("../scenes/ELEMENTS.md");
+
+/// Definitions of the schema whose variants are elements, and their chapters.
+const CHAPTERS: [(&str, &str); 2] = [("Spring", "Springs"), ("Constraint", "Constraints")];
+
+/// All scenes of the folder.
+fn scenes() -> Vec<Scene> {
+    let mut scenes = Vec::new();
+    for entry in std::fs::read_dir(FOLDER).unwrap() {
+        let path = entry.unwrap().path();
+        let scene = Scene::from_toml(&std::fs::read_to_string(&path).unwrap())
+            .unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+        assert_eq!(path.file_stem(), Some(scene.name.as_ref()), "a scene bears its file's name");
+        scenes.push(scene);
+    }
+    scenes.sort_by(|a, b| a.name.cmp(&b.name));
+    scenes
+}
+
+fn scene(name: &str) -> Scene {
+    let path = Path::new(FOLDER).join(name).with_extension("toml");
+    Scene::from_toml(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+/// Nothing does work on it from outside, and nothing takes energy.
+fn is_conservative(scene: &Scene) -> bool {
+    let rest = Scene { springs: Vec::new(), constraints: Vec::new(), ..scene.clone() };
+    let text = rest.to_toml();
+    scene.damping == 0.0
+        && scene
+            .coordinates
+            .iter()
+            .all(|c| c.kind == CoordinateKind::Dynamic && c.damping.unwrap_or_default() == 0.0)
+        && !["[[forces]]", "[[inputs]]", "[[signals]]"].iter().any(|part| text.contains(part))
+}
+
+/// Variants of a tagged enum of the schema.
+fn variants(definition: &str) -> Vec<String> {
+    let schema = Scene::json_schema();
+    let variants = schema["$defs"][definition]["oneOf"].as_array().unwrap().clone();
+    let tag = |variant: &serde_json::Value| {
+        variant["properties"]["type"]["const"].as_str().unwrap().to_owned()
+    };
+    variants.iter().map(tag).collect()
+}
+
+#[test]
+fn every_element_has_a_section_and_a_scene() {
+    let texts: Vec<String> = scenes().iter().map(|s| serde_json::to_string(s).unwrap()).collect();
+    for (definition, chapter) in CHAPTERS {
+        let chapter = PAGE.split("\n## ").find(|part| part.starts_with(chapter)).unwrap();
+        for element in variants(definition) {
+            let is_section =
+                |line: &str| line.starts_with("### ") && line.contains(&format!("`{element}`"));
+            assert!(chapter.lines().any(is_section), "ELEMENTS.md has no section `{element}`");
+            let used = format!("\"type\":\"{element}\"");
+            assert!(texts.iter().any(|text| text.contains(&used)), "no scene has `{element}`");
+        }
+    }
+}
+
+#[test]
+fn every_scene_moves() {
+    for scene in scenes() {
+        let mut plant = plant(&scene, |_| ());
+        let start = plant.q().to_vec();
+        wave(&mut plant, 100);
+        let moved = start.iter().zip(plant.q()).fold(0.0_f64, |m, (a, b)| m.max((a - b).abs()));
+        assert!(moved > 1e-3, "{} does not move", scene.name);
+        assert!(plant.q().iter().all(|x| x.is_finite()), "{}", scene.name);
+    }
+}
+
+/// Orientations, whose increments do not add, are differentiated in `joints.rs`.
+#[test]
+fn every_linearization_agrees_with_differences() {
+    let turns_freely =
+        |frame: &Frame| matches!(frame.joint, Some(Joint::Ball { .. } | Joint::Free { .. }));
+    for scene in scenes().iter().filter(|scene| !scene.frames.iter().any(turns_freely)) {
+        linearization::check(scene);
+    }
+}
+
+/// `Aᵀ J A = J` with `J = [[0, 1], [−1, 0]]`.
+#[test]
+fn maps_of_conservative_scenes_are_symplectic() {
+    let conservative = scenes().into_iter().filter(is_conservative);
+    for scene in conservative.filter(|scene| scene.constraints.is_empty()) {
+        let mut plant = plant(&scene, |_| ());
+        wave(&mut plant, 30);
+        let model = plant.model().clone();
+        let n = model.dimensions().dynamic;
+        let mut out = Linearization::new(&model);
+        plant.linearize(&[], &mut out).unwrap();
+        let a = out.a();
+        let j = DMatrix::from_fn(2 * n, 2 * n, |row, column| {
+            f64::from(u8::from(column == row + n)) - f64::from(u8::from(row == column + n))
+        });
+        let defect = (a.transpose() * &j * &a - &j).amax();
+        let size = a.amax().max(1.0);
+        assert!(defect <= 1e-14 * n as f64 * size * size, "{}: {defect:e}", scene.name);
+    }
+}
+
+fn total_energy(plant: &mut Plant) -> f64 {
+    let energy = plant.energy();
+    energy.kinetic_j + energy.potential_j
+}
+
+/// Energy is the work balance of springs and constraints: it swings by a part of second order in the
+/// time step and does not drift. Constraints hold to round-off all the way.
+#[test]
+fn energy_is_kept_to_second_order_and_constraints_to_round_off() {
+    for scene in scenes().into_iter().filter(is_conservative) {
+        let mut worst = [0.0_f64; 2];
+        for (worst, refinement) in worst.iter_mut().zip([1, 2]) {
+            let mut plant = plant(&scene, |s| s.time_step_s = 2e-3 / f64::from(refinement));
+            let start = total_energy(&mut plant);
+            for step in 0..1000 * refinement {
+                let report = plant.step(&[]).unwrap_or_else(|e| panic!("{}: {e}", scene.name));
+                let violation = report.constraint_residual;
+                assert!(violation < 1e3, "{} step {step}: {violation}", scene.name);
+                *worst = worst.max((total_energy(&mut plant) - start).abs());
+            }
+        }
+        let [coarse, fine] = worst;
+        let ratio = coarse / fine;
+        assert!(ratio > 3.0 && ratio < 5.0, "{}: {coarse:e} and {fine:e} J", scene.name);
+    }
+}
+
+/// A scene of frames that slide along world axes or turn about y, and what acts on them.
+fn mechanism(frames: &[&str], actions: &str) -> Scene {
+    let mut text = "format = 1\nname = \"test\"\ntime_step_s = 0.01\n".to_owned();
+    text.push_str("gravity = [0.0, 0.0, -9.81]\n");
+    for frame in frames {
+        text.push_str(&format!("[[frames]]\n{frame}\n"));
+    }
+    text.push_str(actions);
+    Scene::from_toml(&text).unwrap_or_else(|e| panic!("{e}\n{text}"))
+}
+
+/// From rest with a constant acceleration `a` of coordinate `i`: `q = ½ a t²`, exactly.
+fn accelerates(scene: &Scene, u: &[f64], coordinate: &str, acceleration: f64) {
+    let mut plant = plant(scene, |_| ());
+    let i = plant.model().coordinate_index(coordinate).unwrap();
+    let start = plant.q()[i];
+    for _ in 0..100 {
+        plant.step(u).unwrap();
+    }
+    let moved = plant.q()[i] - start;
+    let expected = 0.5 * acceleration * plant.time_s().powi(2);
+    assert!((moved - expected).abs() < 1e-11 * expected.abs(), "{moved} instead of {expected}");
+}
+
+/// Through gears with `q1 = −3 q2` the second rotor's inertia appears as a ninth at the first.
+#[test]
+fn a_gear_pair_reflects_inertia() {
+    let rotor = |name: &str, inertia: f64| {
+        format!(
+            "name = \"{name}\"\njoint = {{ type = \"revolute\", axis = [0.0, 1.0, 0.0] }}\nbody = {{ mass = 1.0, inertia = [{inertia}, {inertia}, {inertia}] }}"
+        )
+    };
+    let scene = mechanism(
+        &[&rotor("first", 0.02), &rotor("second", 0.9)],
+        r#"
+        [[inputs]]
+        name = "torque"
+        coordinate = "first"
+        [[constraints]]
+        type = "coupling"
+        name = "teeth"
+        terms = [
+            { coordinate = "first", coefficients = [1.0] },
+            { coordinate = "second", coefficients = [3.0] },
+        ]
+        "#,
+    );
+    let acceleration = 0.6 / (0.02 + 0.9 / 9.0);
+    accelerates(&scene, &[0.6], "first", acceleration);
+    accelerates(&scene, &[0.6], "second", -acceleration / 3.0);
+}
+
+/// Atwood's machine: `a = g (m1 − m2)/(m1 + m2)`.
+#[test]
+fn a_rope_over_a_pulley_makes_an_atwood_machine() {
+    let weight = |name: &str, x: f64, mass: f64| {
+        format!(
+            "name = \"{name}\"\ntranslation = [{x}, 0.0, -4.0]\njoint = {{ type = \"prismatic\", axis = [0.0, 0.0, 1.0] }}\nbody = {{ mass = {mass} }}"
+        )
+    };
+    let scene = mechanism(
+        &[&weight("left", 0.0, 3.0), &weight("right", 0.4, 2.0)],
+        r#"
+        [[constraints]]
+        type = "path_length"
+        name = "rope"
+        points = [
+            { frame = "left" },
+            { frame = "world" },
+            { frame = "world", at = [0.4, 0.0, 0.0] },
+            { frame = "right" },
+        ]
+        length = 8.4
+        "#,
+    );
+    accelerates(&scene, &[], "left", -9.81 / 5.0);
+    accelerates(&scene, &[], "right", 9.81 / 5.0);
+}
+
+const POINT_MASS: [&str; 3] = [
+    "name = \"x\"\njoint = { type = \"prismatic\", axis = [1.0, 0.0, 0.0] }",
+    "name = \"y\"\nparent = \"x\"\njoint = { type = \"prismatic\", axis = [0.0, 1.0, 0.0] }",
+    "name = \"z\"\nparent = \"y\"\njoint = { type = \"prismatic\", axis = [0.0, 0.0, 1.0] }\nbody = { mass = 2.0 }",
+];
+
+/// Down a plane that falls 4 on 3: `a = g sin α` along it.
+#[test]
+fn a_bead_slides_down_a_plane() {
+    let scene = mechanism(
+        &POINT_MASS,
+        r#"
+        [[constraints]]
+        type = "point_on_plane"
+        name = "slope"
+        plane = { frame = "world", normal = [4.0, 0.0, 3.0] }
+        point = { frame = "z" }
+        "#,
+    );
+    accelerates(&scene, &[], "x", 9.81 * 0.8 * 0.6);
+    accelerates(&scene, &[], "z", -9.81 * 0.8 * 0.8);
+}
+
+/// A spline through a line is a linear spring.
+#[test]
+fn a_straight_spline_is_a_coordinate_spring() {
+    let arm = "name = \"arm\"\njoint = { type = \"revolute\", axis = [0.0, 1.0, 0.0] }\nbody = { mass = 1.0, center_of_mass = [0.5, 0.0, 0.0] }";
+    let linear = mechanism(
+        &[arm],
+        "[[springs]]\ntype = \"coordinate\"\ncoordinate = \"arm\"\nstiffness = 8.0\nrest = 0.25\n",
+    );
+    let spline = mechanism(
+        &[arm],
+        r#"
+        [[springs]]
+        type = "spline"
+        coordinate = "arm"
+        knots = [
+            { x = 0.25, value = 0.0 },
+            { x = 0.5, value = -2.0 },
+            { x = 1.25, value = -8.0, curvature = 0.0 },
+        ]
+        "#,
+    );
+    let [mut linear, mut spline] = [linear, spline].map(|scene| plant(&scene, |_| ()));
+    for _ in 0..500 {
+        linear.step(&[]).unwrap();
+        spline.step(&[]).unwrap();
+        assert!((linear.q()[0] - spline.q()[0]).abs() < 1e-12);
+        let (a, b) = (linear.energy(), spline.energy());
+        assert!((a.potential_j - b.potential_j).abs() < 1e-12, "{a:?} {b:?}");
+    }
+}
+
+/// A cord through an eye that lies on the straight line between its ends is a two-point spring.
+#[test]
+fn a_path_without_corner_is_a_two_point_spring() {
+    let weight = "name = \"weight\"\ntranslation = [0.0, 0.0, -1.0]\njoint = { type = \"prismatic\", axis = [0.0, 0.0, 1.0] }\nbody = { mass = 2.0 }";
+    let cord = mechanism(
+        &[weight],
+        r#"
+        [[springs]]
+        type = "path"
+        points = [{ frame = "world" }, { frame = "world", at = [0.0, 0.0, -0.3] }, { frame = "weight" }]
+        stiffness = 100.0
+        rest_length = 0.9
+        "#,
+    );
+    let spring = mechanism(
+        &[weight],
+        r#"
+        [[springs]]
+        type = "two_point"
+        a = { frame = "weight" }
+        b = { frame = "world" }
+        stiffness = 100.0
+        rest_length = 0.9
+        "#,
+    );
+    let [mut cord, mut spring] = [cord, spring].map(|scene| plant(&scene, |_| ()));
+    for _ in 0..500 {
+        cord.step(&[]).unwrap();
+        spring.step(&[]).unwrap();
+        assert!((cord.q()[0] - spring.q()[0]).abs() < 1e-12);
+        let (a, b) = (cord.energy(), spring.energy());
+        assert!((a.potential_j - b.potential_j).abs() < 1e-12, "{a:?} {b:?}");
+    }
+}
+
+/// A welded body moves as one that is part of the link, up to the error of the time step.
+#[test]
+fn a_welded_body_moves_as_if_it_were_part_of_the_link() {
+    let welded = scene("weld");
+    let mut one_piece = welded.clone();
+    one_piece.constraints.clear();
+    let bob = one_piece.frames.pop().unwrap();
+    one_piece.frames.truncate(3);
+    one_piece.coordinates.clear();
+    one_piece.frames[2].body = bob.body;
+    let apart = |h: f64| {
+        let [mut a, mut b] = [&welded, &one_piece].map(|scene| plant(scene, |s| s.time_step_s = h));
+        for _ in 0..(0.5 / h).round() as u32 {
+            a.step(&[]).unwrap();
+            b.step(&[]).unwrap();
+        }
+        a.q().iter().zip(b.q()).fold(0.0_f64, |m, (a, b)| m.max((a - b).abs()))
+    };
+    let (coarse, fine) = (apart(4e-3), apart(2e-3));
+    assert!(fine < 1e-4 && coarse / fine > 3.5, "{coarse:e} {fine:e}");
+}
+
+#[test]
+fn configurations_without_direction_or_wrongly_aligned_are_refused() {
+    let refused = |scene: &Scene, change: &[(&str, f64)]| {
+        let mut plant = plant(scene, |_| ());
+        let mut q = plant.q().to_vec();
+        for (name, value) in change {
+            q[plant.model().coordinate_index(name).unwrap()] = *value;
+        }
+        let p = vec![0.0; plant.p().len()];
+        plant.initialize(&Initial::Momentum { q, p, v: Vec::new() }).unwrap_err()
+    };
+    let rope = refused(&scene("path-length"), &[("weight", 0.0), ("bob_z", 0.0), ("bob_x", 3.0)]);
+    assert!(matches!(&rope, InitialError::Degenerate { constraint, .. } if constraint == "rope"));
+    // Half a turn about x, and a third of a turn about the diagonal of the axes.
+    let (half, quarter) = (std::f64::consts::PI, std::f64::consts::FRAC_PI_2);
+    for turns in [[half, 0.0, 0.0], [0.0, half, 0.0], [0.0, 0.0, half], [quarter, 0.0, quarter]] {
+        let change = ["wheel", "inner", "outer"].into_iter().zip(turns);
+        let error = refused(&scene("orientation"), &change.collect::<Vec<_>>());
+        let found = matches!(&error, InitialError::Degenerate { constraint, .. } if constraint == "aligned");
+        assert!(found, "{turns:?}: {error}");
+    }
+}
