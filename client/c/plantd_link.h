@@ -1,17 +1,17 @@
 /*
- * plantd_link.h: layout of the shared-memory link of plantd, version 1.
+ * plantd_link.h: layout of the shared-memory link of plantd, version 2.
  *
  * A message is one plantd_link_header (the user header of an iceoryx2 sample) and a slice of
  * double. Each open plant has, in the iceoryx2 domain of the server,
  *
- *     plantd/1/<plant>/input   publish-subscribe and event, drivers to server
- *     plantd/1/<plant>/state   publish-subscribe and event, server to drivers
+ *     plantd/2/<plant>/input   publish-subscribe and event, drivers to server
+ *     plantd/2/<plant>/state   publish-subscribe and event, server to drivers
  *
  * The domain is an iceoryx2 0.10 configuration with the server's root path and the prefix
  * plantd1_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
  * by exclusive or, as eight hexadecimal digits. The publish-subscribe services have the payload type
  * "f64" (dynamic), the user header type PLANTD_LINK_TYPE_NAME, and the attributes
- * plantd.layout = "1" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
+ * plantd.layout = "2" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
  *
  * Conversation:
  *
@@ -42,10 +42,10 @@
 extern "C" {
 #endif
 
-#define PLANTD_LINK_LAYOUT_VERSION 1u
+#define PLANTD_LINK_LAYOUT_VERSION 2u
 #define PLANTD_LINK_MAGIC 0x746e6c70u /* "plnt" */
-#define PLANTD_LINK_SCHEMA_HASH UINT64_C(0x879761770b5a4bdf)
-#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader1"
+#define PLANTD_LINK_SCHEMA_HASH UINT64_C(0x6847a2fcb4d7d53d)
+#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader2"
 #define PLANTD_LINK_POLL_FOREVER_NS UINT64_MAX
 
 /* What a message is. */
@@ -74,8 +74,12 @@ enum plantd_link_code {
     PLANTD_LINK_CODE_SINGULAR = 10,        /* detail_a: coordinate; detail_value: relative pivot */
     PLANTD_LINK_CODE_PLANT_DELETED = 11,
     PLANTD_LINK_CODE_LINK_CLOSED = 12,
-    PLANTD_LINK_CODE_TOO_FAST = 13         /* detail_a: coordinate; detail_value: its increment, rad,
+    PLANTD_LINK_CODE_TOO_FAST = 13,        /* detail_a: coordinate; detail_value: its increment, rad,
                                               more than half a turn */
+    PLANTD_LINK_CODE_SINGULAR_CONSTRAINTS = 14, /* detail_a: first constraint equation; detail_b: how
+                                                   many; detail_value: reciprocal condition */
+    PLANTD_LINK_CODE_INCONSISTENT_CONSTRAINTS = 15 /* detail_a, detail_b: as above; detail_value: the
+                                                      largest violation */
 };
 
 /* Who holds a lease. */
@@ -109,10 +113,11 @@ struct plantd_link_header {
     uint32_t constraints;         /* constraint equations, nc */
     uint32_t iterations;          /* residual evaluations of the step */
     uint32_t factorizations;      /* factorizations of the step */
-    uint32_t reserved;            /* zero */
+    uint32_t redundant_constraints; /* constraint equations that follow from others */
     double residual;              /* final residual in units of its own round-off */
     double constraint_residual;   /* constraint violation in units of its own round-off */
-    double reciprocal_condition;  /* smallest pivot relative to the largest entry */
+    double reciprocal_condition;  /* estimate for the Newton matrix, at most 1 */
+    double constraint_reciprocal_condition; /* the same for the constraints; 1 without any */
     uint64_t detail_a;            /* first detail of a failure */
     uint64_t detail_b;            /* second detail of a failure */
     double detail_value;          /* number that goes with a failure */

@@ -118,6 +118,11 @@ impl Client {
         Ok(self.models().validate_scene(self.limited(request)).await?.into_inner())
     }
 
+    /// Finds a configuration in which a model rests, or one that satisfies its constraints.
+    pub async fn settle(&self, request: v1::SettleRequest) -> Result<v1::SettleResponse> {
+        Ok(self.models().settle(self.limited(request)).await?.into_inner())
+    }
+
     /// Forgets an uploaded model; its plants live on.
     pub async fn delete_model(&self, name: impl Into<String>) -> Result<()> {
         let request = v1::DeleteModelRequest { name: name.into() };
@@ -138,6 +143,11 @@ impl Client {
     pub async fn get_plant(&self, id: impl Into<String>) -> Result<v1::GetPlantResponse> {
         let request = v1::GetPlantRequest { id: id.into() };
         Ok(self.plants().get_plant(self.limited(request)).await?.into_inner())
+    }
+
+    /// What can be said of a state of a plant or a model: degrees of freedom, energy, momenta, forces.
+    pub async fn diagnose(&self, request: v1::DiagnoseRequest) -> Result<v1::DiagnoseResponse> {
+        Ok(self.plants().diagnose(self.limited(request)).await?.into_inner())
     }
 
     /// All plants, by id.
@@ -217,11 +227,32 @@ impl Client {
     }
 }
 
-/// Linearizations, regulators and rollouts; nothing here touches a plant.
+/// Linearizations, analysis, regulators and rollouts; nothing here changes a plant.
 impl Client {
     /// Linearizes the map of a model at one point.
     pub async fn linearize(&self, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse> {
         Ok(self.control().linearize(self.limited(request)).await?.into_inner())
+    }
+
+    /// Second derivatives of the map of a model at one point: tensors, or contracted with weights.
+    pub async fn linearize_second_order(
+        &self,
+        request: v1::LinearizeSecondOrderRequest,
+    ) -> Result<v1::LinearizeSecondOrderResponse> {
+        Ok(self.control().linearize_second_order(self.limited(request)).await?.into_inner())
+    }
+
+    /// Accelerations and constraint forces of continuous time, with their derivatives.
+    pub async fn evaluate_dynamics(
+        &self,
+        request: v1::EvaluateDynamicsRequest,
+    ) -> Result<v1::EvaluateDynamicsResponse> {
+        Ok(self.control().evaluate_dynamics(self.limited(request)).await?.into_inner())
+    }
+
+    /// Controllability, observability, modes and frequency response of the linearized map.
+    pub async fn analyze(&self, request: v1::AnalyzeRequest) -> Result<v1::AnalyzeResponse> {
+        Ok(self.control().analyze(self.limited(request)).await?.into_inner())
     }
 
     /// Linearizes the map at every step of a trajectory, in order.

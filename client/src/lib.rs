@@ -56,13 +56,15 @@ mod driver;
 mod error;
 pub mod link;
 mod matrix;
+mod rotation;
 mod stream;
 
 pub use channel::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use client::Client;
 pub use driver::Driver;
 pub use error::{Error, Refusal, Result, Violation};
-pub use matrix::{GainExt, MatrixExt, StateExt, diagonal, operating_point};
+pub use matrix::{GainExt, MatrixExt, StateExt, diagonal, operating_point, present_state};
+pub use rotation::{difference, rotations};
 pub use stream::Answers;
 
 /// The messages and stubs of the contract, `plantd.v1`.

@@ -103,8 +103,12 @@ pub struct StateView<'a> {
     pub residual: f64,
     /// Constraint violation in units of its own round-off.
     pub constraint_residual: f64,
-    /// Smallest pivot of the Newton matrix relative to its largest entry.
+    /// Estimate of the reciprocal condition of the Newton matrix, at most 1.
     pub reciprocal_condition: f64,
+    /// The same for the constraints, without redundant ones; 1 without constraints.
+    pub constraint_reciprocal_condition: f64,
+    /// Constraint equations that follow from others.
+    pub redundant_constraints: u32,
 }
 
 /// A driver of one plant. It holds the plant's lease until it is dropped.
@@ -188,6 +192,8 @@ impl LinkDriver {
             residual: self.last.residual,
             constraint_residual: self.last.constraint_residual,
             reciprocal_condition: self.last.reciprocal_condition,
+            constraint_reciprocal_condition: self.last.constraint_reciprocal_condition,
+            redundant_constraints: self.last.redundant_constraints,
         }
     }
 

@@ -2,6 +2,8 @@
 
 use plantd_proto::v1;
 
+use crate::rotation::difference;
+
 /// Reading and writing of [`v1::Matrix`].
 pub trait MatrixExt: Sized {
     /// A matrix of these rows, which must have equal lengths; no rows give a 0 × 0 matrix.
@@ -67,13 +69,14 @@ impl StateExt for v1::State {
 pub trait GainExt {
     /// The feedback law `u = u_reference − K (x − x_reference)`.
     ///
-    /// Differences of angles are taken as they are: a joint that has turned by 2π is 2π away.
+    /// Differences of angles are taken as they are: a joint that has turned by 2π is 2π away. Those of
+    /// ball joints are rotation vectors, see [`difference`].
     fn control(&self, state: &v1::State) -> Vec<f64>;
 }
 
 impl GainExt for v1::Gain {
     fn control(&self, state: &v1::State) -> Vec<f64> {
-        let error: Vec<f64> = state.x().iter().zip(&self.x_reference).map(|(x, r)| x - r).collect();
+        let error = difference(&self.x_reference, &state.x(), &self.rotations);
         let correction = self.k.as_ref().map(|k| k.times(&error)).unwrap_or_default();
         let mut u = self.u_reference.clone();
         for (u, du) in u.iter_mut().zip(correction) {
@@ -81,6 +84,11 @@ impl GainExt for v1::Gain {
         }
         u
     }
+}
+
+/// The present state of a plant, where a linearization, an analysis or a regulator is wanted.
+pub fn present_state(plant: impl Into<String>) -> v1::Point {
+    v1::Point { source: Some(v1::point::Source::Plant(plant.into())) }
 }
 
 /// A weight with these diagonal entries.
@@ -105,6 +113,7 @@ mod tests {
             k: Some(v1::Matrix::from_rows(&[[2.0, 3.0]])),
             x_reference: vec![1.0, 0.5],
             u_reference: vec![10.0],
+            rotations: Vec::new(),
         };
         let state = v1::State { q: vec![2.0], p: vec![0.0], ..Default::default() };
         assert_eq!(gain.control(&state), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);

@@ -1,4 +1,4 @@
-//! Linear-quadratic control on the discrete map `x[k+1] = A x[k] + B u[k]`.
+//! Analysis of the discrete map and linear-quadratic control on it, `x[k+1] = A x[k] + B u[k]`.
 //!
 //! The cost is `Σ ½ xᵀQx + ½ uᵀRu`, with `½ xᵀ Q_f x` at the end of a finite horizon, and the
 //! feedback law is `u = u_ref − K (x − x_ref)`.
@@ -8,7 +8,9 @@
 //! | gains along a trajectory | [`finite_horizon`], [`finite_horizon_on_manifold`] |
 //! | a regulator about an equilibrium | [`infinite_horizon`], [`infinite_horizon_on_manifold`] |
 //! | directions that a constrained system can move in | [`Tangent`], [`tangent_basis`] |
-//! | what the inputs reach | [`controllability_rank`] |
+//! | what the inputs reach, what the outputs show | [`controllability_rank`], [`observability_rank`] |
+//! | how the map moves by itself | [`modes`] |
+//! | how it answers a sinusoid | [`TransferFunction`] |
 //!
 //! Everything here allocates and may take milliseconds to seconds: it belongs on a worker, never
 //! on a control path. Costs are given in flops of `n` states and `m` inputs.
@@ -17,16 +19,20 @@ mod controllability;
 mod doubling;
 mod error;
 mod finite_horizon;
+mod frequency;
 mod infinite_horizon;
 mod manifold;
+mod modes;
 mod spectrum;
 mod weights;
 
-pub use controllability::controllability_rank;
-pub use error::RiccatiError;
+pub use controllability::{controllability_rank, observability_rank};
+pub use error::{AnalysisError, RiccatiError};
 pub use finite_horizon::{FiniteHorizon, Sample, finite_horizon, finite_horizon_on_manifold};
+pub use frequency::TransferFunction;
 pub use infinite_horizon::{Regulator, infinite_horizon, infinite_horizon_on_manifold};
 pub use manifold::{Tangent, tangent_basis};
+pub use modes::{Mode, modes};
 pub use spectrum::spectral_radius;
 pub use weights::{Weights, WeightsError};
 

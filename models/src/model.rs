@@ -303,6 +303,11 @@ impl Model {
         &self.operating_points
     }
 
+    /// First of the three coordinates of each orientation (ball joint): a rotation vector.
+    pub fn orientations(&self) -> &[usize] {
+        &self.orientations
+    }
+
     /// Index of a coordinate.
     pub fn coordinate_index(&self, name: &str) -> Option<usize> {
         self.coordinates.iter().position(|c| c.name == name)

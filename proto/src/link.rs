@@ -4,12 +4,12 @@
 //!
 //! | name | pattern | from | to |
 //! | --- | --- | --- | --- |
-//! | `plantd/1/<plant>/input` | publish-subscribe | drivers | server |
-//! | `plantd/1/<plant>/input` | event | drivers | server |
-//! | `plantd/1/<plant>/state` | publish-subscribe | server | drivers |
-//! | `plantd/1/<plant>/state` | event | server | drivers |
+//! | `plantd/2/<plant>/input` | publish-subscribe | drivers | server |
+//! | `plantd/2/<plant>/input` | event | drivers | server |
+//! | `plantd/2/<plant>/state` | publish-subscribe | server | drivers |
+//! | `plantd/2/<plant>/state` | event | server | drivers |
 //!
-//! The `1` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
+//! The `2` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
 //! slice of `f64`: the input `u` one way, `(q, p, v, multipliers)` the other way.
 //!
 //! # Conversation

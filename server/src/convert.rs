@@ -6,8 +6,8 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::Weights;
 use plantd_models::{
-    Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model, Plant, Scene,
-    SceneError, Settings, Snapshot, State, StepReport,
+    Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
+    Plant, Scene, SceneError, Settings, Snapshot, State, StepReport,
 };
 use plantd_proto::v1;
 use v1::initial_state::Form as InitialForm;
@@ -108,6 +108,12 @@ pub fn settings(
         LimitExceeded::check("max_iterations", limit, "iterations", asked)?;
         settings.max_iterations = given.max_iterations;
     }
+    if given.singular_below != 0.0 {
+        if !(given.singular_below > 0.0 && given.singular_below < 1.0) {
+            return Err(Fault::field("settings.singular_below", "must lie between 0 and 1"));
+        }
+        settings.singular_below = given.singular_below;
+    }
     Ok(settings)
 }
 
@@ -121,11 +127,16 @@ pub fn settings_message(settings: &Settings) -> v1::PlantSettings {
         time_step_s: settings.time_step_s,
         force_split: force_split.into(),
         max_iterations: settings.max_iterations,
+        singular_below: settings.singular_below,
     }
 }
 
 /// How a plant starts; not given means the scene's initial configuration.
-pub fn start(initial: Option<v1::InitialState>, model: &Model) -> Result<Start, Fault> {
+pub fn start(
+    initial: Option<v1::InitialState>,
+    model: &Model,
+    limits: &Limits,
+) -> Result<Start, Fault> {
     let initial = match initial.and_then(|initial| initial.form) {
         None => Initial::Scene,
         Some(InitialForm::Momentum(form)) => momentum(form.q, form.p, form.v, model),
@@ -135,11 +146,30 @@ pub fn start(initial: Option<v1::InitialState>, model: &Model) -> Result<Start, 
         }
         Some(InitialForm::Projection(form)) => Initial::Projection { q: form.q, hold: form.hold },
         Some(InitialForm::OperatingPoint(name)) => Initial::OperatingPoint(name),
+        Some(InitialForm::Equilibrium(form)) => {
+            check_settling(model, limits)?;
+            let q = if form.q.is_empty() { initial_configuration(model) } else { form.q };
+            let zeros = || vec![0.0; model.dimensions().inputs];
+            let inputs = if form.inputs.is_empty() { zeros() } else { form.inputs };
+            Initial::Equilibrium { q, hold: form.hold, inputs }
+        }
         Some(InitialForm::Snapshot(bytes)) => {
             return Ok(Start::Snapshot(Box::new(Snapshot::from_bytes(&bytes)?)));
         }
     };
     Ok(Start::Initial(initial))
+}
+
+/// Configuration in which the scene starts.
+pub fn initial_configuration(model: &Model) -> Vec<f64> {
+    model.coordinates().iter().map(|coordinate| coordinate.initial).collect()
+}
+
+/// Refuses to search an equilibrium of a model so large that it would take minutes.
+pub fn check_settling(model: &Model, limits: &Limits) -> Result<(), Fault> {
+    let (name, limit) = ("settle_coordinates", limits.settle_coordinates);
+    let count = model.dimensions().coordinates();
+    Ok(LimitExceeded::check(name, limit, "coordinates to settle", count)?)
 }
 
 fn momentum(q: Vec<f64>, p: Vec<f64>, v: Vec<f64>, model: &Model) -> Initial {
@@ -174,6 +204,7 @@ pub fn point(
 ) -> Result<(Plant, Vec<f64>), Fault> {
     match point.and_then(|point| point.source) {
         None => Err(Fault::field("point", "is missing")),
+        Some(PointSource::Plant(_)) => Err(Fault::field("point.plant", "is not for this call")),
         Some(PointSource::OperatingPoint(name)) => {
             let field = "point.operating_point";
             let input = model.operating_points().iter().find(|point| point.name == name);
@@ -274,7 +305,7 @@ fn check_shape(field: &str, matrix: &v1::Matrix) -> Result<(), Fault> {
 }
 
 /// Checks a vector's length, and that its entries are finite.
-fn check_numbers(field: &str, numbers: &[f64], expected: usize) -> Result<(), Fault> {
+pub fn check_numbers(field: &str, numbers: &[f64], expected: usize) -> Result<(), Fault> {
     if numbers.len() != expected {
         let problem = format!("has {} entries; {expected} are needed", numbers.len());
         return Err(Fault::field(field, problem));
@@ -282,7 +313,8 @@ fn check_numbers(field: &str, numbers: &[f64], expected: usize) -> Result<(), Fa
     check_finite(field, numbers)
 }
 
-fn check_finite(field: &str, numbers: &[f64]) -> Result<(), Fault> {
+/// Checks that numbers are finite.
+pub fn check_finite(field: &str, numbers: &[f64]) -> Result<(), Fault> {
     match numbers.iter().position(|number| !number.is_finite()) {
         Some(index) => {
             Err(Fault::field(format!("{field}[{index}]"), format!("is {}", numbers[index])))
@@ -312,15 +344,26 @@ fn weight(field: &str, weight: Option<v1::Weight>, size: usize) -> Result<DMatri
             Ok(DMatrix::from_diagonal(&DVector::from_vec(diagonal.values)))
         }
         Some(WeightForm::Full(matrix)) => {
-            check_shape(&format!("{field}.full"), &matrix)?;
-            let (rows, cols) = (matrix.rows as usize, matrix.cols as usize);
-            if (rows, cols) != (size, size) {
-                let problem = format!("is {rows} x {cols}; {size} x {size} is needed");
-                return Err(Fault::field(format!("{field}.full"), problem));
-            }
-            Ok(DMatrix::from_row_slice(rows, cols, &matrix.data))
+            matrix_of(&format!("{field}.full"), &matrix, Some(size), size)
         }
     }
+}
+
+/// A matrix of the request: of so many columns, and rows where their number is given.
+pub fn matrix_of(
+    field: &str,
+    matrix: &v1::Matrix,
+    expected_rows: Option<usize>,
+    expected_cols: usize,
+) -> Result<DMatrix<f64>, Fault> {
+    check_shape(field, matrix)?;
+    let (rows, cols) = (matrix.rows as usize, matrix.cols as usize);
+    let needed = expected_rows.unwrap_or(rows);
+    if (rows, cols) != (needed, expected_cols) {
+        let problem = format!("is {rows} x {cols}; {needed} x {expected_cols} is needed");
+        return Err(Fault::field(field, problem));
+    }
+    Ok(DMatrix::from_row_slice(rows, cols, &matrix.data))
 }
 
 /// A matrix as a message.
@@ -375,7 +418,23 @@ pub fn report(report: &StepReport) -> v1::StepReport {
         residual: report.residual,
         constraint_residual: report.constraint_residual,
         reciprocal_condition: report.reciprocal_condition,
+        constraint_reciprocal_condition: report.constraint_reciprocal_condition,
+        redundant_constraints: report.redundant_constraints,
     }
+}
+
+/// Names of the entries of `x = (q, p, v)`: `theta`, `p(theta)`, `v(lift)`.
+pub fn state_names(model: &Model) -> Vec<String> {
+    let (dynamic, prescribed) = model.coordinates().split_at(model.dimensions().dynamic);
+    let all = model.coordinates().iter().map(|c| c.name.clone());
+    all.chain(dynamic.iter().map(|c| format!("p({})", c.name)))
+        .chain(prescribed.iter().map(|c| format!("v({})", c.name)))
+        .collect()
+}
+
+/// Indices in `x` at which the rotation vectors of ball joints begin.
+pub fn rotations(model: &Model) -> Vec<u32> {
+    model.orientations().iter().map(|&start| start as u32).collect()
 }
 
 /// Numbers in the message of a linearization.
@@ -386,6 +445,25 @@ pub fn linearization_numbers(d: Dimensions) -> usize {
 /// Numbers in the message of a state.
 pub fn state_numbers(d: Dimensions) -> usize {
     d.state() + d.constraints
+}
+
+/// Diagnostics of the state at `step` as a message.
+pub fn diagnostics(step: u64, diagnostics: Diagnostics) -> v1::DiagnoseResponse {
+    let count = |number: usize| number as u32;
+    v1::DiagnoseResponse {
+        step,
+        degrees_of_freedom: count(diagnostics.degrees_of_freedom),
+        constraint_rank: count(diagnostics.constraint_rank),
+        redundant_constraints: diagnostics.redundant_constraints,
+        energy: Some(energy(diagnostics.energy)),
+        linear_momentum: diagnostics.linear_momentum.to_vec(),
+        angular_momentum: diagnostics.angular_momentum.to_vec(),
+        center_of_mass: diagnostics.center_of_mass.to_vec(),
+        mass_kg: diagnostics.mass_kg,
+        constraint_forces: diagnostics.constraint_forces,
+        mass_matrix_reciprocal_condition: diagnostics.mass_matrix_reciprocal_condition,
+        constraint_reciprocal_condition: diagnostics.constraint_reciprocal_condition,
+    }
 }
 
 /// An energy as a message.
@@ -411,14 +489,26 @@ pub fn model(name: &str, builtin: bool, model: &Model, with_texts: bool) -> v1::
         name: name.to_owned(),
         description: scene.description.clone(),
         builtin,
-        coordinates: model.coordinates().iter().map(coordinate).collect(),
+        coordinates: coordinates(model),
         inputs: scene.inputs.iter().map(|input| input.name.clone()).collect(),
         constraints: model.constraint_names().to_vec(),
         operating_points: model.operating_points().iter().map(|p| p.name.clone()).collect(),
         scene_toml: if with_texts { scene.to_toml() } else { String::new() },
         plan: if with_texts { model.plan() } else { String::new() },
         time_step_s: scene.time_step_s,
+        signals: Vec::new(),
     }
+}
+
+fn coordinates(model: &Model) -> Vec<v1::Coordinate> {
+    let mut coordinates: Vec<_> = model.coordinates().iter().map(coordinate).collect();
+    for &start in model.orientations() {
+        let group = coordinates[start].name.trim_end_matches(".rx").to_owned();
+        for component in &mut coordinates[start..start + 3] {
+            component.rotation_group.clone_from(&group);
+        }
+    }
+    coordinates
 }
 
 fn coordinate(coordinate: &plantd_models::Coordinate) -> v1::Coordinate {
@@ -428,6 +518,7 @@ fn coordinate(coordinate: &plantd_models::Coordinate) -> v1::Coordinate {
         prescribed: coordinate.kind == plantd_models::scene::CoordinateKind::Prescribed,
         unit: unit.into(),
         initial: coordinate.initial,
+        rotation_group: String::new(),
     }
 }
 

@@ -78,6 +78,12 @@ limits! {
     trajectory_numbers = 32_000_000 in 1000..=10_000_000_000;
     /// Trajectory regulators that may be held at a time.
     trajectory_solves = 4 in 1..=1000;
+    /// Frequencies of one Analyze call.
+    frequencies = 10_000 in 1..=1_000_000;
+    /// Second derivatives of one call, formed or contracted: outputs times pairs of parameters.
+    second_order_numbers = 64_000_000 in 1000..=10_000_000_000;
+    /// Coordinates of a model whose equilibrium is searched.
+    settle_coordinates = 128 in 1..=65_536;
     /// Heavy computations that may wait for a worker.
     queued_jobs = 256 in 1..=1_000_000;
 }

@@ -166,6 +166,12 @@ impl Session {
         self.core().plant.clone()
     }
 
+    /// The same with the input of its last step; before the first one, the input that holds it.
+    pub fn copy_plant_and_input(&self) -> (Plant, Vec<f64>) {
+        let core = self.core();
+        (core.plant.clone(), core.input.clone())
+    }
+
     /// Who drives the plant.
     pub fn driver(&self) -> Option<DriverKind> {
         DriverKind::from_code(self.driver.load(Ordering::Acquire))

@@ -9,6 +9,7 @@
 //! | INVALID_ARGUMENT | `INVALID_SCENE` | BadRequest, one entry per error of the scene while they fit a trailer | a scene does not compile |
 //! | INVALID_ARGUMENT | `INPUT_DIMENSION`, `INPUT_NOT_FINITE` | BadRequest | the input of a step |
 //! | INVALID_ARGUMENT | `OFF_CONSTRAINT`, `DEGENERATE`, `PROJECTION_FAILED` | BadRequest | an initial configuration cannot satisfy the constraints |
+//! | INVALID_ARGUMENT | `NOT_SETTLED` | BadRequest | no equilibrium was found from a guess |
 //! | INVALID_ARGUMENT | `INVALID_SNAPSHOT`, `SNAPSHOT_MISMATCH` | BadRequest | damaged, or of another model or other settings |
 //! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice |
@@ -16,9 +17,10 @@
 //! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS` | ResourceInfo | the name is taken |
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
-//! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR` | PreconditionFailure; metadata `steps_taken` | the step has no solution; the plant stays at the last good state |
+//! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
 //! | FAILED_PRECONDITION | `NOT_AN_EQUILIBRIUM` | PreconditionFailure; metadata `drift`, `coordinate` | the point of an infinite-horizon regulator moves |
 //! | FAILED_PRECONDITION | `NOT_STABILISABLE`, `NOT_DETECTABLE`, `RICCATI_NOT_CONVERGED`, `RICCATI_OVERFLOW`, `EIGENVALUES_NOT_FOUND` | PreconditionFailure | there is no such regulator |
+//! | FAILED_PRECONDITION | `POLE` | PreconditionFailure; metadata `frequency_hz` | the frequency response is infinite |
 //! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
 //! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::limits`] |
 //! | UNAVAILABLE | `SHUTTING_DOWN` | | the server ends; try again |
@@ -28,8 +30,10 @@
 
 use std::collections::HashMap;
 
-use plantd_models::control::{RiccatiError, WeightsError};
-use plantd_models::{InitialError, SceneError, SnapshotError, StepError};
+use plantd_models::control::{AnalysisError, RiccatiError, WeightsError};
+use plantd_models::{
+    ContinuousError, InitialError, SceneError, SettleError, SnapshotError, StepError, TooLarge,
+};
 use plantd_proto::v1;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
@@ -262,8 +266,28 @@ impl Fault {
                 Self::field_because("PROJECTION_FAILED", field, message)
                     .with("constraint", constraint)
             }
-            InitialError::Settle(_) => Self::field_because("NOT_SETTLED", field, message),
+            InitialError::Settle(error) => Self::from_settle(error, field),
             InitialError::Settings { name, .. } => Self::field(format!("settings.{name}"), message),
+        }
+    }
+}
+
+impl Fault {
+    /// The fault of a guess that did not settle, in `field` of the request.
+    pub fn from_settle(error: SettleError, field: &str) -> Self {
+        let message = error.to_string();
+        match error {
+            SettleError::Dimension { name, .. } => Self::field(format!("{field}.{name}"), message),
+            SettleError::NotFinite { name, index, .. } => {
+                Self::field(format!("{field}.{name}[{index}]"), message)
+            }
+            SettleError::Unknown { .. } => Self::field(format!("{field}.hold"), message),
+            SettleError::Constraints { constraint, .. } => {
+                Self::field_because("NOT_SETTLED", field, message).with("constraint", constraint)
+            }
+            SettleError::Unbounded { .. } | SettleError::NotConverged { .. } => {
+                Self::field_because("NOT_SETTLED", field, message)
+            }
         }
     }
 }
@@ -304,10 +328,11 @@ impl From<StepError> for Fault {
             StepError::NotConverged { .. }
             | StepError::NotFinite { .. }
             | StepError::TooFast { .. }
-            | StepError::Singular { .. }
-            | StepError::SingularConstraints { .. }
-            | StepError::InconsistentConstraints { .. } => {
+            | StepError::Singular { .. } => Self::precondition(reason, "step", message),
+            StepError::SingularConstraints { constraints, .. }
+            | StepError::InconsistentConstraints { constraints, .. } => {
                 Self::precondition(reason, "step", message)
+                    .with("constraints", constraints.join(", "))
             }
         }
     }
@@ -350,6 +375,58 @@ impl From<RiccatiError> for Fault {
             }
         };
         Self::precondition(reason, "regulator", error.to_string())
+    }
+}
+
+impl From<TooLarge> for Fault {
+    fn from(error: TooLarge) -> Self {
+        Self::new(Code::ResourceExhausted, "LIMIT_EXCEEDED", error.to_string())
+            .with("actual", error.entries)
+    }
+}
+
+impl From<ContinuousError> for Fault {
+    fn from(error: ContinuousError) -> Self {
+        let message = error.to_string();
+        match error {
+            ContinuousError::Dimension { name, .. } => Self::field(name, message),
+            ContinuousError::NotFinite { name, index, .. } => {
+                Self::field(format!("{name}[{index}]"), message)
+            }
+            ContinuousError::Overflow => Self::precondition("MOTION_NOT_FINITE", "q", message),
+            ContinuousError::SingularMass { coordinate, .. } => {
+                Self::precondition("SINGULAR", "q", message).with("coordinate", coordinate)
+            }
+            ContinuousError::SingularConstraints { constraint, .. } => {
+                Self::precondition("SINGULAR_CONSTRAINTS", "q", message)
+                    .with("constraints", constraint)
+            }
+            ContinuousError::TooLarge { entries } => {
+                Self::new(Code::ResourceExhausted, "LIMIT_EXCEEDED", message)
+                    .with("actual", entries)
+            }
+        }
+    }
+}
+
+impl From<AnalysisError> for Fault {
+    fn from(error: AnalysisError) -> Self {
+        let message = error.to_string();
+        match error {
+            AnalysisError::Pole { frequency_hz, .. } => {
+                Self::precondition("POLE", "frequencies_hz", message)
+                    .with("frequency_hz", frequency_hz)
+            }
+            AnalysisError::Frequency { .. } => Self::field("frequencies_hz", message),
+            AnalysisError::Eigenvalues { .. } => {
+                Self::precondition("EIGENVALUES_NOT_FOUND", "modes", message)
+            }
+            AnalysisError::NotFinite { .. } => {
+                Self::precondition("MOTION_NOT_FINITE", "linearization", message)
+            }
+            // The server made the matrices, so a misfit among them is its own mistake.
+            AnalysisError::Dimension { .. } => Self::internal(message),
+        }
     }
 }
 

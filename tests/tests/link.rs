@@ -208,7 +208,7 @@ fn a_driver_that_breaks_the_rules_is_told_which_one_and_moves_nothing() {
     assert_eq!((wrong.detail_a, wrong.detail_b), (1, 2));
     let lost = raw.assert_refused(raw.input(5), &[0.0], Code::Sequence);
     assert_eq!(lost.detail_a, 2);
-    raw.assert_refused(Header { layout_version: 2, ..raw.input(6) }, &[0.0], Code::Layout);
+    raw.assert_refused(Header { layout_version: 1, ..raw.input(6) }, &[0.0], Code::Layout);
     raw.assert_refused(Header { kind: 99, ..raw.input(6) }, &[0.0], Code::Kind);
     raw.assert_refused(Header { kind: Kind::State as u32, ..raw.input(6) }, &[0.0], Code::Kind);
     raw.assert_refused(Header { server: 1, ..raw.input(6) }, &[0.0], Code::NotAttached);
@@ -311,7 +311,7 @@ fn a_driver_is_told_that_the_link_was_closed_and_can_connect_when_it_is_open_aga
 
     let info = fixture.host.open(fixture.session.clone()).unwrap();
     assert_eq!(fixture.host.open(fixture.session.clone()).unwrap(), info);
-    assert_eq!((info.service.as_str(), info.layout_version), ("plantd/1/plant", 1));
+    assert_eq!((info.service.as_str(), info.layout_version), ("plantd/2/plant", 2));
     // Without reconnecting it speaks to a link that is no more.
     let error = driver.step(&[0.0]).unwrap_err();
     assert!(matches!(error, LinkError::ServerRestarted), "{error}");

@@ -108,6 +108,90 @@ fn linearizations_and_gains_are_printed_for_people_and_for_programs() {
 }
 
 #[test]
+fn second_derivatives_and_dynamics_are_printed() {
+    let server = ServerProcess::start().unwrap();
+    let at = ["pendulum", "--at", "hanging", "--paper"];
+    let answer = json(&server, &[&["second-order"], at.as_slice()].concat());
+    assert_eq!(answer["tensors"]["xx"]["outputs"], 2);
+    assert_eq!(answer["tensors"]["xu"]["data"].as_array().unwrap().len(), 4);
+    let shown = text(&server, &[&["second-order"], at.as_slice()].concat());
+    assert!(shown.contains("d²/dxdx of p(theta) (2 × 2)"), "{shown}");
+    let shown = text(&server, &[&["second-order"], at.as_slice(), &["--weights", "1,-1"]].concat());
+    assert!(shown.contains("d²/dxdu (2 × 1)") && !shown.contains(" of "), "{shown}");
+
+    let arguments = ["dynamics", "pendulum", "--q", "0.4", "--inputs", "-0.5", "--order", "2"];
+    let answer = json(&server, &arguments);
+    let expected = -0.5 - 9.8 * f64::sin(0.4);
+    assert!((answer["acceleration"][0].as_f64().unwrap() - expected).abs() < 1e-12);
+    let shown = text(&server, &arguments);
+    for part in ["d²(theta)/dt²", "derivatives (1 × 3)", "second derivatives of theta (3 × 3)"]
+    {
+        assert!(shown.contains(part), "no `{part}` in\n{shown}");
+    }
+}
+
+#[test]
+fn modes_and_responses_are_printed() {
+    let server = ServerProcess::start().unwrap();
+    let arguments = ["analyze", "cart-pole", "--at", "hanging", "--outputs", "theta,p(x)"];
+    let arguments = [&arguments[..], &["--frequencies", "0.1,2"]].concat();
+    let answer = json(&server, &arguments);
+    assert_eq!((&answer["order"], &answer["controllability_rank"]), (&4.into(), &4.into()));
+    assert_eq!(answer["responses"][1]["magnitude"]["rows"], 2);
+    let shown = text(&server, &arguments);
+    for part in ["observability rank: 3", "damping ratio", " ± ", "response at 2.000000 Hz: phase"]
+    {
+        assert!(shown.contains(part), "no `{part}` in\n{shown}");
+    }
+}
+
+#[test]
+fn a_settled_configuration_can_be_pasted_into_the_scene() {
+    let server = ServerProcess::start().unwrap();
+    let arguments = ["settle", "pendulum", "--guess", "theta=0.3", "--inputs", "tau=4.9"];
+    let settled = json(&server, &arguments);
+    assert_eq!(settled["equilibrium"]["stable"], true);
+    let shown = text(&server, &arguments);
+    assert!(shown.contains("stable equilibrium after"), "{shown}");
+    let point = text(&server, &[&arguments[..], &["--toml"]].concat());
+    let scene = json(&server, &["show", "model", "pendulum"])["scene_toml"].clone();
+    let scene = scene.as_str().unwrap().replace("\"pendulum\"", "\"settled\"") + &point;
+    let file = server.directory().join("settled.toml");
+    std::fs::write(&file, scene).unwrap();
+    json(&server, &["upload", file.to_str().unwrap()]);
+    json(&server, &["create", "settled", "--id", "s", "--at", "settled"]);
+    let after = json(&server, &["step", "s", "--u", "4.9", "--count", "50"]);
+    let angle = |state: &Value| state["q"][0].as_f64().unwrap();
+    assert!(
+        (angle(&after["states"][0]) - angle(&settled)).abs() < 1e-8,
+        "it stays where it settled"
+    );
+
+    let arguments =
+        ["settle", "four-bar", "--hold", "crank", "--guess", "crank=-0.8", "--constraints"];
+    let held = json(&server, &arguments);
+    assert_eq!((&held["q"][0], held["equilibrium"].is_null()), (&(-0.8).into(), true));
+    assert_eq!(run(&server, &["settle", "pendulum", "--guess", "theta"]).status.code(), Some(2));
+}
+
+#[test]
+fn a_state_is_diagnosed() {
+    let server = ServerProcess::start().unwrap();
+    let shown = text(&server, &["diagnose", "four-bar"]);
+    for part in
+        ["degrees of freedom: 1", "independent constraints: 2 of 2; redundant: none", "mass: 2.7"]
+    {
+        assert!(shown.contains(part), "no `{part}` in\n{shown}");
+    }
+    json(&server, &["create", "four-bar", "--id", "f"]);
+    json(&server, &["step", "f", "--count", "3"]);
+    let answer = json(&server, &["diagnose", "--plant", "f"]);
+    assert_eq!((&answer["step"], &answer["constraint_rank"]), (&3.into(), &2.into()));
+    assert_eq!(answer["constraint_forces"].as_array().unwrap().len(), 2);
+    assert!(text(&server, &["diagnose", "--plant", "f"]).contains("pin.x"));
+}
+
+#[test]
 fn scenes_are_checked_explained_and_uploaded() {
     let server = ServerProcess::start().unwrap();
     let good = server.directory().join("slider.toml");

@@ -177,3 +177,72 @@ def test_arguments_that_contradict_each_other(client):
         client.create_plant("pendulum", v=[0.0])
     with pytest.raises(ValueError):
         client.solve_lqr("pendulum", q=np.zeros((2, 2, 2)), r=[1])
+
+
+def test_modes_and_responses(client):
+    pendulum = client.analyze("pendulum", at="hanging", frequencies=[0.0, 0.2])
+    assert (pendulum.order, pendulum.controllability_rank, pendulum.observability_rank) == (2, 2, 2)
+    # The midpoint rule swings a little slower than sqrt(g / l).
+    expected = 2 / 0.1 * math.atan(math.sqrt(9.8) * 0.1 / 2) / (2 * math.pi)
+    assert [mode.frequency for mode in pendulum.modes] == pytest.approx([expected] * 2)
+    a = client.linearize("pendulum", at="hanging")
+    z = np.exp(2j * np.pi * 0.2 * 0.1)
+    response = np.linalg.solve(z * np.eye(2) - a.a, a.b)
+    assert pendulum.response.shape == (2, 2, 1) and pendulum.outputs == ["theta", "p(theta)"]
+    assert np.allclose(pendulum.response[1], response, rtol=1e-12, atol=0)
+    seen = client.analyze("pendulum", at="hanging", outputs=["p(theta)"], frequencies=0.2)
+    assert np.allclose(seen.response[0], response[1:], rtol=1e-12, atol=0)
+    weighted = client.analyze("pendulum", at="hanging", outputs=[[2.0, 1.0]], frequencies=0.2)
+    assert np.allclose(weighted.response[0], [[2.0, 1.0]] @ response, rtol=1e-12, atol=0)
+    with pytest.raises(plantd.PlantdError) as caught:
+        client.analyze("pendulum", outputs=["phi"])
+    assert caught.value.violations[0].field == "outputs[0]"
+
+
+def test_a_plant_is_analysed_where_it_is(client):
+    plant = client.create_plant("cart-pole").id
+    state = client.step(plant, [[2.0]] * 5)[-1]
+    assert client.analyze(plant=plant).state.x.tobytes() == state.x.tobytes()
+    here = client.linearize(plant=plant)
+    assert here.u.tolist() == [2.0] and here.step == 5
+
+
+def test_second_derivatives(client):
+    plant = client.create_plant("four-bar").id
+    client.step(plant, [[0.4]] * 5)
+    tensors = client.linearize_second_order(plant=plant)
+    assert tensors.xx.shape == (6, 6, 6) and tensors.xu.shape == (6, 6, 1)
+    assert tensors.uu.shape == (6, 1, 1) and tensors.multipliers_xx.shape == (2, 6, 6)
+    assert tensors.linearization.a.tobytes() == client.linearize(plant=plant).a.tobytes()
+    weights, impulses = np.arange(1.0, 7.0), np.array([0.5, -2.0])
+    sum = client.contract_second_order(plant=plant, weights=weights, multiplier_weights=impulses)
+    expected = np.tensordot(weights, tensors.xx, 1) + np.tensordot(impulses, tensors.multipliers_xx, 1)
+    assert np.allclose(sum.xx, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    # The marionette's tensors are too large to send; their contraction is not.
+    with pytest.raises(plantd.PlantdError) as caught:
+        client.linearize_second_order("marionette")
+    assert caught.value.reason == "LIMIT_EXCEEDED"
+    assert client.contract_second_order("marionette", np.ones(80)).xu.shape == (80, 18)
+
+
+def test_continuous_dynamics(client):
+    motion = client.evaluate_dynamics("pendulum", 0.4, 3.0, 0.7, order=2)
+    assert motion.acceleration == pytest.approx([0.7 - 9.8 * math.sin(0.4)], rel=1e-13)
+    assert motion.jacobian == pytest.approx(np.array([[-9.8 * math.cos(0.4), 0, 1]]), abs=1e-12)
+    assert motion.hessian[0, 0, 0] == pytest.approx(9.8 * math.sin(0.4), rel=1e-12)
+    assert client.evaluate_dynamics("pendulum").jacobian is None
+
+
+def test_settle_and_diagnose(client):
+    rest = client.settle("pendulum", guess={"theta": 0.9}, inputs={"tau": 4.9})
+    assert rest.q == pytest.approx([math.pi / 6]) and rest.u.tolist() == [4.9] and rest.stable
+    on = client.settle("four-bar", guess={"crank": -0.8}, hold=["crank"], constraints_only=True)
+    assert on.q[0] == -0.8 and on.stable is None
+    plant = client.create_plant("four-bar", q=on.q).id
+    diagnosed = client.diagnose(plant)
+    assert (diagnosed.degrees_of_freedom, diagnosed.constraint_rank) == (1, 2)
+    assert diagnosed.mass == pytest.approx(2.7) and diagnosed.redundant_constraints == []
+    assert diagnosed.energy.total == pytest.approx(client.get_plant(plant).energy.total)
+    initial = common_pb2.InitialState(operating_point="hanging")
+    hanging = client.diagnose(model="pendulum", initial=initial)
+    assert hanging.center_of_mass == pytest.approx([0, -1, 0], abs=1e-15)

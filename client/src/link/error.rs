@@ -112,6 +112,30 @@ pub enum StepFailure {
         /// Its increment, rad.
         increment: f64,
     },
+    /// Constraint equations lost their independence.
+    #[error(
+        "singular constraints: {count}, the first is equation {constraint} (reciprocal condition {reciprocal_condition:e})"
+    )]
+    SingularConstraints {
+        /// Index of the first equation concerned.
+        constraint: usize,
+        /// How many are concerned.
+        count: usize,
+        /// Reciprocal condition.
+        reciprocal_condition: f64,
+    },
+    /// Constraint equations contradict each other.
+    #[error(
+        "{count} constraints, the first of them equation {constraint}, contradict each other by {violation:e}"
+    )]
+    InconsistentConstraints {
+        /// Index of the first equation concerned.
+        constraint: usize,
+        /// How many are concerned.
+        count: usize,
+        /// Largest violation.
+        violation: f64,
+    },
 }
 
 /// Who drives a plant.
@@ -153,6 +177,14 @@ pub(super) fn from_failure(answer: &Header) -> LinkError {
         Some(Code::NotFinite) => StepFailure::NotFinite { iterations },
         Some(Code::Singular) => StepFailure::Singular { coordinate: a, pivot: value },
         Some(Code::TooFast) => StepFailure::TooFast { coordinate: a, increment: value },
+        Some(Code::SingularConstraints) => StepFailure::SingularConstraints {
+            constraint: a,
+            count: b,
+            reciprocal_condition: value,
+        },
+        Some(Code::InconsistentConstraints) => {
+            StepFailure::InconsistentConstraints { constraint: a, count: b, violation: value }
+        }
         Some(Code::Dimension) => return LinkError::Dimension { expected: a, actual: b },
         Some(Code::Sequence) => return LinkError::Sequence { expected: answer.detail_a },
         Some(Code::LeaseHeld) => return LinkError::LeaseHeld { by: holder(answer) },

@@ -1,4 +1,4 @@
-//! What the inputs reach.
+//! What the inputs reach, and what the outputs show.
 
 use nalgebra::DMatrix;
 use nalgebra::linalg::{SVD, balancing};
@@ -38,6 +38,12 @@ pub fn controllability_rank(a: &DMatrix<f64>, b: &DMatrix<f64>) -> usize {
         fresh = &a * directions;
     }
     reached.ncols()
+}
+
+/// Rank of the observability matrix `[C; CA; CA²; …]`: how many directions of the state the outputs
+/// `y = C x` tell apart. By duality the controllability rank of `(Aᵀ, Cᵀ)`; same costs, same cautions.
+pub fn observability_rank(a: &DMatrix<f64>, c: &DMatrix<f64>) -> usize {
+    controllability_rank(&a.transpose(), &c.transpose())
 }
 
 fn normalize_columns(m: &mut DMatrix<f64>) {
@@ -97,6 +103,16 @@ mod tests {
         let units = DMatrix::from_diagonal(&nalgebra::dvector![1e-6, 1.0, 1e7]);
         let inverse = DMatrix::from_diagonal(&nalgebra::dvector![1e6, 1.0, 1e-7]);
         assert_eq!(controllability_rank(&(&units * a * inverse), &(units * b * 1e-12)), 3);
+    }
+
+    #[test]
+    fn a_position_shows_the_velocity_and_not_the_other_way_round() {
+        // x = (position, velocity) without a spring.
+        let a = DMatrix::from_row_slice(2, 2, &[1.0, 0.1, 0.0, 1.0]);
+        assert_eq!(observability_rank(&a, &DMatrix::from_row_slice(1, 2, &[1.0, 0.0])), 2);
+        assert_eq!(observability_rank(&a, &DMatrix::from_row_slice(1, 2, &[0.0, 1.0])), 1);
+        assert_eq!(observability_rank(&a, &DMatrix::zeros(0, 2)), 0);
+        assert_eq!(observability_rank(&a, &DMatrix::zeros(1, 3)), 0);
     }
 
     #[test]

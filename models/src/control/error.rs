@@ -1,4 +1,6 @@
-//! Why a Riccati equation could not be solved.
+//! Why a regulator or an analysis is not to be had.
+
+use nalgebra::DMatrix;
 
 /// Why there is no regulator.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -85,4 +87,69 @@ pub enum RiccatiError {
         /// Size of the matrix.
         size: usize,
     },
+}
+
+/// Why a linear map could not be analysed.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum AnalysisError {
+    /// A matrix has the wrong shape.
+    #[error("{matrix} is {rows} x {cols}; {expected_rows} x {expected_cols} is needed")]
+    Dimension {
+        /// `A`, `B`, `C` or `D`.
+        matrix: &'static str,
+        /// Rows it has.
+        rows: usize,
+        /// Columns it has.
+        cols: usize,
+        /// Rows it should have.
+        expected_rows: usize,
+        /// Columns it should have.
+        expected_cols: usize,
+    },
+    /// A matrix holds NaN or infinity.
+    #[error("{matrix} is not finite")]
+    NotFinite {
+        /// `A`, `B`, `C` or `D`.
+        matrix: &'static str,
+    },
+    /// A frequency is NaN or infinite.
+    #[error("a frequency is {frequency_hz}")]
+    Frequency {
+        /// The frequency.
+        frequency_hz: f64,
+    },
+    /// The response is infinite: `e^{iωh}` is an eigenvalue of `A`.
+    #[error(
+        "the response is infinite at {frequency_hz} Hz: {real} {imaginary:+}i is a pole on the unit \
+         circle"
+    )]
+    Pole {
+        /// The frequency.
+        frequency_hz: f64,
+        /// Real part of the pole.
+        real: f64,
+        /// Imaginary part of the pole.
+        imaginary: f64,
+    },
+    /// The eigenvalues of `A` were not found.
+    #[error("the eigenvalues of the {size} x {size} matrix were not found")]
+    Eigenvalues {
+        /// Size of the matrix.
+        size: usize,
+    },
+}
+
+impl AnalysisError {
+    /// Refuses a matrix that is not of the shape (rows, columns), or not finite.
+    pub(super) fn check(
+        matrix: &'static str,
+        m: &DMatrix<f64>,
+        (expected_rows, expected_cols): (usize, usize),
+    ) -> Result<(), Self> {
+        let (rows, cols) = m.shape();
+        if (rows, cols) != (expected_rows, expected_cols) {
+            return Err(Self::Dimension { matrix, rows, cols, expected_rows, expected_cols });
+        }
+        if super::all_finite(m) { Ok(()) } else { Err(Self::NotFinite { matrix }) }
+    }
 }

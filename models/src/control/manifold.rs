@@ -79,6 +79,20 @@ impl Tangent {
         Self { transpose: basis.transpose(), basis }
     }
 
+    /// The same without the motion of the prescribed coordinates: `T = diag([Z; 0], Z, 0)`. What moves
+    /// by itself while they are held; the modes of a map are those of `Tᵀ A T`.
+    ///
+    /// # Panics
+    /// If `dh` has fewer than `dynamic` columns.
+    pub fn held(dh: &DMatrix<f64>, dynamic: usize) -> Self {
+        let free = tangent_basis(&dh.columns(0, dynamic).into_owned());
+        let (coordinates, directions) = (dh.ncols(), free.ncols());
+        let mut basis = DMatrix::zeros(2 * coordinates, 2 * directions);
+        basis.view_mut((0, 0), (dynamic, directions)).copy_from(&free);
+        basis.view_mut((coordinates, directions), (dynamic, directions)).copy_from(&free);
+        Self { transpose: basis.transpose(), basis }
+    }
+
     /// `T`, states × dimension, orthonormal columns.
     pub fn basis(&self) -> &DMatrix<f64> {
         &self.basis
@@ -90,6 +104,10 @@ impl Tangent {
     /// `Tᵀ m`: from a difference of states to its coordinates in the tangent space.
     pub fn reduce(&self, m: &DMatrix<f64>) -> DMatrix<f64> {
         &self.transpose * m
+    }
+    /// `Tᵀ a T`: a map on the tangent space.
+    pub fn restrict_map(&self, a: &DMatrix<f64>) -> DMatrix<f64> {
+        self.reduce(a) * &self.basis
     }
 
     /// `Tᵀ q T`: a weight on the tangent space.

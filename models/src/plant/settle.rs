@@ -215,6 +215,10 @@ impl<'a> Search<'a> {
             let slope = basis.transpose() * self.scaled_vector(&point.gradient);
             let residual = point.residual();
             let round_off = f64::EPSILON * self.magnitude(&point, &stiffness);
+            // Eigenvalues of what is not finite are searched without end.
+            if !residual.is_finite() || reduced.iter().any(|entry| !entry.is_finite()) {
+                return Err(SettleError::NotConverged { iterations: iteration, residual });
+            }
             if basis.ncols() == 0 {
                 return self.equilibrium(point, iteration);
             }
@@ -519,7 +523,7 @@ impl<'a> Search<'a> {
 /// The least-squares solution of least norm.
 fn pseudo_solve(matrix: DMatrix<f64>, right: &DVector<f64>) -> DVector<f64> {
     let columns = matrix.ncols();
-    if matrix.is_empty() {
+    if matrix.is_empty() || matrix.iter().any(|entry| !entry.is_finite()) {
         return DVector::zeros(columns);
     }
     let svd = SVD::new(matrix, true, true);

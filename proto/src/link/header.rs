@@ -3,7 +3,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 /// Version of the layout and of the conversation. Part of the services' names.
-pub const LAYOUT_VERSION: u32 = 1;
+pub const LAYOUT_VERSION: u32 = 2;
 
 /// First field of every header: `plnt` in ASCII, little-endian.
 pub const MAGIC: u32 = u32::from_le_bytes(*b"plnt");
@@ -43,7 +43,7 @@ header! {
     /// Fields that a kind of message does not use are zero.
     #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
     #[repr(C)]
-    #[type_name("PlantdLinkHeader1")]
+    #[type_name("PlantdLinkHeader2")]
     pub struct Header {
         /// [`MAGIC`].
         pub magic: u32,
@@ -94,14 +94,16 @@ header! {
         pub iterations: u32,
         /// Factorizations of the step.
         pub factorizations: u32,
-        /// Zero.
-        pub reserved: u32,
+        /// Constraint equations that follow from others.
+        pub redundant_constraints: u32,
         /// Final residual of the step in units of its own round-off.
         pub residual: f64,
         /// Largest constraint violation in units of its own round-off.
         pub constraint_residual: f64,
-        /// Smallest pivot of the Newton matrix relative to its largest entry.
+        /// Estimate of the reciprocal condition of the Newton matrix, at most 1.
         pub reciprocal_condition: f64,
+        /// The same for the constraints, without redundant ones; 1 without constraints.
+        pub constraint_reciprocal_condition: f64,
         /// First detail of a failure, see [`Code`].
         pub detail_a: u64,
         /// Second detail of a failure.
@@ -221,8 +223,8 @@ numbered! {
         NotConverged = 8,
         /// The iteration left the finite numbers after `iterations`.
         NotFinite = 9,
-        /// Singular Newton matrix at coordinate `detail_a`; the pivot is `detail_value` of the
-        /// largest entry.
+        /// Singular Newton matrix at coordinate `detail_a`; the pivot is `detail_value` of what it
+        /// can be.
         Singular = 10,
         /// The plant was deleted.
         PlantDeleted = 11,
@@ -230,6 +232,12 @@ numbered! {
         LinkClosed = 12,
         /// Coordinate `detail_a` turned by `detail_value` rad, more than half a turn, in one step.
         TooFast = 13,
+        /// Constraint equations lost their independence: `detail_a` is the index of the first
+        /// concerned, `detail_b` their number, `detail_value` the reciprocal condition.
+        SingularConstraints = 14,
+        /// Constraint equations contradict each other: `detail_a` is the index of the first
+        /// concerned, `detail_b` their number, `detail_value` the largest violation.
+        InconsistentConstraints = 15,
     }
 }
 
@@ -286,10 +294,10 @@ mod tests {
 
     /// Bindings in other languages repeat the layout; this pins it. A change needs a new version.
     #[test]
-    fn the_layout_of_version_1_is_pinned() {
-        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (1, 184));
+    fn the_layout_of_version_2_is_pinned() {
+        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (2, 192));
         assert_eq!(align_of::<Header>(), 8);
-        assert_eq!(SCHEMA_HASH, 0x8797_6177_0b5a_4bdf);
+        assert_eq!(SCHEMA_HASH, 0x6847_a2fc_b4d7_d53d);
     }
 
     #[test]
@@ -317,7 +325,7 @@ mod tests {
     fn a_header_of_another_version_is_recognised() {
         let good = Header::new(Kind::Input);
         assert!(good.is_of_this_layout());
-        assert!(!Header { layout_version: 2, ..good }.is_of_this_layout());
+        assert!(!Header { layout_version: 1, ..good }.is_of_this_layout());
         assert!(!Header { magic: 0, ..good }.is_of_this_layout());
         assert!(!Header { schema_hash: 1, ..good }.is_of_this_layout());
     }

@@ -12,8 +12,7 @@ use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status};
 
-use super::Answers;
-use super::rollout;
+use super::{Answers, analysis, derivatives, rollout};
 use crate::convert::{self, Inputs};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
@@ -49,8 +48,22 @@ pub(super) fn model_and_settings(
     Ok((model, settings))
 }
 
+/// A plant at a point, and the input there.
+pub(super) fn at_point(
+    hub: &Hub,
+    model: &str,
+    settings: Option<v1::PlantSettings>,
+    point: Option<v1::Point>,
+) -> Result<(Plant, Vec<f64>), Fault> {
+    if let Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) = &point {
+        return Ok(hub.session(id)?.copy_plant_and_input());
+    }
+    let (model, settings) = model_and_settings(hub, model, settings)?;
+    convert::point(point, &model, settings)
+}
+
 /// Refuses matrices that no client would take.
-fn check_linearization(hub: &Hub, model: &Model) -> Result<(), Fault> {
+pub(super) fn check_linearization(hub: &Hub, model: &Model) -> Result<(), Fault> {
     let numbers = convert::linearization_numbers(model.dimensions());
     let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
     Ok(LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?)
@@ -65,13 +78,13 @@ fn tangent(plant: &mut Plant, constraints: Constraints) -> Option<Tangent> {
 
 /// On which space a regulator is solved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Constraints {
+pub(super) enum Constraints {
     Manifold,
     Full,
 }
 
 impl Constraints {
-    fn new(handling: i32) -> Result<Self, Fault> {
+    pub(super) fn new(handling: i32) -> Result<Self, Fault> {
         match v1::ConstraintHandling::try_from(handling) {
             Ok(v1::ConstraintHandling::Unspecified | v1::ConstraintHandling::Manifold) => {
                 Ok(Self::Manifold)
@@ -83,15 +96,14 @@ impl Constraints {
 }
 
 fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse, Fault> {
-    let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
-    check_linearization(hub, &model)?;
-    let (mut plant, u) = convert::point(request.point, &model, settings)?;
+    let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
+    check_linearization(hub, plant.model())?;
     let state = convert::plant_state(&plant);
-    let mut linearization = Linearization::new(&model);
+    let mut linearization = Linearization::new(plant.model());
     plant.step_and_linearize(&u, &mut linearization)?;
     let rank = control::controllability_rank(&linearization.a(), &linearization.b());
     Ok(v1::LinearizeResponse {
-        linearization: Some(convert::linearization(0, &linearization)),
+        linearization: Some(convert::linearization(state.step, &linearization)),
         next: Some(convert::plant_state(&plant)),
         controllability_rank: u32::try_from(rank).unwrap_or(u32::MAX),
         state: Some(state),
@@ -101,12 +113,11 @@ fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeRe
 
 fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResponse, Fault> {
     let constraints = Constraints::new(request.constraints)?;
-    let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
-    check_linearization(hub, &model)?;
-    let (mut plant, u) = convert::point(request.point, &model, settings)?;
-    let weights = convert::weights(request.weights, &model)?;
+    let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
+    check_linearization(hub, plant.model())?;
+    let weights = convert::weights(request.weights, plant.model())?;
     check_equilibrium(plant.clone(), &u)?;
-    let mut linearization = Linearization::new(&model);
+    let mut linearization = Linearization::new(plant.model());
     plant.linearize(&u, &mut linearization)?;
     let (a, b) = (linearization.a(), linearization.b());
     let Regulator { gain, value, spectral_radius, residual, iterations } =
@@ -120,6 +131,7 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
             k: Some(convert::matrix(&gain)),
             x_reference: convert::x(&plant),
             u_reference: u,
+            rotations: convert::rotations(plant.model()),
         }),
         value: Some(convert::matrix(&value)),
         spectral_radius,
@@ -135,8 +147,8 @@ fn check_equilibrium(mut plant: Plant, u: &[f64]) -> Result<(), Fault> {
     let mut q = plant.q().to_vec();
     for _ in 0..2 {
         plant.step(u)?;
-        let drifts = plant.q().iter().zip(&q).map(|(next, now)| (next - now).abs());
-        let worst = drifts.enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
+        let drifts = plant.model().difference(&q, plant.q());
+        let worst = drifts.into_iter().map(f64::abs).enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
         let Some((index, distance)) = worst else { return Ok(()) };
         let drift = distance / (time_step_s * time_step_s);
         if drift > EQUILIBRIUM_DRIFT_MAX {
@@ -242,6 +254,7 @@ struct TrajectoryRegulator {
     gains: std::vec::IntoIter<DMatrix<f64>>,
     states: std::vec::IntoIter<State>,
     inputs: Inputs,
+    rotations: Vec<u32>,
     next: usize,
     /// Room in memory that the server grants.
     _permit: OwnedSemaphorePermit,
@@ -267,6 +280,7 @@ impl TrajectoryRegulator {
             gains: gains.into_iter(),
             states: path.states.into_iter(),
             inputs,
+            rotations: convert::rotations(&model),
             next: 0,
             _permit: permit,
         })
@@ -340,6 +354,7 @@ impl Iterator for TrajectoryRegulator {
             k: self.gains.next().map(|gain| convert::matrix(&gain)),
             x_reference: state.x(),
             u_reference: u,
+            rotations: self.rotations.clone(),
         };
         Some(v1::SolveTrajectoryLqrResponse { gain: Some(gain) })
     }
@@ -403,5 +418,32 @@ impl v1::control_service_server::ControlService for ControlService {
         let rollout = self.hub.workers.run(job).await?;
         let answers = rollout.run(self.hub.workers.clone());
         Ok(Response::new(self.hub.until_ending(answers)))
+    }
+
+    async fn linearize_second_order(
+        &self,
+        request: Request<v1::LinearizeSecondOrderRequest>,
+    ) -> Result<Response<v1::LinearizeSecondOrderResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| derivatives::linearize_second_order(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn evaluate_dynamics(
+        &self,
+        request: Request<v1::EvaluateDynamicsRequest>,
+    ) -> Result<Response<v1::EvaluateDynamicsResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| derivatives::evaluate_dynamics(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn analyze(
+        &self,
+        request: Request<v1::AnalyzeRequest>,
+    ) -> Result<Response<v1::AnalyzeResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |abandoned: &Abandoned| analysis::analyze(&hub, request, abandoned);
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 }

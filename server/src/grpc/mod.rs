@@ -1,12 +1,15 @@
 //! The services of `plantd.v1`, one file each. They check requests and translate; what they do is
 //! done by sessions, the catalog and the workers.
 
+mod analysis;
 pub mod control;
+mod derivatives;
 pub mod drive;
 pub mod model;
 pub mod observe;
 pub mod plant;
 mod rollout;
+mod settle;
 pub mod watch;
 
 use std::pin::Pin;

@@ -6,7 +6,7 @@ use plantd_models::{Model, Problem, SceneError};
 use plantd_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::cut_page;
+use super::{cut_page, settle};
 use crate::catalog::Entry;
 use crate::convert;
 use crate::hub::Hub;
@@ -125,6 +125,15 @@ impl v1::model_service_server::ModelService for ModelService {
     ) -> Result<Response<v1::DeleteModelResponse>, Status> {
         self.hub.catalog.remove(&request.into_inner().name)?;
         Ok(Response::new(v1::DeleteModelResponse {}))
+    }
+
+    async fn settle(
+        &self,
+        request: Request<v1::SettleRequest>,
+    ) -> Result<Response<v1::SettleResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| settle::settle(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 }
 

@@ -40,7 +40,7 @@ impl PlantService {
         let job = move |_: &_| {
             let entry = hub.catalog.get(&model)?;
             let settings = convert::settings(settings, &entry.model, &hub.limits)?;
-            let start = convert::start(initial, &entry.model)?;
+            let start = convert::start(initial, &entry.model, &hub.limits)?;
             let plant = convert::plant(&entry.model, settings, &start, "initial")?;
             hub.insert(id, entry.name, plant)
         };
@@ -230,10 +230,10 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<v1::ResetRequest>,
     ) -> Result<Response<v1::ResetResponse>, Status> {
         let v1::ResetRequest { id, initial } = request.into_inner();
-        let model = Arc::clone(self.hub.session(&id)?.model());
+        let (hub, model) = (Arc::clone(&self.hub), Arc::clone(self.hub.session(&id)?.model()));
         let change = move |lease: &mut Lease| match initial {
             None => Ok(lease.reset()?),
-            Some(initial) => match convert::start(Some(initial), &model)? {
+            Some(initial) => match convert::start(Some(initial), &model, &hub.limits)? {
                 Start::Snapshot(snapshot) => Ok(lease.restore(&snapshot)?),
                 Start::Initial(initial) => initialize(lease, &initial),
             },
@@ -263,6 +263,29 @@ impl v1::plant_service_server::PlantService for PlantService {
         };
         let state = Some(self.put(&id, change).await?);
         Ok(Response::new(v1::RestoreResponse { state }))
+    }
+
+    async fn diagnose(
+        &self,
+        request: Request<v1::DiagnoseRequest>,
+    ) -> Result<Response<v1::DiagnoseResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| {
+            let v1::DiagnoseRequest { id, model, initial } = request;
+            let mut plant = if model.is_empty() {
+                hub.session(&id)?.copy_plant()
+            } else if id.is_empty() {
+                let model = hub.catalog.get(&model)?.model;
+                let start = convert::start(initial, &model, &hub.limits)?;
+                let settings = convert::settings(None, &model, &hub.limits)?;
+                convert::plant(&model, settings, &start, "initial")?
+            } else {
+                return Err(Fault::field("model", "is given together with `id`"));
+            };
+            let step = plant.step_index();
+            Ok(convert::diagnostics(step, plant.diagnose()))
+        };
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 
     async fn open_link(

@@ -52,7 +52,7 @@ impl Rollout {
             let numbers = states.saturating_mul(state_numbers);
             let (name, limit) = ("reply_numbers", limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in the states of a case", numbers)?;
-            let start = convert::start(case.initial, &model)?;
+            let start = convert::start(case.initial, &model, &hub.limits)?;
             cases.push(Case { index, start, inputs, steps });
         }
         Ok(Self { shared: Arc::new(Shared { model, settings, every }), cases })

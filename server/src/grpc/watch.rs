@@ -195,6 +195,7 @@ impl Analysis {
                 k: Some(k),
                 x_reference: state.x(),
                 u_reference: frame.input.clone(),
+                rotations: convert::rotations(self.plant.model()),
             });
         }
         Ok(())

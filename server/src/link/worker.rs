@@ -299,6 +299,10 @@ impl Failure {
         let solver =
             |iterations, residual| StepReport { iterations, residual, ..StepReport::default() };
         let index_of = |name: &str| session.model().coordinate_index(name).unwrap_or(0) as u64;
+        let first_equation = |concerned: &[String]| {
+            let names = session.model().constraint_names();
+            concerned.first().and_then(|c| names.iter().position(|n| n == c)).unwrap_or(0) as u64
+        };
         match *error {
             StepError::Dimension { expected, actual } => {
                 Self { a: expected as u64, b: actual as u64, ..Self::new(Code::Dimension) }
@@ -316,9 +320,18 @@ impl Failure {
                 Self { a: index_of(coordinate), value: pivot, ..Self::new(Code::Singular) }
             }
             // The link has no room for names: gRPC tells them.
-            StepError::SingularConstraints { .. } | StepError::InconsistentConstraints { .. } => {
-                Self::new(Code::NotConverged)
-            }
+            StepError::SingularConstraints { ref constraints, reciprocal_condition } => Self {
+                a: first_equation(constraints),
+                b: constraints.len() as u64,
+                value: reciprocal_condition,
+                ..Self::new(Code::SingularConstraints)
+            },
+            StepError::InconsistentConstraints { ref constraints, violation } => Self {
+                a: first_equation(constraints),
+                b: constraints.len() as u64,
+                value: violation,
+                ..Self::new(Code::InconsistentConstraints)
+            },
             StepError::TooFast { ref coordinate, increment } => {
                 Self { a: index_of(coordinate), value: increment, ..Self::new(Code::TooFast) }
             }
@@ -333,6 +346,8 @@ fn with_report(header: Header, report: &StepReport) -> Header {
         residual: report.residual,
         constraint_residual: report.constraint_residual,
         reciprocal_condition: report.reciprocal_condition,
+        constraint_reciprocal_condition: report.constraint_reciprocal_condition,
+        redundant_constraints: report.redundant_constraints,
         ..header
     }
 }

@@ -1,10 +1,13 @@
 //! The contract, through a real client against a real server process: what each call does, and the
 //! status, reason and details of each refusal.
 
+mod analysis;
 mod answers;
+mod derivatives;
 mod drive;
 mod limits;
 mod refusals;
+mod rest;
 mod support;
 mod transport;
 mod watch;

@@ -17,32 +17,49 @@ Vectors and matrices are numpy arrays in SI units and radians. What the server r
 from ._client import Client, connect
 from ._drive import Driver
 from ._errors import PlantdError, StepError, Violation
+from ._rotation import difference, rotations
 from ._types import (
+    Analysis,
+    Contraction,
+    Diagnostics,
+    Dynamics,
     Energy,
     Gain,
     Linearization,
+    Mode,
     Plant,
     Regulator,
     Rollout,
+    SecondOrder,
+    Settled,
     State,
     StepReport,
     Watched,
 )
 
 __all__ = [
+    "Analysis",
     "Client",
+    "Contraction",
+    "Diagnostics",
     "Driver",
+    "Dynamics",
     "Energy",
     "Gain",
     "Linearization",
+    "Mode",
     "Plant",
     "PlantdError",
     "Regulator",
     "Rollout",
+    "SecondOrder",
+    "Settled",
     "State",
     "StepError",
     "StepReport",
     "Violation",
     "Watched",
     "connect",
+    "difference",
+    "rotations",
 ]

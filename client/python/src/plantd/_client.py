@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import grpc
@@ -17,13 +17,19 @@ from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 from ._drive import Driver
 from ._errors import PlantdError, translate, translated
 from ._types import (
+    Analysis,
     Array,
+    Contraction,
+    Diagnostics,
+    Dynamics,
     Energy,
     Gain,
     Linearization,
     Plant,
     Regulator,
     Rollout,
+    SecondOrder,
+    Settled,
     State,
     Vector,
     Watched,
@@ -117,6 +123,33 @@ class Client:
         request = model_service_pb2.ValidateSceneRequest(scene=scene)
         return list(self._call(self.models.ValidateScene, request).problems)
 
+    def settle(
+        self,
+        model: str,
+        *,
+        q: Vector = (),
+        guess: Mapping[str, float] | None = None,
+        hold: Sequence[str] = (),
+        inputs: Mapping[str, float] | None = None,
+        constraints_only: bool = False,
+    ) -> Settled:
+        """Finds a configuration in which the model rests, from a guess.
+
+        The guess is ``q``, or the scene's initial configuration, with the values of ``guess`` put in;
+        coordinates in ``hold`` keep their value of it. ``inputs`` are the forces that act.
+        ``constraints_only`` finds a configuration close to the guess that satisfies the constraints.
+        """
+        goal = "SETTLE_GOAL_CONSTRAINTS" if constraints_only else "SETTLE_GOAL_EQUILIBRIUM"
+        request = model_service_pb2.SettleRequest(
+            model=model,
+            q=vector(q),
+            guess=dict(guess or {}),
+            hold=hold,
+            inputs=dict(inputs or {}),
+            goal=model_service_pb2.SettleGoal.Value(goal),
+        )
+        return Settled._from(self._call(self.models.Settle, request))
+
     def delete_model(self, name: str) -> None:
         """Forgets an uploaded model; its plants live on."""
         self._call(self.models.DeleteModel, model_service_pb2.DeleteModelRequest(name=name))
@@ -156,6 +189,17 @@ class Client:
         """A plant, its state and its energy."""
         answer = self._call(self.plants.GetPlant, plant_service_pb2.GetPlantRequest(id=id))
         return Plant._from(answer.plant, Energy._from(answer.energy))
+
+    def diagnose(
+        self,
+        id: str = "",
+        *,
+        model: str = "",
+        initial: common_pb2.InitialState | None = None,
+    ) -> Diagnostics:
+        """What can be said of a plant's present state, or of a state of a model."""
+        request = plant_service_pb2.DiagnoseRequest(id=id, model=model, initial=initial)
+        return Diagnostics._from(self._call(self.plants.Diagnose, request))
 
     def list_plants(self) -> list[Plant]:
         """All plants, by id."""
@@ -247,21 +291,23 @@ class Client:
         """Opens the shared-memory link of a plant and says how to reach it."""
         return self._call(self.plants.OpenLink, plant_service_pb2.OpenLinkRequest(id=id))
 
-    # ---- linearizations, regulators and rollouts ----
+    # ---- linearizations, analysis, regulators and rollouts ----
 
     def linearize(
         self,
-        model: str,
+        model: str = "",
         *,
         at: str = "initial",
         state: State | None = None,
         u: Vector = (),
+        plant: str = "",
         dt: float = 0.0,
         paper: bool = False,
     ) -> Linearization:
-        """Linearizes the map of a model at an operating point, or at ``state`` with input ``u``."""
+        """Linearizes the map of a model at an operating point, or at ``state`` with input ``u``; or
+        that of a ``plant``, where it is."""
         request = control_service_pb2.LinearizeRequest(
-            model=model, settings=_settings(dt, paper), point=_point(at, state, u)
+            model=model, settings=_settings(dt, paper), point=_point(at, state, u, plant)
         )
         answer = self._call(self.control.Linearize, request)
         return Linearization._from(
@@ -271,6 +317,109 @@ class Client:
             next=State._from(answer.next),
             controllability_rank=answer.controllability_rank,
         )
+
+    def linearize_second_order(
+        self,
+        model: str = "",
+        *,
+        at: str = "initial",
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        dt: float = 0.0,
+        paper: bool = False,
+    ) -> SecondOrder:
+        """All second derivatives of the map at a point given as in `linearize`."""
+        request = control_service_pb2.LinearizeSecondOrderRequest(
+            model=model, settings=_settings(dt, paper), point=_point(at, state, u, plant)
+        )
+        return SecondOrder._from(self._call(self.control.LinearizeSecondOrder, request))
+
+    def contract_second_order(
+        self,
+        model: str = "",
+        weights: Vector = (),
+        *,
+        multiplier_weights: Vector = (),
+        at: str = "initial",
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        dt: float = 0.0,
+        paper: bool = False,
+    ) -> Contraction:
+        """The Hessian of ``weights @ x[k+1] + multiplier_weights @ multipliers`` at such a point.
+
+        The tensors are not formed: it works where they would be too large.
+        """
+        request = control_service_pb2.LinearizeSecondOrderRequest(
+            model=model,
+            settings=_settings(dt, paper),
+            point=_point(at, state, u, plant),
+            weights=common_pb2.ContractionWeights(
+                x=vector(weights), multipliers=vector(multiplier_weights)
+            ),
+        )
+        return Contraction._from(self._call(self.control.LinearizeSecondOrder, request))
+
+    def evaluate_dynamics(
+        self,
+        model: str,
+        q: Vector = (),
+        v: Vector = (),
+        inputs: Vector = (),
+        prescribed_acceleration: Vector = (),
+        *,
+        at: str = "",
+        order: int = 0,
+    ) -> Dynamics:
+        """Accelerations and constraint forces of continuous time, with derivatives up to ``order``.
+
+        What is not given is that of the operating point ``at``, at rest.
+        """
+        request = control_service_pb2.EvaluateDynamicsRequest(
+            model=model,
+            operating_point=at,
+            q=vector(q),
+            v=vector(v),
+            inputs=vector(inputs),
+            prescribed_acceleration=vector(prescribed_acceleration),
+            order=order,
+        )
+        return Dynamics._from(self._call(self.control.EvaluateDynamics, request))
+
+    def analyze(
+        self,
+        model: str = "",
+        *,
+        outputs: Sequence[str] | npt.ArrayLike = (),
+        frequencies: Vector = (),
+        at: str = "initial",
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        dt: float = 0.0,
+        paper: bool = False,
+        full: bool = False,
+    ) -> Analysis:
+        """Controllability, observability, modes and frequency response at such a point.
+
+        ``outputs`` are names of entries of x such as ``theta`` or ``p(theta)``, or a matrix; all of x
+        if not given. ``frequencies`` in Hz. ``full`` looks at the full state of a constrained model
+        instead of at its manifold.
+        """
+        request = control_service_pb2.AnalyzeRequest(
+            model=model,
+            settings=_settings(dt, paper),
+            point=_point(at, state, u, plant),
+            constraints=_constraints(full),
+            frequencies_hz=vector(frequencies),
+        )
+        if isinstance(outputs, np.ndarray) or (len(outputs) and not isinstance(outputs[0], str)):
+            request.output_x.CopyFrom(matrix_message(outputs))
+        else:
+            request.outputs.extend(outputs)
+        return Analysis._from(self._call(self.control.Analyze, request))
 
     def solve_lqr(
         self,
@@ -395,7 +544,9 @@ def _initial(
     return common_pb2.InitialState(velocity=velocity)
 
 
-def _point(at: str, state: State | None, u: Vector) -> common_pb2.Point:
+def _point(at: str, state: State | None, u: Vector, plant: str = "") -> common_pb2.Point:
+    if plant:
+        return common_pb2.Point(plant=plant)
     if state is None:
         return common_pb2.Point(operating_point=at)
     here = common_pb2.StateAndInput(state=state._message(), u=vector(u))

@@ -10,7 +10,9 @@ from typing import Any, Union
 import numpy as np
 import numpy.typing as npt
 
-from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
+from plantd.v1 import common_pb2, control_service_pb2, model_service_pb2, plant_service_pb2
+
+from ._rotation import difference
 
 Array = npt.NDArray[np.float64]
 Vector = Union[Sequence[float], npt.NDArray[Any], float]
@@ -75,13 +77,23 @@ class StepReport:
     residual: float
     #: Largest constraint violation in units of its own round-off.
     constraint_residual: float
-    #: Smallest pivot of the Newton matrix relative to its largest entry.
+    #: Estimate of the reciprocal condition of the Newton matrix, at most 1.
     reciprocal_condition: float
+    #: The same for the constraints, without redundant ones; 1 without constraints.
+    constraint_reciprocal_condition: float = 1.0
+    #: Constraint equations that follow from others.
+    redundant_constraints: int = 0
 
     @classmethod
     def _from(cls, m: common_pb2.StepReport) -> StepReport:
         return cls(
-            m.iterations, m.factorizations, m.residual, m.constraint_residual, m.reciprocal_condition
+            m.iterations,
+            m.factorizations,
+            m.residual,
+            m.constraint_residual,
+            m.reciprocal_condition,
+            m.constraint_reciprocal_condition,
+            m.redundant_constraints,
         )
 
 
@@ -110,21 +122,232 @@ class Linearization:
 
 
 @dataclass(frozen=True, eq=False)
+class SecondOrder:
+    """Second derivatives of the map at a point, as arrays [output][first][second].
+
+    Outputs are the entries of x[k+1], or the constraint multipliers.
+    """
+
+    xx: Array
+    xu: Array
+    uu: Array
+    multipliers_xx: Array
+    multipliers_xu: Array
+    multipliers_uu: Array
+    #: First derivatives.
+    linearization: Linearization
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.LinearizeSecondOrderResponse) -> SecondOrder:
+        t = m.tensors
+        blocks = (t.xx, t.xu, t.uu, t.multipliers_xx, t.multipliers_xu, t.multipliers_uu)
+        return cls(*map(tensor, blocks), _linearized(m))
+
+
+@dataclass(frozen=True, eq=False)
+class Contraction:
+    """The Hessian of a weighted sum of the map's outputs."""
+
+    xx: Array
+    xu: Array
+    uu: Array
+    #: First derivatives.
+    linearization: Linearization
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.LinearizeSecondOrderResponse) -> Contraction:
+        c = m.contraction
+        return cls(matrix(c.xx), matrix(c.xu), matrix(c.uu), _linearized(m))
+
+
+def _linearized(m: control_service_pb2.LinearizeSecondOrderResponse) -> Linearization:
+    return Linearization._from(
+        m.linearization, state=State._from(m.state), u=array(m.u), next=State._from(m.next)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """Accelerations and constraint forces of continuous time.
+
+    Parameters of the derivatives are (q, v, inputs, prescribed_acceleration), outputs are
+    (acceleration, multipliers).
+    """
+
+    acceleration: Array
+    multipliers: Array
+    #: [output][parameter]; None if it was not asked for.
+    jacobian: Array | None
+    #: [output][first parameter][second parameter]; None if it was not asked for.
+    hessian: Array | None
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.EvaluateDynamicsResponse) -> Dynamics:
+        return cls(
+            array(m.acceleration),
+            array(m.multipliers),
+            matrix(m.jacobian) if m.HasField("jacobian") else None,
+            tensor(m.hessian) if m.HasField("hessian") else None,
+        )
+
+
+@dataclass(frozen=True)
+class Mode:
+    """An eigenvalue of the map, read as a mode of continuous time."""
+
+    eigenvalue: complex
+    modulus: float
+    #: Natural frequency, Hz; infinite for the eigenvalue 0.
+    frequency: float
+    #: 1 decays without oscillation, 0 oscillates without decay, negative grows.
+    damping_ratio: float
+    #: Time to decay to 1/e, s; negative when it grows, infinite when it does neither.
+    time_constant: float
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.Mode) -> Mode:
+        return cls(
+            complex(m.real, m.imaginary),
+            m.modulus,
+            m.natural_frequency_hz,
+            m.damping_ratio,
+            m.time_constant_s,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """What can be said of the linearized map."""
+
+    #: Independent directions of the state.
+    order: int
+    controllability_rank: int
+    observability_rank: int
+    #: Largest modulus of the modes.
+    spectral_radius: float
+    #: Modes, the slowest to decay first.
+    modes: list[Mode]
+    #: Names of the outputs.
+    outputs: list[str]
+    #: Frequencies of the response, Hz.
+    frequencies: Array
+    #: Complex response, [frequency][output][input].
+    response: npt.NDArray[np.complex128]
+    #: State and input at which the map was linearized.
+    state: State
+    u: Array
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.AnalyzeResponse) -> Analysis:
+        responses = [
+            matrix(r.magnitude) * np.exp(1j * matrix(r.phase_rad)) for r in m.responses
+        ]
+        return cls(
+            m.order,
+            m.controllability_rank,
+            m.observability_rank,
+            m.spectral_radius,
+            [Mode._from(mode) for mode in m.modes],
+            list(m.outputs),
+            array(r.frequency_hz for r in m.responses),
+            np.array(responses, dtype=np.complex128),
+            State._from(m.state),
+            array(m.u),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A configuration on the constraints; of an equilibrium also what holds it."""
+
+    q: Array
+    #: Input: forces, then the prescribed positions of ``q``.
+    u: Array
+    #: Potential energy, J; None if only the constraints were asked for, as all that follows.
+    potential: float | None = None
+    #: Largest force that remains on a coordinate, N or N m.
+    residual: float | None = None
+    #: Constraint forces that hold it.
+    constraint_forces: Array | None = None
+    #: A minimum of the potential energy, held coordinates apart.
+    stable: bool | None = None
+    #: Smallest eigenvalue of the stiffness on the constraints, N/m or N m/rad.
+    smallest_stiffness: float | None = None
+
+    @classmethod
+    def _from(cls, m: model_service_pb2.SettleResponse) -> Settled:
+        q, u = array(m.q), array(m.u)
+        if not m.HasField("equilibrium"):
+            return cls(q, u)
+        e = m.equilibrium
+        forces = array(e.constraint_forces)
+        return cls(q, u, e.potential_j, e.residual, forces, e.stable, e.smallest_stiffness)
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnostics:
+    """What can be said of a state; vectors in world axes."""
+
+    step: int
+    degrees_of_freedom: int
+    #: Independent constraint equations.
+    constraint_rank: int
+    #: Names of constraint equations that follow from the others.
+    redundant_constraints: list[str]
+    energy: Energy
+    #: kg m/s.
+    linear_momentum: Array
+    #: About the world's origin, kg m²/s.
+    angular_momentum: Array
+    #: m.
+    center_of_mass: Array
+    #: kg.
+    mass: float
+    #: Multipliers of the last step by the time step.
+    constraint_forces: Array
+    mass_matrix_reciprocal_condition: float
+    constraint_reciprocal_condition: float
+
+    @classmethod
+    def _from(cls, m: plant_service_pb2.DiagnoseResponse) -> Diagnostics:
+        return cls(
+            m.step,
+            m.degrees_of_freedom,
+            m.constraint_rank,
+            list(m.redundant_constraints),
+            Energy._from(m.energy),
+            array(m.linear_momentum),
+            array(m.angular_momentum),
+            array(m.center_of_mass),
+            m.mass_kg,
+            array(m.constraint_forces),
+            m.mass_matrix_reciprocal_condition,
+            m.constraint_reciprocal_condition,
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Gain:
-    """The feedback law u = u_reference - k (x - x_reference); call it with a state."""
+    """The feedback law u = u_reference - k (x - x_reference); call it with a state.
+
+    Differences of orientations of ball joints are those of `plantd.difference`.
+    """
 
     #: Step index from which it holds.
     step: int
     k: Array
     x_reference: Array
     u_reference: Array
+    #: Indices in x at which rotation vectors of ball joints begin.
+    rotations: tuple[int, ...]
 
     def __call__(self, state: State) -> Array:
-        return self.u_reference - self.k @ (state.x - self.x_reference)
+        return self.u_reference - self.k @ difference(self.x_reference, state.x, self.rotations)
 
     @classmethod
     def _from(cls, m: common_pb2.Gain) -> Gain:
-        return cls(m.step, matrix(m.k), array(m.x_reference), array(m.u_reference))
+        references = array(m.x_reference), array(m.u_reference)
+        return cls(m.step, matrix(m.k), *references, tuple(m.rotations))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +369,7 @@ class Regulator(Gain):
             gain.k,
             gain.x_reference,
             gain.u_reference,
+            gain.rotations,
             matrix(m.value),
             m.spectral_radius,
             m.residual,
@@ -225,7 +449,7 @@ class Rollout:
 
 def array(values: Iterable[float]) -> Array:
     """A repeated field as an array."""
-    return np.array(values, dtype=np.float64)
+    return np.array(values if hasattr(values, "__len__") else list(values), dtype=np.float64)
 
 
 def vector(values: Vector) -> Array:
@@ -239,6 +463,11 @@ def vector(values: Vector) -> Array:
 def matrix(m: common_pb2.Matrix) -> Array:
     """A matrix message as an array."""
     return array(m.data).reshape(m.rows, m.cols)
+
+
+def tensor(m: common_pb2.Tensor) -> Array:
+    """A tensor message as an array [output][first][second]."""
+    return array(m.data).reshape(m.outputs, m.first, m.second)
 
 
 def matrix_message(values: npt.ArrayLike) -> common_pb2.Matrix:

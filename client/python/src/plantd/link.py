@@ -25,7 +25,7 @@ import numpy as np
 from ._errors import PlantdError, StepError
 from ._types import Array, State, StepReport, Vector, vector
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
 MAGIC = int.from_bytes(b"plnt", "little")
 POLL_FOREVER_NS = 2**64 - 1
 
@@ -46,7 +46,9 @@ ATTACHED, STATE, FAILURE, CLOSED = 16, 17, 18, 19
     CODE_PLANT_DELETED,
     CODE_LINK_CLOSED,
     CODE_TOO_FAST,
-) = range(1, 14)
+    CODE_SINGULAR_CONSTRAINTS,
+    CODE_INCONSISTENT_CONSTRAINTS,
+) = range(1, 16)
 
 # Codes and reasons are those of gRPC; the message takes the header `h`.
 _STEP_ERRORS = {
@@ -80,6 +82,18 @@ _STEP_ERRORS = {
         "FAILED_PRECONDITION",
         "TOO_FAST",
         "coordinate {h.detail_a} turned by {h.detail_value:.3f} rad in one step",
+    ),
+    CODE_SINGULAR_CONSTRAINTS: (
+        "FAILED_PRECONDITION",
+        "SINGULAR_CONSTRAINTS",
+        "singular constraints: {h.detail_b} from equation {h.detail_a} on (reciprocal condition "
+        "{h.detail_value:g})",
+    ),
+    CODE_INCONSISTENT_CONSTRAINTS: (
+        "FAILED_PRECONDITION",
+        "INCONSISTENT_CONSTRAINTS",
+        "{h.detail_b} constraints, the first of them equation {h.detail_a}, contradict each other "
+        "by {h.detail_value:g}",
     ),
 }
 _LINK_ERRORS = {
@@ -124,10 +138,11 @@ class Header(ctypes.Structure):
         ("constraints", ctypes.c_uint32),
         ("iterations", ctypes.c_uint32),
         ("factorizations", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("redundant_constraints", ctypes.c_uint32),
         ("residual", ctypes.c_double),
         ("constraint_residual", ctypes.c_double),
         ("reciprocal_condition", ctypes.c_double),
+        ("constraint_reciprocal_condition", ctypes.c_double),
         ("detail_a", ctypes.c_uint64),
         ("detail_b", ctypes.c_uint64),
         ("detail_value", ctypes.c_double),
@@ -136,7 +151,7 @@ class Header(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the service knows the type."""
-        return "PlantdLinkHeader1"
+        return "PlantdLinkHeader2"
 
 
 def _fnv1a(data: bytes) -> int:
@@ -218,6 +233,8 @@ class LinkDriver:
             h.residual,
             h.constraint_residual,
             h.reciprocal_condition,
+            h.constraint_reciprocal_condition,
+            h.redundant_constraints,
         )
 
     @property

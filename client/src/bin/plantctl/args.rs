@@ -13,6 +13,8 @@ Examples:
   plantctl watch p1 --fields state,energy --json    one JSON object per step
   plantctl linearize cart-pole --at upright         A and B of x[k+1] = f(x[k], u[k])
   plantctl lqr cart-pole --at upright --q 100,1,1,1 --r 0.1
+  plantctl analyze cart-pole --at hanging --outputs theta --frequencies 0.1,0.5,1
+  plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
   plantctl validate arm.toml                        all errors of a scene, with their paths
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
@@ -129,6 +131,90 @@ pub(crate) enum Command {
         #[arg(long)]
         full: bool,
     },
+    /// Second derivatives of the discrete map: all tensors, or contracted with weights.
+    SecondOrder {
+        #[command(flatten)]
+        point: Point,
+        #[command(flatten)]
+        settings: Settings,
+        /// Weights of the entries of x[k+1], comma-separated: print the contraction.
+        #[arg(long, value_name = "Z", value_parser = numbers, allow_hyphen_values = true)]
+        weights: Option<Numbers>,
+        /// Weights of the constraint multipliers, comma-separated: print the contraction.
+        #[arg(long, value_name = "Z", value_parser = numbers, allow_hyphen_values = true)]
+        multiplier_weights: Option<Numbers>,
+    },
+    /// Accelerations and constraint forces of continuous time, and their derivatives.
+    Dynamics {
+        /// Name of a model.
+        model: String,
+        /// Operating point whose configuration and inputs hold where others are not given.
+        #[arg(long, value_name = "POINT", default_value = "initial")]
+        at: String,
+        /// Configuration, comma-separated, dynamic coordinates first.
+        #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
+        q: Option<Numbers>,
+        /// Velocity, comma-separated; zero if not given.
+        #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
+        v: Option<Numbers>,
+        /// Input forces, comma-separated.
+        #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
+        inputs: Option<Numbers>,
+        /// Accelerations of the prescribed coordinates, comma-separated; zero if not given.
+        #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
+        prescribed_acceleration: Option<Numbers>,
+        /// Highest order of the derivatives to print.
+        #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(0..=2))]
+        order: u32,
+    },
+    /// Controllability, observability, modes and frequency response of the linearized map.
+    Analyze {
+        #[command(flatten)]
+        point: Point,
+        #[command(flatten)]
+        settings: Settings,
+        /// Outputs, comma-separated entries of x such as `theta` or `p(theta)`; all if not given.
+        #[arg(long, value_delimiter = ',')]
+        outputs: Vec<String>,
+        /// Frequencies of the response, comma-separated, Hz.
+        #[arg(long, value_name = "HZ", value_parser = numbers)]
+        frequencies: Option<Numbers>,
+        /// Look at the full state of a constrained model instead of at its manifold.
+        #[arg(long)]
+        full: bool,
+    },
+    /// Finds a configuration in which a model rests, from a guess.
+    Settle {
+        /// Name of a model.
+        model: String,
+        /// Coordinates that keep their value of the guess, comma-separated.
+        #[arg(long, value_delimiter = ',')]
+        hold: Vec<String>,
+        /// Values of coordinates of the guess; the scene's initial ones if not given.
+        #[arg(long, num_args = 1.., value_name = "NAME=VALUE", value_parser = assignment)]
+        guess: Vec<Assignment>,
+        /// Input forces that act.
+        #[arg(long, num_args = 1.., value_name = "NAME=VALUE", value_parser = assignment)]
+        inputs: Vec<Assignment>,
+        /// Only satisfy the constraints.
+        #[arg(long)]
+        constraints: bool,
+        /// Print an operating point in the notation of a scene.
+        #[arg(long)]
+        toml: bool,
+    },
+    /// Degrees of freedom, redundant constraints, energy, momenta and forces of a state.
+    Diagnose {
+        /// Name of a model.
+        #[arg(required_unless_present = "plant")]
+        model: Option<String>,
+        /// Operating point of the model.
+        #[arg(long, value_name = "POINT", default_value = "initial")]
+        at: String,
+        /// Instead: the present state of this plant.
+        #[arg(long, value_name = "ID", conflicts_with_all = ["model", "at"])]
+        plant: Option<String>,
+    },
     /// Checks a scene and prints all its errors.
     Validate {
         /// File; `-` reads standard input.
@@ -214,6 +300,9 @@ pub(crate) struct Settings {
     /// Newton iterations before a step is given up.
     #[arg(long, value_name = "N")]
     max_iterations: Option<u32>,
+    /// Reciprocal condition below which a step is refused.
+    #[arg(long, value_name = "NUMBER")]
+    singular_below: Option<f64>,
 }
 
 impl From<Settings> for v1::PlantSettings {
@@ -224,6 +313,7 @@ impl From<Settings> for v1::PlantSettings {
             time_step_s: settings.dt.unwrap_or(0.0),
             force_split: split.into(),
             max_iterations: settings.max_iterations.unwrap_or(0),
+            singular_below: settings.singular_below.unwrap_or(0.0),
         }
     }
 }
@@ -274,7 +364,7 @@ pub(crate) struct Point {
     #[arg(long, value_name = "POINT", default_value = "initial")]
     pub(crate) at: String,
     /// Instead: the model, the settings and the present state of this plant.
-    #[arg(long, value_name = "ID", conflicts_with_all = ["model", "at", "dt", "paper", "max_iterations"])]
+    #[arg(long, value_name = "ID", conflicts_with_all = ["model", "at", "dt", "paper", "max_iterations", "singular_below"])]
     pub(crate) plant: Option<String>,
 }
 
@@ -314,6 +404,17 @@ fn numbers(text: &str) -> Result<Numbers, String> {
         entry.trim().parse().map_err(|_| format!("`{}` is not a number", entry.trim()))
     };
     text.split(',').map(number).collect::<Result<_, _>>().map(Numbers)
+}
+
+/// A named value.
+#[derive(Clone, Debug)]
+pub(crate) struct Assignment(pub(crate) String, pub(crate) f64);
+
+fn assignment(text: &str) -> Result<Assignment, String> {
+    let (name, value) = text.split_once('=').ok_or("a name and a value with `=` are needed")?;
+    let number = value.trim().parse();
+    let number = number.map_err(|_| format!("`{}` is not a number", value.trim()))?;
+    Ok(Assignment(name.trim().to_owned(), number))
 }
 
 #[cfg(test)]

@@ -8,7 +8,9 @@ use anyhow::{Context as _, Result};
 use plantd_client::{Client, MatrixExt as _, v1};
 use serde_json::{Value, json};
 
-use crate::args::{Args, Command, Field, Plural, Point, Settings, Singular, Weights};
+use crate::args::{
+    Args, Assignment, Command, Field, Numbers, Plural, Point, Settings, Singular, Weights,
+};
 use crate::{FAILED, json, text};
 
 /// Runs a command; the code is that of a command which ran.
@@ -64,6 +66,59 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
         }
         Command::Lqr { point, settings, weights, full } => {
             lqr(&client, output, point, settings, &weights, full).await?;
+        }
+        Command::SecondOrder { point, settings, weights, multiplier_weights } => {
+            let numbers = |weights: Option<Numbers>| weights.map_or_else(Vec::new, |w| w.0);
+            let is_contracted = weights.is_some() || multiplier_weights.is_some();
+            let weights = v1::ContractionWeights {
+                x: numbers(weights),
+                multipliers: numbers(multiplier_weights),
+            };
+            let weights = is_contracted.then_some(weights);
+            second_order(&client, output, point, settings, weights).await?;
+        }
+        Command::Dynamics { model, at, q, v, inputs, prescribed_acceleration, order } => {
+            let numbers = |given: Option<Numbers>| given.map_or_else(Vec::new, |g| g.0);
+            let request = v1::EvaluateDynamicsRequest {
+                model,
+                operating_point: at,
+                q: numbers(q),
+                v: numbers(v),
+                inputs: numbers(inputs),
+                prescribed_acceleration: numbers(prescribed_acceleration),
+                order,
+            };
+            dynamics(&client, output, request).await?;
+        }
+        Command::Analyze { point, settings, outputs, frequencies, full } => {
+            let frequencies_hz = frequencies.map_or_else(Vec::new, |f| f.0);
+            let request = v1::AnalyzeRequest { outputs, frequencies_hz, ..Default::default() };
+            analyze(&client, output, point, settings, request, full).await?;
+        }
+        Command::Settle { model, hold, guess, inputs, constraints, toml } => {
+            let goal =
+                if constraints { v1::SettleGoal::Constraints } else { v1::SettleGoal::Equilibrium };
+            let request = v1::SettleRequest {
+                model,
+                hold,
+                guess: values(guess),
+                inputs: values(inputs),
+                goal: goal.into(),
+                ..Default::default()
+            };
+            settle(&client, output, request, toml).await?;
+        }
+        Command::Diagnose { model, at, plant } => {
+            let form = v1::initial_state::Form::OperatingPoint(at);
+            let request = match plant {
+                Some(id) => v1::DiagnoseRequest { id, ..Default::default() },
+                None => v1::DiagnoseRequest {
+                    model: model.unwrap_or_default(),
+                    initial: Some(v1::InitialState { form: Some(form) }),
+                    ..Default::default()
+                },
+            };
+            diagnose(&client, output, request).await?;
         }
         Command::Validate { scene } => return validate(&client, output, &scene).await,
         Command::Explain { scene } => return explain(&client, output, &scene).await,
@@ -258,9 +313,7 @@ async fn resolve(
     };
     let plant = client.get_plant(id).await?.plant.context("no plant in the answer")?;
     let model = client.get_model(plant.model).await?;
-    let here = v1::StateAndInput { state: plant.state, u: Vec::new() };
-    let point = v1::Point { source: Some(v1::point::Source::StateAndInput(here)) };
-    Ok((model, plant.settings.unwrap_or_default(), point))
+    Ok((model, plant.settings.unwrap_or_default(), plantd_client::present_state(plant.id)))
 }
 
 async fn linearize(
@@ -294,13 +347,12 @@ async fn lqr(
     full: bool,
 ) -> Result<()> {
     let (model, settings, point) = resolve(client, point, settings).await?;
-    let space = if full { v1::ConstraintHandling::Full } else { v1::ConstraintHandling::Manifold };
     let request = v1::SolveLqrRequest {
         model: model.name.clone(),
         settings: Some(settings),
         point: Some(point),
         weights: Some(weights.for_model(&model)),
-        constraints: space.into(),
+        constraints: space(full).into(),
     };
     let answer = client.solve_lqr(request).await?;
     let as_text = || {
@@ -312,6 +364,98 @@ async fn lqr(
         )
     };
     Ok(output.print(|| json::message("SolveLqrResponse", &answer), as_text)?)
+}
+
+async fn second_order(
+    client: &Client,
+    output: Output,
+    point: Point,
+    settings: Settings,
+    weights: Option<v1::ContractionWeights>,
+) -> Result<()> {
+    let (model, settings, point) = resolve(client, point, settings).await?;
+    let request = v1::LinearizeSecondOrderRequest {
+        model: model.name.clone(),
+        settings: Some(settings),
+        point: Some(point),
+        weights,
+    };
+    let answer = client.linearize_second_order(request).await?;
+    let as_text = || {
+        let tensors = answer.tensors.as_ref().map(|t| text::second_order(t, &model));
+        let contraction = answer.contraction.as_ref().map(|c| text::contraction(c, &model));
+        tensors.or(contraction).unwrap_or_default()
+    };
+    Ok(output.print(|| json::message("LinearizeSecondOrderResponse", &answer), as_text)?)
+}
+
+async fn dynamics(
+    client: &Client,
+    output: Output,
+    request: v1::EvaluateDynamicsRequest,
+) -> Result<()> {
+    let model = client.get_model(&request.model).await?;
+    let answer = client.evaluate_dynamics(request).await?;
+    let as_text = || text::dynamics(&answer, &model);
+    Ok(output.print(|| json::message("EvaluateDynamicsResponse", &answer), as_text)?)
+}
+
+async fn analyze(
+    client: &Client,
+    output: Output,
+    point: Point,
+    settings: Settings,
+    request: v1::AnalyzeRequest,
+    full: bool,
+) -> Result<()> {
+    let (model, settings, point) = resolve(client, point, settings).await?;
+    let request = v1::AnalyzeRequest {
+        model: model.name.clone(),
+        settings: Some(settings),
+        point: Some(point),
+        constraints: space(full).into(),
+        ..request
+    };
+    let answer = client.analyze(request).await?;
+    let as_text = || text::analysis(&answer, &model);
+    Ok(output.print(|| json::message("AnalyzeResponse", &answer), as_text)?)
+}
+
+async fn settle(
+    client: &Client,
+    output: Output,
+    request: v1::SettleRequest,
+    toml: bool,
+) -> Result<()> {
+    let model = client.get_model(&request.model).await?;
+    let answer = client.settle(request).await?;
+    let as_text = || match toml {
+        true => text::operating_point(&answer, &model),
+        false => text::settled(&answer, &model),
+    };
+    Ok(output.print(|| json::message("SettleResponse", &answer), as_text)?)
+}
+
+async fn diagnose(client: &Client, output: Output, request: v1::DiagnoseRequest) -> Result<()> {
+    let name = if request.id.is_empty() {
+        request.model.clone()
+    } else {
+        client.get_plant(&request.id).await?.plant.context("no plant in the answer")?.model
+    };
+    let model = client.get_model(name).await?;
+    let answer = client.diagnose(request).await?;
+    let as_text = || text::diagnosis(&answer, &model);
+    Ok(output.print(|| json::message("DiagnoseResponse", &answer), as_text)?)
+}
+
+/// Named values as the contract has them.
+fn values(given: Vec<Assignment>) -> std::collections::HashMap<String, f64> {
+    given.into_iter().map(|Assignment(name, value)| (name, value)).collect()
+}
+
+/// The space on which a constrained model is looked at.
+fn space(full: bool) -> v1::ConstraintHandling {
+    if full { v1::ConstraintHandling::Full } else { v1::ConstraintHandling::Manifold }
 }
 
 async fn validate(client: &Client, output: Output, scene: &Path) -> Result<ExitCode> {

@@ -73,6 +73,8 @@ pub(crate) fn number(x: f64) -> String {
     let magnitude = x.abs();
     if x == 0.0 {
         "0".to_owned()
+    } else if !x.is_finite() {
+        x.to_string()
     } else if (1e-4..1e7).contains(&magnitude) {
         let before_point = magnitude.log10().floor() as i32 + 1;
         format!("{x:.*}", (7 - before_point).clamp(0, 10) as usize)
@@ -116,6 +118,14 @@ pub(crate) fn model(model: &v1::Model) -> String {
     ] {
         let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
         let _ = writeln!(text, "\n{title}: {names}");
+    }
+    if !model.signals.is_empty() {
+        let row = |s: &v1::Signal| {
+            let effect = if s.replaces { "replaces u" } else { "added to u" };
+            vec![s.drives.clone(), s.kind.clone(), format!("{effect}[{}]", s.u_index)]
+        };
+        let rows: Vec<_> = model.signals.iter().map(row).collect();
+        let _ = write!(text, "\n{}", table(&["signal drives", "kind", "effect"], &rows));
     }
     text
 }
@@ -194,8 +204,12 @@ pub(crate) fn energy(energy: &v1::Energy) -> String {
 
 /// A step report.
 pub(crate) fn report(report: &v1::StepReport) -> String {
+    let redundant = match report.redundant_constraints {
+        0 => String::new(),
+        count => format!(", {count} redundant constraints"),
+    };
     format!(
-        "  solver: {} iterations, {} factorizations, residual {} round-offs\n",
+        "  solver: {} iterations, {} factorizations, residual {} round-offs{redundant}\n",
         report.iterations,
         report.factorizations,
         number(report.residual)
@@ -216,6 +230,233 @@ pub(crate) fn linearization(linearization: &v1::Linearization, model: &v1::Model
         Some(matrix(title, block, rows, cols))
     });
     filled.collect::<Vec<_>>().join("\n")
+}
+
+/// One matrix per output of a tensor that has any, under a title with the output's name.
+fn slices(
+    title: &str,
+    tensor: Option<&v1::Tensor>,
+    outputs: &[String],
+    first: &[String],
+    second: &[String],
+) -> String {
+    let Some(tensor) = tensor.filter(|t| !t.data.is_empty()) else { return String::new() };
+    let (rows, cols) = (tensor.first, tensor.second);
+    let slices = tensor.data.chunks(rows as usize * cols as usize).enumerate();
+    let slice = |(output, data): (usize, &[f64])| {
+        let block = v1::Matrix { rows, cols, data: data.to_vec() };
+        matrix(&format!("{title} of {}", label(outputs, output)), &block, first, second)
+    };
+    slices.map(slice).collect::<Vec<_>>().join("\n")
+}
+
+/// Second derivatives, block by block and output by output.
+pub(crate) fn second_order(tensors: &v1::SecondOrder, model: &v1::Model) -> String {
+    let (x, u, c) = (state_names(model), input_names(model), &model.constraints);
+    let blocks = [
+        slices("d²/dxdx", tensors.xx.as_ref(), &x, &x, &x),
+        slices("d²/dxdu", tensors.xu.as_ref(), &x, &x, &u),
+        slices("d²/dudu", tensors.uu.as_ref(), &x, &u, &u),
+        slices("d²/dxdx", tensors.multipliers_xx.as_ref(), c, &x, &x),
+        slices("d²/dxdu", tensors.multipliers_xu.as_ref(), c, &x, &u),
+        slices("d²/dudu", tensors.multipliers_uu.as_ref(), c, &u, &u),
+    ];
+    blocks.into_iter().filter(|block| !block.is_empty()).collect::<Vec<_>>().join("\n")
+}
+
+/// A Hessian of a weighted sum of outputs.
+pub(crate) fn contraction(contraction: &v1::Contraction, model: &v1::Model) -> String {
+    let (x, u) = (state_names(model), input_names(model));
+    let blocks = [
+        ("d²/dxdx", &contraction.xx, &x, &x),
+        ("d²/dxdu", &contraction.xu, &x, &u),
+        ("d²/dudu", &contraction.uu, &u, &u),
+    ];
+    let filled = blocks.into_iter().filter_map(|(title, block, rows, cols)| {
+        Some(matrix(title, block.as_ref().filter(|m| !m.data.is_empty())?, rows, cols))
+    });
+    filled.collect::<Vec<_>>().join("\n")
+}
+
+/// Accelerations, constraint forces, and their derivatives where there are any.
+pub(crate) fn dynamics(answer: &v1::EvaluateDynamicsResponse, model: &v1::Model) -> String {
+    let all = || model.coordinates.iter();
+    let dynamic: Vec<_> = all().filter(|c| !c.prescribed).map(|c| c.name.clone()).collect();
+    let forces = answer.multipliers.iter().zip(&model.constraints);
+    let rows: Vec<_> = answer
+        .acceleration
+        .iter()
+        .zip(&dynamic)
+        .map(|(value, name)| vec![format!("d²({name})/dt²"), number(*value)])
+        .chain(forces.map(|(value, name)| vec![format!("λ({name})"), number(*value)]))
+        .collect();
+    let mut text = table(&["", "value"], &rows);
+    let outputs: Vec<_> = dynamic.iter().chain(&model.constraints).cloned().collect();
+    let rates = all().map(|c| format!("d({})/dt", c.name));
+    let accelerations = all().filter(|c| c.prescribed).map(|c| format!("d²({})/dt²", c.name));
+    let parameters: Vec<_> = all()
+        .map(|c| c.name.clone())
+        .chain(rates)
+        .chain(model.inputs.iter().cloned())
+        .chain(accelerations)
+        .collect();
+    if let Some(jacobian) = &answer.jacobian {
+        let _ = write!(text, "\n{}", matrix("derivatives", jacobian, &outputs, &parameters));
+    }
+    if answer.hessian.is_some() {
+        let hessian = slices(
+            "second derivatives",
+            answer.hessian.as_ref(),
+            &outputs,
+            &parameters,
+            &parameters,
+        );
+        let _ = write!(text, "\n{hessian}");
+    }
+    text
+}
+
+/// Ranks, modes and responses.
+pub(crate) fn analysis(answer: &v1::AnalyzeResponse, model: &v1::Model) -> String {
+    let mut text = format!(
+        "order {}\ncontrollability rank: {}\nobservability rank: {}\nspectral radius: {}\n",
+        answer.order,
+        answer.controllability_rank,
+        answer.observability_rank,
+        number(answer.spectral_radius)
+    );
+    // Of a conjugate pair one stands for both.
+    let shown = answer.modes.iter().filter(|mode| mode.imaginary >= 0.0);
+    let rows: Vec<_> = shown
+        .map(|mode| {
+            let eigenvalue = match mode.imaginary {
+                0.0 => number(mode.real),
+                imaginary => format!("{} ± {}i", number(mode.real), number(imaginary)),
+            };
+            vec![
+                eigenvalue,
+                number(mode.modulus),
+                number(mode.natural_frequency_hz),
+                number(mode.damping_ratio),
+                number(mode.time_constant_s),
+            ]
+        })
+        .collect();
+    let head = ["eigenvalue", "modulus", "frequency/Hz", "damping ratio", "time constant/s"];
+    let _ = write!(text, "\n{}", table(&head, &rows));
+    let inputs = input_names(model);
+    for response in &answer.responses {
+        let title = format!("response at {} Hz", number(response.frequency_hz));
+        for (what, block) in
+            [("magnitude", &response.magnitude), ("phase, rad", &response.phase_rad)]
+        {
+            if let Some(block) = block {
+                let title = format!("{title}: {what}");
+                let _ = write!(text, "\n{}", matrix(&title, block, &answer.outputs, &inputs));
+            }
+        }
+    }
+    text
+}
+
+/// A settled configuration.
+pub(crate) fn settled(answer: &v1::SettleResponse, model: &v1::Model) -> String {
+    let coordinates = model.coordinates.iter().map(|c| c.name.as_str());
+    let inputs = model.inputs.iter().map(String::as_str);
+    let rows: Vec<_> = coordinates
+        .zip(&answer.q)
+        .chain(inputs.zip(&answer.u))
+        .map(|(name, value)| vec![name.to_owned(), number(*value)])
+        .collect();
+    let mut text = table(&["coordinate or input", "value"], &rows);
+    if let Some(equilibrium) = &answer.equilibrium {
+        let kind = if equilibrium.stable { "stable" } else { "unstable" };
+        let _ = write!(
+            text,
+            "\n{kind} equilibrium after {} iterations: {} J, smallest stiffness {}, residual {}\n",
+            equilibrium.iterations,
+            number(equilibrium.potential_j),
+            number(equilibrium.smallest_stiffness),
+            number(equilibrium.residual)
+        );
+        let _ = write!(text, "{}", forces(&equilibrium.constraint_forces, model));
+    }
+    text
+}
+
+/// Constraint forces, one per row; nothing without constraints.
+fn forces(forces: &[f64], model: &v1::Model) -> String {
+    if forces.is_empty() {
+        return String::new();
+    }
+    let row = |(name, force): (&String, &f64)| vec![name.clone(), number(*force)];
+    let rows: Vec<_> = model.constraints.iter().zip(forces).map(row).collect();
+    format!("\n{}", table(&["constraint", "force"], &rows))
+}
+
+/// A settled configuration as an operating point of a scene: what differs from the initial one, in
+/// all digits.
+pub(crate) fn operating_point(answer: &v1::SettleResponse, model: &v1::Model) -> String {
+    let list = |entries: Vec<String>| format!("{{ {} }}", entries.join(", "));
+    let coordinates: Vec<_> = model
+        .coordinates
+        .iter()
+        .zip(&answer.q)
+        .filter(|(coordinate, value)| coordinate.initial != **value)
+        .map(|(coordinate, value)| format!("{} = {value:?}", key(&coordinate.name)))
+        .collect();
+    let mut text =
+        format!("[[operating_points]]\nname = \"settled\"\ncoordinates = {}\n", list(coordinates));
+    let inputs: Vec<_> = model
+        .inputs
+        .iter()
+        .zip(&answer.u)
+        .filter(|(_, value)| **value != 0.0)
+        .map(|(name, value)| format!("{} = {value:?}", key(name)))
+        .collect();
+    if !inputs.is_empty() {
+        let _ = writeln!(text, "inputs = {}", list(inputs));
+    }
+    text
+}
+
+/// A key of TOML, quoted where it must be.
+fn key(name: &str) -> String {
+    let is_bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if !name.is_empty() && name.chars().all(is_bare) {
+        return name.to_owned();
+    }
+    format!("{:?}", name)
+}
+
+/// What can be said of a state.
+pub(crate) fn diagnosis(answer: &v1::DiagnoseResponse, model: &v1::Model) -> String {
+    let redundant = match answer.redundant_constraints.as_slice() {
+        [] => "none".to_owned(),
+        names => names.join(", "),
+    };
+    let mut text = format!(
+        "step {}\n  degrees of freedom: {}\n  independent constraints: {} of {}; redundant: \
+         {redundant}\n",
+        answer.step,
+        answer.degrees_of_freedom,
+        answer.constraint_rank,
+        model.constraints.len(),
+    );
+    text += &answer.energy.as_ref().map(energy).unwrap_or_default();
+    let _ = write!(
+        text,
+        "  mass: {} kg, centre at ({}) m\n  linear momentum: ({}) kg m/s\n  angular momentum about \
+         the origin: ({}) kg m²/s\n  reciprocal condition: {} mass matrix, {} constraints\n",
+        number(answer.mass_kg),
+        numbers(&answer.center_of_mass),
+        numbers(&answer.linear_momentum),
+        numbers(&answer.angular_momentum),
+        number(answer.mass_matrix_reciprocal_condition),
+        number(answer.constraint_reciprocal_condition),
+    );
+    text += &forces(&answer.constraint_forces, model);
+    text
 }
 
 /// A feedback law.

@@ -128,7 +128,7 @@ fn settings() -> v1::PlantSettings {
     v1::PlantSettings {
         time_step_s: TIME_STEP_S,
         force_split: v1::ForceSplit::Paper.into(),
-        max_iterations: 0,
+        ..Default::default()
     }
 }
 

@@ -75,7 +75,7 @@ async fn paper_step(client: &Client) -> Result<PaperStep> {
     let settings = v1::PlantSettings {
         time_step_s: 0.1,
         force_split: v1::ForceSplit::Paper.into(),
-        max_iterations: 0,
+        ..Default::default()
     };
     let momentum = v1::initial_state::Momentum { q: vec![0.2], p: vec![0.5], v: vec![] };
     let plant = client
