@@ -1,5 +1,5 @@
-//! Times steps and linearizations of the built-in scenes, beside the figures of trep, the paper's
-//! software, where there are some.
+//! Times steps, linearizations, full second-order linearizations and their contractions of the built-in
+//! scenes, beside the figures of trep, the paper's software, where there are some.
 //!
 //! `cargo run --release -p plantd-models --example speed`
 //!
@@ -11,45 +11,73 @@ use std::error::Error;
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use plantd_models::{ForceSplit, Linearization, Model, Plant, Settings, Snapshot, builtin};
+use plantd_models::{
+    Contraction, ForceSplit, Linearization, Model, Plant, SecondOrder, Settings, Snapshot, builtin,
+};
 
 const STEPS: usize = 200;
 const PASSES: usize = 25;
 
-/// Scene, time step in seconds, and trep's step and first derivatives in microseconds.
-type Row = (&'static str, f64, Option<(f64, f64)>);
+/// The same for second-order linearizations, which are taken at every so many steps.
+const SECOND_PASSES: usize = 5;
+const SPACING: usize = 10;
+
+/// Scene, time step in seconds, and trep's step, first and second derivatives in microseconds.
+type Row = (&'static str, f64, Option<[f64; 3]>);
 
 const SCENES: &[Row] = &[
-    ("pendulum", 0.1, Some((6.3, 0.86))),
+    ("pendulum", 0.1, Some([6.3, 0.86, 1.65])),
     ("double-pendulum", 0.01, None),
     ("cart-pole", 0.01, None),
-    ("chain-8", 0.01, None),
+    ("chain-8", 0.01, Some([133.0, 33.0, 214.0])),
     ("chain-32", 0.0025, None),
     ("four-bar", 0.01, None),
-    ("scissor-8", 0.01, Some((536.0, 239.0))),
-    ("marionette", 0.01, Some((1317.0, 598.0))),
+    ("scissor-8", 0.01, Some([536.0, 239.0, 3295.0])),
+    ("marionette", 0.01, Some([1317.0, 598.0, 21_008.0])),
 ];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!(
-        "{:<16} {:>10} {:>14} {:>12} {:>12} {:>12}",
-        "scene", "step/µs", "+ linearize/µs", "iterations", "trep/step", "trep/linear."
+        "{:<16} {:>10} {:>14} {:>14} {:>14} {:>12} {:>11} {:>11} {:>11}",
+        "scene",
+        "step/µs",
+        "+ linearize/µs",
+        "+ second/µs",
+        "+ contract/µs",
+        "iterations",
+        "trep/step",
+        "trep/linear",
+        "trep/second"
     );
     for (name, time_step_s, trep) in SCENES {
         let scene = builtin::scene(name).ok_or("no such scene")?;
         let mut motion = Motion::new(Arc::new(Model::compile(&scene)?), *time_step_s)?;
         let step = median(PASSES, || motion.pass(false))?;
         let both = median(PASSES, || motion.pass(true))?;
+        let second = median(SECOND_PASSES, || motion.second_pass(Form::Full))? - both;
+        let contraction = median(SECOND_PASSES, || motion.second_pass(Form::Contracted))? - both;
         let linearize = both - step;
-        let ratio = |trep: f64, own: f64| format!("{:.0}", trep / own);
-        let (step_ratio, linearize_ratio) =
-            trep.map_or_else(Default::default, |(s, l)| (ratio(s, step), ratio(l, linearize)));
+        let ratios = trep.map_or_else(Default::default, |trep| {
+            let own = [step, linearize, second];
+            [0, 1, 2].map(|i| format!("{:.0}", trep[i] / own[i]))
+        });
         println!(
-            "{name:<16} {step:>10.2} {linearize:>14.2} {:>12.2} {step_ratio:>12} {linearize_ratio:>12}",
-            motion.iterations as f64 / motion.steps as f64
+            "{name:<16} {step:>10.2} {linearize:>14.2} {second:>14.2} {contraction:>14.2} {:>12.2} \
+             {:>11} {:>11} {:>11}",
+            motion.iterations as f64 / motion.steps as f64,
+            ratios[0],
+            ratios[1],
+            ratios[2],
         );
     }
     Ok(())
+}
+
+/// Which second-order linearization.
+#[derive(Clone, Copy)]
+enum Form {
+    Full,
+    Contracted,
 }
 
 /// A plant with the inputs that keep it moving.
@@ -58,6 +86,8 @@ struct Motion {
     start: Snapshot,
     inputs: Vec<Vec<f64>>,
     out: Linearization,
+    second: SecondOrder,
+    contraction: Contraction,
     iterations: u64,
     steps: u64,
 }
@@ -85,8 +115,16 @@ impl Motion {
             })
             .collect();
         let start = plant.snapshot();
-        let out = Linearization::new(&model);
-        Ok(Self { plant, start, inputs, out, iterations: 0, steps: 0 })
+        Ok(Self {
+            plant,
+            start,
+            inputs,
+            out: Linearization::new(&model),
+            second: SecondOrder::new(&model)?,
+            contraction: Contraction::new(&model),
+            iterations: 0,
+            steps: 0,
+        })
     }
 
     /// Mean time of a step in microseconds.
@@ -103,6 +141,33 @@ impl Motion {
             self.steps += 1;
         }
         Ok((cpu_time_s() - begin) * 1e6 / self.inputs.len() as f64)
+    }
+}
+
+impl Motion {
+    /// Mean time of a step with a second-order linearization in microseconds.
+    fn second_pass(&mut self, form: Form) -> Result<f64, Box<dyn Error>> {
+        self.plant.restore(&self.start)?;
+        let d = self.plant.model().dimensions();
+        let z: Vec<f64> = (0..d.state()).map(|i| (i as f64 + 1.0).sin()).collect();
+        let w = vec![1.0; d.constraints];
+        let (mut total, mut count) = (0.0, 0);
+        for (k, u) in self.inputs.iter().enumerate() {
+            if k % SPACING == 0 {
+                let begin = cpu_time_s();
+                let (plant, first) = (&mut self.plant, &mut self.out);
+                match form {
+                    Form::Full => plant.linearize_second_order(u, first, &mut self.second)?,
+                    Form::Contracted => {
+                        plant.contract_second_order(u, &z, &w, first, &mut self.contraction)?
+                    }
+                };
+                total += cpu_time_s() - begin;
+                count += 1;
+            }
+            self.plant.step(u)?;
+        }
+        Ok(total * 1e6 / f64::from(count))
     }
 }
 
