@@ -1,7 +1,7 @@
 //! Times steps, linearizations, full second-order linearizations and their contractions of the built-in
 //! scenes, beside the figures of trep, the paper's software, where there are some.
 //!
-//! `cargo run --release -p plantd-models --example speed`
+//! `cargo run --release -p plantd-models --example speed [SCENE ..]`
 //!
 //! Each figure is the median over several passes of the mean CPU time over one pass of a moving plant,
 //! so compare ratios and rerun before quoting one. trep's figures were taken on a two-core AMD EPYC
@@ -49,7 +49,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         "trep/linear",
         "trep/second"
     );
-    for (name, time_step_s, trep) in SCENES {
+    let wanted: Vec<String> = std::env::args().skip(1).collect();
+    let is_wanted = |name: &str| wanted.is_empty() || wanted.iter().any(|wanted| wanted == name);
+    for (name, time_step_s, trep) in SCENES.iter().filter(|row| is_wanted(row.0)) {
         let scene = builtin::scene(name).ok_or("no such scene")?;
         let mut motion = Motion::new(Arc::new(Model::compile(&scene)?), *time_step_s)?;
         let step = median(PASSES, || motion.pass(false))?;

@@ -5,7 +5,9 @@ mod common;
 
 use std::sync::Arc;
 
-use common::{Numbers, builtin, floating, model, plant, random_tree, slope, wave};
+use common::{
+    Numbers, builtin, elements_with_coordinates, floating, model, plant, random_tree, slope, wave,
+};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::{
     Continuous, ContinuousError, ContinuousPoint, ForceSplit, Initial, Model, Plant, Scene,
@@ -188,7 +190,7 @@ fn constraints_do_not_accelerate() {
 /// First derivatives against differences of the value, second ones against differences of the first.
 #[test]
 fn derivatives_are_those_of_differences() {
-    for scene in scenes() {
+    for scene in scenes().chain(elements_with_coordinates()) {
         let (plant, at) = point(&scene);
         let mut continuous = Continuous::new(plant.model().clone());
         let linear = continuous.linearize(&at).unwrap();

@@ -3,8 +3,12 @@
 
 mod common;
 
-use common::{SPLITS, builtin, floating, plant, random_tree, slope, wave, waving_input};
+use common::{
+    SPLITS, builtin, elements_with_coordinates, floating, plant, random_tree, slope, wave,
+    waving_input,
+};
 use nalgebra::DMatrix;
+use plantd_models::scene::{Point, Spring};
 use plantd_models::{
     Contraction, ForceSplit, Initial, Linearization, Model, Plant, Scene, SecondOrder, State,
     StepError,
@@ -256,6 +260,29 @@ fn random_trees() {
     for seed in 0..24 {
         check(&random_tree(seed));
     }
+}
+
+#[test]
+fn scenes_of_elements() {
+    for scene in elements_with_coordinates() {
+        check(&scene);
+    }
+}
+
+/// A spring without a rest length is smooth even where its ends meet: at rest on the anchor.
+#[test]
+fn spring_whose_ends_meet() {
+    let mut scene = builtin("double-pendulum");
+    scene.gravity = [0.0; 3];
+    scene.coordinates.clear();
+    scene.springs.push(Spring::TwoPoint {
+        a: Point { frame: "forearm".to_owned(), at: [1.0, 0.0, 0.0] },
+        b: Point { frame: "world".to_owned(), at: [1.0, 0.0, -1.0] },
+        stiffness: 20.0,
+        rest_length: 0.0,
+    });
+    let inputs = scene.inputs.len();
+    Check::at(plant(&scene, |_| ()), vec![0.0; inputs]).columns();
 }
 
 #[test]

@@ -19,6 +19,23 @@ pub(crate) fn builtin(name: &str) -> Scene {
     builtin::scene(name).unwrap_or_else(|| panic!("no scene {name}"))
 }
 
+/// The scene of each element, without those whose ball joints have no coordinates to displace.
+pub(crate) fn elements_with_coordinates() -> Vec<Scene> {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let mut paths: Vec<_> =
+        std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    paths.sort();
+    let read = |path: &std::path::PathBuf| {
+        Scene::from_toml(&std::fs::read_to_string(path).unwrap()).unwrap()
+    };
+    let has_coordinates = |scene: &Scene| {
+        let turns =
+            |frame: &Frame| matches!(frame.joint, Some(Joint::Ball { .. } | Joint::Free { .. }));
+        !scene.frames.iter().any(turns)
+    };
+    paths.iter().map(read).filter(has_coordinates).collect()
+}
+
 /// A compiled scene.
 pub(crate) fn model(scene: &Scene) -> Arc<Model> {
     Arc::new(Model::compile(scene).unwrap_or_else(|e| panic!("{}: {e}", scene.name)))
