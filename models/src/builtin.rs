@@ -65,6 +65,8 @@ fn empty(name: String, description: String) -> Scene {
         coordinates: Vec::new(),
         springs: Vec::new(),
         inputs: Vec::new(),
+        forces: Vec::new(),
+        signals: Vec::new(),
         constraints: Vec::new(),
         operating_points: Vec::new(),
     }
@@ -110,7 +112,7 @@ fn chain(n: usize) -> Scene {
     // Short links swing fast: their time step shrinks with them.
     scene.time_step_s = (0.08 * length).min(0.01);
     scene.coordinates.push(dynamic(link(0), FRAC_PI_6));
-    scene.inputs.push(Input { name: "torque".to_owned(), coordinate: link(0), gain: 1.0 });
+    scene.inputs.push(Input { name: "torque".to_owned(), coordinate: Some(link(0)), gain: 1.0 });
     for (name, angle) in [("hanging", 0.0), ("upright", PI)] {
         scene.operating_points.push(OperatingPoint {
             name: name.to_owned(),
@@ -179,7 +181,7 @@ fn scissor(n: usize) -> Scene {
     }
     scene.inputs.push(Input {
         name: "force".to_owned(),
-        coordinate: "slider".to_owned(),
+        coordinate: Some("slider".to_owned()),
         gain: 1.0,
     });
     scene

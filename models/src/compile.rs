@@ -1,13 +1,15 @@
 //! From scene to model: names resolved, fixed joints merged, bodies lumped, what is not needed
 //! dropped.
 
+mod forces;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::elimination::Elimination;
 use crate::model::{
     Alignment, Carries, Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions,
-    Length, MixedPair, Model, OperatingPoint, Pair, PathJoint, PathSpring, PointPair, PointSpring,
-    Polynomial, Potentials, Product, SplineSpring, Vector,
+    Forces, Length, MixedPair, Model, OperatingPoint, Pair, PathJoint, PathSpring, PointPair,
+    PointSpring, Polynomial, Potentials, Product, SplineSpring, Vector,
 };
 use crate::plant::conditioning::Conditioning;
 use crate::scene::{self, CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
@@ -51,7 +53,9 @@ fn compile(scene: &Scene) -> Model {
     let potentials = layout.potentials(scene, &dynamics, &in_dynamics);
     let equations = layout.equations(scene, &closure, &in_closure);
 
-    let elimination = Elimination::new(&couplings(dynamic, &dynamics, &potentials));
+    let forces = layout.forces(scene, &dynamics, &in_dynamics);
+    let couplings = couplings(dynamic, &dynamics, &potentials, forces.as_ref());
+    let elimination = Elimination::new(&couplings);
     let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
 
     let damping: Vec<f64> = layout.coordinates[..dynamic]
@@ -71,7 +75,9 @@ fn compile(scene: &Scene) -> Model {
         digest: digest(scene),
         gravity: (gravity != Vec3::ZERO).then_some(gravity),
         damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },
-        inputs: scene.inputs.iter().map(|i| (layout.index[&i.coordinate], i.gain)).collect(),
+        coordinate_inputs: layout.coordinate_inputs(scene),
+        forces,
+        signals: layout.signals(scene),
         potentials,
         constraints: equations.constraints,
         constraint_names: equations.names,
@@ -91,6 +97,16 @@ fn compile(scene: &Scene) -> Model {
 
 fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {
     scene.coordinates.iter().find(|c| c.name == name)
+}
+
+/// The coordinate's own, unless a signal drives it.
+fn initial(scene: &Scene, name: &str) -> f64 {
+    let is_input = scene.inputs.iter().any(|input| input.name == name);
+    let signal = scene.signals.iter().find(|signal| signal.drives() == name && !is_input);
+    match signal {
+        Some(signal) => signal.initial(),
+        None => settings(scene, name).map_or(0.0, |c| c.initial),
+    }
 }
 
 /// Where a frame is: fixed in the frame of a joint (or the world).
@@ -217,7 +233,7 @@ impl Layout {
                         CoordinateKind::Dynamic
                     },
                     is_angle: joint.is_some_and(|j| self.joints[j].kind != JointKind::Prismatic),
-                    initial: settings(scene, &name).map_or(0.0, |c| c.initial),
+                    initial: initial(scene, &name),
                     name,
                 }
             })
@@ -276,6 +292,9 @@ impl Layout {
                 }
                 Spring::Coordinate { .. } | Spring::Spline { .. } => {}
             }
+        }
+        for force in &scene.forces {
+            force.points().for_each(|point| mark(&mut needs.dynamics, &point.frame));
         }
         for constraint in &scene.constraints {
             let frames = constraint.frames();
@@ -635,7 +654,12 @@ fn classified(mass: f64, tensor: Sym3) -> Rotational {
 }
 
 /// Which dynamic coordinates each one is coupled with, among those before it.
-fn couplings(dynamic: usize, tree: &Tree, potentials: &Potentials) -> Vec<BTreeSet<usize>> {
+fn couplings(
+    dynamic: usize,
+    tree: &Tree,
+    potentials: &Potentials,
+    forces: Option<&Forces>,
+) -> Vec<BTreeSet<usize>> {
     let mut couplings = vec![BTreeSet::new(); dynamic];
     let mut couple = |coordinates: &[usize]| {
         for (k, &later) in coordinates.iter().enumerate() {
@@ -656,6 +680,9 @@ fn couplings(dynamic: usize, tree: &Tree, potentials: &Potentials) -> Vec<BTreeS
     for spring in &potentials.path_springs {
         let path: BTreeSet<_> = spring.segments.iter().flat_map(coordinates_of).collect();
         couple(&path.into_iter().filter(dynamic_only).collect::<Vec<_>>());
+    }
+    for force in forces.into_iter().flat_map(|forces| &forces.point_forces) {
+        couple(&coordinates_of(&force.ends).filter(dynamic_only).collect::<Vec<_>>());
     }
     couplings
 }

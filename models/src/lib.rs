@@ -27,6 +27,7 @@ mod rotation;
 #[allow(dead_code, reason = "derivatives of second order use all of it")]
 mod scalar;
 pub mod scene;
+mod signal;
 mod spatial;
 mod spline;
 mod tree;

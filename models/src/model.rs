@@ -5,7 +5,8 @@ use std::fmt::Write as _;
 use crate::elimination::Elimination;
 use crate::plant::conditioning::Conditioning;
 use crate::scene::{CoordinateKind, Scene};
-use crate::spatial::Vec3;
+use crate::signal::{Signal, Target};
+use crate::spatial::{Force, Vec3};
 use crate::spline::Spline;
 use crate::tree::{Attachment, JointKind, Tree};
 
@@ -26,8 +27,11 @@ pub struct Model {
     pub(crate) gravity: Option<Vec3>,
     /// Damping of each dynamic coordinate; empty without damping.
     pub(crate) damping: Vec<f64>,
-    /// Coordinate and gain of each input.
-    pub(crate) inputs: Vec<(usize, f64)>,
+    /// Forces of inputs on coordinates.
+    pub(crate) coordinate_inputs: Vec<CoordinateInput>,
+    /// Forces other than those of springs, damping and inputs on coordinates; `None` without any.
+    pub(crate) forces: Option<Forces>,
+    pub(crate) signals: Vec<Signal>,
     pub(crate) potentials: Potentials,
     /// Joints that points of constraints depend on: what a step walks at its ends.
     pub(crate) closure: Tree,
@@ -89,6 +93,79 @@ impl Potentials {
             + self.spline_springs.len()
             + self.path_springs.len()
     }
+}
+
+/// `f = gain u` on a coordinate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct CoordinateInput {
+    pub(crate) input: usize,
+    pub(crate) coordinate: usize,
+    pub(crate) gain: f64,
+}
+
+/// Forces that are evaluated at the midpoint of a step.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Forces {
+    pub(crate) wrenches: Vec<Wrench>,
+    pub(crate) point_forces: Vec<PointForce>,
+    pub(crate) coordinate_forces: Vec<CoordinateForce>,
+}
+
+/// A wrench on a joint that carries a body.
+#[derive(Clone, Debug)]
+pub(crate) struct Wrench {
+    pub(crate) kind: WrenchKind,
+    /// The joint and a point of it; for a wrench that moves or turns with the joint, where it acts.
+    pub(crate) at: Attachment,
+    /// The joint and those above it, root first.
+    pub(crate) path: Vec<usize>,
+    /// Constant part; in the joint's axes if it turns with the joint, else in world axes.
+    pub(crate) constant: Force,
+    /// Inputs, and the wrench of a unit of each.
+    pub(crate) inputs: Vec<(usize, Force)>,
+}
+
+/// How a wrench moves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum WrenchKind {
+    /// With the joint, at its point.
+    Body,
+    /// Not at all: about the world's origin.
+    Spatial,
+    /// Its point moves with the joint, its axes are those of the world.
+    Hybrid,
+}
+
+/// A force between two points that follows from their separation and its rate.
+#[derive(Clone, Debug)]
+pub(crate) struct PointForce {
+    pub(crate) ends: PointPair,
+    pub(crate) law: PointLaw,
+}
+
+/// The force on the first point of a pair, `d = a − b`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum PointLaw {
+    /// `F = −c e (e·ḋ)`, `e = d/|d|`.
+    Damper(f64),
+    /// `F = −c |ḋ| ḋ`.
+    Drag(f64),
+}
+
+/// A force on a coordinate that follows from its velocity.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct CoordinateForce {
+    pub(crate) coordinate: usize,
+    pub(crate) law: CoordinateLaw,
+}
+
+/// The force on a coordinate of velocity `v`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum CoordinateLaw {
+    /// `f = −c |v| v`.
+    Drag(f64),
+    /// `f = −force tanh(v / velocity)`.
+    Friction { force: f64, velocity: f64 },
 }
 
 /// `V = ½ k (q − rest)²`.
@@ -318,6 +395,33 @@ impl Model {
         self.digest
     }
 
+    /// Entries of `u` that signals replace.
+    pub(crate) fn replaced_inputs(&self) -> impl Iterator<Item = usize> {
+        self.signals.iter().filter_map(|signal| match signal.target {
+            Target::Input(_) => None,
+            Target::Prescribed(k) => Some(self.dimensions.inputs + k),
+        })
+    }
+
+    /// Dynamic coordinates and the inputs that act on them: inputs on coordinates, then inputs of
+    /// forces, in the order of [`Forces::for_each_input_derivative`]. A ball joint mixes its rows: with
+    /// one, all pairs.
+    pub(crate) fn input_pattern(&self) -> impl Iterator<Item = (usize, usize)> {
+        let d = self.dimensions;
+        let dense = if self.orientations.is_empty() { 0 } else { d.dynamic * d.inputs };
+        let all = (0..dense).map(move |entry| (entry / d.inputs, entry % d.inputs));
+        let sparse = if dense == 0 { usize::MAX } else { 0 };
+        let on_coordinates = self.coordinate_inputs.iter().map(|i| (i.coordinate, i.input));
+        let wrenches = self.forces.iter().flat_map(|forces| &forces.wrenches);
+        let of_forces = wrenches.flat_map(move |wrench| {
+            wrench.inputs.iter().flat_map(move |&(input, _)| {
+                wrench.path.iter().map(move |&j| (self.dynamics.joints[j].coordinate, input))
+            })
+        });
+        let of_forces = of_forces.filter(move |(coordinate, _)| *coordinate < d.dynamic);
+        all.chain(on_coordinates.chain(of_forces).take(sparse))
+    }
+
     /// What a step evaluates and what it skips, for people to read.
     pub fn plan(&self) -> String {
         let d = self.dimensions;
@@ -364,6 +468,21 @@ impl Model {
         let damped = self.damping.iter().filter(|c| **c != 0.0).count();
         line(format!("damping       {damped} coordinates{}", skipped(damped > 0)));
         line(format!("inputs        {}{}", d.inputs, skipped(d.inputs > 0)));
+        line(match &self.forces {
+            None => "forces        0 (skipped)".to_owned(),
+            Some(forces) => format!(
+                "forces        {} wrenches, {} between points, {} on coordinates",
+                forces.wrenches.len(),
+                forces.point_forces.len(),
+                forces.coordinate_forces.len()
+            ),
+        });
+        let on_inputs = |s: &&Signal| matches!(s.target, Target::Input(_));
+        let on_inputs = self.signals.iter().filter(on_inputs).count();
+        line(match self.signals.len() {
+            0 => "signals       0 (skipped)".to_owned(),
+            n => format!("signals       {on_inputs} on inputs, {} on coordinates", n - on_inputs),
+        });
         let equations = |is: fn(&ConstraintKind) -> bool| {
             self.constraints.iter().filter(|constraint| is(&constraint.kind)).count()
         };

@@ -3,14 +3,19 @@
 //! All quantities are SI; angles are radians. Unknown keys are errors. [`crate::Model::compile`]
 //! reports every error of a scene at once, each with its path.
 
+mod forces;
 mod limits;
+mod signals;
 mod text;
 mod validate;
 
+pub use forces::{Component, Force};
 pub use limits::{
-    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FRAMES, MAX_INPUTS, MAX_KNOTS,
-    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER, MAX_SPRINGS, MAX_TEXT_BYTES,
+    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES, MAX_FRAMES, MAX_INPUTS,
+    MAX_KNOTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER, MAX_SIGNAL_POINTS,
+    MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES,
 };
+pub use signals::{Interpolation, Signal};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -44,9 +49,15 @@ pub struct Scene {
     /// Springs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub springs: Vec<Spring>,
-    /// Generalized-force inputs, in the order of the input vector.
+    /// Force inputs, in the order of the input vector.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub inputs: Vec<Input>,
+    /// Forces other than springs, damping and those of inputs on coordinates.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub forces: Vec<Force>,
+    /// Functions of time that drive inputs and prescribed coordinates.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub signals: Vec<Signal>,
     /// Holonomic constraints.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub constraints: Vec<Constraint>,
@@ -308,15 +319,17 @@ pub struct Knot {
     pub curvature: Option<f64>,
 }
 
-/// A generalized force `gain · u` on one dynamic coordinate.
+/// A number `u` that the driver sends: a generalized force `gain · u` on a dynamic coordinate, a
+/// component of forces that name it, or both.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Input {
     /// Name.
     pub name: String,
-    /// Coordinate on which it acts.
-    pub coordinate: String,
-    /// Factor.
+    /// Coordinate on which it acts; may be left out if a force uses the input.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub coordinate: Option<String>,
+    /// Factor of the force on the coordinate.
     #[serde(default = "one")]
     pub gain: f64,
 }

@@ -251,6 +251,17 @@ impl<S: Scalar> Motion<S> {
         Self { w: self.w + o.w * s, v: self.v + o.v * s }
     }
 
+    /// Velocity of the body's point at `x`, which is measured from the origin.
+    #[inline(always)]
+    pub(crate) fn at(self, x: Vec3<S>) -> Vec3<S> {
+        self.v + self.w.cross(x)
+    }
+
+    #[inline(always)]
+    pub(crate) fn minus(self, o: Self) -> Self {
+        Self { w: self.w - o.w, v: self.v - o.v }
+    }
+
     /// Motion cross product `self × o`.
     #[inline(always)]
     pub(crate) fn cross(self, o: Self) -> Self {

@@ -111,7 +111,11 @@ fn damping(scene: &Scene, coordinate: usize) -> f64 {
 
 fn input(scene: &Scene, coordinate: usize, values: &[f64]) -> f64 {
     let name = name(scene, coordinate);
-    let inputs = scene.inputs.iter().zip(values).filter(|(input, _)| input.coordinate == name);
+    let inputs = scene
+        .inputs
+        .iter()
+        .zip(values)
+        .filter(|(input, _)| input.coordinate.as_ref() == Some(&name));
     inputs.map(|(input, value)| input.gain * value).sum()
 }
 

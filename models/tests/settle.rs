@@ -26,7 +26,7 @@ fn energy_near(plant: &mut Plant, q: Vec<f64>, u: &[f64]) -> (Vec<f64>, f64) {
     let inputs = model.scene().inputs.iter().zip(u);
     let work: f64 = inputs
         .map(|(input, u)| {
-            let index = model.coordinate_index(&input.coordinate).unwrap();
+            let index = model.coordinate_index(input.coordinate.as_ref().unwrap()).unwrap();
             input.gain * u * plant.q()[index]
         })
         .sum();

@@ -279,6 +279,8 @@ impl Mechanism {
             coordinates: self.coordinates(),
             springs: Vec::new(),
             inputs: Vec::new(),
+            forces: Vec::new(),
+            signals: Vec::new(),
             constraints: Vec::new(),
             operating_points: Vec::new(),
         };
@@ -341,7 +343,7 @@ impl Mechanism {
             let config = driven.get(&input.name).context("an input without a force")?;
             scene.inputs.push(Input {
                 name: plain(&input.name),
-                coordinate: plain(config),
+                coordinate: Some(plain(config)),
                 gain: 1.0,
             });
         }

@@ -5,9 +5,11 @@
 //! first-order linearization itself is [`linearize`](super::linearize), which knows the sparsity.
 
 use crate::Model;
+use crate::model::{CoordinateInput, Forces};
 use crate::plant::balls::Turning;
 use crate::plant::closure::Closure;
 use crate::plant::curvature::Curvature;
+use crate::plant::forces::Instant;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::rows::Term;
@@ -88,7 +90,8 @@ impl<S: Scalar> Blocks<S> {
     /// Rows and columns of dynamic rows that may differ from zero.
     fn pattern(&self, model: &Model) -> Vec<(usize, usize)> {
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
-        if model.potentials.couple_branches {
+        let couple = |forces: &Forces| !forces.point_forces.is_empty();
+        if model.potentials.couple_branches || model.forces.as_ref().is_some_and(couple) {
             return (0..nd * n).map(|entry| (entry / n, entry % n)).collect();
         }
         let on_paths = self.pairs.iter().flat_map(|&[_, _, i, j]| [(i, j), (j, i)]);
@@ -160,14 +163,39 @@ impl<S: Scalar> Blocks<S> {
     fn evaluate_forces(&mut self, model: &Model, velocity: &[S], inputs: &[S]) {
         let (n, ni) = (model.dimensions.coordinates(), model.dimensions.inputs);
         self.force.fill(S::ZERO);
+        if model.forces.is_some() {
+            for derivatives in [&mut self.f_q, &mut self.f_v, &mut self.f_u] {
+                derivatives.fill(S::ZERO);
+            }
+        }
         for (i, c) in model.damping.iter().enumerate() {
             self.force[i] -= velocity[i] * *c;
             self.f_v[i * (n + 1)] = S::constant(-c);
         }
-        for (j, (coordinate, gain)) in model.inputs.iter().enumerate() {
-            self.force[*coordinate] += inputs[j] * *gain;
-            self.f_u[coordinate * ni + j] = S::constant(*gain);
+        for &CoordinateInput { input, coordinate, gain } in &model.coordinate_inputs {
+            self.force[coordinate] += inputs[input] * gain;
+            self.f_u[coordinate * ni + input] = S::constant(gain);
         }
+        let (Some(forces), nd) = (&model.forces, model.dimensions.dynamic) else { return };
+        let at = Instant {
+            tree: &model.dynamics,
+            poses: &self.poses,
+            momenta: &self.momenta,
+            velocity,
+            inputs,
+        };
+        forces.add(&at, &mut self.force);
+        forces.for_each_derivative(&at, |i, j, by_q, by_v| {
+            if i < nd {
+                self.f_q[i * n + j] += by_q;
+                self.f_v[i * n + j] += by_v;
+            }
+        });
+        forces.for_each_input_derivative(&at, |i, k, by_u| {
+            if i < nd {
+                self.f_u[i * ni + k] += by_u;
+            }
+        });
     }
 }
 

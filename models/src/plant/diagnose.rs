@@ -83,7 +83,7 @@ impl Plant {
         let model = self.model.clone();
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
         assert!(q0.len() == n && q1.len() == n, "configurations have {n} entries");
-        self.evaluate_between(q0, q1, &[]);
+        self.evaluate_between(q0, q1, &vec![0.0; self.model.dimensions.inputs]);
         let workspace = &mut self.workspace;
         workspace.fill_newton_matrix(&model, &self.settings);
         let elimination = &model.elimination;

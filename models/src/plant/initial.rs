@@ -9,7 +9,7 @@ use crate::plant::momenta::Momenta;
 use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::padded;
-use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, forces, potentials};
+use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, potentials};
 use crate::rotation;
 use crate::spatial::Vec3;
 
@@ -184,7 +184,7 @@ impl Plant {
             Initial::TwoConfigurations { q0, q1 } => {
                 let q0 = checked("q0", q0, n)?;
                 state.q = checked("q1", q1, n)?;
-                state.p = self.momentum_between(&q0, &state.q, &[]);
+                state.p = self.momentum_between(&q0, &state.q, &vec![0.0; d.inputs]);
                 state.v.copy_from_slice(&self.workspace.velocity[nd..]);
             }
             Initial::Equilibrium { q, hold, inputs } => {
@@ -223,8 +223,7 @@ impl Plant {
             workspace.turns[o] = turn;
             workspace.orientations_mid[o] = orientations[o].times(&rotation::exp(turn * 0.5));
         }
-        forces::input_forces(&self.model.inputs, inputs, &mut workspace.input_force);
-        workspace.force.copy_from_slice(&workspace.input_force);
+        workspace.set_inputs(&self.model, inputs);
         workspace.evaluate_lagrangian(&self.model);
     }
 

@@ -17,8 +17,8 @@
 //! p[k+1]' = p' + (½h L_qq + L_qv + h f_v/h) x' + h L_qq q_d' + (prescribed) − A0ᵀ λ' − H q'
 //! ```
 //!
-//! An input on coordinate `i` acts like momentum: its column is `a h` times that of `p_i`, plus
-//! `(1 − a) h` on `p[k+1]_i`.
+//! An input acts like momentum: its column is `Σ_i a h ∂f_i/∂u` times that of `p_i`, plus
+//! `(1 − a) h ∂f_i/∂u` on `p[k+1]_i`. Prescribed positions that signals replace have no effect.
 
 use nalgebra::DMatrix;
 
@@ -29,14 +29,25 @@ use crate::plant::rows::{add_rows, padded};
 use crate::plant::{Plant, StepError, potentials};
 use crate::spatial::{Mat3, Vec3};
 
+/// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.
+#[derive(Clone, Copy, Debug)]
+struct InputImpulse {
+    input: usize,
+    coordinate: usize,
+    residual: f64,
+    momentum: f64,
+}
+
 /// The exact first-order linearization of one step, preallocated.
 #[derive(Clone, Debug)]
 pub struct Linearization {
     nd: usize,
     nk: usize,
     time_step_s: f64,
-    /// Coordinate and gain of each input.
-    inputs: Vec<(usize, f64)>,
+    ni: usize,
+    inputs: Vec<InputImpulse>,
+    /// Prescribed coordinates that signals drive, as columns of `B`.
+    replaced: Vec<usize>,
     at_start: f64,
     /// Length of a row: the columns of the parameters `(q_d, q_k, p, k)`, padded.
     stride: usize,
@@ -59,7 +70,17 @@ impl Linearization {
             nd: d.dynamic,
             nk: d.prescribed,
             time_step_s: model.scene().time_step_s,
-            inputs: model.inputs.clone(),
+            ni: d.inputs,
+            inputs: model
+                .input_pattern()
+                .map(|(coordinate, input)| InputImpulse {
+                    input,
+                    coordinate,
+                    residual: 0.0,
+                    momentum: 0.0,
+                })
+                .collect(),
+            replaced: model.replaced_inputs().collect(),
             at_start: 0.5,
             stride,
             increment: vec![0.0; d.dynamic * stride],
@@ -101,19 +122,18 @@ impl Linearization {
         a
     }
 
-    /// `B = ∂f/∂u`, `2 nd + 2 nk` by `ni + nk`.
+    /// `B = ∂f/∂u`, `2 nd + 2 nk` by `ni + nk`; zero where a signal replaces the entry of `u`.
     pub fn b(&self) -> DMatrix<f64> {
-        let (nd, nk, ni) = (self.nd, self.nk, self.inputs.len());
+        let (nd, nk, ni) = (self.nd, self.nk, self.ni);
         let (n, next) = (nd + nk, self.next_columns());
         let mut b = DMatrix::zeros(2 * n, ni + nk);
-        for (column, &(coordinate, gain)) in self.inputs.iter().enumerate() {
-            let (at_start, impulse) = self.input_impulses(gain);
+        for &InputImpulse { input, coordinate, residual, momentum } in &self.inputs {
             for i in 0..nd {
-                let momentum = i * self.stride + n + coordinate;
-                b[(i, column)] = at_start * self.increment[momentum];
-                b[(n + i, column)] = at_start * self.momentum[momentum];
+                let column = i * self.stride + n + coordinate;
+                b[(i, input)] += residual * self.increment[column];
+                b[(n + i, input)] += residual * self.momentum[column];
             }
-            b[(n + coordinate, column)] += impulse - at_start;
+            b[(n + coordinate, input)] += momentum - residual;
         }
         for k in 0..nk {
             for i in 0..nd {
@@ -133,6 +153,9 @@ impl Linearization {
                 add_block(&t.momentum.scaled(1.0 / self.time_step_s), at, &mut b);
             }
         }
+        for &column in &self.replaced {
+            b.column_mut(column).fill(0.0);
+        }
         b
     }
 
@@ -149,39 +172,39 @@ impl Linearization {
         })
     }
 
-    /// `∂λ/∂u`, nc by `ni + nk`; see [`Linearization::multipliers_x`].
+    /// `∂λ/∂u`, nc by `ni + nk`; see [`Linearization::multipliers_x`]. Zero where a signal replaces the
+    /// entry of `u`.
     pub fn multipliers_u(&self) -> DMatrix<f64> {
-        let ni = self.inputs.len();
-        DMatrix::from_fn(self.constraints(), ni + self.nk, |c, j| {
+        let (n, ni, next) = (self.nd + self.nk, self.ni, self.next_columns());
+        let mut by_u = DMatrix::zeros(self.constraints(), ni + self.nk);
+        for c in 0..self.constraints() {
             let row = &self.multipliers[c * self.stride..][..self.stride];
-            match self.inputs.get(j) {
-                Some(&(coordinate, gain)) => {
-                    self.input_impulses(gain).0 * row[self.nd + self.nk + coordinate]
-                }
-                None => row[self.next_columns() + j - ni],
+            for &InputImpulse { input, coordinate, residual, .. } in &self.inputs {
+                by_u[(c, input)] += residual * row[n + coordinate];
             }
-        })
+            for k in 0..self.nk {
+                by_u[(c, ni + k)] = row[next + k];
+            }
+        }
+        for &column in &self.replaced {
+            by_u.column_mut(column).fill(0.0);
+        }
+        by_u
     }
 
     /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, inputs, k)`.
     pub(crate) fn write_tangent(&self, stride: usize, out: &mut [f64]) {
         let (n, next) = (self.nd + self.nk, self.next_columns());
-        let ni = self.inputs.len();
         let rows = self.increment.chunks_exact(self.stride);
         let rows = rows.chain(self.multipliers.chunks_exact(self.stride));
         for (row, out) in rows.zip(out.chunks_exact_mut(stride)) {
             out[..next].copy_from_slice(&row[..next]);
-            for (out, &(coordinate, gain)) in out[next..].iter_mut().zip(&self.inputs) {
-                *out = self.input_impulses(gain).0 * row[n + coordinate];
+            out[next..][..self.ni].fill(0.0);
+            for &InputImpulse { input, coordinate, residual, .. } in &self.inputs {
+                out[next + input] += residual * row[n + coordinate];
             }
-            out[next + ni..][..self.nk].copy_from_slice(&row[next..][..self.nk]);
+            out[next + self.ni..][..self.nk].copy_from_slice(&row[next..][..self.nk]);
         }
-    }
-
-    /// Impulse of a unit input at the start of the step, and over the whole of it.
-    fn input_impulses(&self, gain: f64) -> (f64, f64) {
-        let impulse = self.time_step_s * gain;
-        (self.at_start * impulse, impulse)
     }
 
     /// First column of the next prescribed positions.
@@ -219,6 +242,11 @@ impl Workspace {
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
         let (n, next) = (nd + nk, out.next_columns());
         out.turnings.extend_from_slice(&blocks.turnings);
+        for place in &mut out.inputs {
+            let entry = place.coordinate * out.ni + place.input;
+            place.residual = blocks.residual_inputs[entry];
+            place.momentum = blocks.momentum_inputs[entry];
+        }
         for i in 0..nd {
             let row = i * n..(i + 1) * n;
             let (increment, momentum) = (
@@ -246,7 +274,8 @@ impl Plant {
             out.nd == d.dynamic
                 && out.nk == d.prescribed
                 && out.constraints() == d.constraints
-                && out.inputs == self.model.inputs,
+                && out.ni == d.inputs
+                && out.inputs.len() == self.model.input_pattern().count(),
             "the linearization belongs to another model"
         );
         out.time_step_s = self.settings.time_step_s;
@@ -255,9 +284,10 @@ impl Plant {
         workspace.factor_newton_matrix(&self.model, &self.settings)?;
         self.fill_right_hand_sides(out);
         let workspace = &mut self.workspace;
-        // Without inertia or springs on prescribed joints, the columns of `k` in r1' are zero.
+        // Without inertia, springs or forces on prescribed joints, the columns of `k` in r1' are zero.
         let moving = !self.model.mixed_pairs.is_empty()
             || self.model.potentials.couple_branches
+            || self.model.forces.is_some()
             || !self.model.orientations.is_empty();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
         workspace.matrix.solve_rows(
@@ -290,6 +320,10 @@ impl Plant {
             workspace.evaluate_turned(model, &self.settings, &self.state);
             workspace.take_turned(out);
             return;
+        }
+        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
+            place.momentum = h * input.gain;
+            place.residual = out.at_start * place.momentum;
         }
         workspace.stiffness.fill(0.0);
         workspace.end_slopes.fill(0.0);
@@ -333,6 +367,7 @@ impl Plant {
             out.momentum[row * stride + next] += 0.5 * h * second.qq + qv;
         }
         self.add_springs(out);
+        self.add_forces(out);
         self.add_constraint_hessian(out);
         for i in 0..nd {
             let momentum = i * stride + nd + nk + i;
@@ -373,6 +408,37 @@ impl Plant {
                 }
             },
         );
+    }
+
+    /// Forces add `a h f_q` to `C_q`, `a h f_v` to `C_v`, and `h (f_q q' + f_v v')` to `p[k+1]'`.
+    fn add_forces(&mut self, out: &mut Linearization) {
+        let Some(forces) = &self.model.forces else { return };
+        let h = self.settings.time_step_s;
+        let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
+        let mut slopes = std::mem::take(&mut self.workspace.end_slopes);
+        let mut stiffness = std::mem::take(&mut self.workspace.stiffness);
+        let instant = self.workspace.instant(&self.model);
+        forces.for_each_derivative(&instant, |row, column, by_q, by_v| {
+            if row < nd && column < nd {
+                out.increment[row * stride + column] += a * h * by_q;
+                slopes[row * nd + column] += 0.5 * h * by_q + by_v;
+                stiffness[row * nd + column] += h * by_q;
+            } else if row < nd {
+                let half = 0.5 * h * by_q;
+                for (column, slope) in [(column, half - by_v), (nd + column + nk, half + by_v)] {
+                    out.increment[row * stride + column] += a * slope;
+                    out.momentum[row * stride + column] += slope;
+                }
+            }
+        });
+        let mut places = out.inputs[self.model.coordinate_inputs.len()..].iter_mut();
+        forces.for_each_input_derivative(&instant, |row, _, by_u| {
+            let place = if row < nd { places.next() } else { None };
+            if let Some(place) = place {
+                (place.residual, place.momentum) = (a * h * by_u, h * by_u);
+            }
+        });
+        (self.workspace.end_slopes, self.workspace.stiffness) = (slopes, stiffness);
     }
 
     /// The constraints' impulses turn with the start configuration.

@@ -34,6 +34,7 @@ use nalgebra::DMatrix;
 
 use crate::Model;
 use crate::rotation::Quaternion;
+use crate::signal::Target;
 use balls::rotation_vector;
 use newton::Workspace;
 
@@ -391,7 +392,8 @@ impl Plant {
         Ok(report)
     }
 
-    /// Writes the input that exerts no force and leaves prescribed coordinates where they are.
+    /// Writes the input that exerts no force and leaves prescribed coordinates where they are; those
+    /// that signals drive, where the signals have them at the end of the step.
     ///
     /// # Panics
     ///
@@ -401,6 +403,40 @@ impl Plant {
         let (inputs, prescribed) = u.split_at_mut(d.inputs);
         inputs.fill(0.0);
         prescribed.copy_from_slice(&self.state.q[d.dynamic..]);
+        for signal in &self.model.signals {
+            if let Target::Prescribed(k) = signal.target {
+                prescribed[k] = signal.at(self.end_of_step_s());
+            }
+        }
+    }
+
+    /// The input with which a step from here runs if it is given `u`: signals add to inputs and replace
+    /// prescribed positions.
+    ///
+    /// # Panics
+    ///
+    /// If `u` does not have `ni + nk` entries.
+    pub fn effective_input(&self, u: &[f64]) -> Vec<f64> {
+        assert_eq!(u.len(), self.model.dimensions.input(), "entries of the input");
+        let mut effective = u.to_vec();
+        self.apply_signals(&mut effective);
+        effective
+    }
+
+    /// Inputs at the middle of the step from here, prescribed positions at its end.
+    fn apply_signals(&self, u: &mut [f64]) {
+        let (inputs, prescribed) = u.split_at_mut(self.model.dimensions.inputs);
+        let middle = (self.state.step as f64 + 0.5) * self.settings.time_step_s;
+        for signal in &self.model.signals {
+            match signal.target {
+                Target::Input(i) => inputs[i] += signal.at(middle),
+                Target::Prescribed(k) => prescribed[k] = signal.at(self.end_of_step_s()),
+            }
+        }
+    }
+
+    fn end_of_step_s(&self) -> f64 {
+        (self.state.step + 1) as f64 * self.settings.time_step_s
     }
 
     /// Steps since the plant was initialised.
@@ -453,7 +489,17 @@ impl Plant {
 
     fn solve(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
         self.check_input(u)?;
-        self.workspace.solve(&self.model, &self.settings, &self.state, u)
+        if self.model.signals.is_empty() {
+            return self.workspace.solve(&self.model, &self.settings, &self.state, u);
+        }
+        let mut effective = std::mem::take(&mut self.workspace.effective_input);
+        effective.copy_from_slice(u);
+        self.apply_signals(&mut effective);
+        let report = self.check_input(&effective).and_then(|()| {
+            self.workspace.solve(&self.model, &self.settings, &self.state, &effective)
+        });
+        self.workspace.effective_input = effective;
+        report
     }
 
     fn check_input(&self, u: &[f64]) -> Result<(), StepError> {

@@ -11,9 +11,11 @@
 //! measured in units of its own round-off; the solver stops where arithmetic does.
 
 use crate::Model;
+use crate::model::Forces;
 use crate::plant::blocks::StepBlocks;
 use crate::plant::closure::{Closure, larger};
 use crate::plant::curvature::Curvature;
+use crate::plant::forces::Instant;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::pivoted_lu::PivotedLu;
@@ -54,8 +56,12 @@ pub(crate) struct Workspace {
     pub(crate) velocity: Vec<f64>,
     pub(crate) l_q: Vec<f64>,
     pub(crate) l_v: Vec<f64>,
+    /// The input with the signals; empty without signals.
+    pub(crate) effective_input: Vec<f64>,
+    /// What forces depend on; empty without forces.
+    pub(crate) inputs: Vec<f64>,
     pub(crate) input_force: Vec<f64>,
-    /// Inputs and damping at the midpoint.
+    /// Inputs, damping and forces at the midpoint.
     pub(crate) force: Vec<f64>,
     pub(crate) residual: Vec<f64>,
     pub(crate) constraint_residual: Vec<f64>,
@@ -122,6 +128,8 @@ impl Workspace {
             velocity: zeros(n),
             l_q: zeros(nd),
             l_v: zeros(nd),
+            effective_input: zeros(if model.signals.is_empty() { 0 } else { d.input() }),
+            inputs: zeros(if model.forces.is_some() { d.inputs } else { 0 }),
             input_force: zeros(nd),
             force: zeros(nd),
             residual: zeros(nd),
@@ -179,13 +187,21 @@ impl Workspace {
             self.prepare_orientations(model, settings, state);
         }
         if d.inputs > 0 {
-            forces::input_forces(&model.inputs, inputs, &mut self.input_force);
-            self.force.copy_from_slice(&self.input_force);
+            self.set_inputs(model, inputs);
         }
         if d.constraints > 0 {
             self.prepare_start(model, state);
             // Until the end has a Jacobian of this step: nothing of the last may decide on this one.
             self.end.expect_round_off_of(&self.start);
+        }
+    }
+
+    /// Inputs, and their forces on coordinates.
+    pub(crate) fn set_inputs(&mut self, model: &Model, inputs: &[f64]) {
+        forces::input_forces(&model.coordinate_inputs, inputs, &mut self.input_force);
+        self.force.copy_from_slice(&self.input_force);
+        if model.forces.is_some() {
+            self.inputs.copy_from_slice(inputs);
         }
     }
 
@@ -352,6 +368,25 @@ impl Workspace {
         if !model.damping.is_empty() {
             forces::add_damping(&model.damping, &self.velocity, &self.input_force, &mut self.force);
         }
+        if let Some(forces) = &model.forces {
+            if model.damping.is_empty() {
+                self.force.copy_from_slice(&self.input_force);
+            }
+            let mut force = std::mem::take(&mut self.force);
+            forces.add(&self.instant(model), &mut force);
+            self.force = force;
+        }
+    }
+
+    /// What forces depend on, at the last evaluation.
+    pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a> {
+        Instant {
+            tree: &model.dynamics,
+            poses: &self.poses,
+            momenta: &self.momenta,
+            velocity: &self.velocity,
+            inputs: &self.inputs,
+        }
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.
@@ -395,7 +430,7 @@ impl Workspace {
         }
         let h = settings.time_step_s;
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
-        if model.potentials.couple_branches {
+        if model.potentials.couple_branches || model.forces.is_some() {
             self.matrix.clear();
         }
         self.curvature.fill_newton_matrix(
@@ -420,6 +455,9 @@ impl Workspace {
             let slot = model.elimination.offsets[i + 1] - 1;
             self.matrix.add_to_diagonal(slot, -settings.force_split.at_start() * c);
         }
+        if let Some(forces) = &model.forces {
+            self.add_forces_to_newton_matrix(model, forces, settings);
+        }
     }
 
     /// Factors `K` at the last evaluation.
@@ -437,6 +475,19 @@ impl Workspace {
         }
         let coordinate = model.coordinates[pivot.row].name.clone();
         Err(StepError::Singular { coordinate, pivot: pivot.relative })
+    }
+
+    /// Adds the part `a (½h f_q + f_v)` of forces to the Newton matrix.
+    fn add_forces_to_newton_matrix(&mut self, model: &Model, forces: &Forces, settings: &Settings) {
+        let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
+        let dynamic = model.dimensions.dynamic;
+        let mut matrix = std::mem::take(&mut self.matrix);
+        forces.for_each_derivative(&self.instant(model), |i, j, by_q, by_v| {
+            if i < dynamic && j < dynamic {
+                matrix.add(&model.elimination, i, j, a * (half * by_q + by_v));
+            }
+        });
+        self.matrix = matrix;
     }
 
     /// Factors `S = A1 K⁻¹ A0ᵀ` with the Jacobians in `start` and `end`.

@@ -96,6 +96,8 @@ struct Scratch {
     /// `x'` and `λ'` by all parameters, row-major, nd + nc rows.
     tangent: Vec<f64>,
     terms: Vec<Term>,
+    /// Entries of `u` that signals replace: they have no effect.
+    replaced: Vec<usize>,
 }
 
 /// The exact second-order linearization of one step, preallocated.
@@ -213,15 +215,21 @@ impl SecondOrder {
     fn mixed_block(&self, row: Option<usize>) -> DMatrix<f64> {
         let layout = self.scratch.layout;
         let moving = layout.inputs();
-        DMatrix::from_fn(2 * layout.n(), layout.ni + layout.nk, |a, b| {
+        let mut block = DMatrix::from_fn(2 * layout.n(), layout.ni + layout.nk, |a, b| {
             if a < moving { self.entry(row, a, moving + b) } else { 0.0 }
-        })
+        });
+        self.scratch.drop_replaced_columns(&mut block);
+        block
     }
 
     fn input_block(&self, row: Option<usize>) -> DMatrix<f64> {
         let layout = self.scratch.layout;
         let (moving, size) = (layout.inputs(), layout.ni + layout.nk);
-        DMatrix::from_fn(size, size, |a, b| self.entry(row, moving + a, moving + b))
+        let mut block =
+            DMatrix::from_fn(size, size, |a, b| self.entry(row, moving + a, moving + b));
+        self.scratch.drop_replaced_columns(&mut block);
+        self.scratch.drop_replaced_rows(&mut block);
+        block
     }
 }
 
@@ -293,7 +301,10 @@ impl Plant {
     ) -> Result<StepReport, StepError> {
         let report = self.linearize(u, first)?;
         assert_layout(&self.model, &second.scratch);
+        let effective = std::mem::take(&mut self.workspace.effective_input);
+        let u = if effective.is_empty() { u } else { &effective };
         self.differentiate_linearization(u, first, second);
+        self.workspace.effective_input = effective;
         Ok(report)
     }
 
@@ -330,11 +341,14 @@ impl Plant {
         assert_layout(&self.model, &out.scratch);
         first.write_tangent(out.scratch.layout.stride, &mut out.scratch.tangent);
         self.find_adjoint(weights_x, weights_multipliers, out);
-        if self.model.orientations.is_empty() {
+        let effective = std::mem::take(&mut self.workspace.effective_input);
+        let u = if effective.is_empty() { u } else { &effective };
+        if self.model.orientations.is_empty() && self.model.forces.is_none() {
             self.contract_gradients(u, out);
         } else {
             self.contract_directions(u, weights_x, out);
         }
+        self.workspace.effective_input = effective;
         out.finish();
         Ok(report)
     }
@@ -544,7 +558,7 @@ impl Plant {
         let (model, workspace) = (&*self.model, &mut self.workspace);
         let h = self.settings.time_step_s;
         let Contraction { scratch, adjoint, cofactor, sum, product, end_hessian, .. } = out;
-        let Scratch { layout, blocks, tangent, terms } = scratch;
+        let Scratch { layout, blocks, tangent, terms, .. } = scratch;
         let Layout { nd, nc, stride, .. } = *layout;
         let n = layout.n();
         let dual = |re: &f64, eps: &f64| Dual::new(*re, *eps);
@@ -708,7 +722,18 @@ impl Scratch {
             blocks: StepBlocks::new(model),
             tangent: vec![0.0; rows * layout.stride],
             terms: Vec::with_capacity(layout.nd * layout.n() + layout.nc),
+            replaced: model.replaced_inputs().collect(),
         }
+    }
+
+    /// Zeroes the columns of the entries of `u` that signals replace.
+    fn drop_replaced_columns(&self, by_u: &mut DMatrix<f64>) {
+        self.replaced.iter().for_each(|&column| by_u.column_mut(column).fill(0.0));
+    }
+
+    /// Zeroes the rows of the entries of `u` that signals replace.
+    fn drop_replaced_rows(&self, by_u: &mut DMatrix<f64>) {
+        self.replaced.iter().for_each(|&row| by_u.row_mut(row).fill(0.0));
     }
 
     /// Places the blocks at the solution, with the tangent of parameter `a`.
@@ -785,5 +810,8 @@ impl Contraction {
                 self.uu[(a, b)] = entry(moving + a, moving + b);
             }
         }
+        self.scratch.drop_replaced_columns(&mut self.xu);
+        self.scratch.drop_replaced_columns(&mut self.uu);
+        self.scratch.drop_replaced_rows(&mut self.uu);
     }
 }

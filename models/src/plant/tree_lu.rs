@@ -5,7 +5,7 @@ use crate::elimination::Elimination;
 use crate::plant::rows::{Term, add_rows};
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct TreeLu {
     /// `upper[slot] = K[ancestor, row]`.
     pub(crate) upper: Vec<f64>,

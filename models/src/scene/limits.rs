@@ -10,6 +10,12 @@ pub const MAX_FRAMES: usize = 4096;
 pub const MAX_COORDINATES: usize = 1024;
 /// Most springs.
 pub const MAX_SPRINGS: usize = 4096;
+/// Most forces.
+pub const MAX_FORCES: usize = 4096;
+/// Most signals.
+pub const MAX_SIGNALS: usize = 1024;
+/// Most knots of splines and times of tables in all signals together.
+pub const MAX_SIGNAL_POINTS: usize = 1 << 18;
 /// Most inputs.
 pub const MAX_INPUTS: usize = 1024;
 /// Most constraint equations.

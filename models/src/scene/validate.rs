@@ -2,17 +2,19 @@
 
 mod actions;
 mod coordinates;
+mod forces;
 mod frames;
 mod shapes;
+mod signals;
 #[cfg(test)]
 mod tests;
 
 use std::collections::BTreeMap;
 
 use super::{
-    Constraint, CoordinateKind, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FRAMES,
-    MAX_INPUTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_SPRINGS, Motion,
-    Problem, Scene, Spring,
+    Constraint, CoordinateKind, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES,
+    MAX_FRAMES, MAX_INPUTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS,
+    MAX_SIGNAL_POINTS, MAX_SIGNALS, MAX_SPRINGS, Motion, Problem, Scene, Signal, Spring,
 };
 
 use crate::Model;
@@ -36,6 +38,8 @@ impl Scene {
         check.coordinates();
         check.springs();
         check.inputs();
+        check.forces();
+        check.signals();
         check.constraints();
         check.operating_points();
         check.problems
@@ -78,6 +82,7 @@ impl<'a> Check<'a> {
     fn limits(&mut self) {
         let scene = self.scene;
         let joints: usize = scene.frames.iter().map(|f| f.motions().len()).sum();
+        let signal_points: usize = scene.signals.iter().map(Signal::points).sum();
         let equations: usize = scene.constraints.iter().map(Constraint::equations).sum();
         let spring_points = scene.springs.iter().map(|spring| match spring {
             Spring::Path { points, .. } => points.len(),
@@ -99,6 +104,9 @@ impl<'a> Check<'a> {
             ("springs", "springs", scene.springs.len(), MAX_SPRINGS),
             ("springs", "points of paths", spring_points.sum(), MAX_PATH_POINTS),
             ("inputs", "inputs", scene.inputs.len(), MAX_INPUTS),
+            ("forces", "forces", scene.forces.len(), MAX_FORCES),
+            ("signals", "signals", scene.signals.len(), MAX_SIGNALS),
+            ("signals", "knots and times", signal_points, MAX_SIGNAL_POINTS),
             ("constraints", "constraints", equations, MAX_CONSTRAINTS),
             ("constraints", "points of paths", constraint_points.sum(), MAX_PATH_POINTS),
             ("constraints", "terms of couplings", terms.sum(), MAX_COUPLING_TERMS),

@@ -34,19 +34,24 @@ struct Check {
     u: Vec<f64>,
     out: Linearization,
     name: String,
+    /// Of displacements, relative to the usual ones.
+    reach: f64,
 }
 
 impl Check {
     /// About a state in full motion.
-    fn new(scene: &Scene, split: ForceSplit) -> Self {
+    fn new(scene: &Scene, split: ForceSplit, reach: f64) -> Self {
         let mut plant = plant(scene, |s| s.force_split = split);
         wave(&mut plant, 20);
+        // Signals begin again where a state is given.
+        let x = plant.state();
+        plant.initialize(&Initial::Momentum { q: x.q, p: x.p, v: x.v }).unwrap();
         let x = plant.state();
         let u = waving_input(&plant, 23);
         let mut out = Linearization::new(&plant.model().clone());
         plant.linearize(&u, &mut out).unwrap();
         assert_eq!(plant.state(), x, "linearize must stay");
-        Self { plant, x, u, out, name: format!("{}, {split:?}", scene.name) }
+        Self { plant, x, u, out, name: format!("{}, {split:?}", scene.name), reach }
     }
 
     /// What the linearization says: the same three vectors for a displacement of `x` and `u`.
@@ -67,7 +72,8 @@ impl Check {
         let (a, b, n) = (self.out.a(), self.out.b(), d.coordinates());
         let rows = |from, count| a.rows(from, count).amax().max(b.rows(from, count).amax());
         let multipliers = self.out.multipliers_x().amax().max(self.out.multipliers_u().amax());
-        [rows(0, n), rows(n, d.dynamic), multipliers].map(|slope| 1e-11 + 1e-12 * slope)
+        [rows(0, n), rows(n, d.dynamic), multipliers]
+            .map(|slope| (1e-11 + 1e-12 * slope) / self.reach)
     }
 
     fn compare(&self, what: &str, found: [Vec<f64>; 3], predicted: [Vec<f64>; 3], tolerance: f64) {
@@ -93,7 +99,7 @@ impl Check {
         for column in first..d.state() {
             // A momentum is changed by what moves coordinates by two thousandths, whatever the masses.
             let mobility = self.out.a().view((0, column), (n, 1)).amax();
-            let delta = if column < n { 1e-3 } else { (2e-3 / mobility).min(0.1) };
+            let delta = self.reach * if column < n { 1e-3 } else { (2e-3 / mobility).min(0.1) };
             let found = slope(delta, |s| {
                 let mut x = self.x.clone();
                 let parts = [&mut x.q[..], &mut x.p, &mut x.v];
@@ -106,7 +112,7 @@ impl Check {
             self.compare(&format!("x[{column}]"), found, predicted, TOLERANCE);
         }
         for column in 0..d.input() {
-            let delta = if column < d.inputs { 1e-1 } else { 1e-3 };
+            let delta = if column < d.inputs { 1e-1 } else { self.reach * 1e-3 };
             let found = slope(delta, |s| {
                 let mut u = self.u.clone();
                 u[column] += s;
@@ -144,8 +150,13 @@ impl Check {
 
 /// Checks every column, for both ways to split forces.
 pub(crate) fn check(scene: &Scene) {
+    check_within(scene, 1.0);
+}
+
+/// The same with smaller displacements, for forces that bend sharply.
+pub(crate) fn check_within(scene: &Scene, reach: f64) {
     for split in SPLITS {
-        let mut check = Check::new(scene, split);
+        let mut check = Check::new(scene, split, reach);
         check.columns();
         if check.plant.model().dimensions().constraints > 0 {
             check.manifold();

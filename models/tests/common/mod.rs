@@ -131,6 +131,8 @@ pub(crate) fn random_tree(seed: u64) -> Scene {
         coordinates: Vec::new(),
         springs: Vec::new(),
         inputs: Vec::new(),
+        forces: Vec::new(),
+        signals: Vec::new(),
         constraints: Vec::new(),
         operating_points: Vec::new(),
     };
@@ -145,7 +147,7 @@ pub(crate) fn random_tree(seed: u64) -> Scene {
             damping: None,
         });
         if !prescribed {
-            let (name, coordinate) = (format!("force{i}"), frame.name.clone());
+            let (name, coordinate) = (format!("force{i}"), Some(frame.name.clone()));
             scene.inputs.push(Input { name, coordinate, gain: random.between(0.5, 2.0) });
         }
         scene.frames.push(frame);

@@ -8,13 +8,13 @@ use crate::scene::{
 };
 
 /// A frame; the world has no index.
-type Carrier = Option<usize>;
+pub(super) type Carrier = Option<usize>;
 
 /// What moves points or frames relative to each other.
 #[derive(Default)]
-struct RelativeMotion {
-    dynamic: bool,
-    prescribed: bool,
+pub(super) struct RelativeMotion {
+    pub(super) dynamic: bool,
+    pub(super) prescribed: bool,
 }
 
 impl Check<'_> {
@@ -169,7 +169,7 @@ impl Check<'_> {
     }
 
     /// Checks two points; tells what moves them relative to each other if both frames exist.
-    fn between(&mut self, path: &str, a: &Point, b: &Point) -> Option<RelativeMotion> {
+    pub(super) fn between(&mut self, path: &str, a: &Point, b: &Point) -> Option<RelativeMotion> {
         let a = self.point(&format!("{path}.a"), a);
         let b = self.point(&format!("{path}.b"), b);
         self.relative_motion(&[a?, b?], |_| true)
@@ -196,13 +196,13 @@ impl Check<'_> {
     }
 
     /// Checks a point and finds its frame.
-    fn point(&mut self, path: &str, point: &Point) -> Option<Carrier> {
+    pub(super) fn point(&mut self, path: &str, point: &Point) -> Option<Carrier> {
         self.finite_all(&format!("{path}.at"), &point.at);
         self.carrier(format!("{path}.frame"), &point.frame)
     }
 
     /// Finds a frame.
-    fn carrier(&mut self, path: String, name: &str) -> Option<Carrier> {
+    pub(super) fn carrier(&mut self, path: String, name: &str) -> Option<Carrier> {
         if name == "world" {
             return Some(None);
         }
@@ -214,7 +214,7 @@ impl Check<'_> {
     }
 
     /// What of the motions that count is between frames: joints that carry some of them, but not all.
-    fn relative_motion(
+    pub(super) fn relative_motion(
         &self,
         carriers: &[Carrier],
         counts: impl Fn(&Motion) -> bool,

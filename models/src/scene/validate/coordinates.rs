@@ -3,19 +3,21 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::Check;
-use crate::scene::{Constraint, CoordinateKind, Motion};
+use crate::scene::{Constraint, CoordinateKind, Force, Motion, Signal};
 
 impl<'a> Check<'a> {
     pub(super) fn coordinates(&mut self) {
         let lengths = self.length_coordinates();
         let coupled = self.coupled_coordinates();
+        // A signal has a start of its own.
+        let driven: BTreeSet<_> = self.scene.signals.iter().map(Signal::drives).collect();
         let mut seen = BTreeMap::new();
         for (i, coordinate) in self.scene.coordinates.iter().enumerate() {
             let path = format!("coordinates[{i}]");
             let name = coordinate.name.as_str();
             self.name(format!("{path}.name"), name, &mut seen);
             let prescribed = coordinate.kind == CoordinateKind::Prescribed;
-            if prescribed && lengths.contains(name) {
+            if prescribed && lengths.contains(name) && !driven.contains(name) {
                 self.positive(format!("{path}.initial"), coordinate.initial);
             } else {
                 self.finite(format!("{path}.initial"), coordinate.initial);
@@ -43,7 +45,7 @@ impl<'a> Check<'a> {
     }
 
     /// Coordinates that are lengths of constraints.
-    fn length_coordinates(&self) -> BTreeSet<&'a str> {
+    pub(super) fn length_coordinates(&self) -> BTreeSet<&'a str> {
         self.scene.constraints.iter().filter_map(Constraint::length_coordinate).collect()
     }
 
@@ -101,6 +103,7 @@ impl<'a> Check<'a> {
     }
 
     pub(super) fn inputs(&mut self) {
+        let used: BTreeSet<_> = self.scene.forces.iter().flat_map(Force::inputs).collect();
         let mut seen = BTreeMap::new();
         for (i, input) in self.scene.inputs.iter().enumerate() {
             let path = format!("inputs[{i}]");
@@ -109,7 +112,16 @@ impl<'a> Check<'a> {
                 let message = format!("`{}` is also a prescribed coordinate", input.name);
                 self.report(format!("{path}.name"), message);
             }
-            self.dynamic_coordinate(format!("{path}.coordinate"), &input.coordinate);
+            match &input.coordinate {
+                Some(name) => self.dynamic_coordinate(format!("{path}.coordinate"), name),
+                None if !used.contains(input.name.as_str()) => {
+                    self.report(path.clone(), "acts on no coordinate, and no force uses it");
+                }
+                None if input.gain != 1.0 => {
+                    self.report(format!("{path}.gain"), "has no effect without a coordinate");
+                }
+                None => {}
+            }
             if self.finite(format!("{path}.gain"), input.gain) && input.gain == 0.0 {
                 self.report(format!("{path}.gain"), "is zero; the input would have no effect");
             }

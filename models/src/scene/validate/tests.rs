@@ -461,3 +461,119 @@ fn sizes_have_limits() {
     assert_eq!(problems.len(), 1);
     assert!(problems[0].message.contains("1025 joints"), "{problems:?}");
 }
+
+/// Adds text to the good scene; tells if the problems are not at `expected`.
+fn check_added(text: &str, expected: &[&str]) -> Option<String> {
+    let scene = Scene::from_toml(&format!("{GOOD}\n{text}"));
+    let problems = scene.unwrap_or_else(|e| panic!("`{text}`: {e}")).validate();
+    let paths: Vec<_> = problems.iter().map(|p| p.path.as_str()).collect();
+    (paths != expected).then(|| format!("`{text}`: {problems:#?}"))
+}
+
+#[test]
+fn faults_of_forces_are_found_where_they_are() {
+    let thrust = "[[inputs]]\nname = \"thrust\"\n[[forces]]\ntype = \"thruster\"\nframe = \"hand\"";
+    let cases: &[(&str, &[&str])] = &[
+        ("type = \"body_wrench\"\nframe = \"hand\"\nforce = [1, 0, \"torque\"]", &[]),
+        ("type = \"body_wrench\"\nframe = \"foot\"\nforce = [1, 0, 0]", &["forces[0].frame"]),
+        ("type = \"spatial_wrench\"\nframe = \"rail\"\nforce = [1, 0, 0]", &["forces[0].frame"]),
+        ("type = \"hybrid_wrench\"\nframe = \"world\"\nforce = [1, 0, 0]", &["forces[0].frame"]),
+        ("type = \"hybrid_wrench\"\nframe = \"hand\"\ntorque = [0, 0.0, 0]", &["forces[0]"]),
+        (
+            "type = \"hybrid_wrench\"\nframe = \"hand\"\nforce = [0, nan, 0]\ntorque = [0, 0, \"tork\"]",
+            &["forces[0].force[1]", "forces[0].torque[2]"],
+        ),
+        (
+            "type = \"two_point_damper\"\na = { frame = \"hand\" }\nb = { frame = \"rail\" }\ndamping = -1.0",
+            &["forces[0].damping"],
+        ),
+        (
+            "type = \"two_point_damper\"\na = { frame = \"hand\" }\nb = { frame = \"arm\" }\ndamping = 1.0",
+            &["forces[0]"],
+        ),
+        (
+            "type = \"two_point_damper\"\na = { frame = \"rail\" }\nb = { frame = \"world\" }\ndamping = 1.0",
+            &["forces[0]"],
+        ),
+        (
+            "type = \"drag\"\nframe = \"hand\"\nat = [0, inf, 0]\ncoefficient = nan",
+            &["forces[0].at[1]", "forces[0].coefficient"],
+        ),
+        (
+            "type = \"coordinate_drag\"\ncoordinate = \"rail\"\ncoefficient = -1.0",
+            &["forces[0].coordinate", "forces[0].coefficient"],
+        ),
+        (
+            "type = \"friction\"\ncoordinate = \"knee\"\nforce = -1.0\nvelocity = 0.0",
+            &["forces[0].coordinate", "forces[0].force", "forces[0].velocity"],
+        ),
+    ];
+    let mut wrong: Vec<_> = cases
+        .iter()
+        .filter_map(|(text, expected)| check_added(&format!("[[forces]]\n{text}"), expected))
+        .collect();
+    let thrusters: &[(&str, &[&str])] = &[
+        ("axis = [1, 0, 0]\ninput = \"thrust\"", &[]),
+        ("axis = [0, 0, 0]\ninput = \"thrust\"", &["forces[0].axis"]),
+        ("axis = [1, 0, 0]\ninput = \"thrust\"\ngain = 0.0", &["forces[0].gain"]),
+        ("axis = [1, 0, 0]\ninput = \"trust\"", &["inputs[1]", "forces[0].input"]),
+    ];
+    wrong.extend(
+        thrusters
+            .iter()
+            .filter_map(|(text, expected)| check_added(&format!("{thrust}\n{text}"), expected)),
+    );
+    let geared = thrust.replace("\"thrust\"", "\"thrust\"\ngain = 2.0");
+    let geared = format!("{geared}\naxis = [1, 0, 0]\ninput = \"thrust\"");
+    wrong.extend(check_added(&geared, &["inputs[1].gain"]));
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn faults_of_signals_are_found_where_they_are() {
+    let sinusoid = "type = \"sinusoid\"\namplitude = 0.5\nfrequency_hz = 1.0";
+    let table = "drives = \"torque\"\ntype = \"table\"";
+    let cases = [
+        (format!("drives = \"torque\"\n{sinusoid}"), &[][..]),
+        (format!("drives = \"rope\"\n{sinusoid}\noffset = 1.0"), &[]),
+        (format!("drives = \"rope\"\n{sinusoid}"), &["signals[0]"]),
+        (format!("drives = \"elbow\"\n{sinusoid}"), &["signals[0].drives"]),
+        (format!("drives = \"knee\"\n{sinusoid}"), &["signals[0].drives"]),
+        (
+            format!("drives = \"torque\"\n{sinusoid}\nphase_rad = nan\noffset = inf"),
+            &["signals[0].phase_rad", "signals[0].offset"],
+        ),
+        (
+            "drives = \"rail\"\ntype = \"constant\"\nvalue = 1.0\n[[signals]]\ndrives = \"rail\"\ntype = \"constant\"\nvalue = 2.0".to_owned(),
+            &["signals[1].drives"],
+        ),
+        (
+            "drives = \"torque\"\ntype = \"chirp\"\namplitude = 1.0\nstart_hz = -1.0\nend_hz = 1.0\nduration_s = 0.0".to_owned(),
+            &["signals[0].start_hz", "signals[0].duration_s"],
+        ),
+        (
+            "drives = \"torque\"\ntype = \"spline\"\nknots = [{ x = 1.0, value = nan }, { x = 1.0, value = 2.0 }]".to_owned(),
+            &["signals[0].knots[0].value", "signals[0].knots[1].x"],
+        ),
+        (format!("{table}\ntimes_s = []\nvalues = []"), &["signals[0].times_s"]),
+        (format!("{table}\ntimes_s = [0]\nvalues = [1]"), &[]),
+        (format!("{table}\ntimes_s = [0]\nvalues = [1]\nrepeat = true"), &["signals[0].times_s"]),
+        (format!("{table}\ntimes_s = [0, 1, 1]\nvalues = [1, 2, 3]"), &["signals[0].times_s[2]"]),
+        (
+            format!("{table}\ntimes_s = [0, nan]\nvalues = [1]"),
+            &["signals[0].times_s[1]", "signals[0].values"],
+        ),
+    ];
+    let wrong: Vec<_> = cases
+        .iter()
+        .filter_map(|(text, expected)| check_added(&format!("[[signals]]\n{text}"), expected))
+        .collect();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    let mut scene = builtin::scene("pendulum").unwrap();
+    let signal = "drives = \"torque\"\ntype = \"table\"\ntimes_s = []\nvalues = []";
+    let mut signal: Signal = toml::from_str(signal).unwrap();
+    let Signal::Table { times_s, .. } = &mut signal else { panic!() };
+    *times_s = (0..=MAX_SIGNAL_POINTS).map(|k| k as f64).collect();
+    scene.signals.push(signal);
+    assert_eq!(scene.validate()[0].path, "signals");
+}

@@ -1,0 +1,147 @@
+//! Forces and signals of a scene, resolved.
+
+use std::collections::BTreeMap;
+
+use super::{Layout, Places};
+use crate::model::{
+    CoordinateForce, CoordinateInput, CoordinateLaw, Forces, PointForce, PointLaw, Wrench,
+    WrenchKind,
+};
+use crate::scene::{self, Component, Point, Scene};
+use crate::signal::{Signal, Target};
+use crate::spatial::{Force, Mat3, Vec3};
+use crate::tree::{Attachment, Tree, WORLD};
+
+/// The forces of a scene over the joints of a tree.
+struct Resolver<'a> {
+    places: Places<'a>,
+    inputs: BTreeMap<&'a str, usize>,
+}
+
+impl Layout {
+    pub(super) fn coordinate_inputs(&self, scene: &Scene) -> Vec<CoordinateInput> {
+        let on_coordinate = |(input, i): (usize, &scene::Input)| {
+            let coordinate = self.index[i.coordinate.as_ref()?];
+            Some(CoordinateInput { input, coordinate, gain: i.gain })
+        };
+        scene.inputs.iter().enumerate().filter_map(on_coordinate).collect()
+    }
+
+    /// Forces without effect are dropped; none if none is left.
+    pub(super) fn forces(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Option<Forces> {
+        let inputs = scene.inputs.iter().enumerate().map(|(i, input)| (input.name.as_str(), i));
+        let places = Places { layout: self, tree, index };
+        let resolver = Resolver { places, inputs: inputs.collect() };
+        let mut forces = Forces::default();
+        for force in &scene.forces {
+            resolver.add(force, &mut forces);
+        }
+        let Forces { wrenches, point_forces, coordinate_forces } = &forces;
+        let none = wrenches.is_empty() && point_forces.is_empty() && coordinate_forces.is_empty();
+        (!none).then_some(forces)
+    }
+
+    pub(super) fn signals(&self, scene: &Scene) -> Vec<Signal> {
+        let target = |name: &str| match scene.inputs.iter().position(|i| i.name == name) {
+            Some(input) => Target::Input(input),
+            None => Target::Prescribed(self.index[name] - self.dynamic),
+        };
+        scene.signals.iter().map(|signal| Signal::new(target(signal.drives()), signal)).collect()
+    }
+}
+
+impl Resolver<'_> {
+    fn add(&self, force: &scene::Force, forces: &mut Forces) {
+        let (layout, index) = (self.places.layout, &self.places.layout.index);
+        match force {
+            scene::Force::BodyWrench { frame, force, torque } => {
+                forces.wrenches.push(self.wrench(WrenchKind::Body, frame, force, torque));
+            }
+            scene::Force::SpatialWrench { frame, force, torque } => {
+                forces.wrenches.push(self.wrench(WrenchKind::Spatial, frame, force, torque));
+            }
+            scene::Force::HybridWrench { frame, force, torque } => {
+                forces.wrenches.push(self.wrench(WrenchKind::Hybrid, frame, force, torque));
+            }
+            scene::Force::Thruster { frame, at, axis, input, gain } => {
+                let axis = layout.frames[frame].rotation.apply(Vec3(*axis));
+                let thrust = Force { n: Vec3::ZERO, f: axis * (gain / axis.norm()) };
+                let at = self.attachment(frame, *at);
+                forces.wrenches.push(Wrench {
+                    kind: WrenchKind::Body,
+                    at,
+                    path: self.places.tree.path(at.joint),
+                    constant: Force::default(),
+                    inputs: vec![(self.inputs[input.as_str()], thrust)],
+                });
+            }
+            scene::Force::TwoPointDamper { a, b, damping } => {
+                if *damping != 0.0 {
+                    let ends = self.places.between(layout.attachment(a), layout.attachment(b));
+                    let law = PointLaw::Damper(*damping);
+                    forces.point_forces.push(PointForce { ends, law });
+                }
+            }
+            scene::Force::Drag { frame, at, coefficient } => {
+                if *coefficient != 0.0 {
+                    let at = Point { frame: frame.clone(), at: *at };
+                    let still = Attachment { joint: WORLD, point: Vec3::ZERO };
+                    let ends = self.places.between(layout.attachment(&at), still);
+                    let law = PointLaw::Drag(*coefficient);
+                    forces.point_forces.push(PointForce { ends, law });
+                }
+            }
+            scene::Force::CoordinateDrag { coordinate, coefficient } => {
+                if *coefficient != 0.0 {
+                    let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
+                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+                }
+            }
+            scene::Force::Friction { coordinate, force, velocity } => {
+                if *force != 0.0 {
+                    let law = CoordinateLaw::Friction { force: *force, velocity: *velocity };
+                    let coordinate = index[coordinate];
+                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+                }
+            }
+        }
+    }
+
+    fn attachment(&self, frame: &str, at: [f64; 3]) -> Attachment {
+        let at = self.places.layout.attachment(&Point { frame: frame.to_owned(), at });
+        let joint = if at.joint == WORLD { WORLD } else { self.places.index[at.joint] };
+        Attachment { joint, ..at }
+    }
+
+    fn wrench(
+        &self,
+        kind: WrenchKind,
+        frame: &str,
+        force: &[Component; 3],
+        torque: &[Component; 3],
+    ) -> Wrench {
+        let axes = match kind {
+            WrenchKind::Body => self.places.layout.frames[frame].rotation,
+            WrenchKind::Spatial | WrenchKind::Hybrid => Mat3::IDENTITY,
+        };
+        let mut constant = Force::default();
+        let mut inputs: BTreeMap<usize, Force> = BTreeMap::new();
+        for (i, axis) in axes.0.into_iter().enumerate() {
+            let along = |n: Vec3, f: Vec3| Force { n, f };
+            for (component, unit) in
+                [(&torque[i], along(axis, Vec3::ZERO)), (&force[i], along(Vec3::ZERO, axis))]
+            {
+                match component {
+                    Component::Constant(value) => constant = constant.add_scaled(*value, unit),
+                    Component::Input(name) => {
+                        let total = inputs.entry(self.inputs[name.as_str()]).or_default();
+                        *total = total.add_scaled(1.0, unit);
+                    }
+                }
+            }
+        }
+        let at = self.attachment(frame, [0.0; 3]);
+        let path = self.places.tree.path(at.joint);
+        Wrench { kind, at, path, constant, inputs: inputs.into_iter().collect() }
+    }
+}

@@ -1,0 +1,151 @@
+//! Forces that do not come from a potential, and that are not the damping of a coordinate.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::{Point, is_zero3, one};
+
+/// A force. Forces act on dynamic coordinates; velocities include those of prescribed ones.
+///
+/// Components of wrenches are numbers, N and N·m, or names of inputs.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Force {
+    /// A wrench in the axes of a frame, at its origin: it turns with the frame.
+    BodyWrench {
+        /// Frame on which it acts.
+        frame: String,
+        /// Force, frame axes, N.
+        #[serde(default, skip_serializing_if = "are_zero")]
+        force: [Component; 3],
+        /// Torque about the frame's origin, frame axes, N·m.
+        #[serde(default, skip_serializing_if = "are_zero")]
+        torque: [Component; 3],
+    },
+    /// A wrench in world axes, about the world's origin: its line of action stays in the world.
+    SpatialWrench {
+        /// Frame on which it acts.
+        frame: String,
+        /// Force, world axes, N.
+        #[serde(default, skip_serializing_if = "are_zero")]
+        force: [Component; 3],
+        /// Torque about the world's origin, world axes, N·m.
+        #[serde(default, skip_serializing_if = "are_zero")]
+        torque: [Component; 3],
+    },
+    /// A wrench in world axes, at the origin of a frame: it moves with the frame and does not turn.
+    HybridWrench {
+        /// Frame on which it acts.
+        frame: String,
+        /// Force, world axes, N.
+        #[serde(default, skip_serializing_if = "are_zero")]
+        force: [Component; 3],
+        /// Torque about the frame's origin, world axes, N·m.
+        #[serde(default, skip_serializing_if = "are_zero")]
+        torque: [Component; 3],
+    },
+    /// `F = gain · u · axis` at a point of a frame, along an axis of that frame.
+    Thruster {
+        /// Frame on which it acts.
+        frame: String,
+        /// Where, in the frame, m.
+        #[serde(default, skip_serializing_if = "is_zero3")]
+        at: [f64; 3],
+        /// Direction in the frame; need not have unit length.
+        axis: [f64; 3],
+        /// Input `u`.
+        input: String,
+        /// Newtons per unit of the input.
+        #[serde(default = "one")]
+        gain: f64,
+    },
+    /// `F = −damping · dl/dt` along the line between two points, `l = |a − b|`.
+    TwoPointDamper {
+        /// One end.
+        a: Point,
+        /// Other end.
+        b: Point,
+        /// N·s/m.
+        damping: f64,
+    },
+    /// `F = −coefficient · |v| v` at a point of a frame, `v` its velocity in the world.
+    Drag {
+        /// Frame on which it acts.
+        frame: String,
+        /// Where, in the frame, m.
+        #[serde(default, skip_serializing_if = "is_zero3")]
+        at: [f64; 3],
+        /// N·s²/m².
+        coefficient: f64,
+    },
+    /// `f = −coefficient · |v| v` on a coordinate of velocity `v`.
+    CoordinateDrag {
+        /// Coordinate.
+        coordinate: String,
+        /// N·s²/m² or N·m·s²/rad².
+        coefficient: f64,
+    },
+    /// `f = −force · tanh(v / velocity)` on a coordinate of velocity `v`: dry friction without a jump.
+    Friction {
+        /// Coordinate.
+        coordinate: String,
+        /// Friction of sliding, N or N·m.
+        force: f64,
+        /// Velocity at which 76 % of it are reached, m/s or rad/s.
+        velocity: f64,
+    },
+}
+
+/// A component of a wrench.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub enum Component {
+    /// Constant.
+    Constant(f64),
+    /// Name of an input.
+    Input(String),
+}
+
+impl Default for Component {
+    fn default() -> Self {
+        Self::Constant(0.0)
+    }
+}
+
+fn are_zero(components: &[Component; 3]) -> bool {
+    components.iter().all(|c| *c == Component::default())
+}
+
+impl Force {
+    /// Points of frames on which it acts.
+    pub fn points(&self) -> impl Iterator<Item = Point> {
+        let of = |frame: &str, at: [f64; 3]| Some(Point { frame: frame.to_owned(), at });
+        let points = match self {
+            Self::BodyWrench { frame, .. }
+            | Self::SpatialWrench { frame, .. }
+            | Self::HybridWrench { frame, .. } => [of(frame, [0.0; 3]), None],
+            Self::Thruster { frame, at, .. } | Self::Drag { frame, at, .. } => {
+                [of(frame, *at), None]
+            }
+            Self::TwoPointDamper { a, b, .. } => [Some(a.clone()), Some(b.clone())],
+            Self::CoordinateDrag { .. } | Self::Friction { .. } => [None, None],
+        };
+        points.into_iter().flatten()
+    }
+
+    /// Names of the inputs that it follows.
+    pub fn inputs(&self) -> impl Iterator<Item = &str> {
+        let (components, thrust) = match self {
+            Self::BodyWrench { force, torque, .. }
+            | Self::SpatialWrench { force, torque, .. }
+            | Self::HybridWrench { force, torque, .. } => (Some(force.iter().chain(torque)), None),
+            Self::Thruster { input, .. } => (None, Some(input.as_str())),
+            _ => (None, None),
+        };
+        let named = components.into_iter().flatten().filter_map(|component| match component {
+            Component::Input(name) => Some(name.as_str()),
+            Component::Constant(_) => None,
+        });
+        named.chain(thrust)
+    }
+}
