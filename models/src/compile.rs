@@ -368,17 +368,12 @@ impl Layout {
                     let points = places.between_in_world(self.attachment(a), self.attachment(b));
                     for &axis in axes {
                         let axis = axis as usize;
-                        let product = Product {
-                            points: points.clone(),
-                            u: Vector::Difference,
-                            w: Vector::World(Mat3::IDENTITY.0[axis]),
-                        };
-                        equations.push(format!("{name}.{}", AXES[axis]), product.into());
+                        let kind = ConstraintKind::Axis(points.clone(), axis);
+                        equations.push(format!("{name}.{}", AXES[axis]), kind);
                     }
                 }
                 scene::Constraint::PointOnPlane { plane, point, .. } => {
-                    let normal = Vec3(plane.normal);
-                    let normal = self.direction(&plane.frame, normal * (1.0 / normal.norm()));
+                    let normal = self.direction(&plane.frame, Vec3(plane.normal));
                     let a = self.fixed(&plane.frame, plane.at);
                     let product = Product {
                         points: places.between(a, self.attachment(point)),
@@ -511,7 +506,9 @@ struct Equations {
 impl Equations {
     fn push(&mut self, name: String, kind: ConstraintKind) {
         let all: Vec<usize> = match &kind {
-            ConstraintKind::Distance(points, _) => coordinates_of(points).collect(),
+            ConstraintKind::Distance(points, _) | ConstraintKind::Axis(points, _) => {
+                coordinates_of(points).collect()
+            }
             ConstraintKind::Product(product) => coordinates_of(&product.points).collect(),
             ConstraintKind::PathLength(segments, _) => {
                 segments.iter().flat_map(coordinates_of).collect()

@@ -205,8 +205,8 @@ pub(crate) struct PointPair {
     pub(crate) a: Attachment,
     pub(crate) b: Attachment,
     /// Joints on the path between the points, ancestors before descendants. Joints that carry both
-    /// points change neither their distance nor anything else that turns with both bodies, and drop
-    /// out; where a world axis is involved, those of them that turn come first.
+    /// points change neither their distance nor what else turns with both bodies, and drop out; but
+    /// where a world axis is involved, those of them that turn come first.
     pub(crate) path: Vec<PathJoint>,
 }
 
@@ -249,6 +249,8 @@ impl Constraint {
 pub(crate) enum ConstraintKind {
     /// `|d|² − length² = 0`.
     Distance(PointPair, Length),
+    /// `d · axis = 0`; the axis is a world axis.
+    Axis(PointPair, usize),
     /// `u · w = 0`.
     Product(Product),
     /// `Σ |d_s| − length = 0` over the segments of a path.
@@ -282,8 +284,6 @@ pub(crate) enum Vector {
     WithA(Vec3),
     /// Fixed in the frame of the joint that carries `b`.
     WithB(Vec3),
-    /// Fixed in the world.
-    World(Vec3),
 }
 
 /// `Σ_k c_k q^k`, powers from 1.
@@ -487,10 +487,11 @@ impl Model {
             self.constraints.iter().filter(|constraint| is(&constraint.kind)).count()
         };
         line(format!(
-            "constraints   {} equations over {} joints: {} distance, {} product, {} path, {} coupling{}",
+            "constraints   {} equations over {} joints: {} distance, {} axis, {} product, {} path, {} coupling{}",
             d.constraints,
             self.closure.joints.len(),
             equations(|kind| matches!(kind, ConstraintKind::Distance(..))),
+            equations(|kind| matches!(kind, ConstraintKind::Axis(..))),
             equations(|kind| matches!(kind, ConstraintKind::Product(_))),
             equations(|kind| matches!(kind, ConstraintKind::PathLength(..))),
             equations(|kind| matches!(kind, ConstraintKind::Coupling(..))),

@@ -423,7 +423,7 @@ pub struct Plane {
     /// A point of the plane in the frame, m.
     #[serde(default, skip_serializing_if = "is_zero3")]
     pub at: [f64; 3],
-    /// Normal in the frame; need not have unit length.
+    /// Normal in the frame. Its length scales `h` and, inversely, the multiplier.
     pub normal: [f64; 3],
 }
 

@@ -220,9 +220,7 @@ impl Workspace {
         blocks.q_start.copy_from_slice(&state.q);
         blocks.multipliers.copy_from_slice(&self.multipliers);
         place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
-        if model.forces.is_some() {
-            blocks.inputs.copy_from_slice(&self.inputs);
-        }
+        blocks.inputs.copy_from_slice(&self.inputs);
         blocks.evaluate(model, settings);
     }
 
@@ -230,9 +228,7 @@ impl Workspace {
     pub(crate) fn fill_turned_newton_matrix(&mut self, model: &Model, settings: &Settings) {
         let Some(blocks) = &mut self.turned else { return };
         place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
-        if model.forces.is_some() {
-            blocks.inputs.copy_from_slice(&self.inputs);
-        }
+        blocks.inputs.copy_from_slice(&self.inputs);
         blocks.place_midpoint(model, settings.time_step_s);
         blocks.q_mid.copy_from_slice(&self.q_mid);
         blocks.evaluate_mid(model);

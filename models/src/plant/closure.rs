@@ -2,13 +2,14 @@
 //!
 //! ```text
 //! distance  h = |d|² − l²            h_i = 2 d·d_i          h_ij = 2 (d_i·d_j + d·d_ij)
+//! axis      h = d·e                  h_i = d_i·e            h_ij = d_ij·e
 //! product   h = u·w                  see [`ProductAt`]
 //! path      h = Σ |d_s| − l          see [`Distance`]
 //! coupling  h = Σ c_jk q_j^k + c     h_j = Σ k c_jk q_j^(k−1)
 //! ```
 //!
-//! with the vector `d` between two points and a length `l`, fixed or a prescribed coordinate. Point to
-//! point, point on plane and orientation are products of vectors between points and directions.
+//! with the vector `d` between two points, a world axis `e`, and a length `l`, fixed or a prescribed
+//! coordinate.
 
 use crate::model::{Alignment, Constraint, ConstraintKind, Length, Model, PointPair, Polynomial};
 use crate::plant::kinematics::Poses;
@@ -113,81 +114,55 @@ impl Constraint {
     /// Value, and the magnitude of what was added for it.
     #[inline]
     fn value<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S]) -> (S, f64) {
-        if let ConstraintKind::Distance(points, length) = &self.kind {
-            distance(points, tree, poses, length.at(q))
-        } else {
-            self.other_value(tree, poses, q)
-        }
-    }
-
-    #[inline(never)]
-    fn other_value<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S]) -> (S, f64) {
         match &self.kind {
             ConstraintKind::Distance(points, length) => distance(points, tree, poses, length.at(q)),
+            ConstraintKind::Axis(points, axis) => {
+                let at = points.separation(tree, poses);
+                (at.difference[*axis], at.magnitude)
+            }
             ConstraintKind::Product(product) => {
                 let at = ProductAt::new(product, tree, poses);
                 (at.value(), at.magnitude())
             }
             ConstraintKind::PathLength(segments, length) => {
-                let length = length.at(q);
-                let (mut value, mut magnitude) = (-length, length.value());
-                for segment in segments {
-                    let segment = Distance::new(segment, tree, poses);
-                    value += segment.length;
-                    magnitude += segment.magnitude();
-                }
-                (value, magnitude)
+                path_length(segments, tree, poses, length.at(q))
             }
-            ConstraintKind::Coupling(terms, constant) => {
-                let (mut value, mut magnitude) = (S::constant(*constant), constant.abs());
-                for term in terms {
-                    let term = term.value(q);
-                    value += term;
-                    magnitude += term.value().abs();
-                }
-                (value, magnitude)
-            }
+            ConstraintKind::Coupling(terms, constant) => coupling(terms, *constant, q),
         }
     }
 
     /// Writes the derivatives into a row of the Jacobian, whose other entries are zero.
     #[inline]
     fn differentiate<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S], row: &mut [S]) {
-        if let ConstraintKind::Distance(points, length) = &self.kind {
-            if let Length::Driven(length) = *length {
-                row[length] = q[length] * -2.0;
-            }
-            let at = points.separation(tree, poses);
-            let weight = at.difference.scaled(2.0);
-            for joint in &points.path {
-                row[joint.coordinate] += weight.dot(joint.gradient(tree, poses, &at));
-            }
-        } else {
-            self.differentiate_other(tree, poses, q, row);
-        }
-    }
-
-    #[inline(never)]
-    fn differentiate_other<S: Scalar>(
-        &self,
-        tree: &Tree,
-        poses: &Poses<S>,
-        q: &[S],
-        row: &mut [S],
-    ) {
         match &self.kind {
-            ConstraintKind::Distance(..) => {}
+            ConstraintKind::Distance(points, length) => {
+                if let Length::Driven(length) = *length {
+                    row[length] = q[length] * -2.0;
+                }
+                let at = points.separation(tree, poses);
+                let weight = at.difference.scaled(2.0);
+                for joint in &points.path {
+                    row[joint.coordinate] += weight.dot(joint.gradient(tree, poses, &at));
+                }
+            }
+            ConstraintKind::Axis(points, axis) => {
+                let at = points.separation(tree, poses);
+                for joint in &points.path {
+                    let gradient = joint.gradient_in_world(tree, poses, &at);
+                    row[joint.coordinate] += gradient[*axis];
+                }
+            }
             ConstraintKind::Product(product) => {
-                ProductAt::new(product, tree, poses)
-                    .for_each_derivative(|i, slope| row[i] += slope);
+                let at = ProductAt::new(product, tree, poses);
+                at.for_each_derivative(|i, slope| row[i] += slope);
             }
             ConstraintKind::PathLength(segments, length) => {
                 if let Length::Driven(length) = *length {
                     row[length] = -S::ONE;
                 }
                 for segment in segments {
-                    Distance::new(segment, tree, poses)
-                        .for_each_derivative(|i, slope| row[i] += slope);
+                    let segment = Distance::new(segment, tree, poses);
+                    segment.for_each_derivative(|i, slope| row[i] += slope);
                 }
             }
             ConstraintKind::Coupling(terms, _) => {
@@ -221,6 +196,18 @@ impl Constraint {
                 }
                 if let Length::Driven(length) = *length {
                     entry(length, length, S::constant(-2.0));
+                }
+            }
+            ConstraintKind::Axis(points, axis) => {
+                let at = points.separation(tree, poses);
+                for row in &points.path {
+                    let row_gradient = row.gradient_in_world(tree, poses, &at);
+                    for column in &points.path {
+                        let gradient = column.gradient_in_world(tree, poses, &at);
+                        let column_at = (column, gradient);
+                        let second = row.second_in_world(row_gradient, tree, poses, column_at);
+                        entry(row.coordinate, column.coordinate, second[*axis]);
+                    }
                 }
             }
             ConstraintKind::Product(product) => {
@@ -266,6 +253,35 @@ fn distance<S: Scalar>(points: &PointPair, tree: &Tree, poses: &Poses<S>, length
     (square - squared_length, round_off)
 }
 
+/// `Σ |d_s| − l`, and its magnitude.
+#[inline(never)]
+fn path_length<S: Scalar>(
+    segments: &[PointPair],
+    tree: &Tree,
+    poses: &Poses<S>,
+    length: S,
+) -> (S, f64) {
+    let (mut value, mut magnitude) = (-length, length.value());
+    for segment in segments {
+        let segment = Distance::new(segment, tree, poses);
+        value += segment.length;
+        magnitude += segment.magnitude();
+    }
+    (value, magnitude)
+}
+
+/// `Σ c_jk q_j^k + c`, and its magnitude.
+#[inline(never)]
+fn coupling<S: Scalar>(terms: &[Polynomial], constant: f64, q: &[S]) -> (S, f64) {
+    let (mut value, mut magnitude) = (S::constant(constant), constant.abs());
+    for term in terms {
+        let term = term.value(q);
+        value += term;
+        magnitude += term.value().abs();
+    }
+    (value, magnitude)
+}
+
 impl Length {
     #[inline(always)]
     fn at<S: Scalar>(self, q: &[S]) -> S {
@@ -303,19 +319,19 @@ pub(crate) fn larger(a: f64, b: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plant::samples;
+    use crate::plant::samples::{self, Configuration};
     use crate::scalar::Dual;
 
-    fn closure<S: Scalar>(model: &Model, q: &[S]) -> Closure<S> {
+    fn closure<S: Scalar>(model: &Model, at: &Configuration<S>) -> Closure<S> {
         let mut closure = Closure::new(model);
-        closure.evaluate(model, q, &[]);
-        closure.differentiate(model, q);
+        closure.evaluate(model, &at.q, &at.orientations);
+        closure.differentiate(model, &at.q);
         closure
     }
 
-    fn hessian<S: Scalar>(model: &Model, q: &[S], multipliers: &[S]) -> Vec<S> {
-        let mut out = vec![S::ZERO; q.len() * q.len()];
-        closure(model, q).hessian(model, q, multipliers, &mut out);
+    fn hessian<S: Scalar>(model: &Model, at: &Configuration<S>, multipliers: &[S]) -> Vec<S> {
+        let mut out = vec![S::ZERO; at.q.len() * at.q.len()];
+        closure(model, at).hessian(model, &at.q, multipliers, &mut out);
         out
     }
 
@@ -331,10 +347,10 @@ mod tests {
                 let (at, curvature) = (closure(model, &q), hessian(model, &q, &multipliers));
                 for j in 0..n {
                     let unit = samples::unit(n, j);
-                    let found = samples::slope(&q, &unit, |q| closure(model, q).value);
+                    let found = samples::slope(model, &q, &unit, |q| closure(model, q).value);
                     let column: Vec<f64> = at.jacobian.iter().skip(j).step_by(n).copied().collect();
                     samples::assert_close(&format!("{name} h_{j}"), &column, &found);
-                    let found = samples::slope(&q, &unit, |q| {
+                    let found = samples::slope(model, &q, &unit, |q| {
                         let jacobian = closure(model, q).jacobian;
                         let pull = |i| {
                             let rows = jacobian.iter().skip(i).step_by(n);
@@ -345,12 +361,13 @@ mod tests {
                     let column: Vec<f64> = curvature.iter().skip(j).step_by(n).copied().collect();
                     samples::assert_close(&format!("{name} h_i{j}"), &column, &found);
                 }
-                let dual = samples::along(&q, &direction);
+                let dual = samples::along(model, &q, &direction);
                 let lifted: Vec<Dual> = multipliers.iter().map(|x| Dual::constant(*x)).collect();
                 let along = |values: Vec<Dual>| values.iter().map(|x| x.eps).collect::<Vec<_>>();
-                let found = samples::slope(&q, &direction, |q| hessian(model, q, &multipliers));
+                let found =
+                    samples::slope(model, &q, &direction, |q| hessian(model, q, &multipliers));
                 samples::assert_close(name, &along(hessian(model, &dual, &lifted)), &found);
-                let found = samples::slope(&q, &direction, |q| closure(model, q).jacobian);
+                let found = samples::slope(model, &q, &direction, |q| closure(model, q).jacobian);
                 samples::assert_close(name, &along(closure(model, &dual).jacobian), &found);
             }
         }

@@ -58,7 +58,7 @@ pub(crate) struct Workspace {
     pub(crate) l_v: Vec<f64>,
     /// The input with the signals; empty without signals.
     pub(crate) effective_input: Vec<f64>,
-    /// What forces depend on; empty without forces.
+    /// The inputs, where forces or ball joints need them; else empty.
     pub(crate) inputs: Vec<f64>,
     pub(crate) input_force: Vec<f64>,
     /// Inputs, damping and forces at the midpoint.
@@ -129,7 +129,7 @@ impl Workspace {
             l_q: zeros(nd),
             l_v: zeros(nd),
             effective_input: zeros(if model.signals.is_empty() { 0 } else { d.input() }),
-            inputs: zeros(if model.forces.is_some() { d.inputs } else { 0 }),
+            inputs: zeros(if model.forces.is_some() || no > 0 { d.inputs } else { 0 }),
             input_force: zeros(nd),
             force: zeros(nd),
             residual: zeros(nd),
@@ -200,7 +200,7 @@ impl Workspace {
     pub(crate) fn set_inputs(&mut self, model: &Model, inputs: &[f64]) {
         forces::input_forces(&model.coordinate_inputs, inputs, &mut self.input_force);
         self.force.copy_from_slice(&self.input_force);
-        if model.forces.is_some() {
+        if !self.inputs.is_empty() {
             self.inputs.copy_from_slice(inputs);
         }
     }

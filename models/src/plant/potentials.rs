@@ -224,28 +224,34 @@ pub(crate) fn add_to_newton_matrix(
 mod tests {
     use super::*;
     use crate::Model;
-    use crate::plant::samples;
+    use crate::plant::samples::{self, Configuration};
     use crate::scalar::Dual;
 
-    fn energy<S: Scalar>(model: &Model, q: &[S]) -> S {
-        potential(&model.potentials, &model.dynamics, &samples::poses(&model.dynamics, q), q)
+    fn energy<S: Scalar>(model: &Model, at: &Configuration<S>) -> S {
+        potential(&model.potentials, &model.dynamics, &at.poses(&model.dynamics), &at.q)
     }
 
     /// `V_q` of the dynamic coordinates.
-    fn gradient<S: Scalar>(model: &Model, q: &[S]) -> Vec<S> {
+    fn gradient<S: Scalar>(model: &Model, at: &Configuration<S>) -> Vec<S> {
         let mut l_q = vec![S::ZERO; model.dimensions.dynamic];
-        let poses = samples::poses(&model.dynamics, q);
-        add_gradient(&model.potentials, &model.dynamics, &poses, q, &mut l_q);
+        let poses = at.poses(&model.dynamics);
+        add_gradient(&model.potentials, &model.dynamics, &poses, &at.q, &mut l_q);
         l_q.into_iter().map(|x| -x).collect()
     }
 
     /// `V_qq`, row-major over all coordinates.
-    fn hessian<S: Scalar>(model: &Model, q: &[S]) -> Vec<S> {
-        let mut out = vec![S::ZERO; q.len() * q.len()];
-        let poses = samples::poses(&model.dynamics, q);
-        for_each_second_derivative(&model.potentials, &model.dynamics, &poses, q, |i, j, value| {
-            out[i * q.len() + j] += value;
-        });
+    fn hessian<S: Scalar>(model: &Model, at: &Configuration<S>) -> Vec<S> {
+        let mut out = vec![S::ZERO; at.q.len() * at.q.len()];
+        let poses = at.poses(&model.dynamics);
+        for_each_second_derivative(
+            &model.potentials,
+            &model.dynamics,
+            &poses,
+            &at.q,
+            |i, j, value| {
+                out[i * at.q.len() + j] += value;
+            },
+        );
         out
     }
 
@@ -258,21 +264,22 @@ mod tests {
                 let (slopes, curvature) = (gradient(model, &q), hessian(model, &q));
                 for i in 0..model.dimensions.dynamic {
                     let unit = samples::unit(n, i);
-                    let found = samples::slope(&q, &unit, |q| vec![energy(model, q)]);
+                    let found = samples::slope(model, &q, &unit, |q| vec![energy(model, q)]);
                     samples::assert_close(&format!("{name} V_{i}"), &slopes[i..=i], &found);
                 }
                 for j in 0..n {
-                    let found = samples::slope(&q, &samples::unit(n, j), |q| gradient(model, q));
+                    let found =
+                        samples::slope(model, &q, &samples::unit(n, j), |q| gradient(model, q));
                     let column: Vec<f64> = (0..found.len()).map(|i| curvature[i * n + j]).collect();
                     samples::assert_close(&format!("{name} V_i{j}"), &column, &found);
                 }
-                let dual = samples::along(&q, &direction);
+                let dual = samples::along(model, &q, &direction);
                 let along = |values: Vec<Dual>| values.iter().map(|x| x.eps).collect::<Vec<_>>();
-                let found = samples::slope(&q, &direction, |q| hessian(model, q));
+                let found = samples::slope(model, &q, &direction, |q| hessian(model, q));
                 samples::assert_close(name, &along(hessian(model, &dual)), &found);
-                let found = samples::slope(&q, &direction, |q| gradient(model, q));
+                let found = samples::slope(model, &q, &direction, |q| gradient(model, q));
                 samples::assert_close(name, &along(gradient(model, &dual)), &found);
-                let found = samples::slope(&q, &direction, |q| vec![energy(model, q)]);
+                let found = samples::slope(model, &q, &direction, |q| vec![energy(model, q)]);
                 samples::assert_close(name, &[energy(model, &dual).eps], &found);
             }
         }
@@ -292,7 +299,8 @@ mod tests {
         let ends = [two_point, &format!("{two_point}rest_length = 0.5"), path];
         for (case, spring) in ends.iter().enumerate() {
             let model = Model::compile(&crate::Scene::from_toml(&text(spring)).unwrap()).unwrap();
-            let q = [Dual::new(0.0, 1.0), Dual::new(0.0, -2.0)];
+            let q = vec![Dual::new(0.0, 1.0), Dual::new(0.0, -2.0)];
+            let q = Configuration { q, orientations: Vec::new() };
             let all =
                 [vec![energy(&model, &q)], gradient(&model, &q), hessian(&model, &q)].concat();
             assert!(all.iter().all(|x| x.re.is_finite() && x.eps.is_finite()), "{spring}: {all:?}");

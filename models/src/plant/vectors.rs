@@ -72,6 +72,38 @@ impl PathJoint {
             Vec3::ZERO
         }
     }
+
+    /// [`Self::gradient`] where joints that carry both points are on the path, too.
+    #[inline]
+    pub(crate) fn gradient_in_world<S: Scalar>(
+        &self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        at: &Separation<S>,
+    ) -> Vec3<S> {
+        if self.carries == Carries::Both {
+            poses.turned(tree, self.joint, at.difference)
+        } else {
+            self.gradient(tree, poses, at)
+        }
+    }
+
+    /// [`Self::second`] where joints that carry both points are on the path, too: they are above all
+    /// others.
+    pub(crate) fn second_in_world<S: Scalar>(
+        &self,
+        gradient: Vec3<S>,
+        tree: &Tree,
+        poses: &Poses<S>,
+        (column, column_gradient): (&PathJoint, Vec3<S>),
+    ) -> Vec3<S> {
+        let above = |joint: &PathJoint| joint.carries == Carries::Both;
+        if above(self) || above(column) || self.carries == column.carries {
+            poses.turned_gradient(tree, (self.joint, gradient), (column.joint, column_gradient))
+        } else {
+            Vec3::ZERO
+        }
+    }
 }
 
 /// The distance of two points at one configuration.
@@ -140,6 +172,8 @@ impl<'a, S: Scalar> Distance<'a, S> {
 /// ```text
 /// h = u·w,  h_i = u_i·w + u·w_i,  h_ij = u_ij·w + u_i·w_j + u_j·w_i + u·w_ij
 /// ```
+///
+/// Joints that carry both bodies turn both vectors alike, and change nothing.
 pub(crate) struct ProductAt<'a, S> {
     product: &'a Product,
     tree: &'a Tree,
@@ -161,7 +195,6 @@ impl<'a, S: Scalar> ProductAt<'a, S> {
             Vector::Difference => at.difference,
             Vector::WithA(direction) => turned(points.a.joint, direction),
             Vector::WithB(direction) => turned(points.b.joint, direction),
-            Vector::World(direction) => Vec3::lift(direction),
         };
         let (u, w) = (in_world(product.u), in_world(product.w));
         Self { product, tree, poses, at, u, w }
@@ -171,33 +204,26 @@ impl<'a, S: Scalar> ProductAt<'a, S> {
         self.u.dot(self.w)
     }
 
-    /// Magnitude of what was subtracted, for round-off estimates; directions have unit length.
+    /// Magnitude of what was subtracted, for round-off estimates.
     pub(crate) fn magnitude(&self) -> f64 {
-        let difference = |vector| matches!(vector, Vector::Difference);
-        if difference(self.product.u) || difference(self.product.w) {
-            self.at.magnitude
-        } else {
-            1.0
-        }
-    }
-
-    /// `∂u/∂q` for the coordinate of a joint on the path, for one of the two vectors.
-    fn gradient(&self, vector: Vector, value: Vec3<S>, joint: &PathJoint) -> Vec3<S> {
-        let carried = match (vector, joint.carries) {
-            (Vector::Difference, Carries::A | Carries::B) => {
-                return joint.gradient(self.tree, self.poses, &self.at);
-            }
-            (Vector::Difference, Carries::Both) => true,
-            (Vector::WithA(_), carries) => carries != Carries::B,
-            (Vector::WithB(_), carries) => carries != Carries::A,
-            (Vector::World(_), _) => false,
+        let magnitude = |vector, value: Vec3<S>| match vector {
+            Vector::Difference => self.at.magnitude,
+            _ => size(value),
         };
-        if carried { self.poses.turned(self.tree, joint.joint, value) } else { Vec3::ZERO }
+        magnitude(self.product.u, self.u) * magnitude(self.product.w, self.w)
     }
 
+    /// Derivatives of `u` and `w` by the coordinate of a joint on the path.
     fn gradients(&self, joint: &PathJoint) -> [Vec3<S>; 2] {
-        [(self.product.u, self.u), (self.product.w, self.w)]
-            .map(|(vector, value)| self.gradient(vector, value, joint))
+        [(self.product.u, self.u), (self.product.w, self.w)].map(|(vector, value)| {
+            match (vector, joint.carries) {
+                (Vector::Difference, _) => joint.gradient(self.tree, self.poses, &self.at),
+                (Vector::WithA(_), Carries::A) | (Vector::WithB(_), Carries::B) => {
+                    self.poses.turned(self.tree, joint.joint, value)
+                }
+                _ => Vec3::ZERO,
+            }
+        })
     }
 
     /// Calls `entry(i, h_i)` for each joint on the path.
@@ -210,19 +236,15 @@ impl<'a, S: Scalar> ProductAt<'a, S> {
 
     /// Calls `entry(i, j, h_ij)` for each ordered pair of joints on the path.
     pub(crate) fn for_each_second_derivative(&self, mut entry: impl FnMut(usize, usize, S)) {
+        let (tree, poses) = (self.tree, self.poses);
         for row in &self.product.points.path {
             let [row_u, row_w] = self.gradients(row);
             for column in &self.product.points.path {
                 let [u, w] = self.gradients(column);
-                let mut value = row_u.dot(w) + u.dot(row_w);
-                let both = row.carries == Carries::Both || column.carries == Carries::Both;
-                if both || row.carries == column.carries {
-                    let turned = |row_gradient, gradient| {
-                        let (row, column) = ((row.joint, row_gradient), (column.joint, gradient));
-                        self.poses.turned_gradient(self.tree, row, column)
-                    };
-                    value += turned(row_u, u).dot(self.w) + self.u.dot(turned(row_w, w));
-                }
+                let u_second = row.second(row_u, tree, poses, (column, u));
+                let w_second = row.second(row_w, tree, poses, (column, w));
+                let mixed = row_u.dot(w) + u.dot(row_w);
+                let value = mixed + u_second.dot(self.w) + self.u.dot(w_second);
                 entry(row.coordinate, column.coordinate, value);
             }
         }

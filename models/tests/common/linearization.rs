@@ -7,12 +7,13 @@ use super::{SPLITS, STENCIL, plant, wave, waving_input};
 /// Of the differences, relative to the largest entry of a block: what their own round-off leaves.
 const TOLERANCE: f64 = 1e-8;
 
-/// A step's result: `q`, `p`, and multipliers.
-fn step(plant: &mut Plant, x: &State, u: &[f64]) -> [Vec<f64>; 3] {
+/// Where a step ends, beyond `from`, with its momentum and multipliers.
+fn step(plant: &mut Plant, x: &State, u: &[f64], from: &[f64]) -> [Vec<f64>; 3] {
     let initial = Initial::Momentum { q: x.q.clone(), p: x.p.clone(), v: x.v.clone() };
     plant.initialize(&initial).unwrap();
     plant.step(u).unwrap();
-    [plant.q().to_vec(), plant.p().to_vec(), plant.multipliers().to_vec()]
+    let beyond = plant.model().difference(from, plant.q());
+    [beyond, plant.p().to_vec(), plant.multipliers().to_vec()]
 }
 
 /// Derivative at 0 of what `along` makes of a displacement.
@@ -32,6 +33,8 @@ struct Check {
     plant: Plant,
     x: State,
     u: Vec<f64>,
+    /// Configuration at the end of the step.
+    end: Vec<f64>,
     out: Linearization,
     name: String,
     /// Of displacements, relative to the usual ones.
@@ -51,7 +54,31 @@ impl Check {
         let mut out = Linearization::new(&plant.model().clone());
         plant.linearize(&u, &mut out).unwrap();
         assert_eq!(plant.state(), x, "linearize must stay");
-        Self { plant, x, u, out, name: format!("{}, {split:?}", scene.name), reach }
+        plant.step(&u).unwrap();
+        let end = plant.q().to_vec();
+        Self { plant, x, u, end, out, name: format!("{}, {split:?}", scene.name), reach }
+    }
+
+    /// The step with a change of the state, and of the input.
+    fn changed(&mut self, column: usize, s: f64) -> [Vec<f64>; 3] {
+        let model = self.plant.model().clone();
+        let (d, n) = (model.dimensions(), model.dimensions().coordinates());
+        let (mut x, mut u) = (self.x.clone(), self.u.clone());
+        let mut change = vec![0.0; n];
+        match column {
+            c if c < n => {
+                change[c] = s;
+                x.q = model.retract(&x.q, &change);
+            }
+            c if c < d.state() => *x.p.iter_mut().chain(&mut x.v).nth(c - n).unwrap() += s,
+            c if c < d.state() + d.inputs => u[c - d.state()] += s,
+            c => {
+                change[d.dynamic + c - d.state() - d.inputs] = s;
+                let end = model.retract(&self.end, &change);
+                u[d.inputs..].copy_from_slice(&end[d.dynamic..]);
+            }
+        }
+        step(&mut self.plant, &x, &u, &self.end)
     }
 
     /// What the linearization says: the same three vectors for a displacement of `x` and `u`.
@@ -100,12 +127,7 @@ impl Check {
             // A momentum is changed by what moves coordinates by two thousandths, whatever the masses.
             let mobility = self.out.a().view((0, column), (n, 1)).amax();
             let delta = self.reach * if column < n { 1e-3 } else { (2e-3 / mobility).min(0.1) };
-            let found = slope(delta, |s| {
-                let mut x = self.x.clone();
-                let parts = [&mut x.q[..], &mut x.p, &mut x.v];
-                *parts.into_iter().flatten().nth(column).unwrap() += s;
-                step(&mut self.plant, &x, &self.u)
-            });
+            let found = slope(delta, |s| self.changed(column, s));
             let mut dx = vec![0.0; d.state()];
             dx[column] = 1.0;
             let predicted = self.predicted(&dx, &vec![0.0; d.input()]);
@@ -113,11 +135,7 @@ impl Check {
         }
         for column in 0..d.input() {
             let delta = if column < d.inputs { 1e-1 } else { self.reach * 1e-3 };
-            let found = slope(delta, |s| {
-                let mut u = self.u.clone();
-                u[column] += s;
-                step(&mut self.plant, &self.x, &u)
-            });
+            let found = slope(delta, |s| self.changed(d.state() + column, s));
             let mut du = vec![0.0; d.input()];
             du[column] = 1.0;
             let predicted = self.predicted(&vec![0.0; d.state()], &du);
@@ -130,15 +148,20 @@ impl Check {
         let d = self.plant.model().dimensions();
         for direction in 0..d.coordinates() {
             let on_manifold = |check: &mut Self, s: f64| {
-                let mut q = check.x.q.clone();
-                q[direction] += s;
+                let model = check.plant.model().clone();
+                let mut change = vec![0.0; d.coordinates()];
+                change[direction] = s;
+                let q = model.retract(&check.x.q, &change);
                 check.plant.initialize(&Initial::Projection { q, hold: Vec::new() }).unwrap();
                 State { q: check.plant.q().to_vec(), ..check.x.clone() }
             };
-            let [dq, ..] = slope(1e-3, |s| [on_manifold(self, s).q, Vec::new(), Vec::new()]);
+            let [dq, ..] = slope(1e-3, |s| {
+                let moved = on_manifold(self, s).q;
+                [self.plant.model().difference(&self.x.q, &moved), Vec::new(), Vec::new()]
+            });
             let found = slope(1e-3, |s| {
                 let x = on_manifold(self, s);
-                step(&mut self.plant, &x, &self.u.clone())
+                step(&mut self.plant, &x, &self.u, &self.end)
             });
             let mut dx = dq;
             dx.resize(d.state(), 0.0);

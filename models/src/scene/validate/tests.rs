@@ -357,9 +357,9 @@ fn faults_of_elements_are_found_where_they_are() {
         ("orientation", "b = \"wheel\"", "b = \"well\"", &["constraints[0].b"]),
         ("weld", "a = \"tip\"", "a = \"top\"", &["constraints[0].a"]),
         (
-            "weld",
-            "type = \"weld\"\nname = \"seam\"\na = \"tip\"\nb = \"bob\"",
-            "type = \"orientation\"\nname = \"seam\"\na = \"world\"\nb = \"z\"",
+            "path-length",
+            "type = \"path_length\"\nname = \"rope\"\npoints = [\n    { frame = \"weight\" },\n    { frame = \"world\" },\n    { frame = \"world\", at = [1.0, 0.0, 0.0] },\n    { frame = \"bob\" },\n]\nlength = 3.0\n",
+            "type = \"orientation\"\nname = \"level\"\na = \"world\"\nb = \"bob\"\n",
             &["constraints[0]"],
         ),
         // Couplings.
