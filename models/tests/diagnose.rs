@@ -114,3 +114,35 @@ fn multipliers_are_forces() {
     let weight = 9.8 * found.mass_kg;
     assert!((lift / weight - 1.0).abs() < 1e-9, "{lift} N instead of {weight}");
 }
+
+/// A free body on a free joint: momentum of flight, and of spin to round-off.
+#[test]
+fn momenta_of_a_free_joint() {
+    let text = r#"
+format = 1
+name = "box"
+[[frames]]
+name = "box"
+joint = { type = "free" }
+body = { mass = 2.0, center_of_mass = [0.02, -0.01, 0.03], inertia = [0.02, 0.03, 0.045, 1e-3, 2e-3, -1e-3] }
+"#;
+    let mut plant = plant(&plantd_models::Scene::from_toml(text).unwrap(), |_| ());
+    let q = vec![1.0, 2.0, 3.0, 0.4, -0.7, 1.1];
+    let v = vec![0.5, -0.3, 0.2, 1.0, 4.0, -2.0];
+    plant.initialize(&Initial::Velocity { q, v }).unwrap();
+    let start = plant.diagnose();
+    for _ in 0..1000 {
+        plant.step(&[]).unwrap();
+    }
+    let end = plant.diagnose();
+    assert!(start.angular_momentum.iter().all(|l| l.abs() > 1e-2), "{start:?}");
+    assert!(close(start.linear_momentum, end.linear_momentum, 1e-12), "{start:?} {end:?}");
+    assert!(close(start.angular_momentum, end.angular_momentum, 1e-11), "{start:?} {end:?}");
+    // The centre of mass has gone straight on.
+    let time_s = plant.time_s();
+    for i in 0..3 {
+        let travelled = end.center_of_mass[i] - start.center_of_mass[i];
+        assert!((travelled - start.linear_momentum[i] / 2.0 * time_s).abs() < 1e-3, "{end:?}");
+    }
+    assert_eq!(end.degrees_of_freedom, 6);
+}

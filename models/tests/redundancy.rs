@@ -5,7 +5,9 @@ mod common;
 use common::{SPLITS, builtin, model, plant, wave, waving_input};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::scene::{Axis, Constraint};
-use plantd_models::{Initial, Linearization, Plant, Scene, StepError};
+use plantd_models::{
+    Continuous, ContinuousPoint, Contraction, Initial, Linearization, Plant, Scene, StepError,
+};
 
 /// The four-bar with its pin stated twice.
 fn doubled() -> Scene {
@@ -334,5 +336,144 @@ fn regular_scenes_have_no_redundant_equations() {
         }
         let dh: DMatrix<f64> = plant.constraint_jacobian().columns(0, d.dynamic).into_owned();
         assert_eq!(dh.rank(1e-9), d.constraints, "{name}");
+    }
+}
+
+/// A beam on three equal cranks. The third pin fixes nothing that the others do not, but only where
+/// they hold: elsewhere its equations are independent.
+fn beam(third: &str) -> Scene {
+    let crank = |name: &str, x: f64| {
+        format!(
+            r#"
+[[frames]]
+name = "{name}"
+translation = [{x:?}, 0.0, 0.0]
+joint = {{ type = "revolute", axis = [0.0, 1.0, 0.0] }}
+body = {{ mass = 0.5, center_of_mass = [0.0, 0.0, -0.2], inertia = [0.01, 0.01, 0.0] }}
+[[coordinates]]
+name = "{name}"
+initial = 0.5
+"#
+        )
+    };
+    let pin = |name: &str, x: f64, axes: &str| {
+        format!(
+            r#"
+[[constraints]]
+type = "point_to_point"
+name = "{name}_pin"
+a = {{ frame = "beam", at = [{x:?}, 0.0, 0.0] }}
+b = {{ frame = "{name}", at = [0.0, 0.0, -0.4] }}
+axes = [{axes}]
+"#
+        )
+    };
+    let text = [
+        "format = 1\nname = \"beam\"\ngravity = [0.0, 0.0, -9.8]\n".to_owned(),
+        crank("first", 0.0),
+        crank("second", 1.0),
+        crank("third", 2.0),
+        r#"
+[[frames]]
+name = "beam"
+parent = "first"
+translation = [0.0, 0.0, -0.4]
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+body = { mass = 2.0, center_of_mass = [0.8, 0.0, 0.1], inertia = [0.01, 0.7, 0.7] }
+[[coordinates]]
+name = "beam"
+initial = -0.5
+[[inputs]]
+name = "torque"
+coordinate = "first"
+"#
+        .to_owned(),
+        pin("second", 1.0, r#""x", "z""#),
+        pin("third", 2.0, third),
+    ];
+    Scene::from_toml(&text.concat()).unwrap()
+}
+
+#[test]
+fn equations_that_are_redundant_on_the_manifold_only() {
+    let mut one = plant(&beam(r#""x""#), |_| ());
+    let mut two = plant(&beam(r#""x", "z""#), |_| ());
+    assert_eq!(two.diagnose().redundant_constraints, ["third_pin.z"]);
+    assert_eq!(two.diagnose().degrees_of_freedom, 1);
+    for k in 0..300 {
+        let u = [0.5 * (0.05 * f64::from(k)).sin()];
+        let dh = [one.constraint_jacobian(), two.constraint_jacobian()];
+        one.step(&u).unwrap();
+        let report = two.step(&u).unwrap();
+        assert_eq!(report.redundant_constraints, 1, "step {k}: {report:?}");
+        let impulse = dh[0].transpose() * DVector::from_column_slice(one.multipliers());
+        let least = dh[1].transpose().svd(true, true).solve(&impulse, 1e-9).unwrap();
+        for (lambda, least) in two.multipliers().iter().zip(least.iter()) {
+            assert!((lambda - least).abs() < 1e-10, "{lambda} instead of {least}");
+        }
+    }
+    for (x, y) in one.q().iter().zip(two.q()) {
+        assert!((x - y).abs() < 1e-10, "{x} instead of {y}");
+    }
+    let (v, w) = (one.velocity(), two.velocity());
+    for (x, y) in v.iter().zip(&w) {
+        assert!((x - y).abs() < 1e-10, "{x} instead of {y}");
+    }
+    // On the manifold the maps have one derivative: along tangents, and by momenta modulo gauge.
+    let u = [0.2];
+    let (first, second) = (linearization(&mut one, &u), linearization(&mut two, &u));
+    let dh = two.constraint_jacobian();
+    let tangent = plantd_models::control::tangent_basis(&dh);
+    let mut directions = DMatrix::zeros(8, tangent.ncols() + 4);
+    directions.view_mut((0, 0), (4, tangent.ncols())).copy_from(&tangent);
+    directions.view_mut((4, tangent.ncols()), (4, 4)).fill_with_identity();
+    // Momenta agree up to what the constraints of the next state absorb.
+    one.step(&u).unwrap();
+    let free = plantd_models::control::tangent_basis(&one.constraint_jacobian()).transpose();
+    for (x, y) in [(first.a() * &directions, second.a() * &directions), (first.b(), second.b())] {
+        let scale = x.amax();
+        assert!((x.rows(0, 4) - y.rows(0, 4)).amax() < 1e-9 * scale, "q");
+        assert!((&free * (x.rows(4, 4) - y.rows(4, 4))).amax() < 1e-9 * scale, "p");
+    }
+}
+
+/// Second derivatives and continuous dynamics are those without redundant equations too.
+#[test]
+fn second_order_and_continuous_dynamics() {
+    for redundant in [doubled(), out_of_plane(false), out_of_plane(true)] {
+        let found = [plain(&redundant), redundant].map(|scene| {
+            let mut plant = plant(&scene, |_| ());
+            wave(&mut plant, 20);
+            let model = plant.model().clone();
+            let d = model.dimensions();
+            let u = waving_input(&plant, 21);
+            let weights: Vec<f64> = (0..d.state()).map(|i| (1.0 + i as f64).sin()).collect();
+            let mut first = Linearization::new(&model);
+            let mut out = Contraction::new(&model);
+            plant
+                .contract_second_order(
+                    &u,
+                    &weights,
+                    &vec![0.0; d.constraints],
+                    &mut first,
+                    &mut out,
+                )
+                .unwrap();
+            let point = ContinuousPoint {
+                q: plant.q().to_vec(),
+                v: plant.velocity(),
+                inputs: u,
+                prescribed_acceleration: vec![],
+            };
+            let continuous = Continuous::new(model).linearize(&point).unwrap();
+            let acceleration = DVector::from_vec(continuous.value.acceleration);
+            let jacobian = continuous.jacobian.rows(0, d.dynamic).into_owned();
+            (out, acceleration, jacobian)
+        });
+        let [(one, a, da), (two, b, db)] = &found;
+        for (x, y) in [(&one.xx, &two.xx), (&one.xu, &two.xu), (&one.uu, &two.uu), (da, db)] {
+            assert!((x - y).amax() < 1e-8 * x.amax().max(1e-3), "{x} instead of {y}");
+        }
+        assert!((a - b).amax() < 1e-10 * a.amax());
     }
 }

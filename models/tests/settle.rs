@@ -247,3 +247,59 @@ fn constraint_forces_balance() {
         assert!((forces[1][c] - forces[1][c + 2]).abs() < 1e-12);
     }
 }
+
+/// Orientations settle as rotations: a lantern on a ball joint hangs from any start, and may still
+/// turn about the vertical; a torsion spring would hold it.
+#[test]
+fn ball_joints_settle() {
+    let text = r#"
+format = 1
+name = "lantern"
+gravity = [0.0, 0.0, -9.8]
+[[frames]]
+name = "lantern"
+joint = { type = "ball" }
+body = { mass = 2.0, center_of_mass = [0.03, 0.0, -0.4], inertia = [0.02, 0.03, 0.01] }
+[[frames]]
+name = "bell"
+parent = "lantern"
+translation = [0.0, 0.1, -0.5]
+joint = { type = "revolute", axis = [1.0, 0.0, 0.0] }
+body = { mass = 0.3, center_of_mass = [0.0, 0.0, -0.1] }
+"#;
+    let scene = Scene::from_toml(text).unwrap();
+    let mut plant = plant(&scene, |_| ());
+    for guess in [[0.0, 0.0, 0.0, 0.3], [1.0, -1.5, 0.7, 2.0], [3.1, 0.0, 0.0, 0.0]] {
+        let rest = settle(&plant, &guess, &[]).unwrap();
+        assert!(rest.residual < 1e-12, "{rest:?}");
+        // Neutral about the vertical, stiff otherwise.
+        assert!(!rest.stable && rest.smallest_stiffness.abs() < 1e-9, "{rest:?}");
+        let q = rest.q.clone();
+        plant.initialize(&Initial::Equilibrium { q, hold: vec![], inputs: vec![] }).unwrap();
+        let found = plant.diagnose();
+        assert!(found.center_of_mass[0].abs() < 1e-12 && found.center_of_mass[1].abs() < 1e-12);
+        assert!(found.center_of_mass[2] < -0.3, "{found:?}");
+        let start = plant.q().to_vec();
+        for _ in 0..100 {
+            plant.step(&[]).unwrap();
+        }
+        for (x, y) in plant.q().iter().zip(&start) {
+            assert!((x - y).abs() < 1e-11, "{x} was {y}");
+        }
+    }
+}
+
+/// A four-bar under a constant torque, and one whose crank is held.
+#[test]
+fn loops_settle_under_inputs_and_with_held_coordinates() {
+    let scene = builtin("four-bar");
+    let plant = plant(&scene, |_| ());
+    let request = SettleRequest { q: plant.q().to_vec(), hold: vec![], inputs: vec![-2.0] };
+    let rest = plant.settle(&request).unwrap();
+    assert!(rest.residual < 1e-12 && rest.stable, "{rest:?}");
+    assert_minimum(&scene, &rest);
+    assert_rest(&scene, plant.q(), &[], &[-2.0]);
+    let rest = settle(&plant, plant.q(), &["crank"]).unwrap();
+    assert_eq!(rest.q[0], plant.q()[0]);
+    assert_eq!(rest.smallest_stiffness, f64::INFINITY);
+}

@@ -74,7 +74,8 @@ impl Plant {
     }
 
     /// The Newton matrix `M[k+1] = D2D1 Ld(q0, q1) + D2F⁻` of the dynamic coordinates for a step from
-    /// `q0` to `q1`, nd + nk each, without input forces (allocates).
+    /// `q0` to `q1`, nd + nk each, without input forces (allocates). For ball joints it is the one that
+    /// the solver uses, which leaves out terms of the order of their turn.
     ///
     /// # Panics
     ///
