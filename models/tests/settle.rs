@@ -209,6 +209,26 @@ fn random_trees_settle() {
     }
 }
 
+/// Guesses at the end of the range of numbers end in an error or an equilibrium, not in NaN.
+#[test]
+fn guesses_out_of_range() {
+    for name in ["four-bar", "marionette", "cart-pole", "double-pendulum"] {
+        let plant = plant(&builtin(name), |_| ());
+        for size in [1e10, 1e100, 1e300, -1e308] {
+            let mut q = plant.q().to_vec();
+            q.iter_mut().for_each(|q| *q = size);
+            if let Ok(rest) = settle(&plant, &q, &[]) {
+                assert!(rest.residual.is_finite() && rest.q.iter().all(|q| q.is_finite()));
+            }
+        }
+        let inputs = vec![1e300; plant.model().dimensions().inputs];
+        let request = SettleRequest { q: plant.q().to_vec(), hold: vec![], inputs };
+        if let Ok(rest) = plant.settle(&request) {
+            assert!(rest.residual.is_finite() && rest.q.iter().all(|q| q.is_finite()));
+        }
+    }
+}
+
 /// Held coordinates keep their value to the bit.
 #[test]
 fn held_coordinates_stay() {

@@ -283,6 +283,29 @@ fn a_scissor_that_settles_on_a_singular_point_names_its_constraints() {
     }
 }
 
+/// A scene that begins on a singular point does not take its missing equations for redundant ones.
+#[test]
+fn a_scene_that_begins_on_a_singular_point() {
+    let mut scene = builtin("scissor-2");
+    for coordinate in &mut scene.coordinates {
+        coordinate.initial = match coordinate.name.as_str() {
+            "slider" => 0.0,
+            "right0" | "left0" => FRAC_PI_2,
+            _ => 0.0,
+        };
+    }
+    let mut plant = plant(&scene, |_| ());
+    let found = plant.diagnose();
+    assert_eq!((found.constraint_rank, found.degrees_of_freedom), (2, 3));
+    assert!(found.constraint_reciprocal_condition < 1e-14, "{found:?}");
+    match plant.step(&[1.0]).unwrap_err() {
+        StepError::SingularConstraints { constraints, .. } => {
+            assert_eq!(constraints, ["pivot0.z", "pivot1.z"]);
+        }
+        error => panic!("{error}"),
+    }
+}
+
 /// The threshold decides what counts as singular.
 #[test]
 fn thresholds_turn_estimates_into_errors() {

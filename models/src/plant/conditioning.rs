@@ -9,10 +9,12 @@
 //! - a pivot of `S = Dh(q[k+1]) K⁻¹ Dh(q[k])ᵀ` with the steepest that its constraint gets over a
 //!   sample of configurations.
 //!
-//! **Redundant or singular?** Equations that depend on others at the scene's initial configuration
-//! are redundant: they get least-norm multipliers and are counted. Where fewer equations are
-//! independent than there, the configuration is singular. A step that cannot be solved there names
-//! the constraints that lost their independence.
+//! **Redundant or singular?** Equations that depend on others at the scene's initial configuration,
+//! and at configurations near it that satisfy the constraints, are redundant: they get least-norm
+//! multipliers and are counted. Where fewer equations are independent than there, the configuration
+//! is singular. A step names the constraints that lost their independence if its estimate falls below
+//! the threshold of the settings, or if it cannot be solved and the estimate is far below that of the
+//! initial configuration. Redundant equations that cannot be satisfied together are named as such.
 
 use std::f64::consts::TAU;
 
@@ -32,10 +34,19 @@ const FLAT: f64 = 1e-13;
 /// Square of the distance from the others, relative to a row of full steepness, below which a row
 /// depends on them.
 pub(crate) const DEPENDENT: f64 = 1e-11;
-/// A step that fails where the constraints' estimate is below this fails because of it.
+/// A step that fails where the constraints' estimate is below this fraction of that of the initial
+/// configuration fails because of it.
 const SUSPECT: f64 = 1e-4;
-/// Corrections before it is believed that constraints contradict each other.
-const RECONCILIATIONS: usize = 100;
+/// Displacements from the initial configuration that tell whether it is a singular one, m or rad.
+const DISPLACEMENTS: [f64; 3] = [0.02, -0.05, 0.11];
+/// Corrections towards the constraints.
+const CORRECTIONS: usize = 30;
+/// Most equations for which dense decompositions are worth their time.
+const MOST_EQUATIONS: usize = 128;
+/// A correction shorter than this leads nowhere, m or rad.
+const SHORT: f64 = 1e-9;
+/// A constraint violated by more than this, in units of round-off, is violated.
+const VIOLATED: f64 = 1e4;
 
 /// References for pivots, and the independent equations.
 #[derive(Clone, Debug, Default)]
@@ -45,8 +56,19 @@ pub(crate) struct Conditioning {
     /// One over the largest gradient of each equation in the metric of `inertia`; zero where no
     /// dynamic coordinate moves it.
     pub(crate) weight: Vec<f64>,
-    /// Equations that are independent at the scene's initial configuration, in their order.
+    /// Equations that are independent at the scene's initial configuration or near it, in their order.
     pub(crate) independent: Vec<usize>,
+    /// The configuration where they are.
+    regular: Vec<f64>,
+}
+
+/// Where corrections towards the constraints lead.
+enum Reached {
+    Satisfied,
+    /// To where no correction reduces the violation.
+    Violated,
+    /// Nowhere.
+    Lost,
 }
 
 impl Conditioning {
@@ -55,10 +77,67 @@ impl Conditioning {
         let mut found = Self { inertia, ..Self::default() };
         if model.dimensions.constraints > 0 {
             found.weight = found.weights(model);
-            let q: Vec<f64> = model.coordinates.iter().map(|c| c.initial).collect();
-            found.independent = independent(&found.rows(model, &mut Closure::new(model), &q));
+            found.find_independent(model);
         }
         found
+    }
+
+    /// Finds the independent equations at the initial configuration; where some depend on others, near
+    /// it too, lest it be a singular one.
+    fn find_independent(&mut self, model: &Model) {
+        let d = model.dimensions;
+        let mut closure = Closure::new(model);
+        let mut q = sample(model, 0, 0.0);
+        self.independent = independent(&self.rows(model, &mut closure, &q));
+        let deficient = self.independent.len() < d.constraints.min(d.dynamic);
+        if deficient && d.constraints <= MOST_EQUATIONS {
+            for size in DISPLACEMENTS {
+                let mut near = q.clone();
+                for (i, x) in near[..d.dynamic].iter_mut().enumerate() {
+                    *x += size * (1.0 + i as f64).sin();
+                }
+                if matches!(self.approach(model, &mut closure, &mut near), Reached::Satisfied) {
+                    let found = independent(&self.rows(model, &mut closure, &near));
+                    if found.len() > self.independent.len() {
+                        (self.independent, q) = (found, near);
+                    }
+                }
+            }
+        }
+        self.regular = q;
+    }
+
+    /// Newton's method with the shortest correction towards the constraints, from `q`.
+    fn approach(&self, model: &Model, closure: &mut Closure, q: &mut Vec<f64>) -> Reached {
+        let d = model.dimensions;
+        for _ in 0..CORRECTIONS {
+            let rows = self.rows(model, closure, q);
+            closure.evaluate(model, q, &orientations(model, q));
+            let value = DVector::from_fn(d.constraints, |c, _| {
+                // What nothing moves keeps its size.
+                let weight = self.weight[c];
+                -closure.value[c] * if weight > 0.0 { weight } else { 1.0 }
+            });
+            if closure.violation() <= VIOLATED {
+                return Reached::Satisfied;
+            }
+            let finite = rows.iter().chain(value.iter()).all(|x| x.is_finite());
+            if rows.is_empty() || !finite {
+                return Reached::Lost;
+            }
+            let Ok(step) = SVD::new(rows, true, true).solve(&value, DEPENDENT.sqrt()) else {
+                return Reached::Lost;
+            };
+            let mut change = vec![0.0; d.coordinates()];
+            for (j, x) in step.iter().enumerate() {
+                change[j] = x / self.inertia_of(j).sqrt();
+            }
+            if change.iter().all(|x| x.abs() < SHORT) {
+                return Reached::Violated;
+            }
+            *q = model.retract(q, &change);
+        }
+        Reached::Lost
     }
 
     /// Dynamic columns of `Dh(q)`, each row with its weight and each column by the root of its
@@ -148,6 +227,25 @@ fn inertia(model: &Model) -> Vec<f64> {
     inertia
 }
 
+/// Scalar products of the chosen rows.
+fn gram(rows: &DMatrix<f64>, chosen: &[usize]) -> DMatrix<f64> {
+    let rows = rows.select_rows(chosen);
+    &rows * rows.transpose()
+}
+
+/// Smallest singular value relative to the largest, or to one; one without any, zero for what is not
+/// finite.
+fn reciprocal_condition(matrix: &DMatrix<f64>) -> f64 {
+    if matrix.is_empty() {
+        return 1.0;
+    }
+    if !matrix.iter().all(|x| x.is_finite()) {
+        return 0.0;
+    }
+    let singular_values = matrix.singular_values();
+    singular_values.min() / singular_values.max().max(1.0)
+}
+
 /// Rows that do not depend on rows before them.
 fn independent(rows: &DMatrix<f64>) -> Vec<usize> {
     let mut basis: Vec<DVector<f64>> = Vec::new();
@@ -204,6 +302,9 @@ impl Model {
     /// Names of the equations that take part in the near-singularity of `matrix`, the rows and
     /// columns of which belong to the independent equations.
     fn names_of_singular(&self, matrix: DMatrix<f64>) -> Vec<String> {
+        if matrix.is_empty() || !matrix.iter().all(|x| x.is_finite()) {
+            return Vec::new();
+        }
         let svd = SVD::new(matrix, true, false);
         let (Some(u), Some(smallest)) =
             (svd.u, svd.singular_values.iter().copied().reduce(f64::min))
@@ -230,15 +331,17 @@ impl Model {
     ) -> StepError {
         let nc = self.dimensions.constraints;
         let (chosen, weight) = (&self.conditioning.independent, &self.conditioning.weight);
+        if chosen.len() > MOST_EQUATIONS {
+            return StepError::SingularConstraints {
+                constraints: Vec::new(),
+                reciprocal_condition,
+            };
+        }
         let matrix = DMatrix::from_fn(chosen.len(), chosen.len(), |i, j| {
             let (i, j) = (chosen[i], chosen[j]);
             weight[i] * schur[i * nc + j] * weight[j]
         });
-        let constraints = if matrix.iter().all(|x| x.is_finite()) {
-            self.names_of_singular(matrix)
-        } else {
-            Vec::new()
-        };
+        let constraints = self.names_of_singular(matrix);
         StepError::SingularConstraints { constraints, reciprocal_condition }
     }
 
@@ -252,65 +355,34 @@ impl Model {
     ) -> StepError {
         let unsolved =
             matches!(error, StepError::NotConverged { .. } | StepError::NotFinite { .. });
-        if !unsolved || self.dimensions.constraints == 0 {
+        if !unsolved || !(1..=MOST_EQUATIONS).contains(&self.dimensions.constraints) {
             return error;
         }
         let mut closure = Closure::new(self);
-        let rows = self.conditioning.rows(self, &mut closure, &state.q);
-        let rows = rows.select_rows(&self.conditioning.independent);
-        let gram = &rows * rows.transpose();
-        let singular_values = gram.clone().singular_values();
-        if !singular_values.is_empty() {
-            let reciprocal_condition = singular_values.min() / singular_values.max().max(1.0);
-            if reciprocal_condition < SUSPECT {
-                let constraints = self.names_of_singular(gram);
-                return StepError::SingularConstraints { constraints, reciprocal_condition };
-            }
+        let conditioning = &self.conditioning;
+        let [regular, gram] = [&conditioning.regular, &state.q]
+            .map(|q| gram(&conditioning.rows(self, &mut closure, q), &conditioning.independent));
+        let regular = reciprocal_condition(&regular);
+        let reciprocal_condition = reciprocal_condition(&gram);
+        if reciprocal_condition < SUSPECT * regular {
+            let constraints = self.names_of_singular(gram);
+            return StepError::SingularConstraints { constraints, reciprocal_condition };
         }
-        self.contradiction(&mut closure, state, q_end).unwrap_or(error)
-    }
-
-    /// Looks for a configuration near the state that satisfies the constraints at the prescribed
-    /// positions of the end; the error if the best one violates them.
-    fn contradiction(
-        &self,
-        closure: &mut Closure,
-        state: &PreciseState,
-        q_end: &[f64],
-    ) -> Option<StepError> {
-        let d = self.dimensions;
+        // Is there a configuration that satisfies the constraints at the end of the step?
         let mut q = state.q.clone();
-        q[d.dynamic..].copy_from_slice(&q_end[d.dynamic..]);
-        for _ in 0..RECONCILIATIONS {
-            let rows = self.conditioning.rows(self, closure, &q);
-            closure.evaluate(self, &q, &[]);
-            let weight = &self.conditioning.weight;
-            let value = DVector::from_fn(d.constraints, |c, _| {
-                // What nothing moves keeps its size.
-                closure.value[c] * if weight[c] > 0.0 { weight[c] } else { 1.0 }
-            });
-            if closure.violation() <= 1e4 {
-                return None;
-            }
-            let correction = SVD::new(rows, true, true).solve(&value, DEPENDENT.sqrt()).ok()?;
-            let mut longest = 0.0_f64;
-            for (j, x) in correction.iter().enumerate() {
-                let x = x / self.conditioning.inertia_of(j).sqrt();
-                longest = longest.max(x.abs());
-                q[j] -= x;
-            }
-            if !longest.is_finite() {
-                return None;
-            }
-            if longest < 1e-9 {
+        q[self.dimensions.dynamic..].copy_from_slice(&q_end[self.dimensions.dynamic..]);
+        match conditioning.approach(self, &mut closure, &mut q) {
+            Reached::Violated => {
                 let relative = |c: usize| (closure.value[c] / closure.round_off[c]).abs();
                 let names = self.constraint_names.iter().enumerate();
-                let constraints =
-                    names.filter(|(c, _)| relative(*c) > 1e4).map(|(_, n)| n.clone()).collect();
+                let constraints = names
+                    .filter(|(c, _)| relative(*c) > VIOLATED)
+                    .map(|(_, n)| n.clone())
+                    .collect();
                 let violation = closure.value.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-                return Some(StepError::InconsistentConstraints { constraints, violation });
+                StepError::InconsistentConstraints { constraints, violation }
             }
+            Reached::Satisfied | Reached::Lost => error,
         }
-        None
     }
 }
