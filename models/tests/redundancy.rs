@@ -477,3 +477,94 @@ fn second_order_and_continuous_dynamics() {
         assert!((a - b).amax() < 1e-10 * a.amax());
     }
 }
+
+/// The four-bar with its rocker sawn in two lengthwise: one half hangs from the coupler, and a weld
+/// of six equations joins the halves. Three of them act across the plane of motion.
+///
+/// Without redundant equations: the halves' tips coincide in the plane, and their angles agree.
+fn welded(join: &str) -> Scene {
+    let mut scene = builtin("four-bar");
+    let four_bar = scene.clone();
+    let initial =
+        |name: &str| four_bar.coordinates.iter().find(|c| c.name == name).unwrap().initial;
+    let angle = initial("rocker") - initial("crank") - initial("coupler");
+    let rocker = scene.frames.iter_mut().find(|f| f.name == "rocker").unwrap();
+    let body = rocker.body.as_mut().unwrap();
+    body.mass *= 0.5;
+    body.inertia.iter_mut().for_each(|x| *x *= 0.5);
+    let halves = Scene::from_toml(&format!(
+        r#"
+format = 1
+name = "halves"
+[[frames]]
+name = "coupler"
+[[frames]]
+name = "rocker"
+[[frames]]
+name = "half"
+parent = "coupler"
+translation = [0.0, 0.0, -1.2]
+joint = {{ type = "revolute", axis = [0.0, 1.0, 0.0] }}
+body = {{ mass = 0.5, center_of_mass = [0.0, 0.0, 0.5], inertia = [{0:?}, {0:?}, 0.0] }}
+[[frames]]
+name = "tip"
+parent = "rocker"
+translation = [0.0, 0.0, -1.0]
+[[coordinates]]
+name = "half"
+initial = {angle:?}
+{join}
+"#,
+        1.0 / 24.0
+    ))
+    .unwrap();
+    scene.frames.extend_from_slice(&halves.frames[2..]);
+    scene.coordinates.extend(halves.coordinates);
+    scene.constraints = halves.constraints;
+    scene.operating_points.clear();
+    scene
+}
+
+#[test]
+fn a_weld_in_a_planar_loop() {
+    let planar = r#"
+[[constraints]]
+type = "point_to_point"
+name = "tips"
+a = { frame = "half" }
+b = { frame = "tip" }
+axes = ["x", "z"]
+[[constraints]]
+type = "coupling"
+name = "angles"
+terms = [
+    { coordinate = "crank", coefficients = [1.0] },
+    { coordinate = "coupler", coefficients = [1.0] },
+    { coordinate = "half", coefficients = [1.0] },
+    { coordinate = "rocker", coefficients = [-1.0] },
+]
+"#;
+    let weld = "[[constraints]]\ntype = \"weld\"\nname = \"cut\"\na = \"half\"\nb = \"tip\"";
+    let mut one = plant(&welded(planar), |_| ());
+    let mut two = plant(&welded(weld), |_| ());
+    let found = two.diagnose();
+    assert_eq!((found.degrees_of_freedom, found.constraint_rank), (1, 3));
+    assert_eq!(found.redundant_constraints.len(), 3, "{found:?}");
+    for k in 0..100 {
+        let u = waving_input(&one, k);
+        one.step(&u).unwrap();
+        let report = two.step(&u).unwrap();
+        assert_eq!(report.redundant_constraints, 3, "{report:?}");
+    }
+    for (x, y) in one.q().iter().zip(two.q()) {
+        assert!((x - y).abs() < 1e-10, "{x} and {y}");
+    }
+    let (e, f) = (one.diagnose(), two.diagnose());
+    assert!((e.energy.kinetic_j - f.energy.kinetic_j).abs() < 1e-9);
+    let rest = [&one, &two].map(|plant| {
+        let request = plantd_models::SettleRequest { q: plant.q().to_vec(), ..Default::default() };
+        plant.settle(&request).unwrap()
+    });
+    assert!((rest[0].potential_j - rest[1].potential_j).abs() < 1e-10, "{rest:?}");
+    assert!(rest[1].stable, "{rest:?}");
+}

@@ -224,9 +224,6 @@ impl<'a> Search<'a> {
             if basis.ncols() == 0 {
                 return self.equilibrium(point, iteration);
             }
-            if !reduced.iter().chain(slope.iter()).all(|x| x.is_finite()) {
-                return Err(SettleError::NotConverged { iterations: iteration, residual });
-            }
             let modes = reduced.symmetric_eigen();
             let stiffest = modes.eigenvalues.amax();
             let at_rest = residual <= 4.0 * round_off;
