@@ -4,7 +4,9 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::Arc;
 
-use plantd_models::{ForceSplit, Linearization, Model, Plant, Settings, builtin};
+use plantd_models::{
+    Contraction, ForceSplit, Linearization, Model, Plant, SecondOrder, Settings, builtin,
+};
 
 /// Counts the allocations of each thread, so that tests in other threads do not disturb.
 struct Counting;
@@ -83,6 +85,32 @@ fn operations_of_a_plant_allocate_nothing() {
             assert_eq!(count, 0, "allocations of `{name}`, {force_split:?}");
             assert_eq!(plant.step_index(), 2 * STEPS as u64, "`{name}` has moved");
         }
+    }
+}
+
+/// Once the plant has made room for their columns, neither form of the second-order linearization does.
+#[test]
+fn second_order_linearizations_allocate_once() {
+    for name in ["pendulum", "four-bar", "marionette"] {
+        let scene = builtin::scene(name).expect("the scene is built in");
+        let model = Arc::new(Model::compile(&scene).expect("it compiles"));
+        let settings = Settings::new(&model);
+        let mut plant = Plant::new(Arc::clone(&model), settings).expect("it starts");
+        let d = model.dimensions();
+        let (z, w) = (vec![1.0; d.state()], vec![1.0; d.constraints]);
+        let mut input = vec![0.0; d.input()];
+        plant.hold_input(&mut input);
+        let mut first = Linearization::new(&model);
+        let mut second = SecondOrder::new(&model).expect("it is small");
+        let mut contraction = Contraction::new(&model);
+        let mut both = || {
+            plant.linearize_second_order(&input, &mut first, &mut second).expect("it succeeds");
+            plant
+                .contract_second_order(&input, &z, &w, &mut first, &mut contraction)
+                .expect("it succeeds");
+        };
+        both();
+        assert_eq!(allocations(both), 0, "allocations of `{name}`");
     }
 }
 

@@ -195,8 +195,8 @@ impl Linearization {
     /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, inputs, k)`.
     pub(crate) fn write_tangent(&self, stride: usize, out: &mut [f64]) {
         let (n, next) = (self.nd + self.nk, self.next_columns());
-        let rows = self.increment.chunks_exact(self.stride);
-        let rows = rows.chain(self.multipliers.chunks_exact(self.stride));
+        let width = self.stride.max(1);
+        let rows = self.increment.chunks_exact(width).chain(self.multipliers.chunks_exact(width));
         for (row, out) in rows.zip(out.chunks_exact_mut(stride)) {
             out[..next].copy_from_slice(&row[..next]);
             out[next..][..self.ni].fill(0.0);

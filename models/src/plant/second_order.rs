@@ -65,7 +65,7 @@ impl Layout {
     fn new(model: &Model) -> Self {
         let d = model.dimensions;
         let (nd, nk, ni, nc) = (d.dynamic, d.prescribed, d.inputs, d.constraints);
-        Self { nd, nk, ni, nc, stride: padded(2 * (nd + nk) + ni) }
+        Self { nd, nk, ni, nc, stride: padded((2 * (nd + nk) + ni).max(1)) }
     }
 
     /// Coordinates.
@@ -368,6 +368,9 @@ impl Plant {
         workspace.schur.reserve(stride);
         first.write_tangent(stride, &mut scratch.tangent);
         let rows = (2 * nd + nc) * stride;
+        if rows == 0 {
+            return;
+        }
         for (a, block) in tensor.chunks_exact_mut(rows).enumerate() {
             scratch.seed(a, &self.state.q, u, &workspace.increment, &workspace.multipliers);
             scratch.seed_orientations(a, model, workspace);
