@@ -5,7 +5,7 @@ use std::cell::Cell;
 use std::sync::Arc;
 
 use plantd_models::{
-    Contraction, ForceSplit, Linearization, Model, Plant, SecondOrder, Settings, builtin,
+    Contraction, ForceSplit, Linearization, Model, Plant, Scene, SecondOrder, Settings, builtin,
 };
 
 /// Counts the allocations of each thread, so that tests in other threads do not disturb.
@@ -68,11 +68,24 @@ fn drive(plant: &mut Plant, input: &mut [f64], out: &mut Linearization) {
     }
 }
 
+/// Built-in scenes, and those of all elements.
+fn scenes() -> Vec<Scene> {
+    let families = ["chain-8", "chain-32", "scissor-8"];
+    let names = builtin::NAMES.iter().chain(&families);
+    let builtin = names.map(|name| builtin::scene(name).expect("the scene is built in"));
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/scenes/elements");
+    let elements = std::fs::read_dir(folder).expect("the folder is there").map(|entry| {
+        let path = entry.expect("it can be listed").path();
+        let text = std::fs::read_to_string(path).expect("it can be read");
+        Scene::from_toml(&text).expect("it is a scene")
+    });
+    builtin.chain(elements).collect()
+}
+
 #[test]
 fn operations_of_a_plant_allocate_nothing() {
-    let families = ["chain-8", "chain-32", "scissor-8"];
-    for name in builtin::NAMES.iter().chain(&families) {
-        let scene = builtin::scene(name).expect("the scene is built in");
+    for scene in scenes() {
+        let name = &scene.name;
         let model = Arc::new(Model::compile(&scene).expect("it compiles"));
         for force_split in [ForceSplit::Symmetric, ForceSplit::Paper] {
             let settings =
