@@ -287,6 +287,12 @@ impl Continuous {
                 residual += term;
                 scale += term.abs();
             });
+            // Where nothing accelerates, what the constraints take away tells the round-off.
+            for (other, multiplier) in multipliers.iter().enumerate() {
+                let responses = self.responses.iter().skip(other).step_by(padded(layout.nc));
+                let taken: f64 = row.iter().zip(responses).map(|(a, r)| a.re.re * r).sum();
+                scale += (taken * multiplier).abs();
+            }
             if residual.abs() > INCONSISTENT * scale {
                 let constraint = self.model.constraint_names[c].clone();
                 return Err(ContinuousError::SingularConstraints { constraint, residual });

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::Weights;
+use plantd_models::scene::Signal;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
     Plant, Scene, SceneError, Settings, Snapshot, State, StepReport,
@@ -69,6 +70,8 @@ pub fn scene(text: &str, format: i32, limits: &Limits) -> Result<Result<Scene, S
         ("frames", scene.frames.len()),
         ("springs", scene.springs.len()),
         ("inputs", scene.inputs.len()),
+        ("forces", scene.forces.len()),
+        ("signals", scene.signals.len()),
         ("constraints", scene.constraints.len()),
         ("coordinate settings", scene.coordinates.len()),
         ("operating points", scene.operating_points.len()),
@@ -496,14 +499,38 @@ pub fn model(name: &str, builtin: bool, model: &Model, with_texts: bool) -> v1::
         scene_toml: if with_texts { scene.to_toml() } else { String::new() },
         plan: if with_texts { model.plan() } else { String::new() },
         time_step_s: scene.time_step_s,
-        signals: Vec::new(),
+        signals: signals(model),
     }
+}
+
+fn signals(model: &Model) -> Vec<v1::Signal> {
+    let (scene, dynamic) = (model.scene(), model.dimensions().dynamic);
+    let signal = |signal: &Signal| {
+        let drives = signal.drives();
+        let kind = match signal {
+            Signal::Constant { .. } => "constant",
+            Signal::Sinusoid { .. } => "sinusoid",
+            Signal::Chirp { .. } => "chirp",
+            Signal::Spline { .. } => "spline",
+            Signal::Table { .. } => "table",
+        };
+        let input = scene.inputs.iter().position(|input| input.name == drives);
+        let prescribed =
+            || Some(model.coordinate_index(drives)?.checked_sub(dynamic)? + scene.inputs.len());
+        Some(v1::Signal {
+            drives: drives.to_owned(),
+            u_index: input.or_else(prescribed)? as u32,
+            kind: kind.to_owned(),
+            replaces: input.is_none(),
+        })
+    };
+    scene.signals.iter().filter_map(signal).collect()
 }
 
 fn coordinates(model: &Model) -> Vec<v1::Coordinate> {
     let mut coordinates: Vec<_> = model.coordinates().iter().map(coordinate).collect();
     for &start in model.orientations() {
-        let group = coordinates[start].name.trim_end_matches(".rx").to_owned();
+        let group = coordinates[start].name.trim_end_matches("_rx").to_owned();
         for component in &mut coordinates[start..start + 3] {
             component.rotation_group.clone_from(&group);
         }

@@ -54,7 +54,7 @@ limits! {
     message_bytes = 16_777_216 in 4096..=1_073_741_824;
     /// Bytes of a scene.
     scene_bytes = 4_194_304 in 64..=1_073_741_824;
-    /// Frames, springs, inputs, constraints, coordinate settings or operating points of a scene, each.
+    /// Frames, springs, inputs, forces, signals, constraints, coordinate settings or operating points of a scene, each.
     scene_items = 4096 in 1..=1_000_000;
     /// Coordinates of a model.
     coordinates = 1024 in 1..=65_536;

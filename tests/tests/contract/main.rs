@@ -5,6 +5,7 @@ mod analysis;
 mod answers;
 mod derivatives;
 mod drive;
+mod elements;
 mod limits;
 mod refusals;
 mod rest;
