@@ -14,7 +14,12 @@ const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
 const PAGE: &str = include_str!("../scenes/ELEMENTS.md");
 
 /// Definitions of the schema whose variants are elements, and their chapters.
-const CHAPTERS: [(&str, &str); 2] = [("Spring", "Springs"), ("Constraint", "Constraints")];
+const CHAPTERS: [(&str, &str); 4] = [
+    ("Spring", "Springs"),
+    ("Constraint", "Constraints"),
+    ("Force", "Forces"),
+    ("Signal", "Signals"),
+];
 
 /// All scenes of the folder.
 fn scenes() -> Vec<Scene> {

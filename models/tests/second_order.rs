@@ -70,6 +70,9 @@ impl Check {
     }
 
     fn at(mut plant: Plant, u: Vec<f64>) -> Self {
+        // Signals begin again where a state is given.
+        let State { q, p, v, .. } = plant.state();
+        plant.initialize(&Initial::Momentum { q, p, v }).unwrap();
         let x = plant.state();
         let model = plant.model().clone();
         let mut first = Linearization::new(&model);
@@ -259,6 +262,16 @@ fn floating_body_with_a_spring_across_its_arms() {
 fn random_trees() {
     for seed in 0..24 {
         check(&random_tree(seed));
+    }
+}
+
+/// Forces of every kind.
+#[test]
+fn random_trees_with_forces() {
+    for seed in 100..108 {
+        let mut check = Check::new(&common::forced_tree(seed), ForceSplit::Symmetric);
+        check.symmetry();
+        check.contraction();
     }
 }
 

@@ -7,8 +7,8 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail, ensure};
 use plantd_models::scene::{
-    Axis, Body, Constraint, Coordinate, CoordinateKind, Frame, Input, Joint, Length, Point,
-    Rotation, Scene, Spring,
+    Axis, Body, Component, Constraint, Coordinate, CoordinateKind, Force, Frame, Input, Joint,
+    Length, Point, Rotation, Scene, Spring,
 };
 use plantd_models::{Initial, Model};
 use serde::Deserialize;
@@ -79,6 +79,7 @@ enum ConstraintRecord {
 enum PotentialRecord {
     Gravity { gravity: [f64; 3] },
     ConfigSpring { config: String, k: f64, q0: f64 },
+    LinearSpring { frame1: usize, frame2: usize, k: f64, x0: f64 },
 }
 
 #[derive(Debug, Deserialize)]
@@ -86,6 +87,19 @@ enum PotentialRecord {
 enum ForceRecord {
     Damping { default: f64, coefficients: BTreeMap<String, f64> },
     ConfigForce { config: String, input: String },
+    LinearDamper { frame1: usize, frame2: usize, c: f64 },
+    BodyWrench { frame: usize, wrench: [Component; 6] },
+    SpatialWrench { frame: usize, wrench: [Component; 6] },
+    HybridWrench { frame: usize, wrench: [Component; 6] },
+}
+
+/// Force, then torque; names of inputs as in scenes.
+fn wrench(wrench: &[Component; 6]) -> ([Component; 3], [Component; 3]) {
+    let [fx, fy, fz, tx, ty, tz] = wrench.clone().map(|component| match component {
+        Component::Input(name) => Component::Input(plain(&name)),
+        constant @ Component::Constant(_) => constant,
+    });
+    ([fx, fy, fz], [tx, ty, tz])
 }
 
 /// Where a trajectory starts.
@@ -291,6 +305,14 @@ impl Mechanism {
         for potential in &self.potentials {
             match potential {
                 PotentialRecord::Gravity { gravity } => scene.gravity = *gravity,
+                PotentialRecord::LinearSpring { frame1, frame2, k, x0 } => {
+                    scene.springs.push(Spring::TwoPoint {
+                        a: origin(*frame1),
+                        b: origin(*frame2),
+                        stiffness: *k,
+                        rest_length: *x0,
+                    })
+                }
                 PotentialRecord::ConfigSpring { config, k, q0 } => {
                     scene.springs.push(Spring::Coordinate {
                         coordinate: plain(config),
@@ -337,13 +359,28 @@ impl Mechanism {
                 ForceRecord::ConfigForce { config, input } => {
                     ensure!(driven.insert(input, config).is_none(), "input `{input}` acts twice");
                 }
+                ForceRecord::LinearDamper { frame1, frame2, c } => {
+                    let (a, b) = (origin(*frame1), origin(*frame2));
+                    scene.forces.push(Force::TwoPointDamper { a, b, damping: *c });
+                }
+                ForceRecord::BodyWrench { frame, wrench: w } => {
+                    let (frame, (force, torque)) = (frame_name(*frame), wrench(w));
+                    scene.forces.push(Force::BodyWrench { frame, force, torque });
+                }
+                ForceRecord::SpatialWrench { frame, wrench: w } => {
+                    let (frame, (force, torque)) = (frame_name(*frame), wrench(w));
+                    scene.forces.push(Force::SpatialWrench { frame, force, torque });
+                }
+                ForceRecord::HybridWrench { frame, wrench: w } => {
+                    let (frame, (force, torque)) = (frame_name(*frame), wrench(w));
+                    scene.forces.push(Force::HybridWrench { frame, force, torque });
+                }
             }
         }
         for input in &self.inputs {
-            let config = driven.get(&input.name).context("an input without a force")?;
             scene.inputs.push(Input {
                 name: plain(&input.name),
-                coordinate: Some(plain(config)),
+                coordinate: driven.get(&input.name).map(|config| plain(config)),
                 gain: 1.0,
             });
         }

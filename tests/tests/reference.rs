@@ -154,6 +154,10 @@ type Indices = Vec<usize>;
 impl Case {
     /// Second derivatives, full or contracted.
     fn second_order(&mut self, at: &LinearizationRecord, record: &SecondOrderRecord) -> Result<()> {
+        if record.arrays.get::<String>("error")?.is_some() {
+            // The program that made the file has none for this mechanism.
+            return Ok(());
+        }
         let Self { golden, order, plant, .. } = self;
         let model = plant.model().clone();
         let d = model.dimensions();
@@ -451,6 +455,8 @@ const CASES: &[&str] = &[
     "marionette",
     "puppet_moving",
     "unit_point_to_point",
+    "unit_body_wrench",
+    "dual_pendulums",
 ];
 
 #[test]

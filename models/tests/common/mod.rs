@@ -7,7 +7,8 @@ use std::f64::consts::PI;
 use std::sync::Arc;
 
 use plantd_models::scene::{
-    Body, Coordinate, CoordinateKind, Frame, Input, Joint, Point, Rotation, Scene, Spring,
+    Body, Component, Coordinate, CoordinateKind, Force, Frame, Input, Joint, Point, Rotation,
+    Scene, Spring,
 };
 use plantd_models::{ForceSplit, Model, Plant, Settings, builtin};
 
@@ -195,6 +196,76 @@ fn random_frame(random: &mut Numbers, index: usize) -> Frame {
             inertia: vec![b + c, a + c, a + b, ab, ac, bc],
         }),
     }
+}
+
+/// Forces of every kind on a random tree: its inputs move to wrenches and thrusters, and dampers and
+/// drag act between and at random points.
+pub(crate) fn forced_tree(seed: u64) -> Scene {
+    let mut scene = random_tree(seed);
+    let mut random = Numbers::new(seed ^ 0x5eed);
+    let last = scene.frames.len() - 1;
+    for name in ["wx", "wy", "thrust"] {
+        let name = name.to_owned();
+        scene.inputs.push(Input { name, coordinate: None, gain: 1.0 });
+    }
+    let frame = |random: &mut Numbers| format!("joint{}", random.below(last + 1));
+    let vector = |random: &mut Numbers| [0; 3].map(|_| random.between(-1.0, 1.0));
+    let wrench = |random: &mut Numbers| {
+        [0; 3].map(|_| match random.below(4) {
+            0 => Component::Input("wx".to_owned()),
+            1 => Component::Input("wy".to_owned()),
+            _ => Component::Constant(random.between(-1.0, 1.0)),
+        })
+    };
+    let dynamic: Vec<String> = scene.inputs.iter().filter_map(|i| i.coordinate.clone()).collect();
+    let forces = [
+        Force::BodyWrench {
+            frame: frame(&mut random),
+            force: wrench(&mut random),
+            torque: wrench(&mut random),
+        },
+        Force::SpatialWrench {
+            frame: frame(&mut random),
+            force: wrench(&mut random),
+            torque: wrench(&mut random),
+        },
+        Force::HybridWrench {
+            frame: frame(&mut random),
+            force: wrench(&mut random),
+            torque: wrench(&mut random),
+        },
+        Force::Thruster {
+            frame: frame(&mut random),
+            at: vector(&mut random),
+            axis: vector(&mut random),
+            input: "thrust".to_owned(),
+            gain: 1.5,
+        },
+        Force::TwoPointDamper {
+            a: Point { frame: "joint0".to_owned(), at: vector(&mut random) },
+            b: Point { frame: format!("joint{last}"), at: vector(&mut random) },
+            damping: 2.0,
+        },
+        Force::TwoPointDamper {
+            a: Point { frame: "world".to_owned(), at: vector(&mut random) },
+            b: Point { frame: frame(&mut random), at: vector(&mut random) },
+            damping: 1.0,
+        },
+        Force::Drag { frame: frame(&mut random), at: vector(&mut random), coefficient: 0.8 },
+        Force::CoordinateDrag { coordinate: dynamic[0].clone(), coefficient: 0.5 },
+        Force::Friction { coordinate: dynamic[0].clone(), force: 0.4, velocity: 0.5 },
+    ];
+    // What a prescribed root carries does not give way.
+    for force in forces {
+        scene.forces.push(force);
+        if scene.validate().iter().any(|problem| problem.path.starts_with("forces")) {
+            scene.forces.pop();
+        }
+    }
+    let used: Vec<String> =
+        scene.forces.iter().flat_map(Force::inputs).map(str::to_owned).collect();
+    scene.inputs.retain(|i| i.coordinate.is_some() || used.contains(&i.name));
+    scene
 }
 
 /// A body that floats freely, with two arms; no gravity.
