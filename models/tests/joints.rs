@@ -385,3 +385,170 @@ fn continuous_derivatives_on_the_manifold() {
         }
     }
 }
+
+/// A ball joint that the input turns, a pendulum with a ball joint below it, tied by a spring and by
+/// a rod.
+const PLATFORM: &str = r#"
+format = 1
+name = "platform"
+gravity = [0.5, 0.0, -9.81]
+damping = 0.02
+
+[[frames]]
+name = "platform"
+translation = [0.1, 0.0, 0.0]
+joint = { type = "ball" }
+[[frames]]
+name = "mast"
+parent = "platform"
+translation = [0.0, 0.2, 0.1]
+joint = { type = "revolute", axis = [1.0, 0.2, 0.0] }
+body = { mass = 0.8, center_of_mass = [0.0, 0.1, 0.3], inertia = [0.02, 0.02, 0.01] }
+[[frames]]
+name = "bob"
+parent = "mast"
+translation = [0.0, 0.0, 0.5]
+joint = { type = "ball" }
+body = { mass = 0.5, center_of_mass = [0.1, 0.0, -0.3], inertia = [0.02, 0.03, 0.025, 1e-3, 0.0, 2e-3] }
+[[frames]]
+name = "free"
+joint = { type = "free" }
+translation = [0.6, 0.0, 0.0]
+body = { mass = 1.0, center_of_mass = [0.05, 0.0, 0.0], inertia = [0.02, 0.03, 0.025] }
+
+[[coordinates]]
+name = "platform_rx"
+kind = "prescribed"
+initial = 0.3
+[[coordinates]]
+name = "platform_ry"
+kind = "prescribed"
+initial = -0.2
+[[coordinates]]
+name = "platform_rz"
+kind = "prescribed"
+initial = 0.5
+[[coordinates]]
+name = "bob_rx"
+initial = 0.4
+[[coordinates]]
+name = "free_rz"
+initial = -0.6
+
+[[springs]]
+type = "two_point"
+a = { frame = "bob", at = [0.0, 0.0, -0.5] }
+b = { frame = "world", at = [1.0, 0.0, 0.0] }
+stiffness = 20.0
+rest_length = 0.4
+[[springs]]
+type = "two_point"
+a = { frame = "bob", at = [0.1, 0.0, -0.5] }
+b = { frame = "free", at = [0.0, 0.2, 0.0] }
+stiffness = 10.0
+rest_length = 0.2
+
+[[inputs]]
+name = "twist"
+coordinate = "bob_ry"
+gain = 0.7
+[[inputs]]
+name = "push"
+coordinate = "free_x"
+"#;
+
+/// The same, with the free body tied to the bob.
+const TIED: &str = r#"
+[[constraints]]
+type = "point_to_point"
+name = "pin"
+a = { frame = "bob", at = [0.0, 0.0, -0.5] }
+b = { frame = "free", at = [-0.2, 0.1, 0.0] }
+axes = ["x", "y", "z"]
+[[constraints]]
+type = "distance"
+name = "rod"
+a = { frame = "mast", at = [0.0, 0.0, 0.2] }
+b = { frame = "free", at = [0.1, 0.1, 0.1] }
+length = 0.9
+"#;
+
+#[test]
+fn ball_joints_with_springs_and_prescribed_ones() {
+    let scene = Scene::from_toml(PLATFORM).unwrap();
+    for split in SPLITS {
+        check_derivatives(&scene, split);
+        check_second_order(&scene, split);
+    }
+}
+
+/// The spherical pendulum without its angles: a ball joint swings through the lower pole and over the
+/// upper one, where the angles are singular, exactly as a hinge does in the plane of the motion.
+#[test]
+fn a_spherical_pendulum_on_a_ball_joint_has_no_poles() {
+    let body = "body = { mass = 1.3, center_of_mass = [0.0, 0.0, -0.7], inertia = [0.01, 0.01, 0.01] }";
+    let scene = |joint: &str| {
+        Scene::from_toml(&format!(
+            "format = 1\nname = \"pendulum\"\ngravity = [0.0, 0.0, -9.81]\n[[frames]]\nname = \"rod\"\njoint = {joint}\n{body}\n"
+        ))
+        .unwrap()
+    };
+    let axis = Vector3::new(0.6, 0.8, 0.0);
+    let mut ball = plant(&scene("{ type = \"ball\" }"), |_| {});
+    let mut hinge =
+        plant(&scene("{ type = \"revolute\", axis = [0.6, 0.8, 0.0] }"), |_| {});
+    let (angle, rate) = (-0.5, 11.5);
+    let [turn, spin] = [axis * angle, axis * rate].map(|v| v.as_slice().to_vec());
+    ball.initialize(&Initial::Velocity { q: turn, v: spin }).unwrap();
+    hinge.initialize(&Initial::Velocity { q: vec![angle], v: vec![rate] }).unwrap();
+    let mut top = 0.0_f64;
+    for _ in 0..400 {
+        let report = ball.step(&[]).unwrap();
+        hinge.step(&[]).unwrap();
+        assert!(report.reciprocal_condition > 1e-3, "{report:?}");
+        let expected = axis * hinge.q()[0];
+        let apart = Rotation3::new(Vector3::from_row_slice(ball.q()))
+            .angle_to(&Rotation3::new(expected));
+        assert!(apart < 1e-11, "{apart:e} at {}", hinge.q()[0]);
+        top = top.max(hinge.q()[0]);
+    }
+    assert!(top > 2.0 * std::f64::consts::TAU, "{top}");
+}
+
+/// Free-flying bodies, one tumbling on a ball joint of the other, keep linear and angular momentum to
+/// round-off over a million steps.
+#[test]
+fn a_million_tumbles_keep_the_momenta() {
+    let text = r#"
+format = 1
+name = "tumbling"
+time_step_s = 0.01
+
+[[frames]]
+name = "hull"
+joint = { type = "free" }
+body = { mass = 2.0, center_of_mass = [0.1, 0.0, -0.05], inertia = [0.02, 0.03, 0.045, 1e-3, 2e-3, -1e-3] }
+[[frames]]
+name = "arm"
+parent = "hull"
+translation = [0.0, 0.2, 0.1]
+joint = { type = "ball" }
+body = { mass = 0.7, center_of_mass = [0.0, 0.2, 0.1], inertia = [0.01, 0.012, 0.008] }
+"#;
+    let mut plant = plant(&Scene::from_toml(text).unwrap(), |_| {});
+    let v = [0.0, 0.0, 0.0, 0.9, -1.4, 2.1, -1.1, 0.8, 1.7];
+    plant.initialize(&Initial::Velocity { q: vec![0.0; 9], v: v.to_vec() }).unwrap();
+    let momenta = |plant: &mut Plant| {
+        let d = plant.diagnose();
+        (Vector3::from(d.linear_momentum), Vector3::from(d.angular_momentum))
+    };
+    let (linear, angular) = momenta(&mut plant);
+    for _ in 0..20 {
+        for _ in 0..50_000 {
+            plant.step(&[]).unwrap();
+        }
+        let (p, l) = momenta(&mut plant);
+        assert!((p - linear).norm() < 1e-14, "{p} {linear}");
+        assert!((l - angular).norm() < 1e-11, "{l} {angular}");
+    }
+}
