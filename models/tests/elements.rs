@@ -14,7 +14,8 @@ const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
 const PAGE: &str = include_str!("../scenes/ELEMENTS.md");
 
 /// Definitions of the schema whose variants are elements, and their chapters.
-const CHAPTERS: [(&str, &str); 4] = [
+const CHAPTERS: [(&str, &str); 5] = [
+    ("Joint", "Joints"),
     ("Spring", "Springs"),
     ("Constraint", "Constraints"),
     ("Force", "Forces"),
