@@ -170,8 +170,11 @@ impl Maker {
     }
 
     fn dynamic_scalar(&mut self) -> Option<String> {
-        let dynamic: Vec<_> =
-            self.scalars.iter().filter(|c| !self.prescribed.contains(c)).cloned().collect();
+        let floating = self.kind == Kind::Floating;
+        let dynamic: Vec<_> = (self.scalars.iter())
+            .filter(|c| !self.prescribed.contains(c) && !(floating && c.starts_with("f0")))
+            .cloned()
+            .collect();
         (!dynamic.is_empty()).then(|| dynamic[self.random.below(dynamic.len())].clone())
     }
 
@@ -483,7 +486,7 @@ fn second_derivatives(seed: u64, plant: &Plant, u: &[f64], direction: &Direction
         + 2.0 * (dx.transpose() * &second.xu * &du)[0]
         + (du.transpose() * &second.uu * &du)[0];
     let (z, w) = (DVector::from_vec(z), DVector::from_vec(w));
-    let found = slope(1e-3, |s| {
+    let found = slope(3e-4, |s| {
         let u = direction.go(&mut moved, plant, u, s);
         moved.linearize(&u, &mut first).unwrap_or_else(|e| panic!("{seed}: {e}"));
         let x = first.a() * &dx + first.b() * &du;

@@ -231,6 +231,7 @@ impl Workspace {
         blocks.inputs.copy_from_slice(&self.inputs);
         blocks.place_midpoint(model, settings.time_step_s);
         blocks.q_mid.copy_from_slice(&self.q_mid);
+        blocks.velocity.copy_from_slice(&self.velocity);
         blocks.evaluate_mid(model);
         blocks.assemble(model, settings);
         let (n, elimination) = (model.dimensions.coordinates(), &model.elimination);

@@ -86,6 +86,13 @@ impl Layout {
     fn parameters(&self) -> usize {
         self.next() + self.nk
     }
+
+    /// Which of the six numbers that turn the ends of a prescribed ball joint a parameter is.
+    fn end_of(&self, coordinate: usize, parameter: usize) -> Option<usize> {
+        let ends = [coordinate, self.next() + coordinate.wrapping_sub(self.nd)];
+        let first = ends.iter().position(|end| (*end..*end + 3).contains(&parameter))?;
+        Some(3 * first + parameter - ends[first])
+    }
 }
 
 /// What both forms compute with.
@@ -109,6 +116,28 @@ pub struct SecondOrder {
     scratch: Scratch,
     /// One block for each parameter `a`: rows `x''` (nd), `λ''` (nc), `p''` (nd), columns `b ≤ a`.
     tensor: Vec<f64>,
+    /// Velocities of prescribed ball joints, `ξ/h`, by both ends of the step.
+    spins: Vec<Spin>,
+}
+
+/// Second derivatives of the velocity of a prescribed ball joint.
+#[derive(Clone, Debug)]
+struct Spin {
+    /// First of its coordinates.
+    coordinate: usize,
+    /// For each component, by the start and by the end of the step.
+    tensor: [DMatrix<f64>; 3],
+}
+
+/// Where the second derivatives of an output stand.
+#[derive(Clone, Copy, Debug)]
+enum Output {
+    /// Nowhere: they are zero.
+    Linear,
+    /// In a row of the blocks.
+    Row(usize),
+    /// A component of a spin.
+    Spin(usize, usize),
 }
 
 impl SecondOrder {
@@ -125,7 +154,10 @@ impl SecondOrder {
         if entries > ENTRIES_MAX {
             return Err(TooLarge { parameters, entries });
         }
-        Ok(Self { scratch: Scratch::new(model), tensor: vec![0.0; entries] })
+        let spin =
+            |&coordinate: &usize| Spin { coordinate, tensor: [0; 3].map(|_| DMatrix::zeros(6, 6)) };
+        let spins = model.orientations.iter().filter(|i| **i >= layout.nd).map(spin).collect();
+        Ok(Self { scratch: Scratch::new(model), tensor: vec![0.0; entries], spins })
     }
 
     /// `∂²x_i[k+1]/∂x∂x` of output `i`, square of `2 nd + 2 nk`.
@@ -182,37 +214,56 @@ impl SecondOrder {
         self.input_block(self.multiplier_row(c))
     }
 
-    /// Row of an output in the blocks; prescribed outputs, which are linear, have none.
-    fn output_row(&self, output: usize) -> Option<usize> {
+    fn output_row(&self, output: usize) -> Output {
         let Layout { nd, nc, .. } = self.scratch.layout;
         let n = self.scratch.layout.n();
         assert!(output < 2 * n, "output {output} of {}", 2 * n);
         match output {
-            i if i < nd => Some(i),
-            i if (n..n + nd).contains(&i) => Some(nd + nc + i - n),
-            _ => None,
+            i if i < nd => Output::Row(i),
+            i if i < n => Output::Linear,
+            i if i < n + nd => Output::Row(nd + nc + i - n),
+            i => {
+                let coordinate = i - n;
+                let holds =
+                    |spin: &Spin| (spin.coordinate..spin.coordinate + 3).contains(&coordinate);
+                match self.spins.iter().position(holds) {
+                    Some(spin) => Output::Spin(spin, coordinate - self.spins[spin].coordinate),
+                    None => Output::Linear,
+                }
+            }
         }
     }
 
-    fn multiplier_row(&self, c: usize) -> Option<usize> {
+    fn multiplier_row(&self, c: usize) -> Output {
         let Layout { nd, nc, .. } = self.scratch.layout;
         assert!(c < nc, "constraint {c} of {nc}");
-        Some(nd + c)
+        Output::Row(nd + c)
     }
 
-    fn entry(&self, row: Option<usize>, a: usize, b: usize) -> f64 {
-        let Layout { nd, nc, stride, .. } = self.scratch.layout;
-        row.map_or(0.0, |row| self.tensor[((a.max(b)) * (2 * nd + nc) + row) * stride + a.min(b)])
+    fn entry(&self, output: Output, a: usize, b: usize) -> f64 {
+        let layout = self.scratch.layout;
+        let Layout { nd, nc, stride, .. } = layout;
+        match output {
+            Output::Linear => 0.0,
+            Output::Row(row) => self.tensor[((a.max(b)) * (2 * nd + nc) + row) * stride + a.min(b)],
+            Output::Spin(spin, component) => {
+                let Spin { coordinate, tensor } = &self.spins[spin];
+                match (layout.end_of(*coordinate, a), layout.end_of(*coordinate, b)) {
+                    (Some(a), Some(b)) => tensor[component][(a, b)],
+                    _ => 0.0,
+                }
+            }
+        }
     }
 
-    fn state_block(&self, row: Option<usize>) -> DMatrix<f64> {
+    fn state_block(&self, row: Output) -> DMatrix<f64> {
         let (n, moving) = (self.scratch.layout.n(), self.scratch.layout.inputs());
         DMatrix::from_fn(2 * n, 2 * n, |a, b| {
             if a < moving && b < moving { self.entry(row, a, b) } else { 0.0 }
         })
     }
 
-    fn mixed_block(&self, row: Option<usize>) -> DMatrix<f64> {
+    fn mixed_block(&self, row: Output) -> DMatrix<f64> {
         let layout = self.scratch.layout;
         let moving = layout.inputs();
         let mut block = DMatrix::from_fn(2 * layout.n(), layout.ni + layout.nk, |a, b| {
@@ -222,7 +273,7 @@ impl SecondOrder {
         block
     }
 
-    fn input_block(&self, row: Option<usize>) -> DMatrix<f64> {
+    fn input_block(&self, row: Output) -> DMatrix<f64> {
         let layout = self.scratch.layout;
         let (moving, size) = (layout.inputs(), layout.ni + layout.nk);
         let mut block =
@@ -361,7 +412,7 @@ impl Plant {
         second: &mut SecondOrder,
     ) {
         let model = &*self.model;
-        let SecondOrder { scratch, tensor } = second;
+        let SecondOrder { scratch, tensor, spins } = second;
         let Layout { nd, nc, stride, .. } = scratch.layout;
         let n = scratch.layout.n();
         let workspace = &mut self.workspace;
@@ -439,9 +490,21 @@ impl Plant {
             for t in blocks.turnings.iter().filter(|t| t.coordinate < nd) {
                 layout.turn_rows(t, tangent, solved);
             }
+            let prescribed = blocks.turnings.iter().filter(|t| t.coordinate >= nd);
+            for (spin, t) in spins.iter_mut().zip(prescribed) {
+                if let Some(a) = layout.end_of(t.coordinate, a) {
+                    let change = spin_change(t, self.settings.time_step_s);
+                    for (tensor, row) in spin.tensor.iter_mut().zip(change) {
+                        tensor.row_mut(a).iter_mut().zip(row).for_each(|(to, from)| *to = from);
+                    }
+                }
+            }
         }
         if !model.orientations.is_empty() {
             symmetrise(tensor, rows, stride);
+            for tensor in spins.iter_mut().flat_map(|spin| &mut spin.tensor) {
+                *tensor = (&*tensor + tensor.transpose()) * 0.5;
+            }
         }
     }
 
@@ -542,6 +605,15 @@ impl Plant {
                         let z = z[t.coordinate + k];
                         row[i] += z * t.carried.0[b][k].eps;
                         add_next(row, i, z * t.to_end.0[b][k].eps);
+                    }
+                }
+            }
+            for t in blocks.turnings.iter().filter(|t| t.coordinate >= nd) {
+                let z = &z[n + t.coordinate..][..3];
+                for (z, change) in z.iter().zip(spin_change(t, self.settings.time_step_s)) {
+                    for b in 0..3 {
+                        row[t.coordinate + b] += z * change[b];
+                        row[next + t.coordinate - nd + b] += z * change[3 + b];
                     }
                 }
             }
@@ -693,6 +765,21 @@ impl Layout {
             }
         }
     }
+}
+
+/// How the derivatives of the velocity of a prescribed ball joint by the ends of the step,
+/// `(N⁻ η₁ − N⁺ η₀) / h`, change along the direction of the duals.
+fn spin_change(t: &Turning<Dual>, time_step_s: f64) -> [[f64; 6]; 3] {
+    [0, 1, 2].map(|row| {
+        [0, 1, 2, 3, 4, 5].map(|column| {
+            let entry = if column < 3 {
+                -t.momentum.0[row][column].eps
+            } else {
+                t.momentum.0[column - 3][row].eps
+            };
+            entry / time_step_s
+        })
+    })
 }
 
 /// Replaces the derivative along `a` of the tangent `b` by its mean with that along `b` of the tangent
