@@ -335,9 +335,16 @@ mod tests {
         out
     }
 
+    /// Scenes of elements, and random ones.
+    fn models() -> Vec<Model> {
+        let random = samples::random_models(100);
+        assert!(random.len() > 25, "a test of little: {} models", random.len());
+        samples::models().into_iter().chain(random).collect()
+    }
+
     #[test]
     fn derivatives_agree_with_differences_and_dual_numbers() {
-        for model in samples::models().iter().filter(|model| !model.constraints.is_empty()) {
+        for model in models().iter().filter(|model| !model.constraints.is_empty()) {
             let (name, d) = (&model.scene.name, model.dimensions);
             let n = d.coordinates();
             let multipliers: Vec<f64> =

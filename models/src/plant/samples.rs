@@ -19,6 +19,108 @@ pub(crate) fn models() -> Vec<Model> {
     models.collect()
 }
 
+/// Models of random trees of all joints, with every spring and constraint of points and frames between
+/// random places of theirs.
+pub(crate) fn random_models(count: u64) -> Vec<Model> {
+    // Some are refused, because nothing moves between two of the places.
+    (0..count).filter_map(|seed| Model::compile(&random_scene(seed)).ok()).collect()
+}
+
+/// Numbers that look random, the same on every run (SplitMix64).
+struct Numbers(u64);
+
+impl Numbers {
+    /// Between 0 and 1.
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() * n as f64) as usize
+    }
+    fn vector(&mut self) -> String {
+        format!("{:?}", [0; 3].map(|_| 2.0 * self.next() - 1.0))
+    }
+    /// A frame of the first `n`, or the world.
+    fn frame(&mut self, n: usize) -> String {
+        match self.below(n + 1) {
+            i if i == n => "\"world\"".to_owned(),
+            i => format!("\"f{i}\""),
+        }
+    }
+}
+
+fn random_scene(seed: u64) -> Scene {
+    const FRAMES: usize = 6;
+    let mut random = Numbers(seed);
+    let mut text = format!("format = 1\nname = \"random-{seed}\"\n");
+    for i in 0..FRAMES {
+        let (parent, axis) = (random.frame(i), random.vector());
+        let joint = match random.below(5) {
+            0 => format!("type = \"prismatic\", axis = {axis}"),
+            1 => format!("type = \"screw\", pitch = 0.3, axis = {axis}"),
+            2 => "type = \"ball\"".to_owned(),
+            _ => format!("type = \"revolute\", axis = {axis}"),
+        };
+        let [translation, rpy, center] = [0; 3].map(|_| random.vector());
+        text += &format!(
+            "[[frames]]\nname = \"f{i}\"\nparent = {parent}\ntranslation = {translation}\n\
+             rotation = {{ rpy = {rpy} }}\njoint = {{ {joint} }}\n\
+             body = {{ mass = 1.0, center_of_mass = {center}, inertia = [0.1, 0.1, 0.1] }}\n"
+        );
+    }
+    let [a, b, c, d] = [0; 4].map(|_| {
+        let (frame, at) = (random.frame(FRAMES), random.vector());
+        format!("frame = {frame}, at = {at}")
+    });
+    text += &format!(
+        r#"
+        [[springs]]
+        type = "two_point"
+        a = {{ {a} }}
+        b = {{ {b} }}
+        stiffness = 2.0
+        rest_length = 0.5
+        [[springs]]
+        type = "path"
+        points = [{{ {a} }}, {{ {b} }}, {{ {c} }}, {{ {d} }}]
+        stiffness = 2.0
+        rest_length = 0.5
+        [[constraints]]
+        type = "distance"
+        name = "distance"
+        a = {{ {a} }}
+        b = {{ {b} }}
+        length = 1.0
+        [[constraints]]
+        type = "point_to_point"
+        name = "pin"
+        a = {{ {b} }}
+        b = {{ {c} }}
+        axes = ["x", "y", "z"]
+        [[constraints]]
+        type = "point_on_plane"
+        name = "plane"
+        plane = {{ {c}, normal = [0.3, -0.5, 0.8] }}
+        point = {{ {d} }}
+        [[constraints]]
+        type = "path_length"
+        name = "path"
+        points = [{{ {b} }}, {{ {d} }}, {{ {a} }}, {{ {c} }}]
+        length = 1.0
+        [[constraints]]
+        type = "weld"
+        name = "weld"
+        a = "f5"
+        b = "f2"
+        "#
+    );
+    Scene::from_toml(&text).unwrap()
+}
+
 /// A configuration, with the orientations of ball joints.
 pub(crate) struct Configuration<S> {
     pub(crate) q: Vec<S>,
@@ -71,7 +173,7 @@ pub(crate) fn slope(
     direction: &[f64],
     mut f: impl FnMut(&Configuration<f64>) -> Vec<f64>,
 ) -> Vec<f64> {
-    const DELTA: f64 = 2e-3;
+    const DELTA: f64 = 5e-4;
     let stencil = [(1.0, 3.0 / 4.0), (2.0, -3.0 / 20.0), (3.0, 1.0 / 60.0)];
     let mut sum = Vec::new();
     for (offset, weight) in stencil {
