@@ -8,7 +8,7 @@
  *     plantd/2/<plant>/state   publish-subscribe and event, server to drivers
  *
  * The domain is an iceoryx2 0.10 configuration with the server's root path and the prefix
- * plantd1_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
+ * plantd2_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
  * by exclusive or, as eight hexadecimal digits. The publish-subscribe services have the payload type
  * "f64" (dynamic), the user header type PLANTD_LINK_TYPE_NAME, and the attributes
  * plantd.layout = "2" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
@@ -23,6 +23,9 @@
  *    1) and waits for STATE or FAILURE with the same `sequence`. A failed step leaves the plant as
  *    it was, and the conversation goes on.
  * 3. The driver sends DETACH, or dies: the server notices and takes the lease back.
+ *
+ * The orientation of a ball joint takes three entries of q, a rotation vector: a controller takes the
+ * difference of two of them on the rotation group, log(R_reference' R).
  *
  * The server broadcasts; a driver ignores messages with another `driver` number than its own, except
  * CLOSED. A `server` number other than the one in ATTACHED means that the server has restarted or

@@ -246,3 +246,60 @@ def test_settle_and_diagnose(client):
     initial = common_pb2.InitialState(operating_point="hanging")
     hanging = client.diagnose(model="pendulum", initial=initial)
     assert hanging.center_of_mass == pytest.approx([0, -1, 0], abs=1e-15)
+
+
+STICK = """
+format = 1
+name = "py-stick"
+gravity = [0.0, 0.0, -9.8]
+time_step_s = 0.02
+
+[[frames]]
+name = "stick"
+joint = { type = "ball" }
+body = { mass = 1.0, center_of_mass = [0.0, 0.0, -0.5], inertia = [0.1, 0.1, 0.02] }
+
+[[inputs]]
+name = "x"
+coordinate = "stick_rx"
+
+[[inputs]]
+name = "y"
+coordinate = "stick_ry"
+
+[[inputs]]
+name = "z"
+coordinate = "stick_rz"
+
+[[signals]]
+drives = "z"
+type = "constant"
+value = 0.0
+
+[[operating_points]]
+name = "turned"
+coordinates = { stick_rz = 3.0 }
+"""
+
+
+def test_a_gain_turns_a_ball_joint_the_short_way(client):
+    model = client.create_model(STICK)
+    try:
+        assert [c.rotation_group for c in model.coordinates] == ["stick"] * 3
+        assert [(s.drives, s.u_index, s.kind, s.replaces) for s in model.signals] == [
+            ("z", 2, "constant", False)
+        ]
+        gain = client.solve_lqr("py-stick", at="turned", q=[100] * 3 + [1] * 3, r=[1] * 3)
+        plant = client.create_plant("py-stick", q=[0.0, 0.3, -3.0])
+        reference, rotations = gain.x_reference[:3], plantd.rotations(model)
+        state = plant.state
+        # The vectors are six radians apart, the orientations less than half a radian.
+        assert np.linalg.norm(state.q - reference) > 5.9
+        with client.drive(plant.id) as driver:
+            for _ in range(200):
+                error = plantd.difference(reference, state.q, rotations)
+                assert np.linalg.norm(error) < 0.7
+                state = driver.step(gain(state))
+        assert np.linalg.norm(plantd.difference(reference, state.q, rotations)) < 1e-4
+    finally:
+        client.delete_model("py-stick")

@@ -137,7 +137,11 @@ fn coordinate(c: &v1::Coordinate) -> Vec<String> {
         v1::Unit::Radian => "rad",
         v1::Unit::Unspecified => "",
     };
-    vec![c.name.clone(), kind.to_owned(), unit.to_owned(), number(c.initial)]
+    let unit = match c.rotation_group.as_str() {
+        "" => unit.to_owned(),
+        joint => format!("{unit}, rotation vector of {joint}"),
+    };
+    vec![c.name.clone(), kind.to_owned(), unit, number(c.initial)]
 }
 
 /// Models, one per row.
