@@ -11,11 +11,13 @@
 //! with the vector `d` between two points, a world axis `e`, and a length `l`, fixed or a prescribed
 //! coordinate.
 
-use crate::model::{Alignment, Constraint, ConstraintKind, Length, Model, PointPair, Polynomial};
+use crate::model::{
+    Alignment, Constraint, ConstraintKind, Length, Model, PathJoint, PointPair, Polynomial,
+};
 use crate::plant::kinematics::Poses;
 use crate::plant::vectors::{Distance, ProductAt};
 use crate::scalar::Scalar;
-use crate::spatial::Mat3;
+use crate::spatial::{Mat3, Vec3};
 use crate::tree::Tree;
 
 /// The constraints at a configuration.
@@ -185,13 +187,18 @@ impl Constraint {
         match &self.kind {
             ConstraintKind::Distance(points, length) => {
                 let at = points.separation(tree, poses);
-                for row in &points.path {
+                for (k, row) in points.path.iter().enumerate() {
                     let row_gradient = row.gradient(tree, poses, &at);
-                    for column in &points.path {
+                    for column in &points.path[..=k] {
                         let gradient = column.gradient(tree, poses, &at);
-                        let second = row.second(row_gradient, tree, poses, (column, gradient));
-                        let half = gradient.dot(row_gradient) + at.difference.dot(second);
-                        entry(row.coordinate, column.coordinate, half * 2.0);
+                        let both = [(row, row_gradient), (column, gradient)];
+                        let (second, mirrored) = PathJoint::seconds(both, tree, poses);
+                        let product = gradient.dot(row_gradient);
+                        let value = |second: Vec3<S>| (product + at.difference.dot(second)) * 2.0;
+                        entry(row.coordinate, column.coordinate, value(second));
+                        if row.joint != column.joint {
+                            entry(column.coordinate, row.coordinate, value(mirrored));
+                        }
                     }
                 }
                 if let Length::Driven(length) = *length {

@@ -12,11 +12,12 @@
 //! its stiffness there is taken as `k` in all directions.
 
 use crate::elimination::Elimination;
-use crate::model::{PathSpring, PointSpring, Potentials};
+use crate::model::{PathJoint, PathSpring, PointSpring, Potentials};
 use crate::plant::kinematics::Poses;
 use crate::plant::tree_lu::TreeLu;
 use crate::plant::vectors::{Distance, Separation};
 use crate::scalar::Scalar;
+use crate::spatial::Vec3;
 use crate::tree::Tree;
 
 /// A two-point spring at one configuration.
@@ -157,16 +158,21 @@ pub(crate) fn for_each_second_derivative<S: Scalar>(
     }
     for spring in &potentials.point_springs {
         let s = stretched(spring, tree, poses);
-        let path = &spring.ends.path;
-        for row in path {
+        for (k, row) in spring.ends.path.iter().enumerate() {
             let row_gradient = row.gradient(tree, poses, &s.at);
             let bend = s.bend * s.at.difference.dot(row_gradient);
-            for column in path {
+            for column in &spring.ends.path[..=k] {
                 let gradient = column.gradient(tree, poses, &s.at);
-                let second = row.second(row_gradient, tree, poses, (column, gradient));
-                let value = s.tension * (gradient.dot(row_gradient) + s.at.difference.dot(second))
-                    + bend * s.at.difference.dot(gradient);
-                entry(row.coordinate, column.coordinate, value);
+                let both = [(row, row_gradient), (column, gradient)];
+                let (second, mirrored) = PathJoint::seconds(both, tree, poses);
+                let product = gradient.dot(row_gradient);
+                let along = bend * s.at.difference.dot(gradient);
+                let value =
+                    |second: Vec3<S>| s.tension * (product + s.at.difference.dot(second)) + along;
+                entry(row.coordinate, column.coordinate, value(second));
+                if row.joint != column.joint {
+                    entry(column.coordinate, row.coordinate, value(mirrored));
+                }
             }
         }
     }

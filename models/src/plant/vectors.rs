@@ -73,6 +73,22 @@ impl PathJoint {
         }
     }
 
+    /// [`Self::second`] of the first joint by the second, and of the second by the first. They differ
+    /// within a ball joint only.
+    #[inline]
+    pub(crate) fn seconds<S: Scalar>(
+        [(row, row_gradient), (column, gradient)]: [(&PathJoint, Vec3<S>); 2],
+        tree: &Tree,
+        poses: &Poses<S>,
+    ) -> (Vec3<S>, Vec3<S>) {
+        let second = row.second(row_gradient, tree, poses, (column, gradient));
+        if tree.one_ball(row.joint, column.joint) {
+            (second, column.second(gradient, tree, poses, (row, row_gradient)))
+        } else {
+            (second, second)
+        }
+    }
+
     /// [`Self::gradient`] where joints that carry both points are on the path, too.
     #[inline]
     pub(crate) fn gradient_in_world<S: Scalar>(
