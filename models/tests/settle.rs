@@ -323,3 +323,43 @@ fn loops_settle_under_inputs_and_with_held_coordinates() {
     assert_eq!(rest.q[0], plant.q()[0]);
     assert_eq!(rest.smallest_stiffness, f64::INFINITY);
 }
+
+/// Every element's scene settles and rests there, or says why not.
+#[test]
+fn scenes_of_all_elements() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let mut settled = 0;
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let scene = Scene::from_text(&std::fs::read_to_string(&path).unwrap()).unwrap();
+        let mut plant = plant(&scene, |_| ());
+        let rest = match settle(&plant, plant.q(), &[]) {
+            Ok(rest) => rest,
+            Err(error) => {
+                println!("{}: {error}", scene.name);
+                // What flies falls, and unequal weights run into their pulley.
+                let has_none = matches!(error, SettleError::Unbounded { .. });
+                assert!(has_none || scene.name == "path-length", "{}: {error}", scene.name);
+                continue;
+            }
+        };
+        println!("{}: {} {:e} {}", scene.name, rest.stable, rest.residual, rest.iterations);
+        assert!(rest.residual < 1e-9, "{}: {rest:?}", scene.name);
+        settled += 1;
+        if !scene.signals.is_empty() {
+            continue;
+        }
+        let q = rest.q.clone();
+        plant.initialize(&Initial::Equilibrium { q, hold: vec![], inputs: vec![] }).unwrap();
+        let start = plant.q().to_vec();
+        let mut u = vec![0.0; plant.model().dimensions().input()];
+        plant.hold_input(&mut u);
+        for _ in 0..20 {
+            plant.step(&u).unwrap();
+        }
+        for (x, y) in plant.q().iter().zip(&start) {
+            assert!((x - y).abs() < 1e-9, "{}: {x} was {y}", scene.name);
+        }
+    }
+    assert!(settled > 5, "{settled}");
+}

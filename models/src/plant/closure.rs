@@ -53,7 +53,9 @@ impl<S: Scalar> Closure<S> {
         for (c, constraint) in model.constraints.iter().enumerate() {
             let (value, magnitude) = constraint.value(&model.closure, &self.poses, q);
             self.value[c] = value;
-            self.round_off[c] = f64::EPSILON * magnitude + self.coordinate_round_off[c];
+            // Not less than what the smallest numbers are rounded by: some terms may all be zero.
+            self.round_off[c] =
+                f64::EPSILON * magnitude + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
         }
     }
 

@@ -41,6 +41,8 @@ const FAR_RAD: f64 = 50.0;
 const RANK_CUT: f64 = 1e-9;
 /// Curvatures below this fraction of the largest are flat.
 const FLAT: f64 = 1e-9;
+/// Curvature of constraints blurs no more than this fraction of the forces.
+const CURVED: f64 = 1e-9;
 /// A residual that no longer falls is at its floor below this fraction of the forces.
 const FLOOR: f64 = 1e-7;
 
@@ -216,7 +218,7 @@ impl<'a> Search<'a> {
             let reduced = basis.transpose() * self.scaled(&stiffness) * &basis;
             let slope = basis.transpose() * self.scaled_vector(&point.gradient);
             let residual = point.residual();
-            let round_off = f64::EPSILON * self.magnitude(&point, &stiffness);
+            let (size, round_off) = self.magnitudes(&point, &stiffness);
             // Eigenvalues of what is not finite are searched without end.
             if !residual.is_finite() || reduced.iter().any(|entry| !entry.is_finite()) {
                 return Err(SettleError::NotConverged { iterations: iteration, residual });
@@ -254,7 +256,7 @@ impl<'a> Search<'a> {
                     }
                     point = next;
                 }
-                None if residual <= FLOOR / f64::EPSILON * round_off => {
+                None if residual <= FLOOR * size => {
                     return self.equilibrium(point, iteration);
                 }
                 None => return Err(SettleError::NotConverged { iterations: iteration, residual }),
@@ -436,10 +438,15 @@ impl<'a> Search<'a> {
         (distance > limit).then(|| coordinate.name.clone())
     }
 
-    /// What forces of this size are made of.
-    fn magnitude(&self, point: &Point, stiffness: &DMatrix<f64>) -> f64 {
+    /// What the forces of a point are made of, and their round-off. Where a constraint has a kink, its
+    /// curvature knows no bound and says nothing of that.
+    fn magnitudes(&self, point: &Point, stiffness: &DMatrix<f64>) -> (f64, f64) {
         let farthest = point.q.iter().fold(1.0_f64, |a, q| a.max(q.abs()));
-        point.gradient.amax() + stiffness.amax() * farthest
+        let own = self.blocks.l_qq.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
+        let forces = point.gradient.amax();
+        let size = forces + own * farthest;
+        let curved = (f64::EPSILON * stiffness.amax() * farthest).min(CURVED * forces);
+        (size, f64::EPSILON * size + curved)
     }
 
     fn equilibrium(&mut self, point: Point, iterations: u32) -> Result<Equilibrium, SettleError> {
