@@ -159,6 +159,8 @@ struct Search<'a> {
     inputs: Vec<f64>,
     /// Whether each dynamic coordinate may move.
     moves: Vec<bool>,
+    /// Largest force that has been met.
+    largest: f64,
 }
 
 /// A configuration on the constraints.
@@ -201,7 +203,7 @@ impl<'a> Search<'a> {
             }
         }
         let (blocks, closure) = (Blocks::new(model), Closure::new(model));
-        Ok(Self { model, blocks, closure, inputs, moves })
+        Ok(Self { model, blocks, closure, inputs, moves, largest: 0.0 })
     }
 
     fn run(&mut self, guess: &[f64]) -> Result<Equilibrium, SettleError> {
@@ -218,6 +220,7 @@ impl<'a> Search<'a> {
             let reduced = basis.transpose() * self.scaled(&stiffness) * &basis;
             let slope = basis.transpose() * self.scaled_vector(&point.gradient);
             let residual = point.residual();
+            self.largest = self.largest.max(point.gradient.amax());
             let (size, round_off) = self.magnitudes(&point, &stiffness);
             // Eigenvalues of what is not finite are searched without end.
             if !residual.is_finite() || reduced.iter().any(|entry| !entry.is_finite()) {
@@ -442,10 +445,10 @@ impl<'a> Search<'a> {
     /// curvature knows no bound and says nothing of that.
     fn magnitudes(&self, point: &Point, stiffness: &DMatrix<f64>) -> (f64, f64) {
         let farthest = point.q.iter().fold(1.0_f64, |a, q| a.max(q.abs()));
-        let own = self.blocks.l_qq.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
-        let forces = point.gradient.amax();
-        let size = forces + own * farthest;
-        let curved = (f64::EPSILON * stiffness.amax() * farthest).min(CURVED * forces);
+        let slopes = self.blocks.l_qq.iter().chain(&self.blocks.f_q);
+        let own = slopes.fold(0.0_f64, |a, x| a.max(x.abs()));
+        let size = self.largest + own * farthest;
+        let curved = (f64::EPSILON * stiffness.amax() * farthest).min(CURVED * self.largest);
         (size, f64::EPSILON * size + curved)
     }
 
