@@ -28,9 +28,12 @@ impl Profile {
 /// The stages that a plan leaves out, by the functions that do their work.
 const CONSTRAINTS: &[&str] =
     &["plant::closure::", "plant::pivoted_lu::", "newton::fill_schur", "Workspace::find_responses"];
-const SPRINGS: &[&str] = &["plant::springs::add_gradient", "plant::springs::add_to_newton_matrix"];
+const SPRINGS: &[&str] = &["plant::potentials::"];
 const DAMPING: &[&str] = &["plant::forces::add_damping"];
 const INPUTS: &[&str] = &["plant::forces::input_forces"];
+const FORCES: &[&str] = &["Forces::", "forces::wrench::", "forces::point::", "forces::coordinate::"];
+const SIGNALS: &[&str] = &["plantd_models::signal::"];
+const BALLS: &[&str] = &["plant::balls::", "plantd_models::rotation::", "plant::blocks::"];
 
 /// A pendulum without anything else.
 const BARE: &str = r#"
@@ -74,13 +77,22 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
     };
     let bare = write("bare.toml", BARE);
     let sprung = write("sprung.toml", &format!("{BARE}{SPRINGS_OF_SPRUNG}"));
-    // Scene; has it constraints, springs, damping, inputs?
+    let element = |name: &str| {
+        format!("{}/../models/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"))
+    };
+    let [ball, drag, table] = ["ball", "drag", "table"].map(element);
+    // Scene; has it constraints, springs, damping, inputs, forces, signals, ball joints?
+    let (f, t) = (false, true);
     let cases = [
-        (bare.as_str(), [false, false, false, false]),
-        (sprung.as_str(), [false, true, false, false]),
-        ("chain-8", [false, false, false, true]),
-        ("damped-pendulum", [false, false, true, false]),
-        ("four-bar", [true, false, false, true]),
+        (bare.as_str(), [f, f, f, f, f, f, f]),
+        (sprung.as_str(), [f, t, f, f, f, f, f]),
+        ("chain-8", [f, f, f, t, f, f, f]),
+        ("damped-pendulum", [f, f, t, f, f, f, f]),
+        ("four-bar", [t, f, f, t, f, f, f]),
+        ("marionette", [t, f, t, f, f, f, f]),
+        (&ball, [f, f, f, t, f, f, t]),
+        (&drag, [f, f, f, f, t, f, f]),
+        (&table, [f, f, f, t, f, t, f]),
     ];
     for (scene, has) in cases {
         for operation in ["step", "linearize"] {
@@ -90,6 +102,9 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
                 ("springs", SPRINGS),
                 ("damping", DAMPING),
                 ("inputs", INPUTS),
+                ("forces", FORCES),
+                ("signals", SIGNALS),
+                ("ball joints", BALLS),
             ];
             for ((stage, functions), has) in stages.into_iter().zip(has) {
                 let cost = profile.of(functions);
