@@ -31,7 +31,8 @@ const CONSTRAINTS: &[&str] =
 const SPRINGS: &[&str] = &["plant::potentials::"];
 const DAMPING: &[&str] = &["plant::forces::add_damping"];
 const INPUTS: &[&str] = &["plant::forces::input_forces"];
-const FORCES: &[&str] = &["Forces::", "forces::wrench::", "forces::point::", "forces::coordinate::"];
+const FORCES: &[&str] =
+    &["Forces::", "forces::wrench::", "forces::point::", "forces::coordinate::"];
 const SIGNALS: &[&str] = &["plantd_models::signal::"];
 const BALLS: &[&str] = &["plant::balls::", "plantd_models::rotation::", "plant::blocks::"];
 
@@ -80,7 +81,7 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
     let element = |name: &str| {
         format!("{}/../models/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"))
     };
-    let [ball, drag, table] = ["ball", "drag", "table"].map(element);
+    let [ball, drag, signals] = ["ball", "drag", "signals"].map(element);
     // Scene; has it constraints, springs, damping, inputs, forces, signals, ball joints?
     let (f, t) = (false, true);
     let cases = [
@@ -92,7 +93,7 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
         ("marionette", [t, f, t, f, f, f, f]),
         (&ball, [f, f, f, t, f, f, t]),
         (&drag, [f, f, f, f, t, f, f]),
-        (&table, [f, f, f, t, f, t, f]),
+        (&signals, [f, f, f, t, f, t, f]),
     ];
     for (scene, has) in cases {
         for operation in ["step", "linearize"] {
