@@ -55,6 +55,7 @@ def test_linearization_at_a_point(client):
     here = client.linearize("cart-pole", at="upright")
     assert here.a.shape == (4, 4) and here.b.shape == (4, 1) and here.c.shape == (0, 4)
     assert here.controllability_rank == 4
+    assert 0 < here.report.reciprocal_condition <= 1
     again = client.linearize("cart-pole", state=here.state, u=here.u)
     assert again.a.tobytes() == here.a.tobytes()
 

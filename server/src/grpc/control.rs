@@ -100,7 +100,7 @@ fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeRe
     check_linearization(hub, plant.model())?;
     let state = convert::plant_state(&plant);
     let mut linearization = Linearization::new(plant.model());
-    plant.step_and_linearize(&u, &mut linearization)?;
+    let report = plant.step_and_linearize(&u, &mut linearization)?;
     let rank = control::controllability_rank(&linearization.a(), &linearization.b());
     Ok(v1::LinearizeResponse {
         linearization: Some(convert::linearization(state.step, &linearization)),
@@ -108,6 +108,7 @@ fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeRe
         controllability_rank: u32::try_from(rank).unwrap_or(u32::MAX),
         state: Some(state),
         u,
+        report: Some(convert::report(&report)),
     })
 }
 
@@ -194,15 +195,19 @@ impl LinearizedTrajectory {
             abandoned.check()?;
             let state = convert::plant_state(&self.plant);
             let u = self.inputs.get(self.steps_taken);
-            if let Err(error) = self.plant.step_and_linearize(u, &mut self.linearization) {
-                let fault = Fault::from(error).with("steps_taken", self.steps_taken);
-                portion.push_back(Err(fault));
-                self.steps_taken = self.inputs.count();
-                break;
-            }
+            let report = match self.plant.step_and_linearize(u, &mut self.linearization) {
+                Ok(report) => convert::report(&report),
+                Err(error) => {
+                    let fault = Fault::from(error).with("steps_taken", self.steps_taken);
+                    portion.push_back(Err(fault));
+                    self.steps_taken = self.inputs.count();
+                    break;
+                }
+            };
             portion.push_back(Ok(v1::LinearizeTrajectoryResponse {
                 linearization: Some(convert::linearization(state.step, &self.linearization)),
                 state: Some(state),
+                report: Some(report),
             }));
             self.steps_taken += 1;
         }

@@ -26,22 +26,22 @@ pub(super) fn linearize_second_order(
     check_second_order(hub, d.state() + d.constraints, d.state() + d.input())?;
     let state = convert::plant_state(&plant);
     let mut first = Linearization::new(&model);
-    let (tensors, contraction) = match request.weights {
+    let (report, tensors, contraction) = match request.weights {
         None => {
             let numbers = (d.state() + d.constraints) * (d.state() + d.input()).pow(2);
             let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in the tensors; give weights", numbers)?;
             let mut second = SecondOrder::new(&model)?;
-            plant.linearize_second_order(&u, &mut first, &mut second)?;
-            (Some(tensors(&second, d)), None)
+            let report = plant.linearize_second_order(&u, &mut first, &mut second)?;
+            (report, Some(tensors(&second, d)), None)
         }
         Some(weights) => {
             let x = weights_of("weights.x", weights.x, d.state())?;
             let multipliers =
                 weights_of("weights.multipliers", weights.multipliers, d.constraints)?;
             let mut sum = Contraction::new(&model);
-            plant.contract_second_order(&u, &x, &multipliers, &mut first, &mut sum)?;
-            (None, Some(contraction(&sum)))
+            let report = plant.contract_second_order(&u, &x, &multipliers, &mut first, &mut sum)?;
+            (report, None, Some(contraction(&sum)))
         }
     };
     plant.step(&u)?;
@@ -52,6 +52,7 @@ pub(super) fn linearize_second_order(
         u,
         tensors,
         contraction,
+        report: Some(convert::report(&report)),
     })
 }
 

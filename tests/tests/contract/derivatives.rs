@@ -72,6 +72,9 @@ async fn tensors_differences_and_contractions_agree() {
     let answer = client.linearize_second_order(of_plant(&id)).await.unwrap();
     assert_eq!(bits(answer.state.as_ref().unwrap()), bits(&state));
     assert_eq!((answer.u.as_slice(), answer.next.unwrap().step), ([0.4].as_slice(), 9));
+    let report = answer.report.unwrap();
+    let conditions = [report.reciprocal_condition, report.constraint_reciprocal_condition];
+    assert!(conditions.iter().all(|c| *c > 0.0 && *c <= 1.0), "{report:?}");
     let tensors = answer.tensors.unwrap();
     let (xx, xu) = (tensors.xx.unwrap(), tensors.xu.unwrap());
     let (mxx, muu) = (tensors.multipliers_xx.unwrap(), tensors.multipliers_uu.unwrap());

@@ -31,6 +31,7 @@ from ._types import (
     SecondOrder,
     Settled,
     State,
+    StepReport,
     Vector,
     Watched,
     matrix_message,
@@ -316,6 +317,7 @@ class Client:
             u=np.array(answer.u),
             next=State._from(answer.next),
             controllability_rank=answer.controllability_rank,
+            report=StepReport._from(answer.report),
         )
 
     def linearize_second_order(
@@ -456,7 +458,9 @@ class Client:
         )
         return self._messages(
             self.control.LinearizeTrajectory(request),
-            lambda m: Linearization._from(m.linearization, state=State._from(m.state)),
+            lambda m: Linearization._from(
+                m.linearization, state=State._from(m.state), report=StepReport._from(m.report)
+            ),
         )
 
     def solve_trajectory_lqr(

@@ -114,6 +114,8 @@ class Linearization:
     #: f(x, u) and the rank of (b, a b, a² b, ...), where the call says so.
     next: State | None = None
     controllability_rank: int | None = None
+    #: What the solver did, and how well conditioned the equations are, where the call says so.
+    report: StepReport | None = None
 
     @classmethod
     def _from(cls, m: common_pb2.Linearization, **extra: Any) -> Linearization:
@@ -162,7 +164,11 @@ class Contraction:
 
 def _linearized(m: control_service_pb2.LinearizeSecondOrderResponse) -> Linearization:
     return Linearization._from(
-        m.linearization, state=State._from(m.state), u=array(m.u), next=State._from(m.next)
+        m.linearization,
+        state=State._from(m.state),
+        u=array(m.u),
+        next=State._from(m.next),
+        report=StepReport._from(m.report),
     )
 
 
