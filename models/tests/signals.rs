@@ -126,6 +126,9 @@ fn signals_continue_bit_for_bit_after_a_snapshot() {
         step(&mut second);
         assert_eq!(first.snapshot().to_bytes(), second.snapshot().to_bytes());
     }
+    second.initialize(&Initial::Scene).unwrap();
+    second.set_step_index(first.step_index());
+    assert_eq!(first.effective_input(&[0.0]), second.effective_input(&[0.0]));
     first.initialize(&Initial::Scene).unwrap();
     assert_eq!(first.effective_input(&[0.0]), plant(&scene, |_| ()).effective_input(&[0.0]));
 }

@@ -436,12 +436,18 @@ impl Plant {
     }
 
     fn end_of_step_s(&self) -> f64 {
-        (self.state.step + 1) as f64 * self.settings.time_step_s
+        (self.state.step as f64 + 1.0) * self.settings.time_step_s
     }
 
     /// Steps since the plant was initialised.
     pub fn step_index(&self) -> u64 {
         self.state.step
+    }
+
+    /// Sets the steps since the plant was initialised, and with them the time of signals: for a plant
+    /// that goes on from a state of another one.
+    pub fn set_step_index(&mut self, step: u64) {
+        self.state.step = step;
     }
 
     /// `step_index × h`, s.
@@ -540,7 +546,7 @@ impl Plant {
         state.impulses.rotate_right(1);
         state.impulses[0].copy_from_slice(&workspace.multipliers);
         state.history = (state.history + 1).min(3);
-        state.step += 1;
+        state.step = state.step.saturating_add(1);
         workspace.move_on();
     }
 }

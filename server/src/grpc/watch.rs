@@ -179,6 +179,7 @@ impl Analysis {
         let momentum =
             Initial::Momentum { q: state.q.clone(), p: state.p.clone(), v: state.v.clone() };
         self.plant.initialize(&momentum).map_err(|error| Fault::from_initial(error, "state"))?;
+        self.plant.set_step_index(state.step);
         if wanted.energy {
             response.energy = Some(convert::energy(self.plant.energy()));
         }
