@@ -150,6 +150,8 @@ pub struct Golden {
     pub k2: Vec<Vec<f64>>,
     /// Energy of each state, J.
     pub energy_state: Vec<f64>,
+    /// Energy at the midpoint of each step, J.
+    pub energy_midpoint: Vec<f64>,
     /// First derivatives of some steps.
     pub linearization: Vec<LinearizationRecord>,
     /// Second derivatives of some of these steps.

@@ -7,8 +7,8 @@ use anyhow::{Context, Result, ensure};
 use nalgebra::DMatrix;
 use plantd_models::scene::Input;
 use plantd_models::{
-    Continuous, ContinuousPoint, Contraction, ForceSplit, Initial, Linearization, Model, Plant,
-    Scene, SecondOrder, Settings, builtin,
+    Continuous, ContinuousPoint, Contraction, Energy, ForceSplit, Initial, Linearization, Model,
+    Plant, Scene, SecondOrder, Settings, builtin,
 };
 use plantd_tests::reference::{
     ContinuousRecord, Golden, LinearizationRecord, Mechanism, Order, PaperStep, Rows,
@@ -17,6 +17,8 @@ use plantd_tests::reference::{
 
 /// Of q, p and multipliers, relative to the largest value of the trajectory.
 const TRAJECTORY_TOLERANCE: f64 = 1e-9;
+/// Of energies, relative to the larger of both kinds.
+const ENERGY_TOLERANCE: f64 = 1e-10;
 /// Of each block of first derivatives, relative to its largest entry.
 const DERIVATIVE_TOLERANCE: f64 = 1e-8;
 /// Of each block of second derivatives, relative to its largest entry.
@@ -97,14 +99,16 @@ impl Case {
             close(&at("v"), plant.v(), &golden.kin_velocity_v[k], 1e-9)?;
             if unconstrained {
                 // Elsewhere the reference takes the momentum as it is, this one its projection.
-                let energy = plant.energy();
-                let scale = energy.kinetic_j.abs().max(energy.potential_j.abs()).max(1.0);
-                let total = energy.kinetic_j + energy.potential_j;
-                close(&at("energy"), &[total], &golden.energy_state[k..=k], tolerance * scale)?;
+                energy(&at("energy"), plant.energy(), golden.energy_state[k])?;
             }
             if k == golden.u.len() {
                 break;
             }
+            let [start, end] = [k, k + 1].map(|k| order.coordinates(&golden.q[k]));
+            let middle: Vec<f64> = start.iter().zip(&end).map(|(a, b)| 0.5 * (a + b)).collect();
+            let rate: Vec<f64> = start.iter().zip(&end).map(|(a, b)| (b - a) / golden.dt).collect();
+            let found = plant.energy_at(&middle, &rate)?;
+            energy(&at("midpoint energy"), found, golden.energy_midpoint[k])?;
             plant.step(&[&golden.u[k][..], &golden.k2[k]].concat()).with_context(|| at("step"))?;
             let multipliers = plant.multipliers();
             close(&at("λ"), multipliers, &golden.lambda1[k], tolerance * lambda_scale)?;
@@ -423,6 +427,12 @@ impl Blocks<'_> {
         }
         Ok(())
     }
+}
+
+fn energy(what: &str, found: Energy, expected: f64) -> Result<()> {
+    let scale = found.kinetic_j.abs().max(found.potential_j.abs()).max(1.0);
+    let total = found.kinetic_j + found.potential_j;
+    close(what, &[total], &[expected], ENERGY_TOLERANCE * scale)
 }
 
 fn largest(values: &[f64]) -> f64 {

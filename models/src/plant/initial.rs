@@ -337,18 +337,19 @@ impl Plant {
     /// Energy of the state, with the projected momentum.
     pub fn energy(&mut self) -> Energy {
         let velocity = self.velocity();
-        let model = &self.model;
-        let workspace = &mut self.workspace;
-        workspace.gradient_at(model, &self.state, &velocity);
-        Energy {
-            kinetic_j: 0.5 * workspace.momenta.twice_kinetic_energy(&model.dynamics, &velocity),
-            potential_j: potential_energy(
-                model,
-                &workspace.poses,
-                &workspace.momenta,
-                &self.state.q,
-            ),
-        }
+        self.workspace.energy_of(&self.model, &self.state, &velocity)
+    }
+
+    /// Energy `T(q, v) + V(q)` at any configuration and velocity, both nd + nk, whether they satisfy
+    /// the constraints or not (allocates).
+    pub fn energy_at(&mut self, q: &[f64], v: &[f64]) -> Result<Energy, InitialError> {
+        let n = self.model.dimensions.coordinates();
+        let mut state = PreciseState::new(&self.model);
+        state.q = checked("q", q, n)?;
+        state.orient(&self.model);
+        let energy = self.workspace.energy_of(&self.model, &state, &checked("v", v, n)?);
+        self.workspace.forget();
+        Ok(energy)
     }
 }
 
@@ -376,6 +377,15 @@ fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f6
 }
 
 impl Workspace {
+    fn energy_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Energy {
+        self.gradient_at(model, state, velocity);
+        let (poses, momenta) = (&self.poses, &self.momenta);
+        Energy {
+            kinetic_j: 0.5 * momenta.twice_kinetic_energy(&model.dynamics, velocity),
+            potential_j: potential_energy(model, poses, momenta, &state.q),
+        }
+    }
+
     /// The state has changed: nothing of the last step holds.
     pub(crate) fn forget(&mut self) {
         self.start_is_valid = false;
