@@ -150,13 +150,15 @@ impl<S: Scalar> Blocks<S> {
                 self.l_qv[at(row) * n + at(column)] = qv;
             }
         }
-        potentials::for_each_second_derivative(
-            &model.potentials,
-            &model.dynamics,
-            &self.poses,
-            q,
-            |i, j, value| self.l_qq[i * n + j] -= value,
-        );
+        if model.potentials.any {
+            potentials::for_each_second_derivative(
+                &model.potentials,
+                &model.dynamics,
+                &self.poses,
+                q,
+                |i, j, value| self.l_qq[i * n + j] -= value,
+            );
+        }
     }
 
     /// Forces and their derivatives; poses and momenta are those of the last [`Self::evaluate`].

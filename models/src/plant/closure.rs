@@ -209,13 +209,23 @@ impl Constraint {
             }
             ConstraintKind::Axis(points, axis) => {
                 let at = points.separation(tree, poses);
-                for row in &points.path {
+                for (k, row) in points.path.iter().enumerate() {
                     let row_gradient = row.gradient_in_world(tree, poses, &at);
-                    for column in &points.path {
+                    for column in &points.path[..=k] {
                         let gradient = column.gradient_in_world(tree, poses, &at);
-                        let column_at = (column, gradient);
+                        let (row_at, column_at) = ((row, row_gradient), (column, gradient));
                         let second = row.second_in_world(row_gradient, tree, poses, column_at);
                         entry(row.coordinate, column.coordinate, second[*axis]);
+                        if row.joint == column.joint {
+                            continue;
+                        }
+                        // Only within a ball joint does the order matter.
+                        let mirrored = if tree.one_ball(row.joint, column.joint) {
+                            column.second_in_world(gradient, tree, poses, row_at)
+                        } else {
+                            second
+                        };
+                        entry(column.coordinate, row.coordinate, mirrored[*axis]);
                     }
                 }
             }
