@@ -437,12 +437,19 @@ impl Model {
             d.input()
         ));
         let joints = &self.dynamics.joints;
-        let revolute = joints.iter().filter(|j| j.kind == JointKind::Revolute).count();
+        let count = |is: fn(&JointKind) -> bool| joints.iter().filter(|j| is(&j.kind)).count();
+        let kinds = [
+            ("revolute", count(|kind| matches!(kind, JointKind::Revolute))),
+            ("prismatic", count(|kind| matches!(kind, JointKind::Prismatic))),
+            ("screw", count(|kind| matches!(kind, JointKind::Screw(_)))),
+            ("of ball joints", count(|kind| matches!(kind, JointKind::Ball(_)))),
+        ];
+        let kinds = kinds.iter().filter(|(_, n)| *n > 0).map(|(kind, n)| format!("{n} {kind}"));
         line(format!(
-            "midpoint      {} joints of {} moving frames: {revolute} revolute, {} prismatic",
+            "midpoint      {} axes of {} moving frames: {}",
             joints.len(),
-            self.scene.frames.iter().filter(|f| f.joint.is_some()).count(),
-            joints.len() - revolute
+            self.scene.frames.iter().filter(|f| !f.motions().is_empty()).count(),
+            kinds.collect::<Vec<_>>().join(", ")
         ));
         line(format!(
             "factorization tree-sparse, {} entries of {} in each triangle, {} {}",
