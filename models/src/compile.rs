@@ -12,6 +12,7 @@ use crate::model::{
     PointSpring, Polynomial, Potentials, Product, SplineSpring, Vector,
 };
 use crate::plant::conditioning::Conditioning;
+use crate::rotation::Quaternion;
 use crate::scene::{self, CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
 use crate::spatial::{Mat3, Sym3, Vec3};
 use crate::spline::Spline;
@@ -574,12 +575,7 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
         }
         Some(scene::Rotation::Quaternion(q)) => {
             let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
-            let [w, x, y, z] = q.map(|c| c / norm);
-            Mat3::from_rows([
-                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-                [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-                [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-            ])
+            Quaternion(q.map(|c| c / norm)).matrix()
         }
     }
 }

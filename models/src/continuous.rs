@@ -26,7 +26,7 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::Model;
-use crate::plant::balls::orientations;
+use crate::plant::balls::{orientations, three};
 use crate::plant::blocks::Blocks;
 use crate::plant::closure::Closure;
 use crate::plant::pivoted_lu::PivotedLu;
@@ -672,11 +672,6 @@ impl Equations<Dual> {
             self.multipliers[c] = Dual::new(at.multipliers[c], moved);
         }
     }
-}
-
-/// The three numbers that begin at `i`.
-fn three<S: Scalar>(values: &[S], i: usize) -> Vec3<S> {
-    Vec3([values[i], values[i + 1], values[i + 2]])
 }
 
 fn pairs<S: Scalar>(re: Vec3<S>, eps: Vec3<S>) -> Vec3<Dual<S>> {

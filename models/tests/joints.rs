@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{SPLITS, builtin, plant, wave, waving_input};
+use common::{SPLITS, builtin, plant, slope, wave, waving_input};
 use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
 use plantd_models::{
     Continuous, ContinuousPoint, Contraction, ForceSplit, Initial, Linearization, Plant, Scene,
@@ -12,20 +12,6 @@ use plantd_models::{
 fn element(name: &str) -> Scene {
     let path = format!("{}/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"));
     Scene::from_toml(&std::fs::read_to_string(path).unwrap()).unwrap()
-}
-
-/// Sixth-order central difference of a function with values `q`, `p`, `λ`.
-fn slope(delta: f64, mut along: impl FnMut(f64) -> Vec<f64>) -> Vec<f64> {
-    let stencil = [(1.0, 3.0 / 4.0), (2.0, -3.0 / 20.0), (3.0, 1.0 / 60.0)];
-    let mut sum = Vec::new();
-    for (k, weight) in stencil {
-        let (ahead, behind) = (along(k * delta), along(-k * delta));
-        sum.resize(ahead.len(), 0.0);
-        for ((sum, a), b) in sum.iter_mut().zip(ahead).zip(behind) {
-            *sum += weight / delta * (a - b);
-        }
-    }
-    sum
 }
 
 /// The linearization of a step against differences on the manifold.

@@ -21,14 +21,14 @@ use crate::rotation::{self, Quaternion};
 use crate::scalar::{Dual, Scalar};
 use crate::spatial::{Mat3, Vec3};
 
-/// The three numbers of `q` that begin at `i`.
-pub(crate) fn rotation_vector(q: &[f64], i: usize) -> Vec3 {
-    Vec3([q[i], q[i + 1], q[i + 2]])
+/// The three numbers that begin at `i`: those of a ball joint.
+pub(crate) fn three<S: Scalar>(values: &[S], i: usize) -> Vec3<S> {
+    Vec3([values[i], values[i + 1], values[i + 2]])
 }
 
 /// Orientations of all ball joints at `q`.
 pub(crate) fn orientations(model: &Model, q: &[f64]) -> Vec<Mat3> {
-    let matrix = |&i: &usize| Quaternion::exp(rotation_vector(q, i)).matrix();
+    let matrix = |&i: &usize| Quaternion::exp(three(q, i)).matrix();
     model.orientations.iter().map(matrix).collect()
 }
 
@@ -44,8 +44,7 @@ impl Model {
         assert!(q.len() == n && change.len() == n, "a configuration has {n} coordinates");
         let mut moved: Vec<f64> = q.iter().zip(change).map(|(q, change)| q + change).collect();
         for &i in &self.orientations {
-            let turned = Quaternion::exp(rotation_vector(q, i))
-                .times(Quaternion::exp(rotation_vector(change, i)));
+            let turned = Quaternion::exp(three(q, i)).times(Quaternion::exp(three(change, i)));
             moved[i..i + 3].copy_from_slice(&turned.log().0);
         }
         moved
@@ -62,9 +61,8 @@ impl Model {
         assert!(q.len() == n && reference.len() == n, "a configuration has {n} coordinates");
         let mut change: Vec<f64> = q.iter().zip(reference).map(|(q, r)| q - r).collect();
         for &i in &self.orientations {
-            let turned = Quaternion::exp(rotation_vector(reference, i))
-                .inverse()
-                .times(Quaternion::exp(rotation_vector(q, i)));
+            let turned =
+                Quaternion::exp(three(reference, i)).inverse().times(Quaternion::exp(three(q, i)));
             change[i..i + 3].copy_from_slice(&turned.log().0);
         }
         change
@@ -175,7 +173,7 @@ impl Workspace {
         for (o, &i) in model.orientations.iter().enumerate() {
             self.orientations_start[o] = state.orientations[o].matrix();
             if i >= model.dimensions.dynamic {
-                let end = Quaternion::exp(rotation_vector(&self.q_end, i));
+                let end = Quaternion::exp(three(&self.q_end, i));
                 let turn = state.orientations[o].inverse().times(end).log();
                 self.turns[o] = turn;
                 self.orientations_mid[o] =
@@ -191,7 +189,7 @@ impl Workspace {
     pub(crate) fn turn_to_midpoint(&mut self, model: &Model) {
         for (o, &i) in model.orientations.iter().enumerate() {
             if i < model.dimensions.dynamic {
-                let turn = rotation_vector(&self.increment, i);
+                let turn = three(&self.increment, i);
                 self.turns[o] = turn;
                 self.orientations_mid[o] =
                     self.orientations_start[o].times(&rotation::exp(turn * 0.5));
@@ -203,7 +201,7 @@ impl Workspace {
     pub(crate) fn turn_to_end(&mut self, model: &Model) {
         for (o, &i) in model.orientations.iter().enumerate() {
             if i < model.dimensions.dynamic {
-                let turn = rotation_vector(&self.increment, i);
+                let turn = three(&self.increment, i);
                 self.orientations_end[o] = self.orientations_start[o].times(&rotation::exp(turn));
             }
         }
@@ -248,9 +246,9 @@ impl Workspace {
     pub(crate) fn turn_end_jacobian(&mut self, model: &Model) {
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
         for &i in model.orientations.iter().filter(|i| **i < nd) {
-            let to_end = rotation::dexp(rotation_vector(&self.increment, i));
+            let to_end = rotation::dexp(three(&self.increment, i));
             for row in self.end.jacobian.chunks_exact_mut(n) {
-                let turned = to_end.apply_transposed(rotation_vector(row, i));
+                let turned = to_end.apply_transposed(three(row, i));
                 row[i..i + 3].copy_from_slice(&turned.0);
             }
         }
@@ -270,9 +268,8 @@ impl Workspace {
                 continue;
             }
             let turn = self.turns[o];
-            let momentum = rotation_vector(&self.l_v, i);
-            let torque = rotation_vector(&self.l_q, i) * (0.5 * h)
-                + rotation_vector(&self.force, i) * weight;
+            let momentum = three(&self.l_v, i);
+            let torque = three(&self.l_q, i) * (0.5 * h) + three(&self.force, i) * weight;
             let momentum = rotation::momentum_at_start(turn).apply(momentum);
             let torque = rotation::torque_at_start(turn).apply(torque);
             for a in 0..3 {
@@ -291,8 +288,8 @@ impl Workspace {
                 continue;
             }
             let turn = self.turns[o];
-            let carried = rotation_vector(&self.l_v, i).cross(turn);
-            let force = rotation_vector(&self.force, i);
+            let carried = three(&self.l_v, i).cross(turn);
+            let force = three(&self.force, i);
             let split = (rotation::torque_at_start(turn).apply(force) - force) * skew;
             for a in 0..3 {
                 self.impulse[i + a] += carried[a] + split[a];
@@ -305,12 +302,11 @@ impl Workspace {
         for (o, &i) in model.orientations.iter().enumerate() {
             let orientation = &mut state.orientations[o];
             if i < model.dimensions.dynamic {
-                *orientation =
-                    orientation.times(Quaternion::exp(rotation_vector(&self.increment, i)));
+                *orientation = orientation.times(Quaternion::exp(three(&self.increment, i)));
                 state.q[i..i + 3].copy_from_slice(&orientation.log().0);
                 state.q_low[i..i + 3].fill(0.0);
             } else {
-                *orientation = Quaternion::exp(rotation_vector(&self.q_end, i));
+                *orientation = Quaternion::exp(three(&self.q_end, i));
             }
         }
     }

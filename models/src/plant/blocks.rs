@@ -6,7 +6,7 @@
 
 use crate::Model;
 use crate::model::{CoordinateInput, Forces};
-use crate::plant::balls::Turning;
+use crate::plant::balls::{Turning, three};
 use crate::plant::closure::Closure;
 use crate::plant::curvature::Curvature;
 use crate::plant::forces::Instant;
@@ -328,7 +328,7 @@ impl<S: Scalar> StepBlocks<S> {
         }
         self.turnings.clear();
         for (o, &i) in model.orientations.iter().enumerate() {
-            let turn = Vec3([self.next[i], self.next[i + 1], self.next[i + 2]]);
+            let turn = three(&self.next, i);
             self.velocity[i..i + 3].copy_from_slice(&turn.scaled(1.0 / h).0);
             let start = self.orientations[0][o];
             self.orientations[1][o] = start.times(&rotation::exp(turn.scaled(0.5)));
@@ -474,9 +474,8 @@ impl<S: Scalar> StepBlocks<S> {
                 }
             }
             // The maps turn with the joint's own increment.
-            let three = |v: &[S]| Vec3([v[i], v[i + 1], v[i + 2]]);
             let (torque, momentum, force) =
-                (three(&self.mid.l_q), three(&self.mid.l_v), three(&self.mid.force));
+                (three(&self.mid.l_q, i), three(&self.mid.l_v, i), three(&self.mid.force, i));
             let impulse = torque.scaled(0.5 * h) + force.scaled(split);
             let [residuals, forces] = turning.by_turn(impulse, momentum, force);
             for b in 0..3 {

@@ -2,7 +2,7 @@
 //! velocity and energy that belong to a state.
 
 use crate::Model;
-use crate::plant::balls::{orientations, rotation_vector};
+use crate::plant::balls::{orientations, three};
 use crate::plant::closure::Closure;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
@@ -217,7 +217,7 @@ impl Plant {
             workspace.q_mid[i] = q0[i] + 0.5 * change[i];
             workspace.velocity[i] = change[i] / h;
         }
-        let turns = self.model.orientations.iter().map(|&i| rotation_vector(&change, i));
+        let turns = self.model.orientations.iter().map(|&i| three(&change, i));
         let orientations = orientations(&self.model, q0);
         for (o, turn) in turns.enumerate() {
             workspace.turns[o] = turn;
@@ -238,8 +238,8 @@ impl Plant {
         for (o, &i) in self.model.orientations.iter().enumerate() {
             if let Some(momentum) = momentum.get_mut(i..i + 3) {
                 let turn = workspace.turns[o];
-                let carried = rotation::momentum_at_start(turn)
-                    .apply_transposed(rotation_vector(&workspace.l_v, i));
+                let carried =
+                    rotation::momentum_at_start(turn).apply_transposed(three(&workspace.l_v, i));
                 let torque = rotation::torque_at_start(turn).apply_transposed(Vec3([
                     torque(i),
                     torque(i + 1),

@@ -35,7 +35,7 @@ use nalgebra::DMatrix;
 use crate::Model;
 use crate::rotation::Quaternion;
 use crate::signal::Target;
-use balls::rotation_vector;
+use balls::three;
 use newton::Workspace;
 
 pub use diagnose::Diagnostics;
@@ -281,7 +281,7 @@ impl PreciseState {
     /// Takes the orientations from `q`.
     fn orient(&mut self, model: &Model) {
         for (orientation, &i) in self.orientations.iter_mut().zip(&model.orientations) {
-            *orientation = Quaternion::exp(rotation_vector(&self.q, i));
+            *orientation = Quaternion::exp(three(&self.q, i));
             self.q[i..i + 3].copy_from_slice(&orientation.log().0);
         }
     }

@@ -25,7 +25,7 @@
 use nalgebra::DMatrix;
 
 use crate::Model;
-use crate::plant::balls::{Turning, rotation_vector};
+use crate::plant::balls::{Turning, three};
 use crate::plant::blocks::{StepBlocks, non_zero};
 use crate::plant::linearize::Linearization;
 use crate::plant::newton::Workspace;
@@ -517,8 +517,8 @@ impl Plant {
         let (first, second) = out.adjoint.split_at_mut(nd);
         first.copy_from_slice(&z[..nd]);
         for &i in model.orientations.iter().filter(|i| **i < nd) {
-            let to_end = rotation::dexp(rotation_vector(&workspace.increment, i));
-            let turned = to_end.apply_transposed(rotation_vector(z, i));
+            let to_end = rotation::dexp(three(&workspace.increment, i));
+            let turned = to_end.apply_transposed(three(z, i));
             first[i..i + 3].copy_from_slice(&turned.0);
         }
         for (row, z) in workspace.end_slopes.chunks_exact(nd.max(1)).zip(z_p) {
