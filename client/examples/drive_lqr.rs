@@ -10,8 +10,11 @@ async fn main() -> plantd_client::Result<()> {
     let address = std::env::args().nth(1).unwrap_or_else(|| DEFAULT_ADDRESS.to_owned());
     let client = Client::connect(address).await?;
 
-    let weights =
-        v1::LqrWeights { q: Some(diagonal([100.0, 1.0])), r: Some(diagonal([1.0])), q_final: None };
+    let weights = v1::LqrWeights {
+        q: Some(diagonal([100.0, 1.0])),
+        r: Some(diagonal([1.0])),
+        ..Default::default()
+    };
     let request = v1::SolveLqrRequest {
         model: "pendulum".to_owned(),
         point: Some(operating_point("upright")),

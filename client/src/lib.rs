@@ -12,7 +12,7 @@
 //! let weights = v1::LqrWeights {
 //!     q: Some(diagonal([100.0, 1.0])),
 //!     r: Some(diagonal([1.0])),
-//!     q_final: None,
+//!     ..Default::default()
 //! };
 //! let regulator = client
 //!     .solve_lqr(v1::SolveLqrRequest {

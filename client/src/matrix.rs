@@ -114,6 +114,7 @@ mod tests {
             x_reference: vec![1.0, 0.5],
             u_reference: vec![10.0],
             rotations: Vec::new(),
+            ..Default::default()
         };
         let state = v1::State { q: vec![2.0], p: vec![0.0], ..Default::default() };
         assert_eq!(gain.control(&state), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);

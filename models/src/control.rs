@@ -21,6 +21,8 @@ mod error;
 mod finite_horizon;
 mod frequency;
 mod infinite_horizon;
+#[allow(dead_code, reason = "regulators and trajectory optimisation build on it")]
+mod lq;
 mod manifold;
 mod modes;
 mod spectrum;

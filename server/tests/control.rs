@@ -37,7 +37,7 @@ fn weights(q: &[f64], r: &[f64]) -> v1::LqrWeights {
     let diagonal = |values: &[f64]| v1::Weight {
         form: Some(v1::weight::Form::Diagonal(v1::Diagonal { values: values.to_vec() })),
     };
-    v1::LqrWeights { q: Some(diagonal(q)), r: Some(diagonal(r)), q_final: None }
+    v1::LqrWeights { q: Some(diagonal(q)), r: Some(diagonal(r)), ..Default::default() }
 }
 
 fn at(operating_point: &str) -> v1::Point {

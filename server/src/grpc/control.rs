@@ -133,11 +133,13 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
             x_reference: convert::x(&plant),
             u_reference: u,
             rotations: convert::rotations(plant.model()),
+            feedforward: Vec::new(),
         }),
         value: Some(convert::matrix(&value)),
         spectral_radius,
         residual,
         iterations,
+        ..Default::default()
     })
 }
 
@@ -360,8 +362,9 @@ impl Iterator for TrajectoryRegulator {
             x_reference: state.x(),
             u_reference: u,
             rotations: self.rotations.clone(),
+            feedforward: Vec::new(),
         };
-        Some(v1::SolveTrajectoryLqrResponse { gain: Some(gain) })
+        Some(v1::SolveTrajectoryLqrResponse { gain: Some(gain), ..Default::default() })
     }
 }
 
@@ -370,6 +373,9 @@ impl v1::control_service_server::ControlService for ControlService {
     type LinearizeTrajectoryStream = Answers<v1::LinearizeTrajectoryResponse>;
     type SolveTrajectoryLqrStream = Answers<v1::SolveTrajectoryLqrResponse>;
     type RolloutStream = Answers<v1::RolloutResponse>;
+    type OptimizeTrajectoryStream = Answers<v1::OptimizeTrajectoryResponse>;
+    type ProjectReferenceStream = Answers<v1::ProjectReferenceResponse>;
+    type SolveTrajectoryKalmanStream = Answers<v1::SolveTrajectoryKalmanResponse>;
 
     async fn linearize(
         &self,
@@ -450,5 +456,33 @@ impl v1::control_service_server::ControlService for ControlService {
         let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
         let job = move |abandoned: &Abandoned| analysis::analyze(&hub, request, abandoned);
         Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn optimize_trajectory(
+        &self,
+        _: Request<v1::OptimizeTrajectoryRequest>,
+    ) -> Result<Response<Self::OptimizeTrajectoryStream>, Status> {
+        Err(Status::unimplemented("optimize_trajectory"))
+    }
+
+    async fn project_reference(
+        &self,
+        _: Request<v1::ProjectReferenceRequest>,
+    ) -> Result<Response<Self::ProjectReferenceStream>, Status> {
+        Err(Status::unimplemented("project_reference"))
+    }
+
+    async fn solve_kalman(
+        &self,
+        _: Request<v1::SolveKalmanRequest>,
+    ) -> Result<Response<v1::SolveKalmanResponse>, Status> {
+        Err(Status::unimplemented("solve_kalman"))
+    }
+
+    async fn solve_trajectory_kalman(
+        &self,
+        _: Request<v1::SolveTrajectoryKalmanRequest>,
+    ) -> Result<Response<Self::SolveTrajectoryKalmanStream>, Status> {
+        Err(Status::unimplemented("solve_trajectory_kalman"))
     }
 }

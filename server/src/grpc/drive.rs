@@ -145,6 +145,7 @@ impl Driving {
             state: Some(state),
             report: Some(convert::report(&report)),
             linearization,
+            u: Vec::new(),
         }))
     }
 }

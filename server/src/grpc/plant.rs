@@ -131,7 +131,7 @@ impl StepPlan {
         if !self.all_states {
             states.push(lease.with_plant(convert::plant_state));
         }
-        Ok(v1::StepResponse { states, report })
+        Ok(v1::StepResponse { states, report, u: Vec::new() })
     }
 }
 
@@ -146,6 +146,8 @@ pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
         state: Some(convert::state(&session.state(), settings.time_step_s)),
         driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
         link_open: session.link_open(),
+        feedback: None,
+        parameters: Vec::new(),
     }
 }
 
@@ -153,6 +155,7 @@ pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
 impl v1::plant_service_server::PlantService for PlantService {
     type DriveStream = DriveStream;
     type WatchStream = Answers<v1::WatchResponse>;
+    type WatchGainsStream = Answers<v1::WatchGainsResponse>;
 
     async fn create_plant(
         &self,
@@ -263,6 +266,34 @@ impl v1::plant_service_server::PlantService for PlantService {
         };
         let state = Some(self.put(&id, change).await?);
         Ok(Response::new(v1::RestoreResponse { state }))
+    }
+
+    async fn set_parameters(
+        &self,
+        _: Request<v1::SetParametersRequest>,
+    ) -> Result<Response<v1::SetParametersResponse>, Status> {
+        Err(Status::unimplemented("set_parameters"))
+    }
+
+    async fn set_feedback(
+        &self,
+        _: Request<v1::SetFeedbackRequest>,
+    ) -> Result<Response<v1::SetFeedbackResponse>, Status> {
+        Err(Status::unimplemented("set_feedback"))
+    }
+
+    async fn clear_feedback(
+        &self,
+        _: Request<v1::ClearFeedbackRequest>,
+    ) -> Result<Response<v1::ClearFeedbackResponse>, Status> {
+        Err(Status::unimplemented("clear_feedback"))
+    }
+
+    async fn watch_gains(
+        &self,
+        _: Request<v1::WatchGainsRequest>,
+    ) -> Result<Response<Self::WatchGainsStream>, Status> {
+        Err(Status::unimplemented("watch_gains"))
     }
 
     async fn diagnose(

@@ -42,7 +42,7 @@ impl Wanted {
                 Ok(WatchField::Energy) => wanted.energy = true,
                 Ok(WatchField::Linearization) => wanted.linearization = true,
                 Ok(WatchField::Gain) => wanted.gain = true,
-                Ok(WatchField::Unspecified) | Err(_) => {
+                Ok(WatchField::Unspecified | WatchField::Input) | Err(_) => {
                     let problem = format!("{field} is nothing to watch");
                     return Err(Fault::field(format!("fields[{index}]"), problem));
                 }
@@ -197,6 +197,7 @@ impl Analysis {
                 x_reference: state.x(),
                 u_reference: frame.input.clone(),
                 rotations: convert::rotations(self.plant.model()),
+                feedforward: Vec::new(),
             });
         }
         Ok(())

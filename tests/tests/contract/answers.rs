@@ -199,7 +199,7 @@ async fn an_lqr_gain_balances_the_pendulum() {
         weights: Some(v1::LqrWeights {
             q: Some(diagonal([100.0, 1.0])),
             r: Some(diagonal([1.0])),
-            q_final: None,
+            ..Default::default()
         }),
         ..Default::default()
     };

@@ -93,7 +93,7 @@ async fn a_gain_turns_a_ball_joint_the_short_way() {
         weights: Some(v1::LqrWeights {
             q: Some(diagonal([[100.0; 3], [1.0; 3]].concat())),
             r: Some(diagonal([1.0; 3])),
-            q_final: None,
+            ..Default::default()
         }),
         ..Default::default()
     };

@@ -220,7 +220,7 @@ async fn points_and_weights_are_checked() {
         let request = v1::SolveLqrRequest {
             model: "pendulum".to_owned(),
             point,
-            weights: Some(v1::LqrWeights { q, r, q_final: None }),
+            weights: Some(v1::LqrWeights { q, r, ..Default::default() }),
             ..Default::default()
         };
         client.solve_lqr(request).await

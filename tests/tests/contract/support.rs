@@ -83,7 +83,7 @@ pub(crate) fn unit_weights(states: usize, inputs: usize) -> v1::LqrWeights {
     v1::LqrWeights {
         q: Some(plantd_client::diagonal(vec![1.0; states])),
         r: Some(plantd_client::diagonal(vec![1.0; inputs])),
-        q_final: None,
+        ..Default::default()
     }
 }
 

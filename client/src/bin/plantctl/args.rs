@@ -390,7 +390,7 @@ impl Weights {
         v1::LqrWeights {
             q: Some(weight(&self.q, 2 * model.coordinates.len())),
             r: Some(weight(&self.r, model.inputs.len() + prescribed)),
-            q_final: None,
+            ..Default::default()
         }
     }
 }

@@ -164,7 +164,7 @@ async fn gains(
     let weights = v1::LqrWeights {
         q: Some(diagonal(q)),
         r: Some(diagonal(vec![1.0; inputs])),
-        q_final: None,
+        ..Default::default()
     };
     let trajectory =
         v1::Trajectory { initial: Some(start), u: Some(v1::Matrix::from_rows(&reference.rows)) };
@@ -175,6 +175,7 @@ async fn gains(
         weights: Some(weights),
         // As the paper does; the manifold is the better choice for a new design.
         constraints: v1::ConstraintHandling::Full.into(),
+        ..Default::default()
     };
     let mut answers = client.solve_trajectory_lqr(request).await?;
     let mut gains = Vec::with_capacity(STEPS + 1);

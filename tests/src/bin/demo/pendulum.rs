@@ -103,8 +103,11 @@ async fn paper_step(client: &Client) -> Result<PaperStep> {
 
 /// The server's LQR about the upright equilibrium.
 async fn regulator(client: &Client) -> Result<v1::SolveLqrResponse> {
-    let weights =
-        v1::LqrWeights { q: Some(diagonal([100.0, 1.0])), r: Some(diagonal([1.0])), q_final: None };
+    let weights = v1::LqrWeights {
+        q: Some(diagonal([100.0, 1.0])),
+        r: Some(diagonal([1.0])),
+        ..Default::default()
+    };
     let request = v1::SolveLqrRequest {
         model: MODEL.to_owned(),
         settings: Some(v1::PlantSettings { time_step_s: TIME_STEP_S, ..Default::default() }),
