@@ -3,22 +3,19 @@
 
 use std::f64::consts::PI;
 
-use plantd_client::{Client, DEFAULT_ADDRESS, GainExt as _, diagonal, operating_point, v1};
+use plantd_client::{
+    Client, DEFAULT_ADDRESS, GainExt as _, diagonal, operating_point, v1, weights,
+};
 
 #[tokio::main]
 async fn main() -> plantd_client::Result<()> {
     let address = std::env::args().nth(1).unwrap_or_else(|| DEFAULT_ADDRESS.to_owned());
     let client = Client::connect(address).await?;
 
-    let weights = v1::LqrWeights {
-        q: Some(diagonal([100.0, 1.0])),
-        r: Some(diagonal([1.0])),
-        ..Default::default()
-    };
     let request = v1::SolveLqrRequest {
         model: "pendulum".to_owned(),
         point: Some(operating_point("upright")),
-        weights: Some(weights),
+        weights: Some(weights(diagonal([100.0, 1.0]), diagonal([1.0]))),
         ..Default::default()
     };
     let gain = client.solve_lqr(request).await?.gain.unwrap_or_default();

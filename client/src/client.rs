@@ -53,6 +53,10 @@ impl Client {
         self.channel.clone()
     }
 
+    pub(crate) fn request_timeout(&self) -> std::time::Duration {
+        self.options.request_timeout
+    }
+
     /// A request that the server gives up after the connection's request timeout.
     fn limited<T>(&self, message: T) -> tonic::Request<T> {
         let mut request = tonic::Request::new(message);
@@ -220,6 +224,37 @@ impl Client {
         answer.state.ok_or(Error::Protocol("an answer without a state"))
     }
 
+    /// Changes numbers of a plant's scene, or its time step, between two steps; the state stays.
+    pub async fn set_parameters(&self, request: v1::SetParametersRequest) -> Result<v1::PlantInfo> {
+        let answer = self.plants().set_parameters(self.limited(request)).await?.into_inner();
+        answer.plant.ok_or(Error::Protocol("an answer without a plant"))
+    }
+
+    /// Gives a plant a reference with its regulator: for [`Client::watch_gains`], and for the plant's
+    /// own loop if the request's mode says so. The gains hold when the answer comes.
+    pub async fn set_feedback(&self, request: v1::SetFeedbackRequest) -> Result<v1::FeedbackInfo> {
+        let answer = self.plants().set_feedback(self.limited(request)).await?.into_inner();
+        answer.feedback.ok_or(Error::Protocol("an answer without a feedback"))
+    }
+
+    /// Takes the reference of a plant away; the driver's input acts alone again.
+    pub async fn clear_feedback(&self, id: impl Into<String>) -> Result<()> {
+        let request = v1::ClearFeedbackRequest { id: id.into() };
+        self.plants().clear_feedback(self.limited(request)).await?;
+        Ok(())
+    }
+
+    /// The gains of a plant's feedback as they are computed: along a trajectory all from the present
+    /// step on, ahead of time; about an operating point the one in force and each that replaces it.
+    pub async fn watch_gains(
+        &self,
+        id: impl Into<String>,
+    ) -> Result<Answers<v1::WatchGainsResponse>> {
+        let request = v1::WatchGainsRequest { id: id.into() };
+        let mut stub = self.plants();
+        self.open(stub.watch_gains(request)).await
+    }
+
     /// Opens the shared-memory link of a plant and says how to reach it.
     pub async fn open_link(&self, id: impl Into<String>) -> Result<v1::OpenLinkResponse> {
         let request = v1::OpenLinkRequest { id: id.into() };
@@ -227,7 +262,8 @@ impl Client {
     }
 }
 
-/// Linearizations, analysis, regulators and rollouts; nothing here changes a plant.
+/// Linearizations, analysis, regulators, filters, optimisation and rollouts; nothing here changes a
+/// plant.
 impl Client {
     /// Linearizes the map of a model at one point.
     pub async fn linearize(&self, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse> {
@@ -277,6 +313,43 @@ impl Client {
     ) -> Result<Answers<v1::SolveTrajectoryLqrResponse>> {
         let mut stub = self.control();
         self.open(stub.solve_trajectory_lqr(request)).await
+    }
+
+    /// Finds a trajectory of least cost: one message per iteration, the result last. Dropping the
+    /// answers ends the search.
+    pub async fn optimize_trajectory(
+        &self,
+        request: v1::OptimizeTrajectoryRequest,
+    ) -> Result<Answers<v1::OptimizeTrajectoryResponse>> {
+        let mut stub = self.control();
+        self.open(stub.optimize_trajectory(request)).await
+    }
+
+    /// Compares a configuration trajectory from outside with the motions of the plant and finds one
+    /// that follows it: the report first, then one message per step.
+    pub async fn project_reference(
+        &self,
+        request: v1::ProjectReferenceRequest,
+    ) -> Result<Answers<v1::ProjectReferenceResponse>> {
+        let mut stub = self.control();
+        self.open(stub.project_reference(request)).await
+    }
+
+    /// Steady-state Kalman filter about an equilibrium.
+    pub async fn solve_kalman(
+        &self,
+        request: v1::SolveKalmanRequest,
+    ) -> Result<v1::SolveKalmanResponse> {
+        Ok(self.control().solve_kalman(self.limited(request)).await?.into_inner())
+    }
+
+    /// Time-varying Kalman filter along a trajectory: one message per state, the initial one first.
+    pub async fn solve_trajectory_kalman(
+        &self,
+        request: v1::SolveTrajectoryKalmanRequest,
+    ) -> Result<Answers<v1::SolveTrajectoryKalmanResponse>> {
+        let mut stub = self.control();
+        self.open(stub.solve_trajectory_kalman(request)).await
     }
 
     /// Runs many simulations at once; answers come in the order in which they end.

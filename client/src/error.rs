@@ -36,6 +36,25 @@ pub enum Error {
     /// The server ended a stream that should have gone on.
     #[error("the server closed the stream")]
     StreamClosed,
+    /// A feedback law was asked about a state of another plant.
+    #[error("the state has {actual} entries; the gain is for {expected}")]
+    StateLength {
+        /// Entries that the law's references have.
+        expected: usize,
+        /// Entries of the state.
+        actual: usize,
+    },
+    /// A feedback law was asked about a step whose gain the server no longer sends.
+    #[error("the plant has left step {step} behind: its gains begin at step {first}")]
+    GainPassed {
+        /// The step.
+        step: u64,
+        /// The first step that has a gain.
+        first: u64,
+    },
+    /// Gains from which no feedback law can be made.
+    #[error("these gains make no schedule: {0}")]
+    Gains(&'static str),
     /// The server sent something that the contract does not allow: versions do not fit.
     #[error("unexpected answer from the server: {0}")]
     Protocol(&'static str),

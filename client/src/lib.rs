@@ -5,20 +5,15 @@
 //! one call per step:
 //!
 //! ```no_run
-//! use plantd_client::{Client, GainExt, diagonal, operating_point, v1};
+//! use plantd_client::{Client, GainExt, diagonal, operating_point, v1, weights};
 //!
 //! # async fn balance() -> plantd_client::Result<()> {
 //! let client = Client::connect("http://127.0.0.1:50051").await?;
-//! let weights = v1::LqrWeights {
-//!     q: Some(diagonal([100.0, 1.0])),
-//!     r: Some(diagonal([1.0])),
-//!     ..Default::default()
-//! };
 //! let regulator = client
 //!     .solve_lqr(v1::SolveLqrRequest {
 //!         model: "pendulum".to_owned(),
 //!         point: Some(operating_point("upright")),
-//!         weights: Some(weights),
+//!         weights: Some(weights(diagonal([100.0, 1.0]), diagonal([1.0]))),
 //!         ..Default::default()
 //!     })
 //!     .await?;
@@ -54,6 +49,7 @@ mod channel;
 mod client;
 mod driver;
 mod error;
+mod follower;
 pub mod link;
 mod matrix;
 mod rotation;
@@ -63,7 +59,11 @@ pub use channel::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use client::Client;
 pub use driver::Driver;
 pub use error::{Error, Refusal, Result, Violation};
-pub use matrix::{GainExt, MatrixExt, StateExt, diagonal, operating_point, present_state};
+pub use follower::{Follower, GainSchedule, LawState};
+pub use matrix::{
+    GainExt, MatrixExt, StateExt, WeightsExt, diagonal, full, operating_point, present_state,
+    weights,
+};
 pub use rotation::{difference, rotations};
 pub use stream::Answers;
 

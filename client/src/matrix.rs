@@ -67,18 +67,33 @@ impl StateExt for v1::State {
 
 /// Use of [`v1::Gain`].
 pub trait GainExt {
-    /// The feedback law `u = u_reference − K (x − x_reference)`.
+    /// The feedback law `u = u_reference + feedforward − K (x − x_reference)`.
     ///
     /// Differences of angles are taken as they are: a joint that has turned by 2π is 2π away. Those of
     /// ball joints are rotation vectors, see [`difference`].
+    ///
+    /// # Panics
+    /// If the state has not as many entries as `K` has columns.
     fn control(&self, state: &v1::State) -> Vec<f64>;
+    /// The same for a state vector `x = (q, p, v)`.
+    ///
+    /// # Panics
+    /// If `x` has not as many entries as `K` has columns.
+    fn control_at(&self, x: &[f64]) -> Vec<f64>;
 }
 
 impl GainExt for v1::Gain {
     fn control(&self, state: &v1::State) -> Vec<f64> {
-        let error = difference(&self.x_reference, &state.x(), &self.rotations);
+        self.control_at(&state.x())
+    }
+
+    fn control_at(&self, x: &[f64]) -> Vec<f64> {
+        let error = difference(&self.x_reference, x, &self.rotations);
         let correction = self.k.as_ref().map(|k| k.times(&error)).unwrap_or_default();
         let mut u = self.u_reference.clone();
+        for (u, forward) in u.iter_mut().zip(&self.feedforward) {
+            *u += forward;
+        }
         for (u, du) in u.iter_mut().zip(correction) {
             *u -= du;
         }
@@ -97,6 +112,34 @@ pub fn diagonal(values: impl Into<Vec<f64>>) -> v1::Weight {
     v1::Weight { form: Some(v1::weight::Form::Diagonal(diagonal)) }
 }
 
+/// A weight that is a full symmetric matrix.
+pub fn full(matrix: v1::Matrix) -> v1::Weight {
+    v1::Weight { form: Some(v1::weight::Form::Full(matrix)) }
+}
+
+/// Weights of a regulator: `Σ ½ xᵀ q x + ½ uᵀ r u`, the final one being `q` as well.
+pub fn weights(q: v1::Weight, r: v1::Weight) -> v1::LqrWeights {
+    v1::LqrWeights { q: Some(q), r: Some(r), ..Default::default() }
+}
+
+/// Parts of [`v1::LqrWeights`] that not everybody needs.
+pub trait WeightsExt: Sized {
+    /// With the cross term `xᵀ s u`; `s` has a row per entry of x and a column per entry of u.
+    fn with_cross(self, s: v1::Matrix) -> Self;
+    /// With `½ xᵀ q_final x` at the end of a finite horizon.
+    fn with_final(self, q_final: v1::Weight) -> Self;
+}
+
+impl WeightsExt for v1::LqrWeights {
+    fn with_cross(self, s: v1::Matrix) -> Self {
+        Self { s: Some(s), ..self }
+    }
+
+    fn with_final(self, q_final: v1::Weight) -> Self {
+        Self { q_final: Some(q_final), ..self }
+    }
+}
+
 /// The operating point of that name, where a linearization or a regulator is wanted.
 pub fn operating_point(name: impl Into<String>) -> v1::Point {
     v1::Point { source: Some(v1::point::Source::OperatingPoint(name.into())) }
@@ -113,11 +156,22 @@ mod tests {
             k: Some(v1::Matrix::from_rows(&[[2.0, 3.0]])),
             x_reference: vec![1.0, 0.5],
             u_reference: vec![10.0],
-            rotations: Vec::new(),
             ..Default::default()
         };
         let state = v1::State { q: vec![2.0], p: vec![0.0], ..Default::default() };
         assert_eq!(gain.control(&state), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);
+        let forward = v1::Gain { feedforward: vec![0.25], ..gain };
+        assert_eq!(forward.control_at(&[2.0, 0.0]), [10.25 - 2.0 * 1.0 + 3.0 * 0.5]);
+    }
+
+    #[test]
+    fn weights_keep_what_is_added() {
+        let cross = v1::Matrix::from_rows(&[[0.5], [0.0]]);
+        let weights = weights(diagonal([1.0, 2.0]), full(v1::Matrix::from_rows(&[[3.0]])))
+            .with_cross(cross.clone())
+            .with_final(diagonal([4.0, 5.0]));
+        assert_eq!((weights.s, weights.q_final), (Some(cross), Some(diagonal([4.0, 5.0]))));
+        assert_eq!(weights.q, Some(diagonal([1.0, 2.0])));
     }
 
     #[test]

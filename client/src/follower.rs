@@ -1,0 +1,590 @@
+//! Feedback laws that come as gains: streamed by the server, or collected beforehand.
+
+use std::borrow::Cow;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use plantd_proto::v1;
+use tokio::runtime::Handle;
+use tokio::sync::Notify;
+use tokio::task::JoinHandle;
+
+use crate::channel::within;
+use crate::link::StateView;
+use crate::{Answers, Client, Error, GainExt as _, MatrixExt as _, Refusal, Result, StateExt as _};
+
+/// Gains of a trajectory that are kept ahead of the step asked for.
+const WINDOW: usize = 1024;
+
+/// A state that a feedback law can be asked about: of a [`Driver`](crate::Driver), a watch or a
+/// [`LinkDriver`](crate::link::LinkDriver).
+pub trait LawState {
+    /// Steps since the plant was created or reset.
+    fn step_index(&self) -> u64;
+    /// `x = (q, p, v)`.
+    fn state_vector(&self) -> Cow<'_, [f64]>;
+}
+
+impl LawState for v1::State {
+    fn step_index(&self) -> u64 {
+        self.step
+    }
+
+    fn state_vector(&self) -> Cow<'_, [f64]> {
+        Cow::Owned(self.x())
+    }
+}
+
+impl LawState for StateView<'_> {
+    fn step_index(&self) -> u64 {
+        self.step
+    }
+
+    fn state_vector(&self) -> Cow<'_, [f64]> {
+        Cow::Borrowed(self.x)
+    }
+}
+
+/// `gain`'s input at `state`, about another reference state if one is given.
+fn input_of(gain: &v1::Gain, state: &impl LawState, about: Option<&[f64]>) -> Result<Vec<f64>> {
+    let x = state.state_vector();
+    let expected = gain.x_reference.len();
+    if x.len() != expected {
+        return Err(Error::StateLength { expected, actual: x.len() });
+    }
+    match about {
+        None => Ok(gain.control_at(&x)),
+        Some(x_reference) => {
+            Ok(v1::Gain { x_reference: x_reference.to_vec(), ..gain.clone() }.control_at(&x))
+        }
+    }
+}
+
+/// Whether the contract's promises on a gain hold, so that it can be applied.
+fn check(gain: &v1::Gain) -> Result<()> {
+    let (inputs, states) = (gain.u_reference.len(), gain.x_reference.len());
+    let fits = gain.k.as_ref().is_none_or(|k| {
+        (k.rows as usize, k.cols as usize) == (inputs, states) && k.data.len() == inputs * states
+    });
+    if fits { Ok(()) } else { Err(Error::Protocol("a gain whose sizes do not fit")) }
+}
+
+/// Time-varying gains as a feedback law: those of `SolveTrajectoryLqr` or of `ProjectReference`, or
+/// gains of one's own.
+///
+/// Before the first gain's step that gain holds about its own reference; after the last one the last
+/// gain holds, about the final state if the gains end with one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GainSchedule {
+    /// In the order of their steps, none without `k`.
+    gains: Vec<v1::Gain>,
+    final_state: Option<Vec<f64>>,
+}
+
+impl GainSchedule {
+    /// A schedule of gains in the order of their steps; the last may hold only the final reference
+    /// state, as `SolveTrajectoryLqr` sends it.
+    ///
+    /// # Errors
+    /// [`Error::Gains`] if there is none, if steps do not increase or if sizes do not fit.
+    pub fn from_gains(gains: impl IntoIterator<Item = v1::Gain>) -> Result<Self> {
+        let mut gains: Vec<_> = gains.into_iter().collect();
+        let final_state = match gains.last() {
+            Some(last) if last.k.is_none() => gains.pop().map(|last| last.x_reference),
+            _ => None,
+        };
+        let first = gains.first().ok_or(Error::Gains("there is no gain with `k`"))?;
+        let (states, inputs) = (first.x_reference.len(), first.u_reference.len());
+        for gain in &gains {
+            if gain.k.is_none() {
+                return Err(Error::Gains("only the last one may be without `k`"));
+            }
+            check(gain).map_err(|_| Error::Gains("`k` does not fit the references"))?;
+            if (gain.x_reference.len(), gain.u_reference.len()) != (states, inputs) {
+                return Err(Error::Gains("their references differ in length"));
+            }
+        }
+        if final_state.as_ref().is_some_and(|x| x.len() != states) {
+            return Err(Error::Gains("the final state differs in length from the references"));
+        }
+        if gains.windows(2).any(|pair| pair[0].step >= pair[1].step) {
+            return Err(Error::Gains("their steps do not increase"));
+        }
+        Ok(Self { gains, final_state })
+    }
+
+    /// The same gains with the first one at this step of a plant.
+    #[must_use]
+    pub fn starting_at(mut self, step: u64) -> Self {
+        let first = self.gains[0].step;
+        for gain in &mut self.gains {
+            gain.step = gain.step - first + step;
+        }
+        self
+    }
+
+    /// The gains, without the message that holds only the final state.
+    pub fn gains(&self) -> &[v1::Gain] {
+        &self.gains
+    }
+
+    /// The gain that holds at a step.
+    pub fn gain_at(&self, step: u64) -> &v1::Gain {
+        let after = self.gains.partition_point(|gain| gain.step <= step);
+        &self.gains[after.saturating_sub(1)]
+    }
+
+    /// The input `u_reference + feedforward − K (x − x_reference)` at a state.
+    ///
+    /// # Errors
+    /// [`Error::StateLength`] if the state is not one of the gains' plant.
+    pub fn input(&self, state: &impl LawState) -> Result<Vec<f64>> {
+        let step = state.step_index();
+        let last = self.gains[self.gains.len() - 1].step;
+        let about = self.final_state.as_deref().filter(|_| step > last);
+        input_of(self.gain_at(step), state, about)
+    }
+}
+
+/// The feedback law of a plant, applied here with the gains that the server streams.
+///
+/// ```no_run
+/// # use plantd_client::{Client, v1};
+/// # async fn follow(client: Client, id: &str) -> plantd_client::Result<()> {
+/// let law = client.follow_gains(id).await?;
+/// let mut driver = client.drive(id).await?;
+/// let mut state = driver.plant().state.clone().unwrap_or_default();
+/// loop {
+///     let u = law.input(&state).await?;
+///     state = driver.step(&u).await?.state.unwrap_or_default();
+/// }
+/// # }
+/// ```
+///
+/// A task reads the stream. Along a trajectory it keeps the gains of the coming steps, at most 1024
+/// of them, and [`input`](Self::input) waits where the gain of its step is not there yet; about an
+/// operating point it keeps the latest. When the server computes the gains anew (a new revision),
+/// those from before are forgotten. Dropping the follower ends the stream.
+#[derive(Debug)]
+pub struct Follower {
+    shared: Arc<Shared>,
+    client: Client,
+    runtime: Handle,
+    task: JoinHandle<()>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    window: Mutex<Window>,
+    /// Something has arrived.
+    arrived: Notify,
+    /// The step asked for has changed.
+    asked: Notify,
+}
+
+impl Shared {
+    fn window(&self) -> MutexGuard<'_, Window> {
+        // Nothing that holds the lock can panic half-way.
+        self.window.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// What a follower knows.
+#[derive(Debug, Default)]
+struct Window {
+    revision: u64,
+    dropped: u64,
+    first_step: u64,
+    /// 0 about an operating point.
+    horizon: u64,
+    /// In the order of their steps; about an operating point one at most.
+    gains: VecDeque<v1::Gain>,
+    final_state: Option<Vec<f64>>,
+    failure: Option<Refusal>,
+    /// Step last asked for.
+    step: u64,
+    /// The plant has gone back: the stream is to be opened anew.
+    is_behind: bool,
+    /// Step for which that was done, until it has been answered.
+    reopened_for: Option<u64>,
+    end: Option<Ended>,
+}
+
+#[derive(Clone, Debug)]
+enum Ended {
+    Refused(Box<Refusal>),
+    Closed,
+    Protocol(&'static str),
+}
+
+impl From<Ended> for Error {
+    fn from(end: Ended) -> Self {
+        match end {
+            Ended::Refused(refusal) => Self::Rpc(refusal),
+            Ended::Closed => Self::StreamClosed,
+            Ended::Protocol(what) => Self::Protocol(what),
+        }
+    }
+}
+
+impl From<Error> for Ended {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Rpc(refusal) | Error::Step(refusal) => Self::Refused(refusal),
+            Error::Protocol(what) => Self::Protocol(what),
+            _ => Self::Closed,
+        }
+    }
+}
+
+impl Window {
+    /// Takes in what the server sent.
+    fn note(&mut self, message: v1::WatchGainsResponse) -> Result<()> {
+        if message.revision != self.revision {
+            self.gains.clear();
+            self.final_state = None;
+            self.revision = message.revision;
+        }
+        self.dropped = message.dropped;
+        self.failure = message.failure.map(Refusal::from);
+        self.first_step = message.first_step;
+        self.horizon = message.horizon.into();
+        let Some(gain) = message.gain else { return Ok(()) };
+        check(&gain)?;
+        if gain.k.is_none() {
+            self.final_state = Some(gain.x_reference);
+            return Ok(());
+        }
+        if self.horizon == 0 || self.gains.back().is_some_and(|last| last.step >= gain.step) {
+            self.gains.clear();
+        }
+        self.gains.push_back(gain);
+        self.forget();
+        Ok(())
+    }
+
+    /// Drops the gains of steps that have gone by.
+    fn forget(&mut self) {
+        while self.gains.get(1).is_some_and(|next| next.step <= self.step) {
+            self.gains.pop_front();
+        }
+    }
+
+    /// The input at a state, if the gain of its step is there.
+    fn input(&mut self, state: &impl LawState) -> Result<Option<Vec<f64>>> {
+        self.step = state.step_index();
+        self.forget();
+        let step = self.step.max(self.first_step);
+        let end = self.first_step + self.horizon;
+        let Some(gain) = self.gains.front() else { return Ok(None) };
+        if self.horizon == 0 || gain.step == step {
+            self.reopened_for = None;
+            return input_of(gain, state, None).map(Some);
+        }
+        if gain.step > step {
+            if self.reopened_for == Some(self.step) {
+                return Err(Error::GainPassed { step, first: gain.step });
+            }
+            self.is_behind = true;
+            return Ok(None);
+        }
+        match &self.final_state {
+            Some(x) if step >= end && gain.step + 1 == end => {
+                input_of(gain, state, Some(x)).map(Some)
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// There is room for another gain.
+    fn has_room(&self) -> bool {
+        self.horizon == 0 || self.gains.len() < WINDOW
+    }
+
+    /// Forgets everything but the step asked for.
+    fn begin_anew(&mut self) {
+        *self = Self { step: self.step, reopened_for: Some(self.step), ..Self::default() };
+    }
+}
+
+impl Client {
+    /// Follows the gains of a plant's feedback (see [`Client::set_feedback`]), to apply them here.
+    ///
+    /// # Errors
+    /// `FAILED_PRECONDITION` with reason `NO_FEEDBACK` if the plant has none.
+    pub async fn follow_gains(&self, id: impl Into<String>) -> Result<Follower> {
+        let id = id.into();
+        let mut answers = self.watch_gains(&id).await?;
+        let shared = Arc::new(Shared::default());
+        // The first message says whether there is a feedback at all.
+        let first = within(self.request_timeout(), answers.next()).await?;
+        shared.window().note(first.ok_or(Error::StreamClosed)?)?;
+        let (client, window) = (self.clone(), shared.clone());
+        let task = tokio::spawn(async move {
+            let end = read(&client, &id, answers, &window).await;
+            window.window().end = Some(end);
+            window.arrived.notify_waiters();
+        });
+        Ok(Follower { shared, client: self.clone(), runtime: Handle::current(), task })
+    }
+}
+
+/// Reads the stream until it ends, and opens it anew when the plant has gone back.
+async fn read(
+    client: &Client,
+    id: &str,
+    mut answers: Answers<v1::WatchGainsResponse>,
+    shared: &Shared,
+) -> Ended {
+    loop {
+        let asked = shared.asked.notified();
+        let (is_behind, has_room) = {
+            let window = shared.window();
+            (window.is_behind, window.has_room())
+        };
+        if is_behind {
+            let again = async {
+                let mut answers = client.watch_gains(id).await?;
+                let first = within(client.request_timeout(), answers.next()).await?;
+                Ok::<_, Error>((answers, first.ok_or(Error::StreamClosed)?))
+            };
+            let first = match again.await {
+                Ok((fresh, first)) => {
+                    answers = fresh;
+                    first
+                }
+                Err(error) => return error.into(),
+            };
+            let mut window = shared.window();
+            window.begin_anew();
+            if let Err(error) = window.note(first) {
+                return error.into();
+            }
+            drop(window);
+            shared.arrived.notify_waiters();
+            continue;
+        }
+        if !has_room {
+            asked.await;
+            continue;
+        }
+        tokio::select! {
+            message = answers.next() => match message {
+                Ok(Some(message)) => {
+                    if let Err(error) = shared.window().note(message) {
+                        return error.into();
+                    }
+                    shared.arrived.notify_waiters();
+                }
+                Ok(None) => return Ended::Closed,
+                Err(error) => return error.into(),
+            },
+            () = asked => {}
+        }
+    }
+}
+
+impl Follower {
+    /// The input `u_reference + feedforward − K (x − x_reference)` at a state of the plant, with the
+    /// gain of the state's step.
+    ///
+    /// # Errors
+    /// The error with which the stream ended; along a trajectory only where the gains that came before
+    /// do not cover the step. [`Error::StateLength`] if the state is not one of this plant,
+    /// [`Error::GainPassed`] if it is of a step that the plant has left behind, `DEADLINE_EXCEEDED` if
+    /// the gain does not come within the connection's request timeout.
+    pub async fn input(&self, state: &impl LawState) -> Result<Vec<f64>> {
+        if let Some(u) = self.try_input(state)? {
+            return Ok(u);
+        }
+        within(self.client.request_timeout(), self.wait_for_input(state)).await
+    }
+
+    /// The same for a thread outside the runtime, such as one that steps a
+    /// [`LinkDriver`](crate::link::LinkDriver). The runtime must have threads of its own.
+    ///
+    /// # Panics
+    /// If it is called on a thread of an asynchronous runtime and the gain is not there yet.
+    pub fn blocking_input(&self, state: &impl LawState) -> Result<Vec<f64>> {
+        match self.try_input(state)? {
+            Some(u) => Ok(u),
+            None => self.runtime.block_on(self.input(state)),
+        }
+    }
+
+    /// The same without waiting; `None` if the gain of the state's step is not there yet.
+    pub fn try_input(&self, state: &impl LawState) -> Result<Option<Vec<f64>>> {
+        let mut window = self.shared.window();
+        let had_room = window.has_room();
+        let u = window.input(state)?;
+        let end = window.end.clone().filter(|_| u.is_none() || window.horizon == 0);
+        let must_wake = window.is_behind || (!had_room && window.has_room());
+        drop(window);
+        if must_wake {
+            self.shared.asked.notify_one();
+        }
+        match end {
+            Some(end) => Err(end.into()),
+            None => Ok(u),
+        }
+    }
+
+    async fn wait_for_input(&self, state: &impl LawState) -> Result<Vec<f64>> {
+        loop {
+            let arrived = self.shared.arrived.notified();
+            tokio::pin!(arrived);
+            // Before the look, so that nothing arrives unnoticed in between.
+            arrived.as_mut().enable();
+            if let Some(u) = self.try_input(state)? {
+                return Ok(u);
+            }
+            arrived.await;
+        }
+    }
+
+    /// Of which computation the gains are; a new number means that the server has computed them anew.
+    pub fn revision(&self) -> u64 {
+        self.shared.window().revision
+    }
+
+    /// Revisions that were replaced before this follower saw them.
+    pub fn dropped(&self) -> u64 {
+        self.shared.window().dropped
+    }
+
+    /// Why the gains in force are still those of the parameters before, if the server's last
+    /// computation failed.
+    pub fn failure(&self) -> Option<Refusal> {
+        self.shared.window().failure.clone()
+    }
+
+    /// Steps of the trajectory; 0 about an operating point.
+    pub fn horizon(&self) -> u64 {
+        self.shared.window().horizon
+    }
+
+    /// The error with which the stream has ended; `None` while it goes on.
+    pub fn end(&self) -> Option<Error> {
+        self.shared.window().end.clone().map(Error::from)
+    }
+}
+
+impl Drop for Follower {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gain(step: u64, k: f64, reference: f64) -> v1::Gain {
+        v1::Gain {
+            step,
+            k: Some(v1::Matrix::from_rows(&[[k, 0.0]])),
+            x_reference: vec![reference, 0.0],
+            u_reference: vec![0.0],
+            ..Default::default()
+        }
+    }
+
+    fn end_state(step: u64, reference: f64) -> v1::Gain {
+        v1::Gain { step, x_reference: vec![reference, 0.0], ..Default::default() }
+    }
+
+    fn state(step: u64, q: f64) -> v1::State {
+        v1::State { step, q: vec![q], p: vec![0.0], ..Default::default() }
+    }
+
+    fn message(revision: u64, gain: v1::Gain, horizon: u32) -> v1::WatchGainsResponse {
+        v1::WatchGainsResponse {
+            gain: Some(gain),
+            revision,
+            first_step: if horizon > 0 { 10 } else { 0 },
+            horizon,
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn a_schedule_holds_its_ends() {
+        let gains = [gain(0, 1.0, 0.0), gain(1, 2.0, 1.0), end_state(2, 5.0)];
+        let law = GainSchedule::from_gains(gains).unwrap().starting_at(7);
+        let at = |step, q| law.input(&state(step, q)).unwrap()[0];
+        assert_eq!(at(0, 1.0), -1.0);
+        assert_eq!(at(7, 1.0), -1.0);
+        assert_eq!(at(8, 2.0), -2.0);
+        assert_eq!(at(9, 6.0), -2.0);
+        assert_eq!(at(1000, 5.0), 0.0);
+        assert_eq!(law.gains().len(), 2);
+    }
+
+    #[test]
+    fn a_schedule_says_what_is_wrong_with_its_gains() {
+        for (gains, part) in [
+            (vec![], "no gain"),
+            (vec![end_state(0, 0.0), gain(1, 1.0, 0.0)], "only the last"),
+            (vec![gain(1, 1.0, 0.0), gain(1, 1.0, 0.0)], "increase"),
+            (vec![v1::Gain { u_reference: vec![], ..gain(0, 1.0, 0.0) }], "fit"),
+            (
+                vec![gain(0, 1.0, 0.0), v1::Gain { x_reference: vec![], ..end_state(1, 0.0) }],
+                "final state",
+            ),
+        ] {
+            let error = GainSchedule::from_gains(gains).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        }
+        let law = GainSchedule::from_gains([gain(0, 1.0, 0.0)]).unwrap();
+        let short = v1::State::default();
+        assert!(matches!(law.input(&short), Err(Error::StateLength { expected: 2, actual: 0 })));
+    }
+
+    #[test]
+    fn a_window_waits_for_the_step_and_forgets_what_has_gone_by() {
+        let mut window = Window::default();
+        for k in 10..12 {
+            window.note(message(1, gain(k, k as f64, 0.0), 3)).unwrap();
+        }
+        // Before the first step its gain holds.
+        assert_eq!(window.input(&state(4, 1.0)).unwrap(), Some(vec![-10.0]));
+        assert_eq!(window.input(&state(11, 1.0)).unwrap(), Some(vec![-11.0]));
+        assert_eq!(window.gains.len(), 1);
+        assert_eq!(window.input(&state(12, 1.0)).unwrap(), None);
+        window.note(message(1, gain(12, 12.0, 0.0), 3)).unwrap();
+        assert_eq!(window.input(&state(12, 1.0)).unwrap(), Some(vec![-12.0]));
+        // The end: only the final state tells about what the last gain holds.
+        assert_eq!(window.input(&state(13, 1.0)).unwrap(), None);
+        window.note(message(1, end_state(13, 1.0), 3)).unwrap();
+        assert_eq!(window.input(&state(40, 1.0)).unwrap(), Some(vec![0.0]));
+        // A plant that went back asks for the stream to be opened anew, once.
+        assert_eq!(window.input(&state(10, 1.0)).unwrap(), None);
+        assert!(window.is_behind);
+        window.begin_anew();
+        window.note(message(1, gain(12, 12.0, 0.0), 3)).unwrap();
+        let passed = window.input(&state(10, 1.0)).unwrap_err();
+        assert!(matches!(passed, Error::GainPassed { step: 10, first: 12 }));
+        assert!(window.input(&state(12, 1.0)).unwrap().is_some());
+    }
+
+    #[test]
+    fn a_new_revision_replaces_everything() {
+        let mut window = Window::default();
+        window.note(message(1, gain(10, 1.0, 0.0), 2)).unwrap();
+        window.note(message(2, gain(11, 3.0, 0.0), 2)).unwrap();
+        assert_eq!((window.gains.len(), window.revision), (1, 2));
+        window.note(message(3, gain(20, 4.0, 0.0), 0)).unwrap();
+        window.note(message(4, gain(30, 5.0, 0.0), 0)).unwrap();
+        assert_eq!(window.input(&state(25, 1.0)).unwrap(), Some(vec![-5.0]));
+        let failed = v1::WatchGainsResponse {
+            revision: 4,
+            failure: Some(v1::Failure { reason: "NOT_STABILISABLE".into(), ..Default::default() }),
+            ..Default::default()
+        };
+        window.note(failed).unwrap();
+        assert_eq!(window.input(&state(26, 1.0)).unwrap(), Some(vec![-5.0]));
+        assert_eq!(window.failure.as_ref().unwrap().reason, "NOT_STABILISABLE");
+        let odd = v1::Gain { x_reference: vec![0.0], ..gain(31, 1.0, 0.0) };
+        assert!(window.note(message(5, odd, 0)).is_err());
+    }
+}
