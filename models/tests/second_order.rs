@@ -326,3 +326,25 @@ fn weights_of_the_wrong_length_are_refused() {
         assert!(matches!(refused, Err(StepError::Dimension { .. })), "{refused:?}");
     }
 }
+
+#[test]
+fn a_linearization_is_contracted_wherever_the_plant_is_meanwhile() {
+    for name in ["pendulum", "four-bar", "marionette"] {
+        let mut plant = plant(&builtin(name), |_| ());
+        let model = plant.model().clone();
+        let d = model.dimensions();
+        let z: Vec<f64> = (0..d.state()).map(|i| (i as f64).cos()).collect();
+        let w: Vec<f64> = (0..d.constraints).map(|c| (c as f64).sin()).collect();
+        let mut u = vec![0.0; d.input()];
+        plant.hold_input(&mut u);
+        let mut first = Linearization::new(&model);
+        let (mut there, mut later) = (Contraction::new(&model), Contraction::new(&model));
+        plant.contract_second_order(&u, &z, &w, &mut first, &mut there).unwrap();
+        let mut first = Linearization::new(&model);
+        plant.step_and_linearize(&u, &mut first).unwrap();
+        plant.step(&u).unwrap();
+        later.contract(&model, &first, &z, &w).unwrap();
+        assert_eq!((&there.xx, &there.xu, &there.uu), (&later.xx, &later.xu, &later.uu), "{name}");
+        assert!(there.xx.amax() > 0.0, "{name}");
+    }
+}

@@ -102,6 +102,19 @@ impl<S: Scalar> Blocks<S> {
         pattern
     }
 
+    /// Pairs of coordinates that the Lagrangian couples, both ways round.
+    pub(crate) fn coupled_coordinates(&self, model: &Model) -> Vec<(usize, usize)> {
+        let n = model.dimensions.coordinates();
+        if model.potentials.couple_branches {
+            return (0..n * n).map(|entry| (entry / n, entry % n)).collect();
+        }
+        let on_paths = self.pairs.iter().flat_map(|&[_, _, i, j]| [(i, j), (j, i)]);
+        let mut coupled: Vec<_> = on_paths.chain((0..n).map(|i| (i, i))).collect();
+        coupled.sort_unstable();
+        coupled.dedup();
+        coupled
+    }
+
     /// Evaluates everything at a configuration, with the orientations of ball joints, and a velocity.
     pub(crate) fn evaluate(
         &mut self,

@@ -25,8 +25,9 @@ use nalgebra::DMatrix;
 use crate::Model;
 use crate::plant::balls::Turning;
 use crate::plant::newton::Workspace;
+use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{add_rows, padded};
-use crate::plant::{Plant, StepError, potentials};
+use crate::plant::{Plant, Settings, StepError, potentials};
 use crate::spatial::{Mat3, Vec3};
 
 /// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.
@@ -59,6 +60,71 @@ pub struct Linearization {
     multipliers: Vec<f64>,
     /// How ball joints turn in the step.
     turnings: Vec<Turning>,
+    solved: SolvedStep,
+}
+
+/// The step that was linearized: what its second derivatives need.
+#[derive(Clone, Debug)]
+pub(crate) struct SolvedStep {
+    pub(crate) settings: Settings,
+    /// Configuration at the start, nd + nk, and orientations of ball joints.
+    pub(crate) q: Vec<f64>,
+    pub(crate) orientations: Vec<Mat3>,
+    /// How ball joints turn.
+    pub(crate) turns: Vec<Vec3>,
+    /// Increments of dynamic coordinates, nd.
+    pub(crate) increment: Vec<f64>,
+    /// Next positions of prescribed ones, nk, and inputs, ni, with the signals.
+    pub(crate) next: Vec<f64>,
+    pub(crate) inputs: Vec<f64>,
+    /// `λ`, nc.
+    pub(crate) multipliers: Vec<f64>,
+    /// `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
+    pub(crate) responses: Vec<f64>,
+    /// The factors of `S`.
+    pub(crate) schur: PivotedLu,
+}
+
+impl SolvedStep {
+    fn new(model: &Model) -> Self {
+        let d = model.dimensions;
+        let zeros = |len: usize| vec![0.0; len];
+        Self {
+            settings: Settings::new(model),
+            q: zeros(d.coordinates()),
+            orientations: vec![Mat3::IDENTITY; model.orientations.len()],
+            turns: vec![Vec3::ZERO; model.orientations.len()],
+            increment: zeros(d.dynamic),
+            next: zeros(d.prescribed),
+            inputs: zeros(d.inputs),
+            multipliers: zeros(d.constraints),
+            responses: zeros(d.dynamic * padded(d.constraints)),
+            schur: PivotedLu::new(&model.conditioning.weight, 1),
+        }
+    }
+
+    /// Remembers the solution in the workspace.
+    fn remember(&mut self, workspace: &Workspace, settings: &Settings, q: &[f64], u: &[f64]) {
+        let (inputs, next) = u.split_at(self.inputs.len());
+        self.settings = *settings;
+        for (to, from) in [
+            (&mut self.q, q),
+            (&mut self.increment, &workspace.increment),
+            (&mut self.next, next),
+            (&mut self.inputs, inputs),
+        ] {
+            to.copy_from_slice(from);
+        }
+        if !self.orientations.is_empty() {
+            self.orientations.copy_from_slice(&workspace.orientations_start);
+            self.turns.copy_from_slice(&workspace.turns);
+        }
+        if !self.multipliers.is_empty() {
+            self.multipliers.copy_from_slice(&workspace.multipliers);
+            self.responses.copy_from_slice(&workspace.responses);
+            self.schur.take_factors_of(&workspace.schur);
+        }
+    }
 }
 
 impl Linearization {
@@ -87,7 +153,12 @@ impl Linearization {
             momentum: vec![0.0; d.dynamic * stride],
             multipliers: vec![0.0; d.constraints * stride],
             turnings: Vec::with_capacity(model.orientations.len()),
+            solved: SolvedStep::new(model),
         }
+    }
+
+    pub(crate) fn solved_step(&self) -> &SolvedStep {
+        &self.solved
     }
 
     /// `A = ∂f/∂x`, square of `2 nd + 2 nk`; its `v` columns are zero.
@@ -192,6 +263,18 @@ impl Linearization {
         by_u
     }
 
+    /// The derivative by `p[k]` of `z_x·x + z_λ·λ + z_p·p[k+1]`, nd entries.
+    pub(crate) fn pull_back_to_momentum(&self, z: [&[f64]; 3], out: &mut [f64]) {
+        let n = self.nd + self.nk;
+        out.fill(0.0);
+        for (rows, z) in [&self.increment, &self.multipliers, &self.momentum].into_iter().zip(z) {
+            for (row, z) in rows.chunks_exact(self.stride.max(1)).zip(z) {
+                let by_momentum = &row[n..][..self.nd];
+                out.iter_mut().zip(by_momentum).for_each(|(out, entry)| *out += z * entry);
+            }
+        }
+    }
+
     /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, inputs, k)`.
     pub(crate) fn write_tangent(&self, stride: usize, out: &mut [f64]) {
         let (n, next) = (self.nd + self.nk, self.next_columns());
@@ -268,7 +351,11 @@ impl Workspace {
 
 impl Plant {
     /// Linearizes at the solution in the workspace.
-    pub(crate) fn linearize_solution(&mut self, out: &mut Linearization) -> Result<(), StepError> {
+    pub(crate) fn linearize_solution(
+        &mut self,
+        u: &[f64],
+        out: &mut Linearization,
+    ) -> Result<(), StepError> {
         let d = self.model.dimensions;
         assert!(
             out.nd == d.dynamic
@@ -305,6 +392,10 @@ impl Plant {
             *x = -*x;
         }
         self.differentiate_momentum(out);
+        let workspace = &self.workspace;
+        let effective = &workspace.effective_input[..];
+        let u = if effective.is_empty() { u } else { effective };
+        out.solved.remember(workspace, &self.settings, &self.state.q, u);
         Ok(())
     }
 

@@ -372,7 +372,7 @@ impl Plant {
         out: &mut Linearization,
     ) -> Result<StepReport, StepError> {
         let mut report = self.solve(u)?;
-        self.linearize_solution(out)?;
+        self.linearize_solution(u, out)?;
         self.workspace.estimates.write(&mut report);
         Ok(report)
     }

@@ -89,6 +89,18 @@ impl PivotedLu {
         }
     }
 
+    /// Takes over the factorization of another matrix of the same order and scale.
+    pub(crate) fn take_factors_of(&mut self, other: &Self) {
+        let known = other.null_vectors * other.order;
+        self.matrix.copy_from_slice(&other.matrix);
+        self.rows.copy_from_slice(&other.rows);
+        self.columns.copy_from_slice(&other.columns);
+        self.inverse_pivot.copy_from_slice(&other.inverse_pivot);
+        self.null[..known].copy_from_slice(&other.null[..known]);
+        self.null_vectors = other.null_vectors;
+        (self.rank, self.rest) = (other.rank, other.rest);
+    }
+
     /// Rows that were left out.
     pub(crate) fn deficiency(&self) -> usize {
         self.order - self.rank

@@ -31,16 +31,24 @@ fn add_rows_avx2(target: &mut [f64], source: &[f64], stride: usize, terms: &[Ter
     add_rows_portable(target, source, stride, terms);
 }
 
-/// Two blocks at a time stay in registers while all terms are added to them.
+/// Up to four blocks at a time stay in registers while all terms are added to them: as many sums as
+/// hide the latency of an addition.
 #[inline(always)]
 fn add_rows_portable(target: &mut [f64], source: &[f64], stride: usize, terms: &[Term]) {
-    let (pairs, rest) = target.as_chunks_mut::<{ 2 * LANES }>();
-    let start_of_rest = 2 * LANES * pairs.len();
-    for (b, block) in pairs.iter_mut().enumerate() {
-        add_block(block, source, stride, 2 * LANES * b, terms);
+    let (wide, rest) = target.as_chunks_mut::<{ 4 * LANES }>();
+    let mut column = 0;
+    for block in wide {
+        add_block(block, source, stride, column, terms);
+        column += 4 * LANES;
+    }
+    let (pairs, rest) = rest.as_chunks_mut::<{ 2 * LANES }>();
+    for block in pairs {
+        add_block(block, source, stride, column, terms);
+        column += 2 * LANES;
     }
     for block in rest.as_chunks_mut::<LANES>().0 {
-        add_block(block, source, stride, start_of_rest, terms);
+        add_block(block, source, stride, column, terms);
+        column += LANES;
     }
 }
 

@@ -130,30 +130,6 @@ impl TreeLu {
         }
     }
 
-    /// Solves `Kᵀ x = b` in place.
-    pub(crate) fn solve_transposed(&self, elimination: &Elimination, x: &mut [f64]) {
-        for k in (0..elimination.len()).rev() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
-            x[k] *= self.inverse_pivot[k];
-            let value = x[k];
-            for (&ancestor, l) in
-                elimination.ancestors[range.clone()].iter().zip(&self.lower[range])
-            {
-                x[ancestor] -= l * value;
-            }
-        }
-        for k in 0..elimination.len() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
-            let mut value = x[k];
-            for (&ancestor, u) in
-                elimination.ancestors[range.clone()].iter().zip(&self.upper[range])
-            {
-                value -= u * x[ancestor];
-            }
-            x[k] = value;
-        }
-    }
-
     /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
     /// are whole blocks.
     #[inline(never)]
@@ -225,17 +201,6 @@ mod tests {
         assert!(lu.factor(&elimination, &[0.0; 8], 1.0).relative > 0.1);
         lu.solve(&elimination, &mut x);
         assert!((dense * DVector::from_vec(x) - b).amax() < 1e-14);
-    }
-
-    #[test]
-    fn a_transposed_solution_satisfies_the_transposed_system() {
-        let elimination = elimination();
-        let (mut lu, dense) = matrix(&elimination);
-        let b = DVector::from_fn(elimination.len(), |i, _| (i as f64).cos());
-        let mut x = b.as_slice().to_vec();
-        lu.factor(&elimination, &[0.0; 8], 1.0);
-        lu.solve_transposed(&elimination, &mut x);
-        assert!((dense.transpose() * DVector::from_vec(x) - b).amax() < 1e-14);
     }
 
     #[test]

@@ -1,0 +1,497 @@
+//! Weighted sums of second derivatives, without the tensors.
+//!
+//! `Σ z_i ∂²x_i[k+1] + Σ w_c ∂²λ_c` with `μ = −E⁻ᵀ (z_y + O_yᵀ z_p)` is the Hessian of the scalar
+//! `μ·R + z_p·O`, congruent with `W`:
+//!
+//! ```text
+//! G = Wᵀ ∇²(μ·R + z_p·O) W
+//! Lagrangian     D_(α,β) ∇²L,   α = h (½μ₁ + z_p) along q,  β = −μ₁ along v: one directional derivative
+//! constraints    −(μ₁ + z_p)·(Dhᵀλ)'' at q[k],   μ₂·D²h at q[k+1]
+//! forces         direction by direction: they are no gradient
+//! ```
+//!
+//! The first-order linearization holds the adjoint: with `R_p = O_p = 1`, `μ₁ + z_p` is the derivative
+//! of the weighted sum by `p[k]`. What is left needs the factors of the constraints alone:
+//! `Sᵀ μ₂ = −(K⁻¹A0ᵀ)ᵀ (z_x + O_xᵀ z_p) − A0 μ₁`.
+
+use nalgebra::DMatrix;
+
+use crate::Model;
+use crate::plant::balls::three;
+use crate::plant::blocks::{StepBlocks, non_zero};
+use crate::plant::closure::Closure;
+use crate::plant::linearize::{Linearization, SolvedStep};
+use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::rows::{add_rows, padded};
+use crate::plant::{Plant, StepError, StepReport};
+use crate::rotation;
+use crate::scalar::Dual;
+
+use super::{Layout, Scratch, assert_layout, spin_change};
+
+/// A weighted sum of second derivatives, `Σ z_i ∂²x_i[k+1] + Σ w_c ∂²λ_c`, preallocated.
+#[derive(Clone, Debug)]
+pub struct Contraction {
+    /// By `x` twice, square of `2 nd + 2 nk`.
+    pub xx: DMatrix<f64>,
+    /// By `x` and `u`, `2 nd + 2 nk` by `ni + nk`.
+    pub xu: DMatrix<f64>,
+    /// By `u` twice, square of `ni + nk`.
+    pub uu: DMatrix<f64>,
+    scratch: Scratch,
+    /// `z_x`, by what the increments of the dynamic coordinates are.
+    weights: Vec<f64>,
+    /// `μ₁` (nd) and `μ₂` (nc).
+    adjoint: Vec<f64>,
+    /// `μ₁ + z_p`, with zeros for the prescribed coordinates.
+    impulse: Vec<f64>,
+    quadratic: Quadratic,
+    /// `Y W`, and `Cᵀ W`, rows over all parameters.
+    turned: Vec<f64>,
+    product: Vec<f64>,
+    schur: PivotedLu,
+    /// Constraints at `q[k+1]`.
+    end: Closure,
+    q_end: Vec<f64>,
+    /// Pairs of coordinates that the Lagrangian couples, both ways round.
+    pattern: Vec<(usize, usize)>,
+}
+
+/// A quadratic form in the start of a step and in what is next, in terms of the parameters `θ` and the
+/// unknowns `y`: `½ θᵀ sum θ + yᵀ C θ + ½ xᵀ Y x`.
+#[derive(Clone, Debug)]
+struct Quadratic {
+    layout: Layout,
+    /// Row-major over all parameters; the lower triangle counts.
+    sum: Vec<f64>,
+    /// `C`, column by column, nd + nc rows.
+    mixed: Vec<f64>,
+    /// `Y`, nd by nd.
+    increments: Vec<f64>,
+}
+
+impl Quadratic {
+    fn new(layout: Layout) -> Self {
+        let size = layout.parameters();
+        Self {
+            layout,
+            sum: vec![0.0; size * layout.stride],
+            mixed: vec![0.0; size * (layout.nd + layout.nc)],
+            increments: vec![0.0; layout.nd * layout.nd],
+        }
+    }
+
+    fn clear(&mut self) {
+        self.sum.fill(0.0);
+        self.mixed.fill(0.0);
+        self.increments.fill(0.0);
+    }
+
+    fn add(&mut self, row: usize, column: usize, value: f64) {
+        self.sum[row * self.layout.stride + column] += value;
+    }
+
+    /// Adds to `C`, unknown by parameter.
+    fn add_mixed(&mut self, unknown: usize, parameter: usize, value: f64) {
+        self.mixed[parameter * (self.layout.nd + self.layout.nc) + unknown] += value;
+    }
+
+    /// The form has `value` at the starts of coordinates `i` and `j`.
+    fn add_starts(&mut self, i: usize, j: usize, value: f64) {
+        self.add(i, j, value);
+    }
+
+    /// At the start of `i` and what is next of `j`, and the other way round.
+    fn add_start_next(&mut self, i: usize, j: usize, value: f64) {
+        let Layout { nd, .. } = self.layout;
+        if j < nd {
+            self.add_mixed(j, i, value);
+        } else {
+            // The lower triangle alone: next positions come after all starts.
+            self.add(self.layout.next() + j - nd, i, value);
+        }
+    }
+
+    /// At what is next of `i` and of `j`; comes for `(j, i)` again.
+    fn add_nexts(&mut self, i: usize, j: usize, value: f64) {
+        let (Layout { nd, .. }, next) = (self.layout, self.layout.next());
+        match (i < nd, j < nd) {
+            (true, true) => self.increments[i * nd + j] += value,
+            (true, false) => self.add_mixed(i, next + j - nd, value),
+            (false, false) => self.add(next + i - nd, next + j - nd, value),
+            (false, true) => {}
+        }
+    }
+}
+
+impl Contraction {
+    /// Room for the contraction of a model: `O((2 nd + 2 nk + ni)²)` numbers.
+    pub fn new(model: &Model) -> Self {
+        let layout = Layout::new(model);
+        let (n, rows) = (layout.n(), layout.nd + layout.nc);
+        let (size, inputs) = (layout.parameters(), layout.ni + layout.nk);
+        let scratch = Scratch::new(model);
+        Self {
+            xx: DMatrix::zeros(2 * n, 2 * n),
+            xu: DMatrix::zeros(2 * n, inputs),
+            uu: DMatrix::zeros(inputs, inputs),
+            weights: vec![0.0; layout.nd],
+            adjoint: vec![0.0; rows],
+            impulse: vec![0.0; n],
+            quadratic: Quadratic::new(layout),
+            turned: vec![0.0; layout.nd * layout.stride],
+            product: vec![0.0; size * layout.stride],
+            schur: PivotedLu::new(&model.conditioning.weight, 1),
+            end: Closure::new(model),
+            q_end: vec![0.0; n],
+            pattern: scratch.blocks.mid.coupled_coordinates(model),
+            scratch,
+        }
+    }
+
+    /// Weighted second derivatives of the map at the step that `first` linearizes,
+    /// `Σ z_i ∂²x_i[k+1] + Σ w_c ∂²λ_c` with `z = weights_x` (2 nd + 2 nk) and
+    /// `w = weights_multipliers` (nc). Solves no step: `first` holds all that is needed.
+    ///
+    /// Costs one evaluation of the derivative blocks in dual numbers (with nonlinear forces or ball
+    /// joints: one of them for each parameter), and O(N² nd).
+    ///
+    /// # Errors
+    ///
+    /// [`StepError::Dimension`] for weights of the wrong length.
+    ///
+    /// # Panics
+    ///
+    /// If `first` or `self` was made for a model of other dimensions.
+    pub fn contract(
+        &mut self,
+        model: &Model,
+        first: &Linearization,
+        weights_x: &[f64],
+        weights_multipliers: &[f64],
+    ) -> Result<(), StepError> {
+        check_weights(model, weights_x, weights_multipliers)?;
+        assert_layout(model, &self.scratch);
+        first.write_tangent(self.scratch.layout.stride, &mut self.scratch.tangent);
+        self.find_impulse(model, first, weights_x, weights_multipliers);
+        let step = first.solved_step();
+        if model.orientations.is_empty() && model.forces.is_none() {
+            self.contract_gradients(model, step, weights_x);
+        } else {
+            self.contract_directions(model, step, weights_x);
+        }
+        self.finish();
+        Ok(())
+    }
+
+    /// `μ₁`, from the derivatives by the momentum.
+    fn find_impulse(&mut self, model: &Model, first: &Linearization, z: &[f64], w: &[f64]) {
+        let Layout { nd, .. } = self.scratch.layout;
+        let n = self.scratch.layout.n();
+        let z_p = &z[n..][..nd];
+        self.weights.copy_from_slice(&z[..nd]);
+        for &i in model.orientations.iter().filter(|i| **i < nd) {
+            let to_end = rotation::dexp(three(&first.solved_step().increment, i));
+            let turned = to_end.apply_transposed(three(z, i));
+            self.weights[i..i + 3].copy_from_slice(&turned.0);
+        }
+        first.pull_back_to_momentum([&self.weights, w, z_p], &mut self.impulse[..nd]);
+        for ((mu, impulse), z) in self.adjoint.iter_mut().zip(&self.impulse).zip(z_p) {
+            *mu = impulse - z;
+        }
+    }
+
+    /// `μ₂`, with the blocks at the solution: `slopes` are `O_x`, row-major, with rows of `n`.
+    fn find_multipliers(
+        &mut self,
+        step: &SolvedStep,
+        z: &[f64],
+        slope: impl Fn(&StepBlocks<Dual>, usize, usize) -> f64,
+    ) {
+        let Layout { nd, nc, .. } = self.scratch.layout;
+        let (n, stride) = (self.scratch.layout.n(), padded(nc));
+        let blocks = &self.scratch.blocks;
+        let z_p = &z[n..][..nd];
+        let (first, second) = self.adjoint.split_at_mut(nd);
+        second.fill(0.0);
+        for i in 0..nd {
+            let moved: f64 = z_p.iter().enumerate().map(|(j, z)| z * slope(blocks, j, i)).sum();
+            let pull = self.weights[i] + moved;
+            for (c, entry) in second.iter_mut().enumerate() {
+                let jacobian = blocks.start.jacobian[c * n + i].re;
+                *entry -= step.responses[i * stride + c] * pull + jacobian * first[i];
+            }
+        }
+        self.schur.take_factors_of(&step.schur);
+        self.schur.solve_transposed(second);
+    }
+
+    /// The sum with ball joints, whose tangent spaces do not commute, or with forces: one evaluation of
+    /// all blocks for each parameter.
+    fn contract_directions(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
+        let Layout { nd, nc, ni, stride, .. } = self.scratch.layout;
+        let (n, inputs, next) =
+            (self.scratch.layout.n(), self.scratch.layout.inputs(), self.scratch.layout.next());
+        if nc > 0 {
+            self.scratch.seed(0, model, step);
+            self.scratch.blocks.evaluate(model, &step.settings);
+            self.find_multipliers(step, z, |blocks, i, j| blocks.momentum_next[i * n + j].re);
+        }
+        self.quadratic.clear();
+        let time_step_s = step.settings.time_step_s;
+        let Self { scratch, adjoint, impulse, turned, product, .. } = self;
+        // What `x'` and `λ'` are multiplied with.
+        let by_unknown = &mut turned[..nd + nc];
+        for (a, row) in product.chunks_exact_mut(stride).enumerate() {
+            scratch.seed(a, model, step);
+            scratch.blocks.evaluate(model, &step.settings);
+            let Scratch { blocks, tangent, terms, .. } = &mut *scratch;
+            row.fill(0.0);
+            by_unknown.fill(0.0);
+            let mut add_next = |row: &mut [f64], j: usize, value: f64| {
+                if j < nd {
+                    by_unknown[j] += value;
+                } else {
+                    row[next + j - nd] += value;
+                }
+            };
+            for i in 0..nd {
+                let (mu, z_p) = (adjoint[i], impulse[i] - adjoint[i]);
+                for j in 0..n {
+                    let at = i * n + j;
+                    row[j] +=
+                        mu * blocks.residual_start[at].eps + z_p * blocks.momentum_start[at].eps;
+                    let value =
+                        mu * blocks.residual_next[at].eps + z_p * blocks.momentum_next[at].eps;
+                    add_next(row, j, value);
+                }
+                for j in 0..ni {
+                    let at = i * ni + j;
+                    row[inputs + j] +=
+                        mu * blocks.residual_inputs[at].eps + z_p * blocks.momentum_inputs[at].eps;
+                }
+            }
+            let [by_start, by_next] = blocks.end_jacobians();
+            for (c, mu) in adjoint[nd..].iter().enumerate() {
+                for j in 0..n {
+                    if j < nd {
+                        row[j] += mu * by_start[c * n + j].eps;
+                    }
+                    add_next(row, j, mu * by_next[c * n + j].eps);
+                }
+            }
+            for t in blocks.turnings.iter().filter(|t| t.coordinate < nd) {
+                for (b, i) in (t.coordinate..t.coordinate + 3).enumerate() {
+                    for k in 0..3 {
+                        let z = z[t.coordinate + k];
+                        row[i] += z * t.carried.0[b][k].eps;
+                        add_next(row, i, z * t.to_end.0[b][k].eps);
+                    }
+                }
+            }
+            for t in blocks.turnings.iter().filter(|t| t.coordinate >= nd) {
+                let z = &z[n + t.coordinate..][..3];
+                for (z, change) in z.iter().zip(spin_change(t, time_step_s)) {
+                    for b in 0..3 {
+                        row[t.coordinate + b] += z * change[b];
+                        row[next + t.coordinate - nd + b] += z * change[3 + b];
+                    }
+                }
+            }
+            for c in 0..nc {
+                let turned = (0..nd).map(|i| impulse[i] * blocks.start.jacobian[c * n + i].eps);
+                by_unknown[nd + c] = -turned.sum::<f64>();
+            }
+            terms.clear();
+            terms.extend(non_zero(by_unknown.iter().copied()));
+            add_rows(row, tangent, stride, terms);
+            row.iter_mut().for_each(|entry| *entry *= 0.5);
+        }
+    }
+
+    /// The sum where everything is the gradient of something: the Lagrangian and the constraints.
+    fn contract_gradients(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
+        let h = step.settings.time_step_s;
+        let Layout { nd, nc, stride, .. } = self.scratch.layout;
+        let n = self.scratch.layout.n();
+        let blocks = &mut self.scratch.blocks;
+        for i in 0..n {
+            let (start, mid, velocity) = if i < nd {
+                let x = step.increment[i];
+                (step.q[i], step.q[i] + 0.5 * x, x / h)
+            } else {
+                let next = step.next[i - nd];
+                (step.q[i], 0.5 * (step.q[i] + next), (next - step.q[i]) / h)
+            };
+            let (alpha, beta) = if i < nd {
+                let mu = self.adjoint[i];
+                (h * (self.impulse[i] - 0.5 * mu), -mu)
+            } else {
+                (0.0, 0.0)
+            };
+            blocks.q_mid[i] = Dual::new(mid, alpha);
+            blocks.velocity[i] = Dual::new(velocity, beta);
+            blocks.q_start[i] = Dual::new(start, self.impulse[i]);
+        }
+        for (dual, value) in blocks.inputs.iter_mut().zip(&step.inputs) {
+            *dual = Dual::new(*value, 0.0);
+        }
+        blocks.evaluate_mid(model);
+        self.quadratic.clear();
+        self.add_lagrangian(h);
+        if nc > 0 {
+            self.add_constraints(model, step, z);
+        }
+
+        // G = sum + Wᵀ Y W + Wᵀ C + Cᵀ W, lower triangles of the first two.
+        let Self { scratch, quadratic, turned, product, .. } = self;
+        let Scratch { tangent, terms, .. } = scratch;
+        for (row, by) in turned.chunks_exact_mut(stride).zip(quadratic.increments.chunks_exact(nd))
+        {
+            row.fill(0.0);
+            terms.clear();
+            terms.extend(non_zero(by.iter().copied()));
+            add_rows(row, tangent, stride, terms);
+        }
+        for (a, row) in quadratic.sum.chunks_exact_mut(stride).enumerate() {
+            terms.clear();
+            terms.extend(non_zero((0..nd).map(|i| tangent[i * stride + a])));
+            add_rows(&mut row[..padded(a + 1)], turned, stride, terms);
+        }
+        let rows = (nd + nc).max(1);
+        for (row, by) in product.chunks_exact_mut(stride).zip(quadratic.mixed.chunks_exact(rows)) {
+            row.fill(0.0);
+            terms.clear();
+            terms.extend(non_zero(by.iter().copied()));
+            add_rows(row, tangent, stride, terms);
+        }
+    }
+
+    /// The derivative of the Hessian of the Lagrangian along `(α, β)`.
+    fn add_lagrangian(&mut self, h: f64) {
+        let Layout { nd, .. } = self.scratch.layout;
+        let n = self.scratch.layout.n();
+        let mid = &self.scratch.blocks.mid;
+        let at_start = |i: usize| if i < nd { (1.0, 0.0) } else { (0.5, -1.0 / h) };
+        let at_next = (0.5, 1.0 / h);
+        for &(i, j) in &self.pattern {
+            let (ij, ji) = (i * n + j, j * n + i);
+            let (qq, vv) = (mid.l_qq[ij].eps, mid.l_vv[ij].eps);
+            let (qv, vq) = (mid.l_qv[ij].eps, mid.l_qv[ji].eps);
+            let second = |(c_i, d_i): (f64, f64), (c_j, d_j): (f64, f64)| {
+                c_i * (c_j * qq + d_j * qv) + d_i * (c_j * vq + d_j * vv)
+            };
+            self.quadratic.add_starts(i, j, second(at_start(i), at_start(j)));
+            self.quadratic.add_start_next(i, j, second(at_start(i), at_next));
+            self.quadratic.add_nexts(i, j, second(at_next, at_next));
+        }
+    }
+
+    /// What constraints add: their impulses turn with the start, their values with the end.
+    fn add_constraints(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
+        let Layout { nd, .. } = self.scratch.layout;
+        let n = self.scratch.layout.n();
+        let h = step.settings.time_step_s;
+        let blocks = &mut self.scratch.blocks;
+        blocks.start.evaluate(model, &blocks.q_start, &[]);
+        blocks.start.differentiate(model, &blocks.q_start);
+        self.find_multipliers(step, z, |blocks, i, j| {
+            let slope = 0.5 * h * blocks.mid.l_qq[i * n + j].re + blocks.mid.l_qv[i * n + j].re;
+            if i == j { slope + blocks.mid.f_v[i * n + i].re } else { slope }
+        });
+        let Self { scratch, quadratic, adjoint, end, q_end, .. } = self;
+        let start = &scratch.blocks.start;
+        for (i, q) in step.q.iter().enumerate() {
+            q_end[i] = if i < nd { q + step.increment[i] } else { step.next[i - nd] };
+        }
+        end.poses.evaluate(&model.closure, q_end, &[]);
+        let equations = model.constraints.iter().zip(&step.multipliers).zip(&adjoint[nd..]);
+        for (c, ((constraint, lambda), mu)) in equations.enumerate() {
+            let (tree, q_start) = (&model.closure, &scratch.blocks.q_start);
+            constraint.for_each_second_derivative(tree, &start.poses, q_start, |i, j, value| {
+                quadratic.add_starts(i, j, -lambda * value.eps);
+            });
+            constraint.for_each_second_derivative(tree, &end.poses, q_end, |i, j, value| {
+                let value = mu * value;
+                if i < nd {
+                    quadratic.add_start_next(i, j, value);
+                    if j < nd {
+                        quadratic.add_starts(i, j, value);
+                    }
+                }
+                quadratic.add_nexts(i, j, value);
+            });
+            for &i in &constraint.coordinates {
+                quadratic.add_mixed(nd + c, i, -start.jacobian[c * n + i].eps);
+            }
+        }
+    }
+
+    /// Adds up the products and hands the sum out.
+    fn finish(&mut self) {
+        let layout = self.scratch.layout;
+        let (moving, stride, size) = (layout.inputs(), layout.stride, layout.parameters());
+        let (sum, product) = (&mut self.quadratic.sum, &self.product);
+        for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
+            let mirrored = product.iter().skip(a).step_by(stride);
+            for ((entry, mixed), mirrored) in
+                row[..=a].iter_mut().zip(&product[a * stride..]).zip(mirrored)
+            {
+                *entry += mixed + mirrored;
+            }
+        }
+        for a in 1..size {
+            let (above, row) = sum.split_at_mut(a * stride);
+            let mirrored = above.iter_mut().skip(a).step_by(stride);
+            mirrored.zip(&row[..a]).for_each(|(mirrored, entry)| *mirrored = *entry);
+        }
+        let row = |a: usize| &sum[a * stride..][..size];
+        for a in 0..moving {
+            self.xx.column_mut(a).rows_mut(0, moving).copy_from_slice(&row(a)[..moving]);
+        }
+        for a in 0..size - moving {
+            let (by_x, by_u) = row(moving + a).split_at(moving);
+            self.xu.column_mut(a).rows_mut(0, moving).copy_from_slice(by_x);
+            self.uu.column_mut(a).copy_from_slice(by_u);
+        }
+        self.scratch.drop_replaced_columns(&mut self.xu);
+        self.scratch.drop_replaced_columns(&mut self.uu);
+        self.scratch.drop_replaced_rows(&mut self.uu);
+    }
+}
+
+impl Plant {
+    /// [`Plant::linearize`] into `first`, then [`Contraction::contract`] with `weights_x` and
+    /// `weights_multipliers` into `out`.
+    ///
+    /// # Errors
+    ///
+    /// Those of a step, and [`StepError::Dimension`] for weights of the wrong length.
+    ///
+    /// # Panics
+    ///
+    /// If `first` or `out` was made for a model of other dimensions.
+    pub fn contract_second_order(
+        &mut self,
+        u: &[f64],
+        weights_x: &[f64],
+        weights_multipliers: &[f64],
+        first: &mut Linearization,
+        out: &mut Contraction,
+    ) -> Result<StepReport, StepError> {
+        check_weights(&self.model, weights_x, weights_multipliers)?;
+        let report = self.linearize(u, first)?;
+        out.contract(&self.model, first, weights_x, weights_multipliers)?;
+        Ok(report)
+    }
+}
+
+fn check_weights(model: &Model, x: &[f64], multipliers: &[f64]) -> Result<(), StepError> {
+    let d = model.dimensions;
+    for (weights, expected) in [(x, d.state()), (multipliers, d.constraints)] {
+        if weights.len() != expected {
+            return Err(StepError::Dimension { expected, actual: weights.len() });
+        }
+    }
+    Ok(())
+}
