@@ -214,12 +214,12 @@ impl Contraction {
         let z_p = &z[n..][..nd];
         let (first, second) = self.adjoint.split_at_mut(nd);
         second.fill(0.0);
-        for i in 0..nd {
+        for (i, mu) in first.iter().enumerate() {
             let moved: f64 = z_p.iter().enumerate().map(|(j, z)| z * slope(blocks, j, i)).sum();
             let pull = self.weights[i] + moved;
             for (c, entry) in second.iter_mut().enumerate() {
                 let jacobian = blocks.start.jacobian[c * n + i].re;
-                *entry -= step.responses[i * stride + c] * pull + jacobian * first[i];
+                *entry -= step.responses[i * stride + c] * pull + jacobian * mu;
             }
         }
         self.schur.take_factors_of(&step.schur);
