@@ -17,13 +17,17 @@ Vectors and matrices are numpy arrays in SI units and radians. What the server r
 from ._client import Client, connect
 from ._drive import Driver
 from ._errors import PlantdError, StepError, Violation
-from ._rotation import difference, rotations
+from ._feedback import Follower, GainSchedule
+from ._kalman import Kalman, KalmanStep, TrajectoryKalman
+from ._optimize import Checkpoint, Optimum, Progress, ProjectedReference, Search
+from ._rotation import compose, difference, rotations
 from ._types import (
     Analysis,
     Contraction,
     Diagnostics,
     Dynamics,
     Energy,
+    Feedback,
     Gain,
     Linearization,
     Mode,
@@ -34,31 +38,49 @@ from ._types import (
     Settled,
     State,
     StepReport,
+    Trajectory,
+    TrajectoryGain,
     Watched,
+    WatchedGain,
 )
 
 __all__ = [
     "Analysis",
+    "Checkpoint",
     "Client",
     "Contraction",
     "Diagnostics",
     "Driver",
     "Dynamics",
     "Energy",
+    "Feedback",
+    "Follower",
     "Gain",
+    "GainSchedule",
+    "Kalman",
+    "KalmanStep",
     "Linearization",
     "Mode",
+    "Optimum",
     "Plant",
     "PlantdError",
+    "Progress",
+    "ProjectedReference",
     "Regulator",
     "Rollout",
+    "Search",
     "SecondOrder",
     "Settled",
     "State",
     "StepError",
     "StepReport",
+    "Trajectory",
+    "TrajectoryGain",
+    "TrajectoryKalman",
     "Violation",
     "Watched",
+    "WatchedGain",
+    "compose",
     "connect",
     "difference",
     "rotations",

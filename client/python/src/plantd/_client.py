@@ -16,13 +16,31 @@ from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
 from ._drive import Driver
 from ._errors import PlantdError, translate, translated
+from ._feedback import Follower
+from ._kalman import Kalman, TrajectoryKalman
+from ._optimize import Checkpoint, Method, Optimum, ProjectedReference, Search, method_number
+from ._requests import (
+    Bounds,
+    bounds,
+    constraints,
+    initial_state,
+    measurement,
+    noise,
+    point,
+    settings,
+    split_outputs,
+    stage_weights,
+    trajectory,
+    weights,
+)
 from ._types import (
+    FEEDBACK_MODES,
     Analysis,
-    Array,
     Contraction,
     Diagnostics,
     Dynamics,
     Energy,
+    Feedback,
     Gain,
     Linearization,
     Plant,
@@ -32,8 +50,11 @@ from ._types import (
     Settled,
     State,
     StepReport,
+    Trajectory,
+    TrajectoryGain,
     Vector,
     Watched,
+    WatchedGain,
     matrix_message,
     vector,
     weight,
@@ -42,7 +63,7 @@ from ._types import (
 #: Where a server listens unless it is told otherwise.
 DEFAULT_ADDRESS = "http://127.0.0.1:50051"
 
-Field = Literal["state", "report", "energy", "linearization", "gain"]
+Field = Literal["state", "report", "energy", "linearization", "gain", "input"]
 
 #: Answers hold no more than a request asked for; this only stops a runaway peer.
 _MAX_RECEIVE_BYTES = 256 << 20
@@ -180,8 +201,8 @@ class Client:
         request = plant_service_pb2.CreatePlantRequest(
             id=id,
             model=model,
-            settings=_settings(dt, paper),
-            initial=_initial(at, q, v, p, initial),
+            settings=settings(dt, paper),
+            initial=initial_state(at, q, v, p, initial),
             open_link=open_link,
         )
         return Plant._from(self._call(self.plants.CreatePlant, request).plant)
@@ -259,7 +280,7 @@ class Client:
             ],
             every=every,
             coordinates=coordinates,
-            weights=None if q is None or r is None else _weights(q, r),
+            weights=None if q is None or r is None else weights(q, r),
         )
         # Asked for now rather than at the first message, so that nothing in between is missed.
         return self._messages(self.plants.Watch(request), Watched._from)
@@ -275,7 +296,7 @@ class Client:
         initial: common_pb2.InitialState | None = None,
     ) -> State:
         """Puts a plant back to step 0, where it was created or where the arguments say."""
-        state = _initial(at, q, v, p, initial)
+        state = initial_state(at, q, v, p, initial)
         request = plant_service_pb2.ResetRequest(id=id, initial=state)
         return State._from(self._call(self.plants.Reset, request).state)
 
@@ -287,6 +308,91 @@ class Client:
         """Restores a snapshot of a plant of the same model and settings, step count included."""
         request = plant_service_pb2.RestoreRequest(id=id, snapshot=snapshot)
         return State._from(self._call(self.plants.Restore, request).state)
+
+    def set_parameters(
+        self, id: str, parameters: Mapping[str, float] | None = None, *, dt: float = 0.0
+    ) -> Plant:
+        """Changes numbers of a plant's scene, or its time step, while it runs; its state x stays.
+
+        ``parameters`` by where they stand, as in the errors of scenes: ``gravity[1]``,
+        ``frames[pole].body.mass``. All of them take effect, or none.
+        """
+        request = plant_service_pb2.SetParametersRequest(
+            id=id,
+            parameters=[
+                plant_service_pb2.Parameter(path=path, value=value)
+                for path, value in (parameters or {}).items()
+            ],
+            time_step_s=dt,
+        )
+        return Plant._from(self._call(self.plants.SetParameters, request).plant)
+
+    def set_feedback(
+        self,
+        id: str,
+        *,
+        at: str | None = None,
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        trajectory: Trajectory | None = None,
+        gain: Gain | None = None,
+        q: npt.ArrayLike | None = None,
+        r: npt.ArrayLike | None = None,
+        q_final: npt.ArrayLike | None = None,
+        s: npt.ArrayLike | None = None,
+        stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
+        full: bool = False,
+        mode: Literal["watch", "replace", "add", "guard"] = "watch",
+        first_step: int | None = None,
+        guard: Bounds | None = None,
+    ) -> Feedback:
+        """Gives a plant a reference with its regulator, which the server computes, and computes anew
+        when the plant's parameters change. `follow_gains` applies it here.
+
+        The reference is one of: an equilibrium (``at``, or ``state`` with ``u``, or where ``plant``
+        is), a ``trajectory``, which begins at the plant's step ``first_step`` or at the present one,
+        or a ``gain`` as it stands. ``mode`` is what the feedback does in the plant's own loop, ``law``
+        standing for its input: ``watch`` nothing; ``replace`` u = law; ``add`` u = law + what the
+        driver sends; ``guard`` u = law from the first step on at which an entry of x - x_reference
+        leaves its bounds in ``guard``.
+        """
+        forms = [at is not None, state is not None, bool(plant), trajectory is not None]
+        if sum([*forms, gain is not None]) != 1:
+            raise ValueError("give one of `at`, `state`, `plant`, `trajectory` and `gain`")
+        request = plant_service_pb2.SetFeedbackRequest(
+            id=id,
+            stages=stage_weights(stages),
+            constraints=constraints(full),
+            mode=FEEDBACK_MODES[mode],
+            first_step=first_step,
+            guard=bounds(guard),
+        )
+        if gain is not None:
+            request.gain.CopyFrom(gain._message())
+        elif trajectory is not None:
+            request.trajectory.CopyFrom(trajectory._message())
+        else:
+            request.point.CopyFrom(point(at or "", state, u, plant))
+        given = _trajectory_weights(q, r, q_final, s)
+        if given is not None:
+            request.weights.CopyFrom(given)
+        return Feedback._from(self._call(self.plants.SetFeedback, request).feedback)
+
+    def clear_feedback(self, id: str) -> None:
+        """Takes the reference away; the driver's input acts alone again."""
+        self._call(self.plants.ClearFeedback, plant_service_pb2.ClearFeedbackRequest(id=id))
+
+    def watch_gains(self, id: str) -> Iterator[WatchedGain]:
+        """The gains of a plant's feedback: along a trajectory those of every step from the present one
+        on, ahead of time; about an operating point the one in force and each that replaces it."""
+        request = plant_service_pb2.WatchGainsRequest(id=id)
+        return self._messages(self.plants.WatchGains(request), WatchedGain._from)
+
+    def follow_gains(self, id: str) -> Follower:
+        """Follows the gains of a plant's feedback, to apply them here: ``u = law(state)``."""
+        request = plant_service_pb2.WatchGainsRequest(id=id)
+        return Follower(lambda: self.plants.WatchGains(request), self._timeout)
 
     def open_link(self, id: str) -> plant_service_pb2.OpenLinkResponse:
         """Opens the shared-memory link of a plant and says how to reach it."""
@@ -308,7 +414,7 @@ class Client:
         """Linearizes the map of a model at an operating point, or at ``state`` with input ``u``; or
         that of a ``plant``, where it is."""
         request = control_service_pb2.LinearizeRequest(
-            model=model, settings=_settings(dt, paper), point=_point(at, state, u, plant)
+            model=model, settings=settings(dt, paper), point=point(at, state, u, plant)
         )
         answer = self._call(self.control.Linearize, request)
         return Linearization._from(
@@ -333,7 +439,7 @@ class Client:
     ) -> SecondOrder:
         """All second derivatives of the map at a point given as in `linearize`."""
         request = control_service_pb2.LinearizeSecondOrderRequest(
-            model=model, settings=_settings(dt, paper), point=_point(at, state, u, plant)
+            model=model, settings=settings(dt, paper), point=point(at, state, u, plant)
         )
         return SecondOrder._from(self._call(self.control.LinearizeSecondOrder, request))
 
@@ -356,8 +462,8 @@ class Client:
         """
         request = control_service_pb2.LinearizeSecondOrderRequest(
             model=model,
-            settings=_settings(dt, paper),
-            point=_point(at, state, u, plant),
+            settings=settings(dt, paper),
+            point=point(at, state, u, plant),
             weights=common_pb2.ContractionWeights(
                 x=vector(weights), multipliers=vector(multiplier_weights)
             ),
@@ -412,15 +518,15 @@ class Client:
         """
         request = control_service_pb2.AnalyzeRequest(
             model=model,
-            settings=_settings(dt, paper),
-            point=_point(at, state, u, plant),
-            constraints=_constraints(full),
+            settings=settings(dt, paper),
+            point=point(at, state, u, plant),
+            constraints=constraints(full),
             frequencies_hz=vector(frequencies),
         )
-        if isinstance(outputs, np.ndarray) or (len(outputs) and not isinstance(outputs[0], str)):
-            request.output_x.CopyFrom(matrix_message(outputs))
-        else:
-            request.outputs.extend(outputs)
+        names, rows = split_outputs(outputs)
+        request.outputs.extend(names)
+        if rows is not None:
+            request.output_x.CopyFrom(rows)
         return Analysis._from(self._call(self.control.Analyze, request))
 
     def solve_lqr(
@@ -429,6 +535,7 @@ class Client:
         *,
         q: npt.ArrayLike,
         r: npt.ArrayLike,
+        s: npt.ArrayLike | None = None,
         at: str = "initial",
         state: State | None = None,
         u: Vector = (),
@@ -436,25 +543,32 @@ class Client:
         paper: bool = False,
         full: bool = False,
     ) -> Regulator:
-        """Infinite-horizon LQR about an equilibrium. Weights are diagonals or matrices.
+        """Infinite-horizon LQR about an equilibrium. Weights are diagonals or matrices, ``s`` is that
+        of the cross term x' s u.
 
         ``full`` solves on the full state of a constrained model instead of on its manifold.
         """
         request = control_service_pb2.SolveLqrRequest(
             model=model,
-            settings=_settings(dt, paper),
-            point=_point(at, state, u),
-            weights=_weights(q, r),
-            constraints=_constraints(full),
+            settings=settings(dt, paper),
+            point=point(at, state, u),
+            weights=weights(q, r, s=s),
+            constraints=constraints(full),
         )
         return Regulator._from_answer(self._call(self.control.SolveLqr, request))
 
     def linearize_trajectory(
-        self, model: str, initial: State, u: npt.ArrayLike, *, dt: float = 0.0, paper: bool = False
+        self,
+        model: str,
+        initial: State | Trajectory,
+        u: npt.ArrayLike | None = None,
+        *,
+        dt: float = 0.0,
+        paper: bool = False,
     ) -> Iterator[Linearization]:
         """Linearizes the map at every step of the trajectory that ``u`` drives from ``initial``."""
         request = control_service_pb2.LinearizeTrajectoryRequest(
-            model=model, settings=_settings(dt, paper), trajectory=_trajectory(initial, u)
+            model=model, settings=settings(dt, paper), trajectory=trajectory(initial, u)
         )
         return self._messages(
             self.control.LinearizeTrajectory(request),
@@ -466,28 +580,225 @@ class Client:
     def solve_trajectory_lqr(
         self,
         model: str,
-        initial: State,
-        u: npt.ArrayLike,
+        initial: State | Trajectory,
+        u: npt.ArrayLike | None = None,
         *,
-        q: npt.ArrayLike,
-        r: npt.ArrayLike,
+        q: npt.ArrayLike | None = None,
+        r: npt.ArrayLike | None = None,
         q_final: npt.ArrayLike | None = None,
+        s: npt.ArrayLike | None = None,
+        stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
+        values: bool = False,
         dt: float = 0.0,
         paper: bool = False,
         full: bool = False,
-    ) -> Iterator[Gain]:
+    ) -> Iterator[TrajectoryGain]:
         """Time-varying LQR along a trajectory: one gain per step, then one with only the final
-        reference state."""
+        reference state. `GainSchedule` makes a law of them.
+
+        ``stages`` are weights of each step in place of ``q``, ``r`` and ``s``: mappings of these names
+        and of ``x_linear`` and ``u_linear``. ``values`` also returns the cost to go.
+        """
         request = control_service_pb2.SolveTrajectoryLqrRequest(
             model=model,
-            settings=_settings(dt, paper),
-            trajectory=_trajectory(initial, u),
-            weights=_weights(q, r, q_final),
-            constraints=_constraints(full),
+            settings=settings(dt, paper),
+            trajectory=trajectory(initial, u),
+            weights=_trajectory_weights(q, r, q_final, s),
+            stages=stage_weights(stages),
+            values=values,
+            constraints=constraints(full),
         )
-        return self._messages(
-            self.control.SolveTrajectoryLqr(request), lambda m: Gain._from(m.gain)
+        return self._messages(self.control.SolveTrajectoryLqr(request), TrajectoryGain._from_answer)
+
+    def optimize_trajectory(
+        self,
+        model: str,
+        guess: Trajectory | Optimum | None = None,
+        *,
+        x: npt.ArrayLike,
+        u: npt.ArrayLike | None = None,
+        q: npt.ArrayLike | None = None,
+        r: npt.ArrayLike | None = None,
+        q_final: npt.ArrayLike | None = None,
+        s: npt.ArrayLike | None = None,
+        stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
+        resume: Checkpoint | None = None,
+        state_bounds: Bounds | None = None,
+        input_bounds: Bounds | None = None,
+        final_state: Bounds | None = None,
+        free_initial: bool | Sequence[str] = False,
+        initial_weight: npt.ArrayLike | None = None,
+        method: Method = "newton",
+        first_method: Method | None = None,
+        first_iterations: int = 0,
+        max_iterations: int = 0,
+        tolerance: float = 0.0,
+        alpha: float = 0.0,
+        beta: float = 0.0,
+        max_backtracks: int = 0,
+        projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+        bound_tolerance: float = 0.0,
+        checkpoint_every: int = 0,
+        dt: float = 0.0,
+        paper: bool = False,
+    ) -> Search:
+        """Finds a trajectory that costs least: an iterator over the iterations, with ``result``.
+
+        The cost is that of the distance from the desired states ``x`` (n + 1 rows, which need not be a
+        motion) and inputs ``u`` (n rows; zero if not given), with weights as in
+        `solve_trajectory_lqr`. ``guess`` is where the search begins: a trajectory, or a former result;
+        or ``resume`` is where it left off. Bounds are by the name of an entry, ``{"force": (-5, 5)}``;
+        ``final_state={"theta": math.pi}`` fixes an entry of the last state. ``free_initial`` frees all
+        entries of the initial state, or those that are named; ``initial_weight`` weighs their
+        distance from the guess. ``projection`` is the pair of weights (q, r) of the regulator that
+        projects onto motions of the plant. The other options are those of `OptimizationOptions` in
+        the contract; 0 means its default.
+        """
+        if (guess is None) == (resume is None):
+            raise ValueError("give one of `guess` and `resume`")
+        start = guess.trajectory if isinstance(guess, Optimum) else guess
+        free = None
+        if free_initial is not False:
+            free = control_service_pb2.FreeInitialState(
+                entries=() if free_initial is True else free_initial,
+                weight=None if initial_weight is None else weight(initial_weight),
+            )
+        request = control_service_pb2.OptimizeTrajectoryRequest(
+            model=model,
+            settings=settings(dt, paper),
+            cost=control_service_pb2.TrajectoryCost(
+                x=matrix_message(x),
+                u=None if u is None else matrix_message(u),
+                weights=_trajectory_weights(q, r, q_final, s),
+                stages=stage_weights(stages),
+            ),
+            guess=None if start is None else start._message(),
+            resume=None if resume is None else resume.message,
+            bounds=control_service_pb2.TrajectoryBounds(
+                state=bounds(state_bounds),
+                input=bounds(input_bounds),
+                final_state=bounds(final_state),
+            ),
+            free_initial=free,
+            options=control_service_pb2.OptimizationOptions(
+                method=method_number(method),
+                first_method=method_number(first_method),
+                first_iterations=first_iterations,
+                max_iterations=max_iterations,
+                tolerance=tolerance,
+                alpha=alpha,
+                beta=beta,
+                max_backtracks=max_backtracks,
+                projection=None if projection is None else weights(*projection),
+                bound_tolerance=bound_tolerance,
+                checkpoint_every=checkpoint_every,
+            ),
         )
+        return Search(self.control.OptimizeTrajectory(request))
+
+    def project_reference(
+        self,
+        model: str,
+        reference: npt.ArrayLike,
+        u: npt.ArrayLike | None = None,
+        *,
+        q: npt.ArrayLike | None = None,
+        r: npt.ArrayLike | None = None,
+        q_final: npt.ArrayLike | None = None,
+        s: npt.ArrayLike | None = None,
+        projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+        tolerance: float = 0.0,
+        strict: bool = False,
+        dt: float = 0.0,
+        paper: bool = False,
+        full: bool = False,
+    ) -> ProjectedReference:
+        """Compares configurations from any planner with the motions of the plant, and finds a motion
+        that follows them, with its regulator if the weights ``q`` and ``r`` are given.
+
+        Row k of ``reference`` is the configuration at step k. ``u`` are the planned inputs; forces
+        that fit best if not given. ``strict`` refuses a reference that is no motion, within
+        ``tolerance``, with reason ``INFEASIBLE_REFERENCE``.
+        """
+        has_weights = q is not None and r is not None
+        request = control_service_pb2.ProjectReferenceRequest(
+            model=model,
+            settings=settings(dt, paper),
+            q=matrix_message(reference),
+            u=None if u is None else matrix_message(u),
+            projection=None if projection is None else weights(*projection),
+            weights=_trajectory_weights(q, r, q_final, s) if has_weights else None,
+            constraints=constraints(full),
+            tolerance=tolerance,
+            strict=strict,
+        )
+        with translated():
+            return ProjectedReference._from(self.control.ProjectReference(request))
+
+    def solve_kalman(
+        self,
+        model: str = "",
+        *,
+        outputs: Sequence[str] | npt.ArrayLike = (),
+        output_u: npt.ArrayLike | None = None,
+        measurement_noise: npt.ArrayLike,
+        process_noise: npt.ArrayLike | None = None,
+        input_noise: npt.ArrayLike | None = None,
+        at: str = "initial",
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        dt: float = 0.0,
+        paper: bool = False,
+        full: bool = False,
+    ) -> Kalman:
+        """Steady-state Kalman filter about an equilibrium, ready to ``correct`` and ``predict``.
+
+        ``outputs`` are what is measured: names of entries of x such as ``theta`` or ``p(theta)``, or a
+        matrix. Noises are covariances per step, diagonals or matrices: of the measurement, of the
+        state and of the inputs.
+        """
+        request = control_service_pb2.SolveKalmanRequest(
+            model=model,
+            settings=settings(dt, paper),
+            point=point(at, state, u, plant),
+            measurement=measurement(outputs, output_u),
+            noise=noise(process_noise, input_noise, measurement_noise),
+            constraints=constraints(full),
+        )
+        return Kalman._from(self._call(self.control.SolveKalman, request))
+
+    def solve_trajectory_kalman(
+        self,
+        model: str,
+        initial: State | Trajectory,
+        u: npt.ArrayLike | None = None,
+        *,
+        outputs: Sequence[str] | npt.ArrayLike = (),
+        output_u: npt.ArrayLike | None = None,
+        measurement_noise: npt.ArrayLike,
+        process_noise: npt.ArrayLike | None = None,
+        input_noise: npt.ArrayLike | None = None,
+        initial_covariance: npt.ArrayLike,
+        covariances: bool = False,
+        dt: float = 0.0,
+        paper: bool = False,
+        full: bool = False,
+    ) -> TrajectoryKalman:
+        """Time-varying Kalman filter along a trajectory, as `solve_kalman`; ``initial_covariance`` is
+        that of the error in the initial state. ``covariances`` also returns those of each step."""
+        request = control_service_pb2.SolveTrajectoryKalmanRequest(
+            model=model,
+            settings=settings(dt, paper),
+            trajectory=trajectory(initial, u),
+            measurement=measurement(outputs, output_u),
+            noise=noise(process_noise, input_noise, measurement_noise),
+            initial_covariance=weight(initial_covariance),
+            constraints=constraints(full),
+            covariances=covariances,
+        )
+        with translated():
+            return TrajectoryKalman._from(self.control.SolveTrajectoryKalman(request))
 
     def rollout(
         self,
@@ -500,7 +811,7 @@ class Client:
     ) -> Iterator[Rollout]:
         """Runs many simulations at once; answers come in the order in which they end."""
         request = control_service_pb2.RolloutRequest(
-            model=model, settings=_settings(dt, paper), cases=cases, every=every
+            model=model, settings=settings(dt, paper), cases=cases, every=every
         )
         return self._messages(self.control.Rollout(request), Rollout._from)
 
@@ -517,58 +828,15 @@ class Client:
         return messages()
 
 
-def _settings(dt: float, paper: bool) -> plant_service_pb2.PlantSettings:
-    split = plant_service_pb2.FORCE_SPLIT_PAPER if paper else plant_service_pb2.FORCE_SPLIT_SYMMETRIC
-    return plant_service_pb2.PlantSettings(time_step_s=dt, force_split=split)
-
-
-def _initial(
-    at: str | None,
-    q: Vector | None,
-    v: Vector | None,
-    p: Vector | None,
-    initial: common_pb2.InitialState | None,
-) -> common_pb2.InitialState | None:
-    if sum(given is not None for given in (at, q, initial)) > 1:
-        raise ValueError("give one of `at`, `q` and `initial`")
-    if q is None and (v is not None or p is not None):
-        raise ValueError("`v` and `p` need `q`")
-    if v is not None and p is not None:
-        raise ValueError("give `v` or `p`")
-    if at is not None:
-        return common_pb2.InitialState(operating_point=at)
-    if q is None:
-        return initial
-    configuration = vector(q)
-    if p is not None:
-        momentum = common_pb2.InitialState.Momentum(q=configuration, p=vector(p))
-        return common_pb2.InitialState(momentum=momentum)
-    rate: Array = np.zeros_like(configuration) if v is None else vector(v)
-    velocity = common_pb2.InitialState.Velocity(q=configuration, v=rate)
-    return common_pb2.InitialState(velocity=velocity)
-
-
-def _point(at: str, state: State | None, u: Vector, plant: str = "") -> common_pb2.Point:
-    if plant:
-        return common_pb2.Point(plant=plant)
-    if state is None:
-        return common_pb2.Point(operating_point=at)
-    here = common_pb2.StateAndInput(state=state._message(), u=vector(u))
-    return common_pb2.Point(state_and_input=here)
-
-
-def _trajectory(initial: State, u: npt.ArrayLike) -> common_pb2.Trajectory:
-    return common_pb2.Trajectory(initial=initial._message(), u=matrix_message(u))
-
-
-def _weights(
-    q: npt.ArrayLike, r: npt.ArrayLike, q_final: npt.ArrayLike | None = None
-) -> plant_service_pb2.LqrWeights:
-    final = None if q_final is None else weight(q_final)
-    return plant_service_pb2.LqrWeights(q=weight(q), r=weight(r), q_final=final)
-
-
-def _constraints(full: bool) -> Any:
-    if full:
-        return control_service_pb2.CONSTRAINT_HANDLING_FULL
-    return control_service_pb2.CONSTRAINT_HANDLING_MANIFOLD
+def _trajectory_weights(
+    q: npt.ArrayLike | None,
+    r: npt.ArrayLike | None,
+    q_final: npt.ArrayLike | None,
+    s: npt.ArrayLike | None,
+) -> plant_service_pb2.LqrWeights | None:
+    """The weights that go beside those of each step, or stand for them."""
+    if q is not None and r is not None:
+        return weights(q, r, q_final, s)
+    if q_final is not None:
+        return plant_service_pb2.LqrWeights(q_final=weight(q_final))
+    return None

@@ -9,7 +9,7 @@ from plantd.v1 import plant_service_pb2 as pb
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
 from ._errors import PlantdError, from_failure, translate
-from ._types import Linearization, Plant, State, StepReport, Vector, vector
+from ._types import Array, Linearization, Plant, State, StepReport, Vector, array, vector
 
 
 class Driver:
@@ -24,6 +24,8 @@ class Driver:
         self.report: StepReport | None = None
         #: Linearization of the last step, if the driver was opened with it.
         self.linearization: Linearization | None = None
+        #: Input of the last step, if a feedback in the plant's loop had a say in it.
+        self.u: Array | None = None
         #: The plant as it was when the driver opened it.
         self.plant = Plant._from(self._next().opened.plant)
 
@@ -49,6 +51,7 @@ class Driver:
         if answer.HasField("failure"):
             raise from_failure(answer.failure.failure)
         self.report = StepReport._from(answer.step.report)
+        self.u = array(answer.step.u) if answer.step.u else None
         if answer.step.HasField("linearization"):
             self.linearization = Linearization._from(answer.step.linearization)
         return State._from(answer.step.state)

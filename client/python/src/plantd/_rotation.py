@@ -36,10 +36,26 @@ def difference(
     return out
 
 
+def compose(x_reference: npt.ArrayLike, dx: npt.ArrayLike, rotations: Sequence[int] = ()) -> Array:
+    """The x whose `difference` from ``x_reference`` is ``dx``."""
+    reference = np.atleast_1d(np.asarray(x_reference, dtype=np.float64))
+    error = np.atleast_1d(np.asarray(dx, dtype=np.float64))
+    out: Array = reference + error
+    for start in rotations:
+        entries = slice(start, start + 3)
+        (w0, a), (w1, b) = _quaternion(reference[entries]), _quaternion(error[entries])
+        out[entries] = _vector(float(w0 * w1 - a @ b), w0 * b + w1 * a + np.cross(a, b))
+    return out
+
+
 def _between(start: Array, end: Array) -> Array:
     (w0, a), (w1, b) = _quaternion(start), _quaternion(end)
-    w = w0 * w1 + a @ b
-    v = w0 * b - w1 * a - np.cross(a, b)
+    w = float(w0 * w1 + a @ b)
+    return _vector(w, w0 * b - w1 * a - np.cross(a, b))
+
+
+def _vector(w: float, v: Array) -> Array:
+    """Rotation vector, of a length up to pi, of a unit quaternion."""
     if w < 0:
         w, v = -w, -v
     sine = float(np.linalg.norm(v))

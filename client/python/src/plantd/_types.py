@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Union
 
@@ -46,6 +46,24 @@ class State:
 
     def _message(self) -> common_pb2.State:
         return common_pb2.State(q=self.q, p=self.p, v=self.v)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A motion, given by where it starts and what drives it."""
+
+    #: Initial state; None means the scene's initial configuration, at rest.
+    initial: State | None
+    #: Row k is u[k]; n rows of ni + nk columns.
+    u: Array
+
+    @classmethod
+    def _from(cls, m: common_pb2.Trajectory) -> Trajectory:
+        return cls(State._from(m.initial) if m.HasField("initial") else None, matrix(m.u))
+
+    def _message(self) -> common_pb2.Trajectory:
+        initial = None if self.initial is None else self.initial._message()
+        return common_pb2.Trajectory(initial=initial, u=matrix_message(self.u))
 
 
 @dataclass(frozen=True)
@@ -334,26 +352,73 @@ class Diagnostics:
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """The feedback law u = u_reference - k (x - x_reference); call it with a state.
+    """The feedback law u = u_reference + feedforward - k (x - x_reference); call it with a state.
 
     Differences of orientations of ball joints are those of `plantd.difference`.
     """
 
     #: Step index from which it holds.
     step: int
+    #: Without rows in the message that ends a trajectory, which holds only the final state.
     k: Array
     x_reference: Array
     u_reference: Array
     #: Indices in x at which rotation vectors of ball joints begin.
     rotations: tuple[int, ...]
+    #: Added to the reference's input.
+    feedforward: Array
 
-    def __call__(self, state: State) -> Array:
-        return self.u_reference - self.k @ difference(self.x_reference, state.x, self.rotations)
+    def __call__(self, state: State | npt.ArrayLike) -> Array:
+        error = difference(self.x_reference, state_vector(state), self.rotations)
+        return self.u_reference + self.feedforward - self.k @ error
 
     @classmethod
     def _from(cls, m: common_pb2.Gain) -> Gain:
-        references = array(m.x_reference), array(m.u_reference)
-        return cls(m.step, matrix(m.k), *references, tuple(m.rotations))
+        return cls(**cls._fields(m))
+
+    @staticmethod
+    def _fields(m: common_pb2.Gain) -> dict[str, Any]:
+        reference = array(m.u_reference)
+        return {
+            "step": m.step,
+            "k": matrix(m.k),
+            "x_reference": array(m.x_reference),
+            "u_reference": reference,
+            "rotations": tuple(m.rotations),
+            "feedforward": array(m.feedforward) if m.feedforward else np.zeros_like(reference),
+        }
+
+    def _message(self) -> common_pb2.Gain:
+        return common_pb2.Gain(
+            step=self.step,
+            k=matrix_message(self.k),
+            x_reference=self.x_reference,
+            u_reference=self.u_reference,
+            rotations=self.rotations,
+            feedforward=self.feedforward,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryGain(Gain):
+    """The gain of one step of a trajectory."""
+
+    #: Cost to go, 1/2 dx' value dx + value_linear' dx; None if it was not asked for.
+    value: Array | None
+    #: None where ``value`` is; empty when it is zero.
+    value_linear: Array | None
+    #: Reciprocal condition of r + b' value[k+1] b; 0 in the last message.
+    reciprocal_condition: float
+
+    @classmethod
+    def _from_answer(cls, m: control_service_pb2.SolveTrajectoryLqrResponse) -> TrajectoryGain:
+        has_value = m.HasField("value")
+        return cls(
+            **Gain._fields(m.gain),
+            value=matrix(m.value) if has_value else None,
+            value_linear=array(m.value_linear) if has_value else None,
+            reciprocal_condition=m.reciprocal_condition,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,20 +431,62 @@ class Regulator(Gain):
     spectral_radius: float
     #: Relative residual of the Riccati equation.
     residual: float
+    #: Eigenvalues of the closed loop, the largest first.
+    closed_loop: npt.NDArray[np.complex128]
+    #: Reciprocal condition of r + b' value b, whose inverse makes the gain.
+    reciprocal_condition: float
 
     @classmethod
     def _from_answer(cls, m: control_service_pb2.SolveLqrResponse) -> Regulator:
-        gain = Gain._from(m.gain)
         return cls(
-            gain.step,
-            gain.k,
-            gain.x_reference,
-            gain.u_reference,
-            gain.rotations,
-            matrix(m.value),
-            m.spectral_radius,
-            m.residual,
+            **Gain._fields(m.gain),
+            value=matrix(m.value),
+            spectral_radius=m.spectral_radius,
+            residual=m.residual,
+            closed_loop=complexes(m.closed_loop),
+            reciprocal_condition=m.reciprocal_condition,
         )
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """A feedback of a plant."""
+
+    #: What it does in the plant's loop: ``watch``, ``replace``, ``add`` or ``guard``.
+    mode: str
+    #: Counts the computations of its gains, from 1.
+    revision: int
+    #: Step of the plant at which a trajectory begins.
+    first_step: int
+    #: Steps of the trajectory; 0 about an operating point.
+    horizon: int
+    #: Step at which the watchdog took over, and the entry of x that made it do so.
+    tripped_at_step: int | None
+    tripped_by: str
+    #: Why the gains in force are still those of the parameters before; empty if they are not.
+    failure: str
+
+    @classmethod
+    def _from(cls, m: plant_service_pb2.FeedbackInfo) -> Feedback:
+        modes = {number: name for name, number in FEEDBACK_MODES.items()}
+        return cls(
+            modes.get(m.mode, "watch"),
+            m.revision,
+            m.first_step,
+            m.horizon,
+            m.tripped_at_step if m.HasField("tripped_at_step") else None,
+            m.tripped_by,
+            failure_text(m),
+        )
+
+
+#: What a feedback does in the plant's own loop, see `Client.set_feedback`.
+FEEDBACK_MODES = {
+    "watch": plant_service_pb2.FEEDBACK_MODE_WATCH_ONLY,
+    "replace": plant_service_pb2.FEEDBACK_MODE_REPLACE,
+    "add": plant_service_pb2.FEEDBACK_MODE_ADD,
+    "guard": plant_service_pb2.FEEDBACK_MODE_GUARD,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,11 +505,24 @@ class Plant:
     link_open: bool
     #: Energy of the state, where the call says so.
     energy: Energy | None = None
+    #: Feedback of the plant, if it has one.
+    feedback: Feedback | None = None
+    #: Numbers of the scene that were changed for this plant, by path.
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
-        state = State._from(m.state)
-        return cls(m.id, m.model, m.settings.time_step_s, state, m.driver, m.link_open, energy)
+        return cls(
+            m.id,
+            m.model,
+            m.settings.time_step_s,
+            State._from(m.state),
+            m.driver,
+            m.link_open,
+            energy,
+            Feedback._from(m.feedback) if m.HasField("feedback") else None,
+            {parameter.path: parameter.value for parameter in m.parameters},
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,6 +539,8 @@ class Watched:
     failure: str
     #: Messages that this watcher has lost so far.
     dropped: int
+    #: Input last applied.
+    u: Array | None = None
 
     @classmethod
     def _from(cls, m: plant_service_pb2.WatchResponse) -> Watched:
@@ -432,8 +554,39 @@ class Watched:
             part("energy", Energy),
             part("linearization", Linearization),
             part("gain", Gain),
-            f"{m.failure.reason}: {m.failure.message}" if m.HasField("failure") else "",
+            failure_text(m),
             m.dropped,
+            array(m.u) if m.u else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class WatchedGain:
+    """One message of a watch of gains."""
+
+    #: The gain; without rows in ``k`` in the message with the final state of a trajectory. None in
+    #: a message that only reports a failure.
+    gain: Gain | None
+    #: Of which computation it is.
+    revision: int
+    #: Revisions that this watcher never saw.
+    dropped: int
+    #: Why the gains in force are still those of the parameters before; empty if they are not.
+    failure: str
+    #: Step of the plant at which the gain's trajectory begins, and its steps; 0 steps about an
+    #: operating point.
+    first_step: int
+    horizon: int
+
+    @classmethod
+    def _from(cls, m: plant_service_pb2.WatchGainsResponse) -> WatchedGain:
+        return cls(
+            Gain._from(m.gain) if m.HasField("gain") else None,
+            m.revision,
+            m.dropped,
+            failure_text(m),
+            m.first_step,
+            m.horizon,
         )
 
 
@@ -449,8 +602,22 @@ class Rollout:
 
     @classmethod
     def _from(cls, m: control_service_pb2.RolloutResponse) -> Rollout:
-        failure = f"{m.failure.reason}: {m.failure.message}" if m.HasField("failure") else ""
-        return cls(m.case_index, [State._from(state) for state in m.states], failure)
+        return cls(m.case_index, [State._from(state) for state in m.states], failure_text(m))
+
+
+def failure_text(m: Any) -> str:
+    """The failure that a message carries; empty if there is none."""
+    return f"{m.failure.reason}: {m.failure.message}" if m.HasField("failure") else ""
+
+
+def state_vector(state: State | npt.ArrayLike) -> Array:
+    """x of a state, or a vector that is one."""
+    return state.x if isinstance(state, State) else vector(np.asarray(state))
+
+
+def complexes(values: Iterable[control_service_pb2.Complex]) -> npt.NDArray[np.complex128]:
+    """Complex numbers as an array."""
+    return np.array([complex(z.real, z.imaginary) for z in values], dtype=np.complex128)
 
 
 def array(values: Iterable[float]) -> Array:

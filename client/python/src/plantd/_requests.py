@@ -1,0 +1,148 @@
+"""Parts of requests, from what a caller gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Union
+
+import numpy as np
+import numpy.typing as npt
+
+from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
+
+from ._types import Array, State, Trajectory, Vector, matrix_message, vector, weight
+
+#: Bounds by the name of an entry: (lowest, highest), None for no bound; a number fixes the entry.
+Bounds = Mapping[str, Union[float, tuple[Union[float, None], Union[float, None]]]]
+
+
+def settings(dt: float, paper: bool) -> plant_service_pb2.PlantSettings:
+    split = plant_service_pb2.FORCE_SPLIT_PAPER if paper else plant_service_pb2.FORCE_SPLIT_SYMMETRIC
+    return plant_service_pb2.PlantSettings(time_step_s=dt, force_split=split)
+
+
+def initial_state(
+    at: str | None,
+    q: Vector | None,
+    v: Vector | None,
+    p: Vector | None,
+    initial: common_pb2.InitialState | None,
+) -> common_pb2.InitialState | None:
+    if sum(given is not None for given in (at, q, initial)) > 1:
+        raise ValueError("give one of `at`, `q` and `initial`")
+    if q is None and (v is not None or p is not None):
+        raise ValueError("`v` and `p` need `q`")
+    if v is not None and p is not None:
+        raise ValueError("give `v` or `p`")
+    if at is not None:
+        return common_pb2.InitialState(operating_point=at)
+    if q is None:
+        return initial
+    configuration = vector(q)
+    if p is not None:
+        momentum = common_pb2.InitialState.Momentum(q=configuration, p=vector(p))
+        return common_pb2.InitialState(momentum=momentum)
+    rate: Array = np.zeros_like(configuration) if v is None else vector(v)
+    velocity = common_pb2.InitialState.Velocity(q=configuration, v=rate)
+    return common_pb2.InitialState(velocity=velocity)
+
+
+def point(at: str, state: State | None, u: Vector, plant: str = "") -> common_pb2.Point:
+    if plant:
+        return common_pb2.Point(plant=plant)
+    if state is None:
+        return common_pb2.Point(operating_point=at)
+    here = common_pb2.StateAndInput(state=state._message(), u=vector(u))
+    return common_pb2.Point(state_and_input=here)
+
+
+def trajectory(initial: State | Trajectory, u: npt.ArrayLike | None) -> common_pb2.Trajectory:
+    if isinstance(initial, Trajectory):
+        if u is not None:
+            raise ValueError("a trajectory already has inputs: `u` is not needed")
+        return initial._message()
+    if u is None:
+        raise ValueError("`u`, the inputs of the trajectory, is needed")
+    return Trajectory(initial, np.asarray(u, dtype=np.float64))._message()
+
+
+def weights(
+    q: npt.ArrayLike,
+    r: npt.ArrayLike,
+    q_final: npt.ArrayLike | None = None,
+    s: npt.ArrayLike | None = None,
+) -> plant_service_pb2.LqrWeights:
+    return plant_service_pb2.LqrWeights(
+        q=weight(q),
+        r=weight(r),
+        q_final=None if q_final is None else weight(q_final),
+        s=None if s is None else matrix_message(s),
+    )
+
+
+def stage_weights(stages: Iterable[Mapping[str, npt.ArrayLike]]) -> list[Any]:
+    """Weights of each step: mappings with ``q`` and ``r``, and if need be ``s``, ``x_linear`` and
+    ``u_linear``."""
+    messages = []
+    for step, stage in enumerate(stages):
+        unknown = set(stage) - {"q", "r", "s", "x_linear", "u_linear"}
+        if unknown or "q" not in stage or "r" not in stage:
+            raise ValueError(
+                f"weights of step {step}: `q` and `r`, perhaps `s`, `x_linear`, `u_linear` are "
+                f"needed, not {sorted(stage)}"
+            )
+        messages.append(
+            plant_service_pb2.StageWeights(
+                q=weight(stage["q"]),
+                r=weight(stage["r"]),
+                s=matrix_message(stage["s"]) if "s" in stage else None,
+                x_linear=vector(np.asarray(stage.get("x_linear", ()))),
+                u_linear=vector(np.asarray(stage.get("u_linear", ()))),
+            )
+        )
+    return messages
+
+
+def bounds(given: Bounds | None) -> list[common_pb2.Bound]:
+    messages = []
+    for entry, ends in (given or {}).items():
+        low, high = ends if isinstance(ends, Sequence) else (ends, ends)
+        messages.append(common_pb2.Bound(entry=entry, min=low, max=high))
+    return messages
+
+
+def measurement(
+    outputs: Sequence[str] | npt.ArrayLike, output_u: npt.ArrayLike | None = None
+) -> control_service_pb2.Measurement:
+    """Outputs by names of entries of x, or by a matrix."""
+    names, rows = split_outputs(outputs)
+    return control_service_pb2.Measurement(
+        outputs=names,
+        output_x=rows,
+        output_u=None if output_u is None else matrix_message(output_u),
+    )
+
+
+def split_outputs(
+    outputs: Sequence[str] | npt.ArrayLike,
+) -> tuple[list[str], common_pb2.Matrix | None]:
+    given: Any = outputs
+    if isinstance(given, np.ndarray) or (len(given) and not isinstance(given[0], str)):
+        return [], matrix_message(given)
+    return list(given), None
+
+
+def noise(
+    process: npt.ArrayLike | None, input: npt.ArrayLike | None, measurement: npt.ArrayLike
+) -> control_service_pb2.NoiseCovariances:
+    return control_service_pb2.NoiseCovariances(
+        process=None if process is None else weight(process),
+        input=None if input is None else weight(input),
+        measurement=weight(measurement),
+    )
+
+
+def constraints(full: bool) -> Any:
+    if full:
+        return common_pb2.CONSTRAINT_HANDLING_FULL
+    return common_pb2.CONSTRAINT_HANDLING_MANIFOLD
