@@ -1,12 +1,14 @@
 //! Analysis of the discrete map and linear-quadratic control on it, `x[k+1] = A x[k] + B u[k]`.
 //!
-//! The cost is `Σ ½ xᵀQx + ½ uᵀRu`, with `½ xᵀ Q_f x` at the end of a finite horizon, and the
+//! The cost is `Σ ½ xᵀQx + xᵀSu + ½ uᵀRu`, with `½ xᵀ Q_f x` at the end of a finite horizon, and the
 //! feedback law is `u = u_ref − K (x − x_ref)`.
 //!
 //! | question | answer |
 //! | --- | --- |
 //! | gains along a trajectory | [`finite_horizon`], [`finite_horizon_on_manifold`] |
 //! | a regulator about an equilibrium | [`infinite_horizon`], [`infinite_horizon_on_manifold`] |
+//! | a filter for noisy outputs | [`steady_state_kalman`], [`steady_state_kalman_on_manifold`] |
+//! | filters along a trajectory | [`time_varying_kalman`], [`time_varying_kalman_on_manifold`] |
 //! | directions that a constrained system can move in | [`Tangent`], [`tangent_basis`] |
 //! | what the inputs reach, what the outputs show | [`controllability_rank`], [`observability_rank`] |
 //! | how the map moves by itself | [`modes`] |
@@ -15,14 +17,15 @@
 //! Everything here allocates and may take milliseconds to seconds: it belongs on a worker, never
 //! on a control path. Costs are given in flops of `n` states and `m` inputs.
 
+mod blocked;
 mod controllability;
 mod doubling;
 mod error;
 mod finite_horizon;
 mod frequency;
 mod infinite_horizon;
-#[allow(dead_code, reason = "regulators and trajectory optimisation build on it")]
-mod lq;
+mod kalman;
+pub(crate) mod lq;
 mod manifold;
 mod modes;
 mod spectrum;
@@ -30,13 +33,19 @@ mod weights;
 
 pub use controllability::{controllability_rank, observability_rank};
 pub use error::{AnalysisError, RiccatiError};
-pub use finite_horizon::{FiniteHorizon, Sample, finite_horizon, finite_horizon_on_manifold};
+pub use finite_horizon::{
+    FiniteHorizon, Sample, Values, finite_horizon, finite_horizon_on_manifold,
+};
 pub use frequency::TransferFunction;
 pub use infinite_horizon::{Regulator, infinite_horizon, infinite_horizon_on_manifold};
+pub use kalman::{
+    Kalman, KalmanError, KalmanTrajectory, NoiseCovariances, NoiseError, steady_state_kalman,
+    steady_state_kalman_on_manifold, time_varying_kalman, time_varying_kalman_on_manifold,
+};
 pub use manifold::{Tangent, tangent_basis};
 pub use modes::{Mode, modes};
 pub use spectrum::spectral_radius;
-pub use weights::{Weights, WeightsError};
+pub use weights::{StageWeights, TrajectoryWeights, Weights, WeightsError};
 
 use nalgebra::DMatrix;
 

@@ -3,8 +3,8 @@
 
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::{
-    Regulator, RiccatiError, Sample, Tangent, Weights, finite_horizon, finite_horizon_on_manifold,
-    infinite_horizon, infinite_horizon_on_manifold, spectral_radius,
+    Regulator, RiccatiError, Sample, Tangent, Values, Weights, finite_horizon,
+    finite_horizon_on_manifold, infinite_horizon, infinite_horizon_on_manifold, spectral_radius,
 };
 use serde_json::Value;
 
@@ -74,7 +74,7 @@ fn finite_horizon_agrees_with_sixty_digits() {
         let samples: Vec<_> = pairs.map(|(a, b)| Sample { a: matrix(a), b: matrix(b) }).collect();
         let weight = |key: &str| matrix(&case[key]);
         let weights = Weights::new(weight("q"), weight("r"), Some(weight("q_final"))).unwrap();
-        let solution = finite_horizon(&samples, &weights).unwrap();
+        let solution = finite_horizon(&samples, &weights.into(), Values::Drop).unwrap();
         let mut worst: f64 = 0.0;
         for (gain, expected) in solution.gains.iter().zip(case["gains"].as_array().unwrap()) {
             worst = worst.max(relative_error(gain, &matrix(expected)));
@@ -97,7 +97,7 @@ fn the_value_is_the_cost_of_the_closed_loop() {
     )
     .unwrap();
     let samples: Vec<_> = (0..40).map(|k| system(7, 2, 1.1, f64::from(k))).collect();
-    let solution = finite_horizon(&samples, &weights).unwrap();
+    let solution = finite_horizon(&samples, &weights.into(), Values::Drop).unwrap();
     let start = DVector::from_fn(7, |i, _| 1.0 + i as f64);
     let cost_of = |gains: &[DMatrix<f64>]| {
         let (mut x, mut cost) = (start.clone(), 0.0);
@@ -122,7 +122,7 @@ fn the_value_is_symmetric_positive_semidefinite() {
     let q = DMatrix::from_fn(20, 20, |i, j| if i == 3 && j == 3 { 1.0 } else { 0.0 });
     let weights = Weights::new(q, DMatrix::identity(3, 3) * 1e-9, None).unwrap();
     let samples: Vec<_> = (0..200).map(|k| system(20, 3, 1.0, f64::from(k % 7))).collect();
-    let value = finite_horizon(&samples, &weights).unwrap().value;
+    let value = finite_horizon(&samples, &weights.into(), Values::Drop).unwrap().value;
     assert_eq!(value, value.transpose());
     let eigenvalues = value.symmetric_eigenvalues();
     assert!(eigenvalues.min() > -1e-13 * eigenvalues.max());
@@ -132,7 +132,8 @@ fn the_value_is_symmetric_positive_semidefinite() {
 fn a_long_horizon_ends_in_the_infinite_one() {
     let sample = system(9, 2, 1.15, 4.0);
     let weights = Weights::diagonal(&[1.0; 9], &[1.0; 2]).unwrap();
-    let long = finite_horizon(&vec![sample.clone(); 400], &weights).unwrap();
+    let long =
+        finite_horizon(&vec![sample.clone(); 400], &(&weights).into(), Values::Drop).unwrap();
     let regulator = infinite_horizon(&sample.a, &sample.b, &weights).unwrap();
     assert!(relative_error(&long.gains[0], &regulator.gain) < 1e-12);
     assert!(relative_error(&long.value, &regulator.value) < 1e-12);
@@ -216,15 +217,24 @@ fn wrong_shapes_and_numbers_are_refused() {
     let bad = Sample { a: a.clone() * f64::NAN, b: DMatrix::zeros(2, 1) };
     let good = Sample { a, b: DMatrix::zeros(2, 1) };
     assert_eq!(
-        finite_horizon(&[good.clone(), bad, good.clone()], &weights).unwrap_err(),
+        finite_horizon(&[good.clone(), bad, good.clone()], &(&weights).into(), Values::Drop)
+            .unwrap_err(),
         RiccatiError::NotFinite { matrix: "A", sample: 1 }
     );
     assert_eq!(
-        finite_horizon_on_manifold(std::slice::from_ref(&good), &[], &weights).unwrap_err(),
+        finite_horizon_on_manifold(
+            std::slice::from_ref(&good),
+            &[],
+            &(&weights).into(),
+            Values::Drop
+        )
+        .unwrap_err(),
         RiccatiError::TangentCount { samples: 1, actual: 0 }
     );
     let explosive = Sample { a: DMatrix::identity(2, 2) * 1e120, b: DMatrix::zeros(2, 1) };
-    let error = finite_horizon(&[good, explosive.clone(), explosive], &weights).unwrap_err();
+    let error =
+        finite_horizon(&[good, explosive.clone(), explosive], &weights.into(), Values::Drop)
+            .unwrap_err();
     assert_eq!(error, RiccatiError::Overflow { sample: 1 });
 }
 
@@ -259,7 +269,8 @@ fn on_the_manifold_the_gain_is_blind_to_gauge_and_equals_the_full_one() {
 
     let samples = vec![sample; 200];
     let tangents = vec![tangent; 201];
-    let long = finite_horizon_on_manifold(&samples, &tangents, &restricted).unwrap();
+    let long =
+        finite_horizon_on_manifold(&samples, &tangents, &restricted.into(), Values::Drop).unwrap();
     assert!(relative_error(&long.gains[0], &on_manifold.gain) < 1e-11);
     assert!(relative_error(&long.value, &on_manifold.value) < 1e-11);
 }

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{Complex, DMatrix, DVector};
 use plantd_models::control::Weights;
 use plantd_models::scene::Signal;
 use plantd_models::{
@@ -336,7 +336,15 @@ pub fn weights(weights: Option<v1::LqrWeights>, model: &Model) -> Result<Weights
         Some(given) => Some(weight("weights.q_final", Some(given), d.state())?),
         None => None,
     };
-    Ok(Weights::new(q, r, q_final)?)
+    let s = match &weights.s {
+        Some(s) => Some(matrix_of("weights.s", s, Some(d.state()), d.input())?),
+        None => None,
+    };
+    let weights = Weights::new(q, r, q_final)?;
+    Ok(match s {
+        Some(s) => weights.with_cross(s)?,
+        None => weights,
+    })
 }
 
 fn weight(field: &str, weight: Option<v1::Weight>, size: usize) -> Result<DMatrix<f64>, Fault> {
@@ -367,6 +375,11 @@ pub fn matrix_of(
         return Err(Fault::field(field, problem));
     }
     Ok(DMatrix::from_row_slice(rows, cols, &matrix.data))
+}
+
+/// Complex numbers as messages.
+pub fn complex(numbers: &[Complex<f64>]) -> Vec<v1::Complex> {
+    numbers.iter().map(|z| v1::Complex { real: z.re, imaginary: z.im }).collect()
 }
 
 /// A matrix as a message.

@@ -19,7 +19,7 @@
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
 //! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
 //! | FAILED_PRECONDITION | `NOT_AN_EQUILIBRIUM` | PreconditionFailure; metadata `drift`, `coordinate` | the point of an infinite-horizon regulator moves |
-//! | FAILED_PRECONDITION | `NOT_STABILISABLE`, `NOT_DETECTABLE`, `RICCATI_NOT_CONVERGED`, `RICCATI_OVERFLOW`, `EIGENVALUES_NOT_FOUND` | PreconditionFailure | there is no such regulator |
+//! | FAILED_PRECONDITION | `NOT_STABILISABLE`, `NOT_DETECTABLE`, `NOT_CONVEX`, `RICCATI_NOT_CONVERGED`, `RICCATI_OVERFLOW`, `EIGENVALUES_NOT_FOUND` | PreconditionFailure | there is no such regulator |
 //! | FAILED_PRECONDITION | `POLE` | PreconditionFailure; metadata `frequency_hz` | the frequency response is infinite |
 //! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
 //! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::limits`] |
@@ -350,14 +350,12 @@ impl Fault {
 
 impl From<WeightsError> for Fault {
     fn from(error: WeightsError) -> Self {
-        let field = match &error {
-            WeightsError::Dimension { weight, .. }
-            | WeightsError::NotFinite { weight, .. }
-            | WeightsError::NotSymmetric { weight, .. }
-            | WeightsError::Negative { weight } => weight,
-            WeightsError::NotPositiveDefinite => "r",
+        let weight = error.weight();
+        let field = match error.step() {
+            Some(step) => format!("stages[{step}].{weight}"),
+            None => format!("weights.{weight}"),
         };
-        Self::field_because("INVALID_WEIGHT", format!("weights.{field}"), error.to_string())
+        Self::field_because("INVALID_WEIGHT", field, error.to_string())
     }
 }
 
@@ -367,11 +365,15 @@ impl From<RiccatiError> for Fault {
             RiccatiError::NotStabilisable { .. } => "NOT_STABILISABLE",
             RiccatiError::NotDetectable { .. } => "NOT_DETECTABLE",
             RiccatiError::NotConverged { .. } => "RICCATI_NOT_CONVERGED",
+            RiccatiError::NotConvex { .. } => "NOT_CONVEX",
             RiccatiError::Overflow { .. } | RiccatiError::NotFinite { .. } => "RICCATI_OVERFLOW",
             RiccatiError::Eigenvalues { .. } => "EIGENVALUES_NOT_FOUND",
             // The server made the matrices, so a misfit among them is its own mistake.
             RiccatiError::Dimension { .. } | RiccatiError::TangentCount { .. } => {
                 return Self::internal(error.to_string());
+            }
+            RiccatiError::StageCount { .. } => {
+                return Self::field_because("INVALID_WEIGHT", "stages", error.to_string());
             }
         };
         Self::precondition(reason, "regulator", error.to_string())

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::{
-    FiniteHorizon, Sample, Tangent, Weights, controllability_rank, finite_horizon,
+    FiniteHorizon, Sample, Tangent, Values, Weights, controllability_rank, finite_horizon,
     finite_horizon_on_manifold, infinite_horizon, infinite_horizon_on_manifold,
 };
 use plantd_models::{ForceSplit, Initial, Linearization, Model, Plant, Settings, builtin};
@@ -154,7 +154,8 @@ fn the_experiment_reproduces_in_its_plain_form() {
         assert!((sample.b.norm() / b.as_f64().unwrap() - 1.0).abs() < 1e-9, "B of step {k}");
     }
     let weights = weights(reference.plant.model());
-    let FiniteHorizon { gains, value } = finite_horizon(&reference.samples, &weights).unwrap();
+    let FiniteHorizon { gains, value, .. } =
+        finite_horizon(&reference.samples, &weights.into(), Values::Drop).unwrap();
     assert_close("first gain", gains[0].norm(), number("K0_frobenius"), 1e-10);
     assert_close("first value", value.norm(), number("P0_frobenius"), 1e-10);
 
@@ -194,8 +195,13 @@ fn the_manifold_is_invariant_and_its_gains_steer() {
     }
 
     let weights = weights(reference.plant.model());
-    let regulator =
-        finite_horizon_on_manifold(&reference.samples, &reference.tangents, &weights).unwrap();
+    let regulator = finite_horizon_on_manifold(
+        &reference.samples,
+        &reference.tangents,
+        &weights.into(),
+        Values::Drop,
+    )
+    .unwrap();
     let gauge = gauge(&mut reference, 0);
     let seen = (&regulator.gains[0] * &gauge).norm() / gauge.norm();
     assert!(seen < 1e-12 * regulator.gains[0].norm());

@@ -31,6 +31,23 @@ pub enum RiccatiError {
         /// Tangent spaces.
         actual: usize,
     },
+    /// Weights per step for another number of steps than there are samples.
+    #[error("weights of {stages} steps for {samples} samples; one per sample is needed")]
+    StageCount {
+        /// Samples.
+        samples: usize,
+        /// Weights.
+        stages: usize,
+    },
+    /// Weights that are not convex step by step are not so as a whole either.
+    #[error(
+        "the problem is not convex at sample {sample}: R + BᵀPB is not positive definite there; give \
+         the inputs more weight r, or take weights that are convex step by step"
+    )]
+    NotConvex {
+        /// Index of the sample, counted from the start.
+        sample: usize,
+    },
     /// A matrix holds NaN or infinity.
     #[error("{matrix} of sample {sample} is not finite")]
     NotFinite {

@@ -2,9 +2,12 @@
 
 use nalgebra::{Complex, DMatrix};
 
-use super::finite_horizon::{Sample, check, gain};
-use super::spectrum::{eigenvalues, spectral_radius};
-use super::{RiccatiError, Tangent, Weights, doubling, is_positive_semidefinite, symmetrize};
+use super::finite_horizon::{Sample, check};
+use super::lq::reciprocal_condition;
+use super::spectrum::eigenvalues;
+use super::{
+    RiccatiError, Tangent, Weights, all_finite, doubling, is_positive_semidefinite, symmetrize,
+};
 
 /// Residual above which Newton's method polishes the solution.
 const RESIDUAL_POLISH: f64 = 1e-12;
@@ -29,8 +32,12 @@ pub struct Regulator {
     pub value: DMatrix<f64>,
     /// Largest modulus of the eigenvalues of the closed loop `A − BK`; less than 1.
     pub spectral_radius: f64,
-    /// `‖Q + KᵀRK + (A − BK)ᵀ P (A − BK) − P‖ / ‖P‖`, Frobenius.
+    /// Eigenvalues of the closed loop `A − BK`, largest modulus first, conjugate ones side by side.
+    pub closed_loop: Vec<Complex<f64>>,
+    /// `‖P − (Q + AᵀPA − Kᵀ(R + BᵀPB)K)‖ / ‖P‖`, Frobenius, with the cross term taken into `A` and `Q`.
     pub residual: f64,
+    /// Reciprocal condition of `R + BᵀPB` in the 1-norm, at most 1.
+    pub reciprocal_condition: f64,
     /// Doublings.
     pub iterations: u32,
 }
@@ -38,7 +45,13 @@ pub struct Regulator {
 /// Solves the infinite-horizon regulator problem of `x[k+1] = A x + B u`; `q_final` plays no part.
 ///
 /// Structure-preserving doubling, about `15n³` flops for each of 6 to 30 doublings; `A` may be
-/// singular, as it is with constraints and prescribed coordinates. What comes out has passed three
+/// singular, as it is with constraints and prescribed coordinates. A cross term is taken into the map,
+///
+/// ```text
+/// A' = A − B R⁻¹ Sᵀ ,   Q' = Q − S R⁻¹ Sᵀ ,   K = K' + R⁻¹ Sᵀ ,
+/// ```
+///
+/// which leaves `P` and `A − BK` as they are; `R` is well invertible then. What comes out has passed three
 /// checks: it solves the equation, it is positive semidefinite, and it stabilises. When a check
 /// fails, the modes of `A` tell why.
 pub fn infinite_horizon(
@@ -48,7 +61,7 @@ pub fn infinite_horizon(
 ) -> Result<Regulator, RiccatiError> {
     let sample = Sample { a: a.clone(), b: b.clone() };
     check(0, &sample, weights.states(), weights.inputs())?;
-    solve(a, b, weights.q(), weights.r())
+    solve(a, b, weights.q(), weights.r(), weights.s())
 }
 
 /// The same on the constraint manifold, at an equilibrium with that tangent space: the cost counts
@@ -64,7 +77,9 @@ pub fn infinite_horizon_on_manifold(
     check(0, &sample, weights.states(), weights.inputs())?;
     tangent.check(0, weights.states())?;
     let a = tangent.reduce(a) * tangent.basis();
-    let reduced = solve(&a, &tangent.reduce(b), &tangent.restrict(weights.q()), weights.r())?;
+    let s = weights.s().map(|s| tangent.reduce(s));
+    let q = tangent.restrict(weights.q());
+    let reduced = solve(&a, &tangent.reduce(b), &q, weights.r(), s.as_ref())?;
     Ok(Regulator {
         gain: tangent.extend_gain(&reduced.gain),
         value: tangent.extend_value(&reduced.value),
@@ -73,6 +88,27 @@ pub fn infinite_horizon_on_manifold(
 }
 
 fn solve(
+    a: &DMatrix<f64>,
+    b: &DMatrix<f64>,
+    q: &DMatrix<f64>,
+    r: &DMatrix<f64>,
+    s: Option<&DMatrix<f64>>,
+) -> Result<Regulator, RiccatiError> {
+    let Some(s) = s.filter(|s| s.iter().any(|&entry| entry != 0.0)) else {
+        return solve_without_cross(a, b, q, r);
+    };
+    let Some(factor) = r.clone().cholesky() else {
+        return Err(RiccatiError::Overflow { sample: 0 });
+    };
+    let shift = factor.solve(&s.transpose());
+    let mut rest = q - s * &shift;
+    symmetrize(&mut rest);
+    let regulator = solve_without_cross(&(a - b * &shift), b, &rest, r)?;
+    Ok(Regulator { gain: &regulator.gain + shift, ..regulator })
+}
+
+/// The problem without a cross term, of matrices that fit.
+pub(super) fn solve_without_cross(
     a: &DMatrix<f64>,
     b: &DMatrix<f64>,
     q: &DMatrix<f64>,
@@ -145,13 +181,22 @@ impl Problem<'_> {
     }
 
     fn evaluate(&self, value: DMatrix<f64>, iterations: u32) -> Option<Regulator> {
-        let gain = gain(self.a, self.b, self.r, &value)?;
+        let (gain, reciprocal_condition) = gain(self.a, self.b, self.r, &value)?;
         let closed_loop = self.a - self.b * &gain;
-        let spectral_radius = spectral_radius(&closed_loop).ok()?;
+        let modes = sorted(eigenvalues(&closed_loop).ok()?);
+        let spectral_radius = modes.first().map_or(0.0, |z| z.norm());
         let defect =
             self.stage_cost(&gain) + closed_loop.transpose() * (&value * &closed_loop) - &value;
         let residual = defect.norm() / value.norm().max(f64::MIN_POSITIVE);
-        Some(Regulator { gain, value, spectral_radius, residual, iterations })
+        Some(Regulator {
+            gain,
+            value,
+            spectral_radius,
+            closed_loop: modes,
+            residual,
+            reciprocal_condition,
+            iterations,
+        })
     }
 
     /// Newton-Kleinman: the cost of the gain in hand, then the gain that is best for that cost.
@@ -214,4 +259,29 @@ fn loses_rank(a: &DMatrix<f64>, b: &DMatrix<f64>, z: Complex<f64>) -> bool {
     }
     let svd = nalgebra::SVD::try_new(pencil, false, false, f64::EPSILON, 60 * (n + m));
     svd.is_some_and(|svd| svd.singular_values.min() < RANK_LOST)
+}
+
+/// `(R + BᵀPB)⁻¹ BᵀPA` and the reciprocal condition of the bracket, or nothing if the bracket is not
+/// positive definite in floating point.
+fn gain(
+    a: &DMatrix<f64>,
+    b: &DMatrix<f64>,
+    r: &DMatrix<f64>,
+    p: &DMatrix<f64>,
+) -> Option<(DMatrix<f64>, f64)> {
+    let bt_p = (p * b).transpose();
+    let mut bracket = &bt_p * b + r;
+    symmetrize(&mut bracket);
+    let factor = bracket.cholesky()?;
+    let gain = factor.solve(&(bt_p * a));
+    all_finite(&gain).then(|| (gain, reciprocal_condition(&factor.l())))
+}
+
+/// Largest modulus first, conjugate ones side by side.
+fn sorted(mut modes: Vec<Complex<f64>>) -> Vec<Complex<f64>> {
+    modes.sort_by(|a, b| {
+        let larger = b.norm().total_cmp(&a.norm());
+        larger.then(a.re.total_cmp(&b.re)).then(b.im.total_cmp(&a.im))
+    });
+    modes
 }

@@ -1,9 +1,16 @@
 //! One stage of the linear-quadratic problem, backwards: the kernel under regulators and trajectory
 //! optimisation.
+//!
+//! With `M = [B A]` everything comes from `G = MᵀPM`: its blocks are `BᵀPB`, `AᵀPB` and `AᵀPA`. A
+//! discrete map has rows that say little (the next prescribed coordinate is the input, its velocity is
+//! a difference quotient) and columns that are zero (velocities of prescribed coordinates). Both are
+//! found by looking for zeros: products run over the other rows and columns, a row of a few entries is
+//! added entry by entry, and where a zero column leaves `P` as the weight is, its zeros are not
+//! multiplied either. Of symmetric results the lower triangle is computed.
 
 use nalgebra::{DMatrix, DVector};
 
-use super::symmetrize;
+use super::blocked::{Into, LANES, Operand, Scratch, product};
 
 /// One stage of the cost,
 /// `½ xᵀQx + xᵀSu + ½ uᵀRu + x_linearᵀx + u_linearᵀu`. Nothing here need be definite.
@@ -25,17 +32,79 @@ pub(crate) struct Stage<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct NotConvex;
 
+/// States and inputs up to which plain loops are fastest.
+const SMALL: usize = 8;
+/// Entries up to which a row of the map is added entry by entry.
+const FEW: usize = 4;
+/// Where `Q + AᵀPA − KᵀΓK` leaves less than this of a diagonal entry, it is computed again as a sum
+/// that cancels less.
+const CANCELLED: f64 = 1e-3;
+
 /// The recursion with the cost to go `½ xᵀPx + bᵀx` that it has reached.
 #[derive(Clone, Debug)]
 pub(crate) struct LqRecursion {
     value: DMatrix<f64>,
     linear: DVector<f64>,
+    /// Lower triangular factor of the last `Γ`.
+    factor: DMatrix<f64>,
+    work: Work,
+}
+
+/// Room for the large kernel; nothing here outlives a step.
+#[derive(Clone, Debug, Default)]
+struct Work {
+    structure: Structure,
+    /// `P`, where its columns have to be padded.
+    value: Scratch,
+    /// `Mᵀ`, columns: full rows of `M`.
+    map: Scratch,
+    /// `PM`.
+    reached: Scratch,
+    /// `G`.
+    bracket: Scratch,
+    /// `AᵀPB + S`, divided by the factor of `Γ` from the right; zeros above.
+    cross: Scratch,
+    /// `Kᵀ`.
+    gain: Scratch,
+    /// Diagonal of `AᵀPA`.
+    whole: Vec<f64>,
+    /// `Mᵀb`, then what the offset takes from it.
+    linear: Vec<f64>,
+    /// For the sum that cancels less: `A − BK`, `P (A − BK)`, `RK` and the new `P`.
+    closed_loop: Vec<f64>,
+    pushed: Vec<f64>,
+    priced: Vec<f64>,
+}
+
+/// Where `M = [B A]` has entries.
+#[derive(Clone, Debug, Default)]
+struct Structure {
+    /// Entries in each row of `M`.
+    counts: Vec<f64>,
+    /// States whose column of `A` or row of `S` is not zero, ascending.
+    active: Vec<usize>,
+    /// Rows of `M` that are not of few entries, ascending.
+    full: Vec<usize>,
+    /// Rows of `P` up to here have entries in the columns of full rows of `M`.
+    reach: usize,
+    /// Of rows of few entries: row of `M`, column of `M` (inputs first, then active states), entry.
+    entries: Vec<(usize, usize, f64)>,
+    /// Where the columns of `P` and of `Mᵀ` begin that belong to full rows of `M`, and of the cross
+    /// term.
+    value_columns: Vec<usize>,
+    map_columns: Vec<usize>,
+    cross_columns: Vec<usize>,
 }
 
 impl LqRecursion {
     /// Room for `n` states and `m` inputs; begins with zero cost.
-    pub(crate) fn new(n: usize, _m: usize) -> Self {
-        Self { value: DMatrix::zeros(n, n), linear: DVector::zeros(n) }
+    pub(crate) fn new(n: usize, m: usize) -> Self {
+        Self {
+            value: DMatrix::zeros(n, n),
+            linear: DVector::zeros(n),
+            factor: DMatrix::identity(m, m),
+            work: Work::default(),
+        }
     }
 
     /// Begins at the end of the horizon, with `P = value` and `b = linear` (none means zero).
@@ -57,9 +126,18 @@ impl LqRecursion {
         &self.linear
     }
 
+    /// Reciprocal condition, in the 1-norm, of the last step's `Γ`; 1 before the first. About `2m³`
+    /// flops.
+    pub(crate) fn reciprocal_condition(&self) -> f64 {
+        reciprocal_condition(&self.factor)
+    }
+
     /// One stage back, through `x[k+1] = A x + B u`: the law that is best there,
     /// `u = −gain x − offset`, with `Γ = R + BᵀPB`, `gain = Γ⁻¹(BᵀPA + Sᵀ)`,
     /// `offset = Γ⁻¹(Bᵀb + u_linear)`. On failure the cost to go is that of the stage before.
+    ///
+    /// Allocates nothing after the first step with the same numbers of states and inputs. `A` may
+    /// lead from one number of states to another.
     pub(crate) fn step(
         &mut self,
         a: &DMatrix<f64>,
@@ -68,28 +146,610 @@ impl LqRecursion {
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
-        let bt_p = (&self.value * b).transpose();
-        let mut bracket = &bt_p * b + stage.r;
-        symmetrize(&mut bracket);
-        let mut cross = bt_p * a;
-        if let Some(s) = stage.s {
-            cross += s.transpose();
+        let ((next, n), m) = (a.shape(), b.ncols());
+        assert!(self.value.nrows() == next && b.nrows() == next, "A and B fit P");
+        assert!(stage.q.shape() == (n, n) && stage.r.shape() == (m, m), "Q and R fit A and B");
+        assert!(stage.s.is_none_or(|s| s.shape() == (n, m)), "S fits Q and R");
+        assert!(gain.shape() == (m, n) && offset.len() == m, "room for the law");
+        if self.factor.nrows() != m {
+            self.factor = DMatrix::identity(m, m);
         }
-        let mut input = b.tr_mul(&self.linear);
-        if let Some(u_linear) = stage.u_linear {
-            input += u_linear;
+        if next > SMALL || n > SMALL || m > SMALL {
+            return self.step_large(a, b, stage, gain, offset);
         }
-        let factor = bracket.cholesky().ok_or(NotConvex)?;
-        gain.copy_from(&factor.solve(&cross));
-        offset.copy_from(&factor.solve(&input));
-        let mut value = stage.q + a.transpose() * (&self.value * a) - cross.transpose() * &*gain;
-        symmetrize(&mut value);
-        let mut linear = a.tr_mul(&self.linear) - cross.tr_mul(offset);
-        if let Some(x_linear) = stage.x_linear {
-            linear += x_linear;
+        match (next, n, m) {
+            (2, 2, 1) => self.step_small::<2>((2, 2, 1), a, b, stage, gain, offset),
+            (4, 4, 1) => self.step_small::<4>((4, 4, 1), a, b, stage, gain, offset),
+            sizes => self.step_small::<SMALL>(sizes, a, b, stage, gain, offset),
         }
-        self.value = value;
-        self.linear = linear;
+    }
+
+    /// At most `N` states and inputs, in plain loops.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop, reason = "the indices are those of the formulas")]
+    fn step_small<const N: usize>(
+        &mut self,
+        (next, n, m): (usize, usize, usize),
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        stage: Stage<'_>,
+        gain: &mut DMatrix<f64>,
+        offset: &mut DVector<f64>,
+    ) -> Result<(), NotConvex> {
+        // Columns.
+        let (a, b) = (&a.as_slice()[..next * n], &b.as_slice()[..next * m]);
+        let value = &self.value.as_slice()[..next * next];
+        let (q, r) = (&stage.q.as_slice()[..n * n], &stage.r.as_slice()[..m * m]);
+        let times_value = |x: &[f64]| {
+            let mut y = [0.0; N];
+            for k in 0..next {
+                for i in 0..next {
+                    y[i] += value[next * k + i] * x[k];
+                }
+            }
+            y
+        };
+        let dot = |x: &[f64], y: &[f64]| (0..next).map(|k| x[k] * y[k]).sum::<f64>();
+        let mut value_b = [[0.0; N]; N];
+        let mut bracket = [[0.0; N]; N];
+        let mut cross = [[0.0; N]; N];
+        for j in 0..m {
+            value_b[j] = times_value(&b[next * j..]);
+            for i in 0..=j {
+                bracket[j][i] = r[m * j + i] + dot(&b[next * i..], &value_b[j]);
+            }
+            for i in 0..n {
+                cross[j][i] = dot(&a[next * i..], &value_b[j]);
+                if let Some(s) = stage.s {
+                    cross[j][i] += s.as_slice()[n * j + i];
+                }
+            }
+        }
+        // Row j of the factor is bracket[j].
+        for j in 0..m {
+            for i in 0..=j {
+                let known: f64 = (0..i).map(|k| bracket[j][k] * bracket[i][k]).sum();
+                let rest = bracket[j][i] - known;
+                if i < j {
+                    bracket[j][i] = rest / bracket[i][i];
+                } else if rest > 0.0 {
+                    bracket[j][j] = rest.sqrt();
+                } else {
+                    return Err(NotConvex);
+                }
+            }
+        }
+        let factor = self.factor.as_mut_slice();
+        for j in 0..m {
+            for i in 0..=j {
+                factor[m * i + j] = bracket[j][i];
+            }
+        }
+        // Both as columns of n: first what the factor leaves, then the gain.
+        for j in 0..m {
+            for i in 0..n {
+                let known: f64 = (0..j).map(|k| bracket[j][k] * cross[k][i]).sum();
+                cross[j][i] = (cross[j][i] - known) / bracket[j][j];
+            }
+        }
+        let mut law = cross;
+        for j in (0..m).rev() {
+            for i in 0..n {
+                let known: f64 = (j + 1..m).map(|k| bracket[k][j] * law[k][i]).sum();
+                law[j][i] = (law[j][i] - known) / bracket[j][j];
+            }
+        }
+        let gain = &mut gain.as_mut_slice()[..m * n];
+        for i in 0..n {
+            for j in 0..m {
+                gain[m * i + j] = law[j][i];
+            }
+        }
+        // The linear part; `input` is what the factor leaves of Bᵀb + u_linear.
+        let linear = &self.linear.as_slice()[..next];
+        let mut input = [0.0; N];
+        for j in 0..m {
+            let known: f64 = (0..j).map(|k| bracket[j][k] * input[k]).sum();
+            let given = stage.u_linear.map_or(0.0, |u_linear| u_linear[j]);
+            input[j] = (dot(&b[next * j..], linear) + given - known) / bracket[j][j];
+        }
+        let mut new_linear = [0.0; N];
+        for i in 0..n {
+            let known: f64 = (0..m).map(|k| cross[k][i] * input[k]).sum();
+            let given = stage.x_linear.map_or(0.0, |x_linear| x_linear[i]);
+            new_linear[i] = dot(&a[next * i..], linear) + given - known;
+        }
+        for j in (0..m).rev() {
+            let known: f64 = (j + 1..m).map(|k| bracket[k][j] * input[k]).sum();
+            input[j] = (input[j] - known) / bracket[j][j];
+        }
+        offset.as_mut_slice()[..m].copy_from_slice(&input[..m]);
+        // The value.
+        let mut new_value = [[0.0; N]; N];
+        let mut has_cancelled = false;
+        for j in 0..n {
+            let value_a = times_value(&a[next * j..]);
+            for i in 0..=j {
+                let whole = q[n * j + i] + dot(&a[next * i..], &value_a);
+                let gained: f64 = (0..m).map(|k| cross[k][i] * cross[k][j]).sum();
+                new_value[j][i] = whole - gained;
+                if i == j {
+                    has_cancelled |= new_value[j][j].abs() < CANCELLED * whole.abs();
+                }
+            }
+        }
+        if has_cancelled {
+            let mut closed_loop = [[0.0; N]; N];
+            for j in 0..n {
+                for i in 0..next {
+                    let fed: f64 = (0..m).map(|k| b[next * k + i] * law[k][j]).sum();
+                    closed_loop[j][i] = a[next * j + i] - fed;
+                }
+            }
+            for j in 0..n {
+                let pushed = times_value(&closed_loop[j]);
+                for i in 0..=j {
+                    let mut sum = q[n * j + i] + dot(&closed_loop[i], &pushed);
+                    for k in 0..m {
+                        let priced: f64 = (0..m).map(|l| r[m * k + l] * law[l][j]).sum();
+                        sum += law[k][i] * priced;
+                        if let Some(s) = stage.s {
+                            let s = &s.as_slice()[n * k..];
+                            sum -= s[i] * law[k][j] + s[j] * law[k][i];
+                        }
+                    }
+                    new_value[j][i] = sum;
+                }
+            }
+        }
+        if self.value.nrows() != n {
+            self.value = DMatrix::zeros(n, n);
+            self.linear = DVector::zeros(n);
+        }
+        self.linear.as_mut_slice()[..n].copy_from_slice(&new_linear[..n]);
+        let value = &mut self.value.as_mut_slice()[..n * n];
+        for j in 0..n {
+            for i in 0..=j {
+                value[n * j + i] = new_value[j][i];
+                value[n * i + j] = new_value[j][i];
+            }
+        }
         Ok(())
+    }
+
+    fn step_large(
+        &mut self,
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        stage: Stage<'_>,
+        gain: &mut DMatrix<f64>,
+        offset: &mut DVector<f64>,
+    ) -> Result<(), NotConvex> {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.step_avx2(a, b, stage, gain, offset) };
+        }
+        self.step_portable(a, b, stage, gain, offset)
+    }
+
+    /// The same in wider registers.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn step_avx2(
+        &mut self,
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        stage: Stage<'_>,
+        gain: &mut DMatrix<f64>,
+        offset: &mut DVector<f64>,
+    ) -> Result<(), NotConvex> {
+        self.step_portable(a, b, stage, gain, offset)
+    }
+
+    #[inline(always)]
+    fn step_portable(
+        &mut self,
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        stage: Stage<'_>,
+        gain: &mut DMatrix<f64>,
+        offset: &mut DVector<f64>,
+    ) -> Result<(), NotConvex> {
+        let ((next, n), m) = (a.shape(), b.ncols());
+        let Work {
+            structure, value, map, reached, bracket, cross, gain: law, whole, linear, ..
+        } = &mut self.work;
+        let value_stride = next.next_multiple_of(LANES);
+        structure.find(a, b, stage.s, &self.value, value_stride);
+        let Structure {
+            active,
+            full,
+            reach,
+            entries,
+            value_columns,
+            map_columns,
+            cross_columns,
+            ..
+        } = &*structure;
+        let width = m + active.len();
+        let stride = width.next_multiple_of(LANES);
+        map.reserve(stride * full.len());
+        reached.reserve(value_stride * stride);
+        for scratch in [&mut *bracket, &mut *cross, &mut *law] {
+            scratch.reserve(stride * stride);
+        }
+        let (map, reached) = (map.numbers(), reached.numbers());
+        let (bracket, cross, law) = (bracket.numbers(), cross.numbers(), law.numbers());
+        pack(a, b, active, full, map, stride);
+        let value: &[f64] = if next == value_stride {
+            self.value.as_slice()
+        } else {
+            value.reserve(value_stride * next);
+            let padded = value.numbers();
+            for (target, source) in
+                padded.chunks_exact_mut(value_stride).zip(self.value.as_slice().chunks_exact(next))
+            {
+                target[..next].copy_from_slice(source);
+                target[next..].fill(0.0);
+            }
+            padded
+        };
+
+        // PM.
+        let map = Operand { numbers: map, terms: map_columns, stride: 1 };
+        let operand = Operand { numbers: value, terms: value_columns, stride: 1 };
+        product(reached, value_stride, operand, map, (*reach, width), Into::Set, 0);
+        let known = reach.next_multiple_of(LANES);
+        if known < value_stride {
+            for column in reached.chunks_exact_mut(value_stride).take(width) {
+                column[known..].fill(0.0);
+            }
+        }
+        for &(row, col, entry) in entries {
+            let target = &mut reached[value_stride * col..][..value_stride];
+            subtract(target, -entry, &value[value_stride * row..][..value_stride]);
+        }
+        // G = MᵀPM, lower triangle.
+        let operand = Operand { numbers: reached, terms: full, stride: value_stride };
+        product(bracket, stride, map, operand, (width, width), Into::SetLower, 0);
+        for &(row, col, entry) in entries {
+            let sources = reached[row..].iter().step_by(value_stride);
+            let targets = bracket[col..].iter_mut().step_by(stride);
+            for (target, source) in targets.zip(sources).take(col + 1) {
+                *target += entry * source;
+            }
+        }
+
+        // Γ and its factor, in place; what it leaves of the cross term, and the gain.
+        for (column, r) in bracket.chunks_exact_mut(stride).zip(stage.r.column_iter()) {
+            for (target, r) in column.iter_mut().zip(r.iter()) {
+                *target += r;
+            }
+        }
+        factorize(bracket, stride, m)?;
+        for j in 0..m {
+            let source = &bracket[stride * j..][j..m];
+            self.factor.as_mut_slice()[m * j..][j..m].copy_from_slice(source);
+        }
+        for j in 0..m {
+            let (done, rest) = cross.split_at_mut(stride * j);
+            let target = &mut rest[..stride];
+            target[..m].fill(0.0);
+            target[m..width].copy_from_slice(&bracket[stride * j..][m..width]);
+            target[width..].fill(0.0);
+            if let Some(s) = stage.s {
+                let s = s.column(j);
+                for (target, &state) in target[m..].iter_mut().zip(active) {
+                    *target += s[state];
+                }
+            }
+            for k in 0..j {
+                subtract(target, bracket[stride * k + j], &done[stride * k..][..stride]);
+            }
+            scale(target, bracket[stride * j + j].recip());
+        }
+        for j in (0..m).rev() {
+            let (before, done) = law.split_at_mut(stride * (j + 1));
+            let target = &mut before[stride * j..];
+            target.copy_from_slice(&cross[stride * j..][..stride]);
+            for k in j + 1..m {
+                let source = &done[stride * (k - j - 1)..][..stride];
+                subtract(target, bracket[stride * j + k], source);
+            }
+            scale(target, bracket[stride * j + j].recip());
+        }
+        if active.len() < n {
+            gain.fill(0.0);
+        }
+        for (i, &state) in active.iter().enumerate() {
+            let column = &mut gain.as_mut_slice()[m * state..][..m];
+            for (target, source) in column.iter_mut().zip(law[m + i..].iter().step_by(stride)) {
+                *target = *source;
+            }
+        }
+
+        // The linear part.
+        linear.clear();
+        linear.resize(width, 0.0);
+        if self.linear.iter().any(|&entry| entry != 0.0) {
+            for (&row, &start) in full.iter().zip(map_columns) {
+                subtract(linear, -self.linear[row], &map.numbers[start..][..width]);
+            }
+            for &(row, col, entry) in entries {
+                linear[col] += entry * self.linear[row];
+            }
+        }
+        let (input, state) = linear.split_at_mut(m);
+        if let Some(u_linear) = stage.u_linear {
+            for (input, given) in input.iter_mut().zip(u_linear.iter()) {
+                *input += given;
+            }
+        }
+        if input.iter().any(|&entry| entry != 0.0) {
+            for j in 0..m {
+                input[j] /= bracket[stride * j + j];
+                for k in j + 1..m {
+                    input[k] -= bracket[stride * j + k] * input[j];
+                }
+                subtract(state, input[j], &cross[stride * j..][m..width]);
+            }
+            for j in (0..m).rev() {
+                for k in j + 1..m {
+                    input[j] -= bracket[stride * j + k] * input[k];
+                }
+                input[j] /= bracket[stride * j + j];
+            }
+        }
+        offset.as_mut_slice().copy_from_slice(input);
+
+        // The value: Q + AᵀPA less what the inputs gain.
+        let diagonal = |bracket: &[f64], i: usize| bracket[(stride + 1) * (m + i)];
+        whole.clear();
+        whole.extend((0..active.len()).map(|i| diagonal(bracket, i)));
+        let operand = Operand { numbers: cross, terms: cross_columns, stride: 1 };
+        let first = m / LANES * LANES;
+        product(bracket, stride, operand, operand, (width, width), Into::SubtractLower, first);
+        let has_cancelled = active.iter().zip(&*whole).enumerate().any(|(i, (&state, whole))| {
+            let q = stage.q[(state, state)];
+            (q + diagonal(bracket, i)).abs() < CANCELLED * (q + whole).abs()
+        });
+        if has_cancelled {
+            self.value_again(a, b, stage, gain);
+        } else {
+            if self.value.nrows() == n {
+                self.value.copy_from(stage.q);
+            } else {
+                self.value = stage.q.clone();
+            }
+            let value = self.value.as_mut_slice();
+            for (j, &col) in active.iter().enumerate() {
+                let source = &bracket[stride * (m + j)..][m + j..width];
+                let column = &mut value[n * col..][..n];
+                for (&row, source) in active[j..].iter().zip(source) {
+                    column[row] += source;
+                }
+            }
+            for (j, &col) in active.iter().enumerate() {
+                for &row in &active[j + 1..] {
+                    value[n * row + col] = value[n * col + row];
+                }
+            }
+        }
+        if self.linear.len() != n {
+            self.linear = DVector::zeros(n);
+        }
+        match stage.x_linear {
+            Some(x_linear) => self.linear.copy_from(x_linear),
+            None => self.linear.fill(0.0),
+        }
+        let Work { structure, linear, .. } = &self.work;
+        for (&state, entry) in structure.active.iter().zip(&linear[m..]) {
+            self.linear[state] += entry;
+        }
+        Ok(())
+    }
+
+    /// `P ← Q − SK − KᵀSᵀ + KᵀRK + (A − BK)ᵀP(A − BK)`: forgives an error in `K` to second order.
+    fn value_again(
+        &mut self,
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        stage: Stage<'_>,
+        gain: &DMatrix<f64>,
+    ) {
+        let ((next, n), m) = (a.shape(), b.ncols());
+        let Work { closed_loop, pushed, priced, .. } = &mut self.work;
+        closed_loop.clear();
+        closed_loop.extend_from_slice(a.as_slice());
+        multiply_add(closed_loop, -1.0, b, gain.as_slice());
+        pushed.clear();
+        pushed.resize(next * n, 0.0);
+        multiply_add(pushed, 1.0, &self.value, closed_loop);
+        // RK − Sᵀ, so that KᵀRK − KᵀSᵀ is a product too.
+        priced.clear();
+        priced.resize(m * n, 0.0);
+        multiply_add(priced, 1.0, stage.r, gain.as_slice());
+        if let Some(s) = stage.s {
+            for (i, column) in priced.chunks_exact_mut(m.max(1)).enumerate() {
+                for (j, target) in column.iter_mut().enumerate() {
+                    *target -= s[(i, j)];
+                }
+            }
+        }
+        if self.value.nrows() == n {
+            self.value.copy_from(stage.q);
+        } else {
+            self.value = stage.q.clone();
+        }
+        let dot = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(x, y)| x * y).sum::<f64>();
+        let law = gain.as_slice();
+        for j in 0..n {
+            let pushed = &pushed[next * j..][..next];
+            let priced = &priced[m * j..][..m];
+            for i in j..n {
+                let mut sum = self.value[(i, j)]
+                    + dot(&closed_loop[next * i..][..next], pushed)
+                    + dot(&law[m * i..][..m], priced);
+                if let Some(s) = stage.s {
+                    sum -= (0..m).map(|k| s[(i, k)] * law[m * j + k]).sum::<f64>();
+                }
+                self.value[(i, j)] = sum;
+                self.value[(j, i)] = sum;
+            }
+        }
+    }
+}
+
+impl Structure {
+    #[inline(always)]
+    fn find(
+        &mut self,
+        a: &DMatrix<f64>,
+        b: &DMatrix<f64>,
+        s: Option<&DMatrix<f64>>,
+        value: &DMatrix<f64>,
+        value_stride: usize,
+    ) {
+        let ((next, n), m) = (a.shape(), b.ncols());
+        let Self { counts, active, full, reach, entries, .. } = self;
+        counts.clear();
+        counts.resize(next, 0.0);
+        active.clear();
+        for col in 0..m {
+            count(counts, &b.as_slice()[next * col..][..next]);
+        }
+        for state in 0..n {
+            let is_active = count(counts, &a.as_slice()[next * state..][..next]);
+            if is_active || s.is_some_and(|s| (0..m).any(|j| s[(state, j)] != 0.0)) {
+                active.push(state);
+            }
+        }
+        // Where there is little to spare, all rows are as good as full.
+        let few = if n + m > 4 * FEW { FEW as f64 } else { -1.0 };
+        full.clear();
+        full.extend((0..next).filter(|&row| counts[row] > few));
+        let reaches = |row: usize| {
+            let column = &value.as_slice()[next * row..][..next];
+            full.iter().any(|&full| column[full] != 0.0)
+        };
+        let last_full = full.last().map_or(0, |row| row + 1);
+        *reach = (last_full..next).rev().find(|&row| reaches(row)).map_or(last_full, |row| row + 1);
+        entries.clear();
+        for row in (0..next).filter(|&row| counts[row] <= few) {
+            let inputs = (0..m).map(|j| (j, b[(row, j)]));
+            let states = active.iter().enumerate().map(|(i, &state)| (m + i, a[(row, state)]));
+            let present = inputs.chain(states).filter(|&(_, entry)| entry != 0.0);
+            let rest = counts[row] as usize;
+            entries.extend(present.take(rest).map(|(col, entry)| (row, col, entry)));
+        }
+        let stride = (m + active.len()).next_multiple_of(LANES);
+        for (starts, count, stride) in
+            [(&mut self.map_columns, full.len(), stride), (&mut self.cross_columns, m, stride)]
+        {
+            starts.clear();
+            starts.extend((0..count).map(|k| stride * k));
+        }
+        self.value_columns.clear();
+        self.value_columns.extend(full.iter().map(|row| value_stride * row));
+    }
+}
+
+/// Counts the entries of a column in its rows; whether there are any.
+#[inline(always)]
+fn count(counts: &mut [f64], column: &[f64]) -> bool {
+    for (count, &entry) in counts.iter_mut().zip(column) {
+        *count += if entry == 0.0 { 0.0 } else { 1.0 };
+    }
+    column.iter().any(|&entry| entry != 0.0)
+}
+
+/// `Mᵀ` of the given rows of `M`, padded with zeros.
+#[inline(always)]
+fn pack(
+    a: &DMatrix<f64>,
+    b: &DMatrix<f64>,
+    active: &[usize],
+    rows: &[usize],
+    map: &mut [f64],
+    stride: usize,
+) {
+    let (next, m) = b.shape();
+    let (a, b) = (a.as_slice(), b.as_slice());
+    let width = m + active.len();
+    for (k, &row) in rows.iter().enumerate() {
+        let target = &mut map[stride * k..][..stride];
+        for (j, target) in target[..m].iter_mut().enumerate() {
+            *target = b[next * j + row];
+        }
+        for (target, &state) in target[m..].iter_mut().zip(active) {
+            *target = a[next * state + row];
+        }
+        target[width..].fill(0.0);
+    }
+}
+
+/// The lower triangular factor of the first `m` rows and columns, in place of their lower triangle.
+#[inline(always)]
+fn factorize(c: &mut [f64], stride: usize, m: usize) -> Result<(), NotConvex> {
+    for j in 0..m {
+        let (done, rest) = c.split_at_mut(stride * j);
+        let column = &mut rest[j..m];
+        for k in 0..j {
+            let source = &done[stride * k..][j..m];
+            subtract(column, source[0], source);
+        }
+        let pivot = column[0];
+        if !(pivot > 0.0) {
+            return Err(NotConvex);
+        }
+        let root = pivot.sqrt();
+        column[0] = root;
+        scale(&mut column[1..], root.recip());
+    }
+    Ok(())
+}
+
+#[inline(always)]
+fn subtract(target: &mut [f64], factor: f64, source: &[f64]) {
+    for (target, source) in target.iter_mut().zip(source) {
+        *target -= factor * source;
+    }
+}
+
+#[inline(always)]
+fn scale(target: &mut [f64], factor: f64) {
+    for target in target {
+        *target *= factor;
+    }
+}
+
+/// `C += sign A B`, all of them columns.
+fn multiply_add(c: &mut [f64], sign: f64, a: &DMatrix<f64>, b: &[f64]) {
+    let (rows, terms) = a.shape();
+    if rows == 0 || terms == 0 {
+        return;
+    }
+    for (target, factors) in c.chunks_exact_mut(rows).zip(b.chunks_exact(terms)) {
+        for (column, factor) in a.as_slice().chunks_exact(rows).zip(factors) {
+            subtract(target, -sign * factor, column);
+        }
+    }
+}
+
+/// Reciprocal condition, in the 1-norm, of `L Lᵀ`; at most 1.
+pub(super) fn reciprocal_condition(factor: &DMatrix<f64>) -> f64 {
+    let l = factor.lower_triangle();
+    let Some(inverse) = l.solve_lower_triangular(&DMatrix::identity(l.nrows(), l.ncols())) else {
+        return 0.0;
+    };
+    let norm = |m: DMatrix<f64>| m.column_iter().map(|c| c.lp_norm(1)).fold(0.0, f64::max);
+    let product = norm(&l * l.transpose()) * norm(inverse.transpose() * &inverse);
+    if product.is_nan() {
+        0.0
+    } else if product > 1.0 {
+        product.recip()
+    } else {
+        1.0
     }
 }

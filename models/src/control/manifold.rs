@@ -21,7 +21,7 @@
 //! ignores: `A = A T₀T₀ᵀ` on everything that can occur. A gain for `ξ` acts on the full state as
 //! `K = K_ξ Tᵀ`, blind to gauge and to errors off the manifold.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
 use super::RiccatiError;
 
@@ -115,6 +115,14 @@ impl Tangent {
         let mut restricted = self.reduce(q) * &self.basis;
         super::symmetrize(&mut restricted);
         restricted
+    }
+    /// `Tᵀ v`.
+    pub(super) fn reduce_vector(&self, v: &DVector<f64>) -> DVector<f64> {
+        &self.transpose * v
+    }
+    /// `T v`.
+    pub(super) fn extend_vector(&self, v: &DVector<f64>) -> DVector<f64> {
+        &self.basis * v
     }
     /// `K Tᵀ`: a gain on the full state.
     pub(super) fn extend_gain(&self, gain: &DMatrix<f64>) -> DMatrix<f64> {

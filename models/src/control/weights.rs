@@ -2,41 +2,78 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{all_finite, is_positive_semidefinite, symmetrize};
+use super::lq::Stage;
+use super::{is_positive_semidefinite, symmetrize};
 
 /// Asymmetry, relative to the largest entry, that counts as round-off of whoever made the matrix.
 const ASYMMETRY: f64 = 1e-9;
+/// What rounding may take from the least eigenvalue of `Q − S R⁻¹ Sᵀ` where `Q` has a unit diagonal.
+const CROSS_ROUND_OFF: f64 = 1e-12;
 
-/// Weights of `Σ ½ xᵀQx + ½ uᵀRu` with `½ xᵀ Q_f x` at the end of a finite horizon.
+/// Weights of one step,
 ///
-/// `Q` and `Q_f` are symmetric positive semidefinite, `R` is symmetric positive definite; the
+/// ```text
+/// ½ xᵀQx + xᵀSu + ½ uᵀRu + x_linearᵀ x + u_linearᵀ u
+/// ```
+///
+/// with `Q` n × n, `R` m × m, `S` n × m; what is not given is zero.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StageWeights {
+    q: DMatrix<f64>,
+    r: DMatrix<f64>,
+    s: Option<DMatrix<f64>>,
+    x_linear: Option<DVector<f64>>,
+    u_linear: Option<DVector<f64>>,
+    /// Checked to be convex, with `R` positive definite.
+    is_convex: bool,
+}
+
+/// Weights of `Σ ½ xᵀQx + xᵀSu + ½ uᵀRu` with `½ xᵀ Q_f x` at the end of a finite horizon.
+///
+/// `Q` and `Q_f` are symmetric positive semidefinite, `R` is symmetric positive definite, and so
+/// that no step is worth less than nothing, `Q − S R⁻¹ Sᵀ` is positive semidefinite; the
 /// constructors see to it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Weights {
-    q: DMatrix<f64>,
-    r: DMatrix<f64>,
+    stage: StageWeights,
     q_final: DMatrix<f64>,
+}
+
+/// Weights along a trajectory: the same at each step or each step its own, with `½ xᵀ Q_f x` at the
+/// end.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrajectoryWeights {
+    stages: Stages,
+    q_final: DMatrix<f64>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Stages {
+    Constant(StageWeights),
+    PerStep(Vec<StageWeights>),
 }
 
 /// Why weights were refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WeightsError {
-    /// A weight is not square, or of another size than needed.
-    #[error("weight {weight} is {rows} x {cols}; {expected} x {expected} is needed")]
+    /// A weight is of another shape than needed.
+    #[error("weight {weight} is {rows} x {cols}; {expected_rows} x {expected_cols} is needed")]
     Dimension {
-        /// `q`, `r` or `q_final`.
+        /// `q`, `r`, `s`, `q_final`, `x_linear` or `u_linear`; those two count as columns.
         weight: &'static str,
         /// Rows.
         rows: usize,
         /// Columns.
         cols: usize,
-        /// Size that is needed.
-        expected: usize,
+        /// Rows that are needed.
+        expected_rows: usize,
+        /// Columns that are needed.
+        expected_cols: usize,
     },
     /// An entry is NaN or infinite.
     #[error("weight {weight} holds a number that is not finite in row {row}, column {col}")]
     NotFinite {
-        /// `q`, `r` or `q_final`.
+        /// As in [`WeightsError::Dimension`].
         weight: &'static str,
         /// Row, from 0.
         row: usize,
@@ -62,53 +99,119 @@ pub enum WeightsError {
         /// `q` or `q_final`.
         weight: &'static str,
     },
+    /// The cross term outweighs `q` and `r`: some state and input together cost less than nothing.
+    #[error(
+        "weight s is too large beside q and r: q - s inverse(r) s' has a negative eigenvalue; give \
+         less of s or more of q or r"
+    )]
+    CrossTooLarge,
+    /// The weights of one step were refused.
+    #[error("step {step}: {error}")]
+    Step {
+        /// The step, from 0.
+        step: usize,
+        /// What is wrong with them; never another `Step`.
+        error: Box<WeightsError>,
+    },
+    /// Weights per step without a step.
+    #[error("weights per step need at least one step")]
+    NoSteps,
 }
 
-impl Weights {
-    /// Weights for as many states as `q` has rows and as many inputs as `r` has; `q_final` is `q`
-    /// when not given.
+impl WeightsError {
+    /// The weight at fault: `q`, `r`, `s`, `q_final`, `x_linear` or `u_linear`; of weights per step,
+    /// within that step. Empty when none was given at all.
+    pub fn weight(&self) -> &'static str {
+        match self {
+            Self::Dimension { weight, .. }
+            | Self::NotFinite { weight, .. }
+            | Self::NotSymmetric { weight, .. }
+            | Self::Negative { weight } => weight,
+            Self::NotPositiveDefinite => "r",
+            Self::CrossTooLarge => "s",
+            Self::Step { error, .. } => error.weight(),
+            Self::NoSteps => "",
+        }
+    }
+
+    /// The step whose weights are at fault; none when the weights are not of one step.
+    pub fn step(&self) -> Option<usize> {
+        match self {
+            Self::Step { step, .. } => Some(*step),
+            _ => None,
+        }
+    }
+}
+
+impl StageWeights {
+    /// Convex weights of a step for as many states as `q` has rows and as many inputs as `r` has:
+    /// `R` is positive definite and `Q − S R⁻¹ Sᵀ` positive semidefinite.
     pub fn new(
+        q: DMatrix<f64>,
+        r: DMatrix<f64>,
+        s: Option<DMatrix<f64>>,
+        x_linear: Option<DVector<f64>>,
+        u_linear: Option<DVector<f64>>,
+    ) -> Result<Self, WeightsError> {
+        let mut stage = Self::symmetric(q, r, s, x_linear, u_linear)?;
+        stage.check_convex()?;
+        stage.is_convex = true;
+        Ok(stage)
+    }
+
+    /// Weights that need not be convex: shapes, symmetry of `Q` and `R`, and finiteness are all that
+    /// is checked. For problems that are convex as a whole.
+    pub fn symmetric(
         mut q: DMatrix<f64>,
         mut r: DMatrix<f64>,
-        q_final: Option<DMatrix<f64>>,
+        s: Option<DMatrix<f64>>,
+        x_linear: Option<DVector<f64>>,
+        u_linear: Option<DVector<f64>>,
     ) -> Result<Self, WeightsError> {
         let (states, inputs) = (q.nrows(), r.nrows());
         check_symmetric("q", &mut q, states)?;
         check_symmetric("r", &mut r, inputs)?;
-        if !is_positive_semidefinite(&q) {
+        if let Some(s) = &s {
+            check_entries("s", s.shape(), (states, inputs), s.as_slice())?;
+        }
+        for (weight, linear, size) in
+            [("x_linear", &x_linear, states), ("u_linear", &u_linear, inputs)]
+        {
+            if let Some(linear) = linear {
+                check_entries(weight, linear.shape(), (size, 1), linear.as_slice())?;
+            }
+        }
+        Ok(Self { q, r, s, x_linear, u_linear, is_convex: false })
+    }
+
+    fn check_convex(&self) -> Result<(), WeightsError> {
+        if !is_positive_semidefinite(&self.q) {
             return Err(WeightsError::Negative { weight: "q" });
         }
-        if inputs > 0 && r.clone().cholesky().is_none() {
-            return Err(WeightsError::NotPositiveDefinite);
+        if self.inputs() == 0 {
+            return Ok(());
         }
-        let q_final = match q_final {
-            None => q.clone(),
-            Some(mut q_final) => {
-                check_symmetric("q_final", &mut q_final, states)?;
-                if !is_positive_semidefinite(&q_final) {
-                    return Err(WeightsError::Negative { weight: "q_final" });
-                }
-                q_final
-            }
-        };
-        Ok(Self { q, r, q_final })
-    }
-
-    /// Diagonal weights, with `q_final = q`.
-    pub fn diagonal(q: &[f64], r: &[f64]) -> Result<Self, WeightsError> {
-        let matrix = |d: &[f64]| DMatrix::from_diagonal(&DVector::from_column_slice(d));
-        Self::new(matrix(q), matrix(r), None)
-    }
-
-    /// Weights of a system with `states` and `inputs`, or the dimension that does not fit.
-    pub fn for_system(self, states: usize, inputs: usize) -> Result<Self, WeightsError> {
-        for (weight, size, expected) in [("q", self.states(), states), ("r", self.inputs(), inputs)]
-        {
-            if size != expected {
-                return Err(WeightsError::Dimension { weight, rows: size, cols: size, expected });
+        let factor = self.r.clone().cholesky().ok_or(WeightsError::NotPositiveDefinite)?;
+        let Some(s) = &self.s else { return Ok(()) };
+        // In units in which q's diagonal is one, since s may span as many decades as q.
+        let scales = self.q.diagonal().map(|d| if d > 0.0 { d.sqrt().recip() } else { 1.0 });
+        let mut scaled_s = s.clone();
+        let mut schur = self.q.clone();
+        for row in 0..schur.nrows() {
+            scaled_s.row_mut(row).scale_mut(scales[row]);
+            schur.row_mut(row).scale_mut(scales[row]);
+            schur.column_mut(row).scale_mut(scales[row]);
+        }
+        schur -= &scaled_s * factor.solve(&scaled_s.transpose());
+        for row in 0..schur.nrows() {
+            schur[(row, row)] += CROSS_ROUND_OFF;
+            // A state without weight must have no cross term.
+            if self.q[(row, row)] == 0.0 && scaled_s.row(row).amax() > 0.0 {
+                return Err(WeightsError::CrossTooLarge);
             }
         }
-        Ok(self)
+        symmetrize(&mut schur);
+        schur.cholesky().map(|_| ()).ok_or(WeightsError::CrossTooLarge)
     }
 
     /// Number of states.
@@ -127,27 +230,232 @@ impl Weights {
     pub fn r(&self) -> &DMatrix<f64> {
         &self.r
     }
+    /// Cross term `S`, states × inputs.
+    pub fn s(&self) -> Option<&DMatrix<f64>> {
+        self.s.as_ref()
+    }
+    /// Linear term of the state.
+    pub fn x_linear(&self) -> Option<&DVector<f64>> {
+        self.x_linear.as_ref()
+    }
+    /// Linear term of the input.
+    pub fn u_linear(&self) -> Option<&DVector<f64>> {
+        self.u_linear.as_ref()
+    }
+    /// Whether [`StageWeights::new`] or [`Weights`] saw that the stage is convex.
+    pub fn is_convex(&self) -> bool {
+        self.is_convex
+    }
+
+    /// As the recursion takes them.
+    pub(crate) fn stage(&self) -> Stage<'_> {
+        Stage {
+            q: &self.q,
+            r: &self.r,
+            s: self.s.as_ref(),
+            x_linear: self.x_linear.as_ref(),
+            u_linear: self.u_linear.as_ref(),
+        }
+    }
+}
+
+impl Weights {
+    /// Weights for as many states as `q` has rows and as many inputs as `r` has; `q_final` is `q`
+    /// when not given.
+    pub fn new(
+        q: DMatrix<f64>,
+        r: DMatrix<f64>,
+        q_final: Option<DMatrix<f64>>,
+    ) -> Result<Self, WeightsError> {
+        let stage = StageWeights::new(q, r, None, None, None)?;
+        let q_final = match q_final {
+            None => stage.q.clone(),
+            Some(q_final) => check_final(q_final, stage.states())?,
+        };
+        Ok(Self { stage, q_final })
+    }
+
+    /// Diagonal weights, with `q_final = q`.
+    pub fn diagonal(q: &[f64], r: &[f64]) -> Result<Self, WeightsError> {
+        let matrix = |d: &[f64]| DMatrix::from_diagonal(&DVector::from_column_slice(d));
+        Self::new(matrix(q), matrix(r), None)
+    }
+
+    /// The same with the cross term `xᵀSu`, `S` states × inputs.
+    pub fn with_cross(self, s: DMatrix<f64>) -> Result<Self, WeightsError> {
+        let StageWeights { q, r, .. } = self.stage;
+        let stage = StageWeights::new(q, r, Some(s), None, None)?;
+        Ok(Self { stage, q_final: self.q_final })
+    }
+
+    /// Weights of a system with `states` and `inputs`, or the dimension that does not fit.
+    pub fn for_system(self, states: usize, inputs: usize) -> Result<Self, WeightsError> {
+        self.stage.check_system(states, inputs)?;
+        Ok(self)
+    }
+
+    /// Number of states.
+    pub fn states(&self) -> usize {
+        self.stage.states()
+    }
+    /// Number of inputs.
+    pub fn inputs(&self) -> usize {
+        self.stage.inputs()
+    }
+    /// State weight `Q`.
+    pub fn q(&self) -> &DMatrix<f64> {
+        &self.stage.q
+    }
+    /// Input weight `R`.
+    pub fn r(&self) -> &DMatrix<f64> {
+        &self.stage.r
+    }
+    /// Cross term `S`.
+    pub fn s(&self) -> Option<&DMatrix<f64>> {
+        self.stage.s.as_ref()
+    }
+    /// Weights of each step.
+    pub fn stage(&self) -> &StageWeights {
+        &self.stage
+    }
     /// Final weight `Q_f`.
     pub fn q_final(&self) -> &DMatrix<f64> {
         &self.q_final
     }
 }
 
-fn check_symmetric(
+impl StageWeights {
+    fn check_system(&self, states: usize, inputs: usize) -> Result<(), WeightsError> {
+        for (weight, size, expected) in [("q", self.states(), states), ("r", self.inputs(), inputs)]
+        {
+            if size != expected {
+                let (rows, cols) = (size, size);
+                let (expected_rows, expected_cols) = (expected, expected);
+                return Err(WeightsError::Dimension {
+                    weight,
+                    rows,
+                    cols,
+                    expected_rows,
+                    expected_cols,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+impl TrajectoryWeights {
+    /// The same weights at each step; `q_final` is `stage.q` when not given, and positive
+    /// semidefinite either way.
+    pub fn constant(
+        stage: StageWeights,
+        q_final: Option<DMatrix<f64>>,
+    ) -> Result<Self, WeightsError> {
+        let q_final = match q_final {
+            None => check_final(stage.q.clone(), stage.states())?,
+            Some(q_final) => check_final(q_final, stage.states())?,
+        };
+        Ok(Self { stages: Stages::Constant(stage), q_final })
+    }
+
+    /// Each step its own weights, all of the same numbers of states and inputs, with a positive
+    /// semidefinite `q_final`.
+    pub fn per_step(
+        stages: Vec<StageWeights>,
+        q_final: DMatrix<f64>,
+    ) -> Result<Self, WeightsError> {
+        let first = stages.first().ok_or(WeightsError::NoSteps)?;
+        let (states, inputs) = (first.states(), first.inputs());
+        for (step, stage) in stages.iter().enumerate() {
+            stage
+                .check_system(states, inputs)
+                .map_err(|error| WeightsError::Step { step, error: Box::new(error) })?;
+        }
+        let q_final = check_final(q_final, states)?;
+        Ok(Self { stages: Stages::PerStep(stages), q_final })
+    }
+
+    /// Number of states.
+    pub fn states(&self) -> usize {
+        self.q_final.nrows()
+    }
+    /// Number of inputs.
+    pub fn inputs(&self) -> usize {
+        match &self.stages {
+            Stages::Constant(stage) => stage.inputs(),
+            Stages::PerStep(stages) => stages.first().map_or(0, StageWeights::inputs),
+        }
+    }
+    /// Number of steps; none when the weights are the same at each.
+    pub fn steps(&self) -> Option<usize> {
+        match &self.stages {
+            Stages::Constant(_) => None,
+            Stages::PerStep(stages) => Some(stages.len()),
+        }
+    }
+    /// Weights of step `k`.
+    ///
+    /// # Panics
+    /// If each step has its own and there is no step `k`.
+    pub fn stage(&self, k: usize) -> &StageWeights {
+        match &self.stages {
+            Stages::Constant(stage) => stage,
+            Stages::PerStep(stages) => &stages[k],
+        }
+    }
+    /// Final weight `Q_f`.
+    pub fn q_final(&self) -> &DMatrix<f64> {
+        &self.q_final
+    }
+}
+
+impl From<Weights> for TrajectoryWeights {
+    fn from(weights: Weights) -> Self {
+        Self { stages: Stages::Constant(weights.stage), q_final: weights.q_final }
+    }
+}
+
+impl From<&Weights> for TrajectoryWeights {
+    fn from(weights: &Weights) -> Self {
+        weights.clone().into()
+    }
+}
+
+fn check_final(mut q_final: DMatrix<f64>, states: usize) -> Result<DMatrix<f64>, WeightsError> {
+    check_symmetric("q_final", &mut q_final, states)?;
+    if !is_positive_semidefinite(&q_final) {
+        return Err(WeightsError::Negative { weight: "q_final" });
+    }
+    Ok(q_final)
+}
+
+/// Checks shape and finiteness of a matrix whose columns follow one another in `entries`.
+fn check_entries(
+    weight: &'static str,
+    (rows, cols): (usize, usize),
+    (expected_rows, expected_cols): (usize, usize),
+    entries: &[f64],
+) -> Result<(), WeightsError> {
+    if (rows, cols) != (expected_rows, expected_cols) {
+        return Err(WeightsError::Dimension { weight, rows, cols, expected_rows, expected_cols });
+    }
+    match entries.iter().position(|entry| !entry.is_finite()) {
+        Some(index) => {
+            Err(WeightsError::NotFinite { weight, row: index % rows, col: index / rows })
+        }
+        None => Ok(()),
+    }
+}
+
+/// Checks a square matrix and takes its symmetric part.
+pub(super) fn check_symmetric(
     weight: &'static str,
     m: &mut DMatrix<f64>,
     expected: usize,
 ) -> Result<(), WeightsError> {
-    let (rows, cols) = m.shape();
-    if rows != expected || cols != expected {
-        return Err(WeightsError::Dimension { weight, rows, cols, expected });
-    }
-    if !all_finite(m) {
-        let index = m.iter().position(|entry| !entry.is_finite()).unwrap_or(0);
-        return Err(WeightsError::NotFinite { weight, row: index % rows, col: index / rows });
-    }
-    let tolerance = ASYMMETRY * if rows > 0 { m.amax() } else { 0.0 };
-    for col in 0..cols {
+    check_entries(weight, m.shape(), (expected, expected), m.as_slice())?;
+    let tolerance = ASYMMETRY * if expected > 0 { m.amax() } else { 0.0 };
+    for col in 0..expected {
         for row in 0..col {
             if (m[(row, col)] - m[(col, row)]).abs() > tolerance {
                 return Err(WeightsError::NotSymmetric { weight, row, col });
@@ -175,11 +483,23 @@ mod tests {
         };
         assert_eq!(
             refused(&DMatrix::zeros(2, 3), &identity, None),
-            WeightsError::Dimension { weight: "q", rows: 2, cols: 3, expected: 2 }
+            WeightsError::Dimension {
+                weight: "q",
+                rows: 2,
+                cols: 3,
+                expected_rows: 2,
+                expected_cols: 2
+            }
         );
         assert_eq!(
             refused(&identity, &identity, Some(&DMatrix::zeros(3, 3))),
-            WeightsError::Dimension { weight: "q_final", rows: 3, cols: 3, expected: 2 }
+            WeightsError::Dimension {
+                weight: "q_final",
+                rows: 3,
+                cols: 3,
+                expected_rows: 2,
+                expected_cols: 2
+            }
         );
         assert_eq!(
             refused(&identity, &with(1, 0, f64::NAN), None),
@@ -214,7 +534,68 @@ mod tests {
         assert!(weights.clone().for_system(2, 1).is_ok());
         assert_eq!(
             weights.for_system(2, 3),
-            Err(WeightsError::Dimension { weight: "r", rows: 1, cols: 1, expected: 3 })
+            Err(WeightsError::Dimension {
+                weight: "r",
+                rows: 1,
+                cols: 1,
+                expected_rows: 3,
+                expected_cols: 3
+            })
         );
+    }
+
+    #[test]
+    fn a_cross_term_is_judged_together_with_the_others() {
+        let weights = Weights::diagonal(&[1.0, 1e-8], &[4.0]).unwrap();
+        let cross = |a: f64, b: f64| DMatrix::from_column_slice(2, 1, &[a, b]);
+        // (q1 s1; s1 r) and the like lose definiteness at s1² = q1 r.
+        assert!(weights.clone().with_cross(cross(1.9999, 0.0)).is_ok());
+        assert!(weights.clone().with_cross(cross(0.0, 1.9999e-4)).is_ok());
+        for s in [cross(2.0001, 0.0), cross(0.0, 2.0001e-4)] {
+            assert_eq!(weights.clone().with_cross(s), Err(WeightsError::CrossTooLarge));
+        }
+        let blind = Weights::diagonal(&[1.0, 0.0], &[4.0]).unwrap();
+        assert_eq!(blind.with_cross(cross(0.0, 1e-9)), Err(WeightsError::CrossTooLarge));
+        let error = weights.clone().with_cross(DMatrix::zeros(1, 2)).unwrap_err();
+        assert_eq!(error.weight(), "s");
+        assert!(matches!(
+            error,
+            WeightsError::Dimension { expected_rows: 2, expected_cols: 1, .. }
+        ));
+    }
+
+    #[test]
+    fn weights_per_step_name_the_step() {
+        let stage = |n: usize| {
+            StageWeights::new(DMatrix::identity(n, n), DMatrix::identity(1, 1), None, None, None)
+                .unwrap()
+        };
+        let error = TrajectoryWeights::per_step(vec![stage(2), stage(3)], DMatrix::zeros(2, 2))
+            .unwrap_err();
+        assert_eq!((error.step(), error.weight()), (Some(1), "q"));
+        let error = TrajectoryWeights::per_step(vec![stage(2)], DMatrix::zeros(3, 3)).unwrap_err();
+        assert_eq!((error.step(), error.weight()), (None, "q_final"));
+        assert_eq!(
+            TrajectoryWeights::per_step(Vec::new(), DMatrix::zeros(2, 2)),
+            Err(WeightsError::NoSteps)
+        );
+    }
+
+    #[test]
+    fn a_step_of_an_optimisation_need_not_be_convex() {
+        let (q, r) = (-DMatrix::identity(2, 2), DMatrix::identity(1, 1));
+        let linear = DVector::from_element(2, 1.0);
+        assert!(
+            !StageWeights::symmetric(q.clone(), r.clone(), None, None, None).unwrap().is_convex()
+        );
+        assert_eq!(
+            StageWeights::new(q.clone(), r.clone(), None, None, None),
+            Err(WeightsError::Negative { weight: "q" })
+        );
+        let error = StageWeights::symmetric(q.clone(), r.clone(), None, None, Some(linear.clone()))
+            .unwrap_err();
+        assert_eq!(error.weight(), "u_linear");
+        let error = StageWeights::symmetric(q, r, None, Some(linear * f64::NAN), None).unwrap_err();
+        assert_eq!(error, WeightsError::NotFinite { weight: "x_linear", row: 0, col: 0 });
     }
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use futures::{StreamExt, stream};
 use nalgebra::DMatrix;
-use plantd_models::control::{self, Regulator, Sample, Tangent, Weights};
+use plantd_models::control::{self, Sample, Tangent, TrajectoryWeights, Values, Weights};
 use plantd_models::{Linearization, Model, Plant, Settings, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
@@ -121,25 +121,25 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
     let mut linearization = Linearization::new(plant.model());
     plant.linearize(&u, &mut linearization)?;
     let (a, b) = (linearization.a(), linearization.b());
-    let Regulator { gain, value, spectral_radius, residual, iterations } =
-        match tangent(&mut plant, constraints) {
-            Some(tangent) => control::infinite_horizon_on_manifold(&a, &b, &tangent, &weights)?,
-            None => control::infinite_horizon(&a, &b, &weights)?,
-        };
+    let regulator = match tangent(&mut plant, constraints) {
+        Some(tangent) => control::infinite_horizon_on_manifold(&a, &b, &tangent, &weights)?,
+        None => control::infinite_horizon(&a, &b, &weights)?,
+    };
     Ok(v1::SolveLqrResponse {
         gain: Some(v1::Gain {
             step: 0,
-            k: Some(convert::matrix(&gain)),
+            k: Some(convert::matrix(&regulator.gain)),
             x_reference: convert::x(&plant),
             u_reference: u,
             rotations: convert::rotations(plant.model()),
             feedforward: Vec::new(),
         }),
-        value: Some(convert::matrix(&value)),
-        spectral_radius,
-        residual,
-        iterations,
-        ..Default::default()
+        value: Some(convert::matrix(&regulator.value)),
+        spectral_radius: regulator.spectral_radius,
+        residual: regulator.residual,
+        iterations: regulator.iterations,
+        closed_loop: convert::complex(&regulator.closed_loop),
+        reciprocal_condition: regulator.reciprocal_condition,
     })
 }
 
@@ -339,10 +339,12 @@ impl Path {
     }
 
     fn solve(&self, weights: &Weights) -> Result<Vec<DMatrix<f64>>, Fault> {
+        let weights = TrajectoryWeights::from(weights);
         let solution = if self.tangents.is_empty() {
-            control::finite_horizon(&self.samples, weights)?
+            control::finite_horizon(&self.samples, &weights, Values::Drop)?
         } else {
-            control::finite_horizon_on_manifold(&self.samples, &self.tangents, weights)?
+            let (samples, tangents) = (&self.samples, &self.tangents);
+            control::finite_horizon_on_manifold(samples, tangents, &weights, Values::Drop)?
         };
         Ok(solution.gains)
     }
