@@ -22,7 +22,9 @@ mod continuous;
 pub mod control;
 mod elimination;
 mod model;
+pub mod optimize;
 mod plant;
+pub mod reference;
 mod rotation;
 #[allow(dead_code, reason = "derivatives of second order use all of it")]
 mod scalar;

@@ -163,9 +163,17 @@ impl Linearization {
 
     /// `A = ∂f/∂x`, square of `2 nd + 2 nk`; its `v` columns are zero.
     pub fn a(&self) -> DMatrix<f64> {
+        let size = 2 * (self.nd + self.nk);
+        let mut a = DMatrix::zeros(size, size);
+        self.write_a(&mut a);
+        a
+    }
+
+    /// Writes `A` over a matrix of its shape.
+    pub(crate) fn write_a(&self, a: &mut DMatrix<f64>) {
         let (nd, nk) = (self.nd, self.nk);
         let (n, state_columns) = (nd + nk, self.next_columns());
-        let mut a = DMatrix::zeros(2 * n, 2 * n);
+        a.fill(0.0);
         for i in 0..nd {
             for j in 0..state_columns {
                 a[(i, j)] = self.increment[i * self.stride + j];
@@ -182,22 +190,28 @@ impl Linearization {
                 a[(i, i)] -= 1.0;
                 a[(i + 1, i + 1)] -= 1.0;
                 a[(i + 2, i + 2)] -= 1.0;
-                turn_rows(&t.to_end, i, &mut a);
-                add_block(&t.carried, (i, i), &mut a);
+                turn_rows(&t.to_end, i, a);
+                add_block(&t.carried, (i, i), a);
             } else {
                 let v = n + i;
                 a.view_mut((v, i), (3, 3)).fill(0.0);
-                add_block(&t.momentum.transpose().scaled(-1.0 / self.time_step_s), (v, i), &mut a);
+                add_block(&t.momentum.transpose().scaled(-1.0 / self.time_step_s), (v, i), a);
             }
         }
-        a
     }
 
     /// `B = ∂f/∂u`, `2 nd + 2 nk` by `ni + nk`; zero where a signal replaces the entry of `u`.
     pub fn b(&self) -> DMatrix<f64> {
+        let mut b = DMatrix::zeros(2 * (self.nd + self.nk), self.ni + self.nk);
+        self.write_b(&mut b);
+        b
+    }
+
+    /// Writes `B` over a matrix of its shape.
+    pub(crate) fn write_b(&self, b: &mut DMatrix<f64>) {
         let (nd, nk, ni) = (self.nd, self.nk, self.ni);
         let (n, next) = (nd + nk, self.next_columns());
-        let mut b = DMatrix::zeros(2 * n, ni + nk);
+        b.fill(0.0);
         for &InputImpulse { input, coordinate, residual, momentum } in &self.inputs {
             for i in 0..nd {
                 let column = i * self.stride + n + coordinate;
@@ -217,17 +231,16 @@ impl Linearization {
         for t in &self.turnings {
             let i = t.coordinate;
             if i < nd {
-                turn_rows(&t.to_end, i, &mut b);
+                turn_rows(&t.to_end, i, b);
             } else {
                 let at = (n + i, ni + i - nd);
                 b.view_mut(at, (3, 3)).fill(0.0);
-                add_block(&t.momentum.scaled(1.0 / self.time_step_s), at, &mut b);
+                add_block(&t.momentum.scaled(1.0 / self.time_step_s), at, b);
             }
         }
         for &column in &self.replaced {
             b.column_mut(column).fill(0.0);
         }
-        b
     }
 
     /// `∂λ/∂x`, nc by `2 nd + 2 nk`.
@@ -273,6 +286,17 @@ impl Linearization {
                 out.iter_mut().zip(by_momentum).for_each(|(out, entry)| *out += z * entry);
             }
         }
+    }
+
+    /// What unit inputs give to the residual, `a h ∂f/∂u`, and to `p[k+1]` beyond that,
+    /// `(1 − a) h ∂f/∂u`, nd by ni each.
+    pub(crate) fn input_impulses(&self) -> [DMatrix<f64>; 2] {
+        let [mut at_start, mut at_end] = [0; 2].map(|_| DMatrix::zeros(self.nd, self.ni));
+        for &InputImpulse { input, coordinate, residual, momentum } in &self.inputs {
+            at_start[(coordinate, input)] += residual;
+            at_end[(coordinate, input)] += momentum - residual;
+        }
+        [at_start, at_end]
     }
 
     /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, inputs, k)`.

@@ -3,7 +3,7 @@
 //! The files in the order in which a step runs: [`initial`], [`kinematics`], [`momenta`],
 //! [`vectors`], [`potentials`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`],
 //! [`pivoted_lu`], [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then
-//! [`diagnose`], [`settle`], [`snapshot`].
+//! [`known`], [`diagnose`], [`settle`], [`snapshot`].
 
 pub(crate) mod balls;
 pub(crate) mod blocks;
@@ -14,6 +14,7 @@ mod diagnose;
 mod forces;
 mod initial;
 mod kinematics;
+pub(crate) mod known;
 mod linearize;
 mod momenta;
 mod newton;

@@ -174,7 +174,13 @@ impl Workspace {
     }
 
     /// What does not change within a step: prescribed motion, input forces, constraints at the start.
-    fn prepare(&mut self, model: &Model, settings: &Settings, state: &PreciseState, u: &[f64]) {
+    pub(crate) fn prepare(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+        u: &[f64],
+    ) {
         let d = model.dimensions;
         let (inputs, next) = u.split_at(d.inputs);
         for (k, next) in next.iter().enumerate() {
@@ -312,7 +318,12 @@ impl Workspace {
     }
 
     /// Residual `r1` at the current increment; returns its size in units of round-off.
-    fn evaluate(&mut self, model: &Model, settings: &Settings, state: &PreciseState) -> f64 {
+    pub(crate) fn evaluate(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) -> f64 {
         let h = settings.time_step_s;
         let inverse = 1.0 / h;
         for (i, x) in self.increment.iter().enumerate() {

@@ -1,0 +1,260 @@
+//! Trajectory optimisation by projection-operator Newton.
+//!
+//! ```text
+//! minimise   Σ_{k<n} l(x[k], u[k], k) + l_final(x[n])     over motions  x[k+1] = f(x[k], u[k])
+//! l       = ½ dxᵀQ dx + dxᵀS du + ½ duᵀR du + x_linearᵀ dx + u_linearᵀ du
+//! l_final = ½ dxᵀ Q_f dx            dx = x ⊖ x_desired[k],  du = u − u_desired[k]
+//! ```
+//!
+//! The method is that of Hauser ("A projection operator approach to the optimization of trajectory
+//! functionals", 2002), in discrete time as by Johnson, Schultz and Murphey. About the trajectory
+//! `(x̄, ū)` an iteration
+//!
+//! 1. linearizes the map, `A[k]`, `B[k]`, and finds the gains `K[k]` of a time-varying regulator, the
+//!    **projection**: it makes a motion of the plant of any curve `(x̃, ũ)`, by
+//!    `u[k] = ũ[k] − K[k] (x[k] ⊖ x̃[k])`;
+//! 2. finds the **direction** `(dx, du)` that is best for a quadratic model of the cost under the
+//!    linearized map: a linear-quadratic problem with linear terms. Its second derivatives are
+//!
+//!    | method | second derivatives |
+//!    | --- | --- |
+//!    | [`Method::Steepest`] | identity |
+//!    | [`Method::QuasiNewton`] | of the cost |
+//!    | [`Method::Newton`] | of the cost and of the map, `∇²l + Σ z_i ∇²f_i`, with the adjoint `z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1]` |
+//!
+//!    Where the model has no minimum, or the direction does not descend, Newton **falls back** to
+//!    quasi-Newton, and that to steepest descent;
+//! 3. goes along the direction by Armijo's rule: the longest of the steps `β^m` whose projection
+//!    lowers the cost by at least `α β^m` times what the directional derivative promises.
+//!
+//! The search has converged when the directional derivative is within the tolerance.
+//! Every iterate is a motion of the plant, whatever constraints and prescribed coordinates it has.
+//! Newton's method converges quadratically, and away from a minimum it falls back; quasi-Newton does
+//! nearly as well where the desired motion can be followed closely, and costs less.
+//!
+//! **Orientations.** Differences of ball joints are rotation vectors, and directions live in the
+//! tangent space: the first derivatives go through the derivative of the logarithm. Quasi-Newton leaves
+//! out its second derivative (Gauss-Newton), Newton has it.
+//!
+//! **Bounds** are held by an augmented Lagrangian: each end of each bound at each step has a multiplier
+//! `λ` and adds `(max(0, λ + ρ c)² − λ²) / 2ρ` for its excess `c`, whose kink is passed over (semi-smooth
+//! Newton). `ρ` is the penalty times the weight of the entry in the cost, or the mean weight where that
+//! is zero. When the directional derivative is within the tolerance, or a millionth of the first cost if
+//! that is larger, and the bounds are not met, the multipliers are renewed, `λ ← max(0, λ + ρ c)`, and
+//! the penalty, 10 at first, grows tenfold if the error has not fallen to a quarter. The search has
+//! converged when besides the directional derivative the error, `max |max(c, −λ/ρ)|`, is within
+//! `bound_tolerance`. Bounds of a rotation vector's entries count without their curvature. Equal ends fix
+//! an entry, so that bounds of the final state make terminal constraints.
+//!
+//! **A free initial state** moves along its free entries in the tangent space of the constraints, and
+//! is brought back onto them after each step; the curvature of the constraints is left out, so that
+//! Newton's method is then a Gauss-Newton method in these directions.
+//!
+//! ```
+//! use std::sync::Arc;
+//! use nalgebra::DMatrix;
+//! use plantd_models::control::Weights;
+//! use plantd_models::optimize::{Bounds, Options, Optimizer, Status, TrajectoryCost};
+//! use plantd_models::{Initial, Model, Plant, Settings, builtin};
+//!
+//! // Swing the pendulum up within 5 s and hold it there.
+//! let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap())?);
+//! let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model))?;
+//! plant.initialize(&Initial::Momentum { q: vec![0.0], p: vec![0.0], v: vec![] })?;
+//! let desired = DMatrix::from_fn(101, 2, |k, i| if i == 0 && k >= 50 { 3.14 } else { 0.0 });
+//! let weights = Weights::diagonal(&[100.0, 1.0], &[10.0])?;
+//! let cost = TrajectoryCost { x: desired, u: DMatrix::zeros(100, 1), weights: weights.into() };
+//! let guess = DMatrix::zeros(100, 1);
+//! let mut search =
+//!     Optimizer::new(plant, guess, cost, &Bounds::default(), None, Options::default())?;
+//! while search.status() == Status::Running {
+//!     search.iterate(&mut || true)?;
+//! }
+//! assert_eq!(search.status(), Status::Converged);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod bounds;
+mod error;
+mod problem;
+mod search;
+mod trajectory;
+
+use nalgebra::DMatrix;
+
+use crate::State;
+use crate::control::{TrajectoryWeights, Weights};
+
+pub use error::{BoundFault, OptimizeError, Stuck};
+pub use search::Optimizer;
+
+/// What a trajectory costs; see the [module](self).
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrajectoryCost {
+    /// Row k is the desired `x[k]`: n + 1 rows of `2 nd + 2 nk`. It need not be a motion of the plant.
+    pub x: DMatrix<f64>,
+    /// Row k is the desired `u[k]`: n rows of `ni + nk`.
+    pub u: DMatrix<f64>,
+    /// Weights, constant or one set per step. They need only be convex together with the map.
+    pub weights: TrajectoryWeights,
+}
+
+/// Bounds of single entries.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Bounds {
+    /// Of entries of `x` at steps 1 to n.
+    pub states: Vec<Bound>,
+    /// Of entries of `u` at steps 0 to n − 1.
+    pub inputs: Vec<Bound>,
+    /// Of entries of `x[n]`.
+    pub final_state: Vec<Bound>,
+}
+
+/// Bounds of one entry; at least one end is given, and equal ends fix it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Bound {
+    /// Index of the entry in `x` or `u`.
+    pub index: usize,
+    /// Smallest value.
+    pub min: Option<f64>,
+    /// Largest value.
+    pub max: Option<f64>,
+}
+
+/// An initial state that is free to move on the constraints.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FreeInitialState {
+    /// Indices of the entries of `x` that may change; empty means all.
+    pub entries: Vec<usize>,
+    /// Weight `W` of `½ dxᵀ W dx`, `dx = x[0] ⊖` the initial state of the guess; symmetric positive
+    /// semidefinite, square of `2 nd + 2 nk`. None means zero.
+    pub weight: Option<DMatrix<f64>>,
+}
+
+/// Which quadratic model of the cost gives the direction of descent; see the [module](self).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Method {
+    /// Identity in place of second derivatives, but for those of bounds.
+    Steepest,
+    /// Second derivatives of the cost, first derivatives of the map.
+    QuasiNewton,
+    /// Second derivatives of the cost and of the map.
+    #[default]
+    Newton,
+}
+
+/// How to search.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    /// Method.
+    pub method: Method,
+    /// Method of the first iterations; none means `method`.
+    pub first_method: Option<Method>,
+    /// How many iterations use it.
+    pub first_iterations: u32,
+    /// Iterations at most; 200.
+    pub max_iterations: u32,
+    /// Directional derivative at which the search has converged; none means 1e-9 times the cost with
+    /// which it began.
+    pub tolerance: Option<f64>,
+    /// `α` of Armijo's rule, between 0 and 1; 1e-5.
+    pub alpha: f64,
+    /// `β` of Armijo's rule, between 0 and 1; 0.7.
+    pub beta: f64,
+    /// Shortenings of a step at most; 30.
+    pub max_backtracks: u32,
+    /// Weights of the projection's regulator; none means identities, `Q_f` too.
+    pub projection: Option<Weights>,
+    /// Error of a bound, in the unit of its entry, that counts as none; 1e-6.
+    pub bound_tolerance: f64,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            method: Method::default(),
+            first_method: None,
+            first_iterations: 0,
+            max_iterations: 200,
+            tolerance: None,
+            alpha: 1e-5,
+            beta: 0.7,
+            max_backtracks: 30,
+            projection: None,
+            bound_tolerance: 1e-6,
+        }
+    }
+}
+
+/// Where a search stands: what it goes on from, bit for bit, given the same problem.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Checkpoint {
+    /// Initial state of the trajectory.
+    pub initial: State,
+    /// Row k is `u[k]`.
+    pub inputs: DMatrix<f64>,
+    /// Iterations so far.
+    pub iterations: u32,
+    /// Cost of the trajectory with which the search began.
+    pub first_cost: f64,
+    /// Multipliers of the bounds: those of `states`, `inputs` and `final_state` in this order, for each
+    /// bound the lower before the upper end, for each end its steps. Equal ends have one.
+    pub bound_multipliers: Vec<f64>,
+    /// Penalty of the bounds.
+    pub penalty: f64,
+    /// Error of the bounds when the multipliers were last renewed.
+    pub bound_violation: f64,
+    /// Initial state that [`FreeInitialState::weight`] refers to.
+    pub initial_reference: State,
+}
+
+/// What an iteration did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Progress {
+    /// Number of the iteration, from 0.
+    pub iteration: u32,
+    /// Cost before it, with the penalties of bounds.
+    pub cost_before: f64,
+    /// Cost after it, with the penalties of bounds.
+    pub cost: f64,
+    /// Directional derivative of the cost along the direction.
+    pub directional_derivative: f64,
+    /// Method that gave the direction.
+    pub method: Method,
+    /// Why it was not the one asked for, when it was not.
+    pub fallback: Option<Fallback>,
+    /// Length of the step; 0 when none was taken: the search has ended, or multipliers were renewed.
+    pub step_length: f64,
+    /// Shortenings before it was accepted.
+    pub backtracks: u32,
+    /// Largest violation of a bound.
+    pub bound_violation: f64,
+}
+
+/// Why an iteration did not use the method that it was asked to.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum Fallback {
+    /// The quadratic model has no minimum.
+    #[error("the quadratic model has no minimum at step {step}")]
+    NotConvex {
+        /// The step.
+        step: usize,
+    },
+    /// The direction does not descend.
+    #[error("the direction does not descend: its derivative is {derivative:e}")]
+    Ascent {
+        /// Directional derivative.
+        derivative: f64,
+    },
+}
+
+/// Whether a search goes on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Status {
+    /// It does.
+    Running,
+    /// The directional derivative and the bounds are within their tolerances.
+    Converged,
+    /// It ended without; the trajectory is the best that was found.
+    Stuck(Stuck),
+}

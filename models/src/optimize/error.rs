@@ -1,0 +1,203 @@
+//! Why a problem is refused, and why a search ends without having converged.
+
+use crate::control::WeightsError;
+use crate::{InitialError, StepError};
+
+/// Why a problem was refused, or an iteration failed. An optimizer is as it was before.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum OptimizeError {
+    /// There is no step to optimise.
+    #[error("the guess has no inputs; at least one row is needed")]
+    NoSteps,
+    /// A matrix or a list has the wrong shape.
+    #[error("{what} is {rows} x {cols}; {expected_rows} x {expected_cols} is needed")]
+    Dimension {
+        /// Which one.
+        what: &'static str,
+        /// Rows it has.
+        rows: usize,
+        /// Columns it has.
+        cols: usize,
+        /// Rows that are needed.
+        expected_rows: usize,
+        /// Columns that are needed.
+        expected_cols: usize,
+    },
+    /// A number is NaN or infinite.
+    #[error("{what} holds a number that is not finite in row {row}, column {col}")]
+    NotFinite {
+        /// Where.
+        what: &'static str,
+        /// Row, from 0; the step, for trajectories.
+        row: usize,
+        /// Column, from 0.
+        col: usize,
+    },
+    /// A weight was refused.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// There are weights for another number of steps.
+    #[error("there are weights for {actual} steps; the guess has {expected}")]
+    Stages {
+        /// Stages given.
+        actual: usize,
+        /// Stages needed.
+        expected: usize,
+    },
+    /// An option is out of its range.
+    #[error("option {name} is {value}; it must be {range}")]
+    Option {
+        /// Which one.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+        /// What it may be.
+        range: &'static str,
+    },
+    /// A bound cannot be used.
+    #[error("bound {position} of {list}: {fault}")]
+    Bound {
+        /// `states`, `inputs` or `final_state`.
+        list: &'static str,
+        /// Position in the list, from 0.
+        position: usize,
+        /// What is wrong with it.
+        fault: BoundFault,
+    },
+    /// A free entry of the initial state does not exist.
+    #[error("entry {entry} of the initial state cannot be free: there are {states}")]
+    FreeEntry {
+        /// Index in `x`.
+        entry: usize,
+        /// Entries of `x`.
+        states: usize,
+    },
+    /// The plant cannot run the guess.
+    #[error(
+        "the guess does not simulate: step {step}: {error}; give inputs that the plant can follow"
+    )]
+    Guess {
+        /// Step that failed.
+        step: usize,
+        /// Why.
+        error: StepError,
+    },
+    /// The initial state is refused.
+    #[error("the initial state: {0}")]
+    Initial(#[from] InitialError),
+    /// The cost of the guess is not finite.
+    #[error("the cost of the guess is {cost}; give a guess nearer to what is desired")]
+    Cost {
+        /// The cost.
+        cost: f64,
+    },
+    /// The map has no derivatives at a step of the trajectory.
+    #[error("step {step} cannot be linearized: {error}")]
+    Linearization {
+        /// The step.
+        step: usize,
+        /// Why.
+        error: StepError,
+    },
+    /// The regulator that projects onto motions of the plant cannot be represented.
+    #[error(
+        "the projection regulator has no gain at step {step}: the motion grows too fast there, or its weights span too many orders of magnitude"
+    )]
+    Projection {
+        /// The step, counted from the start.
+        step: usize,
+    },
+    /// A checkpoint belongs to another problem.
+    #[error("the checkpoint does not fit the problem: {what}")]
+    Checkpoint {
+        /// What differs.
+        what: &'static str,
+    },
+    /// The callback said to stop; nothing was changed by the iteration.
+    #[error("cancelled")]
+    Cancelled,
+    /// The search has ended; see [`crate::optimize::Optimizer::status`].
+    #[error("the search has ended")]
+    Finished,
+}
+
+/// What is wrong with a bound.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum BoundFault {
+    /// There is no entry of that index.
+    #[error("there is no entry {index}; there are {entries}")]
+    Index {
+        /// The index.
+        index: usize,
+        /// Entries there are.
+        entries: usize,
+    },
+    /// It bounds nothing.
+    #[error("neither min nor max is given")]
+    Empty,
+    /// An end is NaN or infinite.
+    #[error("an end is {value}")]
+    NotFinite {
+        /// The end.
+        value: f64,
+    },
+    /// Its ends are in the wrong order.
+    #[error("min {min} is greater than max {max}")]
+    Crossed {
+        /// Smallest value.
+        min: f64,
+        /// Largest value.
+        max: f64,
+    },
+}
+
+/// Why a search ended without having converged.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum Stuck {
+    /// As many iterations as allowed.
+    #[error(
+        "no convergence within {iterations} iterations: the directional derivative is {derivative:e}, the tolerance {tolerance:e}; allow more iterations, or go on from the checkpoint"
+    )]
+    MaxIterations {
+        /// Iterations done.
+        iterations: u32,
+        /// Directional derivative of the last one.
+        derivative: f64,
+        /// Tolerance.
+        tolerance: f64,
+    },
+    /// No step along the direction lowers the cost enough.
+    #[error(
+        "no step along a direction with derivative {derivative:e} lowers the cost {cost} after {backtracks} shortenings; allow more of them, raise the tolerance above {tolerance:e}, or give a regulator of the projection that holds the motion more firmly"
+    )]
+    NoDescent {
+        /// Directional derivative.
+        derivative: f64,
+        /// Cost, with penalties.
+        cost: f64,
+        /// Shortenings tried.
+        backtracks: u32,
+        /// Tolerance.
+        tolerance: f64,
+    },
+    /// Not even steepest descent has a direction.
+    #[error(
+        "the quadratic model has no minimum at step {step}, not even with identity weights: the motion grows too fast there; shorten the horizon or begin nearer to the goal"
+    )]
+    NotConvex {
+        /// The step.
+        step: usize,
+    },
+    /// The bounds cannot be met.
+    #[error(
+        "a bound stays violated by {violation:e} at penalty {penalty:e}; the tolerance is {tolerance:e}: widen the bounds, lengthen the horizon, or begin with a guess that meets them"
+    )]
+    BoundsNotMet {
+        /// Largest violation.
+        violation: f64,
+        /// Penalty reached.
+        penalty: f64,
+        /// Tolerance.
+        tolerance: f64,
+    },
+}

@@ -1,0 +1,932 @@
+//! The search, one iteration at a time.
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::problem::{Deviation, Problem, check, dot};
+use super::trajectory::{Trajectory, rows};
+use super::{
+    Bounds, Checkpoint, Fallback, FreeInitialState, Method, OptimizeError, Options, Progress,
+    Status, Stuck, TrajectoryCost,
+};
+use crate::control::lq::{LqRecursion, Stage};
+use crate::control::{Sample, Weights, tangent_basis};
+use crate::plant::known::KnownStep;
+use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State};
+
+/// Penalty with which a search begins.
+const FIRST_PENALTY: f64 = 10.0;
+/// Growth of the penalty.
+const PENALTY_GROWTH: f64 = 10.0;
+/// The error of bounds that the penalty need not grow for, in units of the error before.
+const PENALTY_WORKS: f64 = 0.25;
+/// Beyond this penalty the bounds are taken to be out of reach.
+const PENALTY_MAX: f64 = 1e9;
+/// Part of the first cost to which the cost is minimised before multipliers are renewed.
+const RENEW_BELOW: f64 = 1e-6;
+/// Tolerance where none is given, in units of the first cost.
+const TOLERANCE: f64 = 1e-9;
+/// A promised decrease below this part of the cost drowns in its round-off.
+const ROUND_OFF: f64 = 1e-12;
+/// Steps between two questions whether to go on.
+const STEPS_BETWEEN_QUESTIONS: usize = 16;
+
+/// A search for the trajectory of least cost; see the [module](super).
+#[derive(Debug)]
+pub struct Optimizer {
+    problem: Arc<Problem>,
+    options: Options,
+    projection: Weights,
+    /// Moves through trial motions.
+    plant: Plant,
+    /// The plant at the initial state of the trajectory, and of the trial.
+    start: Snapshot,
+    trial_start: Snapshot,
+    first_step: u64,
+    /// Initial state of the guess.
+    reference: State,
+    current: Trajectory,
+    trial: Trajectory,
+    multipliers: Vec<f64>,
+    penalty: f64,
+    bound_error: f64,
+    iterations: u32,
+    first_cost: f64,
+    status: Status,
+    /// `samples` and `gains` belong to the current trajectory.
+    is_linearized: bool,
+    samples: Vec<Sample>,
+    /// `K[k]` of the projection.
+    gains: Vec<DMatrix<f64>>,
+    /// Gradient of the cost with penalties.
+    by_x: Vec<DVector<f64>>,
+    by_u: Vec<DVector<f64>>,
+    /// The law of the descent, and the direction.
+    descent_gains: Vec<DMatrix<f64>>,
+    descent_offsets: Vec<DVector<f64>>,
+    dx: Vec<f64>,
+    du: Vec<f64>,
+    scratch: Scratch,
+}
+
+/// Memory that iterations use again.
+#[derive(Debug)]
+struct Scratch {
+    /// One per step where Newton's method contracts them, else one in all.
+    linearizations: Vec<Linearization>,
+    contraction: Contraction,
+    recursion: LqRecursion,
+    deviation: Deviation,
+    q: DMatrix<f64>,
+    r: DMatrix<f64>,
+    s: DMatrix<f64>,
+    identity_x: DMatrix<f64>,
+    identity_u: DMatrix<f64>,
+    offset: DVector<f64>,
+    adjoint: Vec<DVector<f64>>,
+    nominal: Vec<f64>,
+    error: Vec<f64>,
+    input: Vec<f64>,
+    zero_multipliers: Vec<f64>,
+}
+
+/// A quadratic model that has a minimum, or why not.
+enum Direction {
+    Found { derivative: f64 },
+    NotConvex { step: usize },
+}
+
+type Go<'a> = &'a mut dyn FnMut() -> bool;
+
+/// Asks now and then whether to go on.
+fn ask(k: usize, go_on: Go<'_>) -> Result<(), OptimizeError> {
+    if k.is_multiple_of(STEPS_BETWEEN_QUESTIONS) && !go_on() {
+        Err(OptimizeError::Cancelled)
+    } else {
+        Ok(())
+    }
+}
+
+impl Optimizer {
+    /// A search that begins with the motion from the state of `plant` under `inputs` (row k is `u[k]`,
+    /// n rows of `ni + nk`).
+    ///
+    /// # Errors
+    ///
+    /// All of [`OptimizeError`] but those of an iteration. Simulates the guess.
+    pub fn new(
+        plant: Plant,
+        inputs: DMatrix<f64>,
+        cost: TrajectoryCost,
+        bounds: &Bounds,
+        free: Option<FreeInitialState>,
+        options: Options,
+    ) -> Result<Self, OptimizeError> {
+        let initial = plant.state();
+        let start = (&initial, &initial);
+        let mut search = Self::at(plant, start, &inputs, cost, bounds, free, options)?;
+        search.first_cost = search.current.cost;
+        search.bound_error = search.error_of_bounds();
+        search.current.merit = search.merit(&search.current);
+        Ok(search)
+    }
+
+    /// Goes on, bit for bit, where a search of the same problem left off. The state of `plant` does not
+    /// matter.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Optimizer::new`], and [`OptimizeError::Checkpoint`].
+    pub fn resume(
+        plant: Plant,
+        cost: TrajectoryCost,
+        bounds: &Bounds,
+        free: Option<FreeInitialState>,
+        options: Options,
+        checkpoint: &Checkpoint,
+    ) -> Result<Self, OptimizeError> {
+        let fits = |fits: bool, what| {
+            if fits { Ok(()) } else { Err(OptimizeError::Checkpoint { what }) }
+        };
+        let Checkpoint { initial, inputs, initial_reference: reference, .. } = checkpoint;
+        let same = |a: &[f64], b: &[f64]| a.len() == b.len() && a.iter().all(|x| x.is_finite());
+        let sizes = same(&reference.q, &initial.q)
+            && same(&reference.p, &initial.p)
+            && same(&reference.v, &initial.v);
+        fits(sizes, "its initial reference")?;
+        let start = (initial, reference);
+        let mut search = Self::at(plant, start, inputs, cost, bounds, free, options)?;
+        let numbers = [checkpoint.first_cost, checkpoint.bound_violation];
+        fits(numbers.iter().all(|x| x.is_finite()), "a number is not finite")?;
+        let penalty = checkpoint.penalty;
+        fits(penalty.is_finite() && penalty > 0.0, "its penalty is not greater than zero")?;
+        let multipliers = &checkpoint.bound_multipliers;
+        fits(multipliers.len() == search.problem.ends.count, "the number of its multipliers")?;
+        fits(multipliers.iter().all(|x| x.is_finite()), "a multiplier is not finite")?;
+        search.iterations = checkpoint.iterations;
+        search.first_cost = checkpoint.first_cost;
+        search.bound_error = checkpoint.bound_violation;
+        search.penalty = penalty;
+        search.multipliers.copy_from_slice(multipliers);
+        search.current.merit = search.merit(&search.current);
+        search.end_by_count(0.0);
+        Ok(search)
+    }
+
+    /// A search at a trajectory, without a past; with the state that the initial one is weighed against.
+    fn at(
+        mut plant: Plant,
+        (initial, reference): (&State, &State),
+        inputs: &DMatrix<f64>,
+        cost: TrajectoryCost,
+        bounds: &Bounds,
+        free: Option<FreeInitialState>,
+        options: Options,
+    ) -> Result<Self, OptimizeError> {
+        let model = Arc::clone(plant.model());
+        let d = model.dimensions();
+        let (states, width, steps) = (d.state(), d.input(), inputs.nrows());
+        if steps == 0 {
+            return Err(OptimizeError::NoSteps);
+        }
+        check("the guess", inputs, steps, width)?;
+        check_options(&options)?;
+        let projection = match &options.projection {
+            Some(weights) => weights.clone().for_system(states, width)?,
+            None => Weights::diagonal(&vec![1.0; states], &vec![1.0; width])?,
+        };
+        let problem = Arc::new(Problem::new(Arc::clone(&model), steps, cost, bounds, free)?);
+        let State { q, p, v, .. } = initial.clone();
+        plant.initialize(&Initial::Momentum { q, p, v })?;
+        plant.set_step_index(initial.step);
+        let start = plant.snapshot();
+        let mut current = Trajectory::new(states, width, d.constraints, steps);
+        current.u = rows(inputs);
+        let vectors = |n: usize, count: usize| vec![DVector::zeros(n); count];
+        let gains = || vec![DMatrix::zeros(width, states); steps];
+        let methods = [Some(options.method), options.first_method];
+        let kept = if methods.contains(&Some(Method::Newton)) { steps } else { 1 };
+        let sample = Sample { a: DMatrix::zeros(states, states), b: DMatrix::zeros(states, width) };
+        let mut search = Self {
+            scratch: Scratch {
+                linearizations: vec![Linearization::new(&model); kept],
+                contraction: Contraction::new(&model),
+                recursion: LqRecursion::new(states, width),
+                deviation: problem.deviation(),
+                q: DMatrix::zeros(states, states),
+                r: DMatrix::zeros(width, width),
+                s: DMatrix::zeros(states, width),
+                identity_x: DMatrix::identity(states, states),
+                identity_u: DMatrix::identity(width, width),
+                offset: DVector::zeros(width),
+                adjoint: vectors(states, steps + 1),
+                nominal: vec![0.0; states],
+                error: vec![0.0; states],
+                input: vec![0.0; width],
+                zero_multipliers: vec![0.0; d.constraints],
+            },
+            multipliers: vec![0.0; problem.ends.count],
+            penalty: FIRST_PENALTY,
+            bound_error: 0.0,
+            iterations: 0,
+            first_cost: 0.0,
+            status: Status::Running,
+            is_linearized: false,
+            samples: vec![sample; steps],
+            gains: gains(),
+            descent_gains: gains(),
+            descent_offsets: vectors(width, steps),
+            by_x: vectors(states, steps + 1),
+            by_u: vectors(width, steps),
+            dx: vec![0.0; (steps + 1) * states],
+            du: vec![0.0; steps * width],
+            first_step: initial.step,
+            reference: reference.clone(),
+            trial: current.clone(),
+            current,
+            trial_start: start.clone(),
+            start,
+            plant,
+            projection,
+            options,
+            problem,
+        };
+        search.simulate_guess()?;
+        Ok(search)
+    }
+
+    fn simulate_guess(&mut self) -> Result<(), OptimizeError> {
+        self.current.set_x(0, [self.plant.q(), self.plant.p(), self.plant.v()]);
+        let mut cost = self.initial_cost(&self.current);
+        let Self { problem, plant, current, scratch, .. } = self;
+        for k in 0..problem.steps {
+            cost += problem.evaluate(k, current.x(k), current.u(k), &mut scratch.deviation);
+            plant.step(current.u(k)).map_err(|error| OptimizeError::Guess { step: k, error })?;
+            current.set_x(k + 1, [plant.q(), plant.p(), plant.v()]);
+            current.set_multipliers(k, plant.multipliers());
+        }
+        cost +=
+            problem.evaluate(problem.steps, current.x(problem.steps), &[], &mut scratch.deviation);
+        current.cost = cost;
+        if cost.is_finite() { Ok(()) } else { Err(OptimizeError::Cost { cost }) }
+    }
+
+    /// Whether the search goes on.
+    pub fn status(&self) -> Status {
+        self.status
+    }
+
+    /// Cost of the trajectory, without penalties.
+    pub fn cost(&self) -> f64 {
+        self.current.cost
+    }
+
+    /// Largest violation of a bound.
+    pub fn bound_violation(&self) -> f64 {
+        self.worst(|end, number, _| end.violation(number))
+    }
+
+    /// Row k is `x[k]`: n + 1 rows.
+    pub fn states(&self) -> DMatrix<f64> {
+        DMatrix::from_row_slice(self.problem.steps + 1, self.problem.states, &self.current.x)
+    }
+
+    /// Row k is `u[k]`: n rows.
+    pub fn inputs(&self) -> DMatrix<f64> {
+        DMatrix::from_row_slice(self.problem.steps, self.problem.inputs, &self.current.u)
+    }
+
+    /// Iterations so far, with those of the search that was resumed.
+    pub fn iterations(&self) -> u32 {
+        self.iterations
+    }
+
+    /// Where the search stands.
+    pub fn checkpoint(&self) -> Checkpoint {
+        Checkpoint {
+            initial: self.initial_state(),
+            inputs: self.inputs(),
+            iterations: self.iterations,
+            first_cost: self.first_cost,
+            bound_multipliers: self.multipliers.clone(),
+            penalty: self.penalty,
+            bound_violation: self.bound_error,
+            initial_reference: self.reference.clone(),
+        }
+    }
+
+    /// Initial state of the trajectory.
+    pub fn initial_state(&self) -> State {
+        let d = self.problem.model.dimensions();
+        let (q, rest) = self.current.x(0).split_at(d.coordinates());
+        let (p, v) = rest.split_at(d.dynamic);
+        State {
+            step: self.first_step,
+            q: q.to_vec(),
+            p: p.to_vec(),
+            v: v.to_vec(),
+            multipliers: vec![0.0; d.constraints],
+        }
+    }
+
+    /// One iteration. `go_on` is asked every few steps of work; where it says no, the iteration ends
+    /// with [`OptimizeError::Cancelled`] and the search is as it was before it.
+    ///
+    /// # Errors
+    ///
+    /// [`OptimizeError::Linearization`], [`OptimizeError::Projection`], [`OptimizeError::Cancelled`],
+    /// and [`OptimizeError::Finished`] when the search has ended.
+    pub fn iterate(&mut self, go_on: &mut dyn FnMut() -> bool) -> Result<Progress, OptimizeError> {
+        if self.status != Status::Running {
+            return Err(OptimizeError::Finished);
+        }
+        self.linearize(go_on)?;
+        self.find_gradient(go_on)?;
+        let asked = match self.options.first_method {
+            Some(first) if self.iterations < self.options.first_iterations => first,
+            _ => self.options.method,
+        };
+        let (method, fallback, derivative) = self.find_direction(asked, go_on)?;
+        let mut progress = Progress {
+            iteration: self.iterations,
+            cost_before: self.current.merit,
+            cost: self.current.merit,
+            directional_derivative: derivative.unwrap_or(f64::NAN),
+            method,
+            fallback,
+            step_length: 0.0,
+            backtracks: 0,
+            bound_violation: 0.0,
+        };
+        let Ok(derivative) = derivative else {
+            let Err(step) = derivative else { unreachable!() };
+            self.status = Status::Stuck(Stuck::NotConvex { step });
+            self.iterations += 1;
+            progress.bound_violation = self.bound_violation();
+            return Ok(progress);
+        };
+        if !self.has_ended(derivative) {
+            let found = self.search_along(derivative, &mut progress, go_on)?;
+            if !found && derivative.abs() <= ROUND_OFF * self.current.merit.abs() {
+                self.end_at_round_off();
+            } else if !found {
+                self.status = Status::Stuck(Stuck::NoDescent {
+                    derivative,
+                    cost: self.current.merit,
+                    backtracks: self.options.max_backtracks,
+                    tolerance: self.tolerance(),
+                });
+            }
+        }
+        self.iterations += 1;
+        self.end_by_count(derivative);
+        progress.cost = self.current.merit;
+        progress.bound_violation = self.bound_violation();
+        Ok(progress)
+    }
+
+    fn tolerance(&self) -> f64 {
+        self.options.tolerance.unwrap_or(TOLERANCE * self.first_cost.abs())
+    }
+
+    fn end_by_count(&mut self, derivative: f64) {
+        if self.status == Status::Running && self.iterations >= self.options.max_iterations {
+            let (iterations, tolerance) = (self.iterations, self.tolerance());
+            self.status = Status::Stuck(Stuck::MaxIterations { iterations, derivative, tolerance });
+        }
+    }
+
+    /// Whether nothing is to be gained along the direction: the search has converged, or multipliers
+    /// are renewed.
+    fn has_ended(&mut self, derivative: f64) -> bool {
+        let (size, tolerance) = (derivative.abs(), self.tolerance());
+        if !self.problem.has_bounds() {
+            if size <= tolerance {
+                self.status = Status::Converged;
+            }
+            return size <= tolerance;
+        }
+        let error = self.error_of_bounds();
+        if error <= self.options.bound_tolerance {
+            if size <= tolerance {
+                self.status = Status::Converged;
+            }
+            return size <= tolerance;
+        }
+        if size <= tolerance.max(RENEW_BELOW * self.first_cost.abs()) {
+            self.renew_multipliers(error);
+            return true;
+        }
+        false
+    }
+
+    /// The cost is as low as its own round-off lets it be.
+    fn end_at_round_off(&mut self) {
+        let error = self.error_of_bounds();
+        if error <= self.options.bound_tolerance {
+            self.status = Status::Converged;
+        } else {
+            self.renew_multipliers(error);
+        }
+    }
+
+    fn renew_multipliers(&mut self, error: f64) {
+        let Self { problem, current, multipliers, penalty, .. } = self;
+        for k in 0..=problem.steps {
+            for (end, place) in problem.ends.at(false, k) {
+                let number = current.x(k)[end.index];
+                multipliers[place] = end.renewed(number, multipliers[place], *penalty);
+            }
+            if k < problem.steps {
+                for (end, place) in problem.ends.at(true, k) {
+                    let number = current.u(k)[end.index];
+                    multipliers[place] = end.renewed(number, multipliers[place], *penalty);
+                }
+            }
+        }
+        if !(error <= PENALTY_WORKS * self.bound_error) {
+            self.penalty *= PENALTY_GROWTH;
+        }
+        self.bound_error = error;
+        if self.penalty > PENALTY_MAX {
+            self.status = Status::Stuck(Stuck::BoundsNotMet {
+                violation: self.bound_violation(),
+                penalty: self.penalty,
+                tolerance: self.options.bound_tolerance,
+            });
+        }
+        self.current.merit = self.merit(&self.current);
+    }
+
+    /// Largest violation of a bound, or distance of a multiplier from what it may be.
+    fn error_of_bounds(&self) -> f64 {
+        self.worst(|end, number, multiplier| end.error(number, multiplier, self.penalty))
+    }
+
+    fn worst(&self, measure: impl Fn(&super::bounds::End, f64, f64) -> f64) -> f64 {
+        let (problem, current) = (&self.problem, &self.current);
+        let mut worst = 0.0_f64;
+        for k in 0..=problem.steps {
+            for (end, place) in problem.ends.at(false, k) {
+                let number = current.x(k)[end.index];
+                worst = worst.max(measure(end, number, self.multipliers[place]));
+            }
+            for (end, place) in problem.ends.at(true, k).filter(|_| k < problem.steps) {
+                let number = current.u(k)[end.index];
+                worst = worst.max(measure(end, number, self.multipliers[place]));
+            }
+        }
+        worst
+    }
+
+    /// Cost with the penalties of bounds.
+    fn merit(&self, trajectory: &Trajectory) -> f64 {
+        let steps = self.problem.steps;
+        let penalty = |k: usize| {
+            let u = if k < steps { trajectory.u(k) } else { &[] };
+            self.problem.penalty(k, (trajectory.x(k), u), (&self.multipliers, self.penalty))
+        };
+        trajectory.cost + (0..=steps).map(penalty).sum::<f64>()
+    }
+
+    /// What the initial state costs.
+    fn initial_cost(&self, trajectory: &Trajectory) -> f64 {
+        let weight = self.problem.free.as_ref().and_then(|free| free.weight.as_ref());
+        let Some(weight) = weight else { return 0.0 };
+        let mut change = DVector::zeros(self.problem.states);
+        let reference = self.reference.x();
+        self.problem.difference(&reference, trajectory.x(0), change.as_mut_slice());
+        0.5 * change.dot(&(weight * &change))
+    }
+
+    /// Linearizes the map along the trajectory, and finds the gains of the projection.
+    fn linearize(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
+        if self.is_linearized {
+            return Ok(());
+        }
+        let Self { problem, plant, current, samples, gains, scratch, .. } = self;
+        let n = problem.model.dimensions().coordinates();
+        for (k, sample) in samples.iter_mut().enumerate() {
+            ask(k, go_on)?;
+            let step = known(current, k, self.first_step, n);
+            let kept = scratch.linearizations.len() - 1;
+            let out = &mut scratch.linearizations[k.min(kept)];
+            plant
+                .linearize_known(&step, out)
+                .map_err(|error| OptimizeError::Linearization { step: k, error })?;
+            out.write_a(&mut sample.a);
+            out.write_b(&mut sample.b);
+        }
+        scratch.recursion.begin(self.projection.q_final(), None);
+        for (k, (sample, gain)) in samples.iter().zip(gains).enumerate().rev() {
+            ask(k, go_on)?;
+            let stage = self.projection.stage().stage();
+            scratch
+                .recursion
+                .step(&sample.a, &sample.b, stage, gain, &mut scratch.offset)
+                .map_err(|_| OptimizeError::Projection { step: k })?;
+            if !gain.iter().all(|entry| entry.is_finite()) {
+                return Err(OptimizeError::Projection { step: k });
+            }
+        }
+        self.is_linearized = true;
+        Ok(())
+    }
+
+    /// Gradient of the cost with penalties, and the adjoint along the projection.
+    fn find_gradient(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
+        let Self { problem, current, by_x, by_u, scratch, samples, gains, .. } = self;
+        let bounds = (&self.multipliers[..], self.penalty);
+        let steps = problem.steps;
+        for (k, by_x) in by_x.iter_mut().enumerate() {
+            ask(k, go_on)?;
+            let x = current.x(k);
+            let u = if k < steps { current.u(k) } else { &[] };
+            problem.evaluate(k, x, u, &mut scratch.deviation);
+            problem.gradient(k, (x, u), &scratch.deviation, bounds, by_x, by_u.get_mut(k));
+        }
+        if let Some(weight) = problem.free.as_ref().and_then(|free| free.weight.as_ref()) {
+            let reference = self.reference.x();
+            problem.difference(&reference, current.x(0), &mut scratch.error);
+            let change = DVector::from_column_slice(&scratch.error);
+            let mut slope = weight * change;
+            for &i in problem.model.orientations() {
+                let map = super::problem::chart(&scratch.error, i);
+                let turned = map.apply_transposed(crate::plant::balls::three(slope.as_slice(), i));
+                slope.rows_mut(i, 3).copy_from_slice(&turned.0);
+            }
+            by_x[0] += slope;
+        }
+        // z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1] = l_x + Aᵀ z[k+1] − Kᵀ (l_u + Bᵀ z[k+1])
+        scratch.adjoint[steps].copy_from(&by_x[steps]);
+        for k in (0..steps).rev() {
+            ask(k, go_on)?;
+            let (head, tail) = scratch.adjoint.split_at_mut(k + 1);
+            let (z, next) = (&mut head[k], &tail[0]);
+            scratch.offset.copy_from(&by_u[k]);
+            scratch.offset.gemv_tr(1.0, &samples[k].b, next, 1.0);
+            z.copy_from(&by_x[k]);
+            z.gemv_tr(1.0, &samples[k].a, next, 1.0);
+            z.gemv_tr(-1.0, &gains[k], &scratch.offset, 1.0);
+        }
+        Ok(())
+    }
+
+    /// The direction of the method asked for, or of the one that it falls back to, with its directional
+    /// derivative; or the step at which not even steepest descent has one.
+    #[allow(clippy::type_complexity, reason = "three answers of one question")]
+    fn find_direction(
+        &mut self,
+        asked: Method,
+        go_on: Go<'_>,
+    ) -> Result<(Method, Option<Fallback>, Result<f64, usize>), OptimizeError> {
+        let (mut method, mut fallback) = (asked, None);
+        loop {
+            let reason = match self.descend(method, go_on)? {
+                Direction::Found { derivative } if derivative <= 0.0 => {
+                    return Ok((method, fallback, Ok(derivative)));
+                }
+                Direction::Found { derivative } => Fallback::Ascent { derivative },
+                Direction::NotConvex { step } => Fallback::NotConvex { step },
+            };
+            method = match (method, reason) {
+                (Method::Newton, _) => Method::QuasiNewton,
+                (Method::QuasiNewton, _) => Method::Steepest,
+                (Method::Steepest, Fallback::Ascent { .. }) => {
+                    return Ok((method, fallback, Err(0)));
+                }
+                (Method::Steepest, Fallback::NotConvex { step }) => {
+                    return Ok((method, fallback, Err(step)));
+                }
+            };
+            fallback = Some(fallback.unwrap_or(reason));
+        }
+    }
+
+    /// Solves the linear-quadratic problem of a method.
+    fn descend(&mut self, method: Method, go_on: Go<'_>) -> Result<Direction, OptimizeError> {
+        let steps = self.problem.steps;
+        self.final_weights(method);
+        self.scratch.recursion.begin(&self.scratch.q, Some(&self.by_x[steps]));
+        for k in (0..steps).rev() {
+            ask(k, go_on)?;
+            self.stage_weights(method, k)?;
+            let Self { samples, by_x, by_u, descent_gains, descent_offsets, scratch, .. } = self;
+            let has_cross = method == Method::Newton
+                || (method == Method::QuasiNewton && self.problem.stage(k).s().is_some());
+            let stage = Stage {
+                q: &scratch.q,
+                r: &scratch.r,
+                s: has_cross.then_some(&scratch.s),
+                x_linear: Some(&by_x[k]),
+                u_linear: Some(&by_u[k]),
+            };
+            let (gain, offset) = (&mut descent_gains[k], &mut descent_offsets[k]);
+            let (a, b) = (&samples[k].a, &samples[k].b);
+            if scratch.recursion.step(a, b, stage, gain, offset).is_err() {
+                return Ok(Direction::NotConvex { step: k });
+            }
+        }
+        if !self.find_initial_change() {
+            return Ok(Direction::NotConvex { step: 0 });
+        }
+        Ok(Direction::Found { derivative: self.roll_direction(go_on)? })
+    }
+
+    /// Writes the second derivatives of the final cost.
+    fn final_weights(&mut self, method: Method) {
+        let Self { problem, current, scratch, .. } = self;
+        let Scratch { q, s, deviation, identity_x, .. } = scratch;
+        let (steps, x) = (problem.steps, current.x(problem.steps));
+        if method == Method::Steepest {
+            q.copy_from(identity_x);
+        } else {
+            q.copy_from(problem.q_final());
+            if !problem.model.orientations().is_empty() {
+                problem.evaluate(steps, x, &[], deviation);
+                s.fill(0.0);
+                problem.turn_weights(deviation, q, s);
+                if method == Method::Newton {
+                    problem.add_chart_curvature(deviation, q);
+                }
+            }
+        }
+        let bounds = (&self.multipliers[..], self.penalty);
+        problem.add_penalty_curvature(steps, (x, &[]), bounds, q, None);
+    }
+
+    /// Writes the second derivatives of step `k`.
+    fn stage_weights(&mut self, method: Method, k: usize) -> Result<(), OptimizeError> {
+        let Self { problem, current, scratch, .. } = self;
+        let Scratch { q, r, s, deviation, identity_x, identity_u, adjoint, .. } = scratch;
+        let Scratch { linearizations, contraction, zero_multipliers, .. } = scratch;
+        let (x, u) = (current.x(k), current.u(k));
+        if method == Method::Steepest {
+            q.copy_from(identity_x);
+            r.copy_from(identity_u);
+        } else {
+            let stage = problem.stage(k);
+            q.copy_from(stage.q());
+            r.copy_from(stage.r());
+            match stage.s() {
+                Some(cross) => s.copy_from(cross),
+                None => s.fill(0.0),
+            }
+            if !problem.model.orientations().is_empty() {
+                problem.evaluate(k, x, u, deviation);
+                problem.turn_weights(deviation, q, s);
+                if method == Method::Newton {
+                    problem.add_chart_curvature(deviation, q);
+                }
+            }
+        }
+        if method == Method::Newton {
+            let weights = adjoint[k + 1].as_slice();
+            contraction
+                .contract(&problem.model, &linearizations[k], weights, zero_multipliers)
+                .map_err(|error| OptimizeError::Linearization { step: k, error })?;
+            *q += &contraction.xx;
+            *s += &contraction.xu;
+            *r += &contraction.uu;
+        }
+        if problem.has_bounds() {
+            let bounds = (&self.multipliers[..], self.penalty);
+            problem.add_penalty_curvature(k, (x, u), bounds, q, Some(r));
+        }
+        Ok(())
+    }
+
+    /// Writes the best change of the initial state into `dx[0]`; false if there is none.
+    fn find_initial_change(&mut self) -> bool {
+        let states = self.problem.states;
+        let change = &mut self.dx[..states];
+        change.fill(0.0);
+        let Some(free) = &self.problem.free else { return true };
+        let d = self.problem.model.dimensions();
+        if self.plant.restore(&self.start).is_err() {
+            return false;
+        }
+        let basis =
+            free_directions(&free.entries, &self.plant.constraint_jacobian(), d.coordinates());
+        if basis.ncols() == 0 {
+            return true;
+        }
+        let mut value = self.scratch.recursion.value().clone();
+        if let Some(weight) = &free.weight {
+            let mut deviation = self.problem.deviation();
+            let reference = self.reference.x();
+            self.problem.difference(&reference, self.current.x(0), &mut deviation.x);
+            let mut weight = weight.clone();
+            self.problem.turn_weights(&deviation, &mut weight, &mut self.scratch.s);
+            value += weight;
+        }
+        let reduced = basis.transpose() * (value * &basis);
+        let slope = basis.tr_mul(self.scratch.recursion.linear());
+        let Some(factor) = reduced.cholesky() else { return false };
+        let step = -(&basis * factor.solve(&slope));
+        change.copy_from_slice(step.as_slice());
+        true
+    }
+
+    /// Runs the law of the descent through the linearized map; returns the directional derivative.
+    fn roll_direction(&mut self, go_on: Go<'_>) -> Result<f64, OptimizeError> {
+        let Self { problem, samples, by_x, by_u, dx, du, descent_gains, descent_offsets, .. } =
+            self;
+        let (states, inputs) = (problem.states, problem.inputs);
+        let mut derivative = dot(by_x[0].as_slice(), &dx[..states]);
+        for k in 0..problem.steps {
+            ask(k, go_on)?;
+            let (head, tail) = dx.split_at_mut((k + 1) * states);
+            let (x, next) = (&head[k * states..], &mut tail[..states]);
+            let u = &mut du[k * inputs..][..inputs];
+            for (u, offset) in u.iter_mut().zip(descent_offsets[k].iter()) {
+                *u = -offset;
+            }
+            subtract_product(&descent_gains[k], x, u);
+            next.fill(0.0);
+            add_product(&samples[k].a, x, next);
+            add_product(&samples[k].b, u, next);
+            derivative += dot(by_u[k].as_slice(), u) + dot(by_x[k + 1].as_slice(), next);
+        }
+        Ok(derivative)
+    }
+
+    /// Armijo's rule. True if a step was taken.
+    fn search_along(
+        &mut self,
+        derivative: f64,
+        progress: &mut Progress,
+        go_on: Go<'_>,
+    ) -> Result<bool, OptimizeError> {
+        let mut length = 1.0;
+        for backtracks in 0..=self.options.max_backtracks {
+            let enough = self.current.merit + self.options.alpha * length * derivative;
+            if self.try_step(length, enough, go_on)? && self.trial.merit < enough {
+                std::mem::swap(&mut self.current, &mut self.trial);
+                if self.problem.free.is_some() {
+                    std::mem::swap(&mut self.start, &mut self.trial_start);
+                }
+                self.is_linearized = false;
+                (progress.step_length, progress.backtracks) = (length, backtracks);
+                return Ok(true);
+            }
+            length *= self.options.beta;
+        }
+        progress.backtracks = self.options.max_backtracks;
+        Ok(false)
+    }
+
+    /// Projects the trajectory moved by `length` along the direction. False if it does not run, or
+    /// costs more than `enough`.
+    fn try_step(&mut self, length: f64, enough: f64, go_on: Go<'_>) -> Result<bool, OptimizeError> {
+        if !self.start_trial(length) {
+            return Ok(false);
+        }
+        let initial_cost = {
+            let states = self.problem.states;
+            let (q, p, v) = (self.plant.q(), self.plant.p(), self.plant.v());
+            self.trial.set_x(0, [q, p, v]);
+            debug_assert_eq!(self.trial.states, states);
+            self.initial_cost(&self.trial)
+        };
+        let bounds = (&self.multipliers[..], self.penalty);
+        let Self { problem, plant, current, trial, gains, dx, du, scratch, .. } = self;
+        let Scratch { deviation, nominal, error, input, .. } = scratch;
+        let (states, inputs, steps) = (problem.states, problem.inputs, problem.steps);
+        let (mut cost, mut penalties) = (initial_cost, 0.0);
+        let may_stop_early = problem.is_nonnegative && !problem.has_bounds();
+        for k in 0..steps {
+            ask(k, go_on)?;
+            problem.retract(current.x(k), &dx[k * states..][..states], length, nominal);
+            problem.difference(nominal, trial.x(k), error);
+            let change = &du[k * inputs..][..inputs];
+            for (u, (nominal, change)) in input.iter_mut().zip(current.u(k).iter().zip(change)) {
+                *u = nominal + length * change;
+            }
+            subtract_product(&gains[k], error, input);
+            cost += problem.evaluate(k, trial.x(k), input, deviation);
+            penalties += problem.penalty(k, (trial.x(k), input), bounds);
+            // What is still to come costs nothing at least.
+            if may_stop_early && !(cost < enough) {
+                return Ok(false);
+            }
+            trial.u[k * inputs..][..inputs].copy_from_slice(input);
+            if plant.step(input).is_err() {
+                return Ok(false);
+            }
+            trial.set_x(k + 1, [plant.q(), plant.p(), plant.v()]);
+            trial.set_multipliers(k, plant.multipliers());
+        }
+        cost += problem.evaluate(steps, trial.x(steps), &[], deviation);
+        penalties += problem.penalty(steps, (trial.x(steps), &[]), bounds);
+        (trial.cost, trial.merit) = (cost, cost + penalties);
+        Ok(trial.merit.is_finite())
+    }
+
+    /// Puts the plant at the initial state of the trial; false if there is none.
+    fn start_trial(&mut self, length: f64) -> bool {
+        if self.problem.free.is_none() {
+            return self.plant.restore(&self.start).is_ok();
+        }
+        let d = self.problem.model.dimensions();
+        let states = self.problem.states;
+        let mut x = vec![0.0; states];
+        self.problem.retract(self.current.x(0), &self.dx[..states], length, &mut x);
+        let (q, rest) = x.split_at(d.coordinates());
+        let (p, v) = rest.split_at(d.dynamic);
+        let mut q = q.to_vec();
+        if d.constraints > 0 && self.dx[..d.coordinates()].iter().any(|x| *x != 0.0) {
+            let free = self.problem.free.as_ref();
+            let holds = |i: &usize| free.is_some_and(|free| !free.entries[*i]);
+            let names = self.problem.model.coordinates();
+            let hold = (0..d.dynamic).filter(holds).map(|i| names[i].name.clone()).collect();
+            if self.plant.initialize(&Initial::Projection { q: q.clone(), hold }).is_err() {
+                return false;
+            }
+            q.copy_from_slice(self.plant.q());
+        }
+        let (p, v) = (p.to_vec(), v.to_vec());
+        if self.plant.initialize(&Initial::Momentum { q, p, v }).is_err() {
+            return false;
+        }
+        self.plant.set_step_index(self.first_step);
+        self.trial_start = self.plant.snapshot();
+        true
+    }
+}
+
+/// Step `k` of a trajectory, `n` coordinates.
+fn known(trajectory: &Trajectory, k: usize, first_step: u64, n: usize) -> KnownStep<'_> {
+    KnownStep {
+        index: first_step.saturating_add(k as u64),
+        q0: &trajectory.x(k)[..n],
+        q1: &trajectory.x(k + 1)[..n],
+        multipliers: trajectory.multipliers(k),
+        u: trajectory.u(k),
+    }
+}
+
+/// Directions of `x` along free entries that keep the constraints, as orthonormal columns.
+fn free_directions(entries: &[bool], jacobian: &DMatrix<f64>, n: usize) -> DMatrix<f64> {
+    let of = |range: std::ops::Range<usize>| range.filter(|i| entries[*i]).collect::<Vec<_>>();
+    let (configuration, others) = (of(0..n), of(n..entries.len()));
+    let mut columns = DMatrix::zeros(jacobian.nrows(), configuration.len());
+    for (to, &from) in configuration.iter().enumerate() {
+        columns.set_column(to, &jacobian.column(from));
+    }
+    let tangent = tangent_basis(&columns);
+    let mut basis = DMatrix::zeros(entries.len(), tangent.ncols() + others.len());
+    for (row, &entry) in configuration.iter().enumerate() {
+        basis.view_mut((entry, 0), (1, tangent.ncols())).copy_from(&tangent.row(row));
+    }
+    for (column, &entry) in others.iter().enumerate() {
+        basis[(entry, tangent.ncols() + column)] = 1.0;
+    }
+    basis
+}
+
+/// `out += m v`, skipping zeros of `v`.
+fn add_product(m: &DMatrix<f64>, v: &[f64], out: &mut [f64]) {
+    for (column, v) in m.as_slice().chunks_exact(out.len().max(1)).zip(v) {
+        if *v != 0.0 {
+            out.iter_mut().zip(column).for_each(|(out, m)| *out += m * v);
+        }
+    }
+}
+
+/// `out −= m v`, skipping zeros of `v`.
+fn subtract_product(m: &DMatrix<f64>, v: &[f64], out: &mut [f64]) {
+    for (column, v) in m.as_slice().chunks_exact(out.len().max(1)).zip(v) {
+        if *v != 0.0 {
+            out.iter_mut().zip(column).for_each(|(out, m)| *out -= m * v);
+        }
+    }
+}
+
+fn check_options(options: &Options) -> Result<(), OptimizeError> {
+    let fraction = |value: f64| value > 0.0 && value < 1.0;
+    let finite = |value: f64| value >= 0.0 && value.is_finite();
+    let tolerance = options.tolerance.unwrap_or(0.0);
+    let checks = [
+        ("alpha", options.alpha, fraction(options.alpha), "between 0 and 1"),
+        ("beta", options.beta, fraction(options.beta), "between 0 and 1"),
+        ("tolerance", tolerance, finite(tolerance), "finite and not less than zero"),
+        (
+            "bound_tolerance",
+            options.bound_tolerance,
+            finite(options.bound_tolerance) && options.bound_tolerance > 0.0,
+            "finite and greater than zero",
+        ),
+        (
+            "max_iterations",
+            f64::from(options.max_iterations),
+            options.max_iterations > 0,
+            "greater than zero",
+        ),
+    ];
+    match checks.into_iter().find(|(_, _, good, _)| !good) {
+        Some((name, value, _, range)) => Err(OptimizeError::Option { name, value, range }),
+        None => Ok(()),
+    }
+}
