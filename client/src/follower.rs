@@ -11,7 +11,7 @@ use tokio::task::JoinHandle;
 
 use crate::channel::within;
 use crate::link::StateView;
-use crate::{Answers, Client, Error, GainExt as _, MatrixExt as _, Refusal, Result, StateExt as _};
+use crate::{Answers, Client, Error, GainExt as _, Refusal, Result, StateExt as _};
 
 /// Gains of a trajectory that are kept ahead of the step asked for.
 const WINDOW: usize = 1024;
@@ -478,6 +478,7 @@ impl Drop for Follower {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::MatrixExt as _;
 
     fn gain(step: u64, k: f64, reference: f64) -> v1::Gain {
         v1::Gain {

@@ -49,6 +49,7 @@ mod channel;
 mod client;
 mod driver;
 mod error;
+mod estimator;
 mod follower;
 pub mod link;
 mod matrix;
@@ -59,12 +60,13 @@ pub use channel::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use client::Client;
 pub use driver::Driver;
 pub use error::{Error, Refusal, Result, Violation};
+pub use estimator::Estimator;
 pub use follower::{Follower, GainSchedule, LawState};
 pub use matrix::{
     GainExt, MatrixExt, StateExt, WeightsExt, diagonal, full, operating_point, present_state,
     weights,
 };
-pub use rotation::{difference, rotations};
+pub use rotation::{compose, difference, rotations};
 pub use stream::Answers;
 
 /// The messages and stubs of the contract, `plantd.v1`.

@@ -34,6 +34,21 @@ pub fn difference(x_reference: &[f64], x: &[f64], rotations: &[u32]) -> Vec<f64>
     difference
 }
 
+/// The `x` whose [`difference`] from `x_reference` is `dx`.
+pub fn compose(x_reference: &[f64], dx: &[f64], rotations: &[u32]) -> Vec<f64> {
+    let mut x: Vec<f64> = dx.iter().zip(x_reference).map(|(dx, r)| dx + r).collect();
+    for &start in rotations {
+        let start = start as usize;
+        let (Some(from), Some(turn)) = (vector(x_reference, start), vector(dx, start)) else {
+            continue;
+        };
+        if let Some(entries) = x.get_mut(start..start.saturating_add(3)) {
+            entries.copy_from_slice(&between(from.map(|e| -e), turn));
+        }
+    }
+    x
+}
+
 fn vector(x: &[f64], start: usize) -> Option<[f64; 3]> {
     x.get(start..)?.first_chunk().copied()
 }
@@ -86,6 +101,15 @@ mod tests {
         let quarter = PI / 2.0;
         let both = 2.0 * PI / 3.0 / f64::sqrt(3.0);
         assert_close(&between([0.0, 0.0, quarter], [both, both, both]), &[quarter, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn compose_undoes_the_difference() {
+        let (from, to) = ([1.0, 0.3, -1.2, 0.8, 5.0], [1.5, -0.9, 1.7, 0.4, 4.0]);
+        let dx = difference(&from, &to, &[1]);
+        assert_close(&compose(&from, &dx, &[1]), &to);
+        let quarters = compose(&[0.0, 0.0, PI / 2.0], &[PI / 2.0, 0.0, 0.0], &[0]);
+        assert_close(&quarters, &[2.0 * PI / 3.0 / f64::sqrt(3.0); 3]);
     }
 
     #[test]

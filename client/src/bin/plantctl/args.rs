@@ -14,6 +14,10 @@ Examples:
   plantctl linearize cart-pole --at upright         A and B of x[k+1] = f(x[k], u[k])
   plantctl lqr cart-pole --at upright --q 100,1,1,1 --r 0.1
   plantctl analyze cart-pole --at hanging --outputs theta --frequencies 0.1,0.5,1
+  plantctl optimize swing-up.toml --save best.json  one line per iteration, then the result
+  plantctl kalman cart-pole --at upright --outputs x,theta --measurement 1e-4 --process 1e-6
+  plantctl set-parameter p1 'frames[pole].body.mass=1.2'
+  plantctl feedback set p1 --at upright --q 100,1 --r 1 --mode replace
   plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
   plantctl validate arm.toml                        all errors of a scene, with their paths
   plantctl --address unix:/run/plantd/plantd.sock list plants";
@@ -26,6 +30,43 @@ Exit codes:
   1  refused by the server, or failed; `validate`: the scene has errors
   2  wrong usage
   3  no server at the address";
+
+pub(crate) const PROBLEM: &str = "\
+The problem, here the swing-up of a pendulum; only model, steps and cost must be there:
+
+  model = \"pendulum\"
+  steps = 100
+  time_step_s = 0.1                 # the scene's if not given
+  paper = false                     # all forces at the start of a step
+
+  [initial]                         # the scene's initial configuration if not given
+  q = [0.0]                         # with p and v; or an operating point: at = \"hanging\"
+
+  [cost]                            # 1/2 dx' q dx + dx' s du + 1/2 du' r du
+  q = [1000.0, 1.0]                 # a diagonal, or a matrix as a list of rows
+  r = [50.0]
+  q_final = [1000.0, 1.0]           # q if not given
+  x = [[0.0, 0.0]]                  # desired states, one row per step; the last one holds on
+  u = [[0.0]]                       # desired inputs, the same way; zero if not given
+  changes = [{ step = 50, x = [3.141592653589793, 0.0] }]   # other desired states from there on
+
+  [guess]
+  u = [[0.0]]                       # inputs, the last row holds on; if not given no forces, and
+                                    # prescribed coordinates stay
+  [bounds]
+  state = { theta = [-4.0, 4.0] }   # inf and -inf for no bound
+  input = { tau = [-5.0, 5.0] }
+  final_state = { theta = [3.14, 3.15] }
+
+  [free_initial]
+  entries = [\"theta\"]
+  weight = [1.0, 1.0]
+
+  [options]                         # names and defaults of OptimizationOptions in the contract
+  first_method = \"quasi-newton\"
+  first_iterations = 4
+  max_iterations = 50
+  projection = { q = [1.0, 1.0], r = [1.0] }";
 
 /// Looks at, drives and asks a plantd server.
 #[derive(Debug, Parser)]
@@ -183,6 +224,96 @@ pub(crate) enum Command {
         #[arg(long)]
         full: bool,
     },
+    /// Finds a trajectory of least cost: prints one line per iteration, then the result.
+    #[command(after_help = PROBLEM)]
+    Optimize {
+        /// File with the problem, TOML or JSON; `-` reads standard input.
+        problem: PathBuf,
+        /// Write the result to this file, as JSON.
+        #[arg(long, value_name = "FILE")]
+        save: Option<PathBuf>,
+        /// Go on, bit for bit, where the search of this file left off: a result or a checkpoint.
+        #[arg(long, value_name = "FILE", conflicts_with = "guess")]
+        resume: Option<PathBuf>,
+        /// Begin with the trajectory of this result.
+        #[arg(long, value_name = "FILE")]
+        guess: Option<PathBuf>,
+        /// How a direction of descent is found, in place of the problem's `options.method`.
+        #[arg(long)]
+        method: Option<Method>,
+        /// Iterations at most, in place of the problem's `options.max_iterations`.
+        #[arg(long, value_name = "N")]
+        iterations: Option<u32>,
+    },
+    /// Finds a motion of a model that follows configurations from elsewhere. The configurations come,
+    /// and the motion goes, as comma-separated values, one row per step; what the reference is like
+    /// goes to standard error.
+    ProjectReference {
+        /// Name of a model.
+        model: String,
+        /// File of configurations, a column per coordinate, with or without a head; `-` reads
+        /// standard input.
+        reference: PathBuf,
+        /// File of planned inputs, one row less; those that fit best if not given.
+        #[arg(long, value_name = "FILE")]
+        u: Option<PathBuf>,
+        #[command(flatten)]
+        settings: Settings,
+        /// Weights of the regulator that pulls the plant along the reference.
+        #[command(flatten)]
+        weights: Weights,
+        /// Error in an acceleration or a constraint up to which the reference is a motion.
+        #[arg(long, value_name = "NUMBER", default_value_t = 0.0)]
+        tolerance: f64,
+        /// Refuse a reference that is not a motion.
+        #[arg(long)]
+        strict: bool,
+    },
+    /// Solves the steady-state Kalman filter about an equilibrium.
+    Kalman {
+        #[command(flatten)]
+        point: Point,
+        #[command(flatten)]
+        settings: Settings,
+        /// What is measured, comma-separated entries of x such as `theta` or `p(theta)`; all if not
+        /// given.
+        #[arg(long, value_delimiter = ',')]
+        outputs: Vec<String>,
+        /// Variances of the measurements' noise, comma-separated; one number stands for all.
+        #[arg(long, value_name = "R", value_parser = numbers, default_value = "1")]
+        measurement: Numbers,
+        /// Variances of the state's noise per step, comma-separated; one number stands for all.
+        #[arg(long, value_name = "Q", value_parser = numbers)]
+        process: Option<Numbers>,
+        /// Variances of the inputs' noise, comma-separated; one number stands for all.
+        #[arg(long, value_name = "W", value_parser = numbers)]
+        input: Option<Numbers>,
+        /// Solve on the full state of a constrained model instead of on its manifold.
+        #[arg(long)]
+        full: bool,
+    },
+    /// Changes numbers of a plant's scene, or its time step, while it runs.
+    SetParameter {
+        /// Plant.
+        id: String,
+        /// Where a number stands, and its value: `gravity[1]=-1.6`, `frames[pole].body.mass=2`.
+        #[arg(value_name = "PATH=VALUE", value_parser = assignment, required_unless_present = "dt")]
+        parameters: Vec<Assignment>,
+        /// Time step, seconds.
+        #[arg(long, value_name = "SECONDS")]
+        dt: Option<f64>,
+    },
+    /// Gives a plant a reference with its regulator, or takes it away.
+    #[command(subcommand)]
+    Feedback(Feedback),
+    /// Prints the gains of a plant's feedback. Ends with Ctrl-C or after `--count`.
+    Gains {
+        /// Plant.
+        id: String,
+        /// End after this many messages.
+        #[arg(long, short = 'n')]
+        count: Option<u64>,
+    },
     /// Finds a configuration in which a model rests, from a guess.
     Settle {
         /// Name of a model.
@@ -255,6 +386,95 @@ pub(crate) enum Command {
     },
 }
 
+#[derive(Debug, Subcommand)]
+pub(crate) enum Feedback {
+    /// Sets the feedback: about an operating point, where the plant is now, or along a trajectory.
+    Set {
+        /// Plant.
+        id: String,
+        #[command(flatten)]
+        reference: Reference,
+        #[command(flatten)]
+        weights: Weights,
+        /// Solve on the full state of a constrained model instead of on its manifold.
+        #[arg(long)]
+        full: bool,
+        /// What it does in the plant's own loop.
+        #[arg(long, default_value = "watch-only")]
+        mode: Mode,
+        /// Step of the plant at which a trajectory begins; the present one if not given.
+        #[arg(long, value_name = "STEP", requires = "trajectory")]
+        first_step: Option<u64>,
+        /// Bounds of entries of x - x_reference, for the mode `guard`; an end may be left out.
+        #[arg(long, num_args = 1.., value_name = "ENTRY=MIN:MAX", value_parser = bound)]
+        guard: Vec<v1::Bound>,
+    },
+    /// Takes the feedback away.
+    Clear {
+        /// Plant.
+        id: String,
+    },
+}
+
+/// What a feedback keeps a plant at.
+#[derive(Debug, Group)]
+#[group(required = true, multiple = false)]
+pub(crate) struct Reference {
+    /// Operating point of the plant's scene.
+    #[arg(long, value_name = "POINT")]
+    pub(crate) at: Option<String>,
+    /// Where the plant is now.
+    #[arg(long)]
+    pub(crate) here: bool,
+    /// The trajectory of this file: a result of `optimize --save`.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) trajectory: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Mode {
+    /// Nothing: the gains are for those who watch them.
+    WatchOnly,
+    /// u = law; what the driver sends is not used.
+    Replace,
+    /// u = law + what the driver sends.
+    Add,
+    /// u = law once an entry has left its bounds.
+    Guard,
+}
+
+impl From<Mode> for v1::FeedbackMode {
+    fn from(mode: Mode) -> Self {
+        match mode {
+            Mode::WatchOnly => Self::WatchOnly,
+            Mode::Replace => Self::Replace,
+            Mode::Add => Self::Add,
+            Mode::Guard => Self::Guard,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum, serde::Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum Method {
+    /// Identity in place of second derivatives.
+    Steepest,
+    /// Second derivatives of the cost, first derivatives of the map.
+    QuasiNewton,
+    /// Second derivatives of the cost and of the map.
+    Newton,
+}
+
+impl From<Method> for v1::DescentMethod {
+    fn from(method: Method) -> Self {
+        match method {
+            Method::Steepest => Self::Steepest,
+            Method::QuasiNewton => Self::QuasiNewton,
+            Method::Newton => Self::Newton,
+        }
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Plural {
     Models,
@@ -274,6 +494,7 @@ pub(crate) enum Field {
     Energy,
     Linearization,
     Gain,
+    Input,
 }
 
 impl From<Field> for v1::WatchField {
@@ -284,6 +505,7 @@ impl From<Field> for v1::WatchField {
             Field::Energy => Self::Energy,
             Field::Linearization => Self::Linearization,
             Field::Gain => Self::Gain,
+            Field::Input => Self::Input,
         }
     }
 }
@@ -383,21 +605,25 @@ impl Weights {
     /// The weights for a model; lengths are for the server to judge.
     pub(crate) fn for_model(&self, model: &v1::Model) -> v1::LqrWeights {
         let prescribed = model.coordinates.iter().filter(|c| c.prescribed).count();
-        let weight = |numbers: &Numbers, count| match numbers.0.as_slice() {
-            [value] => plantd_client::diagonal(vec![*value; count]),
-            values => plantd_client::diagonal(values),
-        };
-        v1::LqrWeights {
-            q: Some(weight(&self.q, 2 * model.coordinates.len())),
-            r: Some(weight(&self.r, model.inputs.len() + prescribed)),
-            ..Default::default()
-        }
+        let states = 2 * model.coordinates.len();
+        let inputs = model.inputs.len() + prescribed;
+        plantd_client::weights(self.q.diagonal(states), self.r.diagonal(inputs))
     }
 }
 
 /// Comma-separated numbers.
 #[derive(Clone, Debug)]
 pub(crate) struct Numbers(pub(crate) Vec<f64>);
+
+impl Numbers {
+    /// A diagonal weight; one number stands for all entries.
+    pub(crate) fn diagonal(&self, count: usize) -> v1::Weight {
+        match self.0.as_slice() {
+            [value] => plantd_client::diagonal(vec![*value; count]),
+            values => plantd_client::diagonal(values),
+        }
+    }
+}
 
 fn numbers(text: &str) -> Result<Numbers, String> {
     let number = |entry: &str| {
@@ -417,6 +643,17 @@ fn assignment(text: &str) -> Result<Assignment, String> {
     Ok(Assignment(name.trim().to_owned(), number))
 }
 
+fn bound(text: &str) -> Result<v1::Bound, String> {
+    let (entry, ends) =
+        text.split_once('=').ok_or("an entry and its bounds with `=` are needed")?;
+    let (min, max) = ends.split_once(':').ok_or("two ends with `:` between are needed")?;
+    let end = |text: &str| match text.trim() {
+        "" => Ok(None),
+        text => text.parse().map(Some).map_err(|_| format!("`{text}` is not a number")),
+    };
+    Ok(v1::Bound { entry: entry.trim().to_owned(), min: end(min)?, max: end(max)? })
+}
+
 #[cfg(test)]
 mod tests {
     use clap::CommandFactory as _;
@@ -426,6 +663,14 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Args::command().debug_assert();
+    }
+
+    #[test]
+    fn an_end_of_a_bound_may_be_left_out() {
+        let both = bound("p(theta)=-1:2").unwrap();
+        assert_eq!((both.entry.as_str(), both.min, both.max), ("p(theta)", Some(-1.0), Some(2.0)));
+        assert_eq!(bound("theta=:3").unwrap().min, None);
+        assert!(bound("theta=3").is_err() && bound("theta=a:3").unwrap_err().contains("`a`"));
     }
 
     #[test]

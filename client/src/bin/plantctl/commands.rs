@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use crate::args::{
     Args, Assignment, Command, Field, Numbers, Plural, Point, Settings, Singular, Weights,
 };
-use crate::{FAILED, json, text};
+use crate::{FAILED, feedback, json, optimize, text};
 
 /// Runs a command; the code is that of a command which ran.
 pub(crate) async fn run(args: Args) -> Result<ExitCode> {
@@ -95,6 +95,59 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
             let request = v1::AnalyzeRequest { outputs, frequencies_hz, ..Default::default() };
             analyze(&client, output, point, settings, request, full).await?;
         }
+        Command::Optimize { problem, save, resume, guess, method, iterations } => {
+            let files = optimize::Files { problem, save, resume, guess };
+            return optimize::optimize(&client, output, files, method, iterations).await;
+        }
+        Command::ProjectReference { model, reference, u, settings, weights, tolerance, strict } => {
+            let request = v1::ProjectReferenceRequest {
+                model,
+                settings: Some(settings.into()),
+                tolerance,
+                strict,
+                ..Default::default()
+            };
+            let files = (reference.as_path(), u.as_deref());
+            optimize::project_reference(&client, output, request, files, &weights).await?;
+        }
+        Command::Kalman { point, settings, outputs, measurement, process, input, full } => {
+            let (model, settings, point) = resolve(&client, point, settings).await?;
+            let states = 2 * model.coordinates.len();
+            let inputs = text::input_names(&model).len();
+            let count = if outputs.is_empty() { states } else { outputs.len() };
+            let request = v1::SolveKalmanRequest {
+                model: model.name.clone(),
+                settings: Some(settings),
+                point: Some(point),
+                measurement: Some(v1::Measurement { outputs, ..Default::default() }),
+                noise: Some(v1::NoiseCovariances {
+                    process: process.map(|p| p.diagonal(states)),
+                    input: input.map(|i| i.diagonal(inputs)),
+                    measurement: Some(measurement.diagonal(count)),
+                }),
+                constraints: space(full).into(),
+            };
+            let answer = client.solve_kalman(request).await?;
+            output.print(
+                || json::message("SolveKalmanResponse", &answer),
+                || text::kalman(&answer, &model),
+            )?;
+        }
+        Command::SetParameter { id, parameters, dt } => {
+            let parameter = |Assignment(path, value)| v1::Parameter { path, value };
+            let request = v1::SetParametersRequest {
+                id,
+                parameters: parameters.into_iter().map(parameter).collect(),
+                time_step_s: dt.unwrap_or(0.0),
+            };
+            let plant = client.set_parameters(request).await?;
+            output.print(
+                || json::message("PlantInfo", &plant),
+                || text::plants(std::slice::from_ref(&plant)) + &text::parameters(&plant),
+            )?;
+        }
+        Command::Feedback(command) => feedback::run(&client, output, command).await?,
+        Command::Gains { id, count } => feedback::gains(&client, output, id, count).await?,
         Command::Settle { model, hold, guess, inputs, constraints, toml } => {
             let goal =
                 if constraints { v1::SettleGoal::Constraints } else { v1::SettleGoal::Equilibrium };
@@ -153,13 +206,13 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
 
 /// Where results go.
 #[derive(Clone, Copy)]
-struct Output {
-    json: bool,
+pub(crate) struct Output {
+    pub(crate) json: bool,
 }
 
 impl Output {
     /// Prints a result, flushed, so that a reader of a stream gets it at once.
-    fn print(
+    pub(crate) fn print(
         self,
         json: impl FnOnce() -> Value,
         text: impl FnOnce() -> String,
@@ -174,7 +227,7 @@ impl Output {
     }
 
     /// Confirms what has no result of its own; people see that it went well by the silence.
-    fn done(self, json: Value) -> std::io::Result<()> {
+    pub(crate) fn done(self, json: Value) -> std::io::Result<()> {
         self.print(|| json, String::new)
     }
 }
@@ -214,6 +267,8 @@ async fn show_plant(client: &Client, output: Output, id: String) -> Result<()> {
             plant.map(|p| text::plants(std::slice::from_ref(p))),
             state.map(text::state),
             answer.energy.as_ref().map(text::energy),
+            plant.map(text::parameters),
+            plant.and_then(|p| p.feedback.as_ref()).map(text::feedback),
         ]
         .into_iter()
         .flatten()
@@ -289,8 +344,10 @@ fn watched(message: &v1::WatchResponse, model: &v1::Model) -> String {
     };
     let lost = (message.dropped > 0).then(|| format!("  {} messages lost\n", message.dropped));
     let failure = message.failure.as_ref().map(|f| format!("  {}: {}\n", f.reason, f.message));
+    let input = (!message.u.is_empty()).then(|| format!("  u: {}\n", text::numbers(&message.u)));
     let parts = [
         Some(head),
+        input,
         message.report.as_ref().map(text::report),
         message.energy.as_ref().map(text::energy),
         message.linearization.as_ref().map(|l| text::linearization(l, model)),
@@ -454,7 +511,7 @@ fn values(given: Vec<Assignment>) -> std::collections::HashMap<String, f64> {
 }
 
 /// The space on which a constrained model is looked at.
-fn space(full: bool) -> v1::ConstraintHandling {
+pub(crate) fn space(full: bool) -> v1::ConstraintHandling {
     if full { v1::ConstraintHandling::Full } else { v1::ConstraintHandling::Manifold }
 }
 
@@ -503,7 +560,7 @@ fn ended(text: &str) -> String {
 }
 
 /// A file's text; `-` stands for standard input.
-fn read_text(path: &Path) -> Result<String> {
+pub(crate) fn read_text(path: &Path) -> Result<String> {
     if path == Path::new("-") {
         let mut text = String::new();
         std::io::stdin().read_to_string(&mut text).context("cannot read standard input")?;

@@ -2,6 +2,7 @@
 
 use std::sync::LazyLock;
 
+use anyhow::Result;
 use plantd_client::Error;
 use prost_reflect::{DescriptorPool, DynamicMessage, SerializeOptions};
 use serde_json::{Value, json};
@@ -26,6 +27,17 @@ pub(crate) fn message(name: &str, message: &impl prost::Message) -> Value {
     dynamic
         .serialize_with_options(serde_json::value::Serializer, &options)
         .expect("numbers and strings are JSON")
+}
+
+/// Reads a message back from JSON.
+pub(crate) fn read<M: prost::Message + Default>(name: &str, text: &str) -> Result<M> {
+    let descriptor = CONTRACT
+        .get_message_by_name(&format!("plantd.v1.{name}"))
+        .expect("the name of a message of the contract");
+    let mut deserializer = serde_json::Deserializer::from_str(text);
+    let dynamic = DynamicMessage::deserialize(descriptor, &mut deserializer)?;
+    deserializer.end()?;
+    Ok(dynamic.transcode_to()?)
 }
 
 /// Messages of one kind as a JSON array.
@@ -57,6 +69,17 @@ mod tests {
     use plantd_client::v1;
 
     use super::*;
+
+    #[test]
+    fn a_message_comes_back_bit_for_bit() {
+        let q = vec![0.1 + 0.2, 1e-300, -0.0, 2.0_f64.sqrt()];
+        let state = v1::State { step: 1 << 60, q, ..Default::default() };
+        let text = message("State", &state).to_string();
+        assert_eq!(read::<v1::State>("State", &text).unwrap(), state);
+        // As other writers of JSON have it.
+        assert_eq!(read::<v1::State>("State", r#"{"step": "7"}"#).unwrap().step, 7);
+        assert!(read::<v1::State>("State", "{} x").is_err());
+    }
 
     #[test]
     fn a_message_keeps_its_field_names_and_types() {

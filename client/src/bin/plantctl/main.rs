@@ -2,7 +2,9 @@
 
 mod args;
 mod commands;
+mod feedback;
 mod json;
+mod optimize;
 mod text;
 
 use std::process::ExitCode;

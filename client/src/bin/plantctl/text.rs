@@ -467,7 +467,150 @@ pub(crate) fn diagnosis(answer: &v1::DiagnoseResponse, model: &v1::Model) -> Str
 pub(crate) fn gain(gain: &v1::Gain, model: &v1::Model) -> String {
     let (x, u) = (state_names(model), input_names(model));
     let k = gain.k.as_ref().map_or(String::new(), |k| matrix("K", k, &u, &x));
-    format!("u = u_reference - K (x - x_reference)\n\n{k}")
+    let forward = if gain.feedforward.is_empty() { "" } else { " + feedforward" };
+    format!("u = u_reference{forward} - K (x - x_reference)\n\n{k}")
+}
+
+/// A steady-state Kalman filter.
+pub(crate) fn kalman(answer: &v1::SolveKalmanResponse, model: &v1::Model) -> String {
+    let gain = answer.gain.as_ref();
+    let gain = gain.map(|l| matrix("L", l, &state_names(model), &answer.outputs));
+    let radius = answer.error_modes.iter().map(|z| z.real.hypot(z.imaginary)).fold(0.0, f64::max);
+    format!(
+        "x = x_predicted + L (y - C x_predicted)\n\n{}\nspectral radius of the error: {}\nRiccati \
+         residual: {}\n",
+        gain.unwrap_or_default(),
+        number(radius),
+        number(answer.residual),
+    )
+}
+
+/// Numbers of the scene that were changed for a plant; nothing if none were.
+pub(crate) fn parameters(plant: &v1::PlantInfo) -> String {
+    let line = |p: &v1::Parameter| format!("  {} = {}\n", p.path, number(p.value));
+    plant.parameters.iter().map(line).collect()
+}
+
+/// What a feedback is and does.
+pub(crate) fn feedback(feedback: &v1::FeedbackInfo) -> String {
+    let about = match feedback.horizon {
+        0 => "about an operating point".to_owned(),
+        steps => format!("along {steps} steps from step {} on", feedback.first_step),
+    };
+    let mode = match feedback.mode() {
+        v1::FeedbackMode::Unspecified | v1::FeedbackMode::WatchOnly => "watch only",
+        v1::FeedbackMode::Replace => "replaces the driver's input",
+        v1::FeedbackMode::Add => "adds to the driver's input",
+        v1::FeedbackMode::Guard => "guards",
+    };
+    let mut text = format!("feedback {about}, revision {}: {mode}\n", feedback.revision);
+    if let Some(step) = feedback.tripped_at_step {
+        let _ = writeln!(text, "  took over at step {step} because of {}", feedback.tripped_by);
+    }
+    if let Some(failure) = &feedback.failure {
+        let _ = writeln!(text, "  {}: {}", failure.reason, failure.message);
+    }
+    text
+}
+
+/// One message of a stream of gains.
+pub(crate) fn watched_gain(message: &v1::WatchGainsResponse, model: &v1::Model) -> String {
+    let mut text = String::new();
+    if let Some(failure) = &message.failure {
+        let _ = writeln!(text, "{}: {}", failure.reason, failure.message);
+    }
+    if let Some(law) = &message.gain {
+        let _ = writeln!(text, "from step {} on, revision {}", law.step, message.revision);
+        let lines = [
+            ("x_reference", &law.x_reference),
+            ("u_reference", &law.u_reference),
+            ("feedforward", &law.feedforward),
+        ];
+        for (name, values) in lines.into_iter().filter(|(_, values)| !values.is_empty()) {
+            let _ = writeln!(text, "  {name}: {}", numbers(values));
+        }
+        if let Some(k) = &law.k {
+            text += &matrix("K", k, &input_names(model), &state_names(model));
+        }
+    }
+    text
+}
+
+/// One iteration of a search, as a row of a table under [`ITERATIONS`].
+pub(crate) fn iteration(progress: &v1::OptimizationProgress) -> String {
+    let mut text = format!(
+        "{:>9}  {:<12}  {:>14}  {:>14}  {:>12}  {:>12}\n",
+        progress.iteration,
+        method(progress.method()),
+        number(progress.cost),
+        number(progress.directional_derivative),
+        number(progress.step_length),
+        number(progress.bound_violation),
+    );
+    if !progress.fallback.is_empty() {
+        let _ = writeln!(text, "           {}", progress.fallback);
+    }
+    text
+}
+
+/// Head of a table of iterations.
+pub(crate) const ITERATIONS: &str =
+    "iteration  method                  cost      derivative   step length  out of bounds\n";
+
+fn method(method: v1::DescentMethod) -> &'static str {
+    match method {
+        v1::DescentMethod::Unspecified => "",
+        v1::DescentMethod::Steepest => "steepest",
+        v1::DescentMethod::QuasiNewton => "quasi-newton",
+        v1::DescentMethod::Newton => "newton",
+    }
+}
+
+/// The end of a search.
+pub(crate) fn optimum(result: &v1::OptimizationResult) -> String {
+    let mut text = match &result.failure {
+        Some(failure) => format!("{}: {}\n", failure.reason, failure.message),
+        None => "converged\n".to_owned(),
+    };
+    let _ = write!(text, "cost {}", number(result.cost));
+    if result.bound_violation != 0.0 {
+        let _ = write!(text, ", out of bounds by {}", number(result.bound_violation));
+    }
+    let iterations = result.checkpoint.as_ref().map_or(0, |c| c.iterations);
+    let _ = writeln!(text, " after {iterations} iterations");
+    text
+}
+
+/// How a reference compares with motions of the plant.
+pub(crate) fn reference(report: &v1::ReferenceReport) -> String {
+    let mut text = String::new();
+    let verdict = if report.feasible { "is a motion" } else { "is not a motion" };
+    let _ = writeln!(text, "the reference {verdict} of the plant");
+    if !report.constraint.is_empty() {
+        let _ = writeln!(
+            text,
+            "  constraints: off by {} at step {} ({})",
+            number(report.constraint_violation),
+            report.constraint_violation_step,
+            report.constraint
+        );
+    }
+    let _ = writeln!(
+        text,
+        "  forces: {} of {} at step {} cannot be exerted (an acceleration of {})",
+        number(report.unexplained_force),
+        report.unexplained_coordinate,
+        report.unexplained_step,
+        number(report.unexplained_acceleration)
+    );
+    let _ = writeln!(
+        text,
+        "  the motion found deviates by {} in {} at step {}",
+        number(report.deviation),
+        report.deviation_coordinate,
+        report.deviation_step
+    );
+    text
 }
 
 #[cfg(test)]
