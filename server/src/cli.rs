@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::config::{Config, ConfigError, Listen, LogFormat};
+use crate::priority::Priority;
 
 /// Simulated plants for real-time controllers.
 #[derive(Debug, Parser)]
@@ -63,6 +64,9 @@ pub struct Settings {
     /// Workers for long computations; 0 means one for each processor.
     #[arg(long, env = "PLANTD_WORKERS", value_name = "COUNT")]
     pub workers: Option<usize>,
+    /// Scheduling priority of those workers.
+    #[arg(long, env = "PLANTD_WORKER_PRIORITY")]
+    pub worker_priority: Option<Priority>,
     /// Seconds for open calls to end at shutdown.
     #[arg(long, env = "PLANTD_SHUTDOWN_GRACE_S", value_name = "SECONDS")]
     pub shutdown_grace_s: Option<f64>,
@@ -112,6 +116,7 @@ impl Settings {
         replace(&mut config.metrics, self.metrics);
         replace(&mut config.threads, self.threads);
         replace(&mut config.workers, self.workers);
+        replace(&mut config.worker_priority, self.worker_priority);
         replace(&mut config.shutdown_grace_s, self.shutdown_grace_s);
         replace(&mut config.log.filter, self.log);
         replace(&mut config.log.format, self.log_format);

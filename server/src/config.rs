@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::{LimitError, Limits};
 use crate::link::LinkConfig;
+use crate::priority::Priority;
 
 /// Port of gRPC over TCP unless another one is given.
 pub const DEFAULT_PORT: u16 = 50051;
@@ -39,6 +40,8 @@ pub struct Config {
     pub threads: usize,
     /// Workers for long computations; 0 means one for each processor.
     pub workers: usize,
+    /// Scheduling priority of those workers.
+    pub worker_priority: Priority,
     /// Time for open calls to end at shutdown before they are cut off, s.
     pub shutdown_grace_s: f64,
     /// Logging.
@@ -59,6 +62,7 @@ impl Default for Config {
             ready_file: None,
             threads: 0,
             workers: 0,
+            worker_priority: Priority::default(),
             shutdown_grace_s: 5.0,
             log: LogConfig::default(),
             link: LinkSettings::default(),

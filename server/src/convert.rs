@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use nalgebra::{Complex, DMatrix, DVector};
-use plantd_models::control::Weights;
+use plantd_models::control::{StageWeights, TrajectoryWeights, Weights, WeightsError};
 use plantd_models::scene::Signal;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
@@ -328,26 +328,124 @@ pub fn check_finite(field: &str, numbers: &[f64]) -> Result<(), Fault> {
 
 /// Weights of a regulator.
 pub fn weights(weights: Option<v1::LqrWeights>, model: &Model) -> Result<Weights, Fault> {
-    let weights = weights.ok_or_else(|| Fault::field("weights", "are missing"))?;
-    let d = model.dimensions();
-    let q = weight("weights.q", weights.q, d.state())?;
-    let r = weight("weights.r", weights.r, d.input())?;
-    let q_final = match weights.q_final {
-        Some(given) => Some(weight("weights.q_final", Some(given), d.state())?),
-        None => None,
-    };
-    let s = match &weights.s {
-        Some(s) => Some(matrix_of("weights.s", s, Some(d.state()), d.input())?),
-        None => None,
-    };
-    let weights = Weights::new(q, r, q_final)?;
-    Ok(match s {
-        Some(s) => weights.with_cross(s)?,
-        None => weights,
-    })
+    weights_in("weights", weights, model)
 }
 
-fn weight(field: &str, weight: Option<v1::Weight>, size: usize) -> Result<DMatrix<f64>, Fault> {
+/// Weights of a regulator in a field of the request.
+pub fn weights_in(
+    field: &str,
+    weights: Option<v1::LqrWeights>,
+    model: &Model,
+) -> Result<Weights, Fault> {
+    let weights = weights.ok_or_else(|| Fault::field(field, "are missing"))?;
+    let d = model.dimensions();
+    let at = |name: &str| format!("{field}.{name}");
+    let q = weight(&at("q"), weights.q, d.state())?;
+    let r = weight(&at("r"), weights.r, d.input())?;
+    let q_final = weights.q_final.map(|given| weight(&at("q_final"), Some(given), d.state()));
+    let s = weights.s.map(|s| matrix_of(&at("s"), &s, Some(d.state()), d.input()));
+    let refuse = |error| Fault::from_weights(error, field, "stages");
+    let weights = Weights::new(q, r, q_final.transpose()?).map_err(refuse)?;
+    match s.transpose()? {
+        Some(s) => weights.with_cross(s).map_err(refuse),
+        None => Ok(weights),
+    }
+}
+
+/// Where weights stand in a request.
+#[derive(Clone, Copy, Debug)]
+pub struct WeightFields {
+    /// Those of all steps.
+    pub weights: &'static str,
+    /// Those of single steps.
+    pub stages: &'static str,
+    /// Each step's must be convex by themselves.
+    pub are_convex: bool,
+}
+
+impl Default for WeightFields {
+    fn default() -> Self {
+        Self { weights: "weights", stages: "stages", are_convex: true }
+    }
+}
+
+/// Weights along a trajectory of so many steps: the same at all of them, or one set per step.
+pub fn trajectory_weights(
+    fields: WeightFields,
+    weights: Option<v1::LqrWeights>,
+    stages: Vec<v1::StageWeights>,
+    steps: usize,
+    model: &Model,
+) -> Result<TrajectoryWeights, Fault> {
+    let WeightFields { weights: field, stages: stages_field, are_convex } = fields;
+    let refuse = |error| Fault::from_weights(error, field, stages_field);
+    if stages.is_empty() && are_convex {
+        return Ok(TrajectoryWeights::from(&weights_in(field, weights, model)?));
+    }
+    let size = model.dimensions().state();
+    let weights = weights.unwrap_or_default();
+    let is_given = weights.q_final.is_some();
+    let given_final = if is_given { weights.q_final } else { weights.q.clone() };
+    let final_field = format!("{field}.{}", if is_given { "q_final" } else { "q" });
+    let build = if are_convex { StageWeights::new } else { StageWeights::symmetric };
+    if stages.is_empty() {
+        let v1::LqrWeights { q, r, s, .. } = weights;
+        let all = v1::StageWeights { q, r, s, ..Default::default() };
+        let (q, r, s, x_linear, u_linear) = stage_parts(field, all, model)?;
+        let stage = build(q, r, s, x_linear, u_linear).map_err(refuse)?;
+        let q_final = Some(weight(&final_field, given_final, size)?);
+        return TrajectoryWeights::constant(stage, q_final).map_err(refuse);
+    }
+    if stages.len() != steps {
+        let problem = format!("has {} entries; the trajectory has {steps} steps", stages.len());
+        return Err(Fault::field(stages_field, problem));
+    }
+    let q_final = weight(&final_field, given_final, size)?;
+    let stage = |(step, stage): (usize, v1::StageWeights)| {
+        let (q, r, s, x_linear, u_linear) =
+            stage_parts(&format!("{stages_field}[{step}]"), stage, model)?;
+        build(q, r, s, x_linear, u_linear)
+            .map_err(|error| refuse(WeightsError::Step { step, error: Box::new(error) }))
+    };
+    let stages: Result<Vec<_>, Fault> = stages.into_iter().enumerate().map(stage).collect();
+    TrajectoryWeights::per_step(stages?, q_final).map_err(refuse)
+}
+
+type StageParts =
+    (DMatrix<f64>, DMatrix<f64>, Option<DMatrix<f64>>, Option<DVector<f64>>, Option<DVector<f64>>);
+
+fn stage_parts(field: &str, stage: v1::StageWeights, model: &Model) -> Result<StageParts, Fault> {
+    let d = model.dimensions();
+    let at = |name: &str| format!("{field}.{name}");
+    let linear = |name: &str, numbers: Vec<f64>, size: usize| {
+        if numbers.is_empty() {
+            return Ok(None);
+        }
+        check_numbers(&at(name), &numbers, size)?;
+        Ok::<_, Fault>(Some(DVector::from_vec(numbers)))
+    };
+    let s = stage.s.map(|s| matrix_of(&at("s"), &s, Some(d.state()), d.input()));
+    Ok((
+        weight(&at("q"), stage.q, d.state())?,
+        weight(&at("r"), stage.r, d.input())?,
+        s.transpose()?,
+        linear("x_linear", stage.x_linear, d.state())?,
+        linear("u_linear", stage.u_linear, d.input())?,
+    ))
+}
+
+/// A vector's numbers.
+pub fn vector(vector: DVector<f64>) -> Vec<f64> {
+    vector.as_slice().to_vec()
+}
+
+/// A vector's numbers; none when all are zero.
+pub fn nonzero(vector: DVector<f64>) -> Vec<f64> {
+    if vector.iter().all(|&number| number == 0.0) { Vec::new() } else { self::vector(vector) }
+}
+
+/// A symmetric weight in a field of the request.
+pub fn weight(field: &str, weight: Option<v1::Weight>, size: usize) -> Result<DMatrix<f64>, Fault> {
     match weight.and_then(|weight| weight.form) {
         None => Err(Fault::field(field, "is missing")),
         Some(WeightForm::Diagonal(diagonal)) => {
@@ -404,11 +502,11 @@ pub fn plant_state(plant: &Plant) -> v1::State {
     }
 }
 
-/// A state as a message.
-pub fn state(state: &State, time_step_s: f64) -> v1::State {
+/// A state at a time as a message.
+pub fn state(state: &State, time_s: f64) -> v1::State {
     v1::State {
         step: state.step,
-        time_s: state.step as f64 * time_step_s,
+        time_s,
         q: state.q.clone(),
         p: state.p.clone(),
         v: state.v.clone(),
@@ -446,6 +544,26 @@ pub fn state_names(model: &Model) -> Vec<String> {
     all.chain(dynamic.iter().map(|c| format!("p({})", c.name)))
         .chain(prescribed.iter().map(|c| format!("v({})", c.name)))
         .collect()
+}
+
+/// Index of a bound's entry among `names`, and its ends; infinite where there is none.
+pub fn bound(field: &str, bound: &v1::Bound, names: &[String]) -> Result<(usize, f64, f64), Fault> {
+    let index = names.iter().position(|name| *name == bound.entry).ok_or_else(|| {
+        Fault::field(format!("{field}.entry"), format!("there is no entry `{}`", bound.entry))
+    })?;
+    if bound.min.is_none() && bound.max.is_none() {
+        return Err(Fault::field(field, "has neither `min` nor `max`"));
+    }
+    let (min, max) = (bound.min.unwrap_or(f64::NEG_INFINITY), bound.max.unwrap_or(f64::INFINITY));
+    for (end, value) in [("min", bound.min), ("max", bound.max)] {
+        if let Some(value) = value.filter(|value| !value.is_finite()) {
+            return Err(Fault::field(format!("{field}.{end}"), format!("is {value}")));
+        }
+    }
+    if min > max {
+        return Err(Fault::field(field, format!("has min {min} above max {max}")));
+    }
+    Ok((index, min, max))
 }
 
 /// Indices in `x` at which the rotation vectors of ball joints begin.

@@ -12,10 +12,12 @@ use tokio_util::sync::CancellationToken;
 use tonic::Code;
 
 use crate::catalog::Catalog;
+use crate::feedback::Room;
 use crate::grpc::Answers;
 use crate::limits::{LimitExceeded, Limits};
 use crate::link::{LinkError, LinkHost, LinkInfo};
 use crate::metrics::Metrics;
+use crate::priority::Priority;
 use crate::session::Session;
 use crate::status::Fault;
 use crate::workers::Workers;
@@ -26,12 +28,17 @@ pub struct Hub {
     pub limits: Limits,
     /// Metrics.
     pub metrics: Arc<Metrics>,
-    /// Workers for long computations.
+    /// Workers for long computations, at low priority.
     pub workers: Workers,
+    /// Workers for what belongs to the running of plants, at the usual priority: long computations do
+    /// not keep it waiting.
+    pub attendants: Workers,
     /// Models.
     pub catalog: Catalog,
     /// Permits to hold a trajectory regulator in memory.
     pub trajectory_solves: Arc<Semaphore>,
+    /// Room in memory for the laws of feedbacks.
+    pub feedback_room: Arc<Room>,
     /// Cancelled when the server begins to shut down: streams end.
     pub ending: CancellationToken,
     links: Option<Arc<LinkHost>>,
@@ -40,12 +47,24 @@ pub struct Hub {
 
 impl Hub {
     /// A hub without plants.
-    pub fn new(limits: Limits, worker_count: usize, links: Option<LinkHost>) -> Self {
+    pub fn new(
+        limits: Limits,
+        worker_count: usize,
+        priority: Priority,
+        links: Option<LinkHost>,
+    ) -> Self {
         let metrics = Arc::new(Metrics::default());
         Self {
-            workers: Workers::new(worker_count, limits.queued_jobs),
+            workers: Workers::new("worker", worker_count, limits.queued_jobs, priority),
+            attendants: Workers::new(
+                "attendant",
+                worker_count,
+                limits.queued_jobs,
+                Priority::Normal,
+            ),
             catalog: Catalog::new(limits.models, Arc::clone(&metrics)),
             trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
+            feedback_room: Room::new(limits.feedback_numbers),
             ending: CancellationToken::new(),
             links: links.map(Arc::new),
             plants: Mutex::default(),

@@ -62,7 +62,7 @@ limits! {
     models = 256 in 0..=1_000_000;
     /// Plants.
     plants = 1024 in 0..=1_000_000;
-    /// Watch streams of one plant.
+    /// Watch streams of one plant, and WatchGains streams.
     watchers_per_plant = 64 in 0..=1_000_000;
     /// Newton iterations that a plant may ask for.
     max_iterations = 1000 in 1..=1_000_000;
@@ -78,6 +78,10 @@ limits! {
     trajectory_numbers = 32_000_000 in 1000..=10_000_000_000;
     /// Trajectory regulators that may be held at a time.
     trajectory_solves = 4 in 1..=1000;
+    /// Numbers held by the feedbacks of all plants together (8 bytes each).
+    feedback_numbers = 64_000_000 in 1000..=10_000_000_000;
+    /// Numbers of its scene that may be changed for one plant.
+    parameters = 1024 in 0..=1_000_000;
     /// Frequencies of one Analyze call.
     frequencies = 10_000 in 1..=1_000_000;
     /// Second derivatives of one call, formed or contracted: outputs times pairs of parameters.

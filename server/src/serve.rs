@@ -89,7 +89,12 @@ impl RunningServer {
         let links = config.link.host_config().map(LinkHost::new).transpose();
         let links = links.context("shared-memory links (turn them off with `--link off`)")?;
         let link_root = config.link.host_config().filter(|_| links.is_some()).map(|link| link.root);
-        let hub = Arc::new(Hub::new(config.limits.clone(), config.worker_count(), links));
+        let hub = Arc::new(Hub::new(
+            config.limits.clone(),
+            config.worker_count(),
+            config.worker_priority,
+            links,
+        ));
         if let Some(directory) = &config.scenes {
             load_scenes(&hub, directory)?;
         }

@@ -11,11 +11,16 @@ use plantd_models::{
     Initial, InitialError, Linearization, Model, Plant, Settings, Snapshot, SnapshotError, State,
     StepError, StepReport,
 };
+use plantd_proto::v1;
+use tokio::sync::watch::{self, Receiver};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
+use crate::feedback::{Feedback, InForce, Law};
 use crate::limits::LimitExceeded;
 use crate::metrics::Metrics;
-use crate::status::step_error_reason;
+use crate::parameters::{self, ChangeError, Parameters};
+use crate::regulator::Spec;
+use crate::status::{Fault, step_error_reason};
 use crate::watch::{Subscription, Watchers};
 
 /// One step in this many is timed for the histogram of step times.
@@ -86,16 +91,63 @@ struct Core {
     input: Vec<f64>,
     /// Report of the last step.
     report: StepReport,
+    feedback: Option<Box<Feedback>>,
+    /// Room for an input that the feedback makes.
+    applied: Vec<f64>,
+    /// Numbers of the scene that were changed.
+    parameters: Arc<Parameters>,
+    /// Counts the changes of parameters and time step.
+    generation: u64,
+    /// Counts the computations of laws.
+    revision: u64,
+}
+
+impl Core {
+    fn state(&self) -> (State, f64) {
+        (self.plant.state(), self.plant.time_s())
+    }
+}
+
+/// A plant as it is, to be shown.
+pub struct View {
+    /// State.
+    pub state: State,
+    /// Its time, s.
+    pub time_s: f64,
+    /// Settings in force.
+    pub settings: Settings,
+    /// Feedback.
+    pub feedback: Option<v1::FeedbackInfo>,
+    /// Numbers of the scene that were changed.
+    pub parameters: Arc<Parameters>,
+}
+
+/// A model with settings, and which of a plant's it is: the number goes up with each change.
+#[derive(Clone)]
+pub struct Mechanics {
+    /// The model.
+    pub model: Arc<Model>,
+    /// The settings.
+    pub settings: Settings,
+    /// Number of changes that led to them.
+    pub generation: u64,
 }
 
 /// A plant with everything that belongs to it, shared by all who use it.
 pub struct Session {
     id: String,
     model_name: String,
+    /// The model at the time of creation; later ones differ from it in numbers only.
     model: Arc<Model>,
-    settings: Settings,
     start: Snapshot,
+    start_state: State,
     core: Mutex<Core>,
+    /// Held by whoever replaces the plant; taken before the core's lock.
+    replacing: Mutex<()>,
+    /// The feedback's law for watchers of gains.
+    in_force: watch::Sender<Option<InForce>>,
+    /// A task computes the feedback's law anew.
+    is_recomputing: AtomicBool,
     driver: AtomicU8,
     link_open: AtomicBool,
     is_closed: AtomicBool,
@@ -113,10 +165,22 @@ impl Session {
         Arc::new(Self {
             id,
             model_name,
-            settings: *plant.settings(),
             start: plant.snapshot(),
+            start_state: plant.state(),
             model,
-            core: Mutex::new(Core { plant, input, report: StepReport::default() }),
+            core: Mutex::new(Core {
+                plant,
+                applied: input.clone(),
+                input,
+                report: StepReport::default(),
+                feedback: None,
+                parameters: Arc::default(),
+                generation: 0,
+                revision: 0,
+            }),
+            replacing: Mutex::default(),
+            in_force: watch::Sender::new(None),
+            is_recomputing: AtomicBool::new(false),
             driver: AtomicU8::new(0),
             link_open: AtomicBool::new(false),
             is_closed: AtomicBool::new(false),
@@ -136,14 +200,17 @@ impl Session {
         &self.model_name
     }
 
-    /// The model.
+    /// The model at the time of creation. [`Session::mechanics`] has the one in force, with the same
+    /// names and sizes.
     pub fn model(&self) -> &Arc<Model> {
         &self.model
     }
 
-    /// The settings.
-    pub fn settings(&self) -> &Settings {
-        &self.settings
+    /// The model and the settings in force.
+    pub fn mechanics(&self) -> Mechanics {
+        let core = self.core();
+        let (model, settings) = (Arc::clone(core.plant.model()), *core.plant.settings());
+        Mechanics { model, settings, generation: core.generation }
     }
 
     /// Metrics of the server.
@@ -156,6 +223,24 @@ impl Session {
         self.core().plant.state()
     }
 
+    /// The plant as it is.
+    pub fn view(&self) -> View {
+        let core = self.core();
+        let (state, time_s) = core.state();
+        View {
+            state,
+            time_s,
+            settings: *core.plant.settings(),
+            feedback: core.feedback.as_ref().map(|feedback| feedback.info()),
+            parameters: Arc::clone(&core.parameters),
+        }
+    }
+
+    /// The present step.
+    pub fn step_index(&self) -> u64 {
+        self.core().plant.step_index()
+    }
+
     /// A snapshot of the plant as it is.
     pub fn snapshot(&self) -> Snapshot {
         self.core().plant.snapshot()
@@ -164,6 +249,12 @@ impl Session {
     /// A copy of the plant as it is, to compute on.
     pub fn copy_plant(&self) -> Plant {
         self.core().plant.clone()
+    }
+
+    /// The same with the number of changes of its parameters so far.
+    pub fn copy_plant_and_generation(&self) -> (Plant, u64) {
+        let core = self.core();
+        (core.plant.clone(), core.generation)
     }
 
     /// The same with the input of its last step; before the first one, the input that holds it.
@@ -214,7 +305,8 @@ impl Session {
             .compare_exchange(0, kind.code(), Ordering::AcqRel, Ordering::Acquire)
             .map_err(|code| LeaseHeld { by: DriverKind::from_code(code).unwrap_or(kind) })?;
         self.metrics.driver_started(kind);
-        Ok(Lease { session: Arc::clone(self), kind, untimed_steps: 0 })
+        let applied = vec![0.0; self.model.dimensions().input()];
+        Ok(Lease { session: Arc::clone(self), kind, untimed_steps: 0, applied, has_applied: false })
     }
 
     /// Subscribes to every `every`-th state. Starts with the state as it is, if its step counts.
@@ -226,7 +318,7 @@ impl Session {
         // Under the core's lock no step falls between the registration and the first frame.
         let core = self.core();
         let subscription = Subscription::new(Arc::clone(self), every, watchers_max)?;
-        subscription.offer(&core.plant, &core.report, &core.input);
+        subscription.offer(core.plant_frame());
         Ok(subscription)
     }
 
@@ -236,18 +328,201 @@ impl Session {
     }
 
     fn core(&self) -> MutexGuard<'_, Core> {
-        // The mechanics does not panic, and leaves the plant as it was when it fails.
-        self.core.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.core)
     }
 
-    /// Replaces the plant by a copy of it that was put into another state.
+    /// Replaces the plant by a copy of it that was put into another state. The caller holds
+    /// `replacing`.
     fn replace_plant(&self, plant: Plant) {
         let mut core = self.core();
-        let core = &mut *core;
         plant.hold_input(&mut core.input);
         core.plant = plant;
         core.report = StepReport::default();
-        self.watchers.publish(&core.plant, &core.report, &core.input);
+        self.watchers.publish(core.plant_frame());
+    }
+
+    /// Changes numbers of the scene, and the time step if one is given, between two steps: the state
+    /// `x` and the count of steps stay, time goes on. True when the feedback's law is to be computed
+    /// anew. Compiles a model: call it on a worker.
+    pub fn change_parameters(
+        &self,
+        changes: &[(String, f64)],
+        time_step_s: Option<f64>,
+        parameters_max: u64,
+    ) -> Result<bool, ParametersError> {
+        let _replacing = lock(&self.replacing);
+        let (before, parameters) = (self.mechanics(), Arc::clone(&self.core().parameters));
+        let (model, parameters) = if changes.is_empty() {
+            (before.model, parameters)
+        } else {
+            let changed = parameters::change(&before.model, &parameters, changes)?;
+            let (what, count) = ("numbers of the scene changed", changed.parameters.len());
+            LimitExceeded::check("parameters", parameters_max, what, count)?;
+            (Arc::new(changed.model), Arc::new(changed.parameters))
+        };
+        let settings = Settings {
+            time_step_s: time_step_s.unwrap_or(before.settings.time_step_s),
+            ..before.settings
+        };
+        let mut plant = Plant::new(model, settings)?;
+        let mut core = self.core();
+        let (State { step, q, p, v, .. }, time_s) = core.state();
+        plant.initialize(&Initial::Momentum { q, p, v })?;
+        plant.set_step_index(step);
+        plant.set_time_s(time_s);
+        std::mem::swap(&mut core.plant, &mut plant);
+        core.parameters = parameters;
+        core.generation += 1;
+        let generation = core.generation;
+        let is_outdated = match &mut core.feedback {
+            // A gain that was given holds as it is.
+            Some(feedback) if feedback.spec.is_fixed() => {
+                feedback.generation = generation;
+                false
+            }
+            feedback => feedback.is_some(),
+        };
+        drop(core);
+        // The former plant is dropped without the lock.
+        drop(plant);
+        Ok(is_outdated)
+    }
+
+    /// Puts a feedback in force. `generation` is that of the mechanics for which its law was computed;
+    /// true when it is to be computed anew.
+    pub fn set_feedback(
+        &self,
+        mut feedback: Box<Feedback>,
+        generation: u64,
+        first_step: Option<u64>,
+    ) -> (v1::FeedbackInfo, bool) {
+        let mut core = self.core();
+        core.revision += 1;
+        let present = core.plant.step_index();
+        feedback.revision = core.revision;
+        feedback.since_step = present;
+        feedback.first_step = match feedback.law.end {
+            Some(_) => first_step.unwrap_or(present),
+            None => present,
+        };
+        let is_outdated = generation != core.generation && !feedback.spec.is_fixed();
+        feedback.generation = if is_outdated { generation } else { core.generation };
+        let info = feedback.info();
+        self.in_force.send_replace(Some(feedback.in_force()));
+        let former = core.feedback.replace(feedback);
+        drop(core);
+        drop(former);
+        (info, is_outdated)
+    }
+
+    /// Takes the feedback away; false when there is none.
+    pub fn clear_feedback(&self) -> bool {
+        let mut core = self.core();
+        let former = core.feedback.take();
+        self.in_force.send_replace(None);
+        drop(core);
+        former.is_some()
+    }
+
+    /// What the feedback's law is to be computed from anew, if its parameters have changed since.
+    pub fn outdated_feedback(&self) -> Option<(Arc<Spec>, Mechanics)> {
+        let spec = {
+            let core = self.core();
+            let feedback = core.feedback.as_ref()?;
+            let is_outdated = feedback.generation != core.generation && !feedback.spec.is_fixed();
+            is_outdated.then(|| Arc::clone(&feedback.spec))?
+        };
+        Some((spec, self.mechanics()))
+    }
+
+    /// Puts a law in force that was computed anew; a failure leaves the former one in force and is
+    /// shown. What belongs to a feedback that is gone is dropped.
+    pub fn renew_feedback(&self, spec: &Arc<Spec>, generation: u64, outcome: Result<Law, Fault>) {
+        let mut core = self.core();
+        let core = &mut *core;
+        let Some(feedback) = core.feedback.as_mut().filter(|f| Arc::ptr_eq(&f.spec, spec)) else {
+            return;
+        };
+        feedback.generation = generation;
+        match outcome {
+            Ok(law) => {
+                core.revision += 1;
+                feedback.revision = core.revision;
+                feedback.since_step = core.plant.step_index();
+                feedback.law = Arc::new(law);
+                feedback.failure = None;
+            }
+            Err(fault) => feedback.failure = Some(fault.into()),
+        }
+        self.in_force.send_replace(Some(feedback.in_force()));
+    }
+
+    /// Claims the task of computing the feedback's law anew; false when somebody is at it.
+    pub fn begin_recomputing(&self) -> bool {
+        !self.is_recomputing.swap(true, Ordering::AcqRel)
+    }
+
+    /// Gives that task back.
+    pub fn end_recomputing(&self) {
+        self.is_recomputing.store(false, Ordering::Release);
+    }
+
+    /// Tells of the feedback's law and of each that replaces it.
+    pub fn watch_gains(
+        &self,
+        watchers_max: u64,
+    ) -> Result<Receiver<Option<InForce>>, LimitExceeded> {
+        let (name, what) = ("watchers_per_plant", "watchers of gains");
+        // The lock makes counting and subscribing one.
+        let _core = self.core();
+        let count = self.in_force.receiver_count() + 1;
+        LimitExceeded::check(name, watchers_max, what, count)?;
+        Ok(self.in_force.subscribe())
+    }
+}
+
+impl Core {
+    fn plant_frame(&self) -> (&Plant, &StepReport, &[f64], u64) {
+        (&self.plant, &self.report, &self.input, self.generation)
+    }
+}
+
+/// Why parameters were not changed.
+#[derive(Debug)]
+pub enum ParametersError {
+    /// The changed scene is none.
+    Change(ChangeError),
+    /// Too many.
+    Limit(LimitExceeded),
+    /// The state does not satisfy the changed constraints.
+    State(InitialError),
+}
+
+impl From<ChangeError> for ParametersError {
+    fn from(error: ChangeError) -> Self {
+        Self::Change(error)
+    }
+}
+
+impl From<LimitExceeded> for ParametersError {
+    fn from(error: LimitExceeded) -> Self {
+        Self::Limit(error)
+    }
+}
+
+impl From<InitialError> for ParametersError {
+    fn from(error: InitialError) -> Self {
+        Self::State(error)
+    }
+}
+
+impl From<ParametersError> for Fault {
+    fn from(error: ParametersError) -> Self {
+        match error {
+            ParametersError::Change(error) => error.into(),
+            ParametersError::Limit(error) => error.into(),
+            ParametersError::State(error) => Self::from_initial(error, "parameters"),
+        }
     }
 }
 
@@ -256,6 +531,9 @@ pub struct Lease {
     session: Arc<Session>,
     kind: DriverKind,
     untimed_steps: u64,
+    /// Input that a feedback gave the last step.
+    applied: Vec<f64>,
+    has_applied: bool,
 }
 
 impl Lease {
@@ -266,7 +544,7 @@ impl Lease {
 
     /// Takes one step.
     pub fn step(&mut self, u: &[f64]) -> Result<StepReport, DriveError> {
-        self.step_by(u, |plant| plant.step(u))
+        self.step_by(u, |plant, u| plant.step(u))
     }
 
     /// Takes one step and linearizes it.
@@ -275,7 +553,12 @@ impl Lease {
         u: &[f64],
         out: &mut Linearization,
     ) -> Result<StepReport, DriveError> {
-        self.step_by(u, |plant| plant.step_and_linearize(u, out))
+        self.step_by(u, |plant, u| plant.step_and_linearize(u, out))
+    }
+
+    /// Input of the last step, when a feedback had a say in it.
+    pub fn applied_input(&self) -> Option<&[f64]> {
+        self.has_applied.then_some(&self.applied)
     }
 
     /// Looks at the plant, which nobody else moves meanwhile.
@@ -283,22 +566,32 @@ impl Lease {
         look(&self.session.core().plant)
     }
 
-    /// Puts the plant back into the state in which the session began.
-    pub fn reset(&mut self) -> Result<(), SnapshotError> {
-        let start = self.session.start.clone();
-        self.restore(&start)
+    /// Puts the plant back into the state in which the session began. Changed parameters stay changed.
+    pub fn reset(&mut self) -> Result<(), InitialError> {
+        let _replacing = lock(&self.session.replacing);
+        let mut plant = self.session.copy_plant();
+        if plant.restore(&self.session.start).is_err() {
+            // Of other parameters or another time step: what can be kept is x.
+            let State { step, q, p, v, .. } = self.session.start_state.clone();
+            plant.initialize(&Initial::Momentum { q, p, v })?;
+            plant.set_step_index(step);
+        }
+        self.session.replace_plant(plant);
+        Ok(())
     }
 
     /// Puts the plant into a state, step 0.
     pub fn initialize(&mut self, initial: &Initial) -> Result<(), InitialError> {
+        let _replacing = lock(&self.session.replacing);
         let mut plant = self.session.copy_plant();
         plant.initialize(initial)?;
         self.session.replace_plant(plant);
         Ok(())
     }
 
-    /// Puts the plant into the state of a snapshot.
+    /// Puts the plant into the state of a snapshot: one of the same parameters and time step.
     pub fn restore(&mut self, snapshot: &Snapshot) -> Result<(), SnapshotError> {
+        let _replacing = lock(&self.session.replacing);
         let mut plant = self.session.copy_plant();
         plant.restore(snapshot)?;
         self.session.replace_plant(plant);
@@ -308,22 +601,36 @@ impl Lease {
     fn step_by(
         &mut self,
         u: &[f64],
-        advance: impl FnOnce(&mut Plant) -> Result<StepReport, StepError>,
+        advance: impl FnOnce(&mut Plant, &[f64]) -> Result<StepReport, StepError>,
     ) -> Result<StepReport, DriveError> {
         if self.session.is_closed() {
             return Err(DriveError::Closed);
         }
         let started = self.is_step_timed().then(Instant::now);
         let mut core = self.session.core();
-        let outcome = advance(&mut core.plant);
+        let core = &mut *core;
+        let has_say = match &mut core.feedback {
+            None => Ok(false),
+            Some(feedback) => feedback.input(&core.plant, u, &mut core.applied),
+        };
+        let outcome = has_say.and_then(|has_say| {
+            self.has_applied = has_say;
+            let u = if has_say { &core.applied[..] } else { u };
+            advance(&mut core.plant, u)
+        });
         if let Some(started) = started {
             self.session.metrics.step_timed(started.elapsed());
         }
         match outcome {
             Ok(report) => {
-                core.input.copy_from_slice(u);
+                if self.has_applied {
+                    core.input.copy_from_slice(&core.applied);
+                    self.applied.copy_from_slice(&core.applied);
+                } else {
+                    core.input.copy_from_slice(u);
+                }
                 core.report = report;
-                self.session.watchers.publish(&core.plant, &core.report, &core.input);
+                self.session.watchers.publish(core.plant_frame());
                 self.session.metrics.stepped(self.kind);
                 Ok(report)
             }
@@ -346,4 +653,9 @@ impl Drop for Lease {
         self.session.metrics.driver_ended(self.kind);
         self.session.driver.store(0, Ordering::Release);
     }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // The mechanics does not panic, and leaves the plant as it was when it fails.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -20,6 +20,8 @@
 //! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
 //! | FAILED_PRECONDITION | `NOT_AN_EQUILIBRIUM` | PreconditionFailure; metadata `drift`, `coordinate` | the point of an infinite-horizon regulator moves |
 //! | FAILED_PRECONDITION | `NOT_STABILISABLE`, `NOT_DETECTABLE`, `NOT_CONVEX`, `RICCATI_NOT_CONVERGED`, `RICCATI_OVERFLOW`, `EIGENVALUES_NOT_FOUND` | PreconditionFailure | there is no such regulator |
+//! | FAILED_PRECONDITION | `NO_FEEDBACK` | PreconditionFailure | the plant has no feedback whose gains could be watched |
+//! | FAILED_PRECONDITION | `TIME_STEP_CHANGED` | PreconditionFailure | the trajectory of a feedback was given for another time step: set a new one |
 //! | FAILED_PRECONDITION | `POLE` | PreconditionFailure; metadata `frequency_hz` | the frequency response is infinite |
 //! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
 //! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::limits`] |
@@ -151,9 +153,29 @@ impl Fault {
         fault
     }
 
+    /// The plant has no feedback.
+    pub fn no_feedback(id: &str) -> Self {
+        let message = format!("plant `{id}` has no feedback; SetFeedback gives it one");
+        Self::precondition("NO_FEEDBACK", format!("plant:{id}"), message)
+    }
+
+    /// A trajectory belongs to another time step than the plant's.
+    pub fn time_step_changed(given_s: f64, present_s: f64) -> Self {
+        let message = format!(
+            "the trajectory of the feedback was given for a time step of {given_s} s; the plant's is \
+             {present_s} s now: call SetFeedback with a trajectory for it"
+        );
+        Self::precondition("TIME_STEP_CHANGED", "trajectory", message)
+    }
+
     /// The server ends.
     pub fn shutting_down() -> Self {
         Self::new(Code::Unavailable, "SHUTTING_DOWN", "the server is shutting down")
+    }
+
+    /// Nobody waits for the result.
+    pub fn cancelled() -> Self {
+        Self::new(Code::Cancelled, "CANCELLED", "the caller has gone away")
     }
 
     /// A defect of the server.
@@ -348,14 +370,22 @@ impl Fault {
     }
 }
 
-impl From<WeightsError> for Fault {
-    fn from(error: WeightsError) -> Self {
+impl Fault {
+    /// The fault of weights that stand in the field `weights` of the request, and those of steps in
+    /// `stages`.
+    pub fn from_weights(error: WeightsError, weights: &str, stages: &str) -> Self {
         let weight = error.weight();
         let field = match error.step() {
-            Some(step) => format!("stages[{step}].{weight}"),
-            None => format!("weights.{weight}"),
+            Some(step) => format!("{stages}[{step}].{weight}"),
+            None => format!("{weights}.{weight}"),
         };
         Self::field_because("INVALID_WEIGHT", field, error.to_string())
+    }
+}
+
+impl From<WeightsError> for Fault {
+    fn from(error: WeightsError) -> Self {
+        Self::from_weights(error, "weights", "stages")
     }
 }
 

@@ -13,11 +13,18 @@ use tokio::sync::Notify;
 use crate::limits::LimitExceeded;
 use crate::session::Session;
 
+/// A plant, the report and the input of its last step, and the number of changes of its parameters.
+pub(crate) type Published<'a> = (&'a Plant, &'a StepReport, &'a [f64], u64);
+
 /// A state with the step that led to it.
 #[derive(Clone, Debug, Default)]
 pub struct Frame {
     /// The state.
     pub state: State,
+    /// Its time, s.
+    pub time_s: f64,
+    /// Number of changes of the plant's parameters and time step so far.
+    pub generation: u64,
     /// Report of the step.
     pub report: StepReport,
     /// Input of the step; before the first one, the input that holds the plant.
@@ -26,12 +33,14 @@ pub struct Frame {
 
 impl Frame {
     /// Copies into memory that is allocated at the first call only.
-    fn copy_from(&mut self, plant: &Plant, report: &StepReport, input: &[f64]) {
+    fn copy_from(&mut self, (plant, report, input, generation): Published<'_>) {
         fn copy(target: &mut Vec<f64>, source: &[f64]) {
             target.clear();
             target.extend_from_slice(source);
         }
         self.state.step = plant.step_index();
+        self.time_s = plant.time_s();
+        self.generation = generation;
         copy(&mut self.state.q, plant.q());
         copy(&mut self.state.p, plant.p());
         copy(&mut self.state.v, plant.v());
@@ -55,12 +64,12 @@ impl Watchers {
     }
 
     /// Offers a state to all watchers whose turn it is.
-    pub(crate) fn publish(&self, plant: &Plant, report: &StepReport, input: &[f64]) {
+    pub(crate) fn publish(&self, published: Published<'_>) {
         if self.count() == 0 {
             return;
         }
         for slot in lock(&self.slots).iter() {
-            slot.offer(plant, report, input);
+            slot.offer(published);
         }
     }
 
@@ -94,12 +103,12 @@ struct Cell {
 }
 
 impl Slot {
-    fn offer(&self, plant: &Plant, report: &StepReport, input: &[f64]) {
-        if !plant.step_index().is_multiple_of(self.every) {
+    fn offer(&self, published: Published<'_>) {
+        if !published.0.step_index().is_multiple_of(self.every) {
             return;
         }
         let mut cell = lock(&self.cell);
-        cell.frame.copy_from(plant, report, input);
+        cell.frame.copy_from(published);
         if cell.is_fresh {
             cell.dropped += 1;
         } else {
@@ -131,8 +140,8 @@ impl Subscription {
         Ok(Self { session, slot, frame: Frame::default(), dropped: 0 })
     }
 
-    pub(crate) fn offer(&self, plant: &Plant, report: &StepReport, input: &[f64]) {
-        self.slot.offer(plant, report, input);
+    pub(crate) fn offer(&self, published: Published<'_>) {
+        self.slot.offer(published);
     }
 
     /// The session that is watched.

@@ -57,15 +57,30 @@ impl Model {
     ///
     /// If a length is not nd + nk.
     pub fn difference(&self, reference: &[f64], q: &[f64]) -> Vec<f64> {
+        let mut change = vec![0.0; self.dimensions.coordinates()];
+        self.write_difference(reference, q, &mut change);
+        change
+    }
+
+    /// [`Model::difference`] without allocation.
+    ///
+    /// # Panics
+    ///
+    /// If a length is not nd + nk.
+    pub fn write_difference(&self, reference: &[f64], q: &[f64], change: &mut [f64]) {
         let n = self.dimensions.coordinates();
-        assert!(q.len() == n && reference.len() == n, "a configuration has {n} coordinates");
-        let mut change: Vec<f64> = q.iter().zip(reference).map(|(q, r)| q - r).collect();
+        assert!(
+            q.len() == n && reference.len() == n && change.len() == n,
+            "a configuration has {n} coordinates"
+        );
+        for (change, (q, r)) in change.iter_mut().zip(q.iter().zip(reference)) {
+            *change = q - r;
+        }
         for &i in &self.orientations {
             let turned =
                 Quaternion::exp(three(reference, i)).inverse().times(Quaternion::exp(three(q, i)));
             change[i..i + 3].copy_from_slice(&turned.log().0);
         }
-        change
     }
 }
 

@@ -243,6 +243,8 @@ pub struct Energy {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct PreciseState {
     pub(crate) step: u64,
+    /// Time that step 0 would have had with the present time step, s; zero unless it has changed.
+    pub(crate) time_origin_s: f64,
     pub(crate) q: Vec<f64>,
     /// What `q` of the dynamic coordinates lost to rounding.
     pub(crate) q_low: Vec<f64>,
@@ -266,6 +268,7 @@ impl PreciseState {
         let history = |n: usize| [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
         Self {
             step: 0,
+            time_origin_s: 0.0,
             q: vec![0.0; nd + nk],
             q_low: vec![0.0; nd],
             p: vec![0.0; nd],
@@ -427,7 +430,7 @@ impl Plant {
     /// Inputs at the middle of the step from here, prescribed positions at its end.
     fn apply_signals(&self, u: &mut [f64]) {
         let (inputs, prescribed) = u.split_at_mut(self.model.dimensions.inputs);
-        let middle = (self.state.step as f64 + 0.5) * self.settings.time_step_s;
+        let middle = self.time_after_s(0.5);
         for signal in &self.model.signals {
             match signal.target {
                 Target::Input(i) => inputs[i] += signal.at(middle),
@@ -437,7 +440,12 @@ impl Plant {
     }
 
     fn end_of_step_s(&self) -> f64 {
-        (self.state.step as f64 + 1.0) * self.settings.time_step_s
+        self.time_after_s(1.0)
+    }
+
+    /// Time after so many more steps, s.
+    fn time_after_s(&self, steps: f64) -> f64 {
+        self.state.time_origin_s + (self.state.step as f64 + steps) * self.settings.time_step_s
     }
 
     /// Steps since the plant was initialised.
@@ -451,9 +459,15 @@ impl Plant {
         self.state.step = step;
     }
 
-    /// `step_index × h`, s.
+    /// `step_index × h`, and what [`Plant::set_time_s`] has added, s.
     pub fn time_s(&self) -> f64 {
-        self.state.step as f64 * self.settings.time_step_s
+        self.time_after_s(0.0)
+    }
+
+    /// Sets the present time, and with it that of signals: for a plant that goes on with another time
+    /// step. Until it is initialised again, its time differs from `step_index × h` by the same amount.
+    pub fn set_time_s(&mut self, time_s: f64) {
+        self.state.time_origin_s = time_s - self.state.step as f64 * self.settings.time_step_s;
     }
 
     /// Configuration, nd + nk.

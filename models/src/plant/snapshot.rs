@@ -2,15 +2,15 @@
 //!
 //! Encoding, little-endian: magic `PLNTSNAP`, version (u32), model digest (u64), time step (f64 bits),
 //! force split (u8), iteration limit (u32), singular threshold (f64 bits), nd, nk, nc, number of
-//! orientations (u32 each), step (u64), history (u8), the
-//! numbers as f64 bits, and the FNV-1a hash (u64) of all that.
+//! orientations (u32 each), step (u64), time
+//! origin (f64 bits), history (u8), the numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
 use crate::compile::fnv1a;
 use crate::plant::{ForceSplit, Plant, PreciseState, Settings};
 use crate::rotation::Quaternion;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 /// Everything a plant needs to go on bit for bit.
 #[derive(Clone, Debug, PartialEq)]
@@ -104,6 +104,7 @@ impl Snapshot {
             bytes.extend((size as u32).to_le_bytes());
         }
         bytes.extend(state.step.to_le_bytes());
+        bytes.extend(state.time_origin_s.to_le_bytes());
         bytes.push(state.history);
         for vector in state.vectors() {
             bytes.extend(vector.iter().flat_map(|value| value.to_le_bytes()));
@@ -144,13 +145,17 @@ impl Snapshot {
         let mut size = || Ok(u32::from_le_bytes(reader.take()?) as usize);
         let (nd, nk, nc, no) = (size()?, size()?, size()?, size()?);
         let step = u64::from_le_bytes(reader.take()?);
+        let time_origin_s = f64::from_le_bytes(reader.take()?);
         let [history] = reader.take()?;
         let numbers = 7 * nd + 2 * nk + 4 * nc + 4 * no;
         if reader.0.len() != 8 * numbers || history > 3 {
             return Err(malformed("sizes do not match"));
         }
+        if !time_origin_s.is_finite() {
+            return Err(malformed("a number is not finite"));
+        }
         let mut state = PreciseState::zeros(nd, nk, nc, no);
-        (state.step, state.history) = (step, history);
+        (state.step, state.time_origin_s, state.history) = (step, time_origin_s, history);
         let mut orientations = std::mem::take(&mut state.orientations);
         let vectors = state.vectors().into_iter().flatten();
         for value in vectors.chain(orientations.iter_mut().flat_map(|q| &mut q.0)) {

@@ -5,10 +5,11 @@ use plantd_models::control::{self, Mode, Tangent, TransferFunction};
 use plantd_models::{Linearization, Model, Plant};
 use plantd_proto::v1;
 
-use super::control::{Constraints, at_point, check_linearization};
+use super::control::{at_point, check_linearization};
 use crate::convert;
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
+use crate::regulator::Constraints;
 use crate::status::Fault;
 use crate::workers::Abandoned;
 

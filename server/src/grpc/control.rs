@@ -5,25 +5,23 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use futures::{StreamExt, stream};
-use nalgebra::DMatrix;
-use plantd_models::control::{self, Sample, Tangent, TrajectoryWeights, Values, Weights};
+use nalgebra::{DMatrix, DVector};
+use plantd_models::control::{self, Values};
 use plantd_models::{Linearization, Model, Plant, Settings, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status};
 
 use super::{Answers, analysis, derivatives, rollout};
-use crate::convert::{self, Inputs};
+use crate::convert::{self, Inputs, WeightFields};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
+use crate::regulator::{self, Constraints, Memory, Path};
 use crate::status::Fault;
 use crate::workers::Abandoned;
 
 /// Numbers that one portion of a stream holds, about: 2 MB.
 const PORTION_NUMBERS: usize = 250_000;
-
-/// Acceleration, in m/s² or rad/s², below which a point counts as an equilibrium.
-const EQUILIBRIUM_DRIFT_MAX: f64 = 1e-4;
 
 /// The service.
 pub struct ControlService {
@@ -69,32 +67,6 @@ pub(super) fn check_linearization(hub: &Hub, model: &Model) -> Result<(), Fault>
     Ok(LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?)
 }
 
-/// The tangent space of the constraints at the plant's state, if it is to be used.
-fn tangent(plant: &mut Plant, constraints: Constraints) -> Option<Tangent> {
-    let d = plant.model().dimensions();
-    let is_needed = constraints == Constraints::Manifold && d.constraints > 0;
-    is_needed.then(|| Tangent::new(&plant.constraint_jacobian(), d.dynamic))
-}
-
-/// On which space a regulator is solved.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Constraints {
-    Manifold,
-    Full,
-}
-
-impl Constraints {
-    pub(super) fn new(handling: i32) -> Result<Self, Fault> {
-        match v1::ConstraintHandling::try_from(handling) {
-            Ok(v1::ConstraintHandling::Unspecified | v1::ConstraintHandling::Manifold) => {
-                Ok(Self::Manifold)
-            }
-            Ok(v1::ConstraintHandling::Full) => Ok(Self::Full),
-            Err(_) => Err(Fault::field("constraints", format!("{handling} is no such space"))),
-        }
-    }
-}
-
 fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse, Fault> {
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
@@ -117,14 +89,7 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
     let weights = convert::weights(request.weights, plant.model())?;
-    check_equilibrium(plant.clone(), &u)?;
-    let mut linearization = Linearization::new(plant.model());
-    plant.linearize(&u, &mut linearization)?;
-    let (a, b) = (linearization.a(), linearization.b());
-    let regulator = match tangent(&mut plant, constraints) {
-        Some(tangent) => control::infinite_horizon_on_manifold(&a, &b, &tangent, &weights)?,
-        None => control::infinite_horizon(&a, &b, &weights)?,
-    };
+    let regulator = regulator::about_point(&mut plant, &u, &weights, constraints)?;
     Ok(v1::SolveLqrResponse {
         gain: Some(v1::Gain {
             step: 0,
@@ -141,32 +106,6 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
         closed_loop: convert::complex(&regulator.closed_loop),
         reciprocal_condition: regulator.reciprocal_condition,
     })
-}
-
-/// Refuses a point that moves. Two steps: a momentum that does not belong to the point shows in the
-/// second at the latest.
-fn check_equilibrium(mut plant: Plant, u: &[f64]) -> Result<(), Fault> {
-    let time_step_s = plant.settings().time_step_s;
-    let mut q = plant.q().to_vec();
-    for _ in 0..2 {
-        plant.step(u)?;
-        let drifts = plant.model().difference(&q, plant.q());
-        let worst = drifts.into_iter().map(f64::abs).enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
-        let Some((index, distance)) = worst else { return Ok(()) };
-        let drift = distance / (time_step_s * time_step_s);
-        if drift > EQUILIBRIUM_DRIFT_MAX {
-            let coordinate = &plant.model().coordinates()[index].name;
-            let message = format!(
-                "the point is not an equilibrium: coordinate `{coordinate}` moves by {distance:e} \
-                 in a step of {time_step_s} s"
-            );
-            return Err(Fault::precondition("NOT_AN_EQUILIBRIUM", "point", message)
-                .with("coordinate", coordinate)
-                .with("drift", distance));
-        }
-        q.copy_from_slice(plant.q());
-    }
-    Ok(())
 }
 
 /// The linearizations of a trajectory, computed portion by portion.
@@ -259,6 +198,9 @@ fn end_with<T>(
 /// A solved regulator along a trajectory, delivered message by message.
 struct TrajectoryRegulator {
     gains: std::vec::IntoIter<DMatrix<f64>>,
+    feedforward: std::vec::IntoIter<DVector<f64>>,
+    values: std::vec::IntoIter<(DMatrix<f64>, DVector<f64>)>,
+    reciprocal_conditions: std::vec::IntoIter<f64>,
     states: std::vec::IntoIter<State>,
     inputs: Inputs,
     rotations: Vec<u32>,
@@ -279,74 +221,25 @@ impl TrajectoryRegulator {
         check_linearization(hub, &model)?;
         let (plant, inputs) =
             convert::trajectory(request.trajectory, &model, settings, &hub.limits)?;
-        check_memory(hub, &model, inputs.count())?;
-        let weights = convert::weights(request.weights, &model)?;
+        let values = if request.values { Values::Keep } else { Values::Drop };
+        let memory = Memory { steps: inputs.count(), stages: request.stages.len(), values };
+        memory.check(&hub.limits, &model)?;
+        let fields = WeightFields::default();
+        let (weights, stages) = (request.weights, request.stages);
+        let weights = convert::trajectory_weights(fields, weights, stages, inputs.count(), &model)?;
         let path = Path::follow(plant, &inputs, constraints, abandoned)?;
-        let gains = path.solve(&weights)?;
+        let solution = path.solve(&weights, values)?;
         Ok(Self {
-            gains: gains.into_iter(),
+            gains: solution.gains.into_iter(),
+            feedforward: solution.feedforward.into_iter(),
+            values: solution.values.unwrap_or_default().into_iter(),
+            reciprocal_conditions: solution.reciprocal_conditions.into_iter(),
             states: path.states.into_iter(),
             inputs,
             rotations: convert::rotations(&model),
             next: 0,
             _permit: permit,
         })
-    }
-}
-
-/// Refuses a trajectory whose matrices would need too much memory: A, B, the gain, and the tangent
-/// space twice.
-fn check_memory(hub: &Hub, model: &Model, steps: usize) -> Result<(), Fault> {
-    let d = model.dimensions();
-    let (nx, nu) = (d.state(), d.input());
-    let tangents = if d.constraints > 0 { 2 * nx * nx } else { 0 };
-    let numbers = (steps + 1).saturating_mul(nx * nx + 2 * nx * nu + tangents);
-    let (name, limit) = ("trajectory_numbers", hub.limits.trajectory_numbers);
-    Ok(LimitExceeded::check(name, limit, "numbers in the trajectory's matrices", numbers)?)
-}
-
-/// A reference motion with its linearizations.
-struct Path {
-    states: Vec<State>,
-    samples: Vec<Sample>,
-    tangents: Vec<Tangent>,
-}
-
-impl Path {
-    fn follow(
-        mut plant: Plant,
-        inputs: &Inputs,
-        constraints: Constraints,
-        abandoned: &Abandoned,
-    ) -> Result<Self, Fault> {
-        let mut linearization = Linearization::new(plant.model());
-        let mut path = Self { states: Vec::new(), samples: Vec::new(), tangents: Vec::new() };
-        for k in 0..inputs.count() {
-            abandoned.check()?;
-            path.note_state(&mut plant, constraints);
-            plant
-                .step_and_linearize(inputs.get(k), &mut linearization)
-                .map_err(|error| Fault::from(error).with("steps_taken", k))?;
-            path.samples.push(Sample { a: linearization.a(), b: linearization.b() });
-        }
-        path.note_state(&mut plant, constraints);
-        Ok(path)
-    }
-
-    fn note_state(&mut self, plant: &mut Plant, constraints: Constraints) {
-        self.states.push(plant.state());
-        self.tangents.extend(tangent(plant, constraints));
-    }
-
-    fn solve(&self, weights: &Weights) -> Result<Vec<DMatrix<f64>>, Fault> {
-        let weights = TrajectoryWeights::from(weights);
-        let solution = if self.tangents.is_empty() {
-            control::finite_horizon(&self.samples, &weights, Values::Drop)?
-        } else {
-            let (samples, tangents) = (&self.samples, &self.tangents);
-            control::finite_horizon_on_manifold(samples, tangents, &weights, Values::Drop)?
-        };
-        Ok(solution.gains)
     }
 }
 
@@ -364,9 +257,15 @@ impl Iterator for TrajectoryRegulator {
             x_reference: state.x(),
             u_reference: u,
             rotations: self.rotations.clone(),
-            feedforward: Vec::new(),
+            feedforward: self.feedforward.next().map(convert::vector).unwrap_or_default(),
         };
-        Some(v1::SolveTrajectoryLqrResponse { gain: Some(gain), ..Default::default() })
+        let (value, linear) = self.values.next().unzip();
+        Some(v1::SolveTrajectoryLqrResponse {
+            gain: Some(gain),
+            value: value.as_ref().map(convert::matrix),
+            value_linear: linear.map(convert::nonzero).unwrap_or_default(),
+            reciprocal_condition: self.reciprocal_conditions.next().unwrap_or_default(),
+        })
     }
 }
 

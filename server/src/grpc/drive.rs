@@ -145,7 +145,7 @@ impl Driving {
             state: Some(state),
             report: Some(convert::report(&report)),
             linearization,
-            u: Vec::new(),
+            u: self.lease.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
         }))
     }
 }

@@ -5,6 +5,7 @@ mod analysis;
 pub mod control;
 mod derivatives;
 pub mod drive;
+mod feedback;
 pub mod model;
 pub mod observe;
 pub mod plant;

@@ -7,7 +7,7 @@ use plantd_proto::v1;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::drive::DriveStream;
-use super::{Answers, cut_page, watch};
+use super::{Answers, cut_page, feedback, watch};
 use crate::convert::{self, Inputs, Start};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
@@ -44,7 +44,7 @@ impl PlantService {
             let plant = convert::plant(&entry.model, settings, &start, "initial")?;
             hub.insert(id, entry.name, plant)
         };
-        let session = self.hub.workers.run(job).await?;
+        let session = self.hub.attendants.run(job).await?;
         if open_link && let Err(fault) = self.hub.open_link(Arc::clone(&session)).await {
             self.hub.delete(session.id()).await?;
             return Err(fault);
@@ -77,7 +77,7 @@ impl PlantService {
             return plan.run(&mut lease, None);
         }
         let job = move |abandoned: &Abandoned| plan.run(&mut lease, Some(abandoned));
-        self.hub.workers.run(job).await
+        self.hub.attendants.run(job).await
     }
 
     /// Puts a plant into another state under a lease of its own.
@@ -91,7 +91,7 @@ impl PlantService {
             change(&mut lease)?;
             Ok(lease.with_plant(convert::plant_state))
         };
-        self.hub.workers.run(job).await
+        self.hub.attendants.run(job).await
     }
 }
 
@@ -131,23 +131,28 @@ impl StepPlan {
         if !self.all_states {
             states.push(lease.with_plant(convert::plant_state));
         }
-        Ok(v1::StepResponse { states, report, u: Vec::new() })
+        let u = lease.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
+        Ok(v1::StepResponse { states, report, u })
     }
 }
 
 /// A plant as a message. Waits for a step in progress, which is long on a large model: call it on a
 /// worker unless you hold the lease.
 pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
-    let settings = session.settings();
+    let view = session.view();
     v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
-        settings: Some(convert::settings_message(settings)),
-        state: Some(convert::state(&session.state(), settings.time_step_s)),
+        settings: Some(convert::settings_message(&view.settings)),
+        state: Some(convert::state(&view.state, view.time_s)),
         driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
         link_open: session.link_open(),
-        feedback: None,
-        parameters: Vec::new(),
+        feedback: view.feedback,
+        parameters: view
+            .parameters
+            .iter()
+            .map(|(path, value)| v1::Parameter { path: path.clone(), value: *value })
+            .collect(),
     }
 }
 
@@ -175,7 +180,7 @@ impl v1::plant_service_server::PlantService for PlantService {
             let energy = Some(convert::energy(session.copy_plant().energy()));
             Ok(v1::GetPlantResponse { plant, energy })
         };
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        Ok(Response::new(self.hub.attendants.run(job).await?))
     }
 
     async fn list_plants(
@@ -192,7 +197,7 @@ impl v1::plant_service_server::PlantService for PlantService {
             let next_page_token = last.map(|plant| plant.id.clone()).unwrap_or_default();
             Ok(v1::ListPlantsResponse { plants, next_page_token })
         };
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        Ok(Response::new(self.hub.attendants.run(job).await?))
     }
 
     async fn delete_plant(
@@ -225,7 +230,7 @@ impl v1::plant_service_server::PlantService for PlantService {
     ) -> Result<Response<Self::WatchStream>, Status> {
         let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
         let job = move |_: &_| watch::stream(&hub, request);
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        Ok(Response::new(self.hub.attendants.run(job).await?))
     }
 
     async fn reset(
@@ -235,7 +240,7 @@ impl v1::plant_service_server::PlantService for PlantService {
         let v1::ResetRequest { id, initial } = request.into_inner();
         let (hub, model) = (Arc::clone(&self.hub), Arc::clone(self.hub.session(&id)?.model()));
         let change = move |lease: &mut Lease| match initial {
-            None => Ok(lease.reset()?),
+            None => lease.reset().map_err(|error| Fault::from_initial(error, "initial")),
             Some(initial) => match convert::start(Some(initial), &model, &hub.limits)? {
                 Start::Snapshot(snapshot) => Ok(lease.restore(&snapshot)?),
                 Start::Initial(initial) => initialize(lease, &initial),
@@ -251,7 +256,7 @@ impl v1::plant_service_server::PlantService for PlantService {
     ) -> Result<Response<v1::SnapshotResponse>, Status> {
         let session = self.hub.session(&request.into_inner().id)?;
         let job = move |_: &_| Ok(session.snapshot().to_bytes());
-        let snapshot = self.hub.workers.run(job).await?;
+        let snapshot = self.hub.attendants.run(job).await?;
         Ok(Response::new(v1::SnapshotResponse { snapshot }))
     }
 
@@ -270,30 +275,30 @@ impl v1::plant_service_server::PlantService for PlantService {
 
     async fn set_parameters(
         &self,
-        _: Request<v1::SetParametersRequest>,
+        request: Request<v1::SetParametersRequest>,
     ) -> Result<Response<v1::SetParametersResponse>, Status> {
-        Err(Status::unimplemented("set_parameters"))
+        Ok(Response::new(feedback::set_parameters(&self.hub, request.into_inner()).await?))
     }
 
     async fn set_feedback(
         &self,
-        _: Request<v1::SetFeedbackRequest>,
+        request: Request<v1::SetFeedbackRequest>,
     ) -> Result<Response<v1::SetFeedbackResponse>, Status> {
-        Err(Status::unimplemented("set_feedback"))
+        Ok(Response::new(feedback::set_feedback(&self.hub, request.into_inner()).await?))
     }
 
     async fn clear_feedback(
         &self,
-        _: Request<v1::ClearFeedbackRequest>,
+        request: Request<v1::ClearFeedbackRequest>,
     ) -> Result<Response<v1::ClearFeedbackResponse>, Status> {
-        Err(Status::unimplemented("clear_feedback"))
+        Ok(Response::new(feedback::clear_feedback(&self.hub, &request.into_inner().id)?))
     }
 
     async fn watch_gains(
         &self,
-        _: Request<v1::WatchGainsRequest>,
+        request: Request<v1::WatchGainsRequest>,
     ) -> Result<Response<Self::WatchGainsStream>, Status> {
-        Err(Status::unimplemented("watch_gains"))
+        Ok(Response::new(feedback::watch_gains(&self.hub, &request.into_inner().id)?))
     }
 
     async fn diagnose(
@@ -316,7 +321,7 @@ impl v1::plant_service_server::PlantService for PlantService {
             let step = plant.step_index();
             Ok(convert::diagnostics(step, plant.diagnose()))
         };
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        Ok(Response::new(self.hub.attendants.run(job).await?))
     }
 
     async fn open_link(

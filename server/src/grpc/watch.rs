@@ -30,6 +30,7 @@ struct Wanted {
     energy: bool,
     linearization: bool,
     gain: bool,
+    input: bool,
 }
 
 impl Wanted {
@@ -42,7 +43,8 @@ impl Wanted {
                 Ok(WatchField::Energy) => wanted.energy = true,
                 Ok(WatchField::Linearization) => wanted.linearization = true,
                 Ok(WatchField::Gain) => wanted.gain = true,
-                Ok(WatchField::Unspecified | WatchField::Input) | Err(_) => {
+                Ok(WatchField::Input) => wanted.input = true,
+                Ok(WatchField::Unspecified) | Err(_) => {
                     let problem = format!("{field} is nothing to watch");
                     return Err(Fault::field(format!("fields[{index}]"), problem));
                 }
@@ -119,11 +121,14 @@ impl Watcher {
             response.report = Some(convert::report(&frame.report));
         }
         if self.wanted.state {
-            let mut state = convert::state(&frame.state, session.settings().time_step_s);
+            let mut state = convert::state(&frame.state, frame.time_s);
             if let Some(mask) = &self.mask {
                 mask.apply(&mut state);
             }
             response.state = Some(state);
+        }
+        if self.wanted.input {
+            response.u.clone_from(&frame.input);
         }
         if !self.wanted.needs_analysis() {
             return Ok(response);
@@ -132,8 +137,8 @@ impl Watcher {
         let (analysis, weights) = (self.analysis.take(), self.weights.clone());
         let job = move |_: &_| {
             let mut analysis = match analysis {
-                Some(analysis) => analysis,
-                None => Box::new(Analysis::new(&session)),
+                Some(analysis) if analysis.generation == frame.generation => analysis,
+                _ => Box::new(Analysis::new(&session)),
             };
             analysis.fill(&mut response, &frame, wanted, weights.as_deref());
             Ok((analysis, response))
@@ -147,12 +152,15 @@ impl Watcher {
 /// A watcher's own plant, on which it computes.
 struct Analysis {
     plant: Plant,
+    /// Number of changes that led to its parameters.
+    generation: u64,
     linearization: Linearization,
 }
 
 impl Analysis {
     fn new(session: &Session) -> Self {
-        Self { plant: session.copy_plant(), linearization: Linearization::new(session.model()) }
+        let (plant, generation) = session.copy_plant_and_generation();
+        Self { plant, generation, linearization: Linearization::new(session.model()) }
     }
 
     /// Computes what is wanted; what fails is reported in the message.
@@ -180,6 +188,7 @@ impl Analysis {
             Initial::Momentum { q: state.q.clone(), p: state.p.clone(), v: state.v.clone() };
         self.plant.initialize(&momentum).map_err(|error| Fault::from_initial(error, "state"))?;
         self.plant.set_step_index(state.step);
+        self.plant.set_time_s(frame.time_s);
         if wanted.energy {
             response.energy = Some(convert::energy(self.plant.energy()));
         }

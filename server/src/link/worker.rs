@@ -67,7 +67,7 @@ impl Worker {
         let dimensions = session.model().dimensions();
         let header = Header {
             server: random_instance(),
-            time_step_s: session.settings().time_step_s,
+            time_step_s: session.mechanics().settings.time_step_s,
             model_digest: session.model().digest(),
             dynamic: dimensions.dynamic as u32,
             prescribed: dimensions.prescribed as u32,
@@ -227,6 +227,9 @@ impl Worker {
                 kind: kind as u32,
                 driver: request.driver,
                 sequence: request.sequence,
+                // They may have changed since the link was opened.
+                time_step_s: plant.settings().time_step_s,
+                model_digest: plant.model().digest(),
                 step: plant.step_index(),
                 time_s: plant.time_s(),
                 ..with_report(common, report)

@@ -1,0 +1,85 @@
+//! Scheduling priority of threads.
+
+use serde::{Deserialize, Serialize};
+
+/// How much of a processor the threads of a pool get while others want it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Priority {
+    /// As every other thread.
+    Normal,
+    /// Little: nice 19.
+    Nice,
+    /// What others leave, and a trickle besides: SCHED_IDLE. A thread that wakes takes the processor
+    /// at once.
+    #[default]
+    Idle,
+}
+
+impl Priority {
+    /// Gives the calling thread this priority, which the threads that it starts inherit. Where the
+    /// system refuses, the thread stays as it is, and the log says so.
+    pub fn apply(self, pool: &str) {
+        let outcome = match self {
+            Self::Normal => Ok(()),
+            Self::Nice => rustix::process::setpriority_process(None, 19).map_err(Into::into),
+            Self::Idle => schedule_when_idle(),
+        };
+        if let Err(error) = outcome {
+            tracing::warn!(pool, priority = ?self, %error, "workers keep the usual priority");
+        }
+    }
+}
+
+#[cfg(target_os = "linux")]
+fn schedule_when_idle() -> std::io::Result<()> {
+    let parameters = libc::sched_param { sched_priority: 0 };
+    // SAFETY: the call reads `parameters`, which lives until it returns; 0 is the calling thread.
+    match unsafe { libc::sched_setscheduler(0, libc::SCHED_IDLE, &raw const parameters) } {
+        0 => Ok(()),
+        _ => Err(std::io::Error::last_os_error()),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn schedule_when_idle() -> std::io::Result<()> {
+    rustix::process::setpriority_process(None, 19).map_err(Into::into)
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use super::*;
+
+    /// Policy and nice value of a thread, from what the system tells of it.
+    fn policy_and_nice(thread: &str) -> (u32, i64) {
+        let text = std::fs::read_to_string(format!("/proc/{thread}/stat")).unwrap();
+        // After the name in parentheses, which may hold blanks, comes field 3.
+        let fields: Vec<&str> = text.rsplit_once(')').unwrap().1.split_whitespace().collect();
+        (fields[41 - 3].parse().unwrap(), fields[19 - 3].parse().unwrap())
+    }
+
+    fn in_a_thread<R: Send + 'static>(work: impl FnOnce() -> R + Send + 'static) -> R {
+        std::thread::spawn(work).join().unwrap()
+    }
+
+    #[test]
+    fn a_thread_and_its_children_have_the_priority() {
+        const SCHED_OTHER: u32 = 0;
+        const SCHED_IDLE: u32 = 5;
+        let usual = policy_and_nice("thread-self");
+        assert_eq!(usual.0, SCHED_OTHER);
+        for (priority, expected) in [
+            (Priority::Normal, usual),
+            (Priority::Nice, (SCHED_OTHER, 19)),
+            (Priority::Idle, (SCHED_IDLE, usual.1)),
+        ] {
+            let (own, childs) = in_a_thread(move || {
+                priority.apply("test");
+                let own = policy_and_nice("thread-self");
+                (own, in_a_thread(|| policy_and_nice("thread-self")))
+            });
+            assert_eq!((own, childs), (expected, expected), "{priority:?}");
+        }
+        assert_eq!(policy_and_nice("thread-self"), usual, "nobody else has changed");
+    }
+}
