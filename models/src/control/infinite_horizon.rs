@@ -1,6 +1,7 @@
 //! Regulator about an equilibrium: the discrete algebraic Riccati equation.
 
-use nalgebra::{Complex, DMatrix};
+use nalgebra::linalg::balancing;
+use nalgebra::{Complex, DMatrix, DVector};
 
 use super::finite_horizon::{Sample, check};
 use super::lq::reciprocal_condition;
@@ -116,11 +117,17 @@ pub(super) fn solve_without_cross(
 ) -> Result<Regulator, RiccatiError> {
     let problem = Problem { a, b, q, r };
     let (regulator, iterations) = problem.attempt(q);
-    if let Some(regulator) = regulator.filter(Regulator::is_good) {
-        return Ok(regulator);
-    }
+    let regulator = regulator.filter(Regulator::is_good);
+    let regulator = match regulator {
+        Some(regulator) if regulator.spectral_radius < MODULUS_MARGINAL => return Ok(regulator),
+        marginal => marginal,
+    };
+    // A closed loop within round-off of the unit circle may be a mode that nothing moves.
     if let Some(reason) = problem.diagnose()? {
         return Err(reason);
+    }
+    if let Some(regulator) = regulator {
+        return Ok(regulator);
     }
     // An unstable mode without weight leads doubling to a solution that leaves the mode alone.
     // With a little weight everywhere it stabilises, and Newton's method then keeps to the
@@ -229,36 +236,90 @@ impl Problem<'_> {
     /// (Popov-Belevitch-Hautus).
     fn diagnose(&self) -> Result<Option<RiccatiError>, RiccatiError> {
         let modes = eigenvalues(self.a)?;
-        let lasting = || modes.iter().filter(|z| z.norm() >= MODULUS_MARGINAL && z.im >= 0.0);
-        if let Some(mode) = lasting().find(|&&z| loses_rank(self.a, self.b, z)) {
+        let lasting: Vec<_> =
+            modes.into_iter().filter(|z| z.norm() >= MODULUS_MARGINAL && z.im >= 0.0).collect();
+        if let Some(mode) = Reach::of_inputs(self.a, self.b).lost(&lasting) {
             let (real, imaginary, modulus) = (mode.re, mode.im, mode.norm());
             return Ok(Some(RiccatiError::NotStabilisable { real, imaginary, modulus }));
         }
-        let a_t = self.a.transpose();
-        let mut on_circle = lasting().filter(|z| z.norm() <= 2.0 - MODULUS_MARGINAL);
-        let unseen = on_circle.find(|&&z| loses_rank(&a_t, self.q, z));
+        let on_circle: Vec<_> =
+            lasting.into_iter().filter(|z| z.norm() <= 2.0 - MODULUS_MARGINAL).collect();
+        let unseen = Reach::of_weight(self.a, self.q).lost(&on_circle);
         Ok(unseen.map(|z| RiccatiError::NotDetectable { real: z.re, imaginary: z.im }))
     }
 }
 
-/// Whether `[A − zI, B]` has a direction that neither side reaches: the mode `z` cannot be moved by
-/// `B`. Both sides count relative to their own size, so that units do not matter.
-fn loses_rank(a: &DMatrix<f64>, b: &DMatrix<f64>, z: Complex<f64>) -> bool {
-    let (n, m) = b.shape();
-    let scale = |m: &DMatrix<f64>| if m.norm() > 0.0 { m.norm().recip() } else { 0.0 };
-    let (a_scale, b_scale) = (scale(a), scale(b));
-    let mut pencil = DMatrix::<Complex<f64>>::zeros(n, n + m);
-    for row in 0..n {
-        for col in 0..n {
-            pencil[(row, col)] = Complex::from(a[(row, col)] * a_scale);
+/// A map and what is to reach its modes, in units in which those of states and inputs do not matter.
+struct Reach {
+    a: DMatrix<f64>,
+    b: DMatrix<f64>,
+}
+
+impl Reach {
+    /// How inputs reach the modes of `A`.
+    fn of_inputs(a: &DMatrix<f64>, b: &DMatrix<f64>) -> Self {
+        let mut reach = Self { a: a.clone(), b: b.clone() };
+        reach.balance();
+        let size = reach.a.norm();
+        for mut column in reach.b.column_iter_mut() {
+            let norm = column.norm();
+            if norm > 0.0 {
+                column *= size / norm;
+            }
         }
-        pencil[(row, row)] -= z * a_scale;
-        for col in 0..m {
-            pencil[(row, n + col)] = Complex::from(b[(row, col)] * b_scale);
-        }
+        reach
     }
-    let svd = nalgebra::SVD::try_new(pencil, false, false, f64::EPSILON, 60 * (n + m));
-    svd.is_some_and(|svd| svd.singular_values.min() < RANK_LOST)
+
+    /// How a weight sees the modes of `A`, whose units it shares.
+    fn of_weight(a: &DMatrix<f64>, q: &DMatrix<f64>) -> Self {
+        let mut reach = Self { a: a.transpose(), b: q.clone() };
+        let scales = reach.balance();
+        for (mut column, scale) in reach.b.column_iter_mut().zip(scales.iter()) {
+            column /= *scale;
+        }
+        let norm = reach.b.norm();
+        if norm > 0.0 {
+            reach.b *= reach.a.norm() / norm;
+        }
+        reach
+    }
+
+    /// Balances the map and takes `B` along; the units of the new states.
+    fn balance(&mut self) -> DVector<f64> {
+        if self.a.is_empty() {
+            return DVector::zeros(0);
+        }
+        let scales = balancing::balance_parlett_reinsch(&mut self.a);
+        for (mut row, scale) in self.b.row_iter_mut().zip(scales.iter()) {
+            row /= *scale;
+        }
+        scales
+    }
+
+    /// Of the modes, the one that `B` moves least, if that is not at all: `[A − zI, B]` loses rank.
+    fn lost(&self, modes: &[Complex<f64>]) -> Option<Complex<f64>> {
+        let distances = modes.iter().filter_map(|&z| Some((z, self.distance(z)?)));
+        let (mode, distance) = distances.min_by(|(_, a), (_, b)| a.total_cmp(b))?;
+        (distance < RANK_LOST).then_some(mode)
+    }
+
+    /// Distance of `[A − zI, B]` to losing rank, relative to the size of `A` and `z`.
+    fn distance(&self, z: Complex<f64>) -> Option<f64> {
+        let (n, m) = self.b.shape();
+        let scale = (self.a.norm() + z.norm()).recip();
+        let mut pencil = DMatrix::<Complex<f64>>::zeros(n, n + m);
+        for row in 0..n {
+            for col in 0..n {
+                pencil[(row, col)] = Complex::from(self.a[(row, col)] * scale);
+            }
+            pencil[(row, row)] -= z * scale;
+            for col in 0..m {
+                pencil[(row, n + col)] = Complex::from(self.b[(row, col)] * scale);
+            }
+        }
+        let svd = nalgebra::SVD::try_new(pencil, false, false, f64::EPSILON, 60 * (n + m))?;
+        Some(svd.singular_values.min())
+    }
 }
 
 /// `(R + BᵀPB)⁻¹ BᵀPA` and the reciprocal condition of the bracket, or nothing if the bracket is not
