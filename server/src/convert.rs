@@ -180,6 +180,11 @@ fn momentum(q: Vec<f64>, p: Vec<f64>, v: Vec<f64>, model: &Model) -> Initial {
     Initial::Momentum { q, p, v }
 }
 
+/// A state as an initial one.
+pub fn momentum_of(state: &State) -> Initial {
+    Initial::Momentum { q: state.q.clone(), p: state.p.clone(), v: state.v.clone() }
+}
+
 /// A plant in its initial state. `field` names the state in errors.
 pub fn plant(
     model: &Arc<Model>,
@@ -237,13 +242,25 @@ pub fn trajectory(
     settings: Settings,
     limits: &Limits,
 ) -> Result<(Plant, Inputs), Fault> {
-    let trajectory = trajectory.ok_or_else(|| Fault::field("trajectory", "is missing"))?;
+    trajectory_in("trajectory", trajectory, model, settings, limits)
+}
+
+/// The initial state and the inputs of a trajectory in a field of the request.
+pub fn trajectory_in(
+    field: &str,
+    trajectory: Option<v1::Trajectory>,
+    model: &Arc<Model>,
+    settings: Settings,
+    limits: &Limits,
+) -> Result<(Plant, Inputs), Fault> {
+    let trajectory = trajectory.ok_or_else(|| Fault::field(field, "is missing"))?;
     let start = match trajectory.initial {
         None => Initial::Scene,
         Some(state) => momentum(state.q, state.p, state.v, model),
     };
-    let plant = plant(model, settings, &Start::Initial(start), "trajectory.initial")?;
-    let inputs = Inputs::new("trajectory.u", trajectory.u, model.dimensions().input())?;
+    let plant = plant(model, settings, &Start::Initial(start), &format!("{field}.initial"))?;
+    let width = model.dimensions().input();
+    let inputs = Inputs::new(&format!("{field}.u"), trajectory.u, width)?;
     LimitExceeded::check("horizon", limits.horizon, "steps", inputs.count())?;
     Ok((plant, inputs))
 }
@@ -273,6 +290,12 @@ impl Inputs {
             return Err(Fault::field(format!("{field}.cols"), problem));
         }
         Ok(Self { columns, count: u.rows as usize, numbers: u.data })
+    }
+
+    /// The rows of a matrix.
+    pub fn from_rows(u: &DMatrix<f64>) -> Self {
+        let (count, columns) = u.shape();
+        Self { columns, count, numbers: u.transpose().as_slice().to_vec() }
     }
 
     /// Number of inputs.
@@ -544,6 +567,13 @@ pub fn state_names(model: &Model) -> Vec<String> {
     all.chain(dynamic.iter().map(|c| format!("p({})", c.name)))
         .chain(prescribed.iter().map(|c| format!("v({})", c.name)))
         .collect()
+}
+
+/// Names of the entries of `u`: inputs, and prescribed coordinates.
+pub fn input_names(model: &Model) -> Vec<String> {
+    let inputs = model.scene().inputs.iter().map(|input| input.name.clone());
+    let prescribed = model.coordinates()[model.dimensions().dynamic..].iter();
+    inputs.chain(prescribed.map(|coordinate| coordinate.name.clone())).collect()
 }
 
 /// Index of a bound's entry among `names`, and its ends; infinite where there is none.

@@ -35,7 +35,7 @@ pub struct Hub {
     pub attendants: Workers,
     /// Models.
     pub catalog: Catalog,
-    /// Permits to hold a trajectory regulator in memory.
+    /// Permits to hold a trajectory's regulator, filter or optimisation in memory.
     pub trajectory_solves: Arc<Semaphore>,
     /// Room in memory for the laws of feedbacks.
     pub feedback_room: Arc<Room>,
@@ -161,10 +161,10 @@ impl Hub {
         })
     }
 
-    /// Room in memory for one more trajectory regulator.
+    /// Room in memory for one more trajectory's regulator, filter or optimisation.
     pub fn trajectory_permit(&self) -> Result<OwnedSemaphorePermit, Fault> {
         let (name, limit) = ("trajectory_solves", self.limits.trajectory_solves);
-        let (what, actual) = ("trajectory regulators at a time", limit + 1);
+        let (what, actual) = ("regulators, filters and optimisations at a time", limit + 1);
         Arc::clone(&self.trajectory_solves)
             .try_acquire_owned()
             .map_err(|_| LimitExceeded { name, limit, what, actual }.into())

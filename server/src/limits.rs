@@ -74,14 +74,18 @@ limits! {
     rollout_cases = 10_000 in 1..=1_000_000;
     /// Numbers in one answer; 400 000 of them fit the 4 MiB that gRPC clients take by default.
     reply_numbers = 400_000 in 1000..=100_000_000;
-    /// Numbers held for one trajectory regulator (8 bytes each).
+    /// Numbers held for one trajectory regulator, filter or optimisation (8 bytes each).
     trajectory_numbers = 32_000_000 in 1000..=10_000_000_000;
-    /// Trajectory regulators that may be held at a time.
+    /// Trajectory regulators, filters and optimisations that may be held at a time.
     trajectory_solves = 4 in 1..=1000;
     /// Numbers held by the feedbacks of all plants together (8 bytes each).
     feedback_numbers = 64_000_000 in 1000..=10_000_000_000;
     /// Numbers of its scene that may be changed for one plant.
     parameters = 1024 in 0..=1_000_000;
+    /// Iterations of one trajectory optimisation.
+    optimization_iterations = 100_000 in 1..=4_000_000_000;
+    /// Shortenings of one step of a trajectory optimisation.
+    optimization_backtracks = 1000 in 1..=1_000_000;
     /// Frequencies of one Analyze call.
     frequencies = 10_000 in 1..=1_000_000;
     /// Second derivatives of one call, formed or contracted: outputs times pairs of parameters.

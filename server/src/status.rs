@@ -12,6 +12,7 @@
 //! | INVALID_ARGUMENT | `NOT_SETTLED` | BadRequest | no equilibrium was found from a guess |
 //! | INVALID_ARGUMENT | `INVALID_SNAPSHOT`, `SNAPSHOT_MISMATCH` | BadRequest | damaged, or of another model or other settings |
 //! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
+//! | INVALID_ARGUMENT | `INVALID_COVARIANCE` | BadRequest | a covariance of noise has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice |
 //! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED` | ResourceInfo | no such thing, or deleted meanwhile |
 //! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS` | ResourceInfo | the name is taken |
@@ -20,6 +21,9 @@
 //! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
 //! | FAILED_PRECONDITION | `NOT_AN_EQUILIBRIUM` | PreconditionFailure; metadata `drift`, `coordinate` | the point of an infinite-horizon regulator moves |
 //! | FAILED_PRECONDITION | `NOT_STABILISABLE`, `NOT_DETECTABLE`, `NOT_CONVEX`, `RICCATI_NOT_CONVERGED`, `RICCATI_OVERFLOW`, `EIGENVALUES_NOT_FOUND` | PreconditionFailure | there is no such regulator |
+//! | FAILED_PRECONDITION | `NOT_EXCITED` | PreconditionFailure | a filter would stop listening: no process noise reaches a mode that does not decay |
+//! | FAILED_PRECONDITION | `MAX_ITERATIONS`, `NO_DESCENT`, `NOT_CONVEX`, `BOUNDS_NOT_MET` | in the result of an optimisation | the search got stuck |
+//! | FAILED_PRECONDITION | `INFEASIBLE_REFERENCE` | PreconditionFailure; metadata `unexplained_acceleration`, `unexplained_coordinate`, `unexplained_step`, `constraint_violation`, `constraint_violation_step` | a reference is no motion of the plant, and `strict` was asked for |
 //! | FAILED_PRECONDITION | `NO_FEEDBACK` | PreconditionFailure | the plant has no feedback whose gains could be watched |
 //! | FAILED_PRECONDITION | `TIME_STEP_CHANGED` | PreconditionFailure | the trajectory of a feedback was given for another time step: set a new one |
 //! | FAILED_PRECONDITION | `POLE` | PreconditionFailure; metadata `frequency_hz` | the frequency response is infinite |
@@ -32,7 +36,9 @@
 
 use std::collections::HashMap;
 
-use plantd_models::control::{AnalysisError, RiccatiError, WeightsError};
+use plantd_models::control::{AnalysisError, KalmanError, NoiseError, RiccatiError, WeightsError};
+use plantd_models::optimize::{OptimizeError, Stuck};
+use plantd_models::reference::ReferenceError;
 use plantd_models::{
     ContinuousError, InitialError, SceneError, SettleError, SnapshotError, StepError, TooLarge,
 };
@@ -407,6 +413,105 @@ impl From<RiccatiError> for Fault {
             }
         };
         Self::precondition(reason, "regulator", error.to_string())
+    }
+}
+
+impl From<NoiseError> for Fault {
+    fn from(error: NoiseError) -> Self {
+        let field = match error.covariance() {
+            "initial_covariance" => "initial_covariance".to_owned(),
+            covariance => format!("noise.{covariance}"),
+        };
+        Self::field_because("INVALID_COVARIANCE", field, error.to_string())
+    }
+}
+
+impl From<KalmanError> for Fault {
+    fn from(error: KalmanError) -> Self {
+        let message = error.to_string();
+        match error {
+            KalmanError::Noise(error) => error.into(),
+            KalmanError::NotDetectable { .. } => {
+                Self::precondition("NOT_DETECTABLE", "filter", message)
+            }
+            KalmanError::NotExcited { .. } => Self::precondition("NOT_EXCITED", "filter", message),
+            KalmanError::Riccati(error) => error.into(),
+            // The server made the lists, so a misfit among them is its own mistake.
+            KalmanError::Count { .. } => Self::internal(message),
+        }
+    }
+}
+
+impl From<OptimizeError> for Fault {
+    fn from(error: OptimizeError) -> Self {
+        let message = error.to_string();
+        match error {
+            OptimizeError::NoSteps => Self::field("guess.u", message),
+            OptimizeError::Dimension { .. } | OptimizeError::NotFinite { .. } => {
+                Self::field("cost", message)
+            }
+            OptimizeError::Weights(error) => {
+                Self::from_weights(error, "cost.weights", "cost.stages")
+            }
+            OptimizeError::Stages { .. } => Self::field("cost.stages", message),
+            OptimizeError::Option { name, .. } => Self::field(format!("options.{name}"), message),
+            OptimizeError::Bound { list, position, .. } => {
+                let list = match list {
+                    "states" => "state",
+                    "inputs" => "input",
+                    other => other,
+                };
+                Self::field(format!("bounds.{list}[{position}]"), message)
+            }
+            OptimizeError::FreeEntry { .. } => Self::field("free_initial.entries", message),
+            OptimizeError::Initial(error) => Self::from_initial(error, "guess.initial"),
+            OptimizeError::Guess { step, ref error } => {
+                Self::precondition(step_error_reason(error), "guess", message).with("step", step)
+            }
+            OptimizeError::Cost { .. } => Self::precondition("MOTION_NOT_FINITE", "guess", message),
+            OptimizeError::Linearization { step, ref error } => {
+                let reason = step_error_reason(error);
+                Self::precondition(reason, "trajectory", message).with("step", step)
+            }
+            OptimizeError::Projection { step } => {
+                let subject = "options.projection";
+                Self::precondition("RICCATI_OVERFLOW", subject, message).with("step", step)
+            }
+            OptimizeError::Checkpoint { .. } => Self::field("resume", message),
+            OptimizeError::Cancelled => Self::cancelled(),
+            // The server asks for no iteration after the last.
+            OptimizeError::Finished => Self::internal(message),
+        }
+    }
+}
+
+impl From<Stuck> for Fault {
+    fn from(stuck: Stuck) -> Self {
+        let reason = match stuck {
+            Stuck::MaxIterations { .. } => "MAX_ITERATIONS",
+            Stuck::NoDescent { .. } => "NO_DESCENT",
+            Stuck::NotConvex { .. } => "NOT_CONVEX",
+            Stuck::BoundsNotMet { .. } => "BOUNDS_NOT_MET",
+        };
+        Self::precondition(reason, "search", stuck.to_string())
+    }
+}
+
+impl From<ReferenceError> for Fault {
+    fn from(error: ReferenceError) -> Self {
+        let message = error.to_string();
+        match error {
+            ReferenceError::Dimension { what, .. } => Self::field(what, message),
+            ReferenceError::TooShort { .. } => Self::field("q", message),
+            ReferenceError::NotFinite { what, .. } => Self::field(what, message),
+            ReferenceError::Linearization { step, ref error }
+            | ReferenceError::Step { step, ref error } => {
+                Self::precondition(step_error_reason(error), "q", message).with("step", step)
+            }
+            ReferenceError::Weights(error) => Self::from_weights(error, "projection", "stages"),
+            ReferenceError::Regulator(error) => error.into(),
+            ReferenceError::Initial(error) => Self::from_initial(error, "q"),
+        }
     }
 }
 

@@ -23,6 +23,7 @@ pub(super) fn analyze(
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
     let outputs = Outputs::new(
+        "",
         request.outputs,
         request.output_x.as_ref(),
         request.output_u.as_ref(),
@@ -55,14 +56,16 @@ pub(super) fn analyze(
 }
 
 /// Outputs `y = x_matrix x + u_matrix u`.
-struct Outputs {
-    names: Vec<String>,
-    x: DMatrix<f64>,
-    u: DMatrix<f64>,
+pub(super) struct Outputs {
+    pub(super) names: Vec<String>,
+    pub(super) x: DMatrix<f64>,
+    pub(super) u: DMatrix<f64>,
 }
 
 impl Outputs {
-    fn new(
+    /// From the fields `outputs`, `output_x` and `output_u` of what `prefix` names.
+    pub(super) fn new(
+        prefix: &str,
         names: Vec<String>,
         x: Option<&v1::Matrix>,
         u: Option<&v1::Matrix>,
@@ -72,20 +75,24 @@ impl Outputs {
         let (nx, nu) = (d.state(), d.input());
         let Some(given) = x else {
             if u.is_some() {
-                return Err(Fault::field("output_u", "is given without `output_x`"));
+                let problem = "is given without `output_x`";
+                return Err(Fault::field(format!("{prefix}output_u"), problem));
             }
-            return Self::named(names, model);
+            return Self::named(prefix, names, model);
         };
         if !names.is_empty() {
-            return Err(Fault::field("outputs", "are given together with `output_x`"));
+            let problem = "are given together with `output_x`";
+            return Err(Fault::field(format!("{prefix}outputs"), problem));
         }
         if given.rows as usize > nx {
             let problem = format!("has {} rows; the state has {nx} entries", given.rows);
-            return Err(Fault::field("output_x.rows", problem));
+            return Err(Fault::field(format!("{prefix}output_x.rows"), problem));
         }
-        let x = convert::matrix_of("output_x", given, None, nx)?;
+        let x = convert::matrix_of(&format!("{prefix}output_x"), given, None, nx)?;
         let u = match u {
-            Some(given) => convert::matrix_of("output_u", given, Some(x.nrows()), nu)?,
+            Some(given) => {
+                convert::matrix_of(&format!("{prefix}output_u"), given, Some(x.nrows()), nu)?
+            }
             None => DMatrix::zeros(x.nrows(), nu),
         };
         let names = (0..x.nrows()).map(|i| format!("y{i}")).collect();
@@ -93,7 +100,7 @@ impl Outputs {
     }
 
     /// Entries of x by name; all of them when there are no names.
-    fn named(names: Vec<String>, model: &Model) -> Result<Self, Fault> {
+    fn named(prefix: &str, names: Vec<String>, model: &Model) -> Result<Self, Fault> {
         let d = model.dimensions();
         let known = convert::state_names(model);
         if names.is_empty() {
@@ -102,12 +109,13 @@ impl Outputs {
         }
         if names.len() > d.state() {
             let problem = format!("has {} entries; the state has {}", names.len(), d.state());
-            return Err(Fault::field("outputs", problem));
+            return Err(Fault::field(format!("{prefix}outputs"), problem));
         }
         let mut x = DMatrix::zeros(names.len(), d.state());
         for (row, name) in names.iter().enumerate() {
             let column = known.iter().position(|known| known == name).ok_or_else(|| {
-                Fault::field(format!("outputs[{row}]"), format!("there is no state entry `{name}`"))
+                let problem = format!("there is no state entry `{name}`");
+                Fault::field(format!("{prefix}outputs[{row}]"), problem)
             })?;
             x[(row, column)] = 1.0;
         }

@@ -12,7 +12,7 @@ use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status};
 
-use super::{Answers, analysis, derivatives, rollout};
+use super::{Answers, analysis, derivatives, kalman, optimize, reference, rollout};
 use crate::convert::{self, Inputs, WeightFields};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
@@ -361,29 +361,50 @@ impl v1::control_service_server::ControlService for ControlService {
 
     async fn optimize_trajectory(
         &self,
-        _: Request<v1::OptimizeTrajectoryRequest>,
+        request: Request<v1::OptimizeTrajectoryRequest>,
     ) -> Result<Response<Self::OptimizeTrajectoryStream>, Status> {
-        Err(Status::unimplemented("optimize_trajectory"))
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let permit = hub.trajectory_permit()?;
+        let job = move |_: &_| optimize::Search::new(&hub, request, permit);
+        let search = self.hub.workers.run(job).await?;
+        let answers = search.run(Arc::clone(&self.hub));
+        Ok(Response::new(self.hub.until_ending(answers)))
     }
 
     async fn project_reference(
         &self,
-        _: Request<v1::ProjectReferenceRequest>,
+        request: Request<v1::ProjectReferenceRequest>,
     ) -> Result<Response<Self::ProjectReferenceStream>, Status> {
-        Err(Status::unimplemented("project_reference"))
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let permit = hub.trajectory_permit()?;
+        let job = move |abandoned: &Abandoned| {
+            reference::Projection::new(&hub, request, permit, abandoned)
+        };
+        let projection = self.hub.workers.run(job).await?;
+        let answers = Box::pin(stream::iter(projection.map(Ok)));
+        Ok(Response::new(self.hub.until_ending(answers)))
     }
 
     async fn solve_kalman(
         &self,
-        _: Request<v1::SolveKalmanRequest>,
+        request: Request<v1::SolveKalmanRequest>,
     ) -> Result<Response<v1::SolveKalmanResponse>, Status> {
-        Err(Status::unimplemented("solve_kalman"))
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| kalman::solve(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 
     async fn solve_trajectory_kalman(
         &self,
-        _: Request<v1::SolveTrajectoryKalmanRequest>,
+        request: Request<v1::SolveTrajectoryKalmanRequest>,
     ) -> Result<Response<Self::SolveTrajectoryKalmanStream>, Status> {
-        Err(Status::unimplemented("solve_trajectory_kalman"))
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let permit = hub.trajectory_permit()?;
+        let job = move |abandoned: &Abandoned| {
+            kalman::TrajectoryFilter::solve(&hub, request, permit, abandoned)
+        };
+        let filter = self.hub.workers.run(job).await?;
+        let answers = Box::pin(stream::iter(filter.map(Ok)));
+        Ok(Response::new(self.hub.until_ending(answers)))
     }
 }
