@@ -31,6 +31,10 @@
 //! # }
 //! ```
 //!
+//! The server can keep the regulator for a plant ([`Client::set_feedback`]) and stream its gains ahead
+//! of time; [`Client::follow_gains`] applies them in one call, [`GainSchedule`] those that were
+//! collected, and [`Estimator`] runs a Kalman filter on what is measured.
+//!
 //! What the server refuses comes back as an [`Error`] with the gRPC code, the reason and the faults
 //! of the request:
 //!
