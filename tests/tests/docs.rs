@@ -19,6 +19,7 @@ fn examples_in_the_readme_are_files_that_are_tested() {
     let readme = read("README.md");
     for (language, file) in [
         ("python", "client/python/examples/pendulum_lqr.py"),
+        ("python", "client/python/examples/swing_up.py"),
         ("toml", "models/scenes/cart-pole.toml"),
     ] {
         let block = format!("```{language}\n{}\n```", read(file).trim());

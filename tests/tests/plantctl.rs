@@ -266,6 +266,161 @@ fn refusals_go_to_standard_error_with_their_exit_code() {
     assert!(stderr(&nowhere).contains("refused"), "{}", stderr(&nowhere));
 }
 
+/// Lines of JSON.
+#[track_caller]
+fn json_lines(server: &ServerProcess, arguments: &[&str]) -> Vec<Value> {
+    let arguments = [arguments, &["--json"]].concat();
+    text(server, &arguments).lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+/// The swing-up of the pendulum, as the help shows it.
+const SWING_UP: &str = "
+model = \"pendulum\"
+steps = 100
+time_step_s = 0.1
+paper = true
+
+[initial]
+q = [0.0]
+
+[cost]
+q = [1000.0, 1.0]
+r = [50.0]
+x = [[0.0, 0.0]]
+changes = [{ step = 50, x = [3.141592653589793, 0.0] }]
+
+[options]
+first_method = \"quasi-newton\"
+first_iterations = 4
+tolerance = 1e-6
+";
+
+#[test]
+fn a_search_is_saved_resumed_and_used_as_a_guess() {
+    let server = ServerProcess::start().unwrap();
+    let file = |name: &str| server.directory().join(name).to_str().unwrap().to_owned();
+    let (problem, best, part) = (file("swing-up.toml"), file("best.json"), file("part.json"));
+    std::fs::write(&problem, SWING_UP).unwrap();
+
+    let lines = json_lines(&server, &["optimize", &problem, "--save", &best]);
+    let (result, iterations) = lines.split_last().unwrap();
+    let result = &result["result"];
+    assert_eq!(result["converged"], true);
+    let cost = result["cost"].as_f64().unwrap();
+    assert!((cost / 13297.378894617856 - 1.0).abs() < 1e-9, "{cost}");
+    assert_eq!(iterations[0]["progress"]["cost_before"].as_f64().unwrap().round(), 251675.0);
+    let saved: Value = serde_json::from_str(&std::fs::read_to_string(&best).unwrap()).unwrap();
+    assert_eq!(&saved, result);
+
+    // Six iterations, then the rest: the same bits, and the same number of them.
+    let stopped = run(&server, &["optimize", &problem, "--iterations", "6", "--save", &part]);
+    assert_eq!(stopped.status.code(), Some(1));
+    let stopped = String::from_utf8(stopped.stdout).unwrap();
+    assert!(stopped.contains("quasi-newton") && stopped.contains("MAX_ITERATIONS"), "{stopped}");
+    let resumed = json_lines(&server, &["optimize", &problem, "--resume", &part]);
+    assert_eq!(resumed.len(), lines.len() - 6);
+    assert_eq!(&resumed.last().unwrap()["result"]["x"], &result["x"]);
+
+    // From the best trajectory there is nothing left to do but to see that.
+    let again = text(&server, &["optimize", &problem, "--guess", &best, "--method", "newton"]);
+    assert!(again.contains("converged") && again.lines().count() <= 5, "{again}");
+
+    std::fs::write(&problem, SWING_UP.replace("r = [50.0]", "r = [50.0, 1.0]")).unwrap();
+    let refused = run(&server, &["optimize", &problem]);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(stderr(&refused).contains("cost.weights.r"), "{}", stderr(&refused));
+    std::fs::write(&problem, SWING_UP.replace("steps", "strides")).unwrap();
+    assert!(stderr(&run(&server, &["optimize", &problem])).contains("strides"));
+}
+
+#[test]
+fn a_table_of_configurations_becomes_a_motion() {
+    let server = ServerProcess::start().unwrap();
+    json(&server, &["create", "cart-pole", "--id", "p", "--at", "hanging"]);
+    let moved = json(&server, &["step", "p", "--u", "2", "--count", "20", "--all"]);
+    let file = server.directory().join("reference.csv");
+    let mut table = "x,theta\n0,0\n".to_owned();
+    for state in moved["states"].as_array().unwrap() {
+        table += &format!("{},{}\n", state["q"][0], state["q"][1]);
+    }
+    std::fs::write(&file, &table).unwrap();
+    let file = file.to_str().unwrap();
+
+    let arguments = ["project-reference", "cart-pole", file, "--strict"];
+    let output = run(&server, &arguments);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(stderr(&output).contains("is a motion"), "{}", stderr(&output));
+    let motion = String::from_utf8(output.stdout).unwrap();
+    let mut lines = motion.lines();
+    assert_eq!(lines.next(), Some("x,theta,p(x),p(theta),u(force)"));
+    let rows: Vec<Vec<&str>> = lines.map(|line| line.split(',').collect()).collect();
+    assert_eq!(rows.len(), 21);
+    for (row, given) in rows.iter().zip(table.lines().skip(1)) {
+        for (found, given) in row.iter().zip(given.split(',')) {
+            let (found, given): (f64, f64) = (found.parse().unwrap(), given.parse().unwrap());
+            assert!((found - given).abs() < 1e-7, "{found} instead of {given}");
+        }
+    }
+    // The force that drove it is found again; the last state has none.
+    assert!((rows[7][4].parse::<f64>().unwrap() - 2.0).abs() < 1e-3, "{:?}", rows[7]);
+    assert_eq!(rows[20][4], "");
+    let lines = json_lines(&server, &["project-reference", "cart-pole", file]);
+    assert_eq!((lines.len(), &lines[0]["report"]["feasible"]), (22, &true.into()));
+
+    // A jump is no motion.
+    let jump = table.replacen("0,0", "0,0.5", 1);
+    std::fs::write(file, jump).unwrap();
+    let refused = run(&server, &arguments);
+    assert_eq!(refused.status.code(), Some(1));
+    assert!(stderr(&refused).contains("INFEASIBLE_REFERENCE"), "{}", stderr(&refused));
+}
+
+#[test]
+fn a_filter_is_printed() {
+    let server = ServerProcess::start().unwrap();
+    let arguments = ["kalman", "cart-pole", "--at", "upright", "--outputs", "x,theta"];
+    let noise = ["--measurement", "1e-4", "--process", "1e-6"];
+    let arguments = [&arguments[..], &noise].concat();
+    let filter = json(&server, &arguments);
+    assert_eq!((&filter["gain"]["rows"], &filter["gain"]["cols"]), (&4.into(), &2.into()));
+    assert!(filter["error_modes"].as_array().unwrap().len() == 4);
+    let printed = text(&server, &arguments);
+    assert!(printed.contains("L (4 × 2)") && printed.contains("p(theta)"), "{printed}");
+}
+
+#[test]
+fn feedback_is_set_streamed_and_cleared() {
+    let server = ServerProcess::start().unwrap();
+    json(&server, &["create", "pendulum", "--id", "p", "--q", "3.0"]);
+    let none = run(&server, &["gains", "p", "--count", "1"]);
+    assert!(stderr(&none).contains("NO_FEEDBACK"), "{}", stderr(&none));
+
+    let set = ["feedback", "set", "p", "--at", "upright", "--q", "100,1", "--mode", "replace"];
+    let feedback = json(&server, &set);
+    assert_eq!((&feedback["revision"], &feedback["horizon"]), (&1.into(), &0.into()));
+    let gain = json(&server, &["gains", "p", "--count", "1"]);
+    assert_eq!(gain["gain"]["x_reference"][0], std::f64::consts::PI);
+    let printed = text(&server, &["gains", "p", "--count", "1"]);
+    assert!(printed.contains("K (1 × 2)"), "{printed}");
+    // The law alone balances the pendulum.
+    let state = json(&server, &["step", "p", "--count", "200"])["states"][0].clone();
+    let error = state["q"][0].as_f64().unwrap() - std::f64::consts::PI;
+    assert!(error.abs() < 1e-6, "{error}");
+
+    let heavier = json(&server, &["set-parameter", "p", "gravity[1]=-1.6", "--dt", "0.05"]);
+    assert_eq!(heavier["parameters"][0]["path"], "gravity[1]");
+    assert_eq!(heavier["settings"]["time_step_s"], 0.05);
+    assert!(text(&server, &["show", "plant", "p"]).contains("gravity[1] = -1.6"));
+    let refused = run(&server, &["set-parameter", "p", "gravity[7]=1"]);
+    assert_eq!(refused.status.code(), Some(1));
+
+    let guard = ["--mode", "guard", "--guard", "theta=-0.5:0.5", "p(theta)=:2"];
+    let guarded = json(&server, &[&set[..5], &guard].concat());
+    assert_eq!(guarded["mode"], "FEEDBACK_MODE_GUARD");
+    assert_eq!(text(&server, &["feedback", "clear", "p"]), "");
+    assert!(!run(&server, &["gains", "p", "--count", "1"]).status.success());
+}
+
 #[test]
 fn the_address_may_be_a_unix_socket_and_the_flag_wins() {
     let server = ServerProcess::start().unwrap();

@@ -1,0 +1,68 @@
+//! The Rust client's examples run and check themselves; Python's are run by its own tests.
+
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
+
+use plantd_tests::server::ServerProcess;
+
+/// Builds the examples with the binaries, so that Cargo sees the same dependencies as for these and
+/// builds none of them a second time.
+fn example(name: &str) -> PathBuf {
+    static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
+    let directory = DIRECTORY.get_or_init(|| {
+        let program = std::env::current_exe().unwrap();
+        let directory = program.ancestors().nth(2).unwrap();
+        let profile = match directory.file_name().and_then(|name| name.to_str()) {
+            Some("debug") => "dev",
+            other => other.unwrap(),
+        };
+        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let status = Command::new(cargo)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .args(["build", "--quiet", "--bins", "--examples"])
+            .args(["-p", "plantd-server", "-p", "plantd-client", "-p", env!("CARGO_PKG_NAME")])
+            .args(["--profile", profile, "--target-dir"])
+            .arg(directory.parent().unwrap())
+            .status()
+            .unwrap();
+        assert!(status.success(), "cannot build the examples");
+        directory.join("examples")
+    });
+    directory.join(name)
+}
+
+#[track_caller]
+fn run(name: &str) -> String {
+    let server = ServerProcess::start().unwrap();
+    let mut command = Command::new(example(name));
+    let output = command.arg(server.address()).stdin(Stdio::null()).output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{name}: {errors}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn drive_lqr() {
+    assert_eq!(run("drive_lqr").lines().count(), 50);
+}
+
+#[test]
+fn swing_up() {
+    assert!(run("swing_up").contains("from (1, 1)"));
+}
+
+#[test]
+fn cart_pole_swing_up() {
+    assert!(run("cart_pole_swing_up").contains("off upright"));
+}
+
+#[test]
+fn optimize_marionette() {
+    assert!(run("optimize_marionette").lines().count() >= 8);
+}
+
+#[test]
+fn cart_pole_lqg() {
+    assert!(run("cart_pole_lqg").contains("estimated to"));
+}
