@@ -34,7 +34,11 @@ fn example(name: &str) -> PathBuf {
 
 #[track_caller]
 fn run(name: &str) -> String {
-    let server = ServerProcess::start().unwrap();
+    // Other tests share the processors; workers that take what others leave would starve.
+    let server = ServerProcess::start_with(|command| {
+        command.args(["--worker-priority", "normal"]);
+    })
+    .unwrap();
     let mut command = Command::new(example(name));
     let output = command.arg(server.address()).stdin(Stdio::null()).output().unwrap();
     let errors = String::from_utf8_lossy(&output.stderr);

@@ -18,10 +18,13 @@ def addresses(tmp_path_factory):
         pytest.exit("PLANTD_SERVER must name the plantd binary", returncode=2)
     folder = tmp_path_factory.mktemp("server")
     ready, log = folder / "ready.json", folder / "log"
+    # Other tests share the processors; workers that take what others leave would starve.
+    environment = {**os.environ, "PLANTD_WORKER_PRIORITY": "normal"}
     arguments = ["serve", "--grpc", "127.0.0.1:0", "--unix", str(folder / "plantd.sock")]
     with log.open("w") as output:
         server = subprocess.Popen(
             [binary, *arguments, "--ready-file", str(ready)],
+            env=environment,
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,

@@ -1,4 +1,4 @@
-"""The examples run, and close their loops in fewer than 45 lines."""
+"""The examples run, and close their loops in fewer than 50 lines."""
 
 import subprocess
 import sys
@@ -62,4 +62,4 @@ def test_cart_pole_lqg(addresses):
 
 def test_examples_are_short():
     for file in EXAMPLES.glob("*.py"):
-        assert len(file.read_text().splitlines()) < 45, file.name
+        assert len(file.read_text().splitlines()) < 50, file.name

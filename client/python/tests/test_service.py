@@ -72,7 +72,7 @@ def test_bounds_and_a_free_initial_state(client):
     assert free.converged and free.cost < 13297.378894617856
     assert free.x[0, 0] != 0 and free.x[0, 1] == 0
     with pytest.raises(plantd.PlantdError) as caught:
-        swing_up(client, final_state={"phi": 1.0}).result
+        list(swing_up(client, final_state={"phi": 1.0}))
     assert caught.value.code == "INVALID_ARGUMENT"
 
 
