@@ -22,7 +22,7 @@ use crate::plant::blocks::{StepBlocks, non_zero};
 use crate::plant::closure::Closure;
 use crate::plant::linearize::{Linearization, SolvedStep};
 use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::rows::{add_rows, padded};
+use crate::plant::rows::{LANES, Term, add_rows, padded};
 use crate::plant::{Plant, StepError, StepReport};
 use crate::rotation;
 use crate::scalar::Dual;
@@ -46,9 +46,6 @@ pub struct Contraction {
     /// `μ₁ + z_p`, with zeros for the prescribed coordinates.
     impulse: Vec<f64>,
     quadratic: Quadratic,
-    /// `Y W`, and `Cᵀ W`, rows over all parameters.
-    turned: Vec<f64>,
-    product: Vec<f64>,
     schur: PivotedLu,
     /// Constraints at `q[k+1]`.
     end: Closure,
@@ -58,25 +55,34 @@ pub struct Contraction {
 }
 
 /// A quadratic form in the start of a step and in what is next, in terms of the parameters `θ` and the
-/// unknowns `y`: `½ θᵀ sum θ + yᵀ C θ + ½ xᵀ Y x`.
+/// unknowns `y`: `½ θᵀ sum θ + yᵀ C θ + ½ xᵀ Y x`. With `y' = W θ` its Hessian is
+///
+/// ```text
+/// sum + Wᵀ (C + Y W) + Cᵀ W
+/// ```
+///
+/// which is symmetric: the lower triangle is computed. `C` and `Y` have few entries.
 #[derive(Clone, Debug)]
 struct Quadratic {
     layout: Layout,
     /// Row-major over all parameters; the lower triangle counts.
     sum: Vec<f64>,
-    /// `C`, column by column, nd + nc rows.
+    /// `C`, row-major, nd + nc rows.
     mixed: Vec<f64>,
+    /// `C + Y W`.
+    cofactor: Vec<f64>,
     /// `Y`, nd by nd.
     increments: Vec<f64>,
 }
 
 impl Quadratic {
     fn new(layout: Layout) -> Self {
-        let size = layout.parameters();
+        let (size, rows) = (layout.parameters(), layout.nd + layout.nc);
         Self {
             layout,
             sum: vec![0.0; size * layout.stride],
-            mixed: vec![0.0; size * (layout.nd + layout.nc)],
+            mixed: vec![0.0; rows * layout.stride],
+            cofactor: vec![0.0; rows * layout.stride],
             increments: vec![0.0; layout.nd * layout.nd],
         }
     }
@@ -93,7 +99,7 @@ impl Quadratic {
 
     /// Adds to `C`, unknown by parameter.
     fn add_mixed(&mut self, unknown: usize, parameter: usize, value: f64) {
-        self.mixed[parameter * (self.layout.nd + self.layout.nc) + unknown] += value;
+        self.mixed[unknown * self.layout.stride + parameter] += value;
     }
 
     /// The form has `value` at the starts of coordinates `i` and `j`.
@@ -122,6 +128,41 @@ impl Quadratic {
             (false, true) => {}
         }
     }
+
+    /// Puts the Hessian into the lower triangle of `sum`; `tangent` is `W`, row-major.
+    fn substitute(&mut self, tangent: &[f64], terms: &mut Vec<Term>) {
+        let Layout { nd, stride, .. } = self.layout;
+        let Self { sum, mixed, cofactor, increments, .. } = self;
+        cofactor.copy_from_slice(mixed);
+        let by_increment = increments.chunks_exact(nd.max(1));
+        for (row, by) in cofactor.chunks_exact_mut(stride).zip(by_increment) {
+            terms.clear();
+            terms.extend(non_zero(by.iter().copied()));
+            add_rows(row, tangent, stride, terms);
+        }
+        for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
+            let row = &mut row[..padded(a + 1)];
+            for (factor, source) in [(tangent, &cofactor[..]), (&mixed[..], tangent)] {
+                terms.clear();
+                terms.extend(non_zero(factor.iter().skip(a).step_by(stride).copied()));
+                add_rows(row, source, stride, terms);
+            }
+        }
+    }
+
+    /// Fills the upper triangle of `sum` with the lower one, block by block.
+    fn mirror(&mut self) {
+        let (stride, size) = (self.layout.stride, self.layout.parameters());
+        for first_row in (0..size).step_by(LANES) {
+            for first_column in (0..=first_row).step_by(LANES) {
+                for a in first_row..(first_row + LANES).min(size) {
+                    for b in first_column..(first_column + LANES).min(a) {
+                        self.sum[b * stride + a] = self.sum[a * stride + b];
+                    }
+                }
+            }
+        }
+    }
 }
 
 impl Contraction {
@@ -129,7 +170,7 @@ impl Contraction {
     pub fn new(model: &Model) -> Self {
         let layout = Layout::new(model);
         let (n, rows) = (layout.n(), layout.nd + layout.nc);
-        let (size, inputs) = (layout.parameters(), layout.ni + layout.nk);
+        let inputs = layout.ni + layout.nk;
         let scratch = Scratch::new(model);
         Self {
             xx: DMatrix::zeros(2 * n, 2 * n),
@@ -139,8 +180,6 @@ impl Contraction {
             adjoint: vec![0.0; rows],
             impulse: vec![0.0; n],
             quadratic: Quadratic::new(layout),
-            turned: vec![0.0; layout.nd * layout.stride],
-            product: vec![0.0; size * layout.stride],
             schur: PivotedLu::new(&model.conditioning.weight, 1),
             end: Closure::new(model),
             q_end: vec![0.0; n],
@@ -239,10 +278,11 @@ impl Contraction {
         }
         self.quadratic.clear();
         let time_step_s = step.settings.time_step_s;
-        let Self { scratch, adjoint, impulse, turned, product, .. } = self;
+        let Self { scratch, adjoint, impulse, quadratic, .. } = self;
+        let Quadratic { sum, cofactor, .. } = quadratic;
         // What `x'` and `λ'` are multiplied with.
-        let by_unknown = &mut turned[..nd + nc];
-        for (a, row) in product.chunks_exact_mut(stride).enumerate() {
+        let by_unknown = &mut cofactor[..nd + nc];
+        for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
             scratch.seed(a, model, step);
             scratch.blocks.evaluate(model, &step.settings);
             let Scratch { blocks, tangent, terms, .. } = &mut *scratch;
@@ -305,14 +345,19 @@ impl Contraction {
             terms.clear();
             terms.extend(non_zero(by_unknown.iter().copied()));
             add_rows(row, tangent, stride, terms);
-            row.iter_mut().for_each(|entry| *entry *= 0.5);
+        }
+        // Both orders of derivatives count the same.
+        for a in 1..sum.len() / stride {
+            for b in 0..a {
+                sum[a * stride + b] = 0.5 * (sum[a * stride + b] + sum[b * stride + a]);
+            }
         }
     }
 
     /// The sum where everything is the gradient of something: the Lagrangian and the constraints.
     fn contract_gradients(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
         let h = step.settings.time_step_s;
-        let Layout { nd, nc, stride, .. } = self.scratch.layout;
+        let Layout { nd, nc, .. } = self.scratch.layout;
         let n = self.scratch.layout.n();
         let blocks = &mut self.scratch.blocks;
         for i in 0..n {
@@ -343,28 +388,8 @@ impl Contraction {
             self.add_constraints(model, step, z);
         }
 
-        // G = sum + Wᵀ Y W + Wᵀ C + Cᵀ W, lower triangles of the first two.
-        let Self { scratch, quadratic, turned, product, .. } = self;
-        let Scratch { tangent, terms, .. } = scratch;
-        for (row, by) in turned.chunks_exact_mut(stride).zip(quadratic.increments.chunks_exact(nd))
-        {
-            row.fill(0.0);
-            terms.clear();
-            terms.extend(non_zero(by.iter().copied()));
-            add_rows(row, tangent, stride, terms);
-        }
-        for (a, row) in quadratic.sum.chunks_exact_mut(stride).enumerate() {
-            terms.clear();
-            terms.extend(non_zero((0..nd).map(|i| tangent[i * stride + a])));
-            add_rows(&mut row[..padded(a + 1)], turned, stride, terms);
-        }
-        let rows = (nd + nc).max(1);
-        for (row, by) in product.chunks_exact_mut(stride).zip(quadratic.mixed.chunks_exact(rows)) {
-            row.fill(0.0);
-            terms.clear();
-            terms.extend(non_zero(by.iter().copied()));
-            add_rows(row, tangent, stride, terms);
-        }
+        let Scratch { tangent, terms, .. } = &mut self.scratch;
+        self.quadratic.substitute(tangent, terms);
     }
 
     /// The derivative of the Hessian of the Lagrangian along `(α, β)`.
@@ -427,24 +452,12 @@ impl Contraction {
         }
     }
 
-    /// Adds up the products and hands the sum out.
+    /// Hands the sum out.
     fn finish(&mut self) {
         let layout = self.scratch.layout;
         let (moving, stride, size) = (layout.inputs(), layout.stride, layout.parameters());
-        let (sum, product) = (&mut self.quadratic.sum, &self.product);
-        for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
-            let mirrored = product.iter().skip(a).step_by(stride);
-            for ((entry, mixed), mirrored) in
-                row[..=a].iter_mut().zip(&product[a * stride..]).zip(mirrored)
-            {
-                *entry += mixed + mirrored;
-            }
-        }
-        for a in 1..size {
-            let (above, row) = sum.split_at_mut(a * stride);
-            let mirrored = above.iter_mut().skip(a).step_by(stride);
-            mirrored.zip(&row[..a]).for_each(|(mirrored, entry)| *mirrored = *entry);
-        }
+        self.quadratic.mirror();
+        let sum = &self.quadratic.sum;
         let row = |a: usize| &sum[a * stride..][..size];
         for a in 0..moving {
             self.xx.column_mut(a).rows_mut(0, moving).copy_from_slice(&row(a)[..moving]);
