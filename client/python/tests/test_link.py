@@ -97,3 +97,13 @@ def test_a_deleted_plant_says_so(client, connect):
     assert (error.value.code, error.value.reason) == ("NOT_FOUND", "PLANT_DELETED")
     with pytest.raises(LinkError, match="NOT_OPEN"):
         LinkDriver(plant, connect_timeout_s=0.05, root=link._root)
+
+
+def test_streamed_gains_drive_over_shared_memory(client, connect):
+    plant, driver = connect("pendulum")
+    client.reset(plant, q=[math.pi - 0.2])
+    client.set_feedback(plant, at="upright", q=[100, 1], r=[1])
+    with driver() as driver, client.follow_gains(plant) as law:
+        for _ in range(100):
+            driver.step(law(driver.state))
+        assert abs(driver.state.q[0] - math.pi) < 1e-9
