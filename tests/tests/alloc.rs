@@ -7,6 +7,9 @@ use std::sync::Arc;
 use plantd_models::{
     Contraction, ForceSplit, Linearization, Model, Plant, Scene, SecondOrder, Settings, builtin,
 };
+use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
+use plantd_server::regulator::{Constraints, Reference, Spec};
+use plantd_server::session::{DriverKind, Session};
 
 /// Counts the allocations of each thread, so that tests in other threads do not disturb.
 struct Counting;
@@ -124,6 +127,57 @@ fn second_order_linearizations_allocate_once() {
         };
         both();
         assert_eq!(allocations(both), 0, "allocations of `{name}`");
+    }
+}
+
+/// Neither does a session whose feedback has a say in each step, with a watchdog or without.
+#[test]
+fn steps_with_feedback_allocate_nothing() {
+    let scene = builtin::scene("cart-pole").expect("the scene is built in");
+    let model = Arc::new(Model::compile(&scene).expect("it compiles"));
+    let d = model.dimensions();
+    let room = Room::new(1_000_000);
+    let stage = |k: usize| Stage {
+        k: vec![0.1 * k as f64; d.input() * d.state()],
+        x: vec![0.0; d.state()],
+        u: vec![1.0; d.input()],
+        feedforward: vec![0.5; d.input()],
+    };
+    let bound = |max: f64| GuardBound { index: 1, name: "theta".to_owned(), min: -max, max };
+    for (mode, guard) in [
+        (Mode::WatchOnly, vec![]),
+        (Mode::Replace, vec![]),
+        (Mode::Add, vec![]),
+        (Mode::Guard, vec![bound(10.0)]),
+        (Mode::Guard, vec![bound(0.1)]),
+    ] {
+        let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("it starts");
+        let session = Session::new("a".to_owned(), "b".to_owned(), plant, Arc::default());
+        let spec = Spec {
+            reference: Reference::Gain(stage(0)),
+            weights: None,
+            trajectory_weights: None,
+            constraints: Constraints::Full,
+            time_step_s: 0.01,
+        };
+        let law = Law {
+            stages: (0..STEPS / 2).map(stage).collect(),
+            end: Some(vec![0.0; d.state()]),
+            room: room.reserve(1).expect("there is room"),
+        };
+        let feedback = Box::new(Feedback::new(Arc::new(spec), law, mode, guard.clone()));
+        session.set_feedback(feedback, 0, None);
+        let mut lease = session.acquire(DriverKind::Step).expect("nobody has it");
+        let mut out = Linearization::new(&model);
+        let count = allocations(|| {
+            for _ in 0..STEPS {
+                lease.step(&[0.2]).expect("a step succeeds");
+                lease.step_and_linearize(&[0.2], &mut out).expect("both succeed together");
+            }
+        });
+        assert_eq!(count, 0, "allocations with {mode:?}");
+        let has_say = matches!(mode, Mode::Replace | Mode::Add) || guard == [bound(0.1)];
+        assert_eq!(lease.applied_input().is_some(), has_say, "{mode:?}");
     }
 }
 
