@@ -161,6 +161,31 @@ fn a_mode_that_no_output_shows_is_named() {
     assert!(matches!(error, KalmanError::NotDetectable { .. }), "{error:?}");
 }
 
+/// Rotated states, and units over twelve decades, hide a mode from the eye and not from the check.
+#[test]
+fn a_mode_that_no_output_shows_is_named_however_it_hides() {
+    for n in [4_usize, 20, 50] {
+        for mode in [1.0, -1.0, 1.4] {
+            let r = 1 + n / 10;
+            let mut a = noise(n, n, 1.0) * (1.1 / (n as f64 / 3.0).sqrt());
+            let mut c = noise(r, n, 2.0);
+            a.column_mut(0).fill(0.0);
+            c.column_mut(0).fill(0.0);
+            a[(0, 0)] = mode;
+            let rotation = noise(n, n, 3.0).qr().q();
+            let units = DVector::from_fn(n, |i, _| 10f64.powi((7 * i as i32) % 13 - 6));
+            let to = DMatrix::from_diagonal(&units) * &rotation;
+            let from = rotation.transpose() * DMatrix::from_diagonal(&units.map(f64::recip));
+            let (a, c, b) = (&to * a * &from, c * &from, DMatrix::zeros(n, 0));
+            let error = steady_state_kalman(&a, &b, &c, &identities(n, r)).unwrap_err();
+            let KalmanError::NotDetectable { real, imaginary, .. } = error else {
+                panic!("{n} states, {mode}: {error}");
+            };
+            assert!((real - mode).hypot(imaginary) < 1e-6, "{n} states, {mode}: {error}");
+        }
+    }
+}
+
 #[test]
 fn a_mode_on_the_unit_circle_without_noise_is_named() {
     let a = DMatrix::from_diagonal(&DVector::from_vec(vec![1.0, 0.5]));

@@ -89,6 +89,9 @@ struct Structure {
     reach: usize,
     /// Of rows of few entries: row of `M`, column of `M` (inputs first, then active states), entry.
     entries: Vec<(usize, usize, f64)>,
+    /// Inputs and rows of the map that they come from.
+    inputs: usize,
+    rows: usize,
     /// Where the columns of `P` and of `Mᵀ` begin that belong to full rows of `M`, and of the cross
     /// term.
     value_columns: Vec<usize>,
@@ -523,18 +526,19 @@ impl LqRecursion {
                 self.value = stage.q.clone();
             }
             let value = self.value.as_mut_slice();
+            let is_whole = active.last().is_none_or(|&last| last + 1 == active.len());
             for (j, &col) in active.iter().enumerate() {
                 let source = &bracket[stride * (m + j)..][m + j..width];
                 let column = &mut value[n * col..][..n];
-                for (&row, source) in active[j..].iter().zip(source) {
-                    column[row] += source;
+                if is_whole {
+                    subtract(&mut column[j..], -1.0, source);
+                } else {
+                    for (&row, source) in active[j..].iter().zip(source) {
+                        column[row] += source;
+                    }
                 }
             }
-            for (j, &col) in active.iter().enumerate() {
-                for &row in &active[j + 1..] {
-                    value[n * row + col] = value[n * col + row];
-                }
-            }
+            mirror(value, n, active);
         }
         if self.linear.len() != n {
             self.linear = DVector::zeros(n);
@@ -612,56 +616,124 @@ impl Structure {
         value_stride: usize,
     ) {
         let ((next, n), m) = (a.shape(), b.ncols());
-        let Self { counts, active, full, reach, entries, .. } = self;
-        counts.clear();
-        counts.resize(next, 0.0);
-        active.clear();
-        for col in 0..m {
-            count(counts, &b.as_slice()[next * col..][..next]);
-        }
-        for state in 0..n {
-            let is_active = count(counts, &a.as_slice()[next * state..][..next]);
-            if is_active || s.is_some_and(|s| (0..m).any(|j| s[(state, j)] != 0.0)) {
-                active.push(state);
-            }
+        let column = |col: usize| next * col..next * (col + 1);
+        self.counts.clear();
+        self.counts.resize(next, 0.0);
+        count(&mut self.counts, b.as_slice());
+        count(&mut self.counts, a.as_slice());
+        let is_active = |state: &usize| {
+            !is_zero(&a.as_slice()[column(*state)])
+                || s.is_some_and(|s| (0..m).any(|j| s[(*state, j)] != 0.0))
+        };
+        let is_same = (0..n).filter(is_active).eq(self.active.iter().copied());
+        if !is_same {
+            self.active.clear();
+            self.active.extend((0..n).filter(is_active));
         }
         // Where there is little to spare, all rows are as good as full.
         let few = if n + m > 4 * FEW { FEW as f64 } else { -1.0 };
-        full.clear();
-        full.extend((0..next).filter(|&row| counts[row] > few));
+        self.full.clear();
+        self.full.extend((0..next).filter(|&row| self.counts[row] > few));
+        let full = &self.full;
         let reaches = |row: usize| {
-            let column = &value.as_slice()[next * row..][..next];
+            let column = &value.as_slice()[column(row)];
             full.iter().any(|&full| column[full] != 0.0)
         };
         let last_full = full.last().map_or(0, |row| row + 1);
-        *reach = (last_full..next).rev().find(|&row| reaches(row)).map_or(last_full, |row| row + 1);
-        entries.clear();
-        for row in (0..next).filter(|&row| counts[row] <= few) {
-            let inputs = (0..m).map(|j| (j, b[(row, j)]));
-            let states = active.iter().enumerate().map(|(i, &state)| (m + i, a[(row, state)]));
-            let present = inputs.chain(states).filter(|&(_, entry)| entry != 0.0);
-            let rest = counts[row] as usize;
-            entries.extend(present.take(rest).map(|(col, entry)| (row, col, entry)));
+        self.reach =
+            (last_full..next).rev().find(|&row| reaches(row)).map_or(last_full, |row| row + 1);
+        if !(is_same && self.renew_entries(a, b, few)) {
+            self.find_entries(a, b, few);
         }
-        let stride = (m + active.len()).next_multiple_of(LANES);
+        let stride = (m + self.active.len()).next_multiple_of(LANES);
         for (starts, count, stride) in
-            [(&mut self.map_columns, full.len(), stride), (&mut self.cross_columns, m, stride)]
+            [(&mut self.map_columns, self.full.len(), stride), (&mut self.cross_columns, m, stride)]
         {
             starts.clear();
             starts.extend((0..count).map(|k| stride * k));
         }
         self.value_columns.clear();
-        self.value_columns.extend(full.iter().map(|row| value_stride * row));
+        self.value_columns.extend(self.full.iter().map(|row| value_stride * row));
+    }
+
+    /// The entry of `M` in a column of the active ones.
+    #[inline(always)]
+    fn entry(&self, a: &DMatrix<f64>, b: &DMatrix<f64>, row: usize, col: usize) -> f64 {
+        let (next, m) = b.shape();
+        if col < m {
+            b.as_slice()[next * col + row]
+        } else {
+            a.as_slice()[next * self.active[col - m] + row]
+        }
+    }
+
+    /// Reads entries where the last map had them; whether these are all.
+    #[inline(always)]
+    fn renew_entries(&mut self, a: &DMatrix<f64>, b: &DMatrix<f64>, few: f64) -> bool {
+        let (next, m) = b.shape();
+        if self.inputs != m || self.rows != next {
+            return false;
+        }
+        let mut entries = std::mem::take(&mut self.entries);
+        for (row, col, entry) in &mut entries {
+            *entry = self.entry(a, b, *row, *col);
+        }
+        // As many entries as the rows have, none of them zero, are all of them.
+        let present =
+            entries.iter().filter(|&&(row, _, entry)| entry != 0.0 && self.counts[row] <= few);
+        let present = present.count();
+        let expected: f64 = self.counts.iter().filter(|&&count| count <= few).sum();
+        let is_whole = present == entries.len() && present as f64 == expected;
+        self.entries = entries;
+        is_whole
+    }
+
+    fn find_entries(&mut self, a: &DMatrix<f64>, b: &DMatrix<f64>, few: f64) {
+        let (next, m) = b.shape();
+        (self.inputs, self.rows) = (m, next);
+        let mut entries = std::mem::take(&mut self.entries);
+        entries.clear();
+        for row in (0..next).filter(|&row| self.counts[row] <= few) {
+            let present = (0..m + self.active.len())
+                .map(|col| (row, col, self.entry(a, b, row, col)))
+                .filter(|&(_, _, entry)| entry != 0.0);
+            entries.extend(present.take(self.counts[row] as usize));
+        }
+        self.entries = entries;
     }
 }
 
-/// Counts the entries of a column in its rows; whether there are any.
+/// Adds the numbers of entries in the rows of a matrix of columns.
 #[inline(always)]
-fn count(counts: &mut [f64], column: &[f64]) -> bool {
-    for (count, &entry) in counts.iter_mut().zip(column) {
-        *count += if entry == 0.0 { 0.0 } else { 1.0 };
+fn count(counts: &mut [f64], columns: &[f64]) {
+    const ROWS: usize = 16;
+    let rows = counts.len();
+    let (blocks, rest) = counts.as_chunks_mut::<ROWS>();
+    let start_of_rest = ROWS * blocks.len();
+    for (k, block) in blocks.iter_mut().enumerate() {
+        let mut sums = *block;
+        for column in columns.chunks_exact(rows) {
+            let entries: &[f64] = &column[ROWS * k..][..ROWS];
+            for (sum, &entry) in sums.iter_mut().zip(entries) {
+                *sum += if entry == 0.0 { 0.0 } else { 1.0 };
+            }
+        }
+        *block = sums;
     }
-    column.iter().any(|&entry| entry != 0.0)
+    if !rest.is_empty() {
+        for column in columns.chunks_exact(rows) {
+            for (sum, &entry) in rest.iter_mut().zip(&column[start_of_rest..]) {
+                *sum += if entry == 0.0 { 0.0 } else { 1.0 };
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn is_zero(column: &[f64]) -> bool {
+    let (blocks, rest) = column.as_chunks::<LANES>();
+    let is_zero = |entries: &[f64]| entries.iter().fold(true, |zero, &entry| zero & (entry == 0.0));
+    blocks.iter().all(|block| is_zero(block)) && is_zero(rest)
 }
 
 /// `Mᵀ` of the given rows of `M`, padded with zeros.
@@ -710,6 +782,20 @@ fn factorize(c: &mut [f64], stride: usize, m: usize) -> Result<(), NotConvex> {
     Ok(())
 }
 
+/// Copies the lower triangle of the given rows and columns to the upper one, block by block.
+#[inline(always)]
+fn mirror(value: &mut [f64], n: usize, indices: &[usize]) {
+    for (first, cols) in indices.chunks(LANES).enumerate() {
+        for rows in indices[LANES * first..].chunks(LANES) {
+            for &row in rows {
+                for &col in cols.iter().take_while(|&&col| col < row) {
+                    value[n * row + col] = value[n * col + row];
+                }
+            }
+        }
+    }
+}
+
 #[inline(always)]
 fn subtract(target: &mut [f64], factor: f64, source: &[f64]) {
     for (target, source) in target.iter_mut().zip(source) {
@@ -739,17 +825,210 @@ fn multiply_add(c: &mut [f64], sign: f64, a: &DMatrix<f64>, b: &[f64]) {
 
 /// Reciprocal condition, in the 1-norm, of `L Lᵀ`; at most 1.
 pub(super) fn reciprocal_condition(factor: &DMatrix<f64>) -> f64 {
-    let l = factor.lower_triangle();
-    let Some(inverse) = l.solve_lower_triangular(&DMatrix::identity(l.nrows(), l.ncols())) else {
-        return 0.0;
-    };
-    let norm = |m: DMatrix<f64>| m.column_iter().map(|c| c.lp_norm(1)).fold(0.0, f64::max);
-    let product = norm(&l * l.transpose()) * norm(inverse.transpose() * &inverse);
+    let m = factor.nrows();
+    // Columns of the inverse of L.
+    let mut inverse = DMatrix::<f64>::zeros(m, m);
+    for j in 0..m {
+        inverse[(j, j)] = 1.0;
+        for k in j..m {
+            let known = inverse[(k, j)] / factor[(k, k)];
+            let (source, column) = (factor.as_slice(), inverse.as_mut_slice());
+            column[m * j + k] = known;
+            subtract(&mut column[m * j..][k + 1..m], known, &source[m * k..][k + 1..m]);
+        }
+    }
+    let (l, inverse) = (factor.as_slice(), inverse.as_slice());
+    let dot = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(x, y)| x * y).sum::<f64>();
+    let (mut largest, mut largest_inverse) = (0.0_f64, 0.0_f64);
+    let mut column = vec![0.0; m];
+    for j in 0..m {
+        // Column j of L Lᵀ, then of its inverse.
+        column.fill(0.0);
+        for k in 0..=j {
+            subtract(&mut column[k..], -l[m * k + j], &l[m * k..][k..m]);
+        }
+        largest = largest.max(column.iter().map(|entry| entry.abs()).sum());
+        let sum = (0..m).map(|i| {
+            let first = i.max(j);
+            dot(&inverse[m * i..][first..m], &inverse[m * j..][first..m]).abs()
+        });
+        largest_inverse = largest_inverse.max(sum.sum());
+    }
+    let product = largest * largest_inverse;
     if product.is_nan() {
         0.0
     } else if product > 1.0 {
         product.recip()
     } else {
         1.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Numbers in (-1, 1) that follow no pattern.
+    fn noise(rows: usize, cols: usize, seed: f64) -> DMatrix<f64> {
+        DMatrix::from_fn(rows, cols, |i, j| {
+            let x = (12.9898 * i as f64 + 78.233 * j as f64 + seed).sin() * 43758.5453;
+            2.0 * (x - x.floor()) - 1.0
+        })
+    }
+
+    /// The map of a system with prescribed coordinates: rows of a single entry, rows of two, columns
+    /// of zeros.
+    fn prescribed(dynamic: usize, prescribed: usize, seed: f64) -> (DMatrix<f64>, DMatrix<f64>) {
+        let (nd, nk) = (dynamic, prescribed);
+        let n = 2 * (nd + nk);
+        let mut a = noise(n, n, seed) * 0.2;
+        let mut b = noise(n, nk, seed + 0.5);
+        a.columns_mut(2 * nd + nk, nk).fill(0.0);
+        for i in 0..nk {
+            let (position, velocity) = (nd + i, 2 * nd + nk + i);
+            for row in [position, velocity] {
+                a.row_mut(row).fill(0.0);
+                b.row_mut(row).fill(0.0);
+            }
+            b[(position, i)] = 1.0;
+            b[(velocity, i)] = 10.0;
+            a[(velocity, position)] = -10.0;
+        }
+        (a, b)
+    }
+
+    fn error(found: &DMatrix<f64>, expected: &DMatrix<f64>) -> f64 {
+        if expected.is_empty() {
+            return 0.0;
+        }
+        (found - expected).amax() / expected.amax().max(1e-300)
+    }
+
+    /// The recursion against its formulas, step by step, with a weight that is not definite and a map
+    /// whose structure changes from step to step.
+    #[test]
+    fn fast_steps_follow_the_formulas() {
+        let plain =
+            |n: usize, m: usize| (noise(n, n, 1.0) * (1.0 / (n as f64).sqrt()), noise(n, m, 2.0));
+        let maps = [
+            vec![plain(1, 1)],
+            vec![plain(2, 1)],
+            vec![plain(4, 1)],
+            vec![plain(5, 3), plain(5, 3)],
+            vec![plain(8, 8)],
+            vec![plain(9, 2), (DMatrix::zeros(9, 9), noise(9, 2, 1.0))],
+            vec![plain(40, 20), (DMatrix::identity(40, 40), noise(40, 20, 1.0))],
+            vec![plain(12, 0)],
+            vec![plain(3, 0)],
+            vec![plain(10, 12)],
+            vec![prescribed(5, 4, 1.0), plain(18, 4), prescribed(5, 4, 2.0)],
+            vec![prescribed(22, 18, 1.0), prescribed(22, 18, 2.0)],
+        ];
+        for maps in maps {
+            let (n, m) = maps[0].1.shape();
+            let mut recursion = LqRecursion::new(n, m);
+            let start = noise(n, n, 3.0);
+            let (mut p, mut linear) = (&start * start.transpose(), DVector::zeros(n));
+            recursion.begin(&p, None);
+            let (mut gain, mut offset) = (DMatrix::zeros(m, n), DVector::zeros(m));
+            for (k, (a, b)) in maps.iter().cycle().take(6).enumerate() {
+                let q = noise(n, n, 4.0);
+                let q = &q * q.transpose() / n as f64 - DMatrix::identity(n, n) * 0.01;
+                let r = DMatrix::identity(m, m) * 500.0;
+                let s = noise(n, m, 5.0);
+                let x_linear = noise(n, 1, 6.0).column(0).into_owned();
+                let u_linear = noise(m, 1, 7.0).column(0).into_owned();
+                let has_more = k % 2 == 1;
+                let stage = Stage {
+                    q: &q,
+                    r: &r,
+                    s: has_more.then_some(&s),
+                    x_linear: has_more.then_some(&x_linear),
+                    u_linear: has_more.then_some(&u_linear),
+                };
+                recursion.step(a, b, stage, &mut gain, &mut offset).unwrap();
+                let more = if has_more { 1.0 } else { 0.0 };
+                let bracket = b.transpose() * &p * b + &r;
+                let cross = b.transpose() * &p * a + s.transpose() * more;
+                let input = b.transpose() * &linear + &u_linear * more;
+                let inverse = bracket.clone().try_inverse().unwrap();
+                let (expected_gain, expected_offset) = (&inverse * &cross, &inverse * input);
+                linear = a.transpose() * &linear + &x_linear * more
+                    - cross.transpose() * &expected_offset;
+                p = &q + a.transpose() * &p * a - cross.transpose() * &expected_gain;
+                let name = format!("{n} states, {m} inputs, step {k}");
+                let off = error(&gain, &expected_gain);
+                assert!(off < 1e-11, "{name}: {off:e}");
+                assert!(error(recursion.value(), &p) < 1e-11, "{name}");
+                assert_eq!(recursion.value(), &recursion.value().transpose(), "{name}");
+                let vector =
+                    |v: &DVector<f64>| DMatrix::from_column_slice(v.len(), 1, v.as_slice());
+                assert!(error(&vector(&offset), &vector(&expected_offset)) < 1e-10, "{name}");
+                assert!(error(&vector(recursion.linear()), &vector(&linear)) < 1e-10, "{name}");
+                let norm =
+                    |m: &DMatrix<f64>| m.column_iter().map(|c| c.lp_norm(1)).fold(0.0, f64::max);
+                let condition = 1.0 / (norm(&bracket) * norm(&inverse)).max(1.0);
+                assert!(
+                    (recursion.reciprocal_condition() / condition - 1.0).abs() < 1e-10,
+                    "{name}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_stage_without_a_minimum_leaves_the_cost_to_go() {
+        for n in [2, 12] {
+            let (a, b) = (noise(n, n, 1.0), noise(n, 1, 2.0));
+            let (q, r) = (DMatrix::identity(n, n), -DMatrix::identity(1, 1) * 1e3);
+            let stage = Stage { q: &q, r: &r, s: None, x_linear: None, u_linear: None };
+            let mut recursion = LqRecursion::new(n, 1);
+            let linear = DVector::from_element(n, 1.0);
+            recursion.begin(&q, Some(&linear));
+            let (mut gain, mut offset) = (DMatrix::zeros(1, n), DVector::zeros(1));
+            assert_eq!(recursion.step(&a, &b, stage, &mut gain, &mut offset), Err(NotConvex));
+            assert_eq!((recursion.value(), recursion.linear()), (&q, &linear));
+            let nan = Stage { r: &(&r * f64::NAN), ..stage };
+            assert_eq!(recursion.step(&a, &b, nan, &mut gain, &mut offset), Err(NotConvex));
+        }
+    }
+
+    #[test]
+    fn a_map_may_lead_from_one_number_of_states_to_another() {
+        for (next, n) in [(2, 3), (12, 14), (14, 12), (3, 12)] {
+            let (a, b, p) =
+                (noise(next, n, 1.0), noise(next, 2, 2.0), DMatrix::identity(next, next));
+            let (q, r) = (DMatrix::identity(n, n), DMatrix::identity(2, 2));
+            let stage = Stage { q: &q, r: &r, s: None, x_linear: None, u_linear: None };
+            let mut recursion = LqRecursion::new(next, 2);
+            recursion.begin(&p, None);
+            let (mut gain, mut offset) = (DMatrix::zeros(2, n), DVector::zeros(2));
+            recursion.step(&a, &b, stage, &mut gain, &mut offset).unwrap();
+            let bracket = b.transpose() * &b + r;
+            let expected = bracket.try_inverse().unwrap() * b.transpose() * &a;
+            assert!(error(&gain, &expected) < 1e-12);
+            let value = &q + a.transpose() * &a - a.transpose() * &b * expected;
+            assert!(error(recursion.value(), &value) < 1e-12);
+            assert_eq!(recursion.linear().len(), n);
+        }
+    }
+
+    /// With cheap control almost all of `Q + AᵀPA` cancels: the state is put where it costs nothing.
+    #[test]
+    fn what_cancels_keeps_its_digits() {
+        for n in [2, 12] {
+            let a = noise(n, n, 1.0) * 1e6;
+            let b = DMatrix::identity(n, n);
+            let (q, r) = (DMatrix::identity(n, n), DMatrix::identity(n, n) * 1e-12);
+            let stage = Stage { q: &q, r: &r, s: None, x_linear: None, u_linear: None };
+            let mut recursion = LqRecursion::new(n, n);
+            recursion.begin(&q, None);
+            let (mut gain, mut offset) = (DMatrix::zeros(n, n), DVector::zeros(n));
+            recursion.step(&a, &b, stage, &mut gain, &mut offset).unwrap();
+            // P = Q + Aᵀ (I − (1 + r)⁻¹) A = Q + Aᵀ A r / (1 + r).
+            let expected = &q + a.transpose() * &a * (1e-12 / (1.0 + 1e-12));
+            let off = error(recursion.value(), &expected);
+            assert!(off < 1e-9, "{n} states: off by {off:e}");
+        }
     }
 }
