@@ -39,9 +39,10 @@
 //! **Bounds** are held by an augmented Lagrangian: each end of each bound at each step has a multiplier
 //! `λ` and adds `(max(0, λ + ρ c)² − λ²) / 2ρ` for its excess `c`, whose kink is passed over (semi-smooth
 //! Newton). `ρ` is the penalty times the weight of the entry in the cost, or the mean weight where that
-//! is zero. When the directional derivative is within the tolerance, or a millionth of the first cost if
-//! that is larger, and the bounds are not met, the multipliers are renewed, `λ ← max(0, λ + ρ c)`, and
-//! the penalty, 10 at first, grows tenfold if the error has not fallen to a quarter. The search has
+//! is zero. When the bounds are not met and the directional derivative is within the tolerance, or, if that
+//! is larger, within a hundredth of the penalties' energy `Σ ½ ρ error²` and a millionth of the first cost,
+//! the multipliers are renewed, `λ ← max(0, λ + ρ c)`, and the penalty, 10 at first, grows tenfold if the
+//! error has not fallen to a quarter. The search has
 //! converged when besides the directional derivative the error, `max |max(c, −λ/ρ)|`, is within
 //! `bound_tolerance`. Bounds of a rotation vector's entries count without their curvature. Equal ends fix
 //! an entry, so that bounds of the final state make terminal constraints.
@@ -78,6 +79,8 @@ mod bounds;
 mod error;
 mod problem;
 mod search;
+#[cfg(test)]
+mod tests;
 mod trajectory;
 
 use nalgebra::DMatrix;

@@ -4,7 +4,7 @@ mod common;
 
 use common::{builtin, plant, waving_input};
 use nalgebra::DMatrix;
-use plantd_models::reference::{check_reference, project};
+use plantd_models::reference::{ReferenceError, check_reference, project};
 use plantd_models::{ForceSplit, Plant};
 
 /// Configurations and inputs of a motion under waving inputs.
@@ -67,4 +67,75 @@ fn a_motion_is_feasible_with_its_own_inputs() {
             assert!(projected.deviation < 1e-9, "{name} {split:?}: {}", projected.deviation);
         }
     }
+}
+
+#[test]
+fn what_is_no_motion_is_told_and_named() {
+    let motion = Motion::new("cart-pole", ForceSplit::Symmetric, 100);
+    let theta = motion.start.model().coordinate_index("theta").unwrap();
+
+    // The pole swings farther than gravity lets it: no input acts on it.
+    let mut wider = motion.q.clone();
+    wider.column_mut(theta).scale_mut(1.3);
+    let found = check_reference(&motion.start, &wider, None).unwrap();
+    assert!(!found.is_feasible(1e-3));
+    assert_eq!(found.unexplained_coordinate, "theta");
+    assert!(found.unexplained_force > 1e-3 && found.unexplained_step > 0);
+    // The plant follows as well as it can.
+    let projected = project(&motion.start, &wider, &found, None, false).unwrap();
+    assert!(projected.deviation > 1e-3 && projected.deviation < 0.5, "{projected:?}");
+    let n = motion.start.model().dimensions().coordinates();
+    let q = projected.states.columns(0, n).into_owned();
+    let again = check_reference(&motion.start, &q, Some(&projected.inputs)).unwrap();
+    assert!(again.is_feasible(1e-8), "{again:?}");
+
+    // A single row that is displaced is found where it is.
+    let mut jump = motion.q.clone();
+    jump[(40, theta)] += 1e-3;
+    let found = check_reference(&motion.start, &jump, Some(&motion.u)).unwrap();
+    assert!(found.unexplained_acceleration > 1.0);
+    assert!(found.unexplained_step.abs_diff(40) <= 1, "{}", found.unexplained_step);
+
+    // The cart has its input: any motion of it alone can be had, given the pole's reaction.
+    let mut shifted = motion.q.clone();
+    shifted.column_mut(1 - theta).add_scalar_mut(0.7);
+    let found = check_reference(&motion.start, &shifted, Some(&motion.u)).unwrap();
+    assert!(found.is_feasible(1e-8), "the rail is the same everywhere: {found:?}");
+}
+
+#[test]
+fn violated_constraints_are_named() {
+    let motion = Motion::new("four-bar", ForceSplit::Symmetric, 60);
+    let mut q = motion.q.clone();
+    q[(30, 0)] += 0.01;
+    let found = check_reference(&motion.start, &q, None).unwrap();
+    assert!(found.constraint_violation > 1e-4);
+    assert_eq!(found.constraint_violation_step, 30);
+    assert!(motion.start.model().constraint_names().contains(&found.constraint));
+
+    // Inputs that prescribe other positions than the reference has.
+    let motion = Motion::new("marionette", ForceSplit::Symmetric, 20);
+    let mut u = motion.u.clone();
+    u[(10, 3)] += 0.02;
+    let found = check_reference(&motion.start, &motion.q, Some(&u)).unwrap();
+    assert!((found.constraint_violation - 0.02).abs() < 1e-12);
+    assert_eq!(found.constraint_violation_step, 11);
+    let nd = motion.start.model().dimensions().dynamic;
+    assert_eq!(found.constraint, motion.start.model().coordinates()[nd + 3].name);
+}
+
+#[test]
+fn faults_of_a_reference_are_named() {
+    let motion = Motion::new("pendulum", ForceSplit::Symmetric, 5);
+    let refuse = |q: &DMatrix<f64>, u: Option<&DMatrix<f64>>| {
+        check_reference(&motion.start, q, u).unwrap_err()
+    };
+    assert_eq!(refuse(&DMatrix::zeros(1, 1), None), ReferenceError::TooShort { rows: 1 });
+    let found = refuse(&DMatrix::zeros(6, 2), None);
+    assert!(matches!(found, ReferenceError::Dimension { what: "q", expected_cols: 1, .. }));
+    let found = refuse(&motion.q, Some(&DMatrix::zeros(6, 1)));
+    assert!(matches!(found, ReferenceError::Dimension { what: "u", expected_rows: 5, .. }));
+    let mut q = motion.q.clone();
+    q[(3, 0)] = f64::INFINITY;
+    assert_eq!(refuse(&q, None), ReferenceError::NotFinite { what: "q", row: 3, col: 0 });
 }

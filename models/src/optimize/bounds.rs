@@ -152,6 +152,11 @@ impl End {
         }
     }
 
+    /// `ρ`.
+    pub(super) fn weight(&self, penalty: f64) -> f64 {
+        penalty * self.scale
+    }
+
     /// The multiplier after this one.
     pub(super) fn renewed(&self, number: f64, multiplier: f64, penalty: f64) -> f64 {
         let next = multiplier + penalty * self.scale * self.excess(number);

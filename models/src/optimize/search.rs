@@ -1,9 +1,11 @@
 //! The search, one iteration at a time.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
+use super::bounds::End;
 use super::problem::{Deviation, Problem, check, dot};
 use super::trajectory::{Trajectory, rows};
 use super::{
@@ -13,7 +15,7 @@ use super::{
 use crate::control::lq::{LqRecursion, Stage};
 use crate::control::{Sample, Weights, tangent_basis};
 use crate::plant::known::KnownStep;
-use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State};
+use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State, StepError};
 
 /// Penalty with which a search begins.
 const FIRST_PENALTY: f64 = 10.0;
@@ -25,10 +27,14 @@ const PENALTY_WORKS: f64 = 0.25;
 const PENALTY_MAX: f64 = 1e9;
 /// Part of the first cost to which the cost is minimised before multipliers are renewed.
 const RENEW_BELOW: f64 = 1e-6;
+/// The same as part of the penalties' energy.
+const RENEW_WITHIN: f64 = 1e-2;
 /// Tolerance where none is given, in units of the first cost.
 const TOLERANCE: f64 = 1e-9;
 /// A promised decrease below this part of the cost drowns in its round-off.
 const ROUND_OFF: f64 = 1e-12;
+/// A step of fewer states is differentiated sooner than a thread starts.
+const STATES_FOR_THREADS: usize = 12;
 /// Steps between two questions whether to go on.
 const STEPS_BETWEEN_QUESTIONS: usize = 16;
 
@@ -67,22 +73,49 @@ pub struct Optimizer {
     descent_offsets: Vec<DVector<f64>>,
     dx: Vec<f64>,
     du: Vec<f64>,
+    /// One per thread; at least one.
+    workers: Vec<Worker>,
     scratch: Scratch,
+}
+
+/// What a thread needs of its own to differentiate steps.
+#[derive(Debug)]
+struct Worker {
+    plant: Plant,
+    linearization: Linearization,
+    contraction: Contraction,
+}
+
+/// Second derivatives of one step.
+#[derive(Clone, Debug)]
+struct Second {
+    xx: DMatrix<f64>,
+    xu: DMatrix<f64>,
+    uu: DMatrix<f64>,
+}
+
+impl Second {
+    fn new(states: usize, inputs: usize) -> Self {
+        Self {
+            xx: DMatrix::zeros(states, states),
+            xu: DMatrix::zeros(states, inputs),
+            uu: DMatrix::zeros(inputs, inputs),
+        }
+    }
 }
 
 /// Memory that iterations use again.
 #[derive(Debug)]
 struct Scratch {
-    /// One per step where Newton's method contracts them, else one in all.
+    /// One per step where Newton's method contracts them, else none.
     linearizations: Vec<Linearization>,
-    contraction: Contraction,
+    /// Contractions of the block at hand, and of the one that is made meanwhile; empty without Newton's
+    /// method.
+    contractions: [Vec<Second>; 2],
     recursion: LqRecursion,
     deviation: Deviation,
-    q: DMatrix<f64>,
-    r: DMatrix<f64>,
-    s: DMatrix<f64>,
-    identity_x: DMatrix<f64>,
-    identity_u: DMatrix<f64>,
+    weights: Second,
+    identity: Second,
     offset: DVector<f64>,
     adjoint: Vec<DVector<f64>>,
     nominal: Vec<f64>,
@@ -206,19 +239,22 @@ impl Optimizer {
         let vectors = |n: usize, count: usize| vec![DVector::zeros(n); count];
         let gains = || vec![DMatrix::zeros(width, states); steps];
         let methods = [Some(options.method), options.first_method];
-        let kept = if methods.contains(&Some(Method::Newton)) { steps } else { 1 };
+        let (kept, block) = match methods.contains(&Some(Method::Newton)) {
+            true => (steps, block_length(states).min(steps)),
+            false => (0, 0),
+        };
+        let mut identity = Second::new(states, width);
+        identity.xx.fill_with_identity();
+        identity.uu.fill_with_identity();
         let sample = Sample { a: DMatrix::zeros(states, states), b: DMatrix::zeros(states, width) };
         let mut search = Self {
             scratch: Scratch {
                 linearizations: vec![Linearization::new(&model); kept],
-                contraction: Contraction::new(&model),
+                contractions: [0; 2].map(|_| vec![Second::new(states, width); block]),
                 recursion: LqRecursion::new(states, width),
                 deviation: problem.deviation(),
-                q: DMatrix::zeros(states, states),
-                r: DMatrix::zeros(width, width),
-                s: DMatrix::zeros(states, width),
-                identity_x: DMatrix::identity(states, states),
-                identity_u: DMatrix::identity(width, width),
+                weights: Second::new(states, width),
+                identity,
                 offset: DVector::zeros(width),
                 adjoint: vectors(states, steps + 1),
                 nominal: vec![0.0; states],
@@ -247,6 +283,7 @@ impl Optimizer {
             current,
             trial_start: start.clone(),
             start,
+            workers: vec![Worker::new(&plant)],
             plant,
             projection,
             options,
@@ -270,6 +307,16 @@ impl Optimizer {
             problem.evaluate(problem.steps, current.x(problem.steps), &[], &mut scratch.deviation);
         current.cost = cost;
         if cost.is_finite() { Ok(()) } else { Err(OptimizeError::Cost { cost }) }
+    }
+
+    /// Lets `threads` threads share the linearizations and contractions of an iteration, where the model
+    /// is large enough to gain from it; 1 at first. Results are the same to the bit for any number.
+    pub fn set_threads(&mut self, threads: usize) {
+        let useful = if self.problem.states < STATES_FOR_THREADS { 1 } else { threads.max(1) };
+        self.workers.truncate(useful);
+        while self.workers.len() < useful {
+            self.workers.push(Worker::new(&self.plant));
+        }
     }
 
     /// Whether the search goes on.
@@ -368,7 +415,10 @@ impl Optimizer {
         };
         if !self.has_ended(derivative) {
             let found = self.search_along(derivative, &mut progress, go_on)?;
-            if !found && derivative.abs() <= ROUND_OFF * self.current.merit.abs() {
+            let round_off = ROUND_OFF * self.current.merit.abs();
+            if !found && self.can_renew(derivative) {
+                self.renew_multipliers(self.error_of_bounds());
+            } else if !found && derivative.abs() <= round_off {
                 self.end_at_round_off();
             } else if !found {
                 self.status = Status::Stuck(Stuck::NoDescent {
@@ -414,11 +464,28 @@ impl Optimizer {
             }
             return size <= tolerance;
         }
-        if size <= tolerance.max(RENEW_BELOW * self.first_cost.abs()) {
+        if size <= tolerance.max(self.renew_below()) {
             self.renew_multipliers(error);
             return true;
         }
         false
+    }
+
+    /// Whether other multipliers may help where the kinks of the penalties let no step descend.
+    fn can_renew(&self, derivative: f64) -> bool {
+        self.problem.has_bounds()
+            && derivative.abs() <= RENEW_BELOW * self.first_cost.abs()
+            && self.error_of_bounds() > self.options.bound_tolerance
+    }
+
+    /// The directional derivative at which multipliers are renewed: so small that the errors of bounds are
+    /// those of the penalty, not of a minimum that is not reached yet.
+    fn renew_below(&self) -> f64 {
+        let energy = self.sum(|end, number, multiplier| {
+            let error = end.error(number, multiplier, self.penalty);
+            0.5 * end.weight(self.penalty) * error * error
+        });
+        (RENEW_WITHIN * energy).min(RENEW_BELOW * self.first_cost.abs())
     }
 
     /// The cost is as low as its own round-off lets it be.
@@ -464,20 +531,29 @@ impl Optimizer {
         self.worst(|end, number, multiplier| end.error(number, multiplier, self.penalty))
     }
 
-    fn worst(&self, measure: impl Fn(&super::bounds::End, f64, f64) -> f64) -> f64 {
+    fn worst(&self, measure: impl Fn(&End, f64, f64) -> f64) -> f64 {
+        self.fold_bounds(|worst, end, number, multiplier| {
+            worst.max(measure(end, number, multiplier))
+        })
+    }
+
+    fn sum(&self, measure: impl Fn(&End, f64, f64) -> f64) -> f64 {
+        self.fold_bounds(|sum, end, number, multiplier| sum + measure(end, number, multiplier))
+    }
+
+    /// Over all ends of bounds at all steps, with the number that is bounded and its multiplier.
+    fn fold_bounds(&self, fold: impl Fn(f64, &End, f64, f64) -> f64) -> f64 {
         let (problem, current) = (&self.problem, &self.current);
-        let mut worst = 0.0_f64;
+        let mut value = 0.0;
         for k in 0..=problem.steps {
             for (end, place) in problem.ends.at(false, k) {
-                let number = current.x(k)[end.index];
-                worst = worst.max(measure(end, number, self.multipliers[place]));
+                value = fold(value, end, current.x(k)[end.index], self.multipliers[place]);
             }
             for (end, place) in problem.ends.at(true, k).filter(|_| k < problem.steps) {
-                let number = current.u(k)[end.index];
-                worst = worst.max(measure(end, number, self.multipliers[place]));
+                value = fold(value, end, current.u(k)[end.index], self.multipliers[place]);
             }
         }
-        worst
+        value
     }
 
     /// Cost with the penalties of bounds.
@@ -505,30 +581,51 @@ impl Optimizer {
         if self.is_linearized {
             return Ok(());
         }
-        let Self { problem, plant, current, samples, gains, scratch, .. } = self;
+        let Self { problem, workers, current, samples, gains, scratch, projection, .. } = self;
         let n = problem.model.dimensions().coordinates();
-        for (k, sample) in samples.iter_mut().enumerate() {
-            ask(k, go_on)?;
-            let step = known(current, k, self.first_step, n);
-            let kept = scratch.linearizations.len() - 1;
-            let out = &mut scratch.linearizations[k.min(kept)];
-            plant
-                .linearize_known(&step, out)
-                .map_err(|error| OptimizeError::Linearization { step: k, error })?;
-            out.write_a(&mut sample.a);
-            out.write_b(&mut sample.b);
-        }
-        scratch.recursion.begin(self.projection.q_final(), None);
-        for (k, (sample, gain)) in samples.iter().zip(gains).enumerate().rev() {
-            ask(k, go_on)?;
-            let stage = self.projection.stage().stage();
-            scratch
-                .recursion
-                .step(&sample.a, &sample.b, stage, gain, &mut scratch.offset)
-                .map_err(|_| OptimizeError::Projection { step: k })?;
-            if !gain.iter().all(|entry| entry.is_finite()) {
-                return Err(OptimizeError::Projection { step: k });
+        let Scratch { linearizations, recursion, offset, .. } = scratch;
+        let first_step = self.first_step;
+        recursion.begin(projection.q_final(), None);
+        for (made, used) in blocks(problem.steps, problem.states) {
+            if !go_on() {
+                return Err(OptimizeError::Cancelled);
             }
+            let (head, tail) = samples.split_at_mut(used.start);
+            let kept = if linearizations.is_empty() { 0..0 } else { made.clone() };
+            let (head, mut rest) = (&mut head[made.clone()], &mut linearizations[kept]);
+            let share = made.len().div_ceil(workers.len()).max(1);
+            let mut jobs: Vec<LinearizeJob<'_>> = Vec::with_capacity(workers.len());
+            for (part, samples) in head.chunks_mut(share).enumerate() {
+                let (kept, others) = rest.split_at_mut(samples.len().min(rest.len()));
+                rest = others;
+                jobs.push((made.start + part * share, samples, kept));
+            }
+            let job = |worker: &mut Worker, (first, samples, kept): LinearizeJob<'_>| {
+                let mut kept = kept.iter_mut();
+                for (k, sample) in (first..).zip(samples) {
+                    let step = known(current, k, first_step, n);
+                    let out = kept.next().unwrap_or(&mut worker.linearization);
+                    worker.plant.linearize_known(&step, out).map_err(|error| (k, error))?;
+                    out.write_a(&mut sample.a);
+                    out.write_b(&mut sample.b);
+                }
+                Ok(())
+            };
+            let consume = || {
+                for k in used.clone().rev() {
+                    ask(k, go_on)?;
+                    let (sample, stage) = (&tail[k - used.start], projection.stage().stage());
+                    let gain = &mut gains[k];
+                    recursion
+                        .step(&sample.a, &sample.b, stage, gain, offset)
+                        .map_err(|_| OptimizeError::Projection { step: k })?;
+                    if !gain.iter().all(|entry| entry.is_finite()) {
+                        return Err(OptimizeError::Projection { step: k });
+                    }
+                }
+                Ok(())
+            };
+            share_work(workers, jobs, job, consume)?;
         }
         self.is_linearized = true;
         Ok(())
@@ -608,25 +705,14 @@ impl Optimizer {
     fn descend(&mut self, method: Method, go_on: Go<'_>) -> Result<Direction, OptimizeError> {
         let steps = self.problem.steps;
         self.final_weights(method);
-        self.scratch.recursion.begin(&self.scratch.q, Some(&self.by_x[steps]));
-        for k in (0..steps).rev() {
-            ask(k, go_on)?;
-            self.stage_weights(method, k)?;
-            let Self { samples, by_x, by_u, descent_gains, descent_offsets, scratch, .. } = self;
-            let has_cross = method == Method::Newton
-                || (method == Method::QuasiNewton && self.problem.stage(k).s().is_some());
-            let stage = Stage {
-                q: &scratch.q,
-                r: &scratch.r,
-                s: has_cross.then_some(&scratch.s),
-                x_linear: Some(&by_x[k]),
-                u_linear: Some(&by_u[k]),
-            };
-            let (gain, offset) = (&mut descent_gains[k], &mut descent_offsets[k]);
-            let (a, b) = (&samples[k].a, &samples[k].b);
-            if scratch.recursion.step(a, b, stage, gain, offset).is_err() {
-                return Ok(Direction::NotConvex { step: k });
-            }
+        self.scratch.recursion.begin(&self.scratch.weights.xx, Some(&self.by_x[steps]));
+        let not_convex = if method == Method::Newton {
+            self.contract_and_recur(go_on)?
+        } else {
+            self.recur(method, go_on)?
+        };
+        if let Some(step) = not_convex {
+            return Ok(Direction::NotConvex { step });
         }
         if !self.find_initial_change() {
             return Ok(Direction::NotConvex { step: 0 });
@@ -634,13 +720,106 @@ impl Optimizer {
         Ok(Direction::Found { derivative: self.roll_direction(go_on)? })
     }
 
+    /// The recursion without second derivatives of the map; the step at which it has no minimum.
+    fn recur(&mut self, method: Method, go_on: Go<'_>) -> Result<Option<usize>, OptimizeError> {
+        let bounds = (&self.multipliers[..], self.penalty);
+        let Self { problem, current, samples, by_x, by_u, scratch, .. } = self;
+        let Scratch { recursion, deviation, weights, identity, .. } = scratch;
+        for k in (0..problem.steps).rev() {
+            ask(k, go_on)?;
+            let at = (k, current.x(k), current.u(k));
+            let stage = Stage {
+                x_linear: Some(&by_x[k]),
+                u_linear: Some(&by_u[k]),
+                ..stage_weights(problem, method, at, bounds, deviation, weights, identity)
+            };
+            let (gain, offset) = (&mut self.descent_gains[k], &mut self.descent_offsets[k]);
+            let Sample { a, b } = &samples[k];
+            if recursion.step(a, b, stage, gain, offset).is_err() {
+                return Ok(Some(k));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The recursion with second derivatives of the map, which are contracted block by block.
+    fn contract_and_recur(&mut self, go_on: Go<'_>) -> Result<Option<usize>, OptimizeError> {
+        let bounds = (&self.multipliers[..], self.penalty);
+        let Self { problem, workers, current, samples, by_x, by_u, scratch, .. } = self;
+        let (descent_gains, descent_offsets) = (&mut self.descent_gains, &mut self.descent_offsets);
+        let Scratch {
+            linearizations,
+            contractions,
+            recursion,
+            deviation,
+            weights,
+            adjoint,
+            zero_multipliers,
+            ..
+        } = scratch;
+        let [mut made_now, mut made_before] = contractions.each_mut();
+        let (model, linearizations, adjoint) = (&*problem.model, &*linearizations, &*adjoint);
+        let zero_multipliers = &*zero_multipliers;
+        let mut not_convex = None;
+        for (made, used) in blocks(problem.steps, problem.states) {
+            if !go_on() {
+                return Err(OptimizeError::Cancelled);
+            }
+            let share = made.len().div_ceil(workers.len()).max(1);
+            let parts = made_now[..made.len()].chunks_mut(share).enumerate();
+            let jobs = parts.map(|(part, slots)| (made.start + part * share, slots)).collect();
+            let job = |worker: &mut Worker, (first, slots): (usize, &mut [Second])| {
+                for (k, slot) in (first..).zip(slots) {
+                    let z = adjoint[k + 1].as_slice();
+                    let contraction = &mut worker.contraction;
+                    contraction
+                        .contract(model, &linearizations[k], z, zero_multipliers)
+                        .map_err(|error| (k, error))?;
+                    // Not swapped: what is always zero is never written again.
+                    slot.xx.copy_from(&contraction.xx);
+                    slot.xu.copy_from(&contraction.xu);
+                    slot.uu.copy_from(&contraction.uu);
+                }
+                Ok(())
+            };
+            let consume = || {
+                for k in used.clone().rev() {
+                    ask(k, go_on)?;
+                    let second = &mut made_before[k - used.start];
+                    let at = (k, current.x(k), current.u(k));
+                    add_stage_weights(problem, at, bounds, deviation, weights, second);
+                    let stage = Stage {
+                        q: &second.xx,
+                        r: &second.uu,
+                        s: Some(&second.xu),
+                        x_linear: Some(&by_x[k]),
+                        u_linear: Some(&by_u[k]),
+                    };
+                    let (gain, offset) = (&mut descent_gains[k], &mut descent_offsets[k]);
+                    let Sample { a, b } = &samples[k];
+                    if recursion.step(a, b, stage, gain, offset).is_err() {
+                        not_convex = Some(k);
+                        break;
+                    }
+                }
+                Ok(())
+            };
+            share_work(workers, jobs, job, consume)?;
+            if not_convex.is_some() {
+                break;
+            }
+            std::mem::swap(&mut made_now, &mut made_before);
+        }
+        Ok(not_convex)
+    }
+
     /// Writes the second derivatives of the final cost.
     fn final_weights(&mut self, method: Method) {
         let Self { problem, current, scratch, .. } = self;
-        let Scratch { q, s, deviation, identity_x, .. } = scratch;
+        let Scratch { weights: Second { xx: q, xu: s, .. }, deviation, identity, .. } = scratch;
         let (steps, x) = (problem.steps, current.x(problem.steps));
         if method == Method::Steepest {
-            q.copy_from(identity_x);
+            q.copy_from(&identity.xx);
         } else {
             q.copy_from(problem.q_final());
             if !problem.model.orientations().is_empty() {
@@ -654,47 +833,6 @@ impl Optimizer {
         }
         let bounds = (&self.multipliers[..], self.penalty);
         problem.add_penalty_curvature(steps, (x, &[]), bounds, q, None);
-    }
-
-    /// Writes the second derivatives of step `k`.
-    fn stage_weights(&mut self, method: Method, k: usize) -> Result<(), OptimizeError> {
-        let Self { problem, current, scratch, .. } = self;
-        let Scratch { q, r, s, deviation, identity_x, identity_u, adjoint, .. } = scratch;
-        let Scratch { linearizations, contraction, zero_multipliers, .. } = scratch;
-        let (x, u) = (current.x(k), current.u(k));
-        if method == Method::Steepest {
-            q.copy_from(identity_x);
-            r.copy_from(identity_u);
-        } else {
-            let stage = problem.stage(k);
-            q.copy_from(stage.q());
-            r.copy_from(stage.r());
-            match stage.s() {
-                Some(cross) => s.copy_from(cross),
-                None => s.fill(0.0),
-            }
-            if !problem.model.orientations().is_empty() {
-                problem.evaluate(k, x, u, deviation);
-                problem.turn_weights(deviation, q, s);
-                if method == Method::Newton {
-                    problem.add_chart_curvature(deviation, q);
-                }
-            }
-        }
-        if method == Method::Newton {
-            let weights = adjoint[k + 1].as_slice();
-            contraction
-                .contract(&problem.model, &linearizations[k], weights, zero_multipliers)
-                .map_err(|error| OptimizeError::Linearization { step: k, error })?;
-            *q += &contraction.xx;
-            *s += &contraction.xu;
-            *r += &contraction.uu;
-        }
-        if problem.has_bounds() {
-            let bounds = (&self.multipliers[..], self.penalty);
-            problem.add_penalty_curvature(k, (x, u), bounds, q, Some(r));
-        }
-        Ok(())
     }
 
     /// Writes the best change of the initial state into `dx[0]`; false if there is none.
@@ -718,7 +856,8 @@ impl Optimizer {
             let reference = self.reference.x();
             self.problem.difference(&reference, self.current.x(0), &mut deviation.x);
             let mut weight = weight.clone();
-            self.problem.turn_weights(&deviation, &mut weight, &mut self.scratch.s);
+            let cross = &mut self.scratch.weights.xu;
+            self.problem.turn_weights(&deviation, &mut weight, cross);
             value += weight;
         }
         let reduced = basis.transpose() * (value * &basis);
@@ -836,15 +975,14 @@ impl Optimizer {
         let (q, rest) = x.split_at(d.coordinates());
         let (p, v) = rest.split_at(d.dynamic);
         let mut q = q.to_vec();
-        if d.constraints > 0 && self.dx[..d.coordinates()].iter().any(|x| *x != 0.0) {
-            let free = self.problem.free.as_ref();
-            let holds = |i: &usize| free.is_some_and(|free| !free.entries[*i]);
-            let names = self.problem.model.coordinates();
-            let hold = (0..d.dynamic).filter(holds).map(|i| names[i].name.clone()).collect();
-            if self.plant.initialize(&Initial::Projection { q: q.clone(), hold }).is_err() {
-                return false;
+        if let Some(free) = &self.problem.free
+            && d.constraints > 0
+            && self.dx[..d.coordinates()].iter().any(|x| *x != 0.0)
+        {
+            match self.plant.project(q, &free.entries[..d.coordinates()]) {
+                Ok(projected) => q = projected,
+                Err(_) => return false,
             }
-            q.copy_from_slice(self.plant.q());
         }
         let (p, v) = (p.to_vec(), v.to_vec());
         if self.plant.initialize(&Initial::Momentum { q, p, v }).is_err() {
@@ -854,6 +992,144 @@ impl Optimizer {
         self.trial_start = self.plant.snapshot();
         true
     }
+}
+
+impl Worker {
+    fn new(plant: &Plant) -> Self {
+        Self {
+            linearization: Linearization::new(plant.model()),
+            contraction: Contraction::new(plant.model()),
+            plant: plant.clone(),
+        }
+    }
+}
+
+/// First step, samples to write, and linearizations to keep.
+type LinearizeJob<'a> = (usize, &'a mut [Sample], &'a mut [Linearization]);
+
+/// Steps of a block: enough for threads to share, few enough for caches and for questions.
+fn block_length(states: usize) -> usize {
+    (2048 / states.max(1)).clamp(4, 64)
+}
+
+/// Blocks of steps from the last to the first: the one to be made, and the one made before, which is used
+/// meanwhile.
+fn blocks(steps: usize, states: usize) -> impl Iterator<Item = (Range<usize>, Range<usize>)> {
+    let length = block_length(states);
+    let count = steps.div_ceil(length);
+    let block = move |i: usize| (i * length).min(steps)..((i + 1) * length).min(steps);
+    (0..=count).rev().map(move |i| (if i == 0 { 0..0 } else { block(i - 1) }, block(i)))
+}
+
+/// Does the jobs, one worker each, and `consume` meanwhile. With one worker, one after the other.
+fn share_work<J: Send>(
+    workers: &mut [Worker],
+    jobs: Vec<J>,
+    job: impl Fn(&mut Worker, J) -> Result<(), (usize, StepError)> + Sync,
+    consume: impl FnOnce() -> Result<(), OptimizeError>,
+) -> Result<(), OptimizeError> {
+    let failed = |(step, error)| OptimizeError::Linearization { step, error };
+    if workers.len() == 1 {
+        for (worker, work) in workers.iter_mut().zip(jobs) {
+            job(worker, work).map_err(failed)?;
+        }
+        return consume();
+    }
+    let job = &job;
+    std::thread::scope(|scope| {
+        let spawn = |(worker, work)| scope.spawn(move || job(worker, work));
+        let handles: Vec<_> = workers.iter_mut().zip(jobs).map(spawn).collect();
+        let consumed = consume();
+        // All are joined, and the first failure counts, whichever thread was faster.
+        let mut made = Ok(());
+        for handle in handles {
+            match handle.join() {
+                Ok(result) => made = made.and(result),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
+        }
+        made.map_err(failed)?;
+        consumed
+    })
+}
+
+/// Second derivatives of a step without those of the map; of the weights themselves where nothing is to be
+/// added.
+fn stage_weights<'a>(
+    problem: &'a Problem,
+    method: Method,
+    (k, x, u): (usize, &[f64], &[f64]),
+    bounds: (&[f64], f64),
+    deviation: &mut Deviation,
+    own: &'a mut Second,
+    identity: &'a Second,
+) -> Stage<'a> {
+    let has_balls = !problem.model.orientations().is_empty();
+    let is_plain = !problem.has_bounds() && (!has_balls || method == Method::Steepest);
+    let stage = problem.stage(k);
+    if is_plain && method == Method::Steepest {
+        return Stage { q: &identity.xx, r: &identity.uu, s: None, x_linear: None, u_linear: None };
+    }
+    if is_plain {
+        return stage.stage();
+    }
+    let Second { xx: q, xu: s, uu: r } = own;
+    let mut has_cross = false;
+    if method == Method::Steepest {
+        q.copy_from(&identity.xx);
+        r.copy_from(&identity.uu);
+    } else {
+        has_cross = copy_weights(problem, k, (&mut *q, &mut *s, &mut *r));
+        if has_balls {
+            problem.evaluate(k, x, u, deviation);
+            problem.turn_weights(deviation, q, s);
+        }
+    }
+    problem.add_penalty_curvature(k, (x, u), bounds, q, Some(&mut *r));
+    Stage { q, r, s: if has_cross { Some(s) } else { None }, x_linear: None, u_linear: None }
+}
+
+/// Adds the second derivatives of the cost of a step to those of the map.
+fn add_stage_weights(
+    problem: &Problem,
+    (k, x, u): (usize, &[f64], &[f64]),
+    bounds: (&[f64], f64),
+    deviation: &mut Deviation,
+    own: &mut Second,
+    second: &mut Second,
+) {
+    let stage = problem.stage(k);
+    if problem.model.orientations().is_empty() {
+        second.xx += stage.q();
+        if let Some(s) = stage.s() {
+            second.xu += s;
+        }
+    } else {
+        copy_weights(problem, k, (&mut own.xx, &mut own.xu, &mut own.uu));
+        problem.evaluate(k, x, u, deviation);
+        problem.turn_weights(deviation, &mut own.xx, &mut own.xu);
+        problem.add_chart_curvature(deviation, &mut own.xx);
+        second.xx += &own.xx;
+        second.xu += &own.xu;
+    }
+    second.uu += stage.r();
+    problem.add_penalty_curvature(k, (x, u), bounds, &mut second.xx, Some(&mut second.uu));
+}
+
+/// Copies the weights of step `k`; true if there is a cross term.
+fn copy_weights(
+    problem: &Problem,
+    k: usize,
+    (q, s, r): (&mut DMatrix<f64>, &mut DMatrix<f64>, &mut DMatrix<f64>),
+) -> bool {
+    let stage = problem.stage(k);
+    q.copy_from(stage.q());
+    r.copy_from(stage.r());
+    match stage.s() {
+        Some(cross) => s.copy_from(cross),
+        None => s.fill(0.0),
+    }
+    stage.s().is_some()
 }
 
 /// Step `k` of a trajectory, `n` coordinates.
@@ -928,5 +1204,61 @@ fn check_options(options: &Options) -> Result<(), OptimizeError> {
     match checks.into_iter().find(|(_, _, good, _)| !good) {
         Some((name, value, _, range)) => Err(OptimizeError::Option { name, value, range }),
         None => Ok(()),
+    }
+}
+
+/// What tests look at.
+#[cfg(test)]
+impl Optimizer {
+    pub(super) fn set_multipliers(&mut self, value: f64) {
+        self.multipliers.fill(value);
+        self.current.merit = self.merit(&self.current);
+    }
+
+    /// First and second derivative of the cost along the direction of a method; none if its model has no
+    /// minimum.
+    pub(super) fn direction(&mut self, method: Method) -> Option<(f64, f64)> {
+        let go_on: Go<'_> = &mut || true;
+        self.linearize(go_on).unwrap();
+        self.find_gradient(go_on).unwrap();
+        let Direction::Found { derivative } = self.descend(method, go_on).unwrap() else {
+            return None;
+        };
+        let steps = self.problem.steps;
+        let bounds = (&self.multipliers[..], self.penalty);
+        let vector =
+            |rows: &[f64], k: usize, n: usize| DVector::from_column_slice(&rows[k * n..][..n]);
+        let mut curvature = 0.0;
+        for k in 0..steps {
+            let (problem, current) = (&self.problem, &self.current);
+            let dx = vector(&self.dx, k, problem.states);
+            let du = vector(&self.du, k, problem.inputs);
+            let Scratch {
+                linearizations, adjoint, deviation, weights, zero_multipliers: zero, ..
+            } = &mut self.scratch;
+            let contraction = &mut self.workers[0].contraction;
+            let z = adjoint[k + 1].as_slice();
+            contraction.contract(&problem.model, &linearizations[k], z, zero).unwrap();
+            let Contraction { xx, xu, uu, .. } = contraction;
+            let mut second = Second { xx: xx.clone(), xu: xu.clone(), uu: uu.clone() };
+            let at = (k, current.x(k), current.u(k));
+            add_stage_weights(problem, at, bounds, deviation, weights, &mut second);
+            curvature += dx.dot(&(&second.xx * &dx)) + du.dot(&(&second.uu * &du));
+            curvature += 2.0 * dx.dot(&(&second.xu * &du));
+        }
+        self.final_weights(Method::Newton);
+        let dx = vector(&self.dx, steps, self.problem.states);
+        curvature += dx.dot(&(&self.scratch.weights.xx * &dx));
+        Some((derivative, curvature))
+    }
+
+    pub(super) fn size_of_direction(&self) -> f64 {
+        self.dx.iter().chain(&self.du).fold(0.0, |m: f64, x| m.max(x.abs()))
+    }
+
+    /// Cost of the projection of the trajectory moved along the direction.
+    pub(super) fn merit_at(&mut self, length: f64) -> Option<f64> {
+        let runs = self.try_step(length, f64::INFINITY, &mut || true).unwrap();
+        runs.then_some(self.trial.merit)
     }
 }

@@ -284,7 +284,11 @@ impl Plant {
     }
 
     /// Newton's method with the shortest correction, `dq = −Aᵀ (A Aᵀ)⁻¹ h`, `A` the columns that move.
-    fn project(&self, mut q: Vec<f64>, moves: &[bool]) -> Result<Vec<f64>, InitialError> {
+    pub(crate) fn project(
+        &self,
+        mut q: Vec<f64>,
+        moves: &[bool],
+    ) -> Result<Vec<f64>, InitialError> {
         let model = &self.model;
         let (n, nc) = (q.len(), model.dimensions.constraints);
         let mut closure = Closure::new(model);

@@ -22,7 +22,7 @@ pub(crate) mod pivoted_lu;
 pub(crate) mod potentials;
 pub(crate) mod rows;
 #[cfg(test)]
-mod samples;
+pub(crate) mod samples;
 mod second_order;
 mod settle;
 mod snapshot;
