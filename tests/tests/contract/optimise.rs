@@ -281,11 +281,30 @@ fn lqr() -> v1::SolveLqrRequest {
     }
 }
 
+const SCHED_OTHER: u32 = 0;
+const SCHED_IDLE: u32 = 5;
+
+/// Scheduling policies of a process's workers for long computations, and of its other threads.
+fn policies(pid: u32) -> (Vec<u32>, Vec<u32>) {
+    let (mut workers, mut others) = (Vec::new(), Vec::new());
+    for thread in std::fs::read_dir(format!("/proc/{pid}/task")).unwrap() {
+        // A thread that has ended meanwhile has no file any more.
+        let Ok(text) = std::fs::read_to_string(thread.unwrap().path().join("stat")) else {
+            continue;
+        };
+        let (name, fields) = text.rsplit_once(')').unwrap();
+        let policy = fields.split_whitespace().nth(41 - 3).unwrap().parse().unwrap();
+        let is_worker = name.contains("(worker-");
+        if is_worker { &mut workers } else { &mut others }.push(policy);
+    }
+    (workers, others)
+}
+
 /// With all workers and more taken by searches that do not end, every step of a plant is answered and
 /// its motion is the same, a regulator is solved, and the searches all go on.
 #[tokio::test(flavor = "multi_thread")]
 async fn searches_disturb_neither_plants_nor_short_calls() {
-    let (_server, client) = server_with(&["--workers", "1"]).await;
+    let (server, client) = server_with(&["--workers", "1"]).await;
     let drive = async |id: &str| {
         let request = v1::CreatePlantRequest {
             id: id.to_owned(),
@@ -309,6 +328,9 @@ async fn searches_disturb_neither_plants_nor_short_calls() {
         soon(search.next()).await.unwrap().unwrap();
         searches.push(search);
     }
+    let (workers, others) = policies(server.pid());
+    assert!(!workers.is_empty() && workers.iter().all(|policy| *policy == SCHED_IDLE));
+    assert!(!others.is_empty() && others.iter().all(|policy| *policy == SCHED_OTHER));
     assert!(drive("beside").await == alone, "the motion is the same bit for bit");
     soon(client.solve_lqr(lqr())).await.unwrap();
     let hold = v1::StepRequest { id: "beside".to_owned(), hold: 1000, ..Default::default() };
