@@ -41,8 +41,8 @@
 //! Newton). `ρ` is the penalty times the weight of the entry in the cost, or the mean weight where that
 //! is zero. When the bounds are not met and the directional derivative is within the tolerance, or, if that
 //! is larger, within a hundredth of the penalties' energy `Σ ½ ρ error²` and a millionth of the first cost,
-//! the multipliers are renewed, `λ ← max(0, λ + ρ c)`, and the penalty, 10 at first, grows tenfold if the
-//! error has not fallen to a quarter. The search has
+//! the multipliers are renewed, `λ ← max(0, λ + ρ c)`, and the penalty, 10 at first, grows fourfold if the
+//! error has not fallen to a half. The search has
 //! converged when besides the directional derivative the error, `max |max(c, −λ/ρ)|`, is within
 //! `bound_tolerance`. Bounds of a rotation vector's entries count without their curvature. Equal ends fix
 //! an entry, so that bounds of the final state make terminal constraints.

@@ -224,7 +224,7 @@ fn slack_bounds_change_nothing() {
 }
 
 #[test]
-fn terminal_constraints_and_a_limit_of_the_force() {
+fn terminal_constraints_with_a_limit_of_the_force_or_of_the_rail() {
     let steps = 120;
     let plant = at_rest("cart-pole", 0.025);
     let index = |name: &str| plant.model().coordinate_index(name).unwrap();
@@ -250,6 +250,10 @@ fn terminal_constraints_and_a_limit_of_the_force() {
     let force = 0.9 * wide.inputs().amax();
     let narrow = search(vec![], vec![between(0, force)]);
     assert!(narrow.inputs().amax() <= force + 2e-6, "{}", narrow.inputs().amax());
+    assert!(narrow.cost() > wide.cost());
+    let rail = 0.8 * wide.states().column(x).amax();
+    let narrow = search(vec![between(x, rail)], vec![]);
+    assert!(narrow.states().column(x).amax() <= rail + 2e-6);
     assert!(narrow.cost() > wide.cost());
 }
 

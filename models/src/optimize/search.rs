@@ -20,9 +20,9 @@ use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State, StepErr
 /// Penalty with which a search begins.
 const FIRST_PENALTY: f64 = 10.0;
 /// Growth of the penalty.
-const PENALTY_GROWTH: f64 = 10.0;
+const PENALTY_GROWTH: f64 = 4.0;
 /// The error of bounds that the penalty need not grow for, in units of the error before.
-const PENALTY_WORKS: f64 = 0.25;
+const PENALTY_WORKS: f64 = 0.5;
 /// Beyond this penalty the bounds are taken to be out of reach.
 const PENALTY_MAX: f64 = 1e9;
 /// Part of the first cost to which the cost is minimised before multipliers are renewed.
@@ -420,6 +420,8 @@ impl Optimizer {
                 self.renew_multipliers(self.error_of_bounds());
             } else if !found && derivative.abs() <= round_off {
                 self.end_at_round_off();
+            } else if !found && self.bound_violation() > self.options.bound_tolerance {
+                self.give_up_bounds();
             } else if !found {
                 self.status = Status::Stuck(Stuck::NoDescent {
                     derivative,
@@ -517,13 +519,17 @@ impl Optimizer {
         }
         self.bound_error = error;
         if self.penalty > PENALTY_MAX {
-            self.status = Status::Stuck(Stuck::BoundsNotMet {
-                violation: self.bound_violation(),
-                penalty: self.penalty,
-                tolerance: self.options.bound_tolerance,
-            });
+            self.give_up_bounds();
         }
         self.current.merit = self.merit(&self.current);
+    }
+
+    fn give_up_bounds(&mut self) {
+        self.status = Status::Stuck(Stuck::BoundsNotMet {
+            violation: self.bound_violation(),
+            penalty: self.penalty,
+            tolerance: self.options.bound_tolerance,
+        });
     }
 
     /// Largest violation of a bound, or distance of a multiplier from what it may be.
