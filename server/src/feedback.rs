@@ -53,7 +53,9 @@ pub struct Stage {
 impl Stage {
     /// `u_ref + feedforward − k error`, the terms of each sum from first to last.
     fn write_input(&self, error: &[f64], out: &mut [f64]) {
-        for (i, (out, row)) in out.iter_mut().zip(self.k.chunks_exact(error.len())).enumerate() {
+        // A plant without coordinates has no rows to cut.
+        for (i, out) in out.iter_mut().enumerate() {
+            let row = &self.k[i * error.len()..][..error.len()];
             let correction: f64 = row.iter().zip(error).map(|(k, error)| k * error).sum();
             *out = self.u[i] + self.feedforward.get(i).copied().unwrap_or(0.0) - correction;
         }
@@ -351,5 +353,8 @@ mod tests {
         let mut out = [0.0; 2];
         stage.write_input(&[1.0, -1.0], &mut out);
         assert_eq!(out, [11.5, 20.5]);
+        let rigid = Stage { u: vec![10.0, 20.0], ..Stage::default() };
+        rigid.write_input(&[], &mut out);
+        assert_eq!(out, [10.0, 20.0]);
     }
 }
