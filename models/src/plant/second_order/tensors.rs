@@ -67,7 +67,7 @@ impl SecondOrder {
     ///
     /// # Errors
     ///
-    /// If these are more than 2²⁷, which is 1 GiB. [`Contraction`] has no such limit.
+    /// If these are more than 2²⁷, which is 1 GiB. [`Contraction`](super::Contraction) has no such limit.
     pub fn new(model: &Model) -> Result<Self, TooLarge> {
         let layout = Layout::new(model);
         let parameters = layout.parameters();
