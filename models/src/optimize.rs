@@ -23,7 +23,8 @@
 //!    | [`Method::Newton`] | of the cost and of the map, `∇²l + Σ z_i ∇²f_i`, with the adjoint `z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1]` |
 //!
 //!    Where the model has no minimum, or the direction does not descend, Newton **falls back** to
-//!    quasi-Newton, and that to steepest descent;
+//!    quasi-Newton, and that to steepest descent; but where the weights leave even the last input
+//!    without a minimum (`R + BᵀQ_f B` is not positive definite), the search ends and says so;
 //! 3. goes along the direction by Armijo's rule: the longest of the steps `β^m` whose projection
 //!    lowers the cost by at least `α β^m` times what the directional derivative promises.
 //!

@@ -7,7 +7,9 @@ use std::sync::Arc;
 
 use common::{builtin, plant, waving_input};
 use nalgebra::{DMatrix, DVector};
-use plantd_models::control::{Sample, Values, Weights, WeightsError, finite_horizon};
+use plantd_models::control::{
+    Sample, StageWeights, TrajectoryWeights, Values, Weights, WeightsError, finite_horizon,
+};
 use plantd_models::optimize::{
     Bound, BoundFault, Bounds, FreeInitialState, Method, OptimizeError, Optimizer, Options,
     Progress, Status, Stuck, TrajectoryCost,
@@ -451,6 +453,19 @@ fn a_search_that_gets_stuck_says_why() {
     let options = Options { max_backtracks: 0, alpha: 0.99, ..Options::default() };
     let found = stuck(&mut swing.search(&none, None, options));
     assert!(matches!(found, Stuck::NoDescent { backtracks: 0, .. }), "{found}");
+
+    // An input that pays.
+    let mut cost = swing.cost.clone();
+    let (q, r) = (DMatrix::identity(2, 2), DMatrix::from_element(1, 1, -50.0));
+    let stage = StageWeights::symmetric(q, r, None, None, None).unwrap();
+    cost.weights = TrajectoryWeights::constant(stage, None).unwrap();
+    let options = Options::default();
+    let plant = swing.plant.clone();
+    let mut search = Optimizer::new(plant, nudges(60, 1), cost, &none, None, options).unwrap();
+    let before = search.cost();
+    let found = stuck(&mut search);
+    assert_eq!(found, Stuck::WeightsNotConvex { step: 59 });
+    assert!(found.to_string().contains("make r positive definite") && search.cost() == before);
 
     // Nobody is up within three seconds with this torque.
     let bounds = Bounds {

@@ -490,7 +490,7 @@ impl From<Stuck> for Fault {
         let reason = match stuck {
             Stuck::MaxIterations { .. } => "MAX_ITERATIONS",
             Stuck::NoDescent { .. } => "NO_DESCENT",
-            Stuck::NotConvex { .. } => "NOT_CONVEX",
+            Stuck::NotConvex { .. } | Stuck::WeightsNotConvex { .. } => "NOT_CONVEX",
             Stuck::BoundsNotMet { .. } => "BOUNDS_NOT_MET",
         };
         Self::precondition(reason, "search", stuck.to_string())

@@ -188,6 +188,15 @@ pub enum Stuck {
         /// The step.
         step: usize,
     },
+    /// The last input's cost has no minimum, whatever the motion: `R + BᵀQ_f B` is not positive
+    /// definite at the last step.
+    #[error(
+        "the weights leave the cost of the input at the last step ({step}) without a minimum; make r positive definite, or q_final larger"
+    )]
+    WeightsNotConvex {
+        /// The step.
+        step: usize,
+    },
     /// The bounds cannot be met.
     #[error(
         "a bound stays violated by {violation:e} at penalty {penalty:e}; the tolerance is {tolerance:e}: widen the bounds, lengthen the horizon, or begin with a guess that meets them"

@@ -408,7 +408,10 @@ impl Optimizer {
         };
         let Ok(derivative) = derivative else {
             let Err(step) = derivative else { unreachable!() };
-            self.status = Status::Stuck(Stuck::NotConvex { step });
+            self.status = Status::Stuck(match method {
+                Method::QuasiNewton => Stuck::WeightsNotConvex { step },
+                _ => Stuck::NotConvex { step },
+            });
             self.iterations += 1;
             progress.bound_violation = self.bound_violation();
             return Ok(progress);
@@ -686,7 +689,12 @@ impl Optimizer {
     ) -> Result<(Method, Option<Fallback>, Result<f64, usize>), OptimizeError> {
         let (mut method, mut fallback) = (asked, None);
         loop {
+            let last = self.problem.steps - 1;
             let reason = match self.descend(method, go_on)? {
+                // Beyond the last step there is no map to make up for the weights.
+                Direction::NotConvex { step } if method == Method::QuasiNewton && step == last => {
+                    return Ok((method, fallback, Err(step)));
+                }
                 Direction::Found { derivative } if derivative <= 0.0 => {
                     return Ok((method, fallback, Ok(derivative)));
                 }
