@@ -9,10 +9,10 @@ pub enum Priority {
     /// As every other thread.
     Normal,
     /// Little: nice 19.
-    Nice,
-    /// What others leave, and a trickle besides: SCHED_IDLE. A thread that wakes takes the processor
-    /// at once.
     #[default]
+    Nice,
+    /// What others leave, and a trickle besides: SCHED_IDLE. For processors that controllers poll on
+    /// all the time; on a machine that is busy with other things nothing gets done.
     Idle,
 }
 
