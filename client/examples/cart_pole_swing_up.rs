@@ -7,7 +7,6 @@ use plantd_client::{
     Client, DEFAULT_ADDRESS, MatrixExt as _, StateExt as _, WeightsExt as _, diagonal,
     operating_point, v1, weights,
 };
-use v1::optimize_trajectory_response::Response;
 use v1::set_feedback_request::Reference;
 
 const STEPS: usize = 400;
@@ -57,15 +56,9 @@ async fn main() -> plantd_client::Result<()> {
         }),
         ..Default::default()
     };
-    let mut search = client.optimize_trajectory(request).await?;
-    let mut best = v1::OptimizationResult::default();
-    while let Some(message) = search.next().await? {
-        match message.response {
-            Some(Response::Progress(step)) => println!("{:3}  cost {}", step.iteration, step.cost),
-            Some(Response::Result(result)) => best = result,
-            None => {}
-        }
-    }
+    let print =
+        |step: &v1::OptimizationProgress| println!("{:3}  cost {}", step.iteration, step.cost);
+    let best = client.find_trajectory(request, print).await?;
     let trajectory = best.checkpoint.and_then(|c| c.trajectory).unwrap_or_default();
     let inputs = trajectory.u.clone().unwrap_or_default().data;
     let largest = inputs.iter().fold(0.0_f64, |largest, u| largest.max(u.abs()));

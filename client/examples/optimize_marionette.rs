@@ -4,7 +4,6 @@
 use std::f64::consts::PI;
 
 use plantd_client::{Client, DEFAULT_ADDRESS, MatrixExt as _, diagonal, v1, weights};
-use v1::optimize_trajectory_response::Response;
 
 const STEPS: usize = 1001;
 
@@ -75,15 +74,9 @@ async fn main() -> plantd_client::Result<()> {
         }),
         ..Default::default()
     };
-    let mut search = client.optimize_trajectory(request).await?;
-    let mut best = v1::OptimizationResult::default();
-    while let Some(message) = search.next().await? {
-        match message.response {
-            Some(Response::Progress(step)) => println!("{:3}  cost {}", step.iteration, step.cost),
-            Some(Response::Result(result)) => best = result,
-            None => {}
-        }
-    }
+    let print =
+        |step: &v1::OptimizationProgress| println!("{:3}  cost {}", step.iteration, step.cost);
+    let best = client.find_trajectory(request, print).await?;
     assert!(best.converged && best.cost < 1472.6934, "cost {}", best.cost);
     Ok(())
 }

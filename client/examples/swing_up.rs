@@ -6,7 +6,6 @@ use std::f64::consts::PI;
 use plantd_client::{
     Client, DEFAULT_ADDRESS, MatrixExt as _, StateExt as _, diagonal, v1, weights,
 };
-use v1::optimize_trajectory_response::Response;
 
 const STEPS: usize = 100;
 
@@ -43,15 +42,9 @@ async fn main() -> plantd_client::Result<()> {
         }),
         ..Default::default()
     };
-    let mut search = client.optimize_trajectory(request).await?;
-    let mut best = v1::OptimizationResult::default();
-    while let Some(message) = search.next().await? {
-        match message.response {
-            Some(Response::Progress(step)) => println!("{:3}  cost {}", step.iteration, step.cost),
-            Some(Response::Result(result)) => best = result,
-            None => {}
-        }
-    }
+    let print =
+        |step: &v1::OptimizationProgress| println!("{:3}  cost {}", step.iteration, step.cost);
+    let best = client.find_trajectory(request, print).await?;
     let target = best.x.as_ref().and_then(|x| x.rows_iter().last()).expect("states").to_vec();
 
     // From elsewhere the regulator leads back to the trajectory.

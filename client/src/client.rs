@@ -325,6 +325,24 @@ impl Client {
         self.open(stub.optimize_trajectory(request)).await
     }
 
+    /// The same to its end: `progress` gets each iteration, the last message comes back.
+    pub async fn find_trajectory(
+        &self,
+        request: v1::OptimizeTrajectoryRequest,
+        mut progress: impl FnMut(&v1::OptimizationProgress),
+    ) -> Result<v1::OptimizationResult> {
+        use v1::optimize_trajectory_response::Response;
+        let mut search = self.optimize_trajectory(request).await?;
+        while let Some(message) = search.next().await? {
+            match message.response {
+                Some(Response::Progress(iteration)) => progress(&iteration),
+                Some(Response::Result(result)) => return Ok(result),
+                None => {}
+            }
+        }
+        Err(Error::StreamClosed)
+    }
+
     /// Compares a configuration trajectory from outside with the motions of the plant and finds one
     /// that follows it: the report first, then one message per step.
     pub async fn project_reference(

@@ -8,24 +8,17 @@ mod common;
 
 use std::f64::consts::{PI, TAU};
 
+use common::oracle::{matrix, oracle};
 use common::{model, plant};
 use nalgebra::{Complex, DMatrix};
 use plantd_models::control::{
     AnalysisError, Mode, Tangent, TransferFunction, controllability_rank, modes, observability_rank,
 };
 use plantd_models::{Initial, Linearization, Plant, Scene};
-use serde_json::Value;
-
-fn matrix(value: &Value) -> DMatrix<f64> {
-    let rows: Vec<Vec<f64>> = serde_json::from_value(value.clone()).unwrap();
-    DMatrix::from_fn(rows.len(), rows[0].len(), |i, j| rows[i][j])
-}
 
 #[test]
 fn maps_agree_with_scipy() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/oracles/analysis.json");
-    let oracle: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
-    for case in oracle["cases"].as_array().unwrap() {
+    for case in oracle("analysis.json")["cases"].as_array().unwrap() {
         let name = case["name"].as_str().unwrap();
         let [a, b, c, d] = ["a", "b", "c", "d"].map(|key| matrix(&case[key]));
         let h = case["time_step_s"].as_f64().unwrap();

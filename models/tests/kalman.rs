@@ -1,6 +1,9 @@
 //! Filters against independent solutions (`tests/oracles/kalman.py`: mpmath, scipy, python-control)
 //! and against what defines them.
 
+mod common;
+
+use common::oracle::{matrix, oracle, relative_error};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::{
     Kalman, KalmanError, NoiseCovariances, NoiseError, RiccatiError, Sample, Tangent, Values,
@@ -9,26 +12,12 @@ use plantd_models::control::{
 };
 use serde_json::Value;
 
-fn oracle() -> Value {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/oracles/kalman.json");
-    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
-}
-
-fn matrix(value: &Value) -> DMatrix<f64> {
-    let rows: Vec<Vec<f64>> = serde_json::from_value(value.clone()).unwrap();
-    DMatrix::from_fn(rows.len(), rows[0].len(), |i, j| rows[i][j])
-}
-
 fn matrices(value: &Value) -> Vec<DMatrix<f64>> {
     value.as_array().unwrap().iter().map(matrix).collect()
 }
 
 fn optional(value: &Value) -> Option<DMatrix<f64>> {
     (!value.is_null()).then(|| matrix(value))
-}
-
-fn relative_error(actual: &DMatrix<f64>, expected: &DMatrix<f64>) -> f64 {
-    (actual - expected).norm() / expected.norm()
 }
 
 /// Numbers in (-1, 1) that follow no pattern.
@@ -46,7 +35,7 @@ fn identities(n: usize, r: usize) -> NoiseCovariances {
 
 #[test]
 fn steady_state_filters_agree_with_independent_solutions() {
-    for case in oracle()["steady"].as_array().unwrap() {
+    for case in oracle("kalman.json")["steady"].as_array().unwrap() {
         let name = case["name"].as_str().unwrap();
         let (process, input) = (optional(&case["process"]), optional(&case["input"]));
         let noise = NoiseCovariances::new(process, input, matrix(&case["measurement"])).unwrap();
@@ -71,7 +60,7 @@ fn steady_state_filters_agree_with_independent_solutions() {
 
 #[test]
 fn filters_along_a_trajectory_agree_with_least_squares_of_all_states_at_once() {
-    let case = &oracle()["trajectory"];
+    let case = &oracle("kalman.json")["trajectory"];
     let pairs = matrices(&case["a"]).into_iter().zip(matrices(&case["b"]));
     let samples: Vec<_> = pairs.map(|(a, b)| Sample { a, b }).collect();
     let covariances = matrices(&case["process"]).into_iter().zip(matrices(&case["input"]));

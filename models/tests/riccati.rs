@@ -1,6 +1,9 @@
 //! Regulators against independent solutions (`tests/oracles/riccati.py`: mpmath, scipy,
 //! python-control) and against what defines them.
 
+mod common;
+
+use common::oracle::{matrix, oracle, relative_error};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::{
     Regulator, RiccatiError, Sample, StageWeights, Tangent, TrajectoryWeights, Values, Weights,
@@ -9,22 +12,8 @@ use plantd_models::control::{
 };
 use serde_json::Value;
 
-fn oracle() -> Value {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/oracles/riccati.json");
-    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
-}
-
-fn matrix(value: &Value) -> DMatrix<f64> {
-    let rows: Vec<Vec<f64>> = serde_json::from_value(value.clone()).unwrap();
-    DMatrix::from_fn(rows.len(), rows[0].len(), |i, j| rows[i][j])
-}
-
 fn vector(value: &Value) -> Vec<f64> {
     serde_json::from_value(value.clone()).unwrap()
-}
-
-fn relative_error(actual: &DMatrix<f64>, expected: &DMatrix<f64>) -> f64 {
-    (actual - expected).norm() / expected.norm()
 }
 
 /// Deterministic numbers in (-1, 1) that follow no pattern.
@@ -43,7 +32,7 @@ fn system(n: usize, m: usize, radius: f64, seed: f64) -> Sample {
 
 #[test]
 fn infinite_horizon_agrees_with_independent_solutions() {
-    for case in oracle()["infinite"].as_array().unwrap() {
+    for case in oracle("riccati.json")["infinite"].as_array().unwrap() {
         let name = case["name"].as_str().unwrap();
         let (a, b) = (matrix(&case["a"]), matrix(&case["b"]));
         let weights = Weights::diagonal(&vector(&case["q"]), &vector(&case["r"])).unwrap();
@@ -69,7 +58,7 @@ fn infinite_horizon_agrees_with_independent_solutions() {
 
 #[test]
 fn finite_horizon_agrees_with_sixty_digits() {
-    for case in oracle()["finite"].as_array().unwrap() {
+    for case in oracle("riccati.json")["finite"].as_array().unwrap() {
         let name = case["name"].as_str().unwrap();
         let pairs = case["a"].as_array().unwrap().iter().zip(case["b"].as_array().unwrap());
         let samples: Vec<_> = pairs.map(|(a, b)| Sample { a: matrix(a), b: matrix(b) }).collect();
@@ -350,7 +339,7 @@ fn large(spec: &Value) -> Large {
 /// integrators, states out of reach, cross terms.
 #[test]
 fn large_and_badly_scaled_regulators_agree_with_independent_solutions() {
-    let oracle = oracle();
+    let oracle = oracle("riccati.json");
     let cases = oracle["large"].as_array().unwrap();
     assert!(cases.len() > 30);
     for case in cases {

@@ -2,6 +2,7 @@
 #![allow(dead_code, reason = "each test program uses some of it")]
 
 pub(crate) mod linearization;
+pub(crate) mod oracle;
 
 use std::f64::consts::PI;
 use std::sync::Arc;

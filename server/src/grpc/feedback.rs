@@ -6,17 +6,15 @@
 
 use std::sync::Arc;
 
-use futures::stream;
 use plantd_models::control::Values;
 use plantd_models::{Initial, Model};
 use plantd_proto::v1;
 use tokio::sync::watch::Receiver;
-use tonic::Status;
 use v1::point::Source;
 use v1::set_feedback_request::Reference as Form;
 
-use super::Answers;
 use super::plant::plant_info;
+use super::{Answers, Messages};
 use crate::convert::{self, Inputs, WeightFields};
 use crate::feedback::{Feedback, GuardBound, InForce, Law, Mode, Stage};
 use crate::hub::Hub;
@@ -277,14 +275,7 @@ pub(super) fn watch_gains(
         dropped: 0,
         failure_of: None,
     };
-    // After an error the state is gone, and with it the stream.
-    Ok(Box::pin(stream::unfold(Some(watcher), |watcher| async {
-        let mut watcher = watcher?;
-        match watcher.next().await {
-            Ok(response) => Some((Ok(response), Some(watcher))),
-            Err(fault) => Some((Err(Status::from(fault)), None)),
-        }
-    })))
+    Ok(watcher.into_answers())
 }
 
 struct Watcher {
@@ -301,7 +292,9 @@ struct Watcher {
     failure_of: Option<u64>,
 }
 
-impl Watcher {
+impl Messages for Watcher {
+    type Message = v1::WatchGainsResponse;
+
     async fn next(&mut self) -> Result<v1::WatchGainsResponse, Fault> {
         loop {
             if self.hub.ending.is_cancelled() {
@@ -323,7 +316,9 @@ impl Watcher {
             }
         }
     }
+}
 
+impl Watcher {
     /// A message that is to be sent now.
     fn ready(&mut self) -> Result<Option<v1::WatchGainsResponse>, Fault> {
         let present = self.in_force.borrow_and_update().clone();

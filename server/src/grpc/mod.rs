@@ -19,11 +19,33 @@ pub mod watch;
 use std::pin::Pin;
 use std::time::Duration;
 
-use futures::Stream;
+use futures::{Stream, stream};
 use tonic::Status;
+
+use crate::status::Fault;
 
 /// A stream of answers.
 pub type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+
+/// What makes the messages of a stream, one after the other.
+trait Messages: Sized + Send + 'static {
+    type Message: Send + 'static;
+
+    /// The next message, or the error that ends the stream.
+    fn next(&mut self) -> impl Future<Output = Result<Self::Message, Fault>> + Send;
+
+    /// The stream.
+    fn into_answers(self) -> Answers<Self::Message> {
+        // After an error the state is gone, and with it the stream.
+        Box::pin(stream::unfold(Some(self), |source| async {
+            let mut source = source?;
+            match source.next().await {
+                Ok(message) => Some((Ok(message), Some(source))),
+                Err(fault) => Some((Err(Status::from(fault)), None)),
+            }
+        }))
+    }
+}
 
 /// Bytes of plants or models in one page of a list, at most: half of what clients take by default.
 const PAGE_BYTES_MAX: usize = 2 << 20;

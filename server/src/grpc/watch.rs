@@ -7,14 +7,12 @@
 use std::collections::HashSet;
 use std::sync::Arc;
 
-use futures::stream;
 use plantd_models::control::{self, Tangent, Weights};
 use plantd_models::{Initial, Linearization, Plant, StepError};
 use plantd_proto::v1;
-use tonic::Status;
 use v1::WatchField;
 
-use super::Answers;
+use super::{Answers, Messages};
 use crate::convert;
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
@@ -87,14 +85,7 @@ pub(super) fn stream(
         weights,
         analysis: None,
     };
-    // After an error the state is gone, and with it the stream.
-    Ok(Box::pin(stream::unfold(Some(watcher), |watcher| async {
-        let mut watcher = watcher?;
-        match watcher.next().await {
-            Ok(response) => Some((Ok(response), Some(watcher))),
-            Err(fault) => Some((Err(Status::from(fault)), None)),
-        }
-    })))
+    Ok(watcher.into_answers())
 }
 
 struct Watcher {
@@ -106,7 +97,9 @@ struct Watcher {
     analysis: Option<Box<Analysis>>,
 }
 
-impl Watcher {
+impl Messages for Watcher {
+    type Message = v1::WatchResponse;
+
     async fn next(&mut self) -> Result<v1::WatchResponse, Fault> {
         let session = Arc::clone(self.subscription.session());
         let (frame, dropped) = tokio::select! {

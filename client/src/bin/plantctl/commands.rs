@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context as _, Result};
-use plantd_client::{Client, MatrixExt as _, v1};
+use plantd_client::{Answers, Client, MatrixExt as _, v1};
 use serde_json::{Value, json};
 
 use crate::args::{
@@ -325,15 +325,19 @@ async fn watch(
     let mut messages = client.watch(request).await?;
     let mut seen = 0;
     while count.is_none_or(|count| seen < count) {
-        let next = tokio::select! {
-            next = messages.next() => next?,
-            _ = tokio::signal::ctrl_c() => return Ok(()),
-        };
-        let Some(message) = next else { break };
+        let Some(message) = next_or_interrupt(&mut messages).await? else { break };
         output.print(|| json::message("WatchResponse", &message), || watched(&message, &model))?;
         seen += 1;
     }
     Ok(())
+}
+
+/// The next message; none at the end of the stream, or when Ctrl-C is pressed.
+pub(crate) async fn next_or_interrupt<T>(messages: &mut Answers<T>) -> Result<Option<T>> {
+    tokio::select! {
+        next = messages.next() => Ok(next?),
+        _ = tokio::signal::ctrl_c() => Ok(None),
+    }
 }
 
 /// A message of a watch as text.

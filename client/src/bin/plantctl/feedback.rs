@@ -5,7 +5,7 @@ use plantd_client::{Client, operating_point, present_state, v1};
 use serde_json::json;
 
 use crate::args::{Feedback, Reference};
-use crate::commands::{Output, space};
+use crate::commands::{Output, next_or_interrupt, space};
 use crate::optimize::read_result;
 use crate::{json, text};
 
@@ -56,11 +56,7 @@ pub(crate) async fn gains(
     let mut messages = client.watch_gains(id).await?;
     let mut seen = 0;
     while count.is_none_or(|count| seen < count) {
-        let next = tokio::select! {
-            next = messages.next() => next?,
-            _ = tokio::signal::ctrl_c() => return Ok(()),
-        };
-        let Some(message) = next else { break };
+        let Some(message) = next_or_interrupt(&mut messages).await? else { break };
         output.print(
             || json::message("WatchGainsResponse", &message),
             || text::watched_gain(&message, &model),

@@ -93,6 +93,7 @@ impl Quadratic {
         self.increments.fill(0.0);
     }
 
+    /// Adds to `sum`: the starts of coordinates, and next positions, are parameters.
     fn add(&mut self, row: usize, column: usize, value: f64) {
         self.sum[row * self.layout.stride + column] += value;
     }
@@ -100,11 +101,6 @@ impl Quadratic {
     /// Adds to `C`, unknown by parameter.
     fn add_mixed(&mut self, unknown: usize, parameter: usize, value: f64) {
         self.mixed[unknown * self.layout.stride + parameter] += value;
-    }
-
-    /// The form has `value` at the starts of coordinates `i` and `j`.
-    fn add_starts(&mut self, i: usize, j: usize, value: f64) {
-        self.add(i, j, value);
     }
 
     /// At the start of `i` and what is next of `j`, and the other way round.
@@ -406,7 +402,7 @@ impl Contraction {
             let second = |(c_i, d_i): (f64, f64), (c_j, d_j): (f64, f64)| {
                 c_i * (c_j * qq + d_j * qv) + d_i * (c_j * vq + d_j * vv)
             };
-            self.quadratic.add_starts(i, j, second(at_start(i), at_start(j)));
+            self.quadratic.add(i, j, second(at_start(i), at_start(j)));
             self.quadratic.add_start_next(i, j, second(at_start(i), at_next));
             self.quadratic.add_nexts(i, j, second(at_next, at_next));
         }
@@ -434,14 +430,14 @@ impl Contraction {
         for (c, ((constraint, lambda), mu)) in equations.enumerate() {
             let (tree, q_start) = (&model.closure, &scratch.blocks.q_start);
             constraint.for_each_second_derivative(tree, &start.poses, q_start, |i, j, value| {
-                quadratic.add_starts(i, j, -lambda * value.eps);
+                quadratic.add(i, j, -lambda * value.eps);
             });
             constraint.for_each_second_derivative(tree, &end.poses, q_end, |i, j, value| {
                 let value = mu * value;
                 if i < nd {
                     quadratic.add_start_next(i, j, value);
                     if j < nd {
-                        quadratic.add_starts(i, j, value);
+                        quadratic.add(i, j, value);
                     }
                 }
                 quadratic.add_nexts(i, j, value);

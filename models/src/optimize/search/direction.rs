@@ -1,0 +1,518 @@
+//! The direction of an iteration: linearizations, the gradient, and the linear-quadratic problem, shared
+//! among threads where that pays.
+
+use std::ops::Range;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::{
+    Direction, Go, Optimizer, Scratch, Second, Worker, add_product, ask, subtract_product,
+};
+use crate::control::lq::Stage;
+use crate::control::{Sample, tangent_basis};
+use crate::optimize::problem::{self, Deviation, Problem, dot};
+use crate::optimize::trajectory::Trajectory;
+use crate::optimize::{Fallback, Method, OptimizeError};
+use crate::plant::known::KnownStep;
+use crate::{Contraction, Linearization, Plant, StepError};
+
+impl Optimizer {
+    /// Linearizes the map along the trajectory, and finds the gains of the projection.
+    pub(super) fn linearize(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
+        if self.is_linearized {
+            return Ok(());
+        }
+        let Self { problem, workers, current, samples, gains, scratch, projection, .. } = self;
+        let n = problem.model.dimensions().coordinates();
+        let Scratch { linearizations, recursion, offset, .. } = scratch;
+        let first_step = self.first_step;
+        recursion.begin(projection.q_final(), None);
+        for (made, used) in blocks(problem.steps, problem.states) {
+            if !go_on() {
+                return Err(OptimizeError::Cancelled);
+            }
+            let (head, tail) = samples.split_at_mut(used.start);
+            let kept = if linearizations.is_empty() { 0..0 } else { made.clone() };
+            let (head, mut rest) = (&mut head[made.clone()], &mut linearizations[kept]);
+            let share = made.len().div_ceil(workers.len()).max(1);
+            let mut jobs: Vec<LinearizeJob<'_>> = Vec::with_capacity(workers.len());
+            for (part, samples) in head.chunks_mut(share).enumerate() {
+                let (kept, others) = rest.split_at_mut(samples.len().min(rest.len()));
+                rest = others;
+                jobs.push((made.start + part * share, samples, kept));
+            }
+            let job = |worker: &mut Worker, (first, samples, kept): LinearizeJob<'_>| {
+                let mut kept = kept.iter_mut();
+                for (k, sample) in (first..).zip(samples) {
+                    let step = known(current, k, first_step, n);
+                    let out = kept.next().unwrap_or(&mut worker.linearization);
+                    worker.plant.linearize_known(&step, out).map_err(|error| (k, error))?;
+                    out.write_a(&mut sample.a);
+                    out.write_b(&mut sample.b);
+                }
+                Ok(())
+            };
+            let consume = || {
+                for k in used.clone().rev() {
+                    ask(k, go_on)?;
+                    let (sample, stage) = (&tail[k - used.start], projection.stage().stage());
+                    let gain = &mut gains[k];
+                    recursion
+                        .step(&sample.a, &sample.b, stage, gain, offset)
+                        .map_err(|_| OptimizeError::Projection { step: k })?;
+                    if !gain.iter().all(|entry| entry.is_finite()) {
+                        return Err(OptimizeError::Projection { step: k });
+                    }
+                }
+                Ok(())
+            };
+            share_work(workers, jobs, job, consume)?;
+        }
+        self.is_linearized = true;
+        Ok(())
+    }
+
+    /// Gradient of the cost with penalties, and the adjoint along the projection.
+    pub(super) fn find_gradient(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
+        let Self { problem, current, by_x, by_u, scratch, samples, gains, .. } = self;
+        let bounds = (&self.multipliers[..], self.penalty);
+        let steps = problem.steps;
+        for (k, by_x) in by_x.iter_mut().enumerate() {
+            ask(k, go_on)?;
+            let x = current.x(k);
+            let u = if k < steps { current.u(k) } else { &[] };
+            problem.evaluate(k, x, u, &mut scratch.deviation);
+            problem.gradient(k, (x, u), &scratch.deviation, bounds, by_x, by_u.get_mut(k));
+        }
+        if let Some(weight) = problem.free.as_ref().and_then(|free| free.weight.as_ref()) {
+            let reference = self.reference.x();
+            problem.difference(&reference, current.x(0), &mut scratch.error);
+            let change = DVector::from_column_slice(&scratch.error);
+            let mut slope = weight * change;
+            for &i in problem.model.orientations() {
+                let map = problem::chart(&scratch.error, i);
+                let turned = map.apply_transposed(crate::plant::balls::three(slope.as_slice(), i));
+                slope.rows_mut(i, 3).copy_from_slice(&turned.0);
+            }
+            by_x[0] += slope;
+        }
+        // z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1] = l_x + Aᵀ z[k+1] − Kᵀ (l_u + Bᵀ z[k+1])
+        scratch.adjoint[steps].copy_from(&by_x[steps]);
+        for k in (0..steps).rev() {
+            ask(k, go_on)?;
+            let (head, tail) = scratch.adjoint.split_at_mut(k + 1);
+            let (z, next) = (&mut head[k], &tail[0]);
+            scratch.offset.copy_from(&by_u[k]);
+            scratch.offset.gemv_tr(1.0, &samples[k].b, next, 1.0);
+            z.copy_from(&by_x[k]);
+            z.gemv_tr(1.0, &samples[k].a, next, 1.0);
+            z.gemv_tr(-1.0, &gains[k], &scratch.offset, 1.0);
+        }
+        Ok(())
+    }
+
+    /// The direction of the method asked for, or of the one that it falls back to, with its directional
+    /// derivative; or the step at which not even steepest descent has one.
+    #[allow(clippy::type_complexity, reason = "three answers of one question")]
+    pub(super) fn find_direction(
+        &mut self,
+        asked: Method,
+        go_on: Go<'_>,
+    ) -> Result<(Method, Option<Fallback>, Result<f64, usize>), OptimizeError> {
+        let (mut method, mut fallback) = (asked, None);
+        loop {
+            let last = self.problem.steps - 1;
+            let reason = match self.descend(method, go_on)? {
+                // Beyond the last step there is no map to make up for the weights.
+                Direction::NotConvex { step } if method == Method::QuasiNewton && step == last => {
+                    return Ok((method, fallback, Err(step)));
+                }
+                Direction::Found { derivative } if derivative <= 0.0 => {
+                    return Ok((method, fallback, Ok(derivative)));
+                }
+                Direction::Found { derivative } => Fallback::Ascent { derivative },
+                Direction::NotConvex { step } => Fallback::NotConvex { step },
+            };
+            method = match (method, reason) {
+                (Method::Newton, _) => Method::QuasiNewton,
+                (Method::QuasiNewton, _) => Method::Steepest,
+                (Method::Steepest, Fallback::Ascent { .. }) => {
+                    return Ok((method, fallback, Err(0)));
+                }
+                (Method::Steepest, Fallback::NotConvex { step }) => {
+                    return Ok((method, fallback, Err(step)));
+                }
+            };
+            fallback = Some(fallback.unwrap_or(reason));
+        }
+    }
+
+    /// Solves the linear-quadratic problem of a method.
+    pub(super) fn descend(
+        &mut self,
+        method: Method,
+        go_on: Go<'_>,
+    ) -> Result<Direction, OptimizeError> {
+        let steps = self.problem.steps;
+        self.final_weights(method);
+        self.scratch.recursion.begin(&self.scratch.weights.xx, Some(&self.by_x[steps]));
+        let not_convex = if method == Method::Newton {
+            self.contract_and_recur(go_on)?
+        } else {
+            self.recur(method, go_on)?
+        };
+        if let Some(step) = not_convex {
+            return Ok(Direction::NotConvex { step });
+        }
+        if !self.find_initial_change() {
+            return Ok(Direction::NotConvex { step: 0 });
+        }
+        Ok(Direction::Found { derivative: self.roll_direction(go_on)? })
+    }
+
+    /// The recursion without second derivatives of the map; the step at which it has no minimum.
+    pub(super) fn recur(
+        &mut self,
+        method: Method,
+        go_on: Go<'_>,
+    ) -> Result<Option<usize>, OptimizeError> {
+        let bounds = (&self.multipliers[..], self.penalty);
+        let Self { problem, current, samples, by_x, by_u, scratch, .. } = self;
+        let Scratch { recursion, deviation, weights, identity, .. } = scratch;
+        for k in (0..problem.steps).rev() {
+            ask(k, go_on)?;
+            let at = (k, current.x(k), current.u(k));
+            let stage = Stage {
+                x_linear: Some(&by_x[k]),
+                u_linear: Some(&by_u[k]),
+                ..stage_weights(problem, method, at, bounds, deviation, weights, identity)
+            };
+            let (gain, offset) = (&mut self.descent_gains[k], &mut self.descent_offsets[k]);
+            let Sample { a, b } = &samples[k];
+            if recursion.step(a, b, stage, gain, offset).is_err() {
+                return Ok(Some(k));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The recursion with second derivatives of the map, which are contracted block by block.
+    pub(super) fn contract_and_recur(
+        &mut self,
+        go_on: Go<'_>,
+    ) -> Result<Option<usize>, OptimizeError> {
+        let bounds = (&self.multipliers[..], self.penalty);
+        let Self { problem, workers, current, samples, by_x, by_u, scratch, .. } = self;
+        let (descent_gains, descent_offsets) = (&mut self.descent_gains, &mut self.descent_offsets);
+        let Scratch {
+            linearizations,
+            contractions,
+            recursion,
+            deviation,
+            weights,
+            adjoint,
+            zero_multipliers,
+            ..
+        } = scratch;
+        let [mut made_now, mut made_before] = contractions.each_mut();
+        let (model, linearizations, adjoint) = (&*problem.model, &*linearizations, &*adjoint);
+        let zero_multipliers = &*zero_multipliers;
+        let mut not_convex = None;
+        for (made, used) in blocks(problem.steps, problem.states) {
+            if !go_on() {
+                return Err(OptimizeError::Cancelled);
+            }
+            let share = made.len().div_ceil(workers.len()).max(1);
+            let parts = made_now[..made.len()].chunks_mut(share).enumerate();
+            let jobs = parts.map(|(part, slots)| (made.start + part * share, slots)).collect();
+            let job = |worker: &mut Worker, (first, slots): (usize, &mut [Second])| {
+                for (k, slot) in (first..).zip(slots) {
+                    let z = adjoint[k + 1].as_slice();
+                    let contraction = &mut worker.contraction;
+                    contraction
+                        .contract(model, &linearizations[k], z, zero_multipliers)
+                        .map_err(|error| (k, error))?;
+                    // Not swapped: what is always zero is never written again.
+                    slot.xx.copy_from(&contraction.xx);
+                    slot.xu.copy_from(&contraction.xu);
+                    slot.uu.copy_from(&contraction.uu);
+                }
+                Ok(())
+            };
+            let consume = || {
+                for k in used.clone().rev() {
+                    ask(k, go_on)?;
+                    let second = &mut made_before[k - used.start];
+                    let at = (k, current.x(k), current.u(k));
+                    add_stage_weights(problem, at, bounds, deviation, weights, second);
+                    let stage = Stage {
+                        q: &second.xx,
+                        r: &second.uu,
+                        s: Some(&second.xu),
+                        x_linear: Some(&by_x[k]),
+                        u_linear: Some(&by_u[k]),
+                    };
+                    let (gain, offset) = (&mut descent_gains[k], &mut descent_offsets[k]);
+                    let Sample { a, b } = &samples[k];
+                    if recursion.step(a, b, stage, gain, offset).is_err() {
+                        not_convex = Some(k);
+                        break;
+                    }
+                }
+                Ok(())
+            };
+            share_work(workers, jobs, job, consume)?;
+            if not_convex.is_some() {
+                break;
+            }
+            std::mem::swap(&mut made_now, &mut made_before);
+        }
+        Ok(not_convex)
+    }
+
+    /// Writes the second derivatives of the final cost.
+    pub(super) fn final_weights(&mut self, method: Method) {
+        let Self { problem, current, scratch, .. } = self;
+        let Scratch { weights: Second { xx: q, xu: s, .. }, deviation, identity, .. } = scratch;
+        let (steps, x) = (problem.steps, current.x(problem.steps));
+        if method == Method::Steepest {
+            q.copy_from(&identity.xx);
+        } else {
+            q.copy_from(problem.q_final());
+            if !problem.model.orientations().is_empty() {
+                problem.evaluate(steps, x, &[], deviation);
+                s.fill(0.0);
+                problem.turn_weights(deviation, q, s);
+                if method == Method::Newton {
+                    problem.add_chart_curvature(deviation, q);
+                }
+            }
+        }
+        let bounds = (&self.multipliers[..], self.penalty);
+        problem.add_penalty_curvature(steps, (x, &[]), bounds, q, None);
+    }
+
+    /// Writes the best change of the initial state into `dx[0]`; false if there is none.
+    pub(super) fn find_initial_change(&mut self) -> bool {
+        let states = self.problem.states;
+        let change = &mut self.dx[..states];
+        change.fill(0.0);
+        let Some(free) = &self.problem.free else { return true };
+        let d = self.problem.model.dimensions();
+        if self.plant.restore(&self.start).is_err() {
+            return false;
+        }
+        let basis =
+            free_directions(&free.entries, &self.plant.constraint_jacobian(), d.coordinates());
+        if basis.ncols() == 0 {
+            return true;
+        }
+        let mut value = self.scratch.recursion.value().clone();
+        if let Some(weight) = &free.weight {
+            let mut deviation = self.problem.deviation();
+            let reference = self.reference.x();
+            self.problem.difference(&reference, self.current.x(0), &mut deviation.x);
+            let mut weight = weight.clone();
+            let cross = &mut self.scratch.weights.xu;
+            self.problem.turn_weights(&deviation, &mut weight, cross);
+            value += weight;
+        }
+        let reduced = basis.transpose() * (value * &basis);
+        let slope = basis.tr_mul(self.scratch.recursion.linear());
+        let Some(factor) = reduced.cholesky() else { return false };
+        let step = -(&basis * factor.solve(&slope));
+        change.copy_from_slice(step.as_slice());
+        true
+    }
+
+    /// Runs the law of the descent through the linearized map; returns the directional derivative.
+    pub(super) fn roll_direction(&mut self, go_on: Go<'_>) -> Result<f64, OptimizeError> {
+        let Self { problem, samples, by_x, by_u, dx, du, descent_gains, descent_offsets, .. } =
+            self;
+        let (states, inputs) = (problem.states, problem.inputs);
+        let mut derivative = dot(by_x[0].as_slice(), &dx[..states]);
+        for k in 0..problem.steps {
+            ask(k, go_on)?;
+            let (head, tail) = dx.split_at_mut((k + 1) * states);
+            let (x, next) = (&head[k * states..], &mut tail[..states]);
+            let u = &mut du[k * inputs..][..inputs];
+            for (u, offset) in u.iter_mut().zip(descent_offsets[k].iter()) {
+                *u = -offset;
+            }
+            subtract_product(&descent_gains[k], x, u);
+            next.fill(0.0);
+            add_product(&samples[k].a, x, next);
+            add_product(&samples[k].b, u, next);
+            derivative += dot(by_u[k].as_slice(), u) + dot(by_x[k + 1].as_slice(), next);
+        }
+        Ok(derivative)
+    }
+}
+
+impl Worker {
+    pub(super) fn new(plant: &Plant) -> Self {
+        Self {
+            linearization: Linearization::new(plant.model()),
+            contraction: Contraction::new(plant.model()),
+            plant: plant.clone(),
+        }
+    }
+}
+
+/// First step, samples to write, and linearizations to keep.
+type LinearizeJob<'a> = (usize, &'a mut [Sample], &'a mut [Linearization]);
+
+/// Steps of a block: enough for threads to share, few enough for caches and for questions.
+pub(super) fn block_length(states: usize) -> usize {
+    (2048 / states.max(1)).clamp(4, 64)
+}
+
+/// Blocks of steps from the last to the first: the one to be made, and the one made before, which is used
+/// meanwhile.
+fn blocks(steps: usize, states: usize) -> impl Iterator<Item = (Range<usize>, Range<usize>)> {
+    let length = block_length(states);
+    let count = steps.div_ceil(length);
+    let block = move |i: usize| (i * length).min(steps)..((i + 1) * length).min(steps);
+    (0..=count).rev().map(move |i| (if i == 0 { 0..0 } else { block(i - 1) }, block(i)))
+}
+
+/// Does the jobs, one worker each, and `consume` meanwhile. With one worker, one after the other.
+fn share_work<J: Send>(
+    workers: &mut [Worker],
+    jobs: Vec<J>,
+    job: impl Fn(&mut Worker, J) -> Result<(), (usize, StepError)> + Sync,
+    consume: impl FnOnce() -> Result<(), OptimizeError>,
+) -> Result<(), OptimizeError> {
+    let failed = |(step, error)| OptimizeError::Linearization { step, error };
+    if workers.len() == 1 {
+        for (worker, work) in workers.iter_mut().zip(jobs) {
+            job(worker, work).map_err(failed)?;
+        }
+        return consume();
+    }
+    let job = &job;
+    std::thread::scope(|scope| {
+        let spawn = |(worker, work)| scope.spawn(move || job(worker, work));
+        let handles: Vec<_> = workers.iter_mut().zip(jobs).map(spawn).collect();
+        let consumed = consume();
+        // All are joined, and the first failure counts, whichever thread was faster.
+        let mut made = Ok(());
+        for handle in handles {
+            match handle.join() {
+                Ok(result) => made = made.and(result),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
+        }
+        made.map_err(failed)?;
+        consumed
+    })
+}
+
+/// Second derivatives of a step without those of the map; of the weights themselves where nothing is to be
+/// added.
+fn stage_weights<'a>(
+    problem: &'a Problem,
+    method: Method,
+    (k, x, u): (usize, &[f64], &[f64]),
+    bounds: (&[f64], f64),
+    deviation: &mut Deviation,
+    own: &'a mut Second,
+    identity: &'a Second,
+) -> Stage<'a> {
+    let has_balls = !problem.model.orientations().is_empty();
+    let is_plain = !problem.has_bounds() && (!has_balls || method == Method::Steepest);
+    let stage = problem.stage(k);
+    if is_plain && method == Method::Steepest {
+        return Stage { q: &identity.xx, r: &identity.uu, s: None, x_linear: None, u_linear: None };
+    }
+    if is_plain {
+        return stage.stage();
+    }
+    let Second { xx: q, xu: s, uu: r } = own;
+    let mut has_cross = false;
+    if method == Method::Steepest {
+        q.copy_from(&identity.xx);
+        r.copy_from(&identity.uu);
+    } else {
+        has_cross = copy_weights(problem, k, (&mut *q, &mut *s, &mut *r));
+        if has_balls {
+            problem.evaluate(k, x, u, deviation);
+            problem.turn_weights(deviation, q, s);
+        }
+    }
+    problem.add_penalty_curvature(k, (x, u), bounds, q, Some(&mut *r));
+    Stage { q, r, s: if has_cross { Some(s) } else { None }, x_linear: None, u_linear: None }
+}
+
+/// Adds the second derivatives of the cost of a step to those of the map.
+pub(super) fn add_stage_weights(
+    problem: &Problem,
+    (k, x, u): (usize, &[f64], &[f64]),
+    bounds: (&[f64], f64),
+    deviation: &mut Deviation,
+    own: &mut Second,
+    second: &mut Second,
+) {
+    let stage = problem.stage(k);
+    if problem.model.orientations().is_empty() {
+        second.xx += stage.q();
+        if let Some(s) = stage.s() {
+            second.xu += s;
+        }
+    } else {
+        copy_weights(problem, k, (&mut own.xx, &mut own.xu, &mut own.uu));
+        problem.evaluate(k, x, u, deviation);
+        problem.turn_weights(deviation, &mut own.xx, &mut own.xu);
+        problem.add_chart_curvature(deviation, &mut own.xx);
+        second.xx += &own.xx;
+        second.xu += &own.xu;
+    }
+    second.uu += stage.r();
+    problem.add_penalty_curvature(k, (x, u), bounds, &mut second.xx, Some(&mut second.uu));
+}
+
+/// Copies the weights of step `k`; true if there is a cross term.
+fn copy_weights(
+    problem: &Problem,
+    k: usize,
+    (q, s, r): (&mut DMatrix<f64>, &mut DMatrix<f64>, &mut DMatrix<f64>),
+) -> bool {
+    let stage = problem.stage(k);
+    q.copy_from(stage.q());
+    r.copy_from(stage.r());
+    match stage.s() {
+        Some(cross) => s.copy_from(cross),
+        None => s.fill(0.0),
+    }
+    stage.s().is_some()
+}
+
+/// Step `k` of a trajectory, `n` coordinates.
+fn known(trajectory: &Trajectory, k: usize, first_step: u64, n: usize) -> KnownStep<'_> {
+    KnownStep {
+        index: first_step.saturating_add(k as u64),
+        q0: &trajectory.x(k)[..n],
+        q1: &trajectory.x(k + 1)[..n],
+        multipliers: trajectory.multipliers(k),
+        u: trajectory.u(k),
+    }
+}
+
+/// Directions of `x` along free entries that keep the constraints, as orthonormal columns.
+fn free_directions(entries: &[bool], jacobian: &DMatrix<f64>, n: usize) -> DMatrix<f64> {
+    let of = |range: std::ops::Range<usize>| range.filter(|i| entries[*i]).collect::<Vec<_>>();
+    let (configuration, others) = (of(0..n), of(n..entries.len()));
+    let mut columns = DMatrix::zeros(jacobian.nrows(), configuration.len());
+    for (to, &from) in configuration.iter().enumerate() {
+        columns.set_column(to, &jacobian.column(from));
+    }
+    let tangent = tangent_basis(&columns);
+    let mut basis = DMatrix::zeros(entries.len(), tangent.ncols() + others.len());
+    for (row, &entry) in configuration.iter().enumerate() {
+        basis.view_mut((entry, 0), (1, tangent.ncols())).copy_from(&tangent.row(row));
+    }
+    for (column, &entry) in others.iter().enumerate() {
+        basis[(entry, tangent.ncols() + column)] = 1.0;
+    }
+    basis
+}
