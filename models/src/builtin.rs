@@ -1,4 +1,4 @@
-//! Built-in scenes: TOML files of `scenes/`, and two families that are generated for any size.
+//! Built-in scenes: TOML files of `scenes/`, and families that are generated for any size.
 
 use std::f64::consts::{FRAC_PI_6, PI};
 
@@ -7,7 +7,7 @@ use crate::scene::{
     Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Point,
 };
 
-/// Names of the built-in scenes. `chain-N` and `scissor-N` stand for whole families.
+/// Names of the built-in scenes. `chain-N`, `tree-N` and `scissor-N` stand for whole families.
 pub const NAMES: &[&str] = &[
     "pendulum",
     "damped-pendulum",
@@ -15,18 +15,19 @@ pub const NAMES: &[&str] = &[
     "cart-pole",
     "spherical-pendulum",
     "chain-4",
+    "tree-7",
     "four-bar",
     "scissor-4",
     "marionette",
 ];
 
-/// Most links of a chain.
+/// Most links of a chain or bodies of a tree.
 const MAX_LINKS: usize = 1024;
 /// Most segments of a scissor.
 const MAX_SEGMENTS: usize = 64;
 
-/// The built-in scene of that name; any `chain-N` with 1 ≤ N ≤ 1024 and `scissor-N` with
-/// 1 ≤ N ≤ 64 exists.
+/// The built-in scene of that name; any `chain-N` and `tree-N` with 1 ≤ N ≤ 1024 and
+/// `scissor-N` with 1 ≤ N ≤ 64 exists.
 pub fn scene(name: &str) -> Option<Scene> {
     let text = match name {
         "pendulum" => include_str!("../scenes/pendulum.toml"),
@@ -48,6 +49,7 @@ fn family(name: &str) -> Option<Scene> {
     let n: usize = size.parse().ok().filter(|n: &usize| n.to_string() == size)?;
     match family {
         "chain" if (1..=MAX_LINKS).contains(&n) => Some(chain(n)),
+        "tree" if (1..=MAX_LINKS).contains(&n) => Some(tree(n)),
         "scissor" if (1..=MAX_SEGMENTS).contains(&n) => Some(scissor(n)),
         _ => None,
     }
@@ -119,6 +121,41 @@ fn chain(n: usize) -> Scene {
             coordinates: [(link(0), angle)].into(),
             inputs: Default::default(),
         });
+    }
+    scene
+}
+
+/// A balanced binary tree of `n` boxes, hinged about the axes x, y and z by turns.
+fn tree(n: usize) -> Scene {
+    let mut scene = empty(
+        format!("tree-{n}"),
+        format!("Balanced binary tree of {n} boxes of 0.96 kg, hinged about x, y and z by turns."),
+    );
+    for i in 0..n {
+        let name = format!("box{i}");
+        let (parent, translation) = match i {
+            0 => ("world".to_owned(), [0.0; 3]),
+            _ => {
+                let side = if i % 2 == 1 { 0.05 } else { -0.05 };
+                (format!("box{}", (i - 1) / 2), [side, 0.02, -0.2])
+            }
+        };
+        let mut axis = [0.0; 3];
+        axis[((i + 1).ilog2() % 3) as usize] = 1.0;
+        scene.frames.push(Frame {
+            name: name.clone(),
+            parent,
+            translation,
+            rotation: None,
+            joint: Some(Joint::Revolute { axis, coordinate: None }),
+            body: Some(Body {
+                mass: 0.96,
+                center_of_mass: [0.01, 0.005, -0.1],
+                inertia: vec![0.003712, 0.003488, 0.0008],
+            }),
+        });
+        scene.coordinates.push(dynamic(name.clone(), 0.6 * (0.7 + 1.3 * i as f64).sin()));
+        scene.inputs.push(Input { name: format!("torque{i}"), coordinate: Some(name), gain: 1.0 });
     }
     scene
 }
@@ -197,7 +234,7 @@ mod tests {
     #[test]
     fn every_scene_is_valid_and_bears_its_name() {
         for name in
-            NAMES.iter().copied().chain(["chain-1", "chain-1024", "scissor-1", "scissor-64"])
+            NAMES.iter().copied().chain(["chain-1", "chain-1024", "tree-1024", "scissor-64"])
         {
             let scene = scene(name).unwrap_or_else(|| panic!("{name} does not exist"));
             assert_eq!(scene.name, name);
@@ -219,7 +256,7 @@ mod tests {
 
     #[test]
     fn plants_start_and_step_at_every_operating_point() {
-        for name in NAMES.iter().copied().chain(["scissor-1", "scissor-12"]) {
+        for name in NAMES.iter().copied().chain(["tree-63", "scissor-1", "scissor-12"]) {
             let model = Arc::new(Model::compile(&scene(name).unwrap()).unwrap());
             let mut plant = Plant::new(model.clone(), Settings::new(&model)).unwrap();
             for point in model.operating_points() {

@@ -3,7 +3,7 @@
 //!
 //! Needs valgrind; without it these tests say so and pass.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
@@ -115,13 +115,8 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
     }
 }
 
-/// Instructions per call of each operation of a scene.
-#[derive(Debug, PartialEq, Serialize, Deserialize)]
-struct Counts {
-    step: u64,
-    linearize: u64,
-    step_and_linearize: u64,
-}
+/// Instructions per call by operation.
+type Counts = BTreeMap<String, u64>;
 
 /// The committed table. It holds for one compiler and one kind of processor: others say little about
 /// a change here.
@@ -153,13 +148,28 @@ impl Conditions {
     }
 }
 
-const SCENES: &[&str] =
-    &["pendulum", "double-pendulum", "chain-8", "chain-16", "four-bar", "scissor-8", "marionette"];
+/// Scene, calls from the initial configuration, operations of `step_count`.
+const CASES: &[(&str, u64, &[&str])] = &[
+    ("pendulum", 50, ALL),
+    ("double-pendulum", 50, ALL),
+    ("chain-8", 50, ALL),
+    ("chain-16", 50, PLANT),
+    ("chain-32", 20, PLANT),
+    ("chain-128", 5, PLANT),
+    ("tree-30", 20, PLANT),
+    ("tree-127", 5, PLANT),
+    ("four-bar", 50, PLANT),
+    ("scissor-8", 50, PLANT),
+    ("marionette", 50, PLANT),
+    ("marionette", 10, &["riccati"]),
+];
+const PLANT: &[&str] = &["step", "linearize", "step-and-linearize", "contract"];
+const ALL: &[&str] = &["step", "linearize", "step-and-linearize", "contract", "riccati", "lqr"];
 /// Relative change that goes unnoticed.
 const TOLERANCE: f64 = 0.05;
-const CALLS: u64 = 50;
 const HEADER: &str = "\
-# Instructions per call, counted by callgrind: 50 calls from the initial configuration.
+# Instructions per call, counted by callgrind from the initial configuration on; \
+riccati: per step of the recursion.
 # To renew: UPDATE_INSTRUCTIONS=1 cargo test -p plantd-tests --test callgrind
 
 ";
@@ -170,10 +180,9 @@ fn instructions_per_step_are_those_of_the_table() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("instructions.toml");
     let update = std::env::var_os("UPDATE_INSTRUCTIONS").is_some();
     let conditions = Conditions::here();
-    let count = |scene: &&str| ((*scene).to_owned(), valgrind.counts(scene));
     if update {
-        let measured = Table { conditions, scenes: SCENES.iter().map(count).collect() };
-        let table = toml::to_string(&measured).expect("a table is text");
+        let scenes = valgrind.counts();
+        let table = toml::to_string(&Table { conditions, scenes }).expect("a table is text");
         std::fs::write(path, format!("{HEADER}{table}")).expect("the table is written");
         return;
     }
@@ -183,11 +192,7 @@ fn instructions_per_step_are_those_of_the_table() {
         eprintln!("skipped: the table is of {:?}, this is {conditions:?}", committed.conditions);
         return;
     }
-    assert!(SCENES.iter().eq(SCENES.iter().filter(|scene| committed.scenes.contains_key(**scene))));
-    let changes: Vec<String> = SCENES
-        .iter()
-        .flat_map(|scene| changes(scene, &committed.scenes[*scene], &valgrind.counts(scene)))
-        .collect();
+    let changes = changes(&committed.scenes, &valgrind.counts());
     assert!(
         changes.is_empty(),
         "instruction counts changed; if that is meant, run again with UPDATE_INSTRUCTIONS=1:\n{}",
@@ -195,20 +200,27 @@ fn instructions_per_step_are_those_of_the_table() {
     );
 }
 
-/// Describes the counts that differ by more than the tolerance.
-fn changes(scene: &str, then: &Counts, now: &Counts) -> Vec<String> {
-    let rows = [
-        ("step", then.step, now.step),
-        ("linearize", then.linearize, now.linearize),
-        ("step_and_linearize", then.step_and_linearize, now.step_and_linearize),
-    ];
-    let changed = |(operation, then, now): (&str, u64, u64)| {
+/// Describes the counts that differ by more than the tolerance, are new or are gone.
+fn changes(then: &BTreeMap<String, Counts>, now: &BTreeMap<String, Counts>) -> Vec<String> {
+    let flat = |table: &BTreeMap<String, Counts>| -> BTreeMap<(String, String), u64> {
+        let rows = table.iter().flat_map(|(scene, counts)| {
+            counts.iter().map(|(what, count)| ((scene.clone(), what.clone()), *count))
+        });
+        rows.collect()
+    };
+    let (then, now) = (flat(then), flat(now));
+    let keys: BTreeSet<_> = then.keys().chain(now.keys()).collect();
+    let changed = |(scene, operation): &(String, String)| {
+        let key = (scene.clone(), operation.clone());
+        let (Some(&then), Some(&now)) = (then.get(&key), now.get(&key)) else {
+            return Some(format!("{scene}, {operation}: only in one of the tables"));
+        };
         let change = now as f64 / then as f64 - 1.0;
         let percent = 100.0 * change;
         let line = format!("{scene}, {operation}: {then} -> {now} ({percent:+.1} %)");
         (change.abs() > TOLERANCE).then_some(line)
     };
-    rows.into_iter().filter_map(changed).collect()
+    keys.into_iter().filter_map(changed).collect()
 }
 
 /// Valgrind with the program that it watches.
@@ -261,13 +273,17 @@ impl Valgrind {
         parse(&std::fs::read_to_string(file).expect("callgrind writes its file"))
     }
 
-    fn counts(&self, scene: &str) -> Counts {
-        let per_call = |operation| self.profile(scene, operation, CALLS).total() / CALLS;
-        Counts {
-            step: per_call("step"),
-            linearize: per_call("linearize"),
-            step_and_linearize: per_call("step-and-linearize"),
+    /// The counts of all cases.
+    fn counts(&self) -> BTreeMap<String, Counts> {
+        let mut scenes: BTreeMap<String, Counts> = BTreeMap::new();
+        for (scene, calls, operations) in CASES {
+            for operation in *operations {
+                let total = self.profile(scene, operation, *calls).total();
+                let counts = scenes.entry((*scene).to_owned()).or_default();
+                counts.insert((*operation).to_owned(), total / calls);
+            }
         }
+        scenes
     }
 }
 

@@ -1,0 +1,197 @@
+//! plantd's driver in the comparison with other engines, `tests/peers`.
+//!
+//! Reads lines `PATH METHOD DT STEPS PASSES`, runs PASSES times STEPS steps of DT seconds from the
+//! start of the mechanism in the JSON file PATH, and answers each with the CPU seconds of its thread and
+//! the last configuration, or with `error:` and a reason. Methods: `midpoint`, `midpoint-ab` (a step
+//! with A and B of all joint torques), and `scalar`: the midpoint rule written by hand for a pendulum.
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::io::BufRead;
+use std::sync::Arc;
+
+use plantd_models::scene::{Axis, Body, Constraint, Coordinate, Frame, Input, Joint, Point};
+use plantd_models::{Initial, Linearization, Model, Plant, Scene, Settings};
+use serde::Deserialize;
+
+/// A mechanism of `tests/peers/mechanisms.py`.
+#[derive(Deserialize)]
+struct Mechanism {
+    name: String,
+    gravity: f64,
+    bodies: Vec<Link>,
+    q0: Vec<f64>,
+    v0: Vec<f64>,
+    loops: Vec<Loop>,
+}
+
+#[derive(Deserialize)]
+struct Link {
+    parent: i64,
+    pos: [f64; 3],
+    axis: [f64; 3],
+    mass: f64,
+    com: [f64; 3],
+    inertia: [f64; 3],
+}
+
+/// Two points that coincide; the mechanism moves in the plane of x and z.
+#[derive(Deserialize)]
+struct Loop {
+    body_a: i64,
+    at_a: [f64; 3],
+    body_b: i64,
+    at_b: [f64; 3],
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let mut mechanisms = BTreeMap::new();
+    for line in std::io::stdin().lock().lines() {
+        match answer(&line?, &mut mechanisms) {
+            Ok((seconds, q)) => {
+                let q: Vec<String> = q.iter().map(f64::to_string).collect();
+                println!("{seconds:e} {}", q.join(" "));
+            }
+            Err(error) => println!("error: {error}"),
+        }
+    }
+    Ok(())
+}
+
+type Mechanisms = BTreeMap<String, (Mechanism, Arc<Model>)>;
+
+/// CPU seconds and the last configuration.
+fn answer(line: &str, mechanisms: &mut Mechanisms) -> Result<(f64, Vec<f64>), Box<dyn Error>> {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let [path, method, dt, steps, passes] = words[..] else {
+        return Err("PATH METHOD DT STEPS PASSES are needed".into());
+    };
+    if !mechanisms.contains_key(path) {
+        let mechanism: Mechanism = serde_json::from_str(&std::fs::read_to_string(path)?)?;
+        let model = Arc::new(Model::compile(&scene(&mechanism))?);
+        mechanisms.insert(path.to_owned(), (mechanism, model));
+    }
+    let (mechanism, model) = &mechanisms[path];
+    let (dt, steps, passes) = (dt.parse()?, steps.parse()?, passes.parse()?);
+    match method {
+        "scalar" => Ok(run_scalar(mechanism, dt, steps, passes)),
+        _ => run(mechanism, model, method, dt, steps, passes),
+    }
+}
+
+fn run(
+    mechanism: &Mechanism,
+    model: &Arc<Model>,
+    method: &str,
+    time_step_s: f64,
+    steps: u64,
+    passes: u64,
+) -> Result<(f64, Vec<f64>), Box<dyn Error>> {
+    let settings = Settings { time_step_s, ..Settings::new(model) };
+    let mut plant = Plant::new(Arc::clone(model), settings)?;
+    let (q, v) = (mechanism.q0.clone(), mechanism.v0.clone());
+    plant.initialize(&Initial::Velocity { q, v })?;
+    let start = plant.snapshot();
+    let u = vec![0.0; model.dimensions().input()];
+    let mut out = Linearization::new(model);
+    let begin = cpu_time_s();
+    for _ in 0..passes {
+        plant.restore(&start)?;
+        for _ in 0..steps {
+            match method {
+                "midpoint" => plant.step(&u)?,
+                "midpoint-ab" => plant.step_and_linearize(&u, &mut out)?,
+                _ => return Err("no such method".into()),
+            };
+        }
+    }
+    Ok((cpu_time_s() - begin, plant.q().to_vec()))
+}
+
+/// The same map for a pendulum alone: p₀ = (J/h)Δ + ½h mgl sin(q₀ + ½Δ), by Newton to round-off.
+fn run_scalar(mechanism: &Mechanism, h: f64, steps: u64, passes: u64) -> (f64, Vec<f64>) {
+    let link = &mechanism.bodies[0];
+    let length = link.com[2];
+    let inertia = link.mass * length * length + link.inertia[1];
+    let torque = link.mass * mechanism.gravity * length.abs();
+    let begin = cpu_time_s();
+    let mut q = 0.0;
+    for _ in 0..passes {
+        q = mechanism.q0[0];
+        let mut p = inertia * mechanism.v0[0];
+        let mut increment = h * p / inertia;
+        for _ in 0..steps {
+            let mut last = f64::INFINITY;
+            let sin = loop {
+                let (sin, cos) = (q + 0.5 * increment).sin_cos();
+                let residual = inertia / h * increment + 0.5 * h * torque * sin - p;
+                let correction = residual / (inertia / h + 0.25 * h * torque * cos);
+                // Round-off: corrections do not get smaller any more.
+                if correction == 0.0 || correction.abs() >= last {
+                    break sin;
+                }
+                increment -= correction;
+                last = correction.abs();
+            };
+            p -= h * torque * sin;
+            q += increment;
+        }
+    }
+    (cpu_time_s() - begin, vec![q])
+}
+
+fn scene(mechanism: &Mechanism) -> Scene {
+    let name = |i: i64| if i < 0 { "world".to_owned() } else { format!("b{i}") };
+    let frames = mechanism.bodies.iter().zip(0..).map(|(link, i)| Frame {
+        name: name(i),
+        parent: name(link.parent),
+        translation: link.pos,
+        rotation: None,
+        joint: Some(Joint::Revolute { axis: link.axis, coordinate: None }),
+        body: (link.mass > 0.0).then(|| Body {
+            mass: link.mass,
+            center_of_mass: link.com,
+            inertia: link.inertia.to_vec(),
+        }),
+    });
+    let coordinates = mechanism.q0.iter().zip(0..).map(|(&initial, i)| Coordinate {
+        name: name(i),
+        kind: Default::default(),
+        initial,
+        damping: None,
+    });
+    let inputs = (0..mechanism.q0.len()).map(|i| Input {
+        name: format!("torque{i}"),
+        coordinate: Some(format!("b{i}")),
+        gain: 1.0,
+    });
+    let point = |body, at| Point { frame: name(body), at };
+    let constraints = mechanism.loops.iter().enumerate().map(|(i, l)| Constraint::PointToPoint {
+        name: format!("loop{i}"),
+        a: point(l.body_a, l.at_a),
+        b: point(l.body_b, l.at_b),
+        axes: vec![Axis::X, Axis::Z],
+    });
+    Scene {
+        format: 1,
+        name: mechanism.name.to_lowercase(),
+        description: String::new(),
+        time_step_s: 0.01,
+        gravity: [0.0, 0.0, -mechanism.gravity],
+        damping: 0.0,
+        frames: frames.collect(),
+        coordinates: coordinates.collect(),
+        springs: Vec::new(),
+        inputs: inputs.collect(),
+        forces: Vec::new(),
+        signals: Vec::new(),
+        constraints: constraints.collect(),
+        operating_points: Vec::new(),
+    }
+}
+
+/// CPU time of this thread: other programs on the machine do not count.
+fn cpu_time_s() -> f64 {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
+}

@@ -1,0 +1,45 @@
+// What the drivers in C and C++ share. A driver reads lines
+//
+//   PATH METHOD DT STEPS PASSES
+//
+// runs PASSES times STEPS steps of DT seconds from the mechanism's start, and answers each line with the
+// CPU seconds of its thread and the last configuration, or with `error:` and a reason.
+
+#ifndef DRIVER_H
+#define DRIVER_H
+
+#include <stdio.h>
+#include <string.h>
+#include <time.h>
+
+struct command {
+  char path[1024];
+  char method[64];
+  double dt;
+  long steps;
+  long passes;
+};
+
+static int read_command(struct command *c) {
+  return scanf("%1023s %63s %lf %ld %ld", c->path, c->method, &c->dt, &c->steps, &c->passes) == 5;
+}
+
+static double cpu_seconds(void) {
+  struct timespec now;
+  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
+  return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+static void answer(double seconds, const double *q, int n) {
+  printf("%.9e", seconds);
+  for (int i = 0; i < n; ++i) printf(" %.17g", q[i]);
+  printf("\n");
+  fflush(stdout);
+}
+
+static void refuse(const char *reason) {
+  printf("error: %s\n", reason);
+  fflush(stdout);
+}
+
+#endif
