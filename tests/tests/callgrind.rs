@@ -273,16 +273,32 @@ impl Valgrind {
         parse(&std::fs::read_to_string(file).expect("callgrind writes its file"))
     }
 
-    /// The counts of all cases.
+    /// The counts of all cases, on all processors.
     fn counts(&self) -> BTreeMap<String, Counts> {
+        let cases: Vec<_> = CASES
+            .iter()
+            .flat_map(|(scene, calls, operations)| {
+                operations.iter().map(move |o| (*scene, *calls, *o))
+            })
+            .collect();
+        let threads = std::thread::available_parallelism().map_or(1, usize::from);
+        let count = |first: usize| {
+            let own = cases.iter().skip(first).step_by(threads);
+            own.map(|&(scene, calls, operation)| {
+                let total = self.profile(scene, operation, calls).total();
+                (scene, operation, total / calls)
+            })
+            .collect::<Vec<_>>()
+        };
         let mut scenes: BTreeMap<String, Counts> = BTreeMap::new();
-        for (scene, calls, operations) in CASES {
-            for operation in *operations {
-                let total = self.profile(scene, operation, *calls).total();
-                let counts = scenes.entry((*scene).to_owned()).or_default();
-                counts.insert((*operation).to_owned(), total / calls);
+        std::thread::scope(|scope| {
+            let workers: Vec<_> = (0..threads).map(|i| scope.spawn(move || count(i))).collect();
+            for worker in workers {
+                for (scene, operation, count) in worker.join().expect("a case is counted") {
+                    scenes.entry(scene.to_owned()).or_default().insert(operation.to_owned(), count);
+                }
             }
-        }
+        });
         scenes
     }
 }
