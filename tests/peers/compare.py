@@ -285,7 +285,7 @@ def table_of_goals(steps, derivatives):
                 continue
             value = ratio(times, own, other)
             verdict = "met" if value <= goal else "missed"
-            lines.append(f"| {what} | {name} | {' '.join(other)} | {value:.2f} | {goal} | {verdict} |")
+            lines.append(f"| {what} | {name} | {' '.join(other)} | {value:.3g} | {goal} | {verdict} |")
     if BY_HAND in steps.get("P", {}):
         value = ratio(steps["P"], PLANTD, BY_HAND)
         lines.append(f"| step | P | the same map by hand | {value:.1f} | | |")
@@ -306,7 +306,7 @@ def measure_growth(plantd):
     for what, method in [("step", "midpoint"), ("step, A and B", "midpoint-ab")]:
         times = {}
         for name in GROWTH:
-            times[name] = repeated(plantd, name, method, time_step(name), 5)[0] / 5
+            times[name] = repeated(plantd, name, method, time_step(name), STEPS)[0] / STEPS
         row = ", ".join(f"{name} {t * 1e6:.0f} µs" for name, t in times.items())
         exponents[what] = exponent(times)
         say(f"{what}: {row}, exponent {exponents[what]:.2f}")
