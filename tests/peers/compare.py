@@ -201,7 +201,7 @@ AB_METHODS = [
 ]
 TABLE = ["P", "D", "S", "L"]
 TABLE += [f"C{2**k}" for k in range(8)] + ["T7", "T15", "T30", "T63"]
-GROWTH = ["C128", "C256", "C512", "C1024"]
+GROWTH = ["H128", "H256", "H512", "H1024"]
 
 # Mechanism, what plantd is compared with, and the ratio that is aimed at.
 STEP_GOALS = [(name, ("Pinocchio", "rk4"), 0.25) for name in ("C8", "C32", "C128")]
@@ -214,7 +214,7 @@ AB_GOALS += [(name, ("MuJoCo", "euler-ab"), 0.1) for name in ("C8", "C32", "T30"
 
 def time_step(name):
     """0.01 s; shorter for long chains, whose links swing faster."""
-    return min(0.01, 0.08 / int(name[1:])) if name[0] == "C" else 0.01
+    return min(0.01, 0.08 / int(name[1:])) if name[0] in "CH" else 0.01
 
 
 def applies(name, method):
@@ -301,12 +301,13 @@ def exponent(times):
 
 
 def measure_growth(plantd):
-    """plantd's exponents over long chains."""
+    """plantd's exponents over long chains, of steps after the first."""
     exponents = {}
-    for what, method in [("step", "midpoint"), ("step, A and B", "midpoint-ab")]:
+    moving = {"step": "midpoint-moving", "step, A and B": "midpoint-ab-moving"}
+    for what, method in moving.items():
         times = {}
         for name in GROWTH:
-            times[name] = repeated(plantd, name, method, time_step(name), STEPS)[0] / STEPS
+            times[name] = repeated(plantd, name, method, time_step(name), STEPS + 1)[0] / STEPS
         row = ", ".join(f"{name} {t * 1e6:.0f} µs" for name, t in times.items())
         exponents[what] = exponent(times)
         say(f"{what}: {row}, exponent {exponents[what]:.2f}")

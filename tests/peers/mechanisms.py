@@ -48,6 +48,11 @@ def chain(n):
     return mechanism(f"C{n}", rods, [math.pi / 2] + [0.0] * (n - 1))
 
 
+def hanging_chain(n):
+    """The same chain, released 30 degrees from hanging: a motion that is as gentle for any n."""
+    return chain(n) | dict(name=f"H{n}", q0=[math.pi / 6] + [0.0] * (n - 1))
+
+
 def tree(n):
     """Balanced binary tree of n boxes, hinged about alternating axes."""
     axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
@@ -69,7 +74,7 @@ def four_bar():
 
 
 SINGLE = {"P": pendulum, "D": double_pendulum, "S": spherical_pendulum, "L": four_bar}
-FAMILIES = {"C": chain, "T": tree}
+FAMILIES = {"C": chain, "H": hanging_chain, "T": tree}
 
 
 def named(name):
