@@ -23,13 +23,22 @@ impl Scratch {
 
     /// All of it.
     pub(super) fn numbers(&mut self) -> &mut [f64] {
+        let range = self.aligned();
+        &mut self.0[range]
+    }
+
+    /// All of it, to read.
+    pub(super) fn read(&self) -> &[f64] {
+        &self.0[self.aligned()]
+    }
+
+    fn aligned(&self) -> std::ops::Range<usize> {
         // No alignment (under an interpreter, say) costs time alone.
         let start = match self.0.as_ptr().align_offset(64) {
             offset if offset < LANES => offset,
             _ => 0,
         };
-        let end = self.0.len() - (LANES - start);
-        &mut self.0[start..end]
+        start..self.0.len().saturating_sub(LANES - start).max(start)
     }
 }
 

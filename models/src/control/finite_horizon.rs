@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::lq::{LqRecursion, NotConvex, Stage};
+use super::lq::{LqRecursion, Map, NotConvex, Stage};
 use super::{RiccatiError, StageWeights, Tangent, TrajectoryWeights, all_finite};
 
 /// The linearized map of one step, `dx[k+1] = A dx[k] + B du[k]`.
@@ -115,6 +115,7 @@ pub fn finite_horizon_on_manifold(
 
 /// What a solution gathers, in the order in which it is found: the end of the horizon first.
 struct Backwards {
+    map: Map,
     gain: DMatrix<f64>,
     offset: DVector<f64>,
     gains: Vec<DMatrix<f64>>,
@@ -126,6 +127,7 @@ struct Backwards {
 impl Backwards {
     fn new(m: usize, n: usize, samples: usize, values: Values) -> Self {
         Self {
+            map: Map::default(),
             gain: DMatrix::zeros(m, n),
             offset: DVector::zeros(m),
             gains: Vec::with_capacity(samples),
@@ -145,7 +147,9 @@ impl Backwards {
         stage: Stage<'_>,
         weights: &StageWeights,
     ) -> Result<(), RiccatiError> {
-        recursion.step(a, b, stage, &mut self.gain, &mut self.offset).map_err(|NotConvex| {
+        self.map.set(a, b);
+        let Self { map, gain, offset, .. } = self;
+        recursion.step(map, stage, gain, offset).map_err(|NotConvex| {
             // Convex stages lose definiteness to overflow or round-off alone.
             if weights.is_convex() || !all_finite(recursion.value()) {
                 RiccatiError::Overflow { sample }

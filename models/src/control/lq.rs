@@ -3,16 +3,16 @@
 //!
 //! With `M = [B A]` everything comes from `G = MᵀPM`: its blocks are `BᵀPB`, `AᵀPB` and `AᵀPA`. A
 //! discrete map has rows that say little (the next prescribed coordinate is the input, its velocity is
-//! a difference quotient) and columns that are zero (velocities of prescribed coordinates). Both are
-//! found by looking for zeros: products run over the other rows and columns, a row of a few entries is
+//! a difference quotient) and columns that are zero (velocities of prescribed coordinates). A [`Map`]
+//! leaves them out: products run over the other rows and columns, a row of a few entries is
 //! added entry by entry, and where a zero column leaves `P` as the weight is, its zeros are not
 //! multiplied either. Of symmetric results the lower triangle is computed.
 
-mod structure;
+mod map;
 
 use nalgebra::{DMatrix, DVector};
 
-use self::structure::Structure;
+pub(crate) use self::map::Map;
 use super::blocked::{Into, LANES, Operand, Scratch, product};
 
 /// One stage of the cost,
@@ -37,8 +37,6 @@ pub(crate) struct NotConvex;
 
 /// States and inputs up to which plain loops are fastest.
 const SMALL: usize = 8;
-/// Entries up to which a row of the map is added entry by entry.
-const FEW: usize = 4;
 /// Where `Q + AᵀPA − KᵀΓK` leaves less than this of a diagonal entry, it is computed again as a sum
 /// that cancels less.
 const CANCELLED: f64 = 1e-3;
@@ -56,11 +54,11 @@ pub(crate) struct LqRecursion {
 /// Room for the large kernel; nothing here outlives a step.
 #[derive(Clone, Debug, Default)]
 struct Work {
-    structure: Structure,
     /// `P`, where its columns have to be padded.
     value: Scratch,
-    /// `Mᵀ`, columns: full rows of `M`.
-    map: Scratch,
+    /// Where the columns of `P` begin that belong to full rows of `M`, and those of the cross term.
+    value_columns: Vec<usize>,
+    cross_columns: Vec<usize>,
     /// `PM`.
     reached: Scratch,
     /// `G`.
@@ -73,9 +71,10 @@ struct Work {
     whole: Vec<f64>,
     /// `Mᵀb`, then what the offset takes from it.
     linear: Vec<f64>,
-    /// For the sum that cancels less: `A − BK`, `P (A − BK)`, `RK` and the new `P`.
-    closed_loop: Vec<f64>,
-    pushed: Vec<f64>,
+    /// For the sum that cancels less: rows of `A − BK`, where they begin, and a row of `½RK − Sᵀ`.
+    closed_loop: Scratch,
+    closed_loop_rows: Vec<usize>,
+    side_by_side: Vec<usize>,
     priced: Vec<f64>,
 }
 
@@ -115,22 +114,21 @@ impl LqRecursion {
         reciprocal_condition(&self.factor)
     }
 
-    /// One stage back, through `x[k+1] = A x + B u`: the law that is best there,
+    /// One stage back, through the map `x[k+1] = A x + B u`: the law that is best there,
     /// `u = −gain x − offset`, with `Γ = R + BᵀPB`, `gain = Γ⁻¹(BᵀPA + Sᵀ)`,
     /// `offset = Γ⁻¹(Bᵀb + u_linear)`. On failure the cost to go is that of the stage before.
     ///
-    /// Allocates nothing after the first step with the same numbers of states and inputs. `A` may
-    /// lead from one number of states to another.
+    /// Allocates nothing after the first step with the same numbers of states and inputs, unless `S`
+    /// has entries of states that `A` leaves out. `A` may lead from one number of states to another.
     pub(crate) fn step(
         &mut self,
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
+        map: &Map,
         stage: Stage<'_>,
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
-        let ((next, n), m) = (a.shape(), b.ncols());
-        assert!(self.value.nrows() == next && b.nrows() == next, "A and B fit P");
+        let Map { next, states: n, inputs: m, .. } = *map;
+        assert!(self.value.nrows() == next, "A and B fit P");
         assert!(stage.q.shape() == (n, n) && stage.r.shape() == (m, m), "Q and R fit A and B");
         assert!(stage.s.is_none_or(|s| s.shape() == (n, m)), "S fits Q and R");
         assert!(gain.shape() == (m, n) && offset.len() == m, "room for the law");
@@ -138,12 +136,12 @@ impl LqRecursion {
             self.factor = DMatrix::identity(m, m);
         }
         if next > SMALL || n > SMALL || m > SMALL {
-            return self.step_large(a, b, stage, gain, offset);
+            return self.step_large(map, stage, gain, offset);
         }
         match (next, n, m) {
-            (2, 2, 1) => self.step_small::<2>((2, 2, 1), a, b, stage, gain, offset),
-            (4, 4, 1) => self.step_small::<4>((4, 4, 1), a, b, stage, gain, offset),
-            sizes => self.step_small::<SMALL>(sizes, a, b, stage, gain, offset),
+            (2, 2, 1) => self.step_small::<2>((2, 2, 1), map, stage, gain, offset),
+            (4, 4, 1) => self.step_small::<4>((4, 4, 1), map, stage, gain, offset),
+            sizes => self.step_small::<SMALL>(sizes, map, stage, gain, offset),
         }
     }
 
@@ -153,14 +151,29 @@ impl LqRecursion {
     fn step_small<const N: usize>(
         &mut self,
         (next, n, m): (usize, usize, usize),
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
+        map: &Map,
         stage: Stage<'_>,
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
         // Columns.
-        let (a, b) = (&a.as_slice()[..next * n], &b.as_slice()[..next * m]);
+        let (mut a, mut b) = ([[0.0; N]; N], [[0.0; N]; N]);
+        for (&row, &start) in map.full.iter().zip(&map.starts) {
+            let numbers = &map.numbers()[start..];
+            for j in 0..m {
+                b[j][row] = numbers[j];
+            }
+            for (&state, entry) in map.active.iter().zip(&numbers[m..]) {
+                a[state][row] = *entry;
+            }
+        }
+        for &(row, col, entry) in &map.entries {
+            if col < m {
+                b[col][row] = entry;
+            } else {
+                a[map.active[col - m]][row] = entry;
+            }
+        }
         let value = &self.value.as_slice()[..next * next];
         let (q, r) = (&stage.q.as_slice()[..n * n], &stage.r.as_slice()[..m * m]);
         let times_value = |x: &[f64]| {
@@ -177,12 +190,12 @@ impl LqRecursion {
         let mut bracket = [[0.0; N]; N];
         let mut cross = [[0.0; N]; N];
         for j in 0..m {
-            value_b[j] = times_value(&b[next * j..]);
+            value_b[j] = times_value(&b[j]);
             for i in 0..=j {
-                bracket[j][i] = r[m * j + i] + dot(&b[next * i..], &value_b[j]);
+                bracket[j][i] = r[m * j + i] + dot(&b[i], &value_b[j]);
             }
             for i in 0..n {
-                cross[j][i] = dot(&a[next * i..], &value_b[j]);
+                cross[j][i] = dot(&a[i], &value_b[j]);
                 if let Some(s) = stage.s {
                     cross[j][i] += s.as_slice()[n * j + i];
                 }
@@ -234,13 +247,13 @@ impl LqRecursion {
         for j in 0..m {
             let known: f64 = (0..j).map(|k| bracket[j][k] * input[k]).sum();
             let given = stage.u_linear.map_or(0.0, |u_linear| u_linear[j]);
-            input[j] = (dot(&b[next * j..], linear) + given - known) / bracket[j][j];
+            input[j] = (dot(&b[j], linear) + given - known) / bracket[j][j];
         }
         let mut new_linear = [0.0; N];
         for i in 0..n {
             let known: f64 = (0..m).map(|k| cross[k][i] * input[k]).sum();
             let given = stage.x_linear.map_or(0.0, |x_linear| x_linear[i]);
-            new_linear[i] = dot(&a[next * i..], linear) + given - known;
+            new_linear[i] = dot(&a[i], linear) + given - known;
         }
         for j in (0..m).rev() {
             let known: f64 = (j + 1..m).map(|k| bracket[k][j] * input[k]).sum();
@@ -251,9 +264,9 @@ impl LqRecursion {
         let mut new_value = [[0.0; N]; N];
         let mut has_cancelled = false;
         for j in 0..n {
-            let value_a = times_value(&a[next * j..]);
+            let value_a = times_value(&a[j]);
             for i in 0..=j {
-                let whole = q[n * j + i] + dot(&a[next * i..], &value_a);
+                let whole = q[n * j + i] + dot(&a[i], &value_a);
                 let gained: f64 = (0..m).map(|k| cross[k][i] * cross[k][j]).sum();
                 new_value[j][i] = whole - gained;
                 if i == j {
@@ -265,8 +278,8 @@ impl LqRecursion {
             let mut closed_loop = [[0.0; N]; N];
             for j in 0..n {
                 for i in 0..next {
-                    let fed: f64 = (0..m).map(|k| b[next * k + i] * law[k][j]).sum();
-                    closed_loop[j][i] = a[next * j + i] - fed;
+                    let fed: f64 = (0..m).map(|k| b[k][i] * law[k][j]).sum();
+                    closed_loop[j][i] = a[j][i] - fed;
                 }
             }
             for j in 0..n {
@@ -302,18 +315,20 @@ impl LqRecursion {
 
     fn step_large(
         &mut self,
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
+        map: &Map,
         stage: Stage<'_>,
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
+        if stage.s.is_some_and(|s| reaches_beyond(s, &map.active)) {
+            return self.step_large(&map.with_all_states(), stage, gain, offset);
+        }
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2.
-            return unsafe { self.step_avx2(a, b, stage, gain, offset) };
+            return unsafe { self.step_avx2(map, stage, gain, offset) };
         }
-        self.step_portable(a, b, stage, gain, offset)
+        self.step_portable(map, stage, gain, offset)
     }
 
     /// The same in wider registers.
@@ -321,50 +336,49 @@ impl LqRecursion {
     #[target_feature(enable = "avx2")]
     fn step_avx2(
         &mut self,
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
+        map: &Map,
         stage: Stage<'_>,
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
-        self.step_portable(a, b, stage, gain, offset)
+        self.step_portable(map, stage, gain, offset)
     }
 
     #[inline(always)]
     fn step_portable(
         &mut self,
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
+        whole_map: &Map,
         stage: Stage<'_>,
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
-        let ((next, n), m) = (a.shape(), b.ncols());
+        let Map { next, states: n, inputs: m, active, full, starts, entries, .. } = whole_map;
+        let (next, n, m) = (*next, *n, *m);
+        let (width, stride) = (whole_map.width(), whole_map.stride());
         let Work {
-            structure, value, map, reached, bracket, cross, gain: law, whole, linear, ..
+            value,
+            value_columns,
+            cross_columns,
+            reached,
+            bracket,
+            cross,
+            gain: law,
+            whole,
+            linear,
+            ..
         } = &mut self.work;
         let value_stride = next.next_multiple_of(LANES);
-        structure.find(a, b, stage.s, &self.value, value_stride);
-        let Structure {
-            active,
-            full,
-            reach,
-            entries,
-            value_columns,
-            map_columns,
-            cross_columns,
-            ..
-        } = &*structure;
-        let width = m + active.len();
-        let stride = width.next_multiple_of(LANES);
-        map.reserve(stride * full.len());
+        value_columns.clear();
+        value_columns.extend(full.iter().map(|row| value_stride * row));
+        cross_columns.clear();
+        cross_columns.extend((0..m).map(|j| stride * j));
+        let reach = reach(&self.value, full);
         reached.reserve(value_stride * stride);
         for scratch in [&mut *bracket, &mut *cross, &mut *law] {
             scratch.reserve(stride * stride);
         }
-        let (map, reached) = (map.numbers(), reached.numbers());
+        let reached = reached.numbers();
         let (bracket, cross, law) = (bracket.numbers(), cross.numbers(), law.numbers());
-        pack(a, b, active, full, map, stride);
         let value: &[f64] = if next == value_stride {
             self.value.as_slice()
         } else {
@@ -380,9 +394,9 @@ impl LqRecursion {
         };
 
         // PM.
-        let map = Operand { numbers: map, terms: map_columns, stride: 1 };
+        let map = Operand { numbers: whole_map.numbers(), terms: starts, stride: 1 };
         let operand = Operand { numbers: value, terms: value_columns, stride: 1 };
-        product(reached, value_stride, operand, map, (*reach, width), Into::Set, 0);
+        product(reached, value_stride, operand, map, (reach, width), Into::Set, 0);
         let known = reach.next_multiple_of(LANES);
         if known < value_stride {
             for column in reached.chunks_exact_mut(value_stride).take(width) {
@@ -443,7 +457,7 @@ impl LqRecursion {
             scale(target, bracket[stride * j + j].recip());
         }
         if active.len() < n {
-            gain.fill(0.0);
+            gain.as_mut_slice().fill(0.0);
         }
         for (i, &state) in active.iter().enumerate() {
             let column = &mut gain.as_mut_slice()[m * state..][..m];
@@ -453,15 +467,11 @@ impl LqRecursion {
         }
 
         // The linear part.
-        linear.clear();
-        linear.resize(width, 0.0);
         if self.linear.iter().any(|&entry| entry != 0.0) {
-            for (&row, &start) in full.iter().zip(map_columns) {
-                subtract(linear, -self.linear[row], &map.numbers[start..][..width]);
-            }
-            for &(row, col, entry) in entries {
-                linear[col] += entry * self.linear[row];
-            }
+            whole_map.pull_back(self.linear.as_slice(), linear);
+        } else {
+            linear.clear();
+            linear.resize(width, 0.0);
         }
         let (input, state) = linear.split_at_mut(m);
         if let Some(u_linear) = stage.u_linear {
@@ -498,26 +508,29 @@ impl LqRecursion {
             (q + diagonal(bracket, i)).abs() < CANCELLED * (q + whole).abs()
         });
         if has_cancelled {
-            self.value_again(a, b, stage, gain);
-        } else {
-            if self.value.nrows() == n {
-                self.value.copy_from(stage.q);
+            self.value_again(whole_map, stage);
+        }
+        let bracket = self.work.bracket.numbers();
+        if self.value.nrows() != n {
+            self.value = DMatrix::zeros(n, n);
+        }
+        let value = self.value.as_mut_slice();
+        value.copy_from_slice(stage.q.as_slice());
+        let is_head = active.last().is_none_or(|&last| last + 1 == active.len());
+        for (j, &col) in active.iter().enumerate() {
+            let source = &bracket[stride * (m + j)..][m + j..width];
+            let column = &mut value[n * col..][..n];
+            if is_head {
+                subtract(&mut column[j..], -1.0, source);
             } else {
-                self.value = stage.q.clone();
-            }
-            let value = self.value.as_mut_slice();
-            let is_whole = active.last().is_none_or(|&last| last + 1 == active.len());
-            for (j, &col) in active.iter().enumerate() {
-                let source = &bracket[stride * (m + j)..][m + j..width];
-                let column = &mut value[n * col..][..n];
-                if is_whole {
-                    subtract(&mut column[j..], -1.0, source);
-                } else {
-                    for (&row, source) in active[j..].iter().zip(source) {
-                        column[row] += source;
-                    }
+                for (&row, source) in active[j..].iter().zip(source) {
+                    column[row] += source;
                 }
             }
+        }
+        if is_head {
+            mirror_head(value, n, active.len());
+        } else {
             mirror(value, n, active);
         }
         if self.linear.len() != n {
@@ -527,87 +540,103 @@ impl LqRecursion {
             Some(x_linear) => self.linear.copy_from(x_linear),
             None => self.linear.fill(0.0),
         }
-        let Work { structure, linear, .. } = &self.work;
-        for (&state, entry) in structure.active.iter().zip(&linear[m..]) {
+        for (&state, entry) in active.iter().zip(&self.work.linear[m..]) {
             self.linear[state] += entry;
         }
         Ok(())
     }
 
-    /// `P ← Q − SK − KᵀSᵀ + KᵀRK + (A − BK)ᵀP(A − BK)`: forgives an error in `K` to second order.
-    fn value_again(
-        &mut self,
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
-        stage: Stage<'_>,
-        gain: &DMatrix<f64>,
-    ) {
-        let ((next, n), m) = (a.shape(), b.ncols());
-        let Work { closed_loop, pushed, priced, .. } = &mut self.work;
-        closed_loop.clear();
-        closed_loop.extend_from_slice(a.as_slice());
-        multiply_add(closed_loop, -1.0, b, gain.as_slice());
-        pushed.clear();
-        pushed.resize(next * n, 0.0);
-        multiply_add(pushed, 1.0, &self.value, closed_loop);
-        // RK − Sᵀ, so that KᵀRK − KᵀSᵀ is a product too.
-        priced.clear();
-        priced.resize(m * n, 0.0);
-        multiply_add(priced, 1.0, stage.r, gain.as_slice());
-        if let Some(s) = stage.s {
-            for (i, column) in priced.chunks_exact_mut(m.max(1)).enumerate() {
-                for (j, target) in column.iter_mut().enumerate() {
-                    *target -= s[(i, j)];
-                }
+    /// `−SK − KᵀSᵀ + KᵀRK + (A − BK)ᵀP(A − BK)` in the place of `AᵀPA − KᵀΓK`: forgives an error in `K`
+    /// to second order.
+    fn value_again(&mut self, map: &Map, stage: Stage<'_>) {
+        let Map { next, inputs: m, ref active, .. } = *map;
+        let (width, stride) = (map.width(), map.stride());
+        let value_stride = next.next_multiple_of(LANES);
+        let Work {
+            value,
+            value_columns,
+            reached,
+            bracket,
+            gain: law,
+            closed_loop,
+            closed_loop_rows: rows,
+            side_by_side,
+            priced,
+            ..
+        } = &mut self.work;
+        let (bracket, law) = (bracket.numbers(), law.numbers());
+        let law = |j: usize| &law[stride * j..][..stride];
+        closed_loop.reserve(stride * next);
+        let closed_loop = closed_loop.numbers();
+        closed_loop[..stride * next].fill(0.0);
+        rows.clear();
+        rows.extend((0..next).map(|row| stride * row));
+        for (&row, &start) in map.full.iter().zip(&map.starts) {
+            let (inputs, states) = map.numbers()[start..][..width].split_at(m);
+            let target = &mut closed_loop[stride * row..][..stride];
+            target[m..width].copy_from_slice(states);
+            inputs.iter().enumerate().for_each(|(j, b)| subtract(target, *b, law(j)));
+        }
+        for &(row, col, entry) in &map.entries {
+            let target = &mut closed_loop[stride * row..][..stride];
+            if col < m {
+                subtract(target, entry, law(col));
+            } else {
+                target[col] += entry;
             }
         }
-        if self.value.nrows() == n {
-            self.value.copy_from(stage.q);
-        } else {
-            self.value = stage.q.clone();
-        }
-        let dot = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(x, y)| x * y).sum::<f64>();
-        let law = gain.as_slice();
-        for j in 0..n {
-            let pushed = &pushed[next * j..][..next];
-            let priced = &priced[m * j..][..m];
-            for i in j..n {
-                let mut sum = self.value[(i, j)]
-                    + dot(&closed_loop[next * i..][..next], pushed)
-                    + dot(&law[m * i..][..m], priced);
-                if let Some(s) = stage.s {
-                    sum -= (0..m).map(|k| s[(i, k)] * law[m * j + k]).sum::<f64>();
-                }
-                self.value[(i, j)] = sum;
-                self.value[(j, i)] = sum;
+        // Columns of inputs stay zero: what they have of the law is nothing.
+        let value = if next == value_stride { self.value.as_slice() } else { value.read() };
+        value_columns.clear();
+        value_columns.extend((0..next).map(|row| value_stride * row));
+        let right = Operand { numbers: closed_loop, terms: rows, stride: 1 };
+        let left = Operand { numbers: value, terms: value_columns, stride: 1 };
+        let reached = reached.numbers();
+        product(reached, value_stride, left, right, (next, width), Into::Set, 0);
+        side_by_side.clear();
+        side_by_side.extend(0..next);
+        let pushed = Operand { numbers: reached, terms: side_by_side, stride: value_stride };
+        product(bracket, stride, right, pushed, (width, width), Into::SetLower, m / LANES * LANES);
+        // KᵀRK − KᵀSᵀ − SK = Kᵀ(½RK − Sᵀ) + its transpose.
+        for j in 0..m {
+            priced.clear();
+            priced.resize(stride, 0.0);
+            (0..m).for_each(|k| subtract(priced, -0.5 * stage.r[(j, k)], law(k)));
+            if let Some(s) = stage.s {
+                let states = priced[m..width].iter_mut().zip(active);
+                states.for_each(|(target, state)| *target -= s[(*state, j)]);
+            }
+            for i in m..width {
+                let target = &mut bracket[stride * i..][i..width];
+                subtract(target, -priced[i], &law(j)[i..width]);
+                subtract(target, -law(j)[i], &priced[i..width]);
             }
         }
     }
 }
 
-/// `Mᵀ` of the given rows of `M`, padded with zeros.
-#[inline(always)]
-fn pack(
-    a: &DMatrix<f64>,
-    b: &DMatrix<f64>,
-    active: &[usize],
-    rows: &[usize],
-    map: &mut [f64],
-    stride: usize,
-) {
-    let (next, m) = b.shape();
-    let (a, b) = (a.as_slice(), b.as_slice());
-    let width = m + active.len();
-    for (k, &row) in rows.iter().enumerate() {
-        let target = &mut map[stride * k..][..stride];
-        for (j, target) in target[..m].iter_mut().enumerate() {
-            *target = b[next * j + row];
+/// Whether `S` has entries of states that are not active.
+fn reaches_beyond(s: &DMatrix<f64>, active: &[usize]) -> bool {
+    let mut rest = active;
+    (0..s.nrows()).any(|state| match rest.split_first() {
+        Some((first, others)) if *first == state => {
+            rest = others;
+            false
         }
-        for (target, &state) in target[m..].iter_mut().zip(active) {
-            *target = a[next * state + row];
-        }
-        target[width..].fill(0.0);
-    }
+        _ => s.row(state).iter().any(|entry| *entry != 0.0),
+    })
+}
+
+/// Rows of `P` up to here have entries in the columns of full rows of `M`.
+fn reach(value: &DMatrix<f64>, full: &[usize]) -> usize {
+    let n = value.nrows();
+    let last_full = full.last().map_or(0, |row| row + 1);
+    let reaches = |row: usize| {
+        let column = &value.as_slice()[n * row..][..last_full];
+        column.iter().fold(false, |any, entry| any | (*entry != 0.0))
+            && full.iter().any(|&full| column[full] != 0.0)
+    };
+    (last_full..n).rev().find(|&row| reaches(row)).map_or(last_full, |row| row + 1)
 }
 
 /// The lower triangular factor of the first `m` rows and columns, in place of their lower triangle.
@@ -631,16 +660,37 @@ fn factorize(c: &mut [f64], stride: usize, m: usize) -> Result<(), NotConvex> {
     Ok(())
 }
 
-/// Copies the lower triangle of the given rows and columns to the upper one, block by block.
-#[inline(always)]
+/// Copies the lower triangle of the given rows and columns to the upper one.
 fn mirror(value: &mut [f64], n: usize, indices: &[usize]) {
-    for (first, cols) in indices.chunks(LANES).enumerate() {
-        for rows in indices[LANES * first..].chunks(LANES) {
-            for &row in rows {
-                for &col in cols.iter().take_while(|&&col| col < row) {
-                    value[n * row + col] = value[n * col + row];
+    for (i, &row) in indices.iter().enumerate() {
+        for &col in &indices[..i] {
+            value[n * row + col] = value[n * col + row];
+        }
+    }
+}
+
+/// The same of the first rows and columns, block by block.
+#[inline(always)]
+fn mirror_head(value: &mut [f64], n: usize, count: usize) {
+    let whole = count / LANES * LANES;
+    for col in (0..whole).step_by(LANES) {
+        for row in (col..whole).step_by(LANES) {
+            let mut block = [[0.0; LANES]; LANES];
+            for (j, lower) in block.iter_mut().enumerate() {
+                lower.copy_from_slice(&value[n * (col + j) + row..][..LANES]);
+            }
+            for i in 0..LANES {
+                let known = if row == col { i } else { LANES };
+                let upper = &mut value[n * (row + i) + col..][..LANES];
+                for (j, upper) in upper.iter_mut().enumerate() {
+                    *upper = if j < known { block[j][i] } else { *upper };
                 }
             }
+        }
+    }
+    for row in whole..count {
+        for col in 0..row {
+            value[n * row + col] = value[n * col + row];
         }
     }
 }
@@ -656,19 +706,6 @@ fn subtract(target: &mut [f64], factor: f64, source: &[f64]) {
 fn scale(target: &mut [f64], factor: f64) {
     for target in target {
         *target *= factor;
-    }
-}
-
-/// `C += sign A B`, all of them columns.
-fn multiply_add(c: &mut [f64], sign: f64, a: &DMatrix<f64>, b: &[f64]) {
-    let (rows, terms) = a.shape();
-    if rows == 0 || terms == 0 {
-        return;
-    }
-    for (target, factors) in c.chunks_exact_mut(rows).zip(b.chunks_exact(terms)) {
-        for (column, factor) in a.as_slice().chunks_exact(rows).zip(factors) {
-            subtract(target, -sign * factor, column);
-        }
     }
 }
 

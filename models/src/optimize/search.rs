@@ -14,8 +14,8 @@ use super::{
     Bounds, Checkpoint, FreeInitialState, Method, OptimizeError, Options, Progress, Status, Stuck,
     TrajectoryCost,
 };
-use crate::control::lq::LqRecursion;
-use crate::control::{Sample, Weights};
+use crate::control::Weights;
+use crate::control::lq::{LqRecursion, Map};
 use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State};
 
 /// Penalty with which a search begins.
@@ -61,9 +61,9 @@ pub struct Optimizer {
     iterations: u32,
     first_cost: f64,
     status: Status,
-    /// `samples` and `gains` belong to the current trajectory.
+    /// `maps` and `gains` belong to the current trajectory.
     is_linearized: bool,
-    samples: Vec<Sample>,
+    maps: Vec<Map>,
     /// `K[k]` of the projection.
     gains: Vec<DMatrix<f64>>,
     /// Gradient of the cost with penalties.
@@ -119,6 +119,7 @@ struct Scratch {
     identity: Second,
     offset: DVector<f64>,
     adjoint: Vec<DVector<f64>>,
+    packed: Vec<f64>,
     nominal: Vec<f64>,
     error: Vec<f64>,
     input: Vec<f64>,
@@ -247,7 +248,6 @@ impl Optimizer {
         let mut identity = Second::new(states, width);
         identity.xx.fill_with_identity();
         identity.uu.fill_with_identity();
-        let sample = Sample { a: DMatrix::zeros(states, states), b: DMatrix::zeros(states, width) };
         let mut search = Self {
             scratch: Scratch {
                 linearizations: vec![Linearization::new(&model); kept],
@@ -258,6 +258,7 @@ impl Optimizer {
                 identity,
                 offset: DVector::zeros(width),
                 adjoint: vectors(states, steps + 1),
+                packed: Vec::new(),
                 nominal: vec![0.0; states],
                 error: vec![0.0; states],
                 input: vec![0.0; width],
@@ -270,7 +271,7 @@ impl Optimizer {
             first_cost: 0.0,
             status: Status::Running,
             is_linearized: false,
-            samples: vec![sample; steps],
+            maps: (0..steps).map(|_| Map::default()).collect(),
             gains: gains(),
             descent_gains: gains(),
             descent_offsets: vectors(width, steps),
@@ -689,15 +690,6 @@ impl Optimizer {
     }
 }
 
-/// `out += m v`, skipping zeros of `v`.
-fn add_product(m: &DMatrix<f64>, v: &[f64], out: &mut [f64]) {
-    for (column, v) in m.as_slice().chunks_exact(out.len().max(1)).zip(v) {
-        if *v != 0.0 {
-            out.iter_mut().zip(column).for_each(|(out, m)| *out += m * v);
-        }
-    }
-}
-
 /// `out −= m v`, skipping zeros of `v`.
 fn subtract_product(m: &DMatrix<f64>, v: &[f64], out: &mut [f64]) {
     for (column, v) in m.as_slice().chunks_exact(out.len().max(1)).zip(v) {
@@ -751,6 +743,7 @@ impl Optimizer {
         let Direction::Found { derivative } = self.descend(method, go_on).unwrap() else {
             return None;
         };
+        self.find_adjoint(go_on).unwrap();
         let steps = self.problem.steps;
         let bounds = (&self.multipliers[..], self.penalty);
         let vector =

@@ -20,6 +20,8 @@
 //! An input acts like momentum: its column is `Σ_i a h ∂f_i/∂u` times that of `p_i`, plus
 //! `(1 − a) h ∂f_i/∂u` on `p[k+1]_i`. Prescribed positions that signals replace have no effect.
 
+mod map;
+
 use nalgebra::DMatrix;
 
 use crate::Model;

@@ -29,6 +29,12 @@ fn prescribed(dynamic: usize, prescribed: usize, seed: f64) -> (DMatrix<f64>, DM
     (a, b)
 }
 
+fn map(a: &DMatrix<f64>, b: &DMatrix<f64>) -> Map {
+    let mut map = Map::default();
+    map.set(a, b);
+    map
+}
+
 fn error(found: &DMatrix<f64>, expected: &DMatrix<f64>) -> f64 {
     if expected.is_empty() {
         return 0.0;
@@ -78,7 +84,7 @@ fn fast_steps_follow_the_formulas() {
                 x_linear: has_more.then_some(&x_linear),
                 u_linear: has_more.then_some(&u_linear),
             };
-            recursion.step(a, b, stage, &mut gain, &mut offset).unwrap();
+            recursion.step(&map(a, b), stage, &mut gain, &mut offset).unwrap();
             let more = if has_more { 1.0 } else { 0.0 };
             let bracket = b.transpose() * &p * b + &r;
             let cross = b.transpose() * &p * a + s.transpose() * more;
@@ -113,10 +119,10 @@ fn a_stage_without_a_minimum_leaves_the_cost_to_go() {
         let linear = DVector::from_element(n, 1.0);
         recursion.begin(&q, Some(&linear));
         let (mut gain, mut offset) = (DMatrix::zeros(1, n), DVector::zeros(1));
-        assert_eq!(recursion.step(&a, &b, stage, &mut gain, &mut offset), Err(NotConvex));
+        assert_eq!(recursion.step(&map(&a, &b), stage, &mut gain, &mut offset), Err(NotConvex));
         assert_eq!((recursion.value(), recursion.linear()), (&q, &linear));
         let nan = Stage { r: &(&r * f64::NAN), ..stage };
-        assert_eq!(recursion.step(&a, &b, nan, &mut gain, &mut offset), Err(NotConvex));
+        assert_eq!(recursion.step(&map(&a, &b), nan, &mut gain, &mut offset), Err(NotConvex));
     }
 }
 
@@ -129,7 +135,7 @@ fn a_map_may_lead_from_one_number_of_states_to_another() {
         let mut recursion = LqRecursion::new(next, 2);
         recursion.begin(&p, None);
         let (mut gain, mut offset) = (DMatrix::zeros(2, n), DVector::zeros(2));
-        recursion.step(&a, &b, stage, &mut gain, &mut offset).unwrap();
+        recursion.step(&map(&a, &b), stage, &mut gain, &mut offset).unwrap();
         let bracket = b.transpose() * &b + r;
         let expected = bracket.try_inverse().unwrap() * b.transpose() * &a;
         assert!(error(&gain, &expected) < 1e-12);
@@ -150,7 +156,7 @@ fn what_cancels_keeps_its_digits() {
         let mut recursion = LqRecursion::new(n, n);
         recursion.begin(&q, None);
         let (mut gain, mut offset) = (DMatrix::zeros(n, n), DVector::zeros(n));
-        recursion.step(&a, &b, stage, &mut gain, &mut offset).unwrap();
+        recursion.step(&map(&a, &b), stage, &mut gain, &mut offset).unwrap();
         // P = Q + Aᵀ (I − (1 + r)⁻¹) A = Q + Aᵀ A r / (1 + r).
         let expected = &q + a.transpose() * &a * (1e-12 / (1.0 + 1e-12));
         let off = error(recursion.value(), &expected);

@@ -5,11 +5,9 @@ use std::ops::Range;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{
-    Direction, Go, Optimizer, Scratch, Second, Worker, add_product, ask, subtract_product,
-};
-use crate::control::lq::Stage;
-use crate::control::{Sample, tangent_basis};
+use super::{Direction, Go, Optimizer, Scratch, Second, Worker, ask, subtract_product};
+use crate::control::lq::{Map, Stage};
+use crate::control::tangent_basis;
 use crate::optimize::problem::{self, Deviation, Problem, dot};
 use crate::optimize::trajectory::Trajectory;
 use crate::optimize::{Fallback, Method, OptimizeError};
@@ -17,12 +15,12 @@ use crate::plant::known::KnownStep;
 use crate::{Contraction, Linearization, Plant, StepError};
 
 impl Optimizer {
-    /// Linearizes the map along the trajectory, and finds the gains of the projection.
+    /// Linearizes along the trajectory, and finds the gains of the projection.
     pub(super) fn linearize(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
         if self.is_linearized {
             return Ok(());
         }
-        let Self { problem, workers, current, samples, gains, scratch, projection, .. } = self;
+        let Self { problem, workers, current, maps, gains, scratch, projection, .. } = self;
         let n = problem.model.dimensions().coordinates();
         let Scratch { linearizations, recursion, offset, .. } = scratch;
         let first_step = self.first_step;
@@ -31,34 +29,33 @@ impl Optimizer {
             if !go_on() {
                 return Err(OptimizeError::Cancelled);
             }
-            let (head, tail) = samples.split_at_mut(used.start);
+            let (head, tail) = maps.split_at_mut(used.start);
             let kept = if linearizations.is_empty() { 0..0 } else { made.clone() };
             let (head, mut rest) = (&mut head[made.clone()], &mut linearizations[kept]);
             let share = made.len().div_ceil(workers.len()).max(1);
             let mut jobs: Vec<LinearizeJob<'_>> = Vec::with_capacity(workers.len());
-            for (part, samples) in head.chunks_mut(share).enumerate() {
-                let (kept, others) = rest.split_at_mut(samples.len().min(rest.len()));
+            for (part, maps) in head.chunks_mut(share).enumerate() {
+                let (kept, others) = rest.split_at_mut(maps.len().min(rest.len()));
                 rest = others;
-                jobs.push((made.start + part * share, samples, kept));
+                jobs.push((made.start + part * share, maps, kept));
             }
-            let job = |worker: &mut Worker, (first, samples, kept): LinearizeJob<'_>| {
+            let job = |worker: &mut Worker, (first, maps, kept): LinearizeJob<'_>| {
                 let mut kept = kept.iter_mut();
-                for (k, sample) in (first..).zip(samples) {
+                for (k, map) in (first..).zip(maps) {
                     let step = known(current, k, first_step, n);
                     let out = kept.next().unwrap_or(&mut worker.linearization);
                     worker.plant.linearize_known(&step, out).map_err(|error| (k, error))?;
-                    out.write_a(&mut sample.a);
-                    out.write_b(&mut sample.b);
+                    out.write_map(map);
                 }
                 Ok(())
             };
             let consume = || {
                 for k in used.clone().rev() {
                     ask(k, go_on)?;
-                    let (sample, stage) = (&tail[k - used.start], projection.stage().stage());
+                    let (map, stage) = (&tail[k - used.start], projection.stage().stage());
                     let gain = &mut gains[k];
                     recursion
-                        .step(&sample.a, &sample.b, stage, gain, offset)
+                        .step(map, stage, gain, offset)
                         .map_err(|_| OptimizeError::Projection { step: k })?;
                     if !gain.iter().all(|entry| entry.is_finite()) {
                         return Err(OptimizeError::Projection { step: k });
@@ -72,9 +69,9 @@ impl Optimizer {
         Ok(())
     }
 
-    /// Gradient of the cost with penalties, and the adjoint along the projection.
+    /// Gradient of the cost with penalties.
     pub(super) fn find_gradient(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
-        let Self { problem, current, by_x, by_u, scratch, samples, gains, .. } = self;
+        let Self { problem, current, by_x, by_u, scratch, .. } = self;
         let bounds = (&self.multipliers[..], self.penalty);
         let steps = problem.steps;
         for (k, by_x) in by_x.iter_mut().enumerate() {
@@ -96,17 +93,24 @@ impl Optimizer {
             }
             by_x[0] += slope;
         }
-        // z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1] = l_x + Aᵀ z[k+1] − Kᵀ (l_u + Bᵀ z[k+1])
-        scratch.adjoint[steps].copy_from(&by_x[steps]);
-        for k in (0..steps).rev() {
+        Ok(())
+    }
+
+    /// The adjoint along the projection, `z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1]`.
+    pub(super) fn find_adjoint(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
+        let Self { problem, by_x, by_u, maps, gains, .. } = self;
+        let Scratch { adjoint, offset, packed, .. } = &mut self.scratch;
+        adjoint[problem.steps].copy_from(&by_x[problem.steps]);
+        for k in (0..problem.steps).rev() {
             ask(k, go_on)?;
-            let (head, tail) = scratch.adjoint.split_at_mut(k + 1);
+            let (head, tail) = adjoint.split_at_mut(k + 1);
             let (z, next) = (&mut head[k], &tail[0]);
-            scratch.offset.copy_from(&by_u[k]);
-            scratch.offset.gemv_tr(1.0, &samples[k].b, next, 1.0);
+            // l_x + Aᵀ z[k+1] − Kᵀ (l_u + Bᵀ z[k+1]).
             z.copy_from(&by_x[k]);
-            z.gemv_tr(1.0, &samples[k].a, next, 1.0);
-            z.gemv_tr(-1.0, &gains[k], &scratch.offset, 1.0);
+            offset.copy_from(&by_u[k]);
+            let (by_x, by_u) = (z.as_mut_slice(), offset.as_mut_slice());
+            maps[k].add_pulled_back(next.as_slice(), packed, by_x, by_u);
+            z.gemv_tr(-1.0, &gains[k], offset, 1.0);
         }
         Ok(())
     }
@@ -177,7 +181,7 @@ impl Optimizer {
         go_on: Go<'_>,
     ) -> Result<Option<usize>, OptimizeError> {
         let bounds = (&self.multipliers[..], self.penalty);
-        let Self { problem, current, samples, by_x, by_u, scratch, .. } = self;
+        let Self { problem, current, maps, by_x, by_u, scratch, .. } = self;
         let Scratch { recursion, deviation, weights, identity, .. } = scratch;
         for k in (0..problem.steps).rev() {
             ask(k, go_on)?;
@@ -188,8 +192,7 @@ impl Optimizer {
                 ..stage_weights(problem, method, at, bounds, deviation, weights, identity)
             };
             let (gain, offset) = (&mut self.descent_gains[k], &mut self.descent_offsets[k]);
-            let Sample { a, b } = &samples[k];
-            if recursion.step(a, b, stage, gain, offset).is_err() {
+            if recursion.step(&maps[k], stage, gain, offset).is_err() {
                 return Ok(Some(k));
             }
         }
@@ -201,8 +204,9 @@ impl Optimizer {
         &mut self,
         go_on: Go<'_>,
     ) -> Result<Option<usize>, OptimizeError> {
+        self.find_adjoint(go_on)?;
         let bounds = (&self.multipliers[..], self.penalty);
-        let Self { problem, workers, current, samples, by_x, by_u, scratch, .. } = self;
+        let Self { problem, workers, current, maps, by_x, by_u, scratch, .. } = self;
         let (descent_gains, descent_offsets) = (&mut self.descent_gains, &mut self.descent_offsets);
         let Scratch {
             linearizations,
@@ -253,8 +257,7 @@ impl Optimizer {
                         u_linear: Some(&by_u[k]),
                     };
                     let (gain, offset) = (&mut descent_gains[k], &mut descent_offsets[k]);
-                    let Sample { a, b } = &samples[k];
-                    if recursion.step(a, b, stage, gain, offset).is_err() {
+                    if recursion.step(&maps[k], stage, gain, offset).is_err() {
                         not_convex = Some(k);
                         break;
                     }
@@ -327,8 +330,8 @@ impl Optimizer {
 
     /// Runs the law of the descent through the linearized map; returns the directional derivative.
     pub(super) fn roll_direction(&mut self, go_on: Go<'_>) -> Result<f64, OptimizeError> {
-        let Self { problem, samples, by_x, by_u, dx, du, descent_gains, descent_offsets, .. } =
-            self;
+        let Self { problem, maps, by_x, by_u, dx, du, descent_gains, descent_offsets, .. } = self;
+        let packed = &mut self.scratch.packed;
         let (states, inputs) = (problem.states, problem.inputs);
         let mut derivative = dot(by_x[0].as_slice(), &dx[..states]);
         for k in 0..problem.steps {
@@ -340,9 +343,7 @@ impl Optimizer {
                 *u = -offset;
             }
             subtract_product(&descent_gains[k], x, u);
-            next.fill(0.0);
-            add_product(&samples[k].a, x, next);
-            add_product(&samples[k].b, u, next);
+            maps[k].apply(x, u, packed, next);
             derivative += dot(by_u[k].as_slice(), u) + dot(by_x[k + 1].as_slice(), next);
         }
         Ok(derivative)
@@ -359,8 +360,8 @@ impl Worker {
     }
 }
 
-/// First step, samples to write, and linearizations to keep.
-type LinearizeJob<'a> = (usize, &'a mut [Sample], &'a mut [Linearization]);
+/// First step, maps to write, and linearizations to keep.
+type LinearizeJob<'a> = (usize, &'a mut [Map], &'a mut [Linearization]);
 
 /// Steps of a block: enough for threads to share, few enough for caches and for questions.
 pub(super) fn block_length(states: usize) -> usize {

@@ -1,0 +1,50 @@
+//! A linearization as the map of a linear-quadratic problem.
+
+use nalgebra::DMatrix;
+
+use super::{InputImpulse, Linearization};
+use crate::control::lq::Map;
+
+impl Linearization {
+    /// Writes `[B A]` without its zeros: rows of dynamic coordinates and momenta are full, those of
+    /// prescribed coordinates have an entry or two.
+    pub(crate) fn write_map(&self, map: &mut Map) {
+        let (nd, nk, ni) = (self.nd, self.nk, self.ni);
+        let (n, next, inputs) = (nd + nk, self.next_columns(), self.ni + self.nk);
+        if !self.turnings.is_empty() {
+            let (mut a, mut b) = (DMatrix::zeros(2 * n, 2 * n), DMatrix::zeros(2 * n, inputs));
+            self.write_a(&mut a);
+            self.write_b(&mut b);
+            map.set(&a, &b);
+            return;
+        }
+        map.begin((2 * n, 2 * n, inputs), 0..next, (0..nd).chain(n..n + nd));
+        for (part, numbers) in [&self.increment, &self.momentum].into_iter().enumerate() {
+            for (i, source) in numbers.chunks_exact(self.stride.max(1)).enumerate() {
+                let target = map.row_mut(part * nd + i);
+                for impulse in &self.inputs {
+                    let InputImpulse { input, coordinate, residual, momentum } = *impulse;
+                    target[input] += residual * source[n + coordinate];
+                    if part == 1 && coordinate == i {
+                        target[input] += momentum - residual;
+                    }
+                }
+                target[ni..inputs].copy_from_slice(&source[next..][..nk]);
+                target[inputs..][..next].copy_from_slice(&source[..next]);
+                if part == 0 {
+                    target[inputs + i] += 1.0;
+                }
+                self.replaced.iter().for_each(|column| target[*column] = 0.0);
+            }
+        }
+        for k in 0..nk {
+            let (input, start) = (ni + k, inputs + nd + k);
+            let (position, velocity) = (nd + k, n + nd + k);
+            if !self.replaced.contains(&input) {
+                map.push(position, input, 1.0);
+                map.push(velocity, input, 1.0 / self.time_step_s);
+            }
+            map.push(velocity, start, -1.0 / self.time_step_s);
+        }
+    }
+}
