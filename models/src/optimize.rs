@@ -28,6 +28,11 @@
 //! 3. goes along the direction by Armijo's rule: the longest of the steps `β^m` whose projection
 //!    lowers the cost by at least `α β^m` times what the directional derivative promises.
 //!
+//! The projection may be any regulator: to first order it leaves directions as they are. With
+//! [`Projection::Descent`] it is the law of step 2, there is no other recursion, and Newton's adjoint is
+//! the linear part of its cost to go: the method is then differential dynamic programming, with
+//! directions in the place of roll-outs.
+//!
 //! The search has converged when the directional derivative is within the tolerance.
 //! Every iterate is a motion of the plant, whatever constraints and prescribed coordinates it has.
 //! Newton's method converges quadratically, and away from a minimum it falls back; quasi-Newton does
@@ -147,6 +152,19 @@ pub enum Method {
     Newton,
 }
 
+/// The regulator whose law makes motions of the plant of curves.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub enum Projection {
+    /// Its weights are identities, `Q_f` too.
+    #[default]
+    Identity,
+    /// Its weights are given. They need not have to do with the cost.
+    Weights(Weights),
+    /// It is the law of the descent, as in differential dynamic programming: one recursion in place of
+    /// two. The weights of the cost must then hold an unstable plant on its course.
+    Descent,
+}
+
 /// How to search.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
@@ -167,8 +185,11 @@ pub struct Options {
     pub beta: f64,
     /// Shortenings of a step at most; 30.
     pub max_backtracks: u32,
-    /// Weights of the projection's regulator; none means identities, `Q_f` too.
-    pub projection: Option<Weights>,
+    /// Looks for a step from the one of the iteration before: fewer trials where steps are short again
+    /// and again. Misses a longer one beyond steps that fail. False.
+    pub near_last_step: bool,
+    /// The projection's regulator.
+    pub projection: Projection,
     /// Error of a bound, in the unit of its entry, that counts as none; 1e-6.
     pub bound_tolerance: f64,
 }
@@ -184,7 +205,8 @@ impl Default for Options {
             alpha: 1e-5,
             beta: 0.7,
             max_backtracks: 30,
-            projection: None,
+            near_last_step: false,
+            projection: Projection::default(),
             bound_tolerance: 1e-6,
         }
     }
@@ -210,6 +232,8 @@ pub struct Checkpoint {
     pub bound_violation: f64,
     /// Initial state that [`FreeInitialState::weight`] refers to.
     pub initial_reference: State,
+    /// Shortenings of the last step that was taken.
+    pub backtracks: u32,
 }
 
 /// What an iteration did.

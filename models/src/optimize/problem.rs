@@ -8,7 +8,7 @@ use super::bounds::{Ends, Of};
 use super::trajectory::rows;
 use super::{Bounds, FreeInitialState, OptimizeError, TrajectoryCost};
 use crate::Model;
-use crate::control::{StageWeights, TrajectoryWeights, WeightsError};
+use crate::control::{StageWeights, TrajectoryWeights, Weights, WeightsError};
 use crate::plant::balls::three;
 use crate::rotation::{self, Quaternion};
 use crate::scalar::Dual;
@@ -159,6 +159,14 @@ impl Problem {
 
     pub(super) fn stage(&self, k: usize) -> &StageWeights {
         self.weights.stage(k)
+    }
+
+    /// Whether these are the second derivatives of all steps.
+    pub(super) fn has_weights(&self, weights: &Weights) -> bool {
+        let (own, other) = (self.weights.stage(0), weights.stage());
+        self.weights.steps().is_none()
+            && (own.q(), own.r(), own.s()) == (other.q(), other.r(), other.s())
+            && self.weights.q_final() == weights.q_final()
     }
 
     pub(super) fn q_final(&self) -> &DMatrix<f64> {

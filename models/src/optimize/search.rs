@@ -6,16 +6,16 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
-use self::direction::block_length;
+use self::direction::{block_length, linearize_behind};
 use super::bounds::End;
 use super::problem::{Deviation, Problem, check};
 use super::trajectory::{Trajectory, rows};
 use super::{
-    Bounds, Checkpoint, FreeInitialState, Method, OptimizeError, Options, Progress, Status, Stuck,
-    TrajectoryCost,
+    Bounds, Checkpoint, FreeInitialState, Method, OptimizeError, Options, Progress, Projection,
+    Status, Stuck, TrajectoryCost,
 };
 use crate::control::Weights;
-use crate::control::lq::{LqRecursion, Map};
+use crate::control::lq::{LqRecursion, Map, Stage};
 use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State};
 
 /// Penalty with which a search begins.
@@ -44,7 +44,8 @@ const STEPS_BETWEEN_QUESTIONS: usize = 16;
 pub struct Optimizer {
     problem: Arc<Problem>,
     options: Options,
-    projection: Weights,
+    /// Weights of the projection; none where it is the law of the descent.
+    projection: Option<Weights>,
     /// Moves through trial motions.
     plant: Plant,
     /// The plant at the initial state of the trajectory, and of the trial.
@@ -55,17 +56,24 @@ pub struct Optimizer {
     reference: State,
     current: Trajectory,
     trial: Trajectory,
+    /// The best trial where a longer one is tried.
+    kept: (Trajectory, Snapshot),
     multipliers: Vec<f64>,
     penalty: f64,
     bound_error: f64,
     iterations: u32,
     first_cost: f64,
+    backtracks: u32,
     status: Status,
-    /// `maps` and `gains` belong to the current trajectory.
-    is_linearized: bool,
+    /// Block by block, whether the maps belong to the current trajectory, or else to the last trial.
+    linearized: Vec<bool>,
+    foreseen: Vec<bool>,
     maps: Vec<Map>,
-    /// `K[k]` of the projection.
+    /// `K[k]` of a projection of its own, and whether they belong to the current trajectory.
     gains: Vec<DMatrix<f64>>,
+    has_gains: bool,
+    /// The projection's law is that of the last descent.
+    projects_by_descent: bool,
     /// Gradient of the cost with penalties.
     by_x: Vec<DVector<f64>>,
     by_u: Vec<DVector<f64>>,
@@ -103,6 +111,17 @@ impl Second {
             uu: DMatrix::zeros(inputs, inputs),
         }
     }
+
+    /// Copies, not swaps: what is always zero in a contraction is never written again.
+    fn take(&mut self, contraction: &Contraction) {
+        self.xx.copy_from(&contraction.xx);
+        self.xu.copy_from(&contraction.xu);
+        self.uu.copy_from(&contraction.uu);
+    }
+
+    fn stage(&self) -> Stage<'_> {
+        Stage { q: &self.xx, r: &self.uu, s: Some(&self.xu), x_linear: None, u_linear: None }
+    }
 }
 
 /// Memory that iterations use again.
@@ -113,6 +132,9 @@ struct Scratch {
     /// Contractions of the block at hand, and of the one that is made meanwhile; empty without Newton's
     /// method.
     contractions: [Vec<Second>; 2],
+    /// Where the recursion contracts a step itself.
+    contraction: Contraction,
+    second: Second,
     recursion: LqRecursion,
     deviation: Deviation,
     weights: Second,
@@ -201,6 +223,7 @@ impl Optimizer {
         fits(multipliers.iter().all(|x| x.is_finite()), "a multiplier is not finite")?;
         search.iterations = checkpoint.iterations;
         search.first_cost = checkpoint.first_cost;
+        search.backtracks = checkpoint.backtracks;
         search.bound_error = checkpoint.bound_violation;
         search.penalty = penalty;
         search.multipliers.copy_from_slice(multipliers);
@@ -228,23 +251,25 @@ impl Optimizer {
         check("the guess", inputs, steps, width)?;
         check_options(&options)?;
         let projection = match &options.projection {
-            Some(weights) => weights.clone().for_system(states, width)?,
-            None => Weights::diagonal(&vec![1.0; states], &vec![1.0; width])?,
+            Projection::Identity => Some(Weights::diagonal(&vec![1.0; states], &vec![1.0; width])?),
+            Projection::Weights(weights) => Some(weights.clone().for_system(states, width)?),
+            Projection::Descent => None,
         };
         let problem = Arc::new(Problem::new(Arc::clone(&model), steps, cost, bounds, free)?);
         let State { q, p, v, .. } = initial.clone();
         plant.initialize(&Initial::Momentum { q, p, v })?;
         plant.set_step_index(initial.step);
         let start = plant.snapshot();
-        let mut current = Trajectory::new(states, width, d.constraints, steps);
+        let mut current = Trajectory::new(d, steps);
         current.u = rows(inputs);
         let vectors = |n: usize, count: usize| vec![DVector::zeros(n); count];
-        let gains = || vec![DMatrix::zeros(width, states); steps];
+        let gains = |count: usize| vec![DMatrix::zeros(width, states); count];
         let methods = [Some(options.method), options.first_method];
         let (kept, block) = match methods.contains(&Some(Method::Newton)) {
             true => (steps, block_length(states).min(steps)),
             false => (0, 0),
         };
+        let block = if projection.is_some() { block } else { 0 };
         let mut identity = Second::new(states, width);
         identity.xx.fill_with_identity();
         identity.uu.fill_with_identity();
@@ -252,6 +277,8 @@ impl Optimizer {
             scratch: Scratch {
                 linearizations: vec![Linearization::new(&model); kept],
                 contractions: [0; 2].map(|_| vec![Second::new(states, width); block]),
+                contraction: Contraction::new(&model),
+                second: Second::new(states, width),
                 recursion: LqRecursion::new(states, width),
                 deviation: problem.deviation(),
                 weights: Second::new(states, width),
@@ -270,10 +297,14 @@ impl Optimizer {
             iterations: 0,
             first_cost: 0.0,
             status: Status::Running,
-            is_linearized: false,
+            backtracks: 0,
+            linearized: vec![false; steps.div_ceil(block_length(states))],
+            foreseen: vec![false; steps.div_ceil(block_length(states))],
             maps: (0..steps).map(|_| Map::default()).collect(),
-            gains: gains(),
-            descent_gains: gains(),
+            gains: gains(if projection.is_some() { steps } else { 0 }),
+            has_gains: false,
+            projects_by_descent: false,
+            descent_gains: gains(steps),
             descent_offsets: vectors(width, steps),
             by_x: vectors(states, steps + 1),
             by_u: vectors(width, steps),
@@ -282,6 +313,7 @@ impl Optimizer {
             first_step: initial.step,
             reference: reference.clone(),
             trial: current.clone(),
+            kept: (current.clone(), start.clone()),
             current,
             trial_start: start.clone(),
             start,
@@ -362,6 +394,7 @@ impl Optimizer {
             penalty: self.penalty,
             bound_violation: self.bound_error,
             initial_reference: self.reference.clone(),
+            backtracks: self.backtracks,
         }
     }
 
@@ -390,7 +423,6 @@ impl Optimizer {
         if self.status != Status::Running {
             return Err(OptimizeError::Finished);
         }
-        self.linearize(go_on)?;
         self.find_gradient(go_on)?;
         let asked = match self.options.first_method {
             Some(first) if self.iterations < self.options.first_iterations => first,
@@ -594,22 +626,81 @@ impl Optimizer {
         progress: &mut Progress,
         go_on: Go<'_>,
     ) -> Result<bool, OptimizeError> {
-        let mut length = 1.0;
-        for backtracks in 0..=self.options.max_backtracks {
-            let enough = self.current.merit + self.options.alpha * length * derivative;
-            if self.try_step(length, enough, go_on)? && self.trial.merit < enough {
-                std::mem::swap(&mut self.current, &mut self.trial);
-                if self.problem.free.is_some() {
-                    std::mem::swap(&mut self.start, &mut self.trial_start);
-                }
-                self.is_linearized = false;
-                (progress.step_length, progress.backtracks) = (length, backtracks);
-                return Ok(true);
-            }
-            length *= self.options.beta;
+        self.projects_by_descent = self.is_projection(progress.method);
+        if !self.projects_by_descent {
+            self.find_gains(go_on)?;
         }
-        progress.backtracks = self.options.max_backtracks;
-        Ok(false)
+        let most = self.options.max_backtracks;
+        let last = if self.options.near_last_step { self.backtracks } else { 0 };
+        let first = last.saturating_sub(1).min(most);
+        let mut backtracks = None;
+        for tried in (first..=most).chain((0..first).rev()) {
+            if self.try_armijo(tried, derivative, go_on)? {
+                backtracks = Some(tried);
+                break;
+            }
+        }
+        let Some(mut backtracks) = backtracks else {
+            progress.backtracks = most;
+            return Ok(false);
+        };
+        // As long as longer steps descend, too.
+        if backtracks == first {
+            while backtracks > 0 {
+                self.swap_kept();
+                if !self.try_armijo(backtracks - 1, derivative, go_on)? {
+                    self.foreseen.fill(false);
+                    self.swap_kept();
+                    break;
+                }
+                backtracks -= 1;
+            }
+        }
+        std::mem::swap(&mut self.current, &mut self.trial);
+        if self.problem.free.is_some() {
+            std::mem::swap(&mut self.start, &mut self.trial_start);
+        }
+        std::mem::swap(&mut self.linearized, &mut self.foreseen);
+        self.has_gains = false;
+        self.backtracks = backtracks;
+        (progress.step_length, progress.backtracks) = (self.length(backtracks), backtracks);
+        Ok(true)
+    }
+
+    /// Whether the law of a descent is that of the projection: it is so by choice, or the weights are the
+    /// same.
+    fn is_projection(&self, method: Method) -> bool {
+        let Some(projection) = &self.projection else { return true };
+        let problem = &self.problem;
+        let is_plain = !problem.has_bounds() && problem.model.orientations().is_empty();
+        match method {
+            Method::Steepest => {
+                self.options.projection == Projection::Identity && !problem.has_bounds()
+            }
+            Method::QuasiNewton => is_plain && problem.has_weights(projection),
+            Method::Newton => false,
+        }
+    }
+
+    fn length(&self, backtracks: u32) -> f64 {
+        (0..backtracks).fold(1.0, |length, _| length * self.options.beta)
+    }
+
+    fn swap_kept(&mut self) {
+        std::mem::swap(&mut self.trial, &mut self.kept.0);
+        std::mem::swap(&mut self.trial_start, &mut self.kept.1);
+    }
+
+    /// Whether the trial of a step descends enough.
+    fn try_armijo(
+        &mut self,
+        backtracks: u32,
+        derivative: f64,
+        go_on: Go<'_>,
+    ) -> Result<bool, OptimizeError> {
+        let length = self.length(backtracks);
+        let enough = self.current.merit + self.options.alpha * length * derivative;
+        Ok(self.try_step(length, enough, go_on)? && self.trial.merit < enough)
     }
 
     /// Projects the trajectory moved by `length` along the direction. False if it does not run, or
@@ -626,37 +717,51 @@ impl Optimizer {
             self.initial_cost(&self.trial)
         };
         let bounds = (&self.multipliers[..], self.penalty);
-        let Self { problem, plant, current, trial, gains, dx, du, scratch, .. } = self;
-        let Scratch { deviation, nominal, error, input, .. } = scratch;
+        let gains = if self.projects_by_descent { &self.descent_gains } else { &self.gains };
+        let Self { problem, plant, current, trial, dx, du, scratch, .. } = self;
+        let Scratch { deviation, nominal, error, input, linearizations, .. } = scratch;
         let (states, inputs, steps) = (problem.states, problem.inputs, problem.steps);
         let (mut cost, mut penalties) = (initial_cost, 0.0);
         let may_stop_early = problem.is_nonnegative && !problem.has_bounds();
-        for k in 0..steps {
-            ask(k, go_on)?;
-            problem.retract(current.x(k), &dx[k * states..][..states], length, nominal);
-            problem.difference(nominal, trial.x(k), error);
-            let change = &du[k * inputs..][..inputs];
-            for (u, (nominal, change)) in input.iter_mut().zip(current.u(k).iter().zip(change)) {
-                *u = nominal + length * change;
-            }
-            subtract_product(&gains[k], error, input);
-            cost += problem.evaluate(k, trial.x(k), input, deviation);
-            penalties += problem.penalty(k, (trial.x(k), input), bounds);
-            // What is still to come costs nothing at least.
-            if may_stop_early && !(cost < enough) {
-                return Ok(false);
-            }
-            trial.u[k * inputs..][..inputs].copy_from_slice(input);
-            if plant.step(input).is_err() {
-                return Ok(false);
-            }
-            trial.set_x(k + 1, [plant.q(), plant.p(), plant.v()]);
-            trial.set_multipliers(k, plant.multipliers());
+        self.foreseen.fill(false);
+        let helpers = &mut self.workers[1..];
+        if !helpers.is_empty() {
+            self.linearized.fill(false);
         }
-        cost += problem.evaluate(steps, trial.x(steps), &[], deviation);
-        penalties += problem.penalty(steps, (trial.x(steps), &[]), bounds);
-        (trial.cost, trial.merit) = (cost, cost + penalties);
-        Ok(trial.merit.is_finite())
+        let maps = (&mut self.maps[..], &mut linearizations[..]);
+        let first_step = self.first_step;
+        let foresee = (helpers, maps, first_step, &mut self.foreseen[..]);
+        let mut roll_out = |behind: &mut dyn FnMut(usize, &Trajectory)| {
+            for k in 0..steps {
+                ask(k, go_on)?;
+                problem.retract(current.x(k), &dx[k * states..][..states], length, nominal);
+                problem.difference(nominal, trial.x(k), error);
+                let change = &du[k * inputs..][..inputs];
+                for (u, (nominal, change)) in input.iter_mut().zip(current.u(k).iter().zip(change))
+                {
+                    *u = nominal + length * change;
+                }
+                subtract_product(&gains[k], error, input);
+                cost += problem.evaluate(k, trial.x(k), input, deviation);
+                penalties += problem.penalty(k, (trial.x(k), input), bounds);
+                // What is still to come costs nothing at least.
+                if may_stop_early && !(cost < enough) {
+                    return Ok(false);
+                }
+                trial.u[k * inputs..][..inputs].copy_from_slice(input);
+                if plant.step(input).is_err() {
+                    return Ok(false);
+                }
+                trial.set_x(k + 1, [plant.q(), plant.p(), plant.v()]);
+                trial.set_multipliers(k, plant.multipliers());
+                behind(k + 1, trial);
+            }
+            cost += problem.evaluate(steps, trial.x(steps), &[], deviation);
+            penalties += problem.penalty(steps, (trial.x(steps), &[]), bounds);
+            (trial.cost, trial.merit) = (cost, cost + penalties);
+            Ok(trial.merit.is_finite())
+        };
+        linearize_behind(foresee, block_length(states), &mut roll_out)
     }
 
     /// Puts the plant at the initial state of the trial; false if there is none.
@@ -738,11 +843,12 @@ impl Optimizer {
     /// minimum.
     pub(super) fn direction(&mut self, method: Method) -> Option<(f64, f64)> {
         let go_on: Go<'_> = &mut || true;
-        self.linearize(go_on).unwrap();
         self.find_gradient(go_on).unwrap();
         let Direction::Found { derivative } = self.descend(method, go_on).unwrap() else {
             return None;
         };
+        self.projects_by_descent = self.is_projection(method);
+        self.find_gains(go_on).unwrap();
         self.find_adjoint(go_on).unwrap();
         let steps = self.problem.steps;
         let bounds = (&self.multipliers[..], self.penalty);

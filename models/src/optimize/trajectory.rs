@@ -1,10 +1,15 @@
 //! Trajectories, row by row.
 
+use std::ops::Range;
+
 use nalgebra::DMatrix;
+
+use crate::Dimensions;
 
 /// States, inputs and constraint impulses of a motion, row-major.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Trajectory {
+    pub(super) coordinates: usize,
     pub(super) states: usize,
     pub(super) inputs: usize,
     pub(super) constraints: usize,
@@ -18,8 +23,10 @@ pub(super) struct Trajectory {
 }
 
 impl Trajectory {
-    pub(super) fn new(states: usize, inputs: usize, constraints: usize, steps: usize) -> Self {
+    pub(super) fn new(d: Dimensions, steps: usize) -> Self {
+        let (states, inputs, constraints) = (d.state(), d.input(), d.constraints);
         Self {
+            coordinates: d.coordinates(),
             states,
             inputs,
             constraints,
@@ -28,6 +35,19 @@ impl Trajectory {
             multipliers: vec![0.0; steps * constraints],
             cost: 0.0,
             merit: 0.0,
+        }
+    }
+
+    /// A copy of some steps.
+    pub(super) fn part(&self, steps: Range<usize>) -> Self {
+        let of = |numbers: &[f64], width: usize, rows: usize| {
+            numbers[steps.start * width..][..rows * width].to_vec()
+        };
+        Self {
+            x: of(&self.x, self.states, steps.len() + 1),
+            u: of(&self.u, self.inputs, steps.len()),
+            multipliers: of(&self.multipliers, self.constraints, steps.len()),
+            ..*self
         }
     }
 

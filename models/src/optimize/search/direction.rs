@@ -2,6 +2,8 @@
 //! among threads where that pays.
 
 use std::ops::Range;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
 
 use nalgebra::{DMatrix, DVector};
 
@@ -14,59 +16,123 @@ use crate::optimize::{Fallback, Method, OptimizeError};
 use crate::plant::known::KnownStep;
 use crate::{Contraction, Linearization, Plant, StepError};
 
+/// What a recursion finds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Law {
+    /// The gains of a projection of its own.
+    Projection,
+    /// The law of the descent.
+    Descent(Method),
+}
+
 impl Optimizer {
-    /// Linearizes along the trajectory, and finds the gains of the projection.
-    pub(super) fn linearize(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
-        if self.is_linearized {
+    /// The gains of the projection, where they are not those of the descent.
+    pub(super) fn find_gains(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
+        let Some(projection) = self.projection.as_ref().filter(|_| !self.has_gains) else {
             return Ok(());
+        };
+        self.scratch.recursion.begin(projection.q_final(), None);
+        if let Some(step) = self.recur(Law::Projection, go_on)? {
+            return Err(OptimizeError::Projection { step });
         }
-        let Self { problem, workers, current, maps, gains, scratch, projection, .. } = self;
-        let n = problem.model.dimensions().coordinates();
-        let Scratch { linearizations, recursion, offset, .. } = scratch;
+        self.has_gains = true;
+        Ok(())
+    }
+
+    /// A recursion; the step at which it has no minimum. Linearizes where that was not done yet: the
+    /// block before the one that is used.
+    fn recur(&mut self, law: Law, go_on: Go<'_>) -> Result<Option<usize>, OptimizeError> {
+        let bounds = (&self.multipliers[..], self.penalty);
+        let Self {
+            problem, workers, current, maps, gains, by_x, by_u, scratch, projection, ..
+        } = self;
+        let (descent_gains, descent_offsets) = (&mut self.descent_gains, &mut self.descent_offsets);
+        let Scratch {
+            linearizations,
+            contraction,
+            second,
+            recursion,
+            deviation,
+            weights,
+            identity,
+            offset,
+            zero_multipliers,
+            ..
+        } = scratch;
         let first_step = self.first_step;
-        recursion.begin(projection.q_final(), None);
+        let mut not_convex = None;
         for (made, used) in blocks(problem.steps, problem.states) {
             if !go_on() {
                 return Err(OptimizeError::Cancelled);
             }
+            let block = made.start / block_length(problem.states);
+            let made = if self.linearized[block] { made.start..made.start } else { made };
             let (head, tail) = maps.split_at_mut(used.start);
-            let kept = if linearizations.is_empty() { 0..0 } else { made.clone() };
-            let (head, mut rest) = (&mut head[made.clone()], &mut linearizations[kept]);
+            let keeps = !linearizations.is_empty();
+            let split = if keeps { used.start } else { 0 };
+            let (linearized_head, linearized) = linearizations.split_at_mut(split);
+            let kept = if keeps { made.clone() } else { 0..0 };
+            let mut rest = &mut linearized_head[kept];
             let share = made.len().div_ceil(workers.len()).max(1);
             let mut jobs: Vec<LinearizeJob<'_>> = Vec::with_capacity(workers.len());
-            for (part, maps) in head.chunks_mut(share).enumerate() {
+            for (part, maps) in head[made.clone()].chunks_mut(share).enumerate() {
                 let (kept, others) = rest.split_at_mut(maps.len().min(rest.len()));
                 rest = others;
                 jobs.push((made.start + part * share, maps, kept));
             }
             let job = |worker: &mut Worker, (first, maps, kept): LinearizeJob<'_>| {
-                let mut kept = kept.iter_mut();
-                for (k, map) in (first..).zip(maps) {
-                    let step = known(current, k, first_step, n);
-                    let out = kept.next().unwrap_or(&mut worker.linearization);
-                    worker.plant.linearize_known(&step, out).map_err(|error| (k, error))?;
-                    out.write_map(map);
-                }
-                Ok(())
+                let steps = (first..).map(|k| known(current, k, first_step));
+                worker.linearize(steps, maps, kept).map_err(|(k, error)| (first + k, error))
             };
             let consume = || {
                 for k in used.clone().rev() {
                     ask(k, go_on)?;
-                    let (map, stage) = (&tail[k - used.start], projection.stage().stage());
-                    let gain = &mut gains[k];
-                    recursion
-                        .step(map, stage, gain, offset)
-                        .map_err(|_| OptimizeError::Projection { step: k })?;
-                    if !gain.iter().all(|entry| entry.is_finite()) {
-                        return Err(OptimizeError::Projection { step: k });
+                    let map = &tail[k - used.start];
+                    let at = (k, current.x(k), current.u(k));
+                    let linear = (Some(&by_x[k]), Some(&by_u[k]));
+                    let (stage, gain, offset) = match (law, &*projection) {
+                        (Law::Projection, Some(weights)) => {
+                            (weights.stage().stage(), &mut gains[k], &mut *offset)
+                        }
+                        (Law::Projection, None) => return Ok(()),
+                        (Law::Descent(method), _) => {
+                            let stage = if method == Method::Newton {
+                                let (z, first) = (recursion.linear(), &linearized[k - used.start]);
+                                contraction
+                                    .contract(&problem.model, first, z.as_slice(), zero_multipliers)
+                                    .map_err(|error| OptimizeError::Linearization {
+                                        step: k,
+                                        error,
+                                    })?;
+                                second.take(contraction);
+                                add_stage_weights(problem, at, bounds, deviation, weights, second);
+                                second.stage()
+                            } else {
+                                stage_weights(
+                                    problem, method, at, bounds, deviation, weights, identity,
+                                )
+                            };
+                            let (x_linear, u_linear) = linear;
+                            let stage = Stage { x_linear, u_linear, ..stage };
+                            (stage, &mut descent_gains[k], &mut descent_offsets[k])
+                        }
+                    };
+                    let found = recursion.step(map, stage, gain, offset);
+                    let is_finite = || gain.iter().all(|entry| entry.is_finite());
+                    if found.is_err() || law == Law::Projection && !is_finite() {
+                        not_convex = Some(k);
+                        break;
                     }
                 }
                 Ok(())
             };
             share_work(workers, jobs, job, consume)?;
+            self.linearized[block] = true;
+            if not_convex.is_some() {
+                break;
+            }
         }
-        self.is_linearized = true;
-        Ok(())
+        Ok(not_convex)
     }
 
     /// Gradient of the cost with penalties.
@@ -98,7 +164,8 @@ impl Optimizer {
 
     /// The adjoint along the projection, `z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1]`.
     pub(super) fn find_adjoint(&mut self, go_on: Go<'_>) -> Result<(), OptimizeError> {
-        let Self { problem, by_x, by_u, maps, gains, .. } = self;
+        let gains = if self.projection.is_some() { &self.gains } else { &self.descent_gains };
+        let Self { problem, by_x, by_u, maps, .. } = self;
         let Scratch { adjoint, offset, packed, .. } = &mut self.scratch;
         adjoint[problem.steps].copy_from(&by_x[problem.steps]);
         for k in (0..problem.steps).rev() {
@@ -158,12 +225,17 @@ impl Optimizer {
         go_on: Go<'_>,
     ) -> Result<Direction, OptimizeError> {
         let steps = self.problem.steps;
+        let contracts = method == Method::Newton && self.projection.is_some();
+        if contracts {
+            self.find_gains(go_on)?;
+            self.find_adjoint(go_on)?;
+        }
         self.final_weights(method);
         self.scratch.recursion.begin(&self.scratch.weights.xx, Some(&self.by_x[steps]));
-        let not_convex = if method == Method::Newton {
+        let not_convex = if contracts {
             self.contract_and_recur(go_on)?
         } else {
-            self.recur(method, go_on)?
+            self.recur(Law::Descent(method), go_on)?
         };
         if let Some(step) = not_convex {
             return Ok(Direction::NotConvex { step });
@@ -174,37 +246,12 @@ impl Optimizer {
         Ok(Direction::Found { derivative: self.roll_direction(go_on)? })
     }
 
-    /// The recursion without second derivatives of the map; the step at which it has no minimum.
-    pub(super) fn recur(
-        &mut self,
-        method: Method,
-        go_on: Go<'_>,
-    ) -> Result<Option<usize>, OptimizeError> {
-        let bounds = (&self.multipliers[..], self.penalty);
-        let Self { problem, current, maps, by_x, by_u, scratch, .. } = self;
-        let Scratch { recursion, deviation, weights, identity, .. } = scratch;
-        for k in (0..problem.steps).rev() {
-            ask(k, go_on)?;
-            let at = (k, current.x(k), current.u(k));
-            let stage = Stage {
-                x_linear: Some(&by_x[k]),
-                u_linear: Some(&by_u[k]),
-                ..stage_weights(problem, method, at, bounds, deviation, weights, identity)
-            };
-            let (gain, offset) = (&mut self.descent_gains[k], &mut self.descent_offsets[k]);
-            if recursion.step(&maps[k], stage, gain, offset).is_err() {
-                return Ok(Some(k));
-            }
-        }
-        Ok(None)
-    }
-
-    /// The recursion with second derivatives of the map, which are contracted block by block.
+    /// The recursion with second derivatives of the map along the adjoint, which are contracted block by
+    /// block.
     pub(super) fn contract_and_recur(
         &mut self,
         go_on: Go<'_>,
     ) -> Result<Option<usize>, OptimizeError> {
-        self.find_adjoint(go_on)?;
         let bounds = (&self.multipliers[..], self.penalty);
         let Self { problem, workers, current, maps, by_x, by_u, scratch, .. } = self;
         let (descent_gains, descent_offsets) = (&mut self.descent_gains, &mut self.descent_offsets);
@@ -236,10 +283,7 @@ impl Optimizer {
                     contraction
                         .contract(model, &linearizations[k], z, zero_multipliers)
                         .map_err(|error| (k, error))?;
-                    // Not swapped: what is always zero is never written again.
-                    slot.xx.copy_from(&contraction.xx);
-                    slot.xu.copy_from(&contraction.xu);
-                    slot.uu.copy_from(&contraction.uu);
+                    slot.take(contraction);
                 }
                 Ok(())
             };
@@ -249,13 +293,8 @@ impl Optimizer {
                     let second = &mut made_before[k - used.start];
                     let at = (k, current.x(k), current.u(k));
                     add_stage_weights(problem, at, bounds, deviation, weights, second);
-                    let stage = Stage {
-                        q: &second.xx,
-                        r: &second.uu,
-                        s: Some(&second.xu),
-                        x_linear: Some(&by_x[k]),
-                        u_linear: Some(&by_u[k]),
-                    };
+                    let (x_linear, u_linear) = (Some(&by_x[k]), Some(&by_u[k]));
+                    let stage = Stage { x_linear, u_linear, ..second.stage() };
                     let (gain, offset) = (&mut descent_gains[k], &mut descent_offsets[k]);
                     if recursion.step(&maps[k], stage, gain, offset).is_err() {
                         not_convex = Some(k);
@@ -358,6 +397,107 @@ impl Worker {
             plant: plant.clone(),
         }
     }
+
+    /// Linearizes steps; where room is given, into that. On failure the place of the step.
+    fn linearize<'a>(
+        &mut self,
+        steps: impl Iterator<Item = KnownStep<'a>>,
+        maps: &mut [Map],
+        kept: &mut [Linearization],
+    ) -> Result<(), (usize, StepError)> {
+        let mut kept = kept.iter_mut();
+        for (place, (map, step)) in maps.iter_mut().zip(steps).enumerate() {
+            let out = kept.next().unwrap_or(&mut self.linearization);
+            self.plant.linearize_known(&step, out).map_err(|error| (place, error))?;
+            out.write_map(map);
+        }
+        Ok(())
+    }
+}
+
+/// Rolls a trial out, and has helpers linearize the blocks behind it meanwhile, the last first; marks
+/// those that they did.
+pub(super) fn linearize_behind(
+    (helpers, (maps, linearizations), first_step, done): (
+        &mut [Worker],
+        (&mut [Map], &mut [Linearization]),
+        u64,
+        &mut [bool],
+    ),
+    length: usize,
+    roll_out: &mut dyn FnMut(&mut dyn FnMut(usize, &Trajectory)) -> Result<bool, OptimizeError>,
+) -> Result<bool, OptimizeError> {
+    if helpers.is_empty() {
+        return roll_out(&mut |_, _| {});
+    }
+    let is_over = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let mut queues = Vec::with_capacity(helpers.len());
+        let mut threads = Vec::with_capacity(helpers.len());
+        for worker in helpers {
+            let (queue, blocks) = mpsc::channel::<Block<'_>>();
+            let is_over = &is_over;
+            queues.push(queue);
+            threads.push(scope.spawn(move || {
+                let (mut waiting, mut done) = (Vec::new(), Vec::new());
+                while !is_over.load(Ordering::Relaxed) {
+                    if waiting.is_empty() {
+                        match blocks.recv() {
+                            Ok(block) => waiting.push(block),
+                            Err(_) => break,
+                        }
+                    }
+                    waiting.extend(blocks.try_iter());
+                    let Some(Block { number, first, motion, maps, kept }) = waiting.pop() else {
+                        break;
+                    };
+                    let known = |k| KnownStep {
+                        index: first_step.saturating_add((first + k) as u64),
+                        ..known(&motion, k, 0)
+                    };
+                    if worker.linearize((0..maps.len()).map(known), maps, kept).is_ok() {
+                        done.push(number);
+                    }
+                }
+                done
+            }));
+        }
+        let mut maps = maps.chunks_mut(length).enumerate();
+        let mut kept = linearizations.chunks_mut(length);
+        let (mut first, mut next) = (0, maps.next());
+        let rolled_out = roll_out(&mut |steps, trial| {
+            let Some((number, _)) = next.as_ref().filter(|(_, maps)| first + maps.len() == steps)
+            else {
+                return;
+            };
+            let queue = &queues[number % queues.len()];
+            if let Some((number, maps)) = next.take() {
+                let motion = trial.part(first..steps);
+                let kept = kept.next().unwrap_or_default();
+                // A helper that is gone leaves its blocks to the next iteration.
+                let _ = queue.send(Block { number, first, motion, maps, kept });
+            }
+            (first, next) = (steps, maps.next());
+        });
+        is_over.store(true, Ordering::Relaxed);
+        drop(queues);
+        for thread in threads {
+            match thread.join() {
+                Ok(numbers) => numbers.into_iter().for_each(|number| done[number] = true),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
+        }
+        rolled_out
+    })
+}
+
+/// A block of a trial.
+struct Block<'a> {
+    number: usize,
+    first: usize,
+    motion: Trajectory,
+    maps: &'a mut [Map],
+    kept: &'a mut [Linearization],
 }
 
 /// First step, maps to write, and linearizations to keep.
@@ -488,8 +628,9 @@ fn copy_weights(
     stage.s().is_some()
 }
 
-/// Step `k` of a trajectory, `n` coordinates.
-fn known(trajectory: &Trajectory, k: usize, first_step: u64, n: usize) -> KnownStep<'_> {
+/// Step `k` of a trajectory.
+fn known(trajectory: &Trajectory, k: usize, first_step: u64) -> KnownStep<'_> {
+    let n = trajectory.coordinates;
     KnownStep {
         index: first_step.saturating_add(k as u64),
         q0: &trajectory.x(k)[..n],
