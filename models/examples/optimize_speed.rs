@@ -26,13 +26,14 @@ fn main() -> Outcome<()> {
         let beside = trep.map_or(String::new(), |t| format!("{t:>10.1} {:>8.0}", t / ms));
         println!("{name:<72} {ms:>10.3} {beside}");
     };
-    for (name, method, passes, trep) in [
-        ("pendulum, second order", Method::Newton, 20, 520.0),
-        ("pendulum, first order", Method::Steepest, 3, 31_700.0),
+    for (name, method, near_last_step, passes, trep) in [
+        ("pendulum, second order", Method::Newton, false, 20, Some(520.0)),
+        ("pendulum, first order", Method::Steepest, false, 3, Some(31_700.0)),
+        ("pendulum, first order, steps near the last", Method::Steepest, true, 3, Some(31_700.0)),
     ] {
         let mut count = 0;
         let ms = least(passes, || {
-            let mut search = pendulum(method)?;
+            let mut search = pendulum(method, near_last_step)?;
             let begin = cpu_time_s();
             count = 0;
             while search.status() == Status::Running {
@@ -41,38 +42,44 @@ fn main() -> Outcome<()> {
             }
             Ok(cpu_time_s() - begin)
         })?;
-        row(&format!("{name}, {count} iterations"), ms, Some(trep));
+        row(&format!("{name}, {count} iterations"), ms, trep);
     }
     let marionette = Marionette::new()?;
     marionette.phases(row)?;
     for (name, method, threads) in [
-        ("marionette, quasi-Newton iteration", Method::QuasiNewton, 1),
-        ("marionette, Newton iteration", Method::Newton, 1),
-        ("marionette, quasi-Newton iteration, 2 threads", Method::QuasiNewton, 2),
-        ("marionette, Newton iteration, 2 threads", Method::Newton, 2),
+        ("quasi-Newton", Method::QuasiNewton, 1),
+        ("quasi-Newton", Method::QuasiNewton, 2),
+        ("Newton", Method::Newton, 1),
+        ("Newton", Method::Newton, 2),
     ] {
-        let mut fallback = String::new();
-        let ms = least(3, || {
-            // Near the end, where steps are not shortened.
-            let mut search = marionette.search(method)?;
-            search.set_threads(threads);
-            let clock = if threads == 1 { cpu_time_s } else { elapsed_s };
-            let begin = clock();
-            let progress = search.iterate(&mut || true)?;
-            let time = clock() - begin;
-            fallback = progress
-                .fallback
-                .map_or(String::new(), |_| format!(" (tried, then {:?})", progress.method));
-            Ok(time)
-        })?;
-        let name = format!("{name}{fallback}");
-        row(&name, ms, Some(1600.0));
+        for is_paper in [false, true] {
+            let mut name = format!("marionette, {name} iteration, {threads} threads");
+            if is_paper {
+                name.push_str(", projection of its own");
+            }
+            let mut fallback = String::new();
+            let ms = least(5, || {
+                // Near the end, where steps are not shortened. Between iterations nothing is done, but
+                // the first has no linearizations from a step before it.
+                let mut search = marionette.search(method, is_paper)?;
+                search.set_threads(threads);
+                search.iterate(&mut || true)?;
+                let clock = if threads == 1 { cpu_time_s } else { elapsed_s };
+                let begin = clock();
+                let progress = search.iterate(&mut || true)?;
+                let time = clock() - begin;
+                let tried = |_| format!(" (tried, then {:?})", progress.method);
+                fallback = progress.fallback.map_or(String::new(), tried);
+                Ok(time)
+            })?;
+            row(&format!("{name}{fallback}"), ms, Some(1600.0));
+        }
     }
     Ok(())
 }
 
 /// The swing-up of the paper.
-fn pendulum(method: Method) -> Outcome<Optimizer> {
+fn pendulum(method: Method, near_last_step: bool) -> Outcome<Optimizer> {
     let model = Arc::new(Model::compile(&builtin::scene("pendulum").ok_or("no scene")?)?);
     let force_split = ForceSplit::Paper;
     let settings = Settings { time_step_s: 0.1, force_split, ..Settings::new(&model) };
@@ -89,6 +96,8 @@ fn pendulum(method: Method) -> Outcome<Optimizer> {
         first_iterations: 4,
         max_iterations: 5000,
         tolerance: Some(1e-6),
+        near_last_step,
+        projection: Some(Weights::diagonal(&[1.0; 2], &[1.0])?),
         ..Options::default()
     };
     let guess = DMatrix::zeros(100, 1);
@@ -140,17 +149,27 @@ impl Marionette {
         let cost =
             TrajectoryCost { x, u: DMatrix::zeros(STEPS, d.input()), weights: weights.into() };
         let mut marionette = Self { plant, cost, inputs: rows(0.0) };
-        let mut search = marionette.search(Method::QuasiNewton)?;
-        for _ in 0..6 {
+        let mut search = marionette.search(Method::QuasiNewton, false)?;
+        for _ in 0..3 {
             search.iterate(&mut || true)?;
         }
         marionette.inputs = search.inputs();
         Ok(marionette)
     }
 
-    fn search(&self, method: Method) -> Outcome<Optimizer> {
+    /// With a projection of its own, whose weights are the paper's, or with the law of the descent.
+    fn search(&self, method: Method, is_paper: bool) -> Outcome<Optimizer> {
         let (plant, cost) = (self.plant.clone(), self.cost.clone());
-        let options = Options { method, ..Options::default() };
+        let d = plant.model().dimensions();
+        let identities = Weights::diagonal(&vec![1.0; d.state()], &vec![1.0; d.input()])?;
+        let options = Options {
+            method,
+            first_method: Some(Method::QuasiNewton),
+            first_iterations: 1,
+            tolerance: Some(1e-9),
+            projection: is_paper.then_some(identities),
+            ..Options::default()
+        };
         let bounds = Bounds::default();
         Ok(Optimizer::new(plant, self.inputs.clone(), cost, &bounds, None, options)?)
     }
@@ -194,7 +213,7 @@ impl Marionette {
             finite_horizon(&samples, &weights, Values::Drop)?;
             Ok(cpu_time_s() - begin)
         })?;
-        row("marionette, regulator along it (two per iteration)", regulator, Some(170.0));
+        row("marionette, regulator along it", regulator, Some(170.0));
         row("marionette, contraction along it", 1e3 * contracting, None);
         Ok(())
     }

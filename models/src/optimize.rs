@@ -28,10 +28,12 @@
 //! 3. goes along the direction by Armijo's rule: the longest of the steps `β^m` whose projection
 //!    lowers the cost by at least `α β^m` times what the directional derivative promises.
 //!
-//! The projection may be any regulator: to first order it leaves directions as they are. With
-//! [`Projection::Descent`] it is the law of step 2, there is no other recursion, and Newton's adjoint is
-//! the linear part of its cost to go: the method is then differential dynamic programming, with
-//! directions in the place of roll-outs.
+//! The projection may be any regulator: to first order it leaves directions as they are. Unless
+//! [`Options::projection`] says otherwise it is the law of step 2: one recursion serves both, the law
+//! knows what the cost cares for, so that longer steps are taken, and Newton's adjoint is the linear
+//! part of the cost to go. That is differential dynamic programming with directions that are tangent
+//! vectors. Johnson, Schultz and Murphey project with identities for weights: more and shorter steps, but
+//! an unstable plant is held on its course whatever the cost leaves out.
 //!
 //! The search has converged when the directional derivative is within the tolerance.
 //! Every iterate is a motion of the plant, whatever constraints and prescribed coordinates it has.
@@ -152,19 +154,6 @@ pub enum Method {
     Newton,
 }
 
-/// The regulator whose law makes motions of the plant of curves.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub enum Projection {
-    /// Its weights are identities, `Q_f` too.
-    #[default]
-    Identity,
-    /// Its weights are given. They need not have to do with the cost.
-    Weights(Weights),
-    /// It is the law of the descent, as in differential dynamic programming: one recursion in place of
-    /// two. The weights of the cost must then hold an unstable plant on its course.
-    Descent,
-}
-
 /// How to search.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
@@ -188,8 +177,8 @@ pub struct Options {
     /// Looks for a step from the one of the iteration before: fewer trials where steps are short again
     /// and again. Misses a longer one beyond steps that fail. False.
     pub near_last_step: bool,
-    /// The projection's regulator.
-    pub projection: Projection,
+    /// Weights of a regulator to project with, of its own; none means the law of the descent.
+    pub projection: Option<Weights>,
     /// Error of a bound, in the unit of its entry, that counts as none; 1e-6.
     pub bound_tolerance: f64,
 }
@@ -206,7 +195,7 @@ impl Default for Options {
             beta: 0.7,
             max_backtracks: 30,
             near_last_step: false,
-            projection: Projection::default(),
+            projection: None,
             bound_tolerance: 1e-6,
         }
     }

@@ -62,6 +62,11 @@ fn pendulum_cost() -> TrajectoryCost {
     }
 }
 
+/// The weights of the paper's projection.
+fn identities(states: usize, inputs: usize) -> Weights {
+    Weights::diagonal(&vec![1.0; states], &vec![1.0; inputs]).unwrap()
+}
+
 /// Four quasi-Newton iterations, then those of a method, until the derivative is below 1e-6.
 fn pendulum_search(method: Method) -> Optimizer {
     let options = Options {
@@ -70,6 +75,7 @@ fn pendulum_search(method: Method) -> Optimizer {
         first_iterations: 4,
         max_iterations: 5000,
         tolerance: Some(1e-6),
+        projection: Some(identities(2, 1)),
         ..Options::default()
     };
     let guess = DMatrix::zeros(100, 1);
@@ -232,10 +238,15 @@ fn the_marionette_is_optimised_as_in_the_paper() {
         first_method: Some(Method::QuasiNewton),
         first_iterations: 10,
         tolerance: Some(1e-2),
+        projection: Some(identities(d.state(), d.input())),
         ..Options::default()
     };
     let guess = string_inputs(&model, n, 0.0);
-    let mut search = Optimizer::new(start, guess, cost, &Bounds::default(), None, options).unwrap();
+    let bounds = Bounds::default();
+    let own_law = Options { projection: None, ..options.clone() };
+    let mut own =
+        Optimizer::new(start.clone(), guess.clone(), cost.clone(), &bounds, None, own_law).unwrap();
+    let mut search = Optimizer::new(start, guess, cost, &bounds, None, options).unwrap();
     let found = run(&mut search);
     assert_eq!(search.status(), Status::Converged);
     close("first cost", found[0].cost_before, 13_575.763, 1e-6);
@@ -247,4 +258,9 @@ fn the_marionette_is_optimised_as_in_the_paper() {
         close(&name, found.directional_derivative, number(&row["dcost"]), 1e-3);
     }
     assert!(search.cost() <= 1472.6934);
+    // With the law of the descent for projection the end is the same, and comes sooner.
+    let count = run(&mut own).len();
+    assert_eq!(own.status(), Status::Converged);
+    assert!(count < found.len(), "{count} of {}", found.len());
+    close("with the law of the descent", own.cost(), search.cost(), 1e-6);
 }

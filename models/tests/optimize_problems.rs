@@ -12,7 +12,7 @@ use plantd_models::control::{
 };
 use plantd_models::optimize::{
     Bound, BoundFault, Bounds, FreeInitialState, Method, OptimizeError, Optimizer, Options,
-    Progress, Projection, Status, Stuck, TrajectoryCost,
+    Progress, Status, Stuck, TrajectoryCost,
 };
 use plantd_models::reference::check_reference;
 use plantd_models::{Initial, Linearization, Model, Plant, Scene, Settings};
@@ -510,7 +510,7 @@ fn each_fault_of_a_problem_is_named() {
     let found = refuse(&|_, _, options, _| options.tolerance = Some(f64::NAN));
     assert!(matches!(found, OptimizeError::Option { name: "tolerance", .. }));
     let found = refuse(&|_, _, options, _| {
-        options.projection = Projection::Weights(Weights::diagonal(&[1.0; 2], &[1.0; 2]).unwrap());
+        options.projection = Some(Weights::diagonal(&[1.0; 2], &[1.0; 2]).unwrap());
     });
     assert!(matches!(found, OptimizeError::Weights(WeightsError::Dimension { weight: "r", .. })));
     let fault = |bound: Bound| match refuse(&|_, bounds, _, _| {

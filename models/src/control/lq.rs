@@ -410,12 +410,11 @@ impl LqRecursion {
         // G = MᵀPM, lower triangle.
         let operand = Operand { numbers: reached, terms: full, stride: value_stride };
         product(bracket, stride, map, operand, (width, width), Into::SetLower, 0);
-        for &(row, col, entry) in entries {
-            let sources = reached[row..].iter().step_by(value_stride);
-            let targets = bracket[col..].iter_mut().step_by(stride);
-            for (target, source) in targets.zip(sources).take(col + 1) {
-                *target += entry * source;
-            }
+        let columns =
+            bracket.chunks_exact_mut(stride.max(1)).zip(reached.chunks_exact(value_stride.max(1)));
+        for (first, (target, source)) in columns.take(width).enumerate() {
+            let lower = &entries[entries.partition_point(|&(_, col, _)| col < first)..];
+            lower.iter().for_each(|&(row, col, entry)| target[col] += entry * source[row]);
         }
 
         // Γ and its factor, in place; what it leaves of the cross term, and the gain.

@@ -6,13 +6,13 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
-use self::direction::{block_length, linearize_behind};
+use self::direction::{Foresight, block_length, linearize_behind};
 use super::bounds::End;
 use super::problem::{Deviation, Problem, check};
 use super::trajectory::{Trajectory, rows};
 use super::{
-    Bounds, Checkpoint, FreeInitialState, Method, OptimizeError, Options, Progress, Projection,
-    Status, Stuck, TrajectoryCost,
+    Bounds, Checkpoint, FreeInitialState, Method, OptimizeError, Options, Progress, Status, Stuck,
+    TrajectoryCost,
 };
 use crate::control::Weights;
 use crate::control::lq::{LqRecursion, Map, Stage};
@@ -250,11 +250,8 @@ impl Optimizer {
         }
         check("the guess", inputs, steps, width)?;
         check_options(&options)?;
-        let projection = match &options.projection {
-            Projection::Identity => Some(Weights::diagonal(&vec![1.0; states], &vec![1.0; width])?),
-            Projection::Weights(weights) => Some(weights.clone().for_system(states, width)?),
-            Projection::Descent => None,
-        };
+        let weights = options.projection.clone();
+        let projection = weights.map(|weights| weights.for_system(states, width)).transpose()?;
         let problem = Arc::new(Problem::new(Arc::clone(&model), steps, cost, bounds, free)?);
         let State { q, p, v, .. } = initial.clone();
         plant.initialize(&Initial::Momentum { q, p, v })?;
@@ -675,7 +672,11 @@ impl Optimizer {
         let is_plain = !problem.has_bounds() && problem.model.orientations().is_empty();
         match method {
             Method::Steepest => {
-                self.options.projection == Projection::Identity && !problem.has_bounds()
+                let Second { xx, uu, .. } = &self.scratch.identity;
+                let stage = projection.stage();
+                !problem.has_bounds()
+                    && (stage.q(), stage.r(), stage.s()) == (xx, uu, None)
+                    && projection.q_final() == xx
             }
             Method::QuasiNewton => is_plain && problem.has_weights(projection),
             Method::Newton => false,
@@ -724,13 +725,17 @@ impl Optimizer {
         let (mut cost, mut penalties) = (initial_cost, 0.0);
         let may_stop_early = problem.is_nonnegative && !problem.has_bounds();
         self.foreseen.fill(false);
-        let helpers = &mut self.workers[1..];
-        if !helpers.is_empty() {
+        if self.workers.len() > 1 {
             self.linearized.fill(false);
         }
-        let maps = (&mut self.maps[..], &mut linearizations[..]);
-        let first_step = self.first_step;
-        let foresee = (helpers, maps, first_step, &mut self.foreseen[..]);
+        let foresight = Foresight {
+            helpers: &mut self.workers[1..],
+            maps: &mut self.maps,
+            linearizations,
+            first_step: self.first_step,
+            length: block_length(states),
+            done: &mut self.foreseen,
+        };
         let mut roll_out = |behind: &mut dyn FnMut(usize, &Trajectory)| {
             for k in 0..steps {
                 ask(k, go_on)?;
@@ -761,7 +766,7 @@ impl Optimizer {
             (trial.cost, trial.merit) = (cost, cost + penalties);
             Ok(trial.merit.is_finite())
         };
-        linearize_behind(foresee, block_length(states), &mut roll_out)
+        linearize_behind(foresight, &mut roll_out)
     }
 
     /// Puts the plant at the initial state of the trial; false if there is none.

@@ -4,7 +4,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::search::Optimizer;
 use super::{Bound, Bounds, FreeInitialState, Method, Options, TrajectoryCost};
-use crate::control::{StageWeights, TrajectoryWeights};
+use crate::control::{StageWeights, TrajectoryWeights, Weights};
 use crate::plant::samples;
 use crate::{ForceSplit, Model, Plant, Settings, builtin};
 use std::sync::Arc;
@@ -28,12 +28,13 @@ struct Case {
     bounds: Bounds,
     free: Option<FreeInitialState>,
     multipliers: f64,
+    projection: Option<Weights>,
 }
 
 impl Case {
     fn new(model: Arc<Model>, split: ForceSplit) -> Self {
         let (bounds, free) = (Bounds::default(), None);
-        Self { model, split, bounds, free, multipliers: 0.0 }
+        Self { model, split, bounds, free, multipliers: 0.0, projection: None }
     }
 
     fn search(&self) -> Optimizer {
@@ -61,7 +62,7 @@ impl Case {
         let x = DMatrix::from_fn(STEPS + 1, n, |k, i| start[i] + 0.2 * wave(k, i, 0.7));
         let u = DMatrix::from_fn(STEPS, m, |k, j| held[j] + 0.1 * wave(k, j, 0.3));
         let cost = TrajectoryCost { x, u, weights };
-        let options = Options::default();
+        let options = Options { projection: self.projection.clone(), ..Options::default() };
         let mut search =
             Optimizer::new(plant, guess, cost, &self.bounds, self.free.clone(), options).unwrap();
         search.set_multipliers(self.multipliers);
@@ -131,10 +132,15 @@ fn derivatives_of_the_projected_cost_along_the_directions() {
     let models = models();
     for model in &models {
         for split in [ForceSplit::Symmetric, ForceSplit::Paper] {
-            newton += usize::from(Case::new(Arc::clone(model), split).check());
+            let d = model.dimensions();
+            let ones = [d.state(), d.input()].map(|n| vec![1.0; n]);
+            for projection in [None, Some(Weights::diagonal(&ones[0], &ones[1]).unwrap())] {
+                let case = Case { projection, ..Case::new(Arc::clone(model), split) };
+                newton += usize::from(case.check());
+            }
         }
     }
-    assert!(newton > models.len(), "{newton} of {}", 2 * models.len());
+    assert!(newton > 2 * models.len(), "{newton} of {}", 4 * models.len());
 }
 
 #[test]

@@ -134,6 +134,7 @@ impl Search {
             penalty,
             bound_violation,
             initial_reference,
+            backtracks,
         } = self.optimizer.checkpoint();
         let state =
             |state: &State| Some(convert::state(state, state.step as f64 * self.time_step_s));
@@ -146,6 +147,7 @@ impl Search {
             penalty,
             bound_violation,
             initial_reference: state(&initial_reference),
+            backtracks,
         }
     }
 
@@ -200,6 +202,7 @@ impl Start {
                     penalty: resume.penalty,
                     bound_violation: resume.bound_violation,
                     initial_reference,
+                    backtracks: resume.backtracks,
                 };
                 Ok(Self::Resume(Box::new(plant), Box::new(checkpoint)))
             }
@@ -244,7 +247,7 @@ fn state(field: &str, state: v1::State, model: &Model) -> Result<State, Fault> {
 }
 
 /// Refuses a search that would need too much memory, or whose result no client would take: A, B, two
-/// gains, the motion four times, and for Newton's method whole linearizations.
+/// gains, the motion and what is as long seven times, and for Newton's method whole linearizations.
 fn check_memory(
     hub: &Hub,
     model: &Model,
@@ -338,6 +341,7 @@ fn given_options(
         alpha: or(given.alpha, defaults.alpha),
         beta: or(given.beta, defaults.beta),
         max_backtracks: count(given.max_backtracks, defaults.max_backtracks),
+        near_last_step: given.near_last_step,
         projection: match given.projection {
             None => None,
             weights => Some(convert::weights_in("options.projection", weights, model)?),

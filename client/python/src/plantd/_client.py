@@ -636,6 +636,7 @@ class Client:
         alpha: float = 0.0,
         beta: float = 0.0,
         max_backtracks: int = 0,
+        near_last_step: bool = False,
         projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         bound_tolerance: float = 0.0,
         checkpoint_every: int = 0,
@@ -650,9 +651,9 @@ class Client:
         or ``resume`` is where it left off. Bounds are by the name of an entry, ``{"force": (-5, 5)}``;
         ``final_state={"theta": math.pi}`` fixes an entry of the last state. ``free_initial`` frees all
         entries of the initial state, or those that are named; ``initial_weight`` weighs their
-        distance from the guess. ``projection`` is the pair of weights (q, r) of the regulator that
-        projects onto motions of the plant. The other options are those of `OptimizationOptions` in
-        the contract; 0 means its default.
+        distance from the guess. ``projection`` is the pair of weights (q, r) of a regulator that
+        projects onto motions of the plant, in place of the law of the descent. The other options are
+        those of `OptimizationOptions` in the contract; 0 means its default.
         """
         if (guess is None) == (resume is None):
             raise ValueError("give one of `guess` and `resume`")
@@ -689,6 +690,7 @@ class Client:
                 alpha=alpha,
                 beta=beta,
                 max_backtracks=max_backtracks,
+                near_last_step=near_last_step,
                 projection=None if projection is None else weights(*projection),
                 bound_tolerance=bound_tolerance,
                 checkpoint_every=checkpoint_every,

@@ -23,7 +23,7 @@ pub(crate) struct Map {
     pub(super) full: Vec<usize>,
     /// Where they begin in the numbers.
     pub(super) starts: Vec<usize>,
-    /// Of the other rows: row, column among inputs and active states, entry.
+    /// Of the other rows: row, column among inputs and active states, entry; by columns.
     pub(super) entries: Vec<(usize, usize, f64)>,
     numbers: Scratch,
 }
@@ -63,6 +63,7 @@ impl Map {
             let all = by_input.chain(by_state).enumerate().map(|(col, x)| (row, col, x));
             entries.extend(all.filter(|(.., x)| *x != 0.0));
         }
+        entries.sort_unstable_by_key(|&(row, col, _)| (col, row));
     }
 
     /// Begins with zeros: rows, states and inputs; active states; full rows.
@@ -91,7 +92,7 @@ impl Map {
         &mut self.numbers.numbers()[stride * place..][..stride]
     }
 
-    /// Adds an entry of a row of few: row, column among inputs and active states.
+    /// Adds an entry of a row of few, columns ascending: row, column among inputs and active states.
     pub(crate) fn push(&mut self, row: usize, column: usize, entry: f64) {
         self.entries.push((row, column, entry));
     }

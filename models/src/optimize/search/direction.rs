@@ -415,18 +415,28 @@ impl Worker {
     }
 }
 
+/// Where helpers linearize a trial.
+pub(super) struct Foresight<'a> {
+    pub(super) helpers: &'a mut [Worker],
+    pub(super) maps: &'a mut [Map],
+    pub(super) linearizations: &'a mut [Linearization],
+    pub(super) first_step: u64,
+    /// Steps of a block, and which blocks are done.
+    pub(super) length: usize,
+    pub(super) done: &'a mut [bool],
+}
+
+/// A roll-out that says after each step how many it took, and shows the motion.
+type RollOut<'a> =
+    &'a mut dyn FnMut(&mut dyn FnMut(usize, &Trajectory)) -> Result<bool, OptimizeError>;
+
 /// Rolls a trial out, and has helpers linearize the blocks behind it meanwhile, the last first; marks
 /// those that they did.
 pub(super) fn linearize_behind(
-    (helpers, (maps, linearizations), first_step, done): (
-        &mut [Worker],
-        (&mut [Map], &mut [Linearization]),
-        u64,
-        &mut [bool],
-    ),
-    length: usize,
-    roll_out: &mut dyn FnMut(&mut dyn FnMut(usize, &Trajectory)) -> Result<bool, OptimizeError>,
+    foresight: Foresight<'_>,
+    roll_out: RollOut<'_>,
 ) -> Result<bool, OptimizeError> {
+    let Foresight { helpers, maps, linearizations, first_step, length, done } = foresight;
     if helpers.is_empty() {
         return roll_out(&mut |_, _| {});
     }

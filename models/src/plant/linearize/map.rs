@@ -37,14 +37,12 @@ impl Linearization {
                 self.replaced.iter().for_each(|column| target[*column] = 0.0);
             }
         }
+        for (k, input) in (0..nk).zip(ni..).filter(|(_, input)| !self.replaced.contains(input)) {
+            map.push(nd + k, input, 1.0);
+            map.push(n + nd + k, input, 1.0 / self.time_step_s);
+        }
         for k in 0..nk {
-            let (input, start) = (ni + k, inputs + nd + k);
-            let (position, velocity) = (nd + k, n + nd + k);
-            if !self.replaced.contains(&input) {
-                map.push(position, input, 1.0);
-                map.push(velocity, input, 1.0 / self.time_step_s);
-            }
-            map.push(velocity, start, -1.0 / self.time_step_s);
+            map.push(n + nd + k, inputs + nd + k, -1.0 / self.time_step_s);
         }
     }
 }
