@@ -59,8 +59,8 @@ fn main() -> Outcome<()> {
             }
             let mut fallback = String::new();
             let ms = least(5, || {
-                // Near the end, where steps are not shortened. Between iterations nothing is done, but
-                // the first has no linearizations from a step before it.
+                // Near the end, where steps are not shortened. The second iteration: the first has no
+                // linearizations that were made behind a roll-out.
                 let mut search = marionette.search(method, is_paper)?;
                 search.set_threads(threads);
                 search.iterate(&mut || true)?;
