@@ -9,8 +9,9 @@ use crate::elimination::Elimination;
 use crate::model::{
     Alignment, Carries, Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions,
     Forces, Length, MixedPair, Model, OperatingPoint, Pair, PathJoint, PathSpring, PointPair,
-    PointSpring, Polynomial, Potentials, Product, SplineSpring, Vector,
+    PointSpring, Polynomial, Potentials, Product, Solver, SplineSpring, Vector,
 };
+use crate::planar::planar;
 use crate::plant::conditioning::Conditioning;
 use crate::rotation::Quaternion;
 use crate::scene::{self, CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
@@ -64,17 +65,25 @@ fn compile(scene: &Scene) -> Model {
         .map(|c| settings(scene, &c.name).and_then(|s| s.damping).unwrap_or(scene.damping))
         .collect();
     let gravity = Vec3(scene.gravity);
+    let gravity = (gravity != Vec3::ZERO).then_some(gravity);
+    let needs_poses = forces.is_some()
+        || !potentials.point_springs.is_empty()
+        || !potentials.path_springs.is_empty();
+    let planar = if needs_poses { None } else { planar(&dynamics, gravity) };
+    let dimensions = Dimensions {
+        dynamic,
+        prescribed: layout.coordinates.len() - dynamic,
+        inputs: scene.inputs.len(),
+        constraints: equations.constraints.len(),
+    };
     let mut model = Model {
         conditioning: Conditioning::default(),
-        dimensions: Dimensions {
-            dynamic,
-            prescribed: layout.coordinates.len() - dynamic,
-            inputs: scene.inputs.len(),
-            constraints: equations.constraints.len(),
-        },
+        dimensions,
         operating_points: layout.operating_points(scene),
         digest: digest(scene),
-        gravity: (gravity != Vec3::ZERO).then_some(gravity),
+        solver: Solver::of(planar.as_deref(), dimensions),
+        planar,
+        gravity,
         damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },
         coordinate_inputs: layout.coordinate_inputs(scene),
         forces,

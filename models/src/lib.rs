@@ -23,6 +23,7 @@ pub mod control;
 mod elimination;
 mod model;
 pub mod optimize;
+mod planar;
 mod plant;
 pub mod reference;
 mod rotation;
@@ -33,6 +34,7 @@ mod signal;
 mod spatial;
 mod spline;
 mod tree;
+mod trigonometry;
 
 pub use continuous::{
     Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::elimination::Elimination;
+use crate::planar::PlanarJoint;
 use crate::plant::conditioning::Conditioning;
 use crate::scene::{CoordinateKind, Scene};
 use crate::signal::{Signal, Target};
@@ -23,6 +24,10 @@ pub struct Model {
     pub(crate) digest: u64,
     /// Joints that carry inertia or springs: what a step walks at the midpoint.
     pub(crate) dynamics: Tree,
+    /// The same as a planar tree, where it is one and nothing needs its poses in space.
+    pub(crate) planar: Option<Vec<PlanarJoint>>,
+    /// How a step solves for corrections.
+    pub(crate) solver: Solver,
     /// `None` without gravity.
     pub(crate) gravity: Option<Vec3>,
     /// Damping of each dynamic coordinate; empty without damping.
@@ -44,6 +49,32 @@ pub struct Model {
     pub(crate) mixed_pairs: Vec<MixedPair>,
     /// What pivots are compared with.
     pub(crate) conditioning: Conditioning,
+}
+
+/// How a step solves with its Newton matrix.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Solver {
+    /// Entry by entry along the elimination tree: O(n·depth²) once, O(n·depth) for each correction.
+    Tree,
+    /// By the vectors that generate the entries: O(n).
+    Generators,
+}
+
+impl Solver {
+    /// Coordinates from which on generators are faster.
+    const MANY: usize = 4;
+
+    /// The faster one for a scene.
+    pub(crate) fn of(planar: Option<&[PlanarJoint]>, d: Dimensions) -> Self {
+        let are_all = |joints: &[PlanarJoint]| {
+            joints.iter().map(|joint| joint.coordinate).eq(0..d.coordinates())
+        };
+        if d.dynamic >= Self::MANY && d.constraints == 0 && planar.is_some_and(are_all) {
+            Self::Generators
+        } else {
+            Self::Tree
+        }
+    }
 }
 
 /// Two dynamic joints on one path to the root, or one joint twice.

@@ -331,8 +331,11 @@ impl Polynomial {
 }
 
 /// The larger of two numbers; a NaN wins, so that it is never taken for converged.
+///
+/// Both are taken without their signs, and bits of such numbers are in their order.
+#[inline(always)]
 pub(crate) fn larger(a: f64, b: f64) -> f64 {
-    if b > a || b.is_nan() { b } else { a }
+    f64::from_bits(a.abs().to_bits().max(b.abs().to_bits()))
 }
 
 #[cfg(test)]

@@ -26,8 +26,10 @@ use nalgebra::DMatrix;
 
 use crate::Model;
 use crate::plant::balls::Turning;
+use crate::plant::curvature::SecondDerivatives;
 use crate::plant::newton::Workspace;
 use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::planar;
 use crate::plant::rows::{add_rows, padded};
 use crate::plant::{Plant, Settings, StepError, potentials};
 use crate::spatial::{Mat3, Vec3};
@@ -375,6 +377,17 @@ impl Workspace {
     }
 }
 
+impl Workspace {
+    /// Second derivatives of the Lagrangian for a pair of joints on one path to the root.
+    #[inline(always)]
+    fn pair(&self, model: &Model, ancestor: usize, descendant: usize) -> SecondDerivatives {
+        match (&self.planar, &model.planar) {
+            (Some(planar), Some(joints)) => planar.pair(joints, ancestor, descendant),
+            _ => self.curvature.pair(&self.momenta, model.gravity, ancestor, descendant),
+        }
+    }
+}
+
 impl Plant {
     /// Linearizes at the solution in the workspace.
     pub(crate) fn linearize_solution(
@@ -393,8 +406,12 @@ impl Plant {
         );
         out.time_step_s = self.settings.time_step_s;
         out.at_start = self.settings.force_split.at_start();
-        let workspace = &mut self.workspace;
-        workspace.factor_newton_matrix(&self.model, &self.settings)?;
+        if self.workspace.generators.is_some() {
+            self.linearize_by_generators(out)?;
+            self.remember(u, out);
+            return Ok(());
+        }
+        self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
         self.fill_right_hand_sides(out);
         let workspace = &mut self.workspace;
         // Without inertia, springs or forces on prescribed joints, the columns of `k` in r1' are zero.
@@ -418,10 +435,49 @@ impl Plant {
             *x = -*x;
         }
         self.differentiate_momentum(out);
-        let workspace = &self.workspace;
-        let effective = &workspace.effective_input[..];
+        self.remember(u, out);
+        Ok(())
+    }
+
+    /// Remembers the step for its second derivatives.
+    fn remember(&self, u: &[f64], out: &mut Linearization) {
+        let effective = &self.workspace.effective_input[..];
         let u = if effective.is_empty() { u } else { effective };
-        out.solved.remember(workspace, &self.settings, &self.state.q, u);
+        out.solved.remember(&self.workspace, &self.settings, &self.state.q, u);
+    }
+
+    /// The same in O(n²), for planar trees without constraints and prescribed coordinates.
+    fn linearize_by_generators(&mut self, out: &mut Linearization) -> Result<(), StepError> {
+        let (model, workspace) = (&self.model, &mut self.workspace);
+        workspace.factor_generators(model, &self.settings)?;
+        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
+            place.momentum = self.settings.time_step_s * input.gain;
+            place.residual = out.at_start * place.momentum;
+        }
+        let (Some(planar), Some(joints), Some(generators)) =
+            (&workspace.planar, &model.planar, &mut workspace.generators)
+        else {
+            return Ok(());
+        };
+        let h = self.settings.time_step_s;
+        // Of springs and dampers of coordinates.
+        let [residual, slope] = &mut workspace.diagonals;
+        if model.potentials.any {
+            residual.fill(0.0);
+            potentials::for_each_second_derivative(
+                &model.potentials,
+                &model.dynamics,
+                &workspace.poses,
+                &workspace.q_mid,
+                |i, _, value| residual[i] -= 0.5 * h * value,
+            );
+        }
+        for (i, slope) in slope.iter_mut().enumerate() {
+            *slope = residual[i] - model.damping.get(i).copied().unwrap_or_default();
+        }
+        let diagonal = planar::Diagonal { residual, momentum: slope };
+        let blocks = [&mut out.increment[..], &mut out.momentum];
+        generators.linearize(planar, joints, &diagonal, blocks, out.stride);
         Ok(())
     }
 
@@ -446,12 +502,7 @@ impl Plant {
         workspace.end_slopes.fill(0.0);
         for pair in &model.pairs {
             let (i, j) = (pair.row as usize, pair.column as usize);
-            let second = workspace.curvature.pair(
-                &workspace.momenta,
-                model.gravity,
-                pair.ancestor as usize,
-                pair.descendant as usize,
-            );
+            let second = workspace.pair(model, pair.ancestor as usize, pair.descendant as usize);
             let half = 0.5 * h * second.qq;
             out.increment[i * stride + j] = half - second.v_above_q_below;
             out.increment[j * stride + i] = half - second.q_above_v_below;
@@ -461,12 +512,7 @@ impl Plant {
             workspace.stiffness[j * nd + i] = h * second.qq;
         }
         for pair in &model.mixed_pairs {
-            let second = workspace.curvature.pair(
-                &workspace.momenta,
-                model.gravity,
-                pair.ancestor,
-                pair.descendant,
-            );
+            let second = workspace.pair(model, pair.ancestor, pair.descendant);
             let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
             let descendant = model.dynamics.joints[pair.descendant].coordinate;
             // Row of the dynamic coordinate, column of the prescribed one.

@@ -19,7 +19,9 @@ mod linearize;
 mod momenta;
 mod newton;
 pub(crate) mod pivoted_lu;
+mod planar;
 pub(crate) mod potentials;
+mod predictor;
 pub(crate) mod rows;
 #[cfg(test)]
 pub(crate) mod samples;
@@ -34,6 +36,7 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::Model;
+use crate::plant::predictor::Predictor;
 use crate::rotation::Quaternion;
 use crate::signal::Target;
 use balls::three;
@@ -255,17 +258,12 @@ pub(crate) struct PreciseState {
     /// Orientations of ball joints; `q` has their rotation vectors.
     pub(crate) orientations: Vec<Quaternion>,
     pub(crate) multipliers: Vec<f64>,
-    /// Increments of the last three steps, latest first.
-    pub(crate) increments: [Vec<f64>; 3],
-    /// Multipliers of the last three steps, latest first.
-    pub(crate) impulses: [Vec<f64>; 3],
-    /// How many of them there are.
-    pub(crate) history: u8,
+    /// Increments of past steps.
+    pub(crate) predictor: Predictor,
 }
 
 impl PreciseState {
     fn zeros(nd: usize, nk: usize, nc: usize, orientations: usize) -> Self {
-        let history = |n: usize| [vec![0.0; n], vec![0.0; n], vec![0.0; n]];
         Self {
             step: 0,
             time_origin_s: 0.0,
@@ -276,9 +274,7 @@ impl PreciseState {
             v: vec![0.0; nk],
             orientations: vec![Quaternion::default(); orientations],
             multipliers: vec![0.0; nc],
-            increments: history(nd),
-            impulses: history(nc),
-            history: 0,
+            predictor: Predictor::new(nd),
         }
     }
 
@@ -556,11 +552,7 @@ impl Plant {
         }
         state.v.copy_from_slice(&workspace.velocity[nd..]);
         state.multipliers.copy_from_slice(&workspace.multipliers);
-        state.increments.rotate_right(1);
-        state.increments[0].copy_from_slice(&workspace.increment);
-        state.impulses.rotate_right(1);
-        state.impulses[0].copy_from_slice(&workspace.multipliers);
-        state.history = (state.history + 1).min(3);
+        state.predictor.record(&workspace.increment, &self.model.conditioning.inertia);
         state.step = state.step.saturating_add(1);
         workspace.move_on();
     }

@@ -11,7 +11,7 @@
 //! measured in units of its own round-off; the solver stops where arithmetic does.
 
 use crate::Model;
-use crate::model::Forces;
+use crate::model::{Forces, Solver};
 use crate::plant::blocks::StepBlocks;
 use crate::plant::closure::{Closure, larger};
 use crate::plant::curvature::Curvature;
@@ -19,8 +19,9 @@ use crate::plant::forces::Instant;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::planar::{self, PlanarTree};
 use crate::plant::rows::{Term, padded};
-use crate::plant::tree_lu::TreeLu;
+use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
 
@@ -30,8 +31,6 @@ const CONVERGED: f64 = 4.0;
 const FLOOR: f64 = 1e4;
 /// The same for a Jacobian that was kept.
 const CHORD_FLOOR: f64 = 1e2;
-/// A residual that falls slower than this asks for a new Jacobian.
-const SLOW: f64 = 0.2;
 
 /// All memory that a step and its linearization need.
 #[derive(Clone, Debug)]
@@ -65,6 +64,15 @@ pub(crate) struct Workspace {
     pub(crate) force: Vec<f64>,
     pub(crate) residual: Vec<f64>,
     pub(crate) constraint_residual: Vec<f64>,
+    /// What follows from configuration and velocity at the midpoint: in the plane where the scene allows
+    /// it, else in space.
+    pub(crate) planar: Option<Box<PlanarTree>>,
+    /// The Newton matrix by its generators, where that is faster.
+    pub(crate) generators: Option<Box<planar::Elimination>>,
+    /// What springs and dampers of coordinates add to its diagonal.
+    diagonal: Vec<f64>,
+    /// The same for the linearization: of the residual by the start, of the momentum by the increment.
+    pub(crate) diagonals: [Vec<f64>; 2],
     pub(crate) poses: Poses,
     pub(crate) momenta: Momenta,
     pub(crate) curvature: Curvature,
@@ -134,6 +142,11 @@ impl Workspace {
             force: zeros(nd),
             residual: zeros(nd),
             constraint_residual: zeros(nc),
+            planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
+            generators: (model.solver == Solver::Generators)
+                .then(|| Box::new(planar::Elimination::new(nd))),
+            diagonal: zeros(nd),
+            diagonals: [zeros(nd), zeros(nd)],
             poses: Poses::new(&model.dynamics),
             momenta: Momenta::new(&model.dynamics),
             curvature: Curvature::new(&model.dynamics),
@@ -161,8 +174,10 @@ impl Workspace {
         u: &[f64],
     ) -> Result<StepReport, StepError> {
         self.prepare(model, settings, state, u);
-        if state.history > 0 {
-            self.extrapolate(state);
+        if state.predictor.is_ready() {
+            state.predictor.predict(&mut self.increment);
+            // The equations are linear in the multipliers: any guess is as good.
+            self.multipliers.copy_from_slice(&state.multipliers);
             let report = self.iterate(model, settings, state, false);
             if report.is_ok() {
                 return report;
@@ -234,25 +249,6 @@ impl Workspace {
         self.end_is_exact = false;
     }
 
-    /// Guess: the polynomial through the increments of up to three past steps.
-    fn extrapolate(&mut self, state: &PreciseState) {
-        let guess = |past: [&[f64]; 3], out: &mut [f64]| match state.history {
-            1 => out.copy_from_slice(past[0]),
-            2 => {
-                for (i, out) in out.iter_mut().enumerate() {
-                    *out = 2.0 * past[0][i] - past[1][i];
-                }
-            }
-            _ => {
-                for (i, out) in out.iter_mut().enumerate() {
-                    *out = 3.0 * (past[0][i] - past[1][i]) + past[2][i];
-                }
-            }
-        };
-        guess(state.increments.each_ref().map(Vec::as_slice), &mut self.increment);
-        guess(state.impulses.each_ref().map(Vec::as_slice), &mut self.multipliers);
-    }
-
     /// Guess: the velocity that belongs to the momentum goes on.
     fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
         self.find_velocity(model, state);
@@ -279,6 +275,11 @@ impl Workspace {
         always_factor: bool,
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
+        // What a factorization costs, in corrections.
+        let patience = match model.solver {
+            Solver::Tree => 3,
+            Solver::Generators => 2,
+        };
         let mut previous = f64::INFINITY;
         let (mut fresh, mut idle) = (false, false);
         while report.iterations < settings.max_iterations {
@@ -301,8 +302,10 @@ impl Workspace {
             let is_idle = idle && report.constraint_residual <= FLOOR;
             let at_floor = stagnates && (size <= floor || is_idle);
             let converged = size <= CONVERGED || at_floor;
-            fresh =
-                !converged && (always_factor || previous.is_infinite() || size > SLOW * previous);
+            // A new Jacobian squares the rate: it pays where the old one needs many corrections more.
+            let rate = size / previous;
+            let later = (0..patience).fold(size, |size, _| size * rate);
+            fresh = !converged && (always_factor || previous.is_infinite() || later > CONVERGED);
             if fresh {
                 self.factor(model, settings)?;
                 report.factorizations += 1;
@@ -324,26 +327,28 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) -> f64 {
-        let h = settings.time_step_s;
+        let (h, nd) = (settings.time_step_s, self.residual.len());
         let inverse = 1.0 / h;
-        for (i, x) in self.increment.iter().enumerate() {
-            self.q_mid[i] = state.q[i] + (state.q_low[i] + 0.5 * x);
-            self.velocity[i] = x * inverse;
+        let (x, q, q_low) = (&self.increment[..nd], &state.q[..nd], &state.q_low[..nd]);
+        let (q_mid, velocity) = (&mut self.q_mid[..nd], &mut self.velocity[..nd]);
+        for i in 0..nd {
+            q_mid[i] = q[i] + (q_low[i] + 0.5 * x[i]);
+            velocity[i] = x[i] * inverse;
         }
         if !model.orientations.is_empty() {
             self.turn_to_midpoint(model);
         }
         self.evaluate_lagrangian(model);
-        let weight = settings.force_split.at_start() * h;
+        let (half, weight) = (0.5 * h, settings.force_split.at_start() * h);
+        let (p, p_low, q_mid) = (&state.p[..nd], &state.p_low[..nd], &self.q_mid[..nd]);
+        let (l_q, l_v, force) = (&self.l_q[..nd], &self.l_v[..nd], &self.force[..nd]);
+        let residual = &mut self.residual[..nd];
         let mut round_off = f64::MIN_POSITIVE;
-        for i in 0..self.residual.len() {
-            let (half_q, force) = (0.5 * h * self.l_q[i], weight * self.force[i]);
-            let inertial = state.p[i] - self.l_v[i];
-            self.residual[i] = (inertial + (half_q + force)) + state.p_low[i];
-            let magnitude = state.p[i].abs()
-                + self.l_v[i].abs()
-                + half_q.abs() * (1.0 + self.q_mid[i].abs())
-                + force.abs();
+        for i in 0..nd {
+            let (half_q, force) = (half * l_q[i], weight * force[i]);
+            residual[i] = ((p[i] - l_v[i]) + (half_q + force)) + p_low[i];
+            let magnitude =
+                p[i].abs() + l_v[i].abs() + half_q.abs() * (1.0 + q_mid[i].abs()) + force.abs();
             round_off = larger(round_off, magnitude);
         }
         if !model.orientations.is_empty() {
@@ -358,15 +363,19 @@ impl Workspace {
 
     /// Gradient of the Lagrangian and forces at the midpoint.
     pub(crate) fn evaluate_lagrangian(&mut self, model: &Model) {
-        self.poses.evaluate(&model.dynamics, &self.q_mid, &self.orientations_mid);
-        self.momenta.gradient(
-            &model.dynamics,
-            &self.poses,
-            &self.velocity,
-            model.gravity,
-            &mut self.l_q,
-            &mut self.l_v,
-        );
+        if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
+            planar.gradient(joints, &self.q_mid, &self.velocity, &mut self.l_q, &mut self.l_v);
+        } else {
+            self.poses.evaluate(&model.dynamics, &self.q_mid, &self.orientations_mid);
+            self.momenta.gradient(
+                &model.dynamics,
+                &self.poses,
+                &self.velocity,
+                model.gravity,
+                &mut self.l_q,
+                &mut self.l_v,
+            );
+        }
         if model.potentials.any {
             potentials::add_gradient(
                 &model.potentials,
@@ -422,7 +431,7 @@ impl Workspace {
 
     /// Factors `K` and `S` at the last evaluation.
     fn factor(&mut self, model: &Model, settings: &Settings) -> Result<(), StepError> {
-        self.factor_newton_matrix(model, settings)?;
+        self.factor_generators(model, settings)?;
         if model.dimensions.constraints > 0 {
             self.end.differentiate(model, &self.q_end);
             if !model.orientations.is_empty() {
@@ -440,17 +449,22 @@ impl Workspace {
             return;
         }
         let h = settings.time_step_s;
-        self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         if model.potentials.couple_branches || model.forces.is_some() {
             self.matrix.clear();
         }
-        self.curvature.fill_newton_matrix(
-            &model.pairs,
-            &self.momenta,
-            model.gravity,
-            h,
-            &mut self.matrix,
-        );
+        if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
+            planar.differentiate(joints);
+            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.matrix);
+        } else {
+            self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
+            self.curvature.fill_newton_matrix(
+                &model.pairs,
+                &self.momenta,
+                model.gravity,
+                h,
+                &mut self.matrix,
+            );
+        }
         if model.potentials.any {
             potentials::add_to_newton_matrix(
                 &model.potentials,
@@ -480,6 +494,48 @@ impl Workspace {
         self.fill_newton_matrix(model, settings);
         let inertia = &model.conditioning.inertia;
         let pivot = self.matrix.factor(&model.elimination, inertia, 1.0 / settings.time_step_s);
+        self.check(model, settings, pivot)
+    }
+
+    /// Factors the generators of `K` at the last evaluation.
+    pub(crate) fn factor_generators(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+    ) -> Result<(), StepError> {
+        let (Some(planar), Some(joints), Some(generators)) =
+            (&mut self.planar, &model.planar, &mut self.generators)
+        else {
+            return self.factor_newton_matrix(model, settings);
+        };
+        let h = settings.time_step_s;
+        planar.differentiate(joints);
+        let diagonal = &mut self.diagonal;
+        if model.potentials.any {
+            diagonal.fill(0.0);
+            potentials::for_each_second_derivative(
+                &model.potentials,
+                &model.dynamics,
+                &self.poses,
+                &self.q_mid,
+                |i, _, value| diagonal[i] -= 0.25 * h * value,
+            );
+        }
+        let a = settings.force_split.at_start();
+        for (i, c) in model.damping.iter().enumerate() {
+            diagonal[i] = if model.potentials.any { diagonal[i] } else { 0.0 } - a * c;
+        }
+        let inertia = &model.conditioning.inertia;
+        let pivot = generators.factor(planar, joints, diagonal, inertia, h);
+        self.check(model, settings, pivot)
+    }
+
+    fn check(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        pivot: SmallestPivot,
+    ) -> Result<(), StepError> {
         self.estimates.matrix = pivot.relative;
         if pivot.relative >= settings.singular_below {
             return Ok(());
@@ -534,7 +590,10 @@ impl Workspace {
 
     /// One correction with the factors at hand.
     fn correct(&mut self, model: &Model) {
-        self.matrix.solve(&model.elimination, &mut self.residual);
+        match (&mut self.generators, &model.planar) {
+            (Some(generators), Some(joints)) => generators.solve(joints, &mut self.residual),
+            _ => self.matrix.solve(&model.elimination, &mut self.residual),
+        }
         if model.dimensions.constraints > 0 {
             let n = model.dimensions.coordinates();
             let stride = padded(model.dimensions.constraints);

@@ -3,14 +3,15 @@
 //! Encoding, little-endian: magic `PLNTSNAP`, version (u32), model digest (u64), time step (f64 bits),
 //! force split (u8), iteration limit (u32), singular threshold (f64 bits), nd, nk, nc, number of
 //! orientations (u32 each), step (u64), time
-//! origin (f64 bits), history (u8), the numbers as f64 bits, and the FNV-1a hash (u64) of all that.
+//! origin (f64 bits), history and order of the predictor (u8 each), the numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
 use crate::compile::fnv1a;
+use crate::plant::predictor::LENGTH;
 use crate::plant::{ForceSplit, Plant, PreciseState, Settings};
 use crate::rotation::Quaternion;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 
 /// Everything a plant needs to go on bit for bit.
 #[derive(Clone, Debug, PartialEq)]
@@ -63,24 +64,17 @@ impl Plant {
 }
 
 impl PreciseState {
-    /// All vectors, in the order of the encoding.
-    fn vectors(&mut self) -> [&mut Vec<f64>; 12] {
-        let [x0, x1, x2] = &mut self.increments;
-        let [l0, l1, l2] = &mut self.impulses;
-        [
+    /// All numbers but orientations, in the order of the encoding.
+    fn numbers(&mut self) -> impl Iterator<Item = &mut f64> {
+        let vectors = [
             &mut self.q,
             &mut self.q_low,
             &mut self.p,
             &mut self.p_low,
             &mut self.v,
             &mut self.multipliers,
-            x0,
-            x1,
-            x2,
-            l0,
-            l1,
-            l2,
-        ]
+        ];
+        vectors.into_iter().flatten().chain(self.predictor.differences.iter_mut().flatten())
     }
 }
 
@@ -105,10 +99,8 @@ impl Snapshot {
         }
         bytes.extend(state.step.to_le_bytes());
         bytes.extend(state.time_origin_s.to_le_bytes());
-        bytes.push(state.history);
-        for vector in state.vectors() {
-            bytes.extend(vector.iter().flat_map(|value| value.to_le_bytes()));
-        }
+        bytes.extend([state.predictor.history, state.predictor.order]);
+        bytes.extend(state.numbers().flat_map(|value| value.to_le_bytes()));
         for Quaternion(components) in &state.orientations {
             bytes.extend(components.iter().flat_map(|value| value.to_le_bytes()));
         }
@@ -146,19 +138,19 @@ impl Snapshot {
         let (nd, nk, nc, no) = (size()?, size()?, size()?, size()?);
         let step = u64::from_le_bytes(reader.take()?);
         let time_origin_s = f64::from_le_bytes(reader.take()?);
-        let [history] = reader.take()?;
-        let numbers = 7 * nd + 2 * nk + 4 * nc + 4 * no;
-        if reader.0.len() != 8 * numbers || history > 3 {
+        let [history, order] = reader.take()?;
+        let numbers = (4 + LENGTH) * nd + 2 * nk + nc + 4 * no;
+        if reader.0.len() != 8 * numbers || usize::from(history) > LENGTH || order > history {
             return Err(malformed("sizes do not match"));
         }
         if !time_origin_s.is_finite() {
             return Err(malformed("a number is not finite"));
         }
         let mut state = PreciseState::zeros(nd, nk, nc, no);
-        (state.step, state.time_origin_s, state.history) = (step, time_origin_s, history);
+        (state.step, state.time_origin_s) = (step, time_origin_s);
+        (state.predictor.history, state.predictor.order) = (history, order);
         let mut orientations = std::mem::take(&mut state.orientations);
-        let vectors = state.vectors().into_iter().flatten();
-        for value in vectors.chain(orientations.iter_mut().flat_map(|q| &mut q.0)) {
+        for value in state.numbers().chain(orientations.iter_mut().flat_map(|q| &mut q.0)) {
             *value = f64::from_le_bytes(reader.take()?);
             if !value.is_finite() {
                 return Err(malformed("a number is not finite"));

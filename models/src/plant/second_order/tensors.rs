@@ -223,6 +223,9 @@ impl Plant {
     ) -> Result<StepReport, StepError> {
         let report = self.linearize(u, first)?;
         assert_layout(&self.model, &second.scratch);
+        if self.workspace.generators.is_some() {
+            self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
+        }
         self.differentiate_linearization(first, second);
         Ok(report)
     }
