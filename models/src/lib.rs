@@ -35,6 +35,7 @@ mod spatial;
 mod spline;
 mod tree;
 mod trigonometry;
+mod wide;
 
 pub use continuous::{
     Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,

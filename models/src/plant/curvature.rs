@@ -13,6 +13,7 @@ use crate::plant::tree_lu::TreeLu;
 use crate::scalar::Scalar;
 use crate::spatial::{Force, Inertia, Motion, Sym3, Vec3};
 use crate::tree::{Rotational, Tree, WORLD};
+use crate::wide::wide;
 
 /// Generators of the second derivatives.
 #[derive(Clone, Debug)]
@@ -45,9 +46,15 @@ impl<S: Scalar> Curvature<S> {
         }
     }
 
-    /// Computes the generators from poses and momenta of the same configuration and velocity.
-    #[inline(never)]
-    pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
+    wide! {
+        /// Computes the generators from poses and momenta of the same configuration and velocity.
+        #[inline(never)]
+        pub(crate) fn evaluate(mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>)
+            = evaluate_portable, evaluate_avx2;
+    }
+
+    #[inline(always)]
+    fn evaluate_portable(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
         for (i, joint) in tree.joints.iter().enumerate() {
             let rotation = &poses.rotation[i];
             let spin = match &joint.body.inertia {
@@ -120,12 +127,24 @@ impl<S: Scalar> Curvature<S> {
 }
 
 impl Curvature {
-    /// Writes the Jacobian of the residual by the increment, without springs and forces:
-    /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
-    ///
-    /// Both entries of a pair come from `½h J̇ ∓ J` of the ancestor and `½P ± F/h` of the descendant.
-    #[inline(never)]
-    pub(crate) fn fill_newton_matrix(
+    wide! {
+        /// Writes the Jacobian of the residual by the increment, without springs and forces:
+        /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
+        ///
+        /// Both entries of a pair come from `½h J̇ ∓ J` of the ancestor and `½P ± F/h` of the descendant.
+        #[inline(never)]
+        pub(crate) fn fill_newton_matrix(
+            self,
+            pairs: &[Pair],
+            momenta: &Momenta,
+            gravity: Option<Vec3>,
+            step: f64,
+            matrix: &mut TreeLu,
+        ) = fill_portable, fill_avx2;
+    }
+
+    #[inline(always)]
+    fn fill_portable(
         &self,
         pairs: &[Pair],
         momenta: &Momenta,

@@ -3,6 +3,7 @@
 use crate::scalar::Scalar;
 use crate::spatial::{Mat3, Vec3};
 use crate::tree::{Attachment, JointKind, Tree, WORLD};
+use crate::wide::wide;
 
 /// Poses of the joints of a tree, each position measured from the origin of its own tree.
 #[derive(Clone, Debug)]
@@ -32,9 +33,16 @@ impl<S: Scalar> Poses<S> {
         self.rotation[joint].0[2]
     }
 
-    /// Poses at the configuration `q`, with the orientations of ball joints: one pass from the roots to
-    /// the leaves, about 50 flops and one sine and cosine for each joint.
-    pub(crate) fn evaluate(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
+    wide! {
+        /// Poses at the configuration `q`, with the orientations of ball joints: one pass from the roots
+        /// to the leaves, about 50 flops and one sine and cosine for each joint.
+        #[inline(never)]
+        pub(crate) fn evaluate(mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>])
+            = evaluate_portable, evaluate_avx2;
+    }
+
+    #[inline(always)]
+    fn evaluate_portable(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
         if tree.has_other_joints {
             self.walk::<true>(tree, q, orientations);
         } else {

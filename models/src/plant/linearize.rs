@@ -476,8 +476,8 @@ impl Plant {
             *slope = residual[i] - model.damping.get(i).copied().unwrap_or_default();
         }
         let diagonal = planar::Diagonal { residual, momentum: slope };
-        let blocks = [&mut out.increment[..], &mut out.momentum];
-        generators.linearize(planar, joints, &diagonal, blocks, out.stride);
+        let (increment, momentum) = (&mut out.increment, &mut out.momentum);
+        generators.linearize(planar, joints, &diagonal, increment, momentum, out.stride);
         Ok(())
     }
 

@@ -11,6 +11,7 @@ use crate::plant::kinematics::Poses;
 use crate::scalar::Scalar;
 use crate::spatial::{Force, Motion, Sym3, Vec3};
 use crate::tree::{Body, JointKind, Rotational, Tree, WORLD};
+use crate::wide::wide;
 
 /// Twists and momenta of the joints of a tree.
 #[derive(Clone, Debug)]
@@ -39,8 +40,22 @@ impl<S: Scalar> Momenta<S> {
         }
     }
 
-    /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones.
-    pub(crate) fn gradient(
+    wide! {
+        /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones.
+        #[inline(never)]
+        pub(crate) fn gradient(
+            mut self,
+            tree: &Tree,
+            poses: &Poses<S>,
+            velocity: &[S],
+            gravity: Option<Vec3>,
+            l_q: &mut [S],
+            l_v: &mut [S],
+        ) = gradient_portable, gradient_avx2;
+    }
+
+    #[inline(always)]
+    fn gradient_portable(
         &mut self,
         tree: &Tree,
         poses: &Poses<S>,

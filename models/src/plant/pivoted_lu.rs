@@ -6,6 +6,7 @@
 
 use crate::plant::conditioning::DEPENDENT;
 use crate::plant::rows::{Term, add_rows};
+use crate::wide::wide;
 
 /// A square matrix, row-major, and its factorization in place.
 #[derive(Clone, Debug)]
@@ -25,6 +26,26 @@ pub(crate) struct PivotedLu {
     /// A permuted right-hand side.
     scratch: Vec<f64>,
     terms: Vec<Term>,
+}
+
+/// The largest entry so far.
+#[derive(Clone, Copy, Debug, Default)]
+struct Largest {
+    row: usize,
+    column: usize,
+    size: f64,
+}
+
+impl Largest {
+    /// Looks at the entries of a row, which begin at `column`.
+    #[inline(always)]
+    fn find(&mut self, row: usize, column: usize, entries: &[f64]) {
+        let size = entries.iter().fold(0.0, |m, x| if x.abs() > m { x.abs() } else { m });
+        if size > self.size {
+            let at = entries.iter().position(|x| x.abs() == size);
+            *self = Self { row, column: column + at.unwrap_or_default(), size };
+        }
+    }
 }
 
 impl PivotedLu {
@@ -50,41 +71,51 @@ impl PivotedLu {
         }
     }
 
-    /// Factors what stands in `matrix`.
-    pub(crate) fn factor(&mut self) {
+    wide! {
+        /// Factors what stands in `matrix`.
+        #[inline(never)]
+        pub(crate) fn factor(mut self) = factor_portable, factor_avx2;
+    }
+
+    #[inline(always)]
+    fn factor_portable(&mut self) {
         let n = self.order;
-        for i in 0..n {
-            self.rows[i] = i;
-            self.columns[i] = i;
-            for j in 0..n {
-                self.matrix[i * n + j] *= self.scale[i] * self.scale[j];
+        for (i, row) in self.matrix.chunks_exact_mut(n.max(1)).enumerate() {
+            (self.rows[i], self.columns[i]) = (i, i);
+            for (entry, scale) in row.iter_mut().zip(&self.scale) {
+                *entry *= self.scale[i] * scale;
             }
         }
         self.rank = n;
         self.null_vectors = 0;
         self.rest = 0.0;
-        let mut first = 0.0;
+        let mut largest = Largest::default();
+        for (i, row) in self.matrix.chunks_exact(n.max(1)).enumerate() {
+            largest.find(i, 0, row);
+        }
+        let first = largest.size;
         for k in 0..n {
-            let (row, column, pivot) = self.largest_from(k);
-            if k == 0 {
-                first = pivot;
-            }
             // Written so that a NaN ends the factorization too.
-            if !(pivot > DEPENDENT * first) {
+            if !(largest.size > DEPENDENT * first) {
                 self.rank = k;
-                self.rest = pivot;
+                self.rest = largest.size;
                 self.find_null();
                 return;
             }
-            self.swap(k, row, column);
+            self.swap(k, largest.row, largest.column);
             let inverse = 1.0 / self.matrix[k * n + k];
             self.inverse_pivot[k] = inverse;
-            for i in k + 1..n {
-                let factor = self.matrix[i * n + k] * inverse;
-                self.matrix[i * n + k] = factor;
-                for j in k + 1..n {
-                    self.matrix[i * n + j] -= factor * self.matrix[k * n + j];
+            let (above, below) = self.matrix.split_at_mut((k + 1) * n);
+            let pivot_row = &above[k * n + k + 1..];
+            largest = Largest { row: k + 1, column: k + 1, size: 0.0 };
+            for (i, row) in below.chunks_exact_mut(n).enumerate() {
+                let factor = row[k] * inverse;
+                row[k] = factor;
+                let row = &mut row[k + 1..];
+                for (entry, pivot) in row.iter_mut().zip(pivot_row) {
+                    *entry -= factor * pivot;
                 }
+                largest.find(k + 1 + i, k + 1, row);
             }
         }
     }
@@ -156,20 +187,6 @@ impl PivotedLu {
         for vector in self.null.chunks_exact(self.order.max(1)).take(self.null_vectors) {
             subtract_part(x, vector);
         }
-    }
-
-    fn largest_from(&self, k: usize) -> (usize, usize, f64) {
-        let n = self.order;
-        let mut largest = (k, k, 0.0);
-        for i in k..n {
-            for j in k..n {
-                let entry = self.matrix[i * n + j].abs();
-                if entry > largest.2 {
-                    largest = (i, j, entry);
-                }
-            }
-        }
-        largest
     }
 
     fn swap(&mut self, k: usize, row: usize, column: usize) {

@@ -27,6 +27,7 @@ use crate::planar::PlanarJoint;
 use crate::plant::curvature::SecondDerivatives;
 use crate::plant::tree_lu::TreeLu;
 use crate::trigonometry::sin_cos;
+use crate::wide::wide;
 
 /// A vector in the plane.
 type Vec2 = [f64; 2];
@@ -117,10 +118,22 @@ impl PlanarTree {
         }
     }
 
-    /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones, without
-    /// springs: two passes over the joints, about 60 flops each beside a sine and a cosine.
-    #[inline(never)]
-    pub(crate) fn gradient(
+    wide! {
+        /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones, without
+        /// springs: two passes over the joints, about 60 flops each beside a sine and a cosine.
+        #[inline(never)]
+        pub(crate) fn gradient(
+            mut self,
+            joints: &[PlanarJoint],
+            q: &[f64],
+            velocity: &[f64],
+            l_q: &mut [f64],
+            l_v: &mut [f64],
+        ) = gradient_portable, gradient_avx2;
+    }
+
+    #[inline(always)]
+    fn gradient_portable(
         &mut self,
         joints: &[PlanarJoint],
         q: &[f64],
@@ -269,3 +282,6 @@ impl PlanarTree {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -34,7 +34,7 @@ fn add_rows_avx2(target: &mut [f64], source: &[f64], stride: usize, terms: &[Ter
 /// Up to four blocks at a time stay in registers while all terms are added to them: as many sums as
 /// hide the latency of an addition.
 #[inline(always)]
-fn add_rows_portable(target: &mut [f64], source: &[f64], stride: usize, terms: &[Term]) {
+pub(crate) fn add_rows_portable(target: &mut [f64], source: &[f64], stride: usize, terms: &[Term]) {
     let (wide, rest) = target.as_chunks_mut::<{ 4 * LANES }>();
     let mut column = 0;
     for block in wide {

@@ -2,7 +2,8 @@
 //! Featherstone's LTL, without fill-in. O(n·depth²) to factor, O(n·depth) to solve.
 
 use crate::elimination::Elimination;
-use crate::plant::rows::{Term, add_rows};
+use crate::plant::rows::{Term, add_rows_portable};
+use crate::wide::wide;
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
 #[derive(Clone, Debug, Default)]
@@ -58,10 +59,31 @@ impl TreeLu {
         }
     }
 
-    /// Factors in place, from the last row to the first. Each pivot is compared with the larger of
-    /// its diagonal entry and `scale · factor` of its row.
-    #[inline(never)]
-    pub(crate) fn factor(
+    wide! {
+        /// Factors in place, from the last row to the first. Each pivot is compared with the larger of
+        /// its diagonal entry and `scale · factor` of its row.
+        #[inline(never)]
+        pub(crate) fn factor(
+            mut self,
+            elimination: &Elimination,
+            scale: &[f64],
+            factor: f64,
+        ) -> SmallestPivot = factor_portable, factor_avx2;
+
+        /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
+        /// are whole blocks.
+        #[inline(never)]
+        pub(crate) fn solve_rows(
+            mut self,
+            elimination: &Elimination,
+            x: &mut [f64],
+            stride: usize,
+            columns: usize,
+        ) = solve_rows_portable, solve_rows_avx2;
+    }
+
+    #[inline(always)]
+    fn factor_portable(
         &mut self,
         elimination: &Elimination,
         scale: &[f64],
@@ -130,10 +152,8 @@ impl TreeLu {
         }
     }
 
-    /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
-    /// are whole blocks.
-    #[inline(never)]
-    pub(crate) fn solve_rows(
+    #[inline(always)]
+    fn solve_rows_portable(
         &mut self,
         elimination: &Elimination,
         x: &mut [f64],
@@ -145,7 +165,7 @@ impl TreeLu {
             let terms = elimination.below(i).iter();
             self.terms.clear();
             self.terms.extend(terms.map(|&(j, slot)| (-self.upper[slot], j - i - 1)));
-            add_rows(&mut row[..columns], below, stride, &self.terms);
+            add_rows_portable(&mut row[..columns], below, stride, &self.terms);
         }
         for i in 0..elimination.len() {
             let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;
@@ -154,7 +174,7 @@ impl TreeLu {
             let ancestors = elimination.ancestors[range.clone()].iter();
             self.terms.clear();
             self.terms.extend(ancestors.zip(&self.lower[range]).map(|(&j, l)| (-l, j)));
-            add_rows(row, above, stride, &self.terms);
+            add_rows_portable(row, above, stride, &self.terms);
             for entry in row {
                 *entry *= self.inverse_pivot[i];
             }

@@ -23,6 +23,7 @@ use super::{PlanarTree, Vec2, Vec3, cross, dot, linear, spun};
 use crate::planar::PlanarJoint;
 use crate::plant::rows::LANES;
 use crate::plant::tree_lu::SmallestPivot;
+use crate::wide::wide;
 
 /// What a joint gives to the matrix, and what is left of it when it has been eliminated.
 #[derive(Clone, Copy, Debug, Default)]
@@ -91,11 +92,44 @@ impl Elimination {
         }
     }
 
-    /// Factors the matrix that belongs to the second derivatives of `tree`; all joints are dynamic, in the
-    /// order of their coordinates. Each pivot is compared with the larger of its diagonal entry and the
-    /// inertia of its row over the step. About 90 flops a joint.
-    #[inline(never)]
-    pub(crate) fn factor(
+    wide! {
+        /// Factors the matrix that belongs to the second derivatives of `tree`; all joints are dynamic, in
+        /// the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
+        /// and the inertia of its row over the step. About 90 flops a joint.
+        #[inline(never)]
+        pub(crate) fn factor(
+            mut self,
+            tree: &PlanarTree,
+            joints: &[PlanarJoint],
+            diagonal: &[f64],
+            inertia: &[f64],
+            step: f64,
+        ) -> SmallestPivot = factor_portable, factor_avx2;
+
+        /// Solves `K x = b` in place, about 30 flops a joint.
+        #[inline(never)]
+        pub(crate) fn solve(mut self, joints: &[PlanarJoint], x: &mut [f64])
+            = solve_portable, solve_avx2;
+
+        /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
+        /// momentum, `[h L_qq 1] + (½h L_qq + L_qv) X`, by configuration and momentum; springs and dampers
+        /// of coordinates are added by `diagonal`s. Rows are those of coordinates, `stride` apart and whole
+        /// blocks. Four passes over the joints for each block of columns, about 75 flops a joint and
+        /// column.
+        #[inline(never)]
+        pub(crate) fn linearize(
+            mut self,
+            tree: &PlanarTree,
+            joints: &[PlanarJoint],
+            diagonal: &Diagonal<'_>,
+            increment: &mut [f64],
+            momentum: &mut [f64],
+            stride: usize,
+        ) = linearize_portable, linearize_avx2;
+    }
+
+    #[inline(always)]
+    fn factor_portable(
         &mut self,
         tree: &PlanarTree,
         joints: &[PlanarJoint],
@@ -160,9 +194,8 @@ impl Elimination {
         smallest
     }
 
-    /// Solves `K x = b` in place, about 30 flops a joint.
-    #[inline(never)]
-    pub(crate) fn solve(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
+    #[inline(always)]
+    fn solve_portable(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
         self.flow.fill([0.0; 3]);
         for (i, joint) in joints.iter().enumerate().rev() {
             let (generator, flow) = (&self.generators[i + 1], self.flow[i + 1]);
@@ -188,51 +221,14 @@ impl Elimination {
         }
     }
 
-    /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
-    /// momentum, `[h L_qq 1] + (½h L_qq + L_qv) X`, by configuration and momentum; springs and dampers of
-    /// coordinates are added by `diagonal`s. Rows are those of coordinates, `stride` apart and whole
-    /// blocks. Four passes over the joints for each block of columns, about 75 flops a joint and column.
-    ///
-    /// On a processor with AVX2 the same operations run in wider registers: the bits are the same.
-    pub(crate) fn linearize(
-        &mut self,
-        tree: &PlanarTree,
-        joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
-        [increment, momentum]: [&mut [f64]; 2],
-        stride: usize,
-    ) {
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2.
-            unsafe {
-                self.linearize_avx2(tree, joints, diagonal, [increment, momentum], stride);
-            }
-            return;
-        }
-        self.linearize_portable(tree, joints, diagonal, [increment, momentum], stride);
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn linearize_avx2(
-        &mut self,
-        tree: &PlanarTree,
-        joints: &[PlanarJoint],
-        diagonal: &Diagonal<'_>,
-        out: [&mut [f64]; 2],
-        stride: usize,
-    ) {
-        self.linearize_portable(tree, joints, diagonal, out, stride);
-    }
-
     #[inline(always)]
     fn linearize_portable(
         &mut self,
         tree: &PlanarTree,
         joints: &[PlanarJoint],
         diagonal: &Diagonal<'_>,
-        [increment, momentum]: [&mut [f64]; 2],
+        increment: &mut [f64],
+        momentum: &mut [f64],
         stride: usize,
     ) {
         let n = joints.len();

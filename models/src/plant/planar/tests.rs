@@ -1,0 +1,156 @@
+//! Planar trees against the same trees in space.
+
+use std::sync::Arc;
+
+use crate::plant::planar::PlanarTree;
+use crate::plant::{Initial, Linearization, Plant, Settings};
+use crate::{Model, Scene, builtin};
+
+/// A number between −1 and 1 that looks random.
+fn wave(i: usize) -> f64 {
+    (12.9898 * i as f64 + 0.3).sin()
+}
+
+/// Trees in oblique planes: hinges both ways about, sliders, bodies off the plane, two roots, and a floating
+/// base of massless joints. `extra` goes on the coordinates.
+fn oblique(n: usize, extra: &str) -> Model {
+    let mut text = "format = 1\nname = \"oblique\"\ngravity = [1.0, -2.0, -9.0]\n".to_owned();
+    for i in 0..n {
+        let number = |k| wave(17 * i + k);
+        let (parent, turn) = match i {
+            0 | 5 => ("world".to_owned(), format!("[{}, {}, {}]", number(0), number(1), number(2))),
+            // A floating base, and what hangs from it; then branches.
+            1..5 => (format!("f{}", i - 1), format!("[0.0, 0.0, {}]", number(2))),
+            _ => (format!("f{}", 5 + (i - 6) / 2), format!("[0.0, 0.0, {}]", number(2))),
+        };
+        let joint = match i {
+            0 | 1 => format!("type = \"prismatic\", axis = [{}, {}, 0.0]", number(3), number(4)),
+            _ if i % 4 == 3 => "type = \"revolute\", axis = [0.0, 0.0, -1.0]".to_owned(),
+            _ if i % 7 == 6 => "type = \"prismatic\", axis = [0.6, 0.8, 0.0]".to_owned(),
+            _ => "type = \"revolute\", axis = [0.0, 0.0, 1.0]".to_owned(),
+        };
+        let offset = format!("[{}, {}, {}]", number(5), number(6), number(7));
+        text += &format!(
+            "[[frames]]\nname = \"f{i}\"\nparent = \"{parent}\"\ntranslation = {offset}\n\
+             rotation = {{ rpy = {turn} }}\njoint = {{ {joint} }}\n"
+        );
+        if i > 1 {
+            let center = format!("[{}, {}, {}]", number(8), number(9), number(10));
+            text += &format!(
+                "body = {{ mass = {}, center_of_mass = {center}, inertia = [0.2, 0.3, 0.4, 0.01, 0.02, 0.03] }}\n",
+                1.0 + number(11)
+            );
+        }
+    }
+    for i in 0..n {
+        text += &format!("[[coordinates]]\nname = \"f{i}\"\ninitial = {}\n{extra}\n", wave(i));
+    }
+    Model::compile(&Scene::from_toml(&text).unwrap()).unwrap()
+}
+
+fn assert_close(a: f64, b: f64, scale: f64, what: &str) {
+    assert!((a - b).abs() <= 1e-13 * scale, "{what}: {a} {b} of {scale}");
+}
+
+#[test]
+fn gradients_and_second_derivatives_are_those_in_space() {
+    for model in [oblique(12, ""), oblique(3, ""), oblique(12, "kind = \"prescribed\"")] {
+        let model = Arc::new(model);
+        let joints = model.planar.as_deref().expect("the tree is planar");
+        let n = model.dimensions.coordinates();
+        let mut spatial = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        let q: Vec<f64> = (0..n).map(|i| 3.0 * wave(i + 100)).collect();
+        let v: Vec<f64> = (0..n).map(|i| 5.0 * wave(i + 200)).collect();
+        let nd = model.dimensions.dynamic;
+        let mut planar = PlanarTree::new(joints);
+        let (mut l_q, mut l_v) = (vec![0.0; nd], vec![0.0; nd]);
+        // Twice: nothing is left of the first time.
+        for _ in 0..2 {
+            planar.gradient(joints, &q, &v, &mut l_q, &mut l_v);
+            planar.differentiate(joints);
+        }
+        planar.place(joints);
+        let workspace = &mut spatial.workspace;
+        workspace.poses.evaluate(&model.dynamics, &q, &[]);
+        let (mut in_space_q, mut in_space_v) = (vec![0.0; nd], vec![0.0; nd]);
+        workspace.momenta.gradient(
+            &model.dynamics,
+            &workspace.poses,
+            &v,
+            model.gravity,
+            &mut in_space_q,
+            &mut in_space_v,
+        );
+        workspace.curvature.evaluate(&model.dynamics, &workspace.poses, &workspace.momenta);
+        let size = |x: &[f64]| 1.0 + x.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
+        for i in 0..nd {
+            assert_close(l_q[i], in_space_q[i], size(&in_space_q), "∂L/∂q");
+            assert_close(l_v[i], in_space_v[i], size(&in_space_v), "∂L/∂v");
+        }
+        for descendant in 0..joints.len() {
+            for ancestor in model.dynamics.path(descendant) {
+                let a = planar.pair(joints, ancestor, descendant);
+                let b = workspace.curvature.pair(
+                    &workspace.momenta,
+                    model.gravity,
+                    ancestor,
+                    descendant,
+                );
+                let scale = 1e3;
+                assert_close(a.qq, b.qq, scale, "qq");
+                assert_close(a.v_above_q_below, b.v_above_q_below, scale, "vq");
+                assert_close(a.q_above_v_below, b.q_above_v_below, scale, "qv");
+                assert_close(a.vv, b.vv, scale, "vv");
+            }
+        }
+    }
+}
+
+#[test]
+fn trees_that_leave_their_planes_are_not_planar() {
+    let tilted = |axis: &str| {
+        let text = format!(
+            "format = 1\nname = \"t\"\n[[frames]]\nname = \"a\"\njoint = {{ type = \"revolute\", axis = [0.0, 0.0, 1.0] }}\n\
+             body = {{ mass = 1.0, center_of_mass = [1.0, 0.0, 0.0] }}\n\
+             [[frames]]\nname = \"b\"\nparent = \"a\"\njoint = {{ {axis} }}\nbody = {{ mass = 1.0, center_of_mass = [1.0, 0.0, 0.5] }}\n"
+        );
+        Model::compile(&Scene::from_toml(&text).unwrap()).unwrap().planar.is_some()
+    };
+    assert!(tilted("type = \"revolute\", axis = [0.0, 0.0, -1.0]"));
+    assert!(tilted("type = \"prismatic\", axis = [1.0, 1.0, 0.0]"));
+    assert!(!tilted("type = \"revolute\", axis = [0.0, 1e-9, 1.0]"));
+    assert!(!tilted("type = \"prismatic\", axis = [1.0, 1.0, 1e-9]"));
+    assert!(!tilted("type = \"ball\""));
+    assert!(!tilted("type = \"screw\", pitch = 0.1, axis = [0.0, 0.0, 1.0]"));
+}
+
+/// Steps and linearizations by generators against those entry by entry.
+#[test]
+fn generators_stand_for_the_newton_matrix() {
+    let chain = |n: usize| Model::compile(&builtin::scene(&format!("chain-{n}")).unwrap()).unwrap();
+    for model in [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3")] {
+        let model = Arc::new(model);
+        let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        assert!(fast.workspace.generators.is_some(), "{}", model.scene.name);
+        let n = model.dimensions.dynamic;
+        let q: Vec<f64> = (0..n).map(wave).collect();
+        let v = (0..n).map(|i| wave(i + 50)).collect();
+        fast.initialize(&Initial::Velocity { q, v }).unwrap();
+        let mut slow = fast.clone();
+        slow.workspace.generators = None;
+        let mut by_generators = Linearization::new(&model);
+        let mut by_entries = Linearization::new(&model);
+        let u: Vec<f64> = (0..model.dimensions.input()).map(wave).collect();
+        for _ in 0..10 {
+            fast.step_and_linearize(&u, &mut by_generators).unwrap();
+            slow.step_and_linearize(&u, &mut by_entries).unwrap();
+            let (a, b) = (by_generators.a(), by_entries.a());
+            assert!((&a - &b).amax() < 1e-11 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
+            let (a, b) = (by_generators.b(), by_entries.b());
+            assert!((&a - &b).amax() <= 1e-11 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
+        }
+        for (a, b) in fast.q().iter().zip(slow.q()) {
+            assert_close(*a, *b, 10.0, "q");
+        }
+    }
+}

@@ -1,0 +1,51 @@
+//! The same code for wider registers.
+
+/// Defines methods that run the one after `=` as it is compiled for processors with AVX2, where there is
+/// one, and as it is compiled for all others elsewhere. The operations are the same, and so are the bits;
+/// the one for AVX2 gets the last name.
+macro_rules! wide {
+    ($(
+        $(#[$attribute:meta])*
+        $visibility:vis fn $name:ident(
+            $($receiver:ident)+ $(, $argument:ident: $type:ty)* $(,)?
+        ) $(-> $out:ty)? = $portable:ident, $avx2:ident;
+    )*) => {$(
+        wide!(@method [$(#[$attribute])* $visibility] $name $portable $avx2
+            [$($receiver)+] [$($argument: $type),*] [$($out)?]);
+    )*};
+    (@method [$($head:tt)*] $name:ident $portable:ident $avx2:ident
+        [mut $self:ident] [$($argument:ident: $type:ty),*] [$($out:ty)?]) => {
+        $($head)* fn $name(&mut $self, $($argument: $type),*) $(-> $out)? {
+            #[cfg(target_arch = "x86_64")]
+            if std::arch::is_x86_feature_detected!("avx2") {
+                // SAFETY: the processor has AVX2.
+                return unsafe { $self.$avx2($($argument),*) };
+            }
+            $self.$portable($($argument),*)
+        }
+
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2")]
+        fn $avx2(&mut $self, $($argument: $type),*) $(-> $out)? {
+            $self.$portable($($argument),*)
+        }
+    };
+    (@method [$($head:tt)*] $name:ident $portable:ident $avx2:ident
+        [$self:ident] [$($argument:ident: $type:ty),*] [$($out:ty)?]) => {
+        $($head)* fn $name(&$self, $($argument: $type),*) $(-> $out)? {
+            #[cfg(target_arch = "x86_64")]
+            if std::arch::is_x86_feature_detected!("avx2") {
+                // SAFETY: the processor has AVX2.
+                return unsafe { $self.$avx2($($argument),*) };
+            }
+            $self.$portable($($argument),*)
+        }
+
+        #[cfg(target_arch = "x86_64")]
+        #[target_feature(enable = "avx2")]
+        fn $avx2(&$self, $($argument: $type),*) $(-> $out)? {
+            $self.$portable($($argument),*)
+        }
+    };
+}
+pub(crate) use wide;
