@@ -672,9 +672,13 @@ fn couplings(
     };
     let dynamic_only = |c: &usize| *c < dynamic;
     for joint in 0..tree.joints.len() {
-        let path = tree.path(joint);
-        let path = path.iter().map(|&j| tree.joints[j].coordinate).filter(dynamic_only);
-        couple(&path.collect::<Vec<_>>());
+        // Those above are coupled when it is their turn.
+        for above in tree.path(joint) {
+            let pair = [tree.joints[above].coordinate, tree.joints[joint].coordinate];
+            if above != joint && pair.iter().all(dynamic_only) {
+                couple(&pair);
+            }
+        }
     }
     for spring in &potentials.point_springs {
         couple(&coordinates_of(&spring.ends).filter(dynamic_only).collect::<Vec<_>>());

@@ -477,18 +477,24 @@ impl Model {
         ];
         let kinds = kinds.iter().filter(|(_, n)| *n > 0).map(|(kind, n)| format!("{n} {kind}"));
         line(format!(
-            "midpoint      {} axes of {} moving frames: {}",
+            "midpoint      {}, {} axes of {} moving frames: {}",
+            if self.planar.is_some() { "in the plane" } else { "in space" },
             joints.len(),
             self.scene.frames.iter().filter(|f| !f.motions().is_empty()).count(),
             kinds.collect::<Vec<_>>().join(", ")
         ));
-        line(format!(
-            "factorization tree-sparse, {} entries of {} in each triangle, {} {}",
-            self.elimination.entries(),
-            d.dynamic * (d.dynamic + 1) / 2,
-            self.elimination.islands(),
-            if self.elimination.islands() == 1 { "island" } else { "islands" }
-        ));
+        let islands = self.elimination.islands();
+        let islands = format!("{islands} {}", if islands == 1 { "island" } else { "islands" });
+        line(match self.solver {
+            Solver::Tree => format!(
+                "factorization tree-sparse, {} entries of {} in each triangle, {islands}",
+                self.elimination.entries(),
+                d.dynamic * (d.dynamic + 1) / 2,
+            ),
+            Solver::Generators => {
+                format!("factorization by generators, {} joints, {islands}", joints.len())
+            }
+        });
         let skipped = |is: bool| if is { "" } else { " (skipped)" };
         line(format!(
             "gravity       {}",

@@ -1,8 +1,9 @@
 //! Plants: a model with a state and a workspace.
 //!
-//! The files in the order in which a step runs: [`initial`], [`kinematics`], [`momenta`],
+//! The files in the order in which a step runs: [`initial`], [`predictor`], [`kinematics`], [`momenta`],
 //! [`vectors`], [`potentials`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`],
-//! [`pivoted_lu`], [`newton`], [`conditioning`], [`linearize`]; [`blocks`] and [`second_order`]; then
+//! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
+//! [`linearize`]; [`blocks`] and [`second_order`]; then
 //! [`known`], [`diagnose`], [`settle`], [`snapshot`].
 
 pub(crate) mod balls;
