@@ -30,9 +30,10 @@ use crate::plant::curvature::SecondDerivatives;
 use crate::plant::newton::Workspace;
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::planar;
-use crate::plant::rows::{add_rows, padded};
+use crate::plant::rows::{add_rows, add_rows_portable, padded};
 use crate::plant::{Plant, Settings, StepError, potentials};
 use crate::spatial::{Mat3, Vec3};
+use crate::wide::wide;
 
 /// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.
 #[derive(Clone, Copy, Debug)]
@@ -431,9 +432,6 @@ impl Plant {
             workspace.factor_schur(&self.model, &self.settings)?;
             self.solve_multipliers(out);
         }
-        for x in &mut out.increment {
-            *x = -*x;
-        }
         self.differentiate_momentum(out);
         self.remember(u, out);
         Ok(())
@@ -481,8 +479,18 @@ impl Plant {
         Ok(())
     }
 
-    /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
-    fn fill_right_hand_sides(&mut self, out: &mut Linearization) {
+    wide! {
+        /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
+        fn fill_right_hand_sides(mut self, out: &mut Linearization) = fill_portable, fill_avx2;
+
+        /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
+        /// `out.momentum`.
+        fn differentiate_momentum(mut self, out: &mut Linearization)
+            = differentiate_momentum_portable, differentiate_momentum_avx2;
+    }
+
+    #[inline(always)]
+    fn fill_portable(&mut self, out: &mut Linearization) {
         let (model, workspace) = (&self.model, &mut self.workspace);
         let h = self.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
@@ -659,8 +667,11 @@ impl Plant {
         }
     }
 
-    /// Adds what depends on `x'` and `λ'` to `out.momentum`.
-    fn differentiate_momentum(&mut self, out: &mut Linearization) {
+    #[inline(always)]
+    fn differentiate_momentum_portable(&mut self, out: &mut Linearization) {
+        for x in &mut out.increment {
+            *x = -*x;
+        }
         let (model, workspace) = (&self.model, &mut self.workspace);
         let d = model.dimensions;
         let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
@@ -675,13 +686,13 @@ impl Plant {
             let slopes = workspace.end_slopes[i * nd..][..nd].iter().enumerate();
             workspace.terms.clear();
             workspace.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
-            add_rows(target, &out.increment, stride, &workspace.terms);
+            add_rows_portable(target, &out.increment, stride, &workspace.terms);
         }
         for (c, constraint) in model.constraints.iter().enumerate() {
             for &i in constraint.dynamic_coordinates() {
                 let entry = workspace.start.jacobian[c * n + i];
                 let target = &mut out.momentum[i * stride..][..stride];
-                add_rows(target, &out.multipliers, stride, &[(-entry, c)]);
+                add_rows_portable(target, &out.multipliers, stride, &[(-entry, c)]);
             }
         }
     }
