@@ -30,7 +30,7 @@ use crate::plant::curvature::SecondDerivatives;
 use crate::plant::newton::Workspace;
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::planar;
-use crate::plant::rows::{add_rows, add_rows_portable, padded};
+use crate::plant::rows::{add_rows, add_rows_portable, padded, spread};
 use crate::plant::{Plant, Settings, StepError, potentials};
 use crate::spatial::{Mat3, Vec3};
 use crate::wide::wide;
@@ -136,7 +136,7 @@ impl Linearization {
     /// Room for the linearization of a model.
     pub fn new(model: &Model) -> Self {
         let d = model.dimensions();
-        let stride = padded(2 * d.coordinates());
+        let stride = spread(padded(2 * d.coordinates()));
         Self {
             nd: d.dynamic,
             nk: d.prescribed,

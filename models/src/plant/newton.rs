@@ -19,8 +19,8 @@ use crate::plant::forces::Instant;
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
 use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::planar::{self, PlanarTree};
-use crate::plant::rows::{Term, padded};
+use crate::plant::planar::{self, Of, PlanarTree};
+use crate::plant::rows::{Term, padded, spread};
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
@@ -156,7 +156,7 @@ impl Workspace {
             end: Closure::new(model),
             end_is_exact: false,
             responses: zeros(nd * padded(nc)),
-            schur: PivotedLu::new(&model.conditioning.weight, padded(2 * n)),
+            schur: PivotedLu::new(&model.conditioning.weight, spread(padded(2 * n))),
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),
             stiffness: zeros(nd * nd),
@@ -251,6 +251,26 @@ impl Workspace {
 
     /// Guess: the velocity that belongs to the momentum goes on.
     fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
+        if let (Some(planar), Some(joints), Some(generators)) =
+            (&mut self.planar, &model.planar, &mut self.generators)
+        {
+            let h = settings.time_step_s;
+            self.velocity.fill(0.0);
+            planar.gradient(joints, &state.q, &self.velocity, &mut self.l_q, &mut self.l_v);
+            planar.differentiate(joints);
+            self.diagonal.fill(0.0);
+            let inertia = &model.conditioning.inertia;
+            generators.factor(planar, joints, &self.diagonal, inertia, h, Of::Masses);
+            for (x, p) in self.increment.iter_mut().zip(&state.p) {
+                *x = -p;
+            }
+            generators.solve(joints, &mut self.increment);
+            // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
+            for x in self.increment.iter_mut().filter(|x| !x.is_finite()) {
+                *x = 0.0;
+            }
+            return;
+        }
         self.find_velocity(model, state);
         for (x, v) in self.increment.iter_mut().zip(&self.residual) {
             // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
@@ -526,7 +546,7 @@ impl Workspace {
             diagonal[i] = if model.potentials.any { diagonal[i] } else { 0.0 } - a * c;
         }
         let inertia = &model.conditioning.inertia;
-        let pivot = generators.factor(planar, joints, diagonal, inertia, h);
+        let pivot = generators.factor(planar, joints, diagonal, inertia, h, Of::Motion);
         self.check(model, settings, pivot)
     }
 

@@ -20,7 +20,7 @@
 
 mod elimination;
 
-pub(crate) use self::elimination::{Diagonal, Elimination};
+pub(crate) use self::elimination::{Diagonal, Elimination, Of};
 
 use crate::model::Pair;
 use crate::planar::PlanarJoint;

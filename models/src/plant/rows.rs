@@ -8,6 +8,13 @@ pub(crate) fn padded(width: usize) -> usize {
     width.next_multiple_of(LANES)
 }
 
+/// The length of long rows of which blocks of columns are written: not an even number of cache lines, lest
+/// the rows share a few places in caches.
+pub(crate) fn spread(length: usize) -> usize {
+    const LONG: usize = 256;
+    if length >= LONG && length.is_multiple_of(2 * LANES) { length + LANES } else { length }
+}
+
 /// A row of the source and the factor with which it is added.
 pub(crate) type Term = (f64, usize);
 

@@ -49,6 +49,15 @@ pub(crate) struct Diagonal<'a> {
     pub(crate) momentum: &'a [f64],
 }
 
+/// What a matrix is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Of {
+    /// Second derivatives by positions and velocities: the Newton matrix.
+    Motion,
+    /// Those by velocities.
+    Masses,
+}
+
 /// The matrix. The first entry of lists of joints is the world.
 #[derive(Clone, Debug)]
 pub(crate) struct Elimination {
@@ -95,7 +104,7 @@ impl Elimination {
     wide! {
         /// Factors the matrix that belongs to the second derivatives of `tree`; all joints are dynamic, in
         /// the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
-        /// and the inertia of its row over the step. About 90 flops a joint.
+        /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 90 flops a joint.
         #[inline(never)]
         pub(crate) fn factor(
             mut self,
@@ -104,6 +113,7 @@ impl Elimination {
             diagonal: &[f64],
             inertia: &[f64],
             step: f64,
+            of: Of,
         ) -> SmallestPivot = factor_portable, factor_avx2;
 
         /// Solves `K x = b` in place, about 30 flops a joint.
@@ -136,8 +146,10 @@ impl Elimination {
         diagonal: &[f64],
         inertia: &[f64],
         step: f64,
+        of: Of,
     ) -> SmallestPivot {
-        let (half, inverse) = (0.5 * step, 1.0 / step);
+        let motion = if of == Of::Masses { 0.0 } else { 1.0 };
+        let (half, inverse) = (0.5 * step * motion, 1.0 / step);
         self.step = step;
         let mut smallest = SmallestPivot { row: 0, relative: 1.0 };
         for ((row, joint), (added, inertia)) in
@@ -149,7 +161,7 @@ impl Elimination {
             let plus = [joint.turn, rx + dx, ry + dy];
             let minus = [-joint.turn, rx - dx, ry - dy];
             let (weight, slope) = (half * link.weight, link.slope);
-            let mut upper = add_scaled(scaled(0.5, slope), inverse, link.force);
+            let mut upper = add_scaled(scaled(0.5 * motion, slope), inverse, link.force);
             let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
             upper[0] -= 0.5 * weight;
             lower[0] += 0.5 * weight;
