@@ -133,7 +133,7 @@ fn generators_stand_for_the_newton_matrix() {
         let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
         assert!(fast.workspace.generators.is_some(), "{}", model.scene.name);
         let n = model.dimensions.dynamic;
-        let q: Vec<f64> = (0..n).map(wave).collect();
+        let q = (0..n).map(|i| 0.3 * wave(i)).collect();
         let v = (0..n).map(|i| 0.1 * wave(i + 50)).collect();
         fast.initialize(&Initial::Velocity { q, v }).unwrap();
         let mut slow = fast.clone();
