@@ -63,7 +63,7 @@ fn cart_pole_swing_up() {
 
 #[test]
 fn optimize_marionette() {
-    assert!(run("optimize_marionette").lines().count() >= 8);
+    assert!(run("optimize_marionette").contains("cost"));
 }
 
 #[test]

@@ -53,7 +53,7 @@ def test_cart_pole_swing_up(addresses):
 
 
 def test_marionette_optimization(addresses):
-    assert len(run("marionette_optimization.py", addresses["grpc"]).splitlines()) >= 8
+    assert "cost" in run("marionette_optimization.py", addresses["grpc"])
 
 
 def test_cart_pole_lqg(addresses):

@@ -36,7 +36,7 @@ impl Map {
         // Where there is little to spare, everything is as good as full.
         let is_small = n + m <= 4 * FEW;
         let is_active = |state: &usize| is_small || column(*state).iter().any(|x| *x != 0.0);
-        let mut counts = vec![0_usize; next];
+        let mut counts = vec![0_usize; if is_small { 0 } else { next }];
         if !is_small {
             for column in [a, b].into_iter().flat_map(|m| m.as_slice().chunks_exact(next.max(1))) {
                 for (count, entry) in counts.iter_mut().zip(column) {
