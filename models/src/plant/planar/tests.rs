@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use nalgebra::DMatrix;
+
 use crate::plant::planar::PlanarTree;
 use crate::plant::{Initial, Linearization, Plant, Settings};
 use crate::{Model, Scene, builtin};
@@ -124,6 +126,21 @@ fn trees_that_leave_their_planes_are_not_planar() {
     assert!(!tilted("type = \"screw\", pitch = 0.1, axis = [0.0, 0.0, 1.0]"));
 }
 
+/// What is missing to `AᵀΩA = Ω`.
+fn defect(a: &DMatrix<f64>) -> f64 {
+    let n = a.nrows() / 2;
+    let omega = DMatrix::from_fn(2 * n, 2 * n, |i, j| {
+        if j == i + n {
+            1.0
+        } else if i == j + n {
+            -1.0
+        } else {
+            0.0
+        }
+    });
+    (a.transpose() * &omega * a - omega).amax()
+}
+
 /// Steps and linearizations by generators against those entry by entry, from the same states.
 #[test]
 fn generators_stand_for_the_newton_matrix() {
@@ -145,10 +162,15 @@ fn generators_stand_for_the_newton_matrix() {
             slow.restore(&fast.snapshot()).unwrap();
             fast.step_and_linearize(&u, &mut by_generators).unwrap();
             slow.step_and_linearize(&u, &mut by_entries).unwrap();
-            let (a, b) = (by_generators.a(), by_entries.a());
-            assert!((&a - &b).amax() < 1e-11 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
-            let (a, b) = (by_generators.b(), by_entries.b());
-            assert!((&a - &b).amax() <= 1e-11 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
+            for (a, b) in [(by_generators.a(), by_entries.a()), (by_generators.b(), by_entries.b())]
+            {
+                assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
+            }
+            // In long chains sums about each joint keep digits that those about one origin lose.
+            if model.damping.is_empty() {
+                let [own, others] = [by_generators.a(), by_entries.a()].map(|a| defect(&a));
+                assert!(own <= 2.0 * others + 1e-13, "{own} {others}");
+            }
             for (a, b) in fast.q().iter().zip(slow.q()) {
                 assert_close(*a, *b, 10.0, "q");
             }
