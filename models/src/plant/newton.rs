@@ -514,7 +514,7 @@ impl Workspace {
         self.fill_newton_matrix(model, settings);
         let inertia = &model.conditioning.inertia;
         let pivot = self.matrix.factor(&model.elimination, inertia, 1.0 / settings.time_step_s);
-        self.check(model, settings, pivot)
+        self.accept_pivot(model, settings, pivot)
     }
 
     /// Factors the generators of `K` at the last evaluation.
@@ -547,10 +547,11 @@ impl Workspace {
         }
         let inertia = &model.conditioning.inertia;
         let pivot = generators.factor(planar, joints, diagonal, inertia, h, Of::Motion);
-        self.check(model, settings, pivot)
+        self.accept_pivot(model, settings, pivot)
     }
 
-    fn check(
+    /// Takes note of the smallest pivot; refuses one that is too small.
+    fn accept_pivot(
         &mut self,
         model: &Model,
         settings: &Settings,
