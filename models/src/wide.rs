@@ -13,26 +13,17 @@ macro_rules! wide {
         wide!(@method [$(#[$attribute])* $visibility] $name $portable $avx2
             [$($receiver)+] [$($argument: $type),*] [$($out)?]);
     )*};
-    (@method [$($head:tt)*] $name:ident $portable:ident $avx2:ident
-        [mut $self:ident] [$($argument:ident: $type:ty),*] [$($out:ty)?]) => {
-        $($head)* fn $name(&mut $self, $($argument: $type),*) $(-> $out)? {
-            #[cfg(target_arch = "x86_64")]
-            if std::arch::is_x86_feature_detected!("avx2") {
-                // SAFETY: the processor has AVX2.
-                return unsafe { $self.$avx2($($argument),*) };
-            }
-            $self.$portable($($argument),*)
-        }
-
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2")]
-        fn $avx2(&mut $self, $($argument: $type),*) $(-> $out)? {
-            $self.$portable($($argument),*)
-        }
+    (@method $head:tt $name:ident $portable:ident $avx2:ident
+        [mut $self:ident] $arguments:tt $out:tt) => {
+        wide!(@both $head $name $portable $avx2 [&mut $self] $self $arguments $out);
     };
-    (@method [$($head:tt)*] $name:ident $portable:ident $avx2:ident
-        [$self:ident] [$($argument:ident: $type:ty),*] [$($out:ty)?]) => {
-        $($head)* fn $name(&$self, $($argument: $type),*) $(-> $out)? {
+    (@method $head:tt $name:ident $portable:ident $avx2:ident
+        [$self:ident] $arguments:tt $out:tt) => {
+        wide!(@both $head $name $portable $avx2 [&$self] $self $arguments $out);
+    };
+    (@both [$($head:tt)*] $name:ident $portable:ident $avx2:ident
+        [$($receiver:tt)+] $self:ident [$($argument:ident: $type:ty),*] [$($out:ty)?]) => {
+        $($head)* fn $name($($receiver)+, $($argument: $type),*) $(-> $out)? {
             #[cfg(target_arch = "x86_64")]
             if std::arch::is_x86_feature_detected!("avx2") {
                 // SAFETY: the processor has AVX2.
@@ -43,7 +34,7 @@ macro_rules! wide {
 
         #[cfg(target_arch = "x86_64")]
         #[target_feature(enable = "avx2")]
-        fn $avx2(&$self, $($argument: $type),*) $(-> $out)? {
+        fn $avx2($($receiver)+, $($argument: $type),*) $(-> $out)? {
             $self.$portable($($argument),*)
         }
     };

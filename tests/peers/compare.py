@@ -318,15 +318,7 @@ def measure_growth(plantd):
 
 ERRORS = [1e-2, 1e-4, 1e-6, 1e-8, 1e-10]
 CASES = [("P", 2), ("P", 10), ("D", 2), ("D", 10), ("S", 2), ("S", 10), ("C4", 2)]
-FIXED_STEP = [
-    PLANTD,
-    ("Pinocchio", "euler"),
-    ("Pinocchio", "rk4"),
-    ("MuJoCo", "euler"),
-    ("MuJoCo", "implicitfast"),
-    ("MuJoCo", "rk4"),
-    ("Drake", "discrete"),
-]
+FIXED_STEP = [m for m in STEP_METHODS if m != BY_HAND and m[0] != "CasADi C"]
 ADAPTIVE = [("Pinocchio", "dop853"), ("Drake", "rk3"), ("Drake", "rk5")]
 LONGEST_SECONDS = 0.2
 

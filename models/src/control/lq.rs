@@ -14,6 +14,7 @@ use nalgebra::{DMatrix, DVector};
 
 pub(crate) use self::map::Map;
 use super::blocked::{Into, LANES, Operand, Scratch, product};
+use crate::wide::wide;
 
 /// One stage of the cost,
 /// `½ xᵀQx + xᵀSu + ½ uᵀRu + x_linearᵀx + u_linearᵀu`. Nothing here need be definite.
@@ -323,25 +324,17 @@ impl LqRecursion {
         if stage.s.is_some_and(|s| reaches_beyond(s, &map.active)) {
             return self.step_large(&map.with_all_states(), stage, gain, offset);
         }
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2.
-            return unsafe { self.step_avx2(map, stage, gain, offset) };
-        }
-        self.step_portable(map, stage, gain, offset)
+        self.step_wide(map, stage, gain, offset)
     }
 
-    /// The same in wider registers.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn step_avx2(
-        &mut self,
-        map: &Map,
-        stage: Stage<'_>,
-        gain: &mut DMatrix<f64>,
-        offset: &mut DVector<f64>,
-    ) -> Result<(), NotConvex> {
-        self.step_portable(map, stage, gain, offset)
+    wide! {
+        fn step_wide(
+            mut self,
+            map: &Map,
+            stage: Stage<'_>,
+            gain: &mut DMatrix<f64>,
+            offset: &mut DVector<f64>,
+        ) -> Result<(), NotConvex> = step_portable, step_avx2;
     }
 
     #[inline(always)]

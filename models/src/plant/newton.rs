@@ -531,8 +531,8 @@ impl Workspace {
         let h = settings.time_step_s;
         planar.differentiate(joints);
         let diagonal = &mut self.diagonal;
+        diagonal.fill(0.0);
         if model.potentials.any {
-            diagonal.fill(0.0);
             potentials::for_each_second_derivative(
                 &model.potentials,
                 &model.dynamics,
@@ -542,8 +542,8 @@ impl Workspace {
             );
         }
         let a = settings.force_split.at_start();
-        for (i, c) in model.damping.iter().enumerate() {
-            diagonal[i] = if model.potentials.any { diagonal[i] } else { 0.0 } - a * c;
+        for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
+            *entry -= a * c;
         }
         let inertia = &model.conditioning.inertia;
         let pivot = generators.factor(planar, joints, diagonal, inertia, h, Of::Motion);
