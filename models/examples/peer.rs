@@ -89,7 +89,11 @@ fn run(
     steps: u64,
     passes: u64,
 ) -> Result<(f64, Vec<f64>), Box<dyn Error>> {
-    let settings = Settings { time_step_s, ..Settings::new(model) };
+    let (method, order) = match method.strip_prefix("order-").map(|rest| rest.split_once('-')) {
+        Some(Some((order, rest))) => (rest, order.parse()?),
+        _ => (method, 2),
+    };
+    let settings = Settings { time_step_s, order, ..Settings::new(model) };
     let mut plant = Plant::new(Arc::clone(model), settings)?;
     let (q, v) = (mechanism.q0.clone(), mechanism.v0.clone());
     plant.initialize(&Initial::Velocity { q, v })?;

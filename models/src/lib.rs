@@ -42,8 +42,8 @@ pub use continuous::{
 };
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
 pub use plant::{
-    Contraction, Diagnostics, Energy, Equilibrium, ForceSplit, Initial, InitialError,
-    Linearization, Plant, SecondOrder, Settings, SettleError, SettleRequest, Snapshot,
-    SnapshotError, State, StepError, StepReport, TooLarge,
+    Contraction, Diagnostics, Energy, Equilibrium, ForceSplit, HALVINGS_MAX, Initial, InitialError,
+    Linearization, Plant, Precision, SUBSTEPS_MAX, SecondOrder, Settings, SettleError,
+    SettleRequest, Snapshot, SnapshotError, State, StepError, StepReport, TooLarge,
 };
 pub use scene::{Problem, Scene, SceneError};

@@ -58,6 +58,9 @@ pub enum ReferenceError {
         /// Columns that are needed.
         expected_cols: usize,
     },
+    /// The period of the plant has several steps or stages.
+    #[error("a reference is compared with steps of order 2; the plant takes others")]
+    Method,
     /// There is no step between the rows.
     #[error("q has {rows} rows; at least two are needed")]
     TooShort {
@@ -230,6 +233,9 @@ impl<'a> Assess<'a> {
     ) -> Result<Self, ReferenceError> {
         let d = plant.model().dimensions();
         let rows = q.nrows();
+        if !plant.is_one_midpoint_step() {
+            return Err(ReferenceError::Method);
+        }
         if rows < 2 {
             return Err(ReferenceError::TooShort { rows });
         }
@@ -267,7 +273,7 @@ impl<'a> Assess<'a> {
     ) -> Result<(), ReferenceError> {
         let (q0, q1, u) = (row(self.q, k), row(self.q, k + 1), self.input(k));
         let index = self.first_step + k as u64;
-        let step = KnownStep { index, q0: &q0, q1: &q1, multipliers, u: &u };
+        let step = KnownStep { index, q0: &q0, p0: None, q1: &q1, multipliers, u: &u };
         self.plant
             .linearize_known(&step, out)
             .map_err(|error| ReferenceError::Linearization { step: k, error })
@@ -280,7 +286,7 @@ impl<'a> Assess<'a> {
         let [at_start, at_end] = out.input_impulses();
         let (q0, q1, u) = (row(self.q, k), row(self.q, k + 1), self.input(k));
         let index = self.first_step + k as u64;
-        let step = KnownStep { index, q0: &q0, q1: &q1, multipliers: &none, u: &u };
+        let step = KnownStep { index, q0: &q0, p0: None, q1: &q1, multipliers: &none, u: &u };
         let (mut leaves, mut arrives) = (DVector::zeros(d.dynamic), DVector::zeros(d.dynamic));
         self.plant
             .momenta_of_known(&step, leaves.as_mut_slice(), arrives.as_mut_slice())

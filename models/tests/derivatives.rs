@@ -2,8 +2,8 @@
 
 mod common;
 
-use common::linearization::check;
-use common::{builtin, floating, random_tree};
+use common::linearization::{check, check_with};
+use common::{builtin, floating, methods, random_tree};
 
 #[test]
 fn unconstrained_builtin_scenes() {
@@ -34,5 +34,20 @@ fn floating_body_with_a_spring_across_its_arms() {
 fn random_trees() {
     for seed in 0..24 {
         check(&random_tree(seed));
+    }
+}
+
+/// Higher orders and substeps: collocation with forces and prescribed joints, compositions with
+/// constraints.
+#[test]
+fn every_order_and_substeps() {
+    let builtins = ["damped-pendulum", "cart-pole", "chain-4", "four-bar"].map(builtin);
+    for scene in builtins.into_iter().chain([floating()]).chain((0..4).map(random_tree)) {
+        for settings in methods(&scene) {
+            check_with(&scene, |s| *s = settings);
+        }
+    }
+    for (order, substeps) in [(2, 2), (4, 1)] {
+        check_with(&builtin("marionette"), |s| (s.order, s.substeps) = (order, substeps));
     }
 }

@@ -4,14 +4,14 @@
 mod common;
 
 use common::{
-    SPLITS, builtin, elements_with_coordinates, floating, plant, random_tree, slope, wave,
+    SPLITS, builtin, elements_with_coordinates, floating, methods, plant, random_tree, slope, wave,
     waving_input,
 };
 use nalgebra::DMatrix;
 use plantd_models::scene::{Point, Spring};
 use plantd_models::{
-    Contraction, ForceSplit, Initial, Linearization, Model, Plant, Scene, SecondOrder, State,
-    StepError,
+    Contraction, ForceSplit, Initial, Linearization, Model, Plant, Scene, SecondOrder, Settings,
+    State, StepError,
 };
 
 /// Of the differences, relative to the largest entry of an output: what their own round-off leaves.
@@ -63,7 +63,11 @@ struct Check {
 impl Check {
     /// About a state in full motion.
     fn new(scene: &Scene, split: ForceSplit) -> Self {
-        let mut plant = plant(scene, |s| s.force_split = split);
+        Self::with(scene, |settings| settings.force_split = split)
+    }
+
+    fn with(scene: &Scene, settings: impl FnOnce(&mut Settings)) -> Self {
+        let mut plant = plant(scene, settings);
         wave(&mut plant, 20);
         let u = waving_input(&plant, 23);
         Self::at(plant, u)
@@ -80,7 +84,8 @@ impl Check {
         plant.linearize_second_order(&u, &mut first, &mut second).unwrap();
         assert_eq!(plant.state(), x, "a linearization must stay");
         let tensors = tensors(&model, &second);
-        let name = format!("{}, {:?}", model.scene().name, plant.settings().force_split);
+        let Settings { order, substeps, force_split, .. } = plant.settings();
+        let name = format!("{}, {force_split:?}, order {order} x {substeps}", model.scene().name);
         Self { plant, x, u, first, tensors, name }
     }
 
@@ -200,12 +205,17 @@ impl Check {
 
 fn check(scene: &Scene) {
     for split in SPLITS {
-        let mut check = Check::new(scene, split);
-        check.symmetry();
-        check.contraction();
-        check.columns();
-        if check.plant.model().dimensions().constraints > 0 {
-            check.manifold();
+        Check::new(scene, split).all();
+    }
+}
+
+impl Check {
+    fn all(&mut self) {
+        self.symmetry();
+        self.contraction();
+        self.columns();
+        if self.plant.model().dimensions().constraints > 0 {
+            self.manifold();
         }
     }
 }
@@ -272,6 +282,22 @@ fn random_trees_with_forces() {
         let mut check = Check::new(&common::forced_tree(seed), ForceSplit::Symmetric);
         check.symmetry();
         check.contraction();
+    }
+}
+
+/// Higher orders and substeps, with forces, prescribed joints and constraints.
+#[test]
+fn every_order_and_substeps() {
+    let builtins = ["damped-pendulum", "cart-pole", "four-bar"].map(builtin);
+    let forces = ["drag", "thruster", "two-point-damper", "spatial-wrench"];
+    let mut elements = elements_with_coordinates();
+    elements.retain(|scene| forces.contains(&scene.name.as_str()));
+    assert_eq!(elements.len(), forces.len());
+    let trees = [1, 2].map(random_tree);
+    for scene in builtins.into_iter().chain(trees).chain(elements) {
+        for settings in methods(&scene) {
+            Check::with(&scene, |s| *s = settings).all();
+        }
     }
 }
 

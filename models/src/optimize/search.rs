@@ -254,6 +254,7 @@ impl Optimizer {
         let projection = weights.map(|weights| weights.for_system(states, width)).transpose()?;
         let problem = Arc::new(Problem::new(Arc::clone(&model), steps, cost, bounds, free)?);
         let State { q, p, v, .. } = initial.clone();
+        plant.keep_periods_whole();
         plant.initialize(&Initial::Momentum { q, p, v })?;
         plant.set_step_index(initial.step);
         let start = plant.snapshot();

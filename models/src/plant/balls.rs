@@ -251,8 +251,8 @@ impl Workspace {
         for row in 0..model.dimensions.dynamic {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let ancestor = elimination.ancestors[slot];
-                self.matrix.upper[slot] = blocks.residual_next[ancestor * n + row];
-                self.matrix.lower[slot] = blocks.residual_next[row * n + ancestor];
+                self.factors.matrix.upper[slot] = blocks.residual_next[ancestor * n + row];
+                self.factors.matrix.lower[slot] = blocks.residual_next[row * n + ancestor];
             }
         }
     }

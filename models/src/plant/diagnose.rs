@@ -92,9 +92,9 @@ impl Plant {
         for row in 0..nd {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let ancestor = elimination.ancestors[slot];
-                matrix[(row, ancestor)] = workspace.matrix.lower[slot];
+                matrix[(row, ancestor)] = workspace.factors.matrix.lower[slot];
                 // The diagonal is kept in the upper triangle alone.
-                matrix[(ancestor, row)] = workspace.matrix.upper[slot];
+                matrix[(ancestor, row)] = workspace.factors.matrix.upper[slot];
             }
         }
         matrix

@@ -133,6 +133,26 @@ pub enum InitialError {
     /// No equilibrium was found.
     #[error(transparent)]
     Settle(#[from] SettleError),
+    /// A whole number is out of range.
+    #[error("{name} is {value}; it must be from {least} to {most}")]
+    OutOfRange {
+        /// Which setting.
+        name: &'static str,
+        /// Its value.
+        value: u32,
+        /// The least allowed.
+        least: u32,
+        /// The most allowed.
+        most: u32,
+    },
+    /// There is no method of that order for the model and the other settings.
+    #[error("order {order} {what}")]
+    Order {
+        /// The order.
+        order: u32,
+        /// Why there is none.
+        what: &'static str,
+    },
     /// A time step or an iteration limit is out of range.
     #[error("{name} is {value}; it must be finite and greater than zero")]
     Settings {
@@ -156,7 +176,7 @@ impl Plant {
     fn state_of(&mut self, initial: &Initial) -> Result<PreciseState, InitialError> {
         let d = self.model.dimensions;
         let (n, nd) = (d.coordinates(), d.dynamic);
-        let mut state = PreciseState::new(&self.model);
+        let mut state = PreciseState::new(&self.model, self.period.scheme);
         match initial {
             Initial::Scene => {}
             Initial::OperatingPoint(name) => {
@@ -348,7 +368,7 @@ impl Plant {
     /// the constraints or not (allocates).
     pub fn energy_at(&mut self, q: &[f64], v: &[f64]) -> Result<Energy, InitialError> {
         let n = self.model.dimensions.coordinates();
-        let mut state = PreciseState::new(&self.model);
+        let mut state = PreciseState::new(&self.model, self.period.scheme);
         state.q = checked("q", q, n)?;
         state.orient(&self.model);
         let energy = self.workspace.energy_of(&self.model, &state, &checked("v", v, n)?);
@@ -429,13 +449,14 @@ impl Workspace {
         self.gradient_at(model, state, &velocity);
         self.velocity = velocity;
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
-        self.matrix.clear();
-        self.curvature.fill_mass_matrix(&model.pairs, &self.momenta, &mut self.matrix);
-        let pivot = self.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
+        self.factors.matrix.clear();
+        self.curvature.fill_mass_matrix(&model.pairs, &self.momenta, &mut self.factors.matrix);
+        let pivot =
+            self.factors.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.iter_mut().enumerate() {
             *r = state.p[i] - self.l_v[i];
         }
-        self.matrix.solve(&model.elimination, &mut self.residual);
+        self.factors.matrix.solve(&model.elimination, &mut self.residual);
         if d.constraints > 0 {
             self.project_velocity(model, state);
         }

@@ -4,6 +4,8 @@ use nalgebra::DMatrix;
 
 use crate::plant::balls::orientations;
 use crate::plant::linearize::Linearization;
+use crate::plant::newton::At;
+use crate::plant::scheme::Scheme;
 use crate::plant::{Plant, StepError};
 
 /// A step that was taken before, or one that a reference asks for.
@@ -13,6 +15,8 @@ pub(crate) struct KnownStep<'a> {
     pub(crate) index: u64,
     /// Configuration at the start, nd + nk.
     pub(crate) q0: &'a [f64],
+    /// Momentum at the start, nd and whatever follows in the state; none where the end is asked for.
+    pub(crate) p0: Option<&'a [f64]>,
     /// Configuration at the end, nd + nk.
     pub(crate) q1: &'a [f64],
     /// Constraint impulses, nc.
@@ -23,14 +27,42 @@ pub(crate) struct KnownStep<'a> {
 
 impl Plant {
     /// Linearizes the map at a known step. Costs one residual evaluation, a factorization, and
-    /// O(n²·depth). Leaves the plant at the start of the step, with the momentum that it had.
+    /// O(n²·depth); where the period has several steps or stages, it is solved again from `p0`. Leaves
+    /// the plant at the start of the step, with the momentum that it had.
     pub(crate) fn linearize_known(
         &mut self,
         step: &KnownStep<'_>,
         out: &mut Linearization,
     ) -> Result<(), StepError> {
+        if let (false, Some(p0)) = (self.is_one_midpoint_step(), step.p0) {
+            self.place_start(step);
+            self.state.p.copy_from_slice(&p0[..self.model.dimensions.dynamic]);
+            self.state.p_low.fill(0.0);
+            self.state.past.forget();
+            return self.solve(step.u, Some(out)).map(|_| ());
+        }
+        out.assert_model(&self.model);
         self.place_known(step)?;
-        self.linearize_solution(step.u, out)
+        let Self { model, settings, state, workspace, period } = self;
+        workspace.linearize(At { model, settings, state, u: period.known_input() }, out)
+    }
+
+    /// Whether the period is one step of the midpoint rule.
+    pub(crate) fn is_one_midpoint_step(&self) -> bool {
+        self.period.scheme == Scheme::Midpoint && self.settings.substeps == 1
+    }
+
+    /// Never halves a period: all steps are of one map.
+    pub(crate) fn keep_periods_whole(&mut self) {
+        self.settings.halvings = 0;
+    }
+
+    fn place_start(&mut self, step: &KnownStep<'_>) {
+        self.state.q.copy_from_slice(step.q0);
+        self.state.q_low.fill(0.0);
+        self.state.step = step.index;
+        self.state.orient(&self.model);
+        self.workspace.forget();
     }
 
     /// Momenta that a step from `q0` to `q1` leaves with and arrives with, without the impulse of
@@ -92,22 +124,12 @@ impl Plant {
 
     /// Puts the solution of a known step into the workspace.
     fn place_known(&mut self, step: &KnownStep<'_>) -> Result<(), StepError> {
-        self.check_input(step.u)?;
-        self.state.q.copy_from_slice(step.q0);
-        self.state.q_low.fill(0.0);
-        self.state.step = step.index;
-        self.state.orient(&self.model);
-        self.workspace.forget();
-        let mut effective = std::mem::take(&mut self.workspace.effective_input);
-        let u = if effective.is_empty() {
-            step.u
-        } else {
-            effective.copy_from_slice(step.u);
-            self.apply_signals(&mut effective);
-            &effective
-        };
-        self.workspace.prepare(&self.model, &self.settings, &self.state, u);
-        self.workspace.effective_input = effective;
+        self.model.check_input(step.u)?;
+        self.place_start(step);
+        self.hold(step.u)?;
+        let Self { model, settings, state, workspace, period } = self;
+        period.set_whole_input(model, state, settings.time_step_s)?;
+        workspace.prepare(At { model, settings, state, u: period.known_input() });
         let nd = self.model.dimensions.dynamic;
         let increment = &mut self.workspace.increment;
         for (x, (q1, q0)) in increment.iter_mut().zip(step.q1.iter().zip(step.q0)) {

@@ -20,20 +20,24 @@
 //! An input acts like momentum: its column is `Σ_i a h ∂f_i/∂u` times that of `p_i`, plus
 //! `(1 − a) h ∂f_i/∂u` on `p[k+1]_i`. Prescribed positions that signals replace have no effect.
 
+mod chain;
 mod map;
 
 use nalgebra::DMatrix;
 
 use crate::Model;
 use crate::plant::balls::Turning;
+use crate::plant::collocation::StageTangents;
 use crate::plant::curvature::SecondDerivatives;
-use crate::plant::newton::Workspace;
+use crate::plant::newton::{At, Workspace};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::planar;
 use crate::plant::rows::{add_rows, add_rows_portable, padded, spread};
-use crate::plant::{Plant, Settings, StepError, potentials};
+use crate::plant::{Settings, StepError, potentials};
 use crate::spatial::{Mat3, Vec3};
 use crate::wide::wide;
+
+pub(crate) use chain::{Chain, Part};
 
 /// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.
 #[derive(Clone, Copy, Debug)]
@@ -44,9 +48,29 @@ struct InputImpulse {
     momentum: f64,
 }
 
-/// The exact first-order linearization of one step, preallocated.
+/// What was linearized.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// A step of the midpoint rule.
+    Step,
+    /// One of collocation.
+    Collocation,
+    /// A control period of so many steps.
+    Period { steps: usize },
+}
+
+/// The exact first-order linearization of a control period. Preallocated for one step of the midpoint
+/// rule; for other methods it gets its memory when it is first used.
 #[derive(Clone, Debug)]
 pub struct Linearization {
+    kind: Kind,
+    /// The steps of a period, at least as many as it has.
+    parts: Vec<Part>,
+    /// `x'`, `λ'` and `p[k+1]'` by the inputs, row-major, 2 nd + nc rows of ni; for collocation and
+    /// periods.
+    driven: Vec<f64>,
+    /// What the second derivatives of a step of collocation need.
+    stages: Option<Box<StageTangents>>,
     nd: usize,
     nk: usize,
     time_step_s: f64,
@@ -109,11 +133,11 @@ impl SolvedStep {
     }
 
     /// Remembers the solution in the workspace.
-    fn remember(&mut self, workspace: &Workspace, settings: &Settings, q: &[f64], u: &[f64]) {
-        let (inputs, next) = u.split_at(self.inputs.len());
-        self.settings = *settings;
+    fn remember(&mut self, workspace: &Workspace, at: At<'_>) {
+        let (inputs, next) = at.u.split_at(self.inputs.len());
+        self.settings = *at.settings;
         for (to, from) in [
-            (&mut self.q, q),
+            (&mut self.q, &at.state.q[..]),
             (&mut self.increment, &workspace.increment),
             (&mut self.next, next),
             (&mut self.inputs, inputs),
@@ -138,6 +162,10 @@ impl Linearization {
         let d = model.dimensions();
         let stride = spread(padded(2 * d.coordinates()));
         Self {
+            kind: Kind::Step,
+            parts: Vec::new(),
+            driven: Vec::new(),
+            stages: None,
             nd: d.dynamic,
             nk: d.prescribed,
             time_step_s: model.scene().time_step_s,
@@ -160,6 +188,73 @@ impl Linearization {
             turnings: Vec::with_capacity(model.orientations.len()),
             solved: SolvedStep::new(model),
         }
+    }
+
+    /// Panics if the linearization was made for a model of other dimensions.
+    pub(crate) fn assert_model(&self, model: &Model) {
+        let d = model.dimensions;
+        assert!(
+            self.nd == d.dynamic
+                && self.nk == d.prescribed
+                && self.constraints() == d.constraints
+                && self.ni == d.inputs
+                && self.inputs.len() == model.input_pattern().count(),
+            "the linearization belongs to another model"
+        );
+    }
+
+    /// The steps of a period of several; none if it is one step.
+    pub(crate) fn parts(&self) -> Option<&[Part]> {
+        match self.kind {
+            Kind::Period { steps } => Some(&self.parts[..steps]),
+            Kind::Step | Kind::Collocation => None,
+        }
+    }
+
+    /// The stages of a step of collocation.
+    pub(crate) fn stages(&self) -> Option<&StageTangents> {
+        if self.kind == Kind::Collocation { self.stages.as_deref() } else { None }
+    }
+
+    /// Whether it is one step of the midpoint rule.
+    pub(crate) fn is_midpoint_step(&self) -> bool {
+        self.kind == Kind::Step
+    }
+
+    /// Room for stages, from the last linearization of collocation.
+    pub(crate) fn take_stages(&mut self) -> Option<Box<StageTangents>> {
+        self.stages.take()
+    }
+
+    pub(crate) fn keep_stages(&mut self, stages: Box<StageTangents>) {
+        self.stages = Some(stages);
+    }
+
+    /// Begins a linearization of collocation over a step of length `h`.
+    pub(crate) fn begin_collocation(&mut self, h: f64) {
+        self.kind = Kind::Collocation;
+        self.time_step_s = h;
+        self.turnings.clear();
+        self.driven.resize((2 * self.nd + self.constraints()) * self.ni, 0.0);
+    }
+
+    /// Sets `x_i'` by the parameters `(q, p, inputs, k)`.
+    pub(crate) fn set_increment_row(&mut self, i: usize, by: &[f64]) {
+        let (next, nk) = (self.next_columns(), self.nk);
+        self.driven[i * self.ni..][..self.ni].copy_from_slice(&by[next..][..self.ni]);
+        let row = &mut self.increment[i * self.stride..][..self.stride];
+        row[..next].copy_from_slice(&by[..next]);
+        row[next..][..nk].copy_from_slice(&by[next + self.ni..][..nk]);
+    }
+
+    /// Sets `p_i[k+1]'` by the parameters `(q, p, inputs, k)`.
+    pub(crate) fn set_momentum_row(&mut self, i: usize, by: &[f64]) {
+        let (next, nk) = (self.next_columns(), self.nk);
+        let driven = (self.nd + self.constraints() + i) * self.ni;
+        self.driven[driven..][..self.ni].copy_from_slice(&by[next..][..self.ni]);
+        let row = &mut self.momentum[i * self.stride..][..self.stride];
+        row[..next].copy_from_slice(&by[..next]);
+        row[next..][..nk].copy_from_slice(&by[next + self.ni..][..nk]);
     }
 
     pub(crate) fn solved_step(&self) -> &SolvedStep {
@@ -217,13 +312,21 @@ impl Linearization {
         let (nd, nk, ni) = (self.nd, self.nk, self.ni);
         let (n, next) = (nd + nk, self.next_columns());
         b.fill(0.0);
-        for &InputImpulse { input, coordinate, residual, momentum } in &self.inputs {
+        for &InputImpulse { input, coordinate, residual, momentum } in self.impulses() {
             for i in 0..nd {
                 let column = i * self.stride + n + coordinate;
                 b[(i, input)] += residual * self.increment[column];
                 b[(n + i, input)] += residual * self.momentum[column];
             }
             b[(n + coordinate, input)] += momentum - residual;
+        }
+        for i in 0..nd {
+            for (input, entry) in self.driven(i).iter().enumerate() {
+                b[(i, input)] = *entry;
+            }
+            for (input, entry) in self.driven(nd + self.constraints() + i).iter().enumerate() {
+                b[(n + i, input)] = *entry;
+            }
         }
         for k in 0..nk {
             for i in 0..nd {
@@ -268,8 +371,11 @@ impl Linearization {
         let mut by_u = DMatrix::zeros(self.constraints(), ni + self.nk);
         for c in 0..self.constraints() {
             let row = &self.multipliers[c * self.stride..][..self.stride];
-            for &InputImpulse { input, coordinate, residual, .. } in &self.inputs {
+            for &InputImpulse { input, coordinate, residual, .. } in self.impulses() {
                 by_u[(c, input)] += residual * row[n + coordinate];
+            }
+            for (input, entry) in self.driven(self.nd + c).iter().enumerate() {
+                by_u[(c, input)] = *entry;
             }
             for k in 0..self.nk {
                 by_u[(c, ni + k)] = row[next + k];
@@ -317,6 +423,16 @@ impl Linearization {
             }
             out[next + self.ni..][..self.nk].copy_from_slice(&row[next..][..self.nk]);
         }
+    }
+
+    /// What unit inputs give to a step of the midpoint rule.
+    fn impulses(&self) -> &[InputImpulse] {
+        if self.kind == Kind::Step { &self.inputs } else { &[] }
+    }
+
+    /// A row of derivatives by the inputs of collocation and periods.
+    fn driven(&self, row: usize) -> &[f64] {
+        if self.kind == Kind::Step { &[] } else { &self.driven[row * self.ni..][..self.ni] }
     }
 
     /// First column of the next prescribed positions.
@@ -389,84 +505,73 @@ impl Workspace {
     }
 }
 
-impl Plant {
+impl Workspace {
     /// Linearizes at the solution in the workspace.
-    pub(crate) fn linearize_solution(
+    pub(crate) fn linearize(
         &mut self,
-        u: &[f64],
+        at: At<'_>,
         out: &mut Linearization,
     ) -> Result<(), StepError> {
-        let d = self.model.dimensions;
-        assert!(
-            out.nd == d.dynamic
-                && out.nk == d.prescribed
-                && out.constraints() == d.constraints
-                && out.ni == d.inputs
-                && out.inputs.len() == self.model.input_pattern().count(),
-            "the linearization belongs to another model"
-        );
-        out.time_step_s = self.settings.time_step_s;
-        out.at_start = self.settings.force_split.at_start();
-        if self.workspace.generators.is_some() {
-            self.linearize_by_generators(out)?;
-            self.remember(u, out);
+        let d = at.model.dimensions;
+        out.kind = Kind::Step;
+        out.time_step_s = at.settings.time_step_s;
+        out.at_start = at.settings.force_split.at_start();
+        if self.factors.generators.is_some() {
+            self.linearize_by_generators(at, out)?;
+            out.solved.remember(self, at);
             return Ok(());
         }
-        self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
-        self.fill_right_hand_sides(out);
-        let workspace = &mut self.workspace;
+        self.factor_newton_matrix(at.model, at.settings)?;
+        self.fill_right_hand_sides(at, out);
         // Without inertia, springs or forces on prescribed joints, the columns of `k` in r1' are zero.
-        let moving = !self.model.mixed_pairs.is_empty()
-            || self.model.potentials.couple_branches
-            || self.model.forces.is_some()
-            || !self.model.orientations.is_empty();
+        let moving = !at.model.mixed_pairs.is_empty()
+            || at.model.potentials.couple_branches
+            || at.model.forces.is_some()
+            || !at.model.orientations.is_empty();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
-        workspace.matrix.solve_rows(
-            &self.model.elimination,
+        self.factors.matrix.solve_rows(
+            &at.model.elimination,
             &mut out.increment,
             out.stride,
             columns,
         );
         if d.constraints > 0 {
-            workspace.finish_end(&self.model, &self.state);
-            workspace.factor_schur(&self.model, &self.settings)?;
-            self.solve_multipliers(out);
+            self.finish_end(at.model, at.state);
+            self.factor_schur(at.model, at.settings)?;
+            self.solve_multipliers(at, out);
         }
-        self.differentiate_momentum(out);
-        self.remember(u, out);
+        self.differentiate_momentum(at, out);
+        out.solved.remember(self, at);
         Ok(())
     }
 
-    /// Remembers the step for its second derivatives.
-    fn remember(&self, u: &[f64], out: &mut Linearization) {
-        let effective = &self.workspace.effective_input[..];
-        let u = if effective.is_empty() { u } else { effective };
-        out.solved.remember(&self.workspace, &self.settings, &self.state.q, u);
-    }
-
     /// The same in O(n²), for planar trees without constraints and prescribed coordinates.
-    fn linearize_by_generators(&mut self, out: &mut Linearization) -> Result<(), StepError> {
-        let (model, workspace) = (&self.model, &mut self.workspace);
-        workspace.factor_generators(model, &self.settings)?;
+    fn linearize_by_generators(
+        &mut self,
+        at: At<'_>,
+        out: &mut Linearization,
+    ) -> Result<(), StepError> {
+        let model = at.model;
+        self.factor_generators(model, at.settings)?;
         for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
-            place.momentum = self.settings.time_step_s * input.gain;
+            place.momentum = at.settings.time_step_s * input.gain;
             place.residual = out.at_start * place.momentum;
         }
         let (Some(planar), Some(joints), Some(generators)) =
-            (&workspace.planar, &model.planar, &mut workspace.generators)
+            (&self.planar, &model.planar, &mut self.factors.generators)
         else {
             return Ok(());
         };
-        let h = self.settings.time_step_s;
+        let h = at.settings.time_step_s;
         // Of springs and dampers of coordinates.
-        let [residual, slope] = &mut workspace.diagonals;
+        let [residual, slope] = &mut self.diagonals;
         if model.potentials.any {
             residual.fill(0.0);
             potentials::for_each_second_derivative(
                 &model.potentials,
                 &model.dynamics,
-                &workspace.poses,
-                &workspace.q_mid,
+                &self.poses,
+                &self.q_mid,
                 |i, _, value| residual[i] -= 0.5 * h * value,
             );
         }
@@ -481,46 +586,46 @@ impl Plant {
 
     wide! {
         /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
-        fn fill_right_hand_sides(mut self, out: &mut Linearization) = fill_portable, fill_avx2;
+        fn fill_right_hand_sides(mut self, at: At<'_>, out: &mut Linearization) = fill_portable, fill_avx2;
 
         /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
         /// `out.momentum`.
-        fn differentiate_momentum(mut self, out: &mut Linearization)
+        fn differentiate_momentum(mut self, at: At<'_>, out: &mut Linearization)
             = differentiate_momentum_portable, differentiate_momentum_avx2;
     }
 
     #[inline(always)]
-    fn fill_portable(&mut self, out: &mut Linearization) {
-        let (model, workspace) = (&self.model, &mut self.workspace);
-        let h = self.settings.time_step_s;
+    fn fill_portable(&mut self, at: At<'_>, out: &mut Linearization) {
+        let model = at.model;
+        let h = at.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
         out.increment.fill(0.0);
         out.momentum.fill(0.0);
         out.turnings.clear();
         if !model.orientations.is_empty() {
-            workspace.evaluate_turned(model, &self.settings, &self.state);
-            workspace.take_turned(out);
+            self.evaluate_turned(model, at.settings, at.state);
+            self.take_turned(out);
             return;
         }
         for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
             place.momentum = h * input.gain;
             place.residual = out.at_start * place.momentum;
         }
-        workspace.stiffness.fill(0.0);
-        workspace.end_slopes.fill(0.0);
+        self.stiffness.fill(0.0);
+        self.end_slopes.fill(0.0);
         for pair in &model.pairs {
             let (i, j) = (pair.row as usize, pair.column as usize);
-            let second = workspace.pair(model, pair.ancestor as usize, pair.descendant as usize);
+            let second = self.pair(model, pair.ancestor as usize, pair.descendant as usize);
             let half = 0.5 * h * second.qq;
             out.increment[i * stride + j] = half - second.v_above_q_below;
             out.increment[j * stride + i] = half - second.q_above_v_below;
-            workspace.end_slopes[i * nd + j] = half + second.q_above_v_below;
-            workspace.end_slopes[j * nd + i] = half + second.v_above_q_below;
-            workspace.stiffness[i * nd + j] = h * second.qq;
-            workspace.stiffness[j * nd + i] = h * second.qq;
+            self.end_slopes[i * nd + j] = half + second.q_above_v_below;
+            self.end_slopes[j * nd + i] = half + second.v_above_q_below;
+            self.stiffness[i * nd + j] = h * second.qq;
+            self.stiffness[j * nd + i] = h * second.qq;
         }
         for pair in &model.mixed_pairs {
-            let second = workspace.pair(model, pair.ancestor, pair.descendant);
+            let second = self.pair(model, pair.ancestor, pair.descendant);
             let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
             let descendant = model.dynamics.joints[pair.descendant].coordinate;
             // Row of the dynamic coordinate, column of the prescribed one.
@@ -537,9 +642,9 @@ impl Plant {
             out.momentum[row * stride + column] += 0.5 * h * second.qq - qv;
             out.momentum[row * stride + next] += 0.5 * h * second.qq + qv;
         }
-        self.add_springs(out);
-        self.add_forces(out);
-        self.add_constraint_hessian(out);
+        self.add_springs(at, out);
+        self.add_forces(at, out);
+        self.add_constraint_hessian(at, out);
         for i in 0..nd {
             let momentum = i * stride + nd + nk + i;
             out.increment[momentum] = 1.0;
@@ -548,14 +653,14 @@ impl Plant {
     }
 
     /// Springs add `−V_qq` to `L_qq`.
-    fn add_springs(&mut self, out: &mut Linearization) {
-        if !self.model.potentials.any {
+    fn add_springs(&mut self, at: At<'_>, out: &mut Linearization) {
+        if !at.model.potentials.any {
             return;
         }
-        let (model, workspace) = (&self.model, &mut self.workspace);
-        let h = self.settings.time_step_s;
+        let model = at.model;
+        let h = at.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
-        let (stiffness, slopes) = (&mut workspace.stiffness, &mut workspace.end_slopes);
+        let (stiffness, slopes) = (&mut self.stiffness, &mut self.end_slopes);
         let mut add = |row: usize, column: usize, value: f64| {
             if column < nd {
                 out.increment[row * stride + column] -= 0.5 * h * value;
@@ -571,8 +676,8 @@ impl Plant {
         potentials::for_each_second_derivative(
             &model.potentials,
             &model.dynamics,
-            &workspace.poses,
-            &workspace.q_mid,
+            &self.poses,
+            &self.q_mid,
             |i, j, value| {
                 if i < nd {
                     add(i, j, value);
@@ -582,13 +687,13 @@ impl Plant {
     }
 
     /// Forces add `a h f_q` to `C_q`, `a h f_v` to `C_v`, and `h (f_q q' + f_v v')` to `p[k+1]'`.
-    fn add_forces(&mut self, out: &mut Linearization) {
-        let Some(forces) = &self.model.forces else { return };
-        let h = self.settings.time_step_s;
+    fn add_forces(&mut self, at: At<'_>, out: &mut Linearization) {
+        let Some(forces) = &at.model.forces else { return };
+        let h = at.settings.time_step_s;
         let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
-        let mut slopes = std::mem::take(&mut self.workspace.end_slopes);
-        let mut stiffness = std::mem::take(&mut self.workspace.stiffness);
-        let instant = self.workspace.instant(&self.model);
+        let mut slopes = std::mem::take(&mut self.end_slopes);
+        let mut stiffness = std::mem::take(&mut self.stiffness);
+        let instant = self.instant(at.model);
         forces.for_each_derivative(&instant, |row, column, by_q, by_v| {
             if row < nd && column < nd {
                 out.increment[row * stride + column] += a * h * by_q;
@@ -602,31 +707,26 @@ impl Plant {
                 }
             }
         });
-        let mut places = out.inputs[self.model.coordinate_inputs.len()..].iter_mut();
+        let mut places = out.inputs[at.model.coordinate_inputs.len()..].iter_mut();
         forces.for_each_input_derivative(&instant, |row, _, by_u| {
             let place = if row < nd { places.next() } else { None };
             if let Some(place) = place {
                 (place.residual, place.momentum) = (a * h * by_u, h * by_u);
             }
         });
-        (self.workspace.end_slopes, self.workspace.stiffness) = (slopes, stiffness);
+        (self.end_slopes, self.stiffness) = (slopes, stiffness);
     }
 
     /// The constraints' impulses turn with the start configuration.
-    fn add_constraint_hessian(&mut self, out: &mut Linearization) {
-        if self.model.dimensions.constraints == 0 {
+    fn add_constraint_hessian(&mut self, at: At<'_>, out: &mut Linearization) {
+        if at.model.dimensions.constraints == 0 {
             return;
         }
-        let (model, workspace) = (&self.model, &mut self.workspace);
-        workspace.start.hessian(
-            model,
-            &self.state.q,
-            &workspace.multipliers,
-            &mut workspace.constraint_hessian,
-        );
+        let model = at.model;
+        self.start.hessian(model, &at.state.q, &self.multipliers, &mut self.constraint_hessian);
         let n = model.dimensions.coordinates();
         for i in 0..out.nd {
-            let row = &workspace.constraint_hessian[i * n..][..n];
+            let row = &self.constraint_hessian[i * n..][..n];
             let range = i * out.stride..i * out.stride + n;
             for (entry, value) in out.increment[range.clone()].iter_mut().zip(row) {
                 *entry -= value;
@@ -638,14 +738,14 @@ impl Plant {
     }
 
     /// From `K⁻¹ r1'` in `out.increment`: solves `S λ' = A1 K⁻¹ r1' − r2'` and subtracts `K⁻¹ A0ᵀ λ'`.
-    fn solve_multipliers(&mut self, out: &mut Linearization) {
-        let (model, workspace) = (&self.model, &mut self.workspace);
+    fn solve_multipliers(&mut self, at: At<'_>, out: &mut Linearization) {
+        let model = at.model;
         let d = model.dimensions;
         let (n, nd, nc, stride) = (d.coordinates(), d.dynamic, d.constraints, out.stride);
         let next = out.next_columns();
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let jacobian = &workspace.end.jacobian[c * n..][..n];
-            let by_start = match &workspace.turned {
+            let jacobian = &self.end.jacobian[c * n..][..n];
+            let by_start = match &self.turned {
                 None => jacobian,
                 Some(blocks) => &blocks.end_jacobians()[0][c * n..][..n],
             };
@@ -654,43 +754,43 @@ impl Plant {
             target.iter_mut().zip(&by_start[..nd]).for_each(|(t, entry)| *t = -entry);
             target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
             let dynamic = constraint.dynamic_coordinates().iter();
-            workspace.terms.clear();
-            workspace.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
-            add_rows(target, &out.increment, stride, &workspace.terms);
+            self.terms.clear();
+            self.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
+            add_rows(target, &out.increment, stride, &self.terms);
         }
-        workspace.schur.solve_rows(&mut out.multipliers, stride);
+        self.schur.solve_rows(&mut out.multipliers, stride);
         for (i, target) in out.increment.chunks_exact_mut(stride).enumerate() {
-            let responses = workspace.responses[i * padded(nc)..][..nc].iter().enumerate();
-            workspace.terms.clear();
-            workspace.terms.extend(responses.map(|(c, r)| (-r, c)));
-            add_rows(target, &out.multipliers, stride, &workspace.terms);
+            let responses = self.responses[i * padded(nc)..][..nc].iter().enumerate();
+            self.terms.clear();
+            self.terms.extend(responses.map(|(c, r)| (-r, c)));
+            add_rows(target, &out.multipliers, stride, &self.terms);
         }
     }
 
     #[inline(always)]
-    fn differentiate_momentum_portable(&mut self, out: &mut Linearization) {
+    fn differentiate_momentum_portable(&mut self, at: At<'_>, out: &mut Linearization) {
         for x in &mut out.increment {
             *x = -*x;
         }
-        let (model, workspace) = (&self.model, &mut self.workspace);
+        let model = at.model;
         let d = model.dimensions;
         let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
         if model.orientations.is_empty() {
             for (i, c) in model.damping.iter().enumerate() {
-                workspace.end_slopes[i * nd + i] -= c;
+                self.end_slopes[i * nd + i] -= c;
             }
         }
         for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
-            let stiffness = &workspace.stiffness[i * nd..][..nd];
+            let stiffness = &self.stiffness[i * nd..][..nd];
             target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
-            let slopes = workspace.end_slopes[i * nd..][..nd].iter().enumerate();
-            workspace.terms.clear();
-            workspace.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
-            add_rows_portable(target, &out.increment, stride, &workspace.terms);
+            let slopes = self.end_slopes[i * nd..][..nd].iter().enumerate();
+            self.terms.clear();
+            self.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
+            add_rows_portable(target, &out.increment, stride, &self.terms);
         }
         for (c, constraint) in model.constraints.iter().enumerate() {
             for &i in constraint.dynamic_coordinates() {
-                let entry = workspace.start.jacobian[c * n + i];
+                let entry = self.start.jacobian[c * n + i];
                 let target = &mut out.momentum[i * stride..][..stride];
                 add_rows_portable(target, &out.multipliers, stride, &[(-entry, c)]);
             }

@@ -3,12 +3,14 @@
 //! The files in the order in which a step runs: [`initial`], [`predictor`], [`kinematics`], [`momenta`],
 //! [`vectors`], [`potentials`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`],
 //! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
-//! [`linearize`]; [`blocks`] and [`second_order`]; then
+//! [`linearize`]; [`scheme`], [`collocation`] and [`period`] (higher order, substeps); [`blocks`] and
+//! [`second_order`]; then
 //! [`known`], [`diagnose`], [`settle`], [`snapshot`].
 
 pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod closure;
+mod collocation;
 pub(crate) mod conditioning;
 mod curvature;
 mod diagnose;
@@ -19,6 +21,7 @@ pub(crate) mod known;
 mod linearize;
 mod momenta;
 mod newton;
+mod period;
 pub(crate) mod pivoted_lu;
 mod planar;
 pub(crate) mod potentials;
@@ -26,7 +29,9 @@ mod predictor;
 pub(crate) mod rows;
 #[cfg(test)]
 pub(crate) mod samples;
+mod scheme;
 mod second_order;
+mod settings;
 mod settle;
 mod snapshot;
 pub(crate) mod tree_lu;
@@ -37,7 +42,9 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::Model;
-use crate::plant::predictor::Predictor;
+use crate::plant::period::Period;
+use crate::plant::predictor::Past;
+use crate::plant::scheme::Scheme;
 use crate::rotation::Quaternion;
 use crate::signal::Target;
 use balls::three;
@@ -47,53 +54,9 @@ pub use diagnose::Diagnostics;
 pub use initial::{Initial, InitialError};
 pub use linearize::Linearization;
 pub use second_order::{Contraction, SecondOrder, TooLarge};
+pub use settings::{ForceSplit, HALVINGS_MAX, Precision, SUBSTEPS_MAX, Settings};
 pub use settle::{Equilibrium, SettleError, SettleRequest};
 pub use snapshot::{Snapshot, SnapshotError};
-
-/// How a plant is stepped.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Settings {
-    /// Time step `h`, s; finite and greater than zero.
-    pub time_step_s: f64,
-    /// How forces are split between the ends of a step.
-    pub force_split: ForceSplit,
-    /// Corrections before a step is given up.
-    pub max_iterations: u32,
-    /// A reciprocal condition estimate below this is an error; greater than zero.
-    pub singular_below: f64,
-}
-
-impl Settings {
-    /// The model's time step, symmetric split, 40 iterations, singular below 1e-14.
-    pub fn new(model: &Model) -> Self {
-        Self {
-            time_step_s: model.scene().time_step_s,
-            force_split: ForceSplit::default(),
-            max_iterations: 40,
-            singular_below: 1e-14,
-        }
-    }
-}
-
-/// How the force impulse of a step is split into `F⁻` and `F⁺`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum ForceSplit {
-    /// `F⁻ = F⁺ = ½ h f`: second order.
-    #[default]
-    Symmetric,
-    /// `F⁻ = h f`, `F⁺ = 0`, as in the paper: first order with forcing.
-    Paper,
-}
-
-impl ForceSplit {
-    /// Weight `a` of `F⁻`: `F⁻ = a h f`, `F⁺ = (1 − a) h f`.
-    pub(crate) fn at_start(self) -> f64 {
-        match self {
-            Self::Symmetric => 0.5,
-            Self::Paper => 1.0,
-        }
-    }
-}
 
 /// A state, by value.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -120,7 +83,8 @@ impl State {
 /// What the solver did.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
-    /// Residual evaluations, each followed by one correction.
+    /// Residual evaluations, each followed by one correction; those of all steps of the period. Of
+    /// collocation, sweeps over the stages.
     pub iterations: u32,
     /// Factorizations of the Newton matrix.
     pub factorizations: u32,
@@ -139,6 +103,10 @@ pub struct StepReport {
     pub constraint_reciprocal_condition: f64,
     /// Equations of constraints that depend on others.
     pub redundant_constraints: u32,
+    /// Steps of the method in the period.
+    pub steps: u32,
+    /// How often the period was halved: 0 unless it could not be solved in longer steps.
+    pub halvings: u32,
 }
 
 /// Why a step failed. The plant is as it was.
@@ -259,12 +227,15 @@ pub(crate) struct PreciseState {
     /// Orientations of ball joints; `q` has their rotation vectors.
     pub(crate) orientations: Vec<Quaternion>,
     pub(crate) multipliers: Vec<f64>,
-    /// Increments of past steps.
-    pub(crate) predictor: Predictor,
+    /// What the next step is guessed from.
+    pub(crate) past: Past,
+    /// How often the last period was halved, and how many since went well.
+    pub(crate) halvings: u8,
+    pub(crate) calm: u8,
 }
 
 impl PreciseState {
-    fn zeros(nd: usize, nk: usize, nc: usize, orientations: usize) -> Self {
+    fn zeros([nd, nk, nc, orientations]: [usize; 4], past: Past) -> Self {
         Self {
             step: 0,
             time_origin_s: 0.0,
@@ -275,8 +246,25 @@ impl PreciseState {
             v: vec![0.0; nk],
             orientations: vec![Quaternion::default(); orientations],
             multipliers: vec![0.0; nc],
-            predictor: Predictor::new(nd),
+            past,
+            halvings: 0,
+            calm: 0,
         }
+    }
+
+    /// Becomes another state of the same model and method; allocates nothing.
+    fn copy_from(&mut self, other: &Self) {
+        let Self { step, time_origin_s, halvings, calm, .. } = *other;
+        (self.step, self.time_origin_s, self.halvings, self.calm) =
+            (step, time_origin_s, halvings, calm);
+        self.q.copy_from_slice(&other.q);
+        self.q_low.copy_from_slice(&other.q_low);
+        self.p.copy_from_slice(&other.p);
+        self.p_low.copy_from_slice(&other.p_low);
+        self.v.copy_from_slice(&other.v);
+        self.orientations.copy_from_slice(&other.orientations);
+        self.multipliers.copy_from_slice(&other.multipliers);
+        self.past.copy_from(&other.past);
     }
 
     /// Takes the orientations from `q`.
@@ -288,11 +276,13 @@ impl PreciseState {
     }
 
     /// At rest in the initial configuration of the scene.
-    fn new(model: &Model) -> Self {
+    fn new(model: &Model, scheme: Scheme) -> Self {
         let d = model.dimensions();
         let no = model.orientations.len();
         let q = model.coordinates().iter().map(|c| c.initial).collect();
-        let mut state = Self { q, ..Self::zeros(d.dynamic, d.prescribed, d.constraints, no) };
+        let past = Past::new(scheme, d.dynamic);
+        let sizes = [d.dynamic, d.prescribed, d.constraints, no];
+        let mut state = Self { q, ..Self::zeros(sizes, past) };
         state.orient(model);
         state
     }
@@ -308,23 +298,17 @@ pub struct Plant {
     settings: Settings,
     state: PreciseState,
     workspace: Workspace,
+    period: Period,
 }
 
 impl Plant {
     /// A plant in the scene's initial configuration, at rest.
     pub fn new(model: Arc<Model>, settings: Settings) -> Result<Self, InitialError> {
-        let positive = |name, value: f64| {
-            if value.is_finite() && value > 0.0 {
-                Ok(())
-            } else {
-                Err(InitialError::Settings { name, value })
-            }
-        };
-        positive("time_step_s", settings.time_step_s)?;
-        positive("max_iterations", f64::from(settings.max_iterations))?;
-        positive("singular_below", settings.singular_below)?;
+        let scheme = settings.check(&model)?;
+        let state = PreciseState::new(&model, scheme);
         let mut plant = Self {
-            state: PreciseState::new(&model),
+            period: Period::new(&model, scheme, &state),
+            state,
             workspace: Workspace::new(&model),
             settings,
             model,
@@ -353,10 +337,10 @@ impl Plant {
     /// p[k+1] = p + h (L_q + f) − Dh(q[k])ᵀ λ
     /// ```
     ///
-    /// Two to four residual evaluations of O(n) and one factorization for a smooth motion. A step
-    /// that fails leaves the plant as it was.
+    /// Two to four residual evaluations of O(n) and one factorization for a smooth motion. Methods of
+    /// higher order and substeps: see [`Settings`]. A step that fails leaves the plant as it was.
     pub fn step(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
-        let report = self.solve(u)?;
+        let report = self.solve(u, None)?;
         self.commit();
         Ok(report)
     }
@@ -372,10 +356,7 @@ impl Plant {
         u: &[f64],
         out: &mut Linearization,
     ) -> Result<StepReport, StepError> {
-        let mut report = self.solve(u)?;
-        self.linearize_solution(u, out)?;
-        self.workspace.estimates.write(&mut report);
-        Ok(report)
+        self.solve(u, Some(out))
     }
 
     /// Takes one step and linearizes it at its solution.
@@ -424,14 +405,13 @@ impl Plant {
         effective
     }
 
-    /// Inputs at the middle of the step from here, prescribed positions at its end.
+    /// Inputs at the middle of the period from here, prescribed positions at its end.
     fn apply_signals(&self, u: &mut [f64]) {
         let (inputs, prescribed) = u.split_at_mut(self.model.dimensions.inputs);
-        let middle = self.time_after_s(0.5);
+        self.model.add_input_signals(self.time_after_s(0.5), inputs);
         for signal in &self.model.signals {
-            match signal.target {
-                Target::Input(i) => inputs[i] += signal.at(middle),
-                Target::Prescribed(k) => prescribed[k] = signal.at(self.end_of_step_s()),
+            if let Target::Prescribed(k) = signal.target {
+                prescribed[k] = signal.at(self.end_of_step_s());
             }
         }
     }
@@ -440,9 +420,8 @@ impl Plant {
         self.time_after_s(1.0)
     }
 
-    /// Time after so many more steps, s.
     fn time_after_s(&self, steps: f64) -> f64 {
-        self.state.time_origin_s + (self.state.step as f64 + steps) * self.settings.time_step_s
+        self.state.time_after_s(steps, self.settings.time_step_s)
     }
 
     /// Steps since the plant was initialised.
@@ -504,58 +483,25 @@ impl Plant {
         let d = self.model.dimensions;
         DMatrix::from_row_slice(d.constraints, d.coordinates(), &self.workspace.start.jacobian)
     }
+}
 
-    fn solve(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
-        self.check_input(u)?;
-        if self.model.signals.is_empty() {
-            return self.workspace.solve(&self.model, &self.settings, &self.state, u);
-        }
-        let mut effective = std::mem::take(&mut self.workspace.effective_input);
-        effective.copy_from_slice(u);
-        self.apply_signals(&mut effective);
-        let report = self.check_input(&effective).and_then(|()| {
-            self.workspace.solve(&self.model, &self.settings, &self.state, &effective)
-        });
-        self.workspace.effective_input = effective;
-        report
-    }
-
-    fn check_input(&self, u: &[f64]) -> Result<(), StepError> {
-        let d = self.model.dimensions;
+impl Model {
+    /// Refuses an input of the wrong length, or with a number that is not finite.
+    pub(crate) fn check_input(&self, u: &[f64]) -> Result<(), StepError> {
+        let d = self.dimensions;
         if u.len() != d.input() {
             return Err(StepError::Dimension { expected: d.input(), actual: u.len() });
         }
         match u.iter().position(|value| !value.is_finite()) {
             None => Ok(()),
             Some(index) => {
-                let name = match self.model.scene.inputs.get(index) {
+                let name = match self.scene.inputs.get(index) {
                     Some(input) => input.name.clone(),
-                    None => self.model.coordinates[d.dynamic + index - d.inputs].name.clone(),
+                    None => self.coordinates[d.dynamic + index - d.inputs].name.clone(),
                 };
                 Err(StepError::InputNotFinite { index, name, value: u[index] })
             }
         }
-    }
-
-    /// Moves on to the solution in the workspace.
-    fn commit(&mut self) {
-        let (state, workspace) = (&mut self.state, &mut self.workspace);
-        let nd = self.model.dimensions.dynamic;
-        for i in 0..nd {
-            let (q, low) = two_sum(state.q[i], workspace.increment[i] + state.q_low[i]);
-            (state.q[i], state.q_low[i]) = (q, low);
-            let (p, low) = two_sum(state.p[i], workspace.impulse[i] + state.p_low[i]);
-            (state.p[i], state.p_low[i]) = (p, low);
-        }
-        state.q[nd..].copy_from_slice(&workspace.q_end[nd..]);
-        if !self.model.orientations.is_empty() {
-            workspace.turn(&self.model, state);
-        }
-        state.v.copy_from_slice(&workspace.velocity[nd..]);
-        state.multipliers.copy_from_slice(&workspace.multipliers);
-        state.predictor.record(&workspace.increment, &self.model.conditioning.inertia);
-        state.step = state.step.saturating_add(1);
-        workspace.move_on();
     }
 }
 

@@ -22,15 +22,56 @@ use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::planar::{self, Of, PlanarTree};
 use crate::plant::rows::{Term, padded, spread};
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
-use crate::plant::{PreciseState, Settings, StepError, StepReport, forces, potentials};
+use crate::plant::{PreciseState, Precision, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
 
 /// A residual this small, in units of round-off, is as good as zero.
 const CONVERGED: f64 = 4.0;
+/// A residual this small will do where precision is not asked for.
+const NEARLY: f64 = 1e5;
 /// A residual that no longer falls, with a fresh Jacobian, is at its floor if it is below this.
-const FLOOR: f64 = 1e4;
+pub(crate) const FLOOR: f64 = 1e4;
 /// The same for a Jacobian that was kept.
-const CHORD_FLOOR: f64 = 1e2;
+pub(crate) const CHORD_FLOOR: f64 = 1e2;
+
+/// What a step is taken of.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct At<'a> {
+    pub(crate) model: &'a Model,
+    /// Of this step: its time step may be a part of the control period, or negative.
+    pub(crate) settings: &'a Settings,
+    pub(crate) state: &'a PreciseState,
+    /// Inputs with the signals, next prescribed positions.
+    pub(crate) u: &'a [f64],
+}
+
+/// The Newton matrix `K`, factored.
+#[derive(Clone, Debug)]
+pub(crate) struct Factors {
+    /// Entry by entry.
+    pub(crate) matrix: TreeLu,
+    /// By its generators, where that is faster.
+    pub(crate) generators: Option<Box<planar::Elimination>>,
+}
+
+impl Factors {
+    pub(crate) fn new(model: &Model) -> Self {
+        let is_generated = model.solver == Solver::Generators;
+        let joints = model.dimensions.dynamic;
+        Self {
+            matrix: TreeLu::new(&model.elimination),
+            generators: is_generated.then(|| Box::new(planar::Elimination::new(joints))),
+        }
+    }
+
+    /// Solves `K x = b` in place.
+    pub(crate) fn solve(&mut self, model: &Model, x: &mut [f64]) {
+        match (&mut self.generators, &model.planar) {
+            (Some(generators), Some(joints)) => generators.solve(joints, x),
+            _ => self.matrix.solve(&model.elimination, x),
+        }
+    }
+}
 
 /// All memory that a step and its linearization need.
 #[derive(Clone, Debug)]
@@ -55,8 +96,6 @@ pub(crate) struct Workspace {
     pub(crate) velocity: Vec<f64>,
     pub(crate) l_q: Vec<f64>,
     pub(crate) l_v: Vec<f64>,
-    /// The input with the signals; empty without signals.
-    pub(crate) effective_input: Vec<f64>,
     /// The inputs, where forces or ball joints need them; else empty.
     pub(crate) inputs: Vec<f64>,
     pub(crate) input_force: Vec<f64>,
@@ -67,8 +106,7 @@ pub(crate) struct Workspace {
     /// What follows from configuration and velocity at the midpoint: in the plane where the scene allows
     /// it, else in space.
     pub(crate) planar: Option<Box<PlanarTree>>,
-    /// The Newton matrix by its generators, where that is faster.
-    pub(crate) generators: Option<Box<planar::Elimination>>,
+    pub(crate) factors: Factors,
     /// What springs and dampers of coordinates add to its diagonal.
     diagonal: Vec<f64>,
     /// The same for the linearization: of the residual by the start, of the momentum by the increment.
@@ -76,7 +114,6 @@ pub(crate) struct Workspace {
     pub(crate) poses: Poses,
     pub(crate) momenta: Momenta,
     pub(crate) curvature: Curvature,
-    pub(crate) matrix: TreeLu,
     /// Constraints at `q[k]`.
     pub(crate) start: Closure,
     /// `start` holds the constraints at the state's configuration.
@@ -96,6 +133,16 @@ pub(crate) struct Workspace {
     pub(crate) stiffness: Vec<f64>,
     pub(crate) terms: Vec<Term>,
     pub(crate) estimates: Estimates,
+}
+
+impl Precision {
+    /// The residual, in units of round-off, after which one more correction is the last.
+    pub(crate) fn residual(self) -> f64 {
+        match self {
+            Self::Exact => CONVERGED,
+            Self::Fast => NEARLY,
+        }
+    }
 }
 
 /// Reciprocal condition estimates of the last factorization.
@@ -136,21 +183,18 @@ impl Workspace {
             velocity: zeros(n),
             l_q: zeros(nd),
             l_v: zeros(nd),
-            effective_input: zeros(if model.signals.is_empty() { 0 } else { d.input() }),
             inputs: zeros(if model.forces.is_some() || no > 0 { d.inputs } else { 0 }),
             input_force: zeros(nd),
             force: zeros(nd),
             residual: zeros(nd),
             constraint_residual: zeros(nc),
             planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
-            generators: (model.solver == Solver::Generators)
-                .then(|| Box::new(planar::Elimination::new(nd))),
+            factors: Factors::new(model),
             diagonal: zeros(nd),
             diagonals: [zeros(nd), zeros(nd)],
             poses: Poses::new(&model.dynamics),
             momenta: Momenta::new(&model.dynamics),
             curvature: Curvature::new(&model.dynamics),
-            matrix: TreeLu::new(&model.elimination),
             start: Closure::new(model),
             start_is_valid: false,
             end: Closure::new(model),
@@ -165,17 +209,11 @@ impl Workspace {
         }
     }
 
-    /// Solves one step from `state`; the solution stays in the workspace.
-    pub(crate) fn solve(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-        state: &PreciseState,
-        u: &[f64],
-    ) -> Result<StepReport, StepError> {
-        self.prepare(model, settings, state, u);
-        if state.predictor.is_ready() {
-            state.predictor.predict(&mut self.increment);
+    /// Solves one step; the solution stays in the workspace.
+    pub(crate) fn solve(&mut self, at: At<'_>) -> Result<StepReport, StepError> {
+        let At { model, settings, state, .. } = at;
+        self.prepare(at);
+        if state.past.predict(settings.time_step_s, &mut self.increment) {
             // The equations are linear in the multipliers: any guess is as good.
             self.multipliers.copy_from_slice(&state.multipliers);
             let report = self.iterate(model, settings, state, false);
@@ -189,13 +227,8 @@ impl Workspace {
     }
 
     /// What does not change within a step: prescribed motion, input forces, constraints at the start.
-    pub(crate) fn prepare(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-        state: &PreciseState,
-        u: &[f64],
-    ) {
+    pub(crate) fn prepare(&mut self, at: At<'_>) {
+        let At { model, settings, state, u } = at;
         let d = model.dimensions;
         let (inputs, next) = u.split_at(d.inputs);
         for (k, next) in next.iter().enumerate() {
@@ -250,9 +283,9 @@ impl Workspace {
     }
 
     /// Guess: the velocity that belongs to the momentum goes on.
-    fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
+    pub(crate) fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
         if let (Some(planar), Some(joints), Some(generators)) =
-            (&mut self.planar, &model.planar, &mut self.generators)
+            (&mut self.planar, &model.planar, &mut self.factors.generators)
         {
             let h = settings.time_step_s;
             self.velocity.fill(0.0);
@@ -300,6 +333,7 @@ impl Workspace {
             Solver::Tree => 3,
             Solver::Generators => 2,
         };
+        let enough = settings.precision.residual();
         let mut previous = f64::INFINITY;
         let (mut fresh, mut idle) = (false, false);
         while report.iterations < settings.max_iterations {
@@ -321,11 +355,11 @@ impl Workspace {
             // Where forces balance, a unit of round-off of a coordinate outweighs the residual's own.
             let is_idle = idle && report.constraint_residual <= FLOOR;
             let at_floor = stagnates && (size <= floor || is_idle);
-            let converged = size <= CONVERGED || at_floor;
+            let converged = size <= enough || at_floor;
             // A new Jacobian squares the rate: it pays where the old one needs many corrections more.
             let rate = size / previous;
             let later = (0..patience).fold(size, |size, _| size * rate);
-            fresh = !converged && (always_factor || previous.is_infinite() || later > CONVERGED);
+            fresh = !converged && (always_factor || previous.is_infinite() || later > enough);
             if fresh {
                 self.factor(model, settings)?;
                 report.factorizations += 1;
@@ -470,11 +504,11 @@ impl Workspace {
         }
         let h = settings.time_step_s;
         if model.potentials.couple_branches || model.forces.is_some() {
-            self.matrix.clear();
+            self.factors.matrix.clear();
         }
         if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
             planar.differentiate(joints);
-            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.matrix);
+            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.factors.matrix);
         } else {
             self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
             self.curvature.fill_newton_matrix(
@@ -482,7 +516,7 @@ impl Workspace {
                 &self.momenta,
                 model.gravity,
                 h,
-                &mut self.matrix,
+                &mut self.factors.matrix,
             );
         }
         if model.potentials.any {
@@ -493,12 +527,12 @@ impl Workspace {
                 &self.q_mid,
                 h,
                 &model.elimination,
-                &mut self.matrix,
+                &mut self.factors.matrix,
             );
         }
         for (i, c) in model.damping.iter().enumerate() {
             let slot = model.elimination.offsets[i + 1] - 1;
-            self.matrix.add_to_diagonal(slot, -settings.force_split.at_start() * c);
+            self.factors.matrix.add_to_diagonal(slot, -settings.force_split.at_start() * c);
         }
         if let Some(forces) = &model.forces {
             self.add_forces_to_newton_matrix(model, forces, settings);
@@ -513,7 +547,11 @@ impl Workspace {
     ) -> Result<(), StepError> {
         self.fill_newton_matrix(model, settings);
         let inertia = &model.conditioning.inertia;
-        let pivot = self.matrix.factor(&model.elimination, inertia, 1.0 / settings.time_step_s);
+        let pivot = self.factors.matrix.factor(
+            &model.elimination,
+            inertia,
+            1.0 / settings.time_step_s.abs(),
+        );
         self.accept_pivot(model, settings, pivot)
     }
 
@@ -524,7 +562,7 @@ impl Workspace {
         settings: &Settings,
     ) -> Result<(), StepError> {
         let (Some(planar), Some(joints), Some(generators)) =
-            (&mut self.planar, &model.planar, &mut self.generators)
+            (&mut self.planar, &model.planar, &mut self.factors.generators)
         else {
             return self.factor_newton_matrix(model, settings);
         };
@@ -569,13 +607,13 @@ impl Workspace {
     fn add_forces_to_newton_matrix(&mut self, model: &Model, forces: &Forces, settings: &Settings) {
         let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
         let dynamic = model.dimensions.dynamic;
-        let mut matrix = std::mem::take(&mut self.matrix);
+        let mut matrix = std::mem::take(&mut self.factors.matrix);
         forces.for_each_derivative(&self.instant(model), |i, j, by_q, by_v| {
             if i < dynamic && j < dynamic {
                 matrix.add(&model.elimination, i, j, a * (half * by_q + by_v));
             }
         });
-        self.matrix = matrix;
+        self.factors.matrix = matrix;
     }
 
     /// Factors `S = A1 K⁻¹ A0ᵀ` with the Jacobians in `start` and `end`.
@@ -588,7 +626,8 @@ impl Workspace {
         fill_schur(model, &self.end, &self.responses, &mut self.schur);
         self.schur.factor();
         let rank = model.constraint_rank();
-        self.estimates.constraints = self.schur.reciprocal_condition(rank, settings.time_step_s);
+        self.estimates.constraints =
+            self.schur.reciprocal_condition(rank, settings.time_step_s.abs());
         self.estimates.redundant = self.schur.deficiency() as u32;
         if self.estimates.constraints >= settings.singular_below {
             return Ok(());
@@ -606,15 +645,12 @@ impl Workspace {
                 self.responses[i * stride + c] = self.start.jacobian[c * n + i];
             }
         }
-        self.matrix.solve_rows(&model.elimination, &mut self.responses, stride, stride);
+        self.factors.matrix.solve_rows(&model.elimination, &mut self.responses, stride, stride);
     }
 
     /// One correction with the factors at hand.
     fn correct(&mut self, model: &Model) {
-        match (&mut self.generators, &model.planar) {
-            (Some(generators), Some(joints)) => generators.solve(joints, &mut self.residual),
-            _ => self.matrix.solve(&model.elimination, &mut self.residual),
-        }
+        self.factors.solve(model, &mut self.residual);
         if model.dimensions.constraints > 0 {
             let n = model.dimensions.coordinates();
             let stride = padded(model.dimensions.constraints);
@@ -656,12 +692,7 @@ impl Workspace {
         settings: &Settings,
         mut report: StepReport,
     ) -> Result<StepReport, StepError> {
-        for (coordinate, x) in model.coordinates.iter().zip(&self.increment) {
-            if coordinate.is_angle && x.abs() > std::f64::consts::PI {
-                let coordinate = coordinate.name.clone();
-                return Err(StepError::TooFast { coordinate, increment: *x });
-            }
-        }
+        model.check_turns(&self.increment)?;
         for (i, impulse) in self.impulse.iter_mut().enumerate() {
             *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
         }
@@ -688,6 +719,19 @@ impl Workspace {
             }
             self.end_is_exact = true;
         }
+    }
+}
+
+impl Model {
+    /// Refuses increments of more than half a turn.
+    pub(crate) fn check_turns(&self, increments: &[f64]) -> Result<(), StepError> {
+        for (coordinate, x) in self.coordinates.iter().zip(increments) {
+            if coordinate.is_angle && x.abs() > std::f64::consts::PI {
+                let coordinate = coordinate.name.clone();
+                return Err(StepError::TooFast { coordinate, increment: *x });
+            }
+        }
+        Ok(())
     }
 }
 

@@ -12,6 +12,7 @@
 //! where `D_a` is the derivative of a block along `W_a`: its dual part when the block is evaluated in
 //! [`Dual`] numbers seeded with `W_a`. [`SecondOrder`] holds all of it, [`Contraction`] weighted sums.
 
+mod chain;
 mod contraction;
 mod tensors;
 

@@ -1,17 +1,19 @@
 //! Snapshots: everything that a plant needs to go on bit for bit.
 //!
-//! Encoding, little-endian: magic `PLNTSNAP`, version (u32), model digest (u64), time step (f64 bits),
-//! force split (u8), iteration limit (u32), singular threshold (f64 bits), nd, nk, nc, number of
-//! orientations (u32 each), step (u64), time
-//! origin (f64 bits), history and order of the predictor (u8 each), the numbers as f64 bits, and the FNV-1a hash (u64) of all that.
+//! Encoding, little-endian: magic `PLNTSNAP`, version (u32), model digest (u64), time step (f64 bits), order
+//! and substeps (u32 each), halvings, precision and force split (u8 each), iteration limit (u32), singular
+//! threshold (f64 bits), nd, nk, nc, number of orientations (u32 each), step (u64), time origin (f64 bits),
+//! halvings of the last period and good ones since (u8 each), what the next step is guessed from (its kind and
+//! two of its counts, u8 each), the numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
 use crate::compile::fnv1a;
-use crate::plant::predictor::LENGTH;
-use crate::plant::{ForceSplit, Plant, PreciseState, Settings};
+use crate::plant::predictor::Past;
+use crate::plant::settings::{ForceSplit, HALVINGS_MAX, Precision, Settings};
+use crate::plant::{Plant, PreciseState};
 use crate::rotation::Quaternion;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
-const VERSION: u32 = 4;
+const VERSION: u32 = 5;
 
 /// Everything a plant needs to go on bit for bit.
 #[derive(Clone, Debug, PartialEq)]
@@ -49,6 +51,7 @@ impl Plant {
                 && a.p.len() == b.p.len()
                 && a.multipliers.len() == b.multipliers.len()
                 && a.orientations.len() == b.orientations.len()
+                && a.past.is_like(&b.past, a.p.len())
         };
         if snapshot.model_digest != self.model.digest() || !same_sizes(&snapshot.state, &self.state)
         {
@@ -74,7 +77,7 @@ impl PreciseState {
             &mut self.v,
             &mut self.multipliers,
         ];
-        vectors.into_iter().flatten().chain(self.predictor.differences.iter_mut().flatten())
+        vectors.into_iter().flatten().chain(self.past.numbers())
     }
 }
 
@@ -86,6 +89,13 @@ impl Snapshot {
         bytes.extend(VERSION.to_le_bytes());
         bytes.extend(self.model_digest.to_le_bytes());
         bytes.extend(self.settings.time_step_s.to_le_bytes());
+        bytes.extend(self.settings.order.to_le_bytes());
+        bytes.extend(self.settings.substeps.to_le_bytes());
+        bytes.push(self.settings.halvings as u8);
+        bytes.push(match self.settings.precision {
+            Precision::Exact => 0,
+            Precision::Fast => 1,
+        });
         bytes.push(match self.settings.force_split {
             ForceSplit::Symmetric => 0,
             ForceSplit::Paper => 1,
@@ -99,7 +109,8 @@ impl Snapshot {
         }
         bytes.extend(state.step.to_le_bytes());
         bytes.extend(state.time_origin_s.to_le_bytes());
-        bytes.extend([state.predictor.history, state.predictor.order]);
+        bytes.extend([state.halvings, state.calm]);
+        bytes.extend(state.past.code());
         bytes.extend(state.numbers().flat_map(|value| value.to_le_bytes()));
         for Quaternion(components) in &state.orientations {
             bytes.extend(components.iter().flat_map(|value| value.to_le_bytes()));
@@ -126,6 +137,14 @@ impl Snapshot {
         let model_digest = u64::from_le_bytes(reader.take()?);
         let settings = Settings {
             time_step_s: f64::from_le_bytes(reader.take()?),
+            order: u32::from_le_bytes(reader.take()?),
+            substeps: u32::from_le_bytes(reader.take()?),
+            halvings: u32::from(reader.take::<1>()?[0]),
+            precision: match reader.take::<1>()? {
+                [0] => Precision::Exact,
+                [1] => Precision::Fast,
+                _ => return Err(malformed("unknown precision")),
+            },
             force_split: match reader.take::<1>()? {
                 [0] => ForceSplit::Symmetric,
                 [1] => ForceSplit::Paper,
@@ -138,17 +157,23 @@ impl Snapshot {
         let (nd, nk, nc, no) = (size()?, size()?, size()?, size()?);
         let step = u64::from_le_bytes(reader.take()?);
         let time_origin_s = f64::from_le_bytes(reader.take()?);
-        let [history, order] = reader.take()?;
-        let numbers = (4 + LENGTH) * nd + 2 * nk + nc + 4 * no;
-        if reader.0.len() != 8 * numbers || usize::from(history) > LENGTH || order > history {
+        let [halvings, calm] = reader.take()?;
+        let mut past = Past::from_code(reader.take()?).ok_or(malformed("unknown kind of past"))?;
+        if u32::from(halvings) > HALVINGS_MAX || settings.halvings > HALVINGS_MAX {
+            return Err(malformed("a period was halved too often"));
+        }
+        let sizes = [nd, nk, nc, no];
+        let numbers = [4 * nd, 2 * nk, nc, 4 * no, past.length(nd)];
+        if reader.0.len() / 8 != numbers.iter().sum::<usize>() || reader.0.len() % 8 != 0 {
             return Err(malformed("sizes do not match"));
         }
         if !time_origin_s.is_finite() {
             return Err(malformed("a number is not finite"));
         }
-        let mut state = PreciseState::zeros(nd, nk, nc, no);
+        past.make_room(nd);
+        let mut state = PreciseState::zeros(sizes, past);
         (state.step, state.time_origin_s) = (step, time_origin_s);
-        (state.predictor.history, state.predictor.order) = (history, order);
+        (state.halvings, state.calm) = (halvings, calm);
         let mut orientations = std::mem::take(&mut state.orientations);
         for value in state.numbers().chain(orientations.iter_mut().flat_map(|q| &mut q.0)) {
             *value = f64::from_le_bytes(reader.take()?);

@@ -1,6 +1,6 @@
 //! The linearization of a step against sixth-order central differences of the step itself.
 
-use plantd_models::{ForceSplit, Initial, Linearization, Plant, Scene, State};
+use plantd_models::{Initial, Linearization, Plant, Scene, Settings, State};
 
 use super::{SPLITS, STENCIL, plant, wave, waving_input};
 
@@ -43,8 +43,8 @@ struct Check {
 
 impl Check {
     /// About a state in full motion.
-    fn new(scene: &Scene, split: ForceSplit, reach: f64) -> Self {
-        let mut plant = plant(scene, |s| s.force_split = split);
+    fn new(scene: &Scene, settings: impl FnOnce(&mut Settings), reach: f64) -> Self {
+        let mut plant = plant(scene, settings);
         wave(&mut plant, 20);
         // Signals begin again where a state is given.
         let x = plant.state();
@@ -56,7 +56,9 @@ impl Check {
         assert_eq!(plant.state(), x, "linearize must stay");
         plant.step(&u).unwrap();
         let end = plant.q().to_vec();
-        Self { plant, x, u, end, out, name: format!("{}, {split:?}", scene.name), reach }
+        let Settings { order, substeps, force_split, .. } = plant.settings();
+        let name = format!("{}, {force_split:?}, order {order} x {substeps}", scene.name);
+        Self { plant, x, u, end, out, name, reach }
     }
 
     /// The step with a change of the state, and of the input.
@@ -143,6 +145,13 @@ impl Check {
         }
     }
 
+    fn all(&mut self) {
+        self.columns();
+        if self.plant.model().dimensions().constraints > 0 {
+            self.manifold();
+        }
+    }
+
     /// Along curves on the constraint manifold, whose own slope is found by the same differences.
     fn manifold(&mut self) {
         let d = self.plant.model().dimensions();
@@ -179,10 +188,11 @@ pub(crate) fn check(scene: &Scene) {
 /// The same with smaller displacements, for forces that bend sharply.
 pub(crate) fn check_within(scene: &Scene, reach: f64) {
     for split in SPLITS {
-        let mut check = Check::new(scene, split, reach);
-        check.columns();
-        if check.plant.model().dimensions().constraints > 0 {
-            check.manifold();
-        }
+        Check::new(scene, |settings| settings.force_split = split, reach).all();
     }
+}
+
+/// The same with any settings.
+pub(crate) fn check_with(scene: &Scene, settings: impl FnOnce(&mut Settings)) {
+    Check::new(scene, settings, 1.0).all();
 }

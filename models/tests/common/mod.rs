@@ -51,6 +51,16 @@ pub(crate) fn plant(scene: &Scene, change: impl FnOnce(&mut Settings)) -> Plant 
     Plant::new(model, settings).unwrap_or_else(|e| panic!("{}: {e}", scene.name))
 }
 
+/// Ways to step a scene: all orders that there are, and substeps.
+pub(crate) fn methods(scene: &Scene) -> Vec<Settings> {
+    let model = model(scene);
+    let usual = Settings::new(&model);
+    let ways = [(2, 1), (2, 3), (4, 1), (4, 2), (6, 1), (8, 1), (12, 1)];
+    let ways = ways.map(|(order, substeps)| Settings { order, substeps, ..usual });
+    let is_possible = |settings: &Settings| Plant::new(Arc::clone(&model), *settings).is_ok();
+    ways.into_iter().filter(is_possible).collect()
+}
+
 /// The input of step `k`: every force and prescribed position waves about its start.
 pub(crate) fn waving_input(plant: &Plant, k: u64) -> Vec<f64> {
     let d = plant.model().dimensions();

@@ -644,6 +644,7 @@ fn known(trajectory: &Trajectory, k: usize, first_step: u64) -> KnownStep<'_> {
     KnownStep {
         index: first_step.saturating_add(k as u64),
         q0: &trajectory.x(k)[..n],
+        p0: Some(&trajectory.x(k)[n..]),
         q1: &trajectory.x(k + 1)[..n],
         multipliers: trajectory.multipliers(k),
         u: trajectory.u(k),

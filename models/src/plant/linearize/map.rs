@@ -22,7 +22,9 @@ impl Linearization {
         for (part, numbers) in [&self.increment, &self.momentum].into_iter().enumerate() {
             for (i, source) in numbers.chunks_exact(self.stride.max(1)).enumerate() {
                 let target = map.row_mut(part * nd + i);
-                for impulse in &self.inputs {
+                let driven = self.driven(part * (nd + self.constraints()) + i);
+                target.iter_mut().zip(driven).for_each(|(target, entry)| *target = *entry);
+                for impulse in self.impulses() {
                     let InputImpulse { input, coordinate, residual, momentum } = *impulse;
                     target[input] += residual * source[n + coordinate];
                     if part == 1 && coordinate == i {

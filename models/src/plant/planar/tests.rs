@@ -148,13 +148,13 @@ fn generators_stand_for_the_newton_matrix() {
     for model in [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3")] {
         let model = Arc::new(model);
         let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
-        assert!(fast.workspace.generators.is_some(), "{}", model.scene.name);
+        assert!(fast.workspace.factors.generators.is_some(), "{}", model.scene.name);
         let n = model.dimensions.dynamic;
         let q = (0..n).map(|i| 0.3 * wave(i)).collect();
         let v = (0..n).map(|i| 0.1 * wave(i + 50)).collect();
         fast.initialize(&Initial::Velocity { q, v }).unwrap();
         let mut slow = fast.clone();
-        slow.workspace.generators = None;
+        slow.workspace.factors.generators = None;
         let mut by_generators = Linearization::new(&model);
         let mut by_entries = Linearization::new(&model);
         let u: Vec<f64> = (0..model.dimensions.input()).map(wave).collect();

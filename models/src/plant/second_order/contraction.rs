@@ -38,14 +38,14 @@ pub struct Contraction {
     pub xu: DMatrix<f64>,
     /// By `u` twice, square of `ni + nk`.
     pub uu: DMatrix<f64>,
-    scratch: Scratch,
+    pub(super) scratch: Scratch,
     /// `z_x`, by what the increments of the dynamic coordinates are.
     weights: Vec<f64>,
     /// `μ₁` (nd) and `μ₂` (nc).
     adjoint: Vec<f64>,
     /// `μ₁ + z_p`, with zeros for the prescribed coordinates.
     impulse: Vec<f64>,
-    quadratic: Quadratic,
+    pub(super) quadratic: Quadratic,
     schur: PivotedLu,
     /// Constraints at `q[k+1]`.
     end: Closure,
@@ -63,10 +63,10 @@ pub struct Contraction {
 ///
 /// which is symmetric: the lower triangle is computed. `C` and `Y` have few entries.
 #[derive(Clone, Debug)]
-struct Quadratic {
+pub(super) struct Quadratic {
     layout: Layout,
     /// Row-major over all parameters; the lower triangle counts.
-    sum: Vec<f64>,
+    pub(super) sum: Vec<f64>,
     /// `C`, row-major, nd + nc rows.
     mixed: Vec<f64>,
     /// `C + Y W`.
@@ -87,7 +87,7 @@ impl Quadratic {
         }
     }
 
-    fn clear(&mut self) {
+    pub(super) fn clear(&mut self) {
         self.sum.fill(0.0);
         self.mixed.fill(0.0);
         self.increments.fill(0.0);
@@ -147,7 +147,7 @@ impl Quadratic {
     }
 
     /// Fills the upper triangle of `sum` with the lower one, block by block.
-    fn mirror(&mut self) {
+    pub(super) fn mirror(&mut self) {
         let (stride, size) = (self.layout.stride, self.layout.parameters());
         for first_row in (0..size).step_by(LANES) {
             for first_column in (0..=first_row).step_by(LANES) {
@@ -188,7 +188,7 @@ impl Contraction {
     /// `Σ z_i ∂²x_i[k+1] + Σ w_c ∂²λ_c` with `z = weights_x` (2 nd + 2 nk) and
     /// `w = weights_multipliers` (nc). Solves no step: `first` holds all that is needed.
     ///
-    /// Costs one evaluation of the derivative blocks in dual numbers (with nonlinear forces or ball
+    /// Costs, for each step and each stage of collocation, one evaluation of the derivative blocks in dual numbers (with nonlinear forces or ball
     /// joints: one of them for each parameter), and O(N² nd).
     ///
     /// # Errors
@@ -207,6 +207,23 @@ impl Contraction {
     ) -> Result<(), StepError> {
         check_weights(model, weights_x, weights_multipliers)?;
         assert_layout(model, &self.scratch);
+        self.contract_any(model, first, weights_x, weights_multipliers)?;
+        self.finish();
+        Ok(())
+    }
+
+    /// The sum for one step.
+    pub(super) fn contract_step(
+        &mut self,
+        model: &Model,
+        first: &Linearization,
+        weights_x: &[f64],
+        weights_multipliers: &[f64],
+    ) -> Result<(), StepError> {
+        if let Some(stages) = first.stages() {
+            self.contract_stages(model, stages, weights_x);
+            return Ok(());
+        }
         first.write_tangent(self.scratch.layout.stride, &mut self.scratch.tangent);
         self.find_impulse(model, first, weights_x, weights_multipliers);
         let step = first.solved_step();
@@ -215,7 +232,6 @@ impl Contraction {
         } else {
             self.contract_directions(model, step, weights_x);
         }
-        self.finish();
         Ok(())
     }
 

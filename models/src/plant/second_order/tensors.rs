@@ -11,7 +11,7 @@ use crate::plant::{Plant, StepError, StepReport};
 use crate::scalar::Dual;
 use crate::spatial::Mat3;
 
-use super::{Layout, Scratch, assert_layout, spin_change};
+use super::{Contraction, Layout, Scratch, assert_layout, spin_change};
 
 /// Full tensors with more numbers than this are refused: 1 GiB.
 const ENTRIES_MAX: usize = 1 << 27;
@@ -135,6 +135,28 @@ impl SecondOrder {
         self.input_block(self.multiplier_row(c))
     }
 
+    /// Fills the tensor output by output.
+    fn gather(&mut self, model: &Model, first: &Linearization) -> Result<(), StepError> {
+        let Layout { nd, nc, stride, .. } = self.scratch.layout;
+        let (n, rows) = (self.scratch.layout.n(), 2 * nd + nc);
+        let mut contraction = Contraction::new(model);
+        for row in 0..rows {
+            let (mut x, mut multipliers) = (vec![0.0; 2 * n], vec![0.0; nc]);
+            match row.checked_sub(nd) {
+                None => x[row] = 1.0,
+                Some(c) if c < nc => multipliers[c] = 1.0,
+                Some(c) => x[n + c - nc] = 1.0,
+            }
+            contraction.contract_any(model, first, &x, &multipliers)?;
+            for (a, block) in self.tensor.chunks_exact_mut(rows * stride).enumerate() {
+                for (b, entry) in block[row * stride..][..=a].iter_mut().enumerate() {
+                    *entry = contraction.entry(a, b);
+                }
+            }
+        }
+        Ok(())
+    }
+
     fn output_row(&self, output: usize) -> Output {
         let Layout { nd, nc, .. } = self.scratch.layout;
         let n = self.scratch.layout.n();
@@ -223,7 +245,11 @@ impl Plant {
     ) -> Result<StepReport, StepError> {
         let report = self.linearize(u, first)?;
         assert_layout(&self.model, &second.scratch);
-        if self.workspace.generators.is_some() {
+        if !first.is_midpoint_step() {
+            second.gather(&self.model, first)?;
+            return Ok(report);
+        }
+        if self.workspace.factors.generators.is_some() {
             self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
         }
         self.differentiate_linearization(first, second);
@@ -278,7 +304,7 @@ impl Plant {
             }
 
             // x'' and λ'' = −E⁻¹ (…).
-            workspace.matrix.solve_rows(&model.elimination, residual, stride, columns);
+            workspace.factors.matrix.solve_rows(&model.elimination, residual, stride, columns);
             for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
                 let row = &mut row[..columns];
                 row.iter_mut().for_each(|entry| *entry = -*entry);

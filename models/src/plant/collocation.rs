@@ -1,0 +1,383 @@
+//! Gauss collocation in Lagrangian form, order `2s` with `s` stages: coupled midpoint rules.
+//!
+//! With the velocities `V_i` at the nodes, `Y_i = h b_i V_i`, and the impulses `P_i = h b_i (L_q + f)`,
+//!
+//! ```text
+//! Q_i = q + Σ_j μ_ij Y_j                    x = Σ Y_j          μ_ij = a_ij / b_j
+//! 0 = p + Σ_j μ_ij P_j − L_v(Q_i, V_i)      p[k+1] = p + Σ P_j
+//! ```
+//!
+//! Since `μ_ii = ½`, each stage is a step of the midpoint rule of length `h b_i`, from what the other
+//! stages give it to begin with: its Newton matrix is that of such a step. The stages are corrected one
+//! after the other, each with its own factors, until all residuals are at round-off. That fails where the
+//! coupling is stiff; then Newton's method takes all stages at once. `μ_ij + μ_ji = 1` makes the method
+//! symplectic whatever the rounding of the weights.
+//!
+//! Prescribed coordinates move at a constant rate, `c_i` of the way at node `i`. Inputs that signals drive
+//! are taken at the nodes.
+
+mod linearize;
+
+use crate::Model;
+use crate::plant::blocks::Blocks;
+use crate::plant::newton::{At, CHORD_FLOOR, FLOOR, Factors, Workspace};
+use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::predictor::Past;
+use crate::plant::rows::padded;
+use crate::plant::scheme::{Scheme, Tableau};
+use crate::plant::{PreciseState, Settings, StepError, StepReport};
+
+pub(crate) use linearize::StageTangents;
+
+/// A residual that falls by less than this from one sweep to the next falls too slowly.
+const SLOW: f64 = 0.5;
+
+/// The stages of a step, and all memory that they need.
+#[derive(Clone, Debug)]
+pub(crate) struct Collocation {
+    pub(crate) tableau: Tableau,
+    pub(crate) stages: Vec<Stage>,
+    /// Where the midpoint rule of a stage begins, and its input.
+    base: PreciseState,
+    input: Vec<f64>,
+    /// Velocities at the stages, one after the other, then forces `L_q + f`.
+    motion: Vec<f64>,
+    /// For Newton's method and derivatives; empty until they are needed.
+    pub(crate) system: Option<Box<System>>,
+}
+
+/// A stage.
+#[derive(Clone, Debug)]
+pub(crate) struct Stage {
+    /// `Y_i` and `P_i`.
+    increment: Vec<f64>,
+    impulse: Vec<f64>,
+    factors: Factors,
+    /// `Q_i` and `V_i` of all coordinates, and the inputs.
+    pub(crate) q: Vec<f64>,
+    pub(crate) velocity: Vec<f64>,
+    pub(crate) inputs: Vec<f64>,
+}
+
+/// All stages at once.
+#[derive(Clone, Debug)]
+pub(crate) struct System {
+    /// Second derivatives at the stages.
+    pub(crate) blocks: Vec<Blocks>,
+    /// Derivatives of the residuals by all `Y`.
+    pub(crate) matrix: PivotedLu,
+    pub(crate) residual: Vec<f64>,
+}
+
+impl Collocation {
+    pub(crate) fn new(model: &Model, stages: usize) -> Self {
+        let d = model.dimensions;
+        let stage = || Stage {
+            increment: vec![0.0; d.dynamic],
+            impulse: vec![0.0; d.dynamic],
+            factors: Factors::new(model),
+            q: vec![0.0; d.coordinates()],
+            velocity: vec![0.0; d.coordinates()],
+            inputs: vec![0.0; d.inputs],
+        };
+        Self {
+            tableau: Tableau::new(stages),
+            stages: (0..stages).map(|_| stage()).collect(),
+            base: PreciseState::new(model, Scheme::Midpoint),
+            input: vec![0.0; d.input()],
+            motion: vec![0.0; 2 * stages * d.dynamic],
+            system: None,
+        }
+    }
+
+    /// Velocities at the stages of the solution, one after the other, then forces.
+    pub(crate) fn motion(&self) -> &[f64] {
+        &self.motion
+    }
+
+    /// Solves one step, which starts at a time; the solution stays here and in the workspace. `u` has no
+    /// signals of inputs.
+    pub(crate) fn solve(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        start_s: f64,
+    ) -> Result<StepReport, StepError> {
+        self.begin(workspace, at, start_s)?;
+        let report = match self.sweep(workspace, at)? {
+            Some(report) => report,
+            None => self.correct_all(workspace, at)?,
+        };
+        self.finish(workspace, at, report)
+    }
+
+    /// Guesses the stages; places what does not change within the step.
+    fn begin(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        start_s: f64,
+    ) -> Result<(), StepError> {
+        let At { model, settings, state, u } = at;
+        let d = model.dimensions;
+        let h = settings.time_step_s;
+        let is_guessed = match &state.past {
+            Past::Stages(past) => past.predict(&self.tableau, &mut self.motion),
+            Past::Increments(_) | Past::Trail(_) => false,
+        };
+        if !is_guessed {
+            workspace.prepare(at);
+            workspace.ballistic(model, settings, state);
+            let (velocities, forces) = self.motion.split_at_mut(self.stages.len() * d.dynamic);
+            for velocities in velocities.chunks_exact_mut(d.dynamic.max(1)) {
+                let pairs = velocities.iter_mut().zip(&workspace.increment);
+                pairs.for_each(|(v, x)| *v = x / h);
+            }
+            forces.fill(0.0);
+        }
+        let Self { stages, tableau, motion, input, .. } = self;
+        let (velocities, forces) = motion.split_at(stages.len() * d.dynamic);
+        for (i, stage) in stages.iter_mut().enumerate() {
+            let length = h * tableau.weights[i];
+            let range = i * d.dynamic..(i + 1) * d.dynamic;
+            let increments = stage.increment.iter_mut().zip(&velocities[range.clone()]);
+            increments.for_each(|(y, v)| *y = length * v);
+            let impulses = stage.impulse.iter_mut().zip(&forces[range]);
+            impulses.for_each(|(p, force)| *p = length * force);
+            stage.inputs.copy_from_slice(&u[..d.inputs]);
+            model.add_input_signals(start_s + tableau.nodes[i] * h, &mut stage.inputs);
+            if !model.signals.is_empty() {
+                input.copy_from_slice(u);
+                input[..d.inputs].copy_from_slice(&stage.inputs);
+                model.check_input(input)?;
+            }
+        }
+        self.base.q.copy_from_slice(&state.q);
+        self.base.p.copy_from_slice(&state.p);
+        Ok(())
+    }
+
+    /// Evaluates a stage; returns the size of its residual, which is left in the workspace, in units of
+    /// round-off.
+    fn evaluate(&mut self, workspace: &mut Workspace, at: At<'_>, i: usize) -> f64 {
+        let At { model, state, u, .. } = at;
+        let d = model.dimensions;
+        let Self { tableau, stages, base, input, .. } = self;
+        base.q_low.copy_from_slice(&state.q_low);
+        base.p_low.copy_from_slice(&state.p_low);
+        let coupling = &tableau.coupling[i * stages.len()..][..stages.len()];
+        let others = stages.iter().zip(coupling).enumerate().filter(|(j, _)| *j != i);
+        for (_, (stage, weight)) in others {
+            for k in 0..d.dynamic {
+                base.q_low[k] += weight * stage.increment[k];
+                base.p_low[k] += weight * stage.impulse[k];
+            }
+        }
+        let (node, half) = (tableau.nodes[i], 0.5 * tableau.weights[i]);
+        for k in 0..d.prescribed {
+            let (start, way) = (state.q[d.dynamic + k], u[d.inputs + k] - state.q[d.dynamic + k]);
+            base.q[d.dynamic + k] = start + (node - half) * way;
+            input[d.inputs + k] = start + (node + half) * way;
+        }
+        input[..d.inputs].copy_from_slice(&stages[i].inputs);
+        let settings = stage_settings(at.settings, tableau.weights[i]);
+        if d.input() > 0 {
+            workspace.prepare(At { model, settings: &settings, state: base, u: input });
+        }
+        workspace.increment.copy_from_slice(&stages[i].increment);
+        let size = workspace.evaluate(model, &settings, base);
+        let stage = &mut stages[i];
+        for (k, impulse) in stage.impulse.iter_mut().enumerate() {
+            *impulse = settings.time_step_s * (workspace.l_q[k] + workspace.force[k]);
+        }
+        stage.q.copy_from_slice(&workspace.q_mid);
+        stage.velocity.copy_from_slice(&workspace.velocity);
+        size
+    }
+
+    /// Corrects stage after stage until all are solved; `None` if that takes too long.
+    fn sweep(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+    ) -> Result<Option<StepReport>, StepError> {
+        let At { model, settings, .. } = at;
+        let enough = settings.precision.residual();
+        let mut report = StepReport::default();
+        let mut previous = f64::INFINITY;
+        let mut slow = 0;
+        while report.iterations < settings.max_iterations {
+            report.iterations += 1;
+            let mut size: f64 = 0.0;
+            for i in 0..self.stages.len() {
+                let residual = self.evaluate(workspace, at, i);
+                if !residual.is_finite() {
+                    return Ok(None);
+                }
+                size = size.max(residual);
+                if report.iterations == 1 {
+                    let settings = stage_settings(settings, self.tableau.weights[i]);
+                    workspace.factor_generators(model, &settings)?;
+                    std::mem::swap(&mut workspace.factors, &mut self.stages[i].factors);
+                    report.factorizations += 1;
+                }
+                let stage = &mut self.stages[i];
+                stage.factors.solve(model, &mut workspace.residual);
+                for (y, correction) in stage.increment.iter_mut().zip(&workspace.residual) {
+                    *y -= correction;
+                }
+            }
+            report.residual = size;
+            let stagnates = size > SLOW * previous;
+            if report.iterations > 1 && (size <= enough || (stagnates && size <= CHORD_FLOOR)) {
+                return Ok(Some(report));
+            }
+            slow = if stagnates { slow + 1 } else { 0 };
+            if slow == 3 {
+                return Ok(None);
+            }
+            previous = size;
+        }
+        Ok(None)
+    }
+
+    /// Newton's method on all stages at once.
+    fn correct_all(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+    ) -> Result<StepReport, StepError> {
+        let At { model, settings, .. } = at;
+        let mut report = StepReport::default();
+        let mut previous = f64::INFINITY;
+        let nd = model.dimensions.dynamic;
+        for iteration in 1..=settings.max_iterations {
+            report.iterations = iteration;
+            // Stages depend on the impulses of others, which are known after a first round alone.
+            for i in 0..self.stages.len() {
+                self.evaluate(workspace, at, i);
+            }
+            let mut size: f64 = 0.0;
+            let mut system = self.take_system(model);
+            for i in 0..self.stages.len() {
+                let residual = self.evaluate(workspace, at, i);
+                if !residual.is_finite() {
+                    return Err(StepError::NotFinite { iterations: iteration });
+                }
+                size = size.max(residual);
+                system.residual[i * nd..][..nd].copy_from_slice(&workspace.residual);
+            }
+            let converged =
+                size <= settings.precision.residual() || (size > SLOW * previous && size <= FLOOR);
+            self.fill_system(model, settings, &mut system);
+            system.matrix.factor();
+            report.factorizations += 1;
+            if system.matrix.deficiency() > 0 {
+                self.system = Some(system);
+                return Err(StepError::NotConverged { iterations: iteration, residual: size });
+            }
+            system.matrix.solve(&mut system.residual);
+            for (stage, correction) in
+                self.stages.iter_mut().zip(system.residual.chunks_exact(nd.max(1)))
+            {
+                stage.increment.iter_mut().zip(correction).for_each(|(y, c)| *y -= c);
+            }
+            self.system = Some(system);
+            report.residual = size;
+            if converged {
+                return Ok(report);
+            }
+            previous = size;
+        }
+        Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
+    }
+
+    /// Checks the solution and sums it up in the workspace.
+    fn finish(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        mut report: StepReport,
+    ) -> Result<StepReport, StepError> {
+        let At { model, settings, .. } = at;
+        workspace.prepare(at);
+        workspace.increment.fill(0.0);
+        workspace.impulse.fill(0.0);
+        let (count, stages) = (model.dimensions.dynamic, self.stages.len());
+        for (i, stage) in self.stages.iter().enumerate() {
+            model.check_turns(&stage.increment)?;
+            let rate = 1.0 / (settings.time_step_s * self.tableau.weights[i]);
+            for k in 0..count {
+                workspace.increment[k] += stage.increment[k];
+                workspace.impulse[k] += stage.impulse[k];
+                self.motion[i * count + k] = rate * stage.increment[k];
+                self.motion[(stages + i) * count + k] = rate * stage.impulse[k];
+            }
+        }
+        workspace.estimates.write(&mut report);
+        Ok(report)
+    }
+
+    /// Room for all stages at once, made when it is first needed.
+    fn take_system(&mut self, model: &Model) -> Box<System> {
+        let count = self.stages.len();
+        let unknowns = count * model.dimensions.dynamic;
+        let d = model.dimensions;
+        let columns = padded(2 * d.coordinates() + d.inputs);
+        self.system.take().unwrap_or_else(|| {
+            Box::new(System {
+                blocks: (0..count).map(|_| Blocks::new(model)).collect(),
+                matrix: PivotedLu::new(&vec![1.0; unknowns], columns),
+                residual: vec![0.0; unknowns],
+            })
+        })
+    }
+
+    /// Derivatives of the residuals `R_i = p + Σ μ_ij P_j − L_v,i` by all `Y`, at the last evaluation:
+    ///
+    /// ```text
+    /// ∂R_i/∂Y_k = Σ_j μ_ij h_j (L_qq + f_q)_j μ_jk + μ_ik (L_qv + f_v)_k − μ_ik (L_vq)_i − δ_ik (L_vv)_i / h_i
+    /// ```
+    fn fill_system(&self, model: &Model, settings: &Settings, system: &mut System) {
+        let (count, nd) = (self.stages.len(), model.dimensions.dynamic);
+        let n = model.dimensions.coordinates();
+        let order = count * nd;
+        for (stage, blocks) in self.stages.iter().zip(&mut system.blocks) {
+            blocks.evaluate(model, (&stage.q, &[]), &stage.velocity, &stage.inputs);
+        }
+        let coupling = |i: usize, j: usize| self.tableau.coupling[i * count + j];
+        let length = |i: usize| settings.time_step_s * self.tableau.weights[i];
+        let System { blocks, matrix, .. } = system;
+        for i in 0..count {
+            for k in 0..count {
+                for a in 0..nd {
+                    let target = &mut matrix.matrix[(i * nd + a) * order + k * nd..][..nd];
+                    target.fill(0.0);
+                    let row = a * n..a * n + nd;
+                    for (j, stage) in blocks.iter().enumerate() {
+                        let weight = coupling(i, j) * length(j) * coupling(j, k);
+                        let entries = stage.l_qq[row.clone()].iter().zip(&stage.f_q[row.clone()]);
+                        target
+                            .iter_mut()
+                            .zip(entries)
+                            .for_each(|(t, (l, f))| *t += weight * (l + f));
+                    }
+                    let weight = coupling(i, k);
+                    let entries = blocks[k].l_qv[row.clone()].iter().zip(&blocks[k].f_v[row]);
+                    target.iter_mut().zip(entries).for_each(|(t, (l, f))| *t += weight * (l + f));
+                    for (b, target) in target.iter_mut().enumerate() {
+                        *target -= weight * blocks[i].l_qv[b * n + a];
+                        if i == k {
+                            *target -= blocks[i].l_vv[a * n + b] / length(i);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The settings of the midpoint rule of a stage.
+fn stage_settings(settings: &Settings, weight: f64) -> Settings {
+    Settings { time_step_s: weight * settings.time_step_s, ..*settings }
+}

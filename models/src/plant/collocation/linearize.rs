@@ -1,0 +1,140 @@
+//! The exact linearization of a step of collocation, from all stages at once.
+//!
+//! With the residuals `R_i` and impulses `P_i` of the stages, and `θ = (q, p, inputs, k)`,
+//!
+//! ```text
+//! Y' = −(∂R/∂Y)⁻¹ R_θ        x' = Σ Y_i'        p[k+1]' = p' + Σ P_i,θ + (Σ ∂P_i/∂Y) Y'
+//! ```
+//!
+//! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
+
+use super::Collocation;
+use crate::plant::linearize::Linearization;
+use crate::plant::newton::At;
+use crate::plant::pivoted_lu::PivotedLu;
+use crate::plant::rows::{Term, add_rows, padded};
+
+/// The stages of a linearized step: what its second derivatives need.
+#[derive(Clone, Debug)]
+pub(crate) struct StageTangents {
+    pub(crate) time_step_s: f64,
+    pub(crate) nodes: Vec<f64>,
+    pub(crate) weights: Vec<f64>,
+    pub(crate) coupling: Vec<f64>,
+    /// `Q_i`, `V_i` and inputs, stage by stage.
+    pub(crate) q: Vec<f64>,
+    pub(crate) velocity: Vec<f64>,
+    pub(crate) inputs: Vec<f64>,
+    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `s n` padded rows.
+    pub(crate) tangent: Vec<f64>,
+    /// `∂P_i/∂θ`, row-major, `s n` rows.
+    impulses: Vec<f64>,
+    /// `Σ ∂P_i/∂Y`, row-major, n by `s n`.
+    pub(crate) slopes: Vec<f64>,
+    /// The factors of `∂R/∂Y`.
+    pub(crate) matrix: PivotedLu,
+    terms: Vec<Term>,
+}
+
+impl Collocation {
+    /// Linearizes at the solution.
+    pub(crate) fn linearize(&mut self, at: At<'_>, out: &mut Linearization) {
+        let model = at.model;
+        let d = model.dimensions;
+        let (count, n, nd) = (self.stages.len(), d.coordinates(), d.dynamic);
+        let h = at.settings.time_step_s;
+        let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
+        let stride = padded((next + d.prescribed).max(1));
+        let mut system = self.take_system(model);
+        self.fill_system(model, at.settings, &mut system);
+        system.matrix.factor();
+        let mut tangents = out.take_stages().unwrap_or_else(|| {
+            Box::new(StageTangents {
+                time_step_s: h,
+                nodes: self.tableau.nodes.clone(),
+                weights: self.tableau.weights.clone(),
+                coupling: self.tableau.coupling.clone(),
+                q: vec![0.0; count * n],
+                velocity: vec![0.0; count * n],
+                inputs: vec![0.0; count * d.inputs],
+                tangent: vec![0.0; count * nd * stride],
+                impulses: vec![0.0; count * nd * stride],
+                slopes: vec![0.0; nd * count * nd],
+                matrix: PivotedLu::new(&vec![1.0; count * nd], 1),
+                terms: Vec::new(),
+            })
+        });
+        let StageTangents { coupling, tangent, impulses, slopes, terms, .. } = &mut *tangents;
+        tangent.fill(0.0);
+        impulses.fill(0.0);
+        slopes.fill(0.0);
+        for (j, blocks) in system.blocks.iter().enumerate() {
+            let (weight, node) = (self.tableau.weights[j], self.tableau.nodes[j]);
+            let length = h * weight;
+            for a in 0..nd {
+                let row = &mut impulses[(j * nd + a) * stride..][..stride];
+                let own = &mut tangent[(j * nd + a) * stride..][..stride];
+                for b in 0..n {
+                    let q = length * (blocks.l_qq[a * n + b] + blocks.f_q[a * n + b]);
+                    let v = blocks.l_qv[a * n + b] + blocks.f_v[a * n + b];
+                    let (p_q, p_v) = (blocks.l_qv[b * n + a], blocks.l_vv[a * n + b]);
+                    if b < nd {
+                        row[b] = q;
+                        own[b] = -p_q;
+                        slopes[a * count * nd + j * nd + b] += v;
+                        for k in 0..count {
+                            slopes[a * count * nd + k * nd + b] += q * coupling[j * count + k];
+                        }
+                    } else {
+                        row[b] = (1.0 - node) * q - weight * v;
+                        row[next + b - nd] = node * q + weight * v;
+                        own[b] = p_v / h - (1.0 - node) * p_q;
+                        own[next + b - nd] = -p_v / h - node * p_q;
+                    }
+                }
+                for input in 0..d.inputs {
+                    row[inputs + input] = length * blocks.f_u[a * d.inputs + input];
+                }
+                own[momentum + a] = 1.0;
+            }
+        }
+        for i in 0..count {
+            for a in 0..nd {
+                terms.clear();
+                terms.extend((0..count).map(|j| (coupling[i * count + j], j * nd + a)));
+                let target = &mut tangent[(i * nd + a) * stride..][..stride];
+                add_rows(target, impulses, stride, terms);
+            }
+        }
+        system.matrix.solve_rows(tangent, stride);
+        tangent.iter_mut().for_each(|entry| *entry = -*entry);
+
+        out.begin_collocation(h);
+        let mut row = vec![0.0; stride];
+        for a in 0..nd {
+            row.fill(0.0);
+            terms.clear();
+            terms.extend((0..count).map(|i| (1.0, i * nd + a)));
+            add_rows(&mut row, tangent, stride, terms);
+            out.set_increment_row(a, &row);
+            row.fill(0.0);
+            row[momentum + a] = 1.0;
+            add_rows(&mut row, impulses, stride, terms);
+            terms.clear();
+            let slopes = slopes[a * count * nd..][..count * nd].iter().copied();
+            terms.extend(slopes.zip(0..).filter(|(slope, _)| *slope != 0.0));
+            add_rows(&mut row, tangent, stride, terms);
+            out.set_momentum_row(a, &row);
+        }
+
+        tangents.time_step_s = h;
+        for (i, stage) in self.stages.iter().enumerate() {
+            tangents.q[i * n..][..n].copy_from_slice(&stage.q);
+            tangents.velocity[i * n..][..n].copy_from_slice(&stage.velocity);
+            tangents.inputs[i * d.inputs..][..d.inputs].copy_from_slice(&stage.inputs);
+        }
+        tangents.matrix.take_factors_of(&system.matrix);
+        out.keep_stages(tangents);
+        self.system = Some(system);
+    }
+}

@@ -1,0 +1,350 @@
+//! A control period as a sequence of steps: substeps, compositions, and what is left of a period that had
+//! to be halved.
+//!
+//! The input is held over the period. Prescribed coordinates move at a constant rate, so that the step from
+//! the fraction `c` of the period ends with them at `(1 − c') k0 + c' k1`. The multipliers of a period are
+//! the sums of those of its steps: they stay impulses.
+//!
+//! **Halving.** A period that cannot be solved in one go is solved again in 2, 4, … 64 times as many steps.
+//! The next period begins with as many; after four that went well, half as many are tried. How often a
+//! period was halved is in its report: it is another map then.
+
+use crate::Model;
+use crate::plant::collocation::Collocation;
+use crate::plant::linearize::{Chain, Linearization};
+use crate::plant::newton::{At, Workspace};
+use crate::plant::predictor::Past;
+use crate::plant::scheme::Scheme;
+use crate::plant::{Plant, PreciseState, Settings, StepError, StepReport, two_sum};
+use crate::signal::Target;
+
+/// Periods that must go well before fewer steps are tried.
+const CALM: u8 = 4;
+
+/// What periods need beside the workspace of a step.
+#[derive(Clone, Debug)]
+pub(crate) struct Period {
+    pub(crate) scheme: Scheme,
+    pub(crate) collocation: Option<Box<Collocation>>,
+    /// How far a period of several steps has got.
+    reached: PreciseState,
+    /// Whether the solution is there; else it is in the workspace.
+    is_reached: bool,
+    /// How often the last solution was halved, and whether it was tried with fewer steps.
+    halvings: u8,
+    failed: bool,
+    /// The input of the period, and that of a step.
+    held: Vec<f64>,
+    input: Vec<f64>,
+    /// Multipliers of the steps, summed.
+    multipliers: Vec<f64>,
+    chain: Chain,
+}
+
+impl Period {
+    pub(crate) fn new(model: &Model, scheme: Scheme, state: &PreciseState) -> Self {
+        let input = vec![0.0; model.dimensions.input()];
+        let collocation = match scheme {
+            Scheme::Gauss(stages) => Some(Box::new(Collocation::new(model, stages))),
+            Scheme::Midpoint | Scheme::Composition(_) => None,
+        };
+        Self {
+            scheme,
+            collocation,
+            reached: state.clone(),
+            is_reached: false,
+            halvings: 0,
+            failed: false,
+            held: input.clone(),
+            input,
+            multipliers: vec![0.0; model.dimensions.constraints],
+            chain: Chain::default(),
+        }
+    }
+}
+
+impl StepError {
+    /// Whether shorter steps may succeed.
+    fn may_be_too_long(&self) -> bool {
+        match self {
+            Self::NotConverged { .. }
+            | Self::NotFinite { .. }
+            | Self::TooFast { .. }
+            | Self::Singular { .. }
+            | Self::SingularConstraints { .. } => true,
+            Self::Dimension { .. }
+            | Self::InputNotFinite { .. }
+            | Self::InconsistentConstraints { .. } => false,
+        }
+    }
+}
+
+impl Plant {
+    /// Solves the period, and linearizes it if asked to; stays where it is. The error is that of the
+    /// longest steps.
+    pub(crate) fn solve(
+        &mut self,
+        u: &[f64],
+        mut out: Option<&mut Linearization>,
+    ) -> Result<StepReport, StepError> {
+        self.model.check_input(u)?;
+        if let Some(out) = &out {
+            out.assert_model(&self.model);
+        }
+        self.hold(u)?;
+        let PreciseState { halvings, calm, .. } = self.state;
+        let first = halvings - u8::from(halvings > 0 && calm >= CALM);
+        let most = if self.model.turns_prescribed() { 0 } else { self.settings.halvings as u8 };
+        let mut failure = None;
+        for halvings in first.. {
+            match self.attempt(halvings, out.as_deref_mut()) {
+                Ok(report) => {
+                    self.period.halvings = halvings;
+                    self.period.failed = failure.is_some();
+                    let halvings = u32::from(halvings);
+                    return Ok(StepReport { halvings, steps: report.steps.max(1), ..report });
+                }
+                Err(error) => {
+                    let is_last = halvings >= most || !error.may_be_too_long();
+                    let first = failure.get_or_insert(error);
+                    if is_last {
+                        return Err(first.clone());
+                    }
+                }
+            }
+        }
+        unreachable!("the last attempt returns")
+    }
+
+    /// The input of the period: signals replace prescribed positions, at its end.
+    pub(crate) fn hold(&mut self, u: &[f64]) -> Result<(), StepError> {
+        self.period.held.copy_from_slice(u);
+        if self.model.signals.is_empty() {
+            return Ok(());
+        }
+        let (_, next) = self.period.held.split_at_mut(self.model.dimensions.inputs);
+        let end = self.state.time_after_s(1.0, self.settings.time_step_s);
+        for signal in &self.model.signals {
+            if let Target::Prescribed(k) = signal.target {
+                next[k] = signal.at(end);
+            }
+        }
+        self.model.check_input(&self.period.held)
+    }
+
+    /// Solves the period in so many times two steps.
+    fn attempt(
+        &mut self,
+        halvings: u8,
+        mut out: Option<&mut Linearization>,
+    ) -> Result<StepReport, StepError> {
+        let Self { model, settings, state, workspace, period } = self;
+        let model = &**model;
+        let h = settings.time_step_s;
+        let count = (settings.substeps as usize) << halvings;
+        let scheme = period.scheme;
+        period.is_reached = count * scheme.steps() > 1 || halvings != state.halvings;
+        if !period.is_reached {
+            period.set_input(model, state, h, 0.0, 1.0)?;
+            let at = At { model, settings, state, u: &period.input };
+            return take(workspace, &mut period.collocation, at, state.time_after_s(0.0, h), out);
+        }
+        workspace.forget();
+        period.reached.copy_from(state);
+        if halvings != state.halvings {
+            let ratio = f64::from(i32::from(state.halvings) - i32::from(halvings)).exp2();
+            period.reached.past.stretch(ratio);
+        }
+        period.multipliers.fill(0.0);
+        if let Some(out) = out.as_deref_mut() {
+            period.chain.begin(model, out);
+        }
+        let mut report = StepReport {
+            reciprocal_condition: 1.0,
+            constraint_reciprocal_condition: 1.0,
+            ..StepReport::default()
+        };
+        let mut fraction = 0.0;
+        for substep in 0..count {
+            for part in 0..scheme.steps() {
+                let length = scheme.fraction(part) / count as f64;
+                let is_last = part + 1 == scheme.steps();
+                let end =
+                    if is_last { (substep + 1) as f64 / count as f64 } else { fraction + length };
+                period.set_input(model, state, h, fraction, end)?;
+                let settings = Settings { time_step_s: length * h, ..*settings };
+                let Period { reached, collocation, input, chain, .. } = period;
+                let at = At { model, settings: &settings, state: reached, u: input };
+                let start_s = state.time_after_s(fraction, h);
+                let part_report = match out.as_deref_mut() {
+                    None => take(workspace, collocation, at, start_s, None)?,
+                    Some(out) => {
+                        let part = chain.next_part(model, out, fraction, end);
+                        let report = take(workspace, collocation, at, start_s, Some(part))?;
+                        chain.go_on(out);
+                        report
+                    }
+                };
+                period.advance(model, workspace, settings.time_step_s);
+                report.add(&part_report);
+                fraction = end;
+            }
+        }
+        period.reached.multipliers.copy_from_slice(&period.multipliers);
+        if let Some(out) = out {
+            period.chain.finish(h, out);
+        }
+        Ok(report)
+    }
+
+    /// Moves on to the solution.
+    pub(crate) fn commit(&mut self) {
+        let Self { model, settings, state, workspace, period } = self;
+        let was = state.halvings;
+        if period.is_reached {
+            std::mem::swap(state, &mut period.reached);
+        } else {
+            state.move_on(model, workspace, period.collocation.as_deref(), settings.time_step_s);
+        }
+        let calm = period.halvings == was && !period.failed;
+        state.calm = if calm { state.calm.saturating_add(1).min(CALM) } else { 0 };
+        state.halvings = period.halvings;
+        state.step = state.step.saturating_add(1);
+        workspace.move_on();
+    }
+}
+
+/// Takes a step and linearizes it if asked to; the solution is in the workspace.
+fn take(
+    workspace: &mut Workspace,
+    collocation: &mut Option<Box<Collocation>>,
+    at: At<'_>,
+    start_s: f64,
+    out: Option<&mut Linearization>,
+) -> Result<StepReport, StepError> {
+    let Some(collocation) = collocation else {
+        let mut report = workspace.solve(at)?;
+        if let Some(out) = out {
+            workspace.linearize(at, out)?;
+            workspace.estimates.write(&mut report);
+        }
+        return Ok(report);
+    };
+    let report = collocation.solve(workspace, at, start_s)?;
+    if let Some(out) = out {
+        collocation.linearize(at, out);
+    }
+    Ok(report)
+}
+
+impl Period {
+    /// The input of the period as that of one step.
+    pub(crate) fn set_whole_input(
+        &mut self,
+        model: &Model,
+        start: &PreciseState,
+        h: f64,
+    ) -> Result<(), StepError> {
+        self.set_input(model, start, h, 0.0, 1.0)
+    }
+
+    pub(crate) fn known_input(&self) -> &[f64] {
+        &self.input
+    }
+
+    /// The input of the step between two fractions of the period, from a state at its start.
+    fn set_input(
+        &mut self,
+        model: &Model,
+        start: &PreciseState,
+        h: f64,
+        from: f64,
+        to: f64,
+    ) -> Result<(), StepError> {
+        let (inputs, next) = self.input.split_at_mut(model.dimensions.inputs);
+        let (held, end) = self.held.split_at(inputs.len());
+        inputs.copy_from_slice(held);
+        if self.collocation.is_none() {
+            model.add_input_signals(start.time_after_s(0.5 * (from + to), h), inputs);
+        }
+        let begin = &start.q[model.dimensions.dynamic..];
+        for ((next, begin), end) in next.iter_mut().zip(begin).zip(end) {
+            *next = if to == 1.0 { *end } else { begin + to * (end - begin) };
+        }
+        if model.signals.is_empty() { Ok(()) } else { model.check_input(&self.input) }
+    }
+
+    /// Moves on to the solution of a step of length `h`.
+    fn advance(&mut self, model: &Model, workspace: &mut Workspace, h: f64) {
+        self.reached.move_on(model, workspace, self.collocation.as_deref(), h);
+        for (sum, impulse) in self.multipliers.iter_mut().zip(&workspace.multipliers) {
+            *sum += impulse;
+        }
+        workspace.move_on();
+    }
+}
+
+impl PreciseState {
+    /// Time after so many more steps of length `h`, s.
+    pub(crate) fn time_after_s(&self, steps: f64, h: f64) -> f64 {
+        self.time_origin_s + (self.step as f64 + steps) * h
+    }
+
+    /// Adds the solution in the workspace.
+    fn move_on(
+        &mut self,
+        model: &Model,
+        workspace: &Workspace,
+        collocation: Option<&Collocation>,
+        h: f64,
+    ) {
+        let nd = model.dimensions.dynamic;
+        for i in 0..nd {
+            let (q, low) = two_sum(self.q[i], workspace.increment[i] + self.q_low[i]);
+            (self.q[i], self.q_low[i]) = (q, low);
+            let (p, low) = two_sum(self.p[i], workspace.impulse[i] + self.p_low[i]);
+            (self.p[i], self.p_low[i]) = (p, low);
+        }
+        self.q[nd..].copy_from_slice(&workspace.q_end[nd..]);
+        if !model.orientations.is_empty() {
+            workspace.turn(model, self);
+        }
+        self.v.copy_from_slice(&workspace.velocity[nd..]);
+        self.multipliers.copy_from_slice(&workspace.multipliers);
+        match (&mut self.past, collocation) {
+            (Past::Stages(past), Some(collocation)) => past.record(collocation.motion()),
+            (past, _) => past.record(h, &workspace.increment, &model.conditioning.inertia),
+        }
+    }
+}
+
+impl StepReport {
+    /// Adds a step of a period.
+    fn add(&mut self, step: &Self) {
+        self.iterations += step.iterations;
+        self.factorizations += step.factorizations;
+        self.residual = self.residual.max(step.residual);
+        self.constraint_residual = self.constraint_residual.max(step.constraint_residual);
+        self.reciprocal_condition = self.reciprocal_condition.min(step.reciprocal_condition);
+        self.constraint_reciprocal_condition =
+            self.constraint_reciprocal_condition.min(step.constraint_reciprocal_condition);
+        self.redundant_constraints = self.redundant_constraints.max(step.redundant_constraints);
+        self.steps += 1;
+    }
+}
+
+impl Model {
+    /// Adds what signals give to inputs at a time.
+    pub(crate) fn add_input_signals(&self, time_s: f64, inputs: &mut [f64]) {
+        for signal in &self.signals {
+            if let Target::Input(i) = signal.target {
+                inputs[i] += signal.at(time_s);
+            }
+        }
+    }
+
+    /// Whether ball joints are prescribed: they turn in one step.
+    pub(crate) fn turns_prescribed(&self) -> bool {
+        self.orientations.iter().any(|i| *i >= self.dimensions.dynamic)
+    }
+}
