@@ -19,6 +19,7 @@
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
 //! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
+//! | FAILED_PRECONDITION | `TOO_MANY_STEPS` | PreconditionFailure | second derivatives of a period of so many substeps take too much memory |
 //! | FAILED_PRECONDITION | `NOT_AN_EQUILIBRIUM` | PreconditionFailure; metadata `drift`, `coordinate` | the point of an infinite-horizon regulator moves |
 //! | FAILED_PRECONDITION | `NOT_STABILISABLE`, `NOT_DETECTABLE`, `NOT_CONVEX`, `RICCATI_NOT_CONVERGED`, `RICCATI_OVERFLOW`, `EIGENVALUES_NOT_FOUND` | PreconditionFailure | there is no such regulator |
 //! | FAILED_PRECONDITION | `NOT_EXCITED` | PreconditionFailure | a filter would stop listening: no process noise reaches a mode that does not decay |
@@ -295,7 +296,10 @@ impl Fault {
                     .with("constraint", constraint)
             }
             InitialError::Settle(error) => Self::from_settle(error, field),
-            InitialError::Settings { name, .. } => Self::field(format!("settings.{name}"), message),
+            InitialError::Settings { name, .. } | InitialError::OutOfRange { name, .. } => {
+                Self::field(format!("settings.{name}"), message)
+            }
+            InitialError::Order { .. } => Self::field("settings.order", message),
         }
     }
 }
@@ -341,6 +345,7 @@ pub fn step_error_reason(error: &StepError) -> &'static str {
         StepError::Singular { .. } => "SINGULAR",
         StepError::SingularConstraints { .. } => "SINGULAR_CONSTRAINTS",
         StepError::InconsistentConstraints { .. } => "INCONSISTENT_CONSTRAINTS",
+        StepError::TooManySteps { .. } => "TOO_MANY_STEPS",
     }
 }
 
@@ -356,6 +361,7 @@ impl From<StepError> for Fault {
             StepError::NotConverged { .. }
             | StepError::NotFinite { .. }
             | StepError::TooFast { .. }
+            | StepError::TooManySteps { .. }
             | StepError::Singular { .. } => Self::precondition(reason, "step", message),
             StepError::SingularConstraints { constraints, .. }
             | StepError::InconsistentConstraints { constraints, .. } => {
@@ -502,6 +508,7 @@ impl From<ReferenceError> for Fault {
         let message = error.to_string();
         match error {
             ReferenceError::Dimension { what, .. } => Self::field(what, message),
+            ReferenceError::Method => Self::field("settings.order", message),
             ReferenceError::TooShort { .. } => Self::field("q", message),
             ReferenceError::NotFinite { what, .. } => Self::field(what, message),
             ReferenceError::Linearization { step, ref error }

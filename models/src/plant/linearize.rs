@@ -64,8 +64,9 @@ pub(crate) enum Kind {
 #[derive(Clone, Debug)]
 pub struct Linearization {
     kind: Kind,
-    /// The steps of a period, at least as many as it has.
+    /// The steps of a period, as many as are kept, and others of periods before.
     parts: Vec<Part>,
+    parts_max: usize,
     /// `x'`, `λ'` and `p[k+1]'` by the inputs, row-major, 2 nd + nc rows of ni; for collocation and
     /// periods.
     driven: Vec<f64>,
@@ -164,6 +165,7 @@ impl Linearization {
         Self {
             kind: Kind::Step,
             parts: Vec::new(),
+            parts_max: 0,
             driven: Vec::new(),
             stages: None,
             nd: d.dynamic,
@@ -204,10 +206,17 @@ impl Linearization {
     }
 
     /// The steps of a period of several; none if it is one step.
-    pub(crate) fn parts(&self) -> Option<&[Part]> {
+    ///
+    /// # Errors
+    ///
+    /// [`StepError::TooManySteps`] if they are not kept.
+    pub(crate) fn parts(&self) -> Result<Option<&[Part]>, StepError> {
         match self.kind {
-            Kind::Period { steps } => Some(&self.parts[..steps]),
-            Kind::Step | Kind::Collocation => None,
+            Kind::Period { steps } if steps > self.parts_max => {
+                Err(StepError::TooManySteps { steps })
+            }
+            Kind::Period { steps } => Ok(Some(&self.parts[..steps])),
+            Kind::Step | Kind::Collocation => Ok(None),
         }
     }
 

@@ -178,6 +178,14 @@ pub enum StepError {
         /// The estimate.
         reciprocal_condition: f64,
     },
+    /// Second derivatives of a period of that many steps take too much memory.
+    #[error(
+        "second derivatives of a period of {steps} steps of this model take more than 1 GiB; take fewer substeps"
+    )]
+    TooManySteps {
+        /// Steps of the period.
+        steps: usize,
+    },
     /// Constraints that depend on each other contradict each other.
     #[error(
         "the constraints {} contradict each other: the best configuration violates them by {violation:e}",

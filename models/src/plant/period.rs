@@ -15,6 +15,7 @@ use crate::plant::linearize::{Chain, Linearization};
 use crate::plant::newton::{At, Workspace};
 use crate::plant::predictor::Past;
 use crate::plant::scheme::Scheme;
+use crate::plant::settings::STEPS_MAX;
 use crate::plant::{Plant, PreciseState, Settings, StepError, StepReport, two_sum};
 use crate::signal::Target;
 
@@ -74,6 +75,7 @@ impl StepError {
             | Self::SingularConstraints { .. } => true,
             Self::Dimension { .. }
             | Self::InputNotFinite { .. }
+            | Self::TooManySteps { .. }
             | Self::InconsistentConstraints { .. } => false,
         }
     }
@@ -94,7 +96,7 @@ impl Plant {
         self.hold(u)?;
         let PreciseState { halvings, calm, .. } = self.state;
         let first = halvings - u8::from(halvings > 0 && calm >= CALM);
-        let most = if self.model.turns_prescribed() { 0 } else { self.settings.halvings as u8 };
+        let most = self.most_halvings();
         let mut failure = None;
         for halvings in first.. {
             match self.attempt(halvings, out.as_deref_mut()) {
@@ -114,6 +116,16 @@ impl Plant {
             }
         }
         unreachable!("the last attempt returns")
+    }
+
+    /// How often a period may be halved.
+    fn most_halvings(&self) -> u8 {
+        if self.model.turns_prescribed() {
+            return 0;
+        }
+        let steps = self.settings.substeps as usize * self.period.scheme.steps();
+        let fits = |halvings: &u32| steps << halvings <= STEPS_MAX;
+        (0..=self.settings.halvings).rev().find(fits).unwrap_or_default() as u8
     }
 
     /// The input of the period: signals replace prescribed positions, at its end.

@@ -5,9 +5,11 @@ use crate::plant::InitialError;
 use crate::plant::scheme::Scheme;
 
 /// Most substeps in a control period.
-pub const SUBSTEPS_MAX: u32 = 1000;
+pub const SUBSTEPS_MAX: u32 = 256;
 /// Most often that a period is halved.
 pub const HALVINGS_MAX: u32 = 6;
+/// Most steps of any length in a period; it is not halved beyond that.
+pub(crate) const STEPS_MAX: usize = 8192;
 
 /// How a plant is stepped.
 #[derive(Clone, Copy, Debug, PartialEq)]

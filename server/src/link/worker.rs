@@ -316,6 +316,8 @@ impl Failure {
             StepError::NotConverged { iterations, residual } => {
                 Self { report: solver(iterations, residual), ..Self::new(Code::NotConverged) }
             }
+            // Of second derivatives, which the link does not have.
+            StepError::TooManySteps { .. } => Self::new(Code::NotConverged),
             StepError::NotFinite { iterations } => {
                 Self { report: solver(iterations, 0.0), ..Self::new(Code::NotFinite) }
             }

@@ -13,6 +13,9 @@ use super::{InputImpulse, Kind, Linearization};
 use crate::Model;
 use crate::plant::rows::{Term, add_rows, padded};
 
+/// Numbers that the steps of a period may take: 1 GiB.
+const NUMBERS_MAX: usize = 1 << 27;
+
 /// A step of a period: its own derivatives, and the tangent of where it begins.
 #[derive(Clone, Debug)]
 pub(crate) struct Part {
@@ -48,7 +51,8 @@ impl Chain {
             self.tangent[row * self.stride + row] = 1.0;
         }
         out.kind = Kind::Period { steps: 0 };
-        out.time_step_s = 0.0;
+        let numbers = 3 * self.tangent.len() + 2 * out.nd * out.stride;
+        out.parts_max = (NUMBERS_MAX / numbers.max(1)).max(1);
     }
 
     /// Room for the derivatives of the next step, which goes from one fraction of the period to another.
@@ -60,7 +64,8 @@ impl Chain {
         to: f64,
     ) -> &'a mut Linearization {
         let Kind::Period { steps } = &mut out.kind else { return out };
-        let at = *steps;
+        // Steps that are too many to be kept share a place.
+        let at = if *steps < out.parts_max { *steps } else { 0 };
         *steps += 1;
         let (nd, nk, last) = (out.nd, out.nk, out.next_columns() + out.ni);
         for k in 0..nk {
@@ -83,7 +88,8 @@ impl Chain {
     /// Goes over the step whose derivatives stand in the last part.
     pub(crate) fn go_on(&mut self, out: &Linearization) {
         let Kind::Period { steps } = out.kind else { return };
-        let Some(step) = steps.checked_sub(1).map(|last| &out.parts[last].step) else { return };
+        let Some(last) = steps.checked_sub(1) else { return };
+        let step = &out.parts[if last < out.parts_max { last } else { 0 }].step;
         let (nd, nk, ni, stride) = (out.nd, out.nk, out.ni, self.stride);
         let (n, inputs) = (nd + nk, out.next_columns());
         let Self { tangent, next, multipliers, terms, .. } = self;

@@ -188,7 +188,7 @@ impl Contraction {
         weights_x: &[f64],
         weights_multipliers: &[f64],
     ) -> Result<(), StepError> {
-        match first.parts() {
+        match first.parts()? {
             Some(parts) => self.contract_period(model, parts, weights_x, weights_multipliers),
             None => self.contract_step(model, first, weights_x, weights_multipliers),
         }
