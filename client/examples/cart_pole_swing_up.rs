@@ -70,12 +70,13 @@ async fn main() -> plantd_client::Result<()> {
         ..Default::default()
     };
     client.set_feedback(feedback(Reference::Trajectory(trajectory))).await?;
-    let law = client.follow_gains(&plant.id).await?;
+    let mut law = client.follow_gains(&plant.id).await?;
     let mut driver = client.drive(&plant.id).await?;
     let mut state = plant.state.clone().unwrap_or_default();
     for k in 0..STEPS + 500 {
         if k == STEPS {
             client.set_feedback(feedback(Reference::Point(operating_point("upright")))).await?;
+            law = client.follow_gains(&plant.id).await?;
         }
         state = driver.step(&law.input(&state).await?).await?.state.unwrap_or_default();
     }

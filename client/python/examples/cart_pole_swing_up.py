@@ -31,14 +31,16 @@ with plantd.connect(address) as client:
     best = search.result
 
     client.set_feedback(plant.id, trajectory=best.trajectory, **weights)
-    with client.drive(plant.id) as driver, client.follow_gains(plant.id) as law:
+    with client.drive(plant.id) as driver:
         state = driver.plant.state
-        for _ in range(steps):
-            state = driver.step(law(state))
+        with client.follow_gains(plant.id) as law:
+            for _ in range(steps):
+                state = driver.step(law(state))
         print(f"up to {state.q[1] - math.pi:+.1e} rad")
         client.set_feedback(plant.id, at="upright", **weights)
-        for _ in range(500):
-            state = driver.step(law(state))
+        with client.follow_gains(plant.id) as law:
+            for _ in range(500):
+                state = driver.step(law(state))
     client.delete_plant(plant.id)
 off = np.abs(state.x - upright[0]).max()
 print(f"largest force {np.abs(best.u).max():.3f} N; off upright by {off:.1e} after 9 s")
