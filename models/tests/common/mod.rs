@@ -2,11 +2,14 @@
 #![allow(dead_code, reason = "each test program uses some of it")]
 
 pub(crate) mod linearization;
+mod numbers;
 pub(crate) mod oracle;
+pub(crate) mod random_scene;
 
 use std::f64::consts::PI;
 use std::sync::Arc;
 
+pub(crate) use numbers::Numbers;
 use plantd_models::scene::{
     Body, Component, Coordinate, CoordinateKind, Force, Frame, Input, Joint, Point, Rotation,
     Scene, Spring,
@@ -98,34 +101,6 @@ pub(crate) fn slope(delta: f64, mut along: impl FnMut(f64) -> Vec<f64>) -> Vec<f
         sum.iter_mut().zip(values).for_each(|(s, x)| *s += weight / delta * x);
     }
     sum
-}
-
-/// Numbers that look random, the same on every run (SplitMix64).
-pub(crate) struct Numbers(u64);
-
-impl Numbers {
-    /// The sequence of a seed.
-    pub(crate) fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
-    }
-    /// Between `low` and `high`.
-    pub(crate) fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * ((self.next() >> 11) as f64 / (1_u64 << 53) as f64)
-    }
-    /// Less than `n`.
-    pub(crate) fn below(&mut self, n: usize) -> usize {
-        (self.next() % n as u64) as usize
-    }
-    fn vector(&mut self, size: f64) -> [f64; 3] {
-        [0; 3].map(|_| self.between(-size, size))
-    }
 }
 
 /// A tree of random shape: oblique hinges and slides, full inertia tensors, springs along and across
