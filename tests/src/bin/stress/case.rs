@@ -66,6 +66,8 @@ pub(crate) struct Finding {
     pub(crate) text: String,
     failed: bool,
     pub(crate) lines: Vec<Line>,
+    /// Order and substeps, where they are not 2 and 1.
+    pub(crate) method: Option<(u32, u32)>,
     /// Largest error of a linearization, and what differences resolve there; relative.
     pub(crate) derivatives: Option<derivatives::Error>,
 }

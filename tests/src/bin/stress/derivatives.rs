@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::{Initial, Linearization, Plant, State};
 
@@ -64,11 +64,13 @@ struct Map {
     u: Vec<f64>,
     /// Where the step ends, with the next prescribed positions.
     end: Vec<f64>,
+    /// How often the period was halved: another number makes another map.
+    halvings: u32,
 }
 
 impl Map {
     /// Where the step ends after a displacement: `(q, p, λ)`, `q` beyond the end of the step in question.
-    /// None where there is no such step.
+    /// None where there is no such step of the same map.
     fn at(&mut self, direction: &Direction, s: f64) -> Option<DVector<f64>> {
         let model = self.plant.model().clone();
         let d = model.dimensions();
@@ -84,10 +86,30 @@ impl Map {
         let forces = self.u[..d.inputs].iter().zip(&direction.forces).map(|(u, x)| u + s * x);
         let end = model.retract(&self.end, &scaled(&direction.next));
         let u: Vec<f64> = forces.chain(end[d.dynamic..].iter().copied()).collect();
-        self.plant.step(&u).ok()?;
+        let report = self.plant.step(&u).ok()?;
+        if report.halvings != self.halvings {
+            return None;
+        }
         let q = model.difference(&self.end, self.plant.q());
         let rows = [&q[..d.dynamic], self.plant.p(), self.plant.multipliers()].concat();
         Some(DVector::from_vec(rows))
+    }
+}
+
+impl Map {
+    /// How results scatter about a line over displacements that are too small to matter otherwise.
+    fn scatter(&mut self, direction: &Direction, slope: &DVector<f64>, reach: f64) -> DVector<f64> {
+        const SMALL: f64 = 1e-11;
+        let mut worst = DVector::zeros(slope.len());
+        let Some(middle) = self.at(direction, 0.0) else { return worst };
+        for k in 1..=4 {
+            let s = SMALL * reach * f64::from(k);
+            if let Some(moved) = self.at(direction, s) {
+                let off = (moved - &middle - slope * s).abs();
+                worst = worst.sup(&off);
+            }
+        }
+        worst
     }
 }
 
@@ -100,12 +122,14 @@ pub(crate) fn check(plant: &Plant, u: &[f64], seed: u64) -> Result<Error> {
     let State { q, p, v, .. } = plant.state();
     plant.initialize(&Initial::Momentum { q, p, v })?;
     let x = plant.state();
+    let tangent = tangent(&mut plant);
+    let jacobian = plant.constraint_jacobian();
     let mut out = Linearization::new(&model);
     let report = plant.linearize(u, &mut out)?;
+    ensure!(plant.constraint_jacobian() == jacobian, "linearize changes the constraint Jacobian");
+    let jacobian = jacobian.columns(0, d.dynamic).into_owned();
     let redundant = report.redundant_constraints > 0;
     let condition = report.reciprocal_condition.min(report.constraint_reciprocal_condition);
-    let tangent = tangent(&mut plant);
-    let jacobian = plant.constraint_jacobian().columns(0, d.dynamic).into_owned();
     plant.step(u)?;
     let end = plant.q().to_vec();
     let stack = |x: DMatrix<f64>, multipliers: DMatrix<f64>| {
@@ -130,7 +154,7 @@ pub(crate) fn check(plant: &Plant, u: &[f64], seed: u64) -> Result<Error> {
             SOLVED * f64::EPSILON * (ends[i].abs() + of_state)
         })
         .collect();
-    let mut map = Map { plant, x, u: u.to_vec(), end };
+    let mut map = Map { plant, x, u: u.to_vec(), end, halvings: report.halvings };
     let mut random = Numbers::new(seed);
     let mut worst = Error { found: 0.0, resolved: f64::MIN_POSITIVE, by: "", of: "" };
     for direction in directions(&mut random, &model.dimensions(), &tangent) {
@@ -146,6 +170,7 @@ pub(crate) fn check(plant: &Plant, u: &[f64], seed: u64) -> Result<Error> {
             continue;
         }
         let table = Table::new(REACH / reach, |s| map.at(&direction, s));
+        let scatter = map.scatter(&direction, &predicted, REACH / reach);
         let parts = [
             ("q", 0..d.dynamic),
             ("p", d.dynamic..2 * d.dynamic),
@@ -154,6 +179,7 @@ pub(crate) fn check(plant: &Plant, u: &[f64], seed: u64) -> Result<Error> {
         ];
         for (of, part) in parts.into_iter().filter(|(_, part)| !part.is_empty()) {
             let noise = largest(&rounding[part.clone()]);
+            let noise = noise.max(largest(&scatter.as_slice()[part.clone()]));
             let (slope, estimate) =
                 table.slope(&part, noise).context("no step near the state succeeds")?;
             let own = if of == "λ" { 0.0 } else { dx.amax() };

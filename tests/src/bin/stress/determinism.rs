@@ -5,45 +5,60 @@ use plantd_models::{Linearization, Plant, Scene, Snapshot};
 
 use crate::case::{Case, Setup};
 use crate::numbers::Numbers;
-use crate::plants;
+use crate::plants::{self, Method};
 use crate::random_scene::{self, Kind};
 
 pub(crate) fn cases() -> Vec<Case> {
     let criterion = "bytes of snapshots are equal over two runs, over 4 threads at once, over restores from \
                      bytes into new plants, and with linearizations on the way";
-    ["double-pendulum", "chain-32", "tree-30", "four-bar", "scissor-4", "marionette", "random"]
-        .into_iter()
-        .map(|name| {
-            Case::new(format!("determinism: {name}"), criterion, move |setup, finding| {
-                let steps = setup.pick(1_000, 10_000);
-                for (scene, plain) in scenes(name, setup, steps) {
-                    let threads: Vec<Result<Vec<u8>>> = std::thread::scope(|scope| {
-                        let start = |_| scope.spawn(|| run(&scene, steps, Way::Plain));
-                        let handles: Vec<_> = (0..4).map(start).collect();
-                        let join = |handle: std::thread::ScopedJoinHandle<'_, _>| {
-                            handle.join().unwrap_or_else(|_| Err(anyhow!("panicked")))
-                        };
-                        handles.into_iter().map(join).collect()
-                    });
-                    for end in threads {
-                        finding.must(end? == plain, || "threads differ".to_owned());
-                    }
-                    for way in [Way::Restored, Way::Linearized] {
-                        let end = run(&scene, steps, way)?;
-                        finding.must(end == plain, || format!("{way:?} differs"));
-                    }
-                    if name != "random" {
-                        finding.note(format!("{steps} steps, digest {:016x}", fnv1a(&plain)));
-                    }
+    let method = |order, substeps| Method::new(2e-3, order, substeps);
+    [
+        ("double-pendulum", method(2, 1)),
+        ("chain-32", method(2, 1)),
+        ("tree-30", method(2, 1)),
+        ("four-bar", method(2, 1)),
+        ("scissor-4", method(2, 1)),
+        ("marionette", method(2, 1)),
+        ("random", method(2, 1)),
+        ("chain-8", method(8, 1)),
+        ("tree-7", method(12, 3)),
+        ("four-bar", method(6, 2)),
+        ("marionette", method(4, 1)),
+    ]
+    .into_iter()
+    .map(|(name, method)| {
+        let title = format!("determinism: {name}{}", method.name());
+        Case::new(title, criterion, move |setup, finding| {
+            finding.method = Some((method.order, method.substeps));
+            let steps = setup.pick(1_000, 10_000);
+            for (scene, plain) in scenes(name, method, setup, steps) {
+                let threads: Vec<Result<Vec<u8>>> = std::thread::scope(|scope| {
+                    let start = |_| scope.spawn(|| run(&scene, method, steps, Way::Plain));
+                    let handles: Vec<_> = (0..4).map(start).collect();
+                    let join = |handle: std::thread::ScopedJoinHandle<'_, _>| {
+                        handle.join().unwrap_or_else(|_| Err(anyhow!("panicked")))
+                    };
+                    handles.into_iter().map(join).collect()
+                });
+                for end in threads {
+                    finding.must(end? == plain, || "threads differ".to_owned());
                 }
-                Ok(())
-            })
+                for way in [Way::Restored, Way::Linearized] {
+                    let end = run(&scene, method, steps, way)?;
+                    finding.must(end == plain, || format!("{way:?} differs"));
+                }
+                if name != "random" {
+                    finding.note(format!("{steps} steps, digest {:016x}", fnv1a(&plain)));
+                }
+            }
+            Ok(())
         })
-        .collect()
+    })
+    .collect()
 }
 
 /// Scenes with the bytes at the end of a plain run.
-fn scenes(name: &str, setup: &Setup, steps: u64) -> Vec<(Scene, Vec<u8>)> {
+fn scenes(name: &str, method: Method, setup: &Setup, steps: u64) -> Vec<(Scene, Vec<u8>)> {
     let named = match name {
         "random" => (0..200)
             .filter_map(|i| {
@@ -53,7 +68,7 @@ fn scenes(name: &str, setup: &Setup, steps: u64) -> Vec<(Scene, Vec<u8>)> {
             .collect(),
         _ => vec![plants::scene(name)],
     };
-    let ended = |scene: Scene| run(&scene, steps, Way::Plain).ok().map(|end| (scene, end));
+    let ended = |scene: Scene| run(&scene, method, steps, Way::Plain).ok().map(|end| (scene, end));
     named.into_iter().filter_map(ended).take(setup.pick(5, 50)).collect()
 }
 
@@ -66,9 +81,10 @@ enum Way {
     Linearized,
 }
 
-fn run(scene: &Scene, steps: u64, way: Way) -> Result<Vec<u8>> {
-    let h = scene.time_step_s.min(2e-3);
-    let mut plant = plants::plant(scene, h)?;
+fn run(scene: &Scene, method: Method, steps: u64, way: Way) -> Result<Vec<u8>> {
+    let time_step_s = scene.time_step_s.min(method.time_step_s);
+    let method = Method { time_step_s, ..method };
+    let mut plant = plants::plant(scene, method)?;
     let d = plant.model().dimensions();
     let mut out = Linearization::new(&plant.model().clone());
     let mut random = Numbers::new(7);
@@ -81,7 +97,7 @@ fn run(scene: &Scene, steps: u64, way: Way) -> Result<Vec<u8>> {
         }
         if way == Way::Restored && k % 97 == 13 {
             let bytes = plant.snapshot().to_bytes();
-            plant = plants::plant(scene, h)?;
+            plant = plants::plant(scene, method)?;
             plant.restore(&Snapshot::from_bytes(&bytes)?)?;
         }
         match way {

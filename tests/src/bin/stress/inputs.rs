@@ -2,41 +2,44 @@
 
 use std::f64::consts::PI;
 
-use plantd_models::{Scene, StepError};
+use plantd_models::{HALVINGS_MAX, Scene, StepError};
 
 use crate::case::Case;
 use crate::geometry::Geometry;
 use crate::numbers::Numbers;
-use crate::plants::{self, energy, hold, moving, step};
+use crate::plants::{self, Method, energy, hold, moving, step};
 
 pub(crate) fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
     for torque in [1e2, 1e4, 6e4, 7e4, 1e6, 1e12] {
-        let criterion = "one step of 10 ms from rest solves x/h = ½h(u − g sin ½x) of the pendulum to 8 ε; or \
-                         it is refused, and the solution turns by more than half a turn";
+        let criterion = "a step of 10 ms from rest, in 2ᵐ equal parts where it is halved, solves v = h(u − g sin \
+                         θ)/2 + p of the pendulum in each to 64 ε; or it is refused, and turns by more than \
+                         half a turn in the shortest parts";
         let name = format!("impulsive torque of {torque:e} N m");
         cases.push(Case::new(name, criterion, move |_, finding| {
-            let h = 0.01;
-            let mut plant = moving(&plants::scene("pendulum"), h, &[0.0], &[0.0])?;
-            let before = plant.snapshot().to_bytes();
-            let solution = {
-                let mut x = 0.5 * h * h * torque;
-                (0..100).for_each(|_| x = 0.5 * h * h * (torque - 9.8 * (0.5 * x).sin()));
-                x
-            };
-            match plant.step(&[torque]) {
-                Ok(_) => {
-                    let error = (plant.q()[0] - solution).abs() / solution;
-                    finding.at_most("error", error, 8.0 * f64::EPSILON);
-                    if torque < 1e5 * h {
-                        finding.linearization(&plant, &[torque], 1);
+            for halvings in [0, HALVINGS_MAX] {
+                let method = Method { halvings, ..0.01.into() };
+                let mut plant = moving(&plants::scene("pendulum"), method, &[0.0], &[0.0])?;
+                let before = plant.snapshot().to_bytes();
+                match plant.step(&[torque]) {
+                    Ok(report) => {
+                        let (angle, _) = pushed_pendulum(torque, report.halvings);
+                        let error = (plant.q()[0] - angle).abs() / angle;
+                        finding.at_most(
+                            &format!("error in {} parts", 1 << report.halvings),
+                            error,
+                            64.0 * f64::EPSILON,
+                        );
                     }
-                }
-                Err(error) => {
-                    finding.must(plant.snapshot().to_bytes() == before, || "state changed".into());
-                    let too_fast = matches!(error, StepError::TooFast { .. });
-                    finding.must(too_fast && solution > PI, || format!("turns by {solution:.2}"));
-                    finding.note(format!("refused: {error}"));
+                    Err(error) => {
+                        let same = plant.snapshot().to_bytes() == before;
+                        finding.must(same, || "state changed".to_owned());
+                        let (_, turn) = pushed_pendulum(torque, halvings);
+                        let too_fast = matches!(error, StepError::TooFast { .. });
+                        finding
+                            .must(too_fast && turn > PI, || format!("turns by {turn:.2}: {error}"));
+                        finding.note(format!("refused with {halvings} halvings: {error}"));
+                    }
                 }
             }
             Ok(())
@@ -114,4 +117,20 @@ pub(crate) fn cases() -> Vec<Case> {
         }));
     }
     cases
+}
+
+/// Midpoint steps of the pendulum from rest over 10 ms, in parts: where it ends, and its largest turn in
+/// one of them.
+fn pushed_pendulum(torque: f64, halvings: u32) -> (f64, f64) {
+    let parts = 1 << halvings;
+    let h = 0.01 / f64::from(parts);
+    let (mut q, mut p, mut largest) = (0.0, 0.0, 0.0_f64);
+    for _ in 0..parts {
+        let mut x = h * p;
+        (0..100).for_each(|_| x = h * (p + 0.5 * h * (torque - 9.8 * f64::sin(q + 0.5 * x))));
+        p += h * (torque - 9.8 * f64::sin(q + 0.5 * x));
+        q += x;
+        largest = largest.max(x.abs());
+    }
+    (q, largest)
 }

@@ -7,7 +7,7 @@ use plantd_models::{Linearization, Model, Plant, Scene};
 use crate::case::{Case, Finding, Setup};
 use crate::derivatives;
 use crate::geometry::Geometry;
-use crate::plants::{self, coast, hold, pushed, step};
+use crate::plants::{self, Method, coast, hold, pushed, step};
 use crate::random_scene::{self, Kind};
 
 /// Free-flying bodies, one tumbling on a ball joint of the other.
@@ -56,23 +56,41 @@ pub(crate) fn cases() -> Vec<Case> {
         finding.note(format!("{count} trees, {steps} steps each"));
         Ok(())
     }));
-    let symplectic: [(&str, Make, f64, u64); 8] = [
-        ("pendulum", || Ok(plants::scene("pendulum")), 0.05, 1_000_000),
-        ("double pendulum", || Ok(plants::scene("double-pendulum")), 0.01, 1_000_000),
-        ("spherical pendulum", || Ok(plants::scene("spherical-pendulum")), 0.01, 1_000_000),
-        ("tumbling bodies", tumbling, 0.01, 1_000_000),
-        ("chain of 12 rods", || Ok(plants::scene("chain-12")), 2e-3, 1_000_000),
-        ("four-bar linkage", || Ok(plants::scene("four-bar")), 0.01, 1_000_000),
-        ("scissor of 4", || Ok(plants::scene("scissor-4")), 2e-3, 200_000),
-        ("marionette", || Ok(plants::undamped("marionette")), 5e-3, 100_000),
+    let symplectic: [(&str, Make, Method, u64); 14] = [
+        ("pendulum", || Ok(plants::scene("pendulum")), 0.05.into(), 1_000_000),
+        ("double pendulum", || Ok(plants::scene("double-pendulum")), 0.01.into(), 1_000_000),
+        ("spherical pendulum", || Ok(plants::scene("spherical-pendulum")), 0.01.into(), 1_000_000),
+        ("tumbling bodies", tumbling, 0.01.into(), 1_000_000),
+        ("chain of 12 rods", || Ok(plants::scene("chain-12")), 2e-3.into(), 1_000_000),
+        ("four-bar linkage", || Ok(plants::scene("four-bar")), 0.01.into(), 1_000_000),
+        ("scissor of 4", || Ok(plants::scene("scissor-4")), 2e-3.into(), 200_000),
+        ("marionette", || Ok(plants::undamped("marionette")), 5e-3.into(), 100_000),
+        (
+            "double pendulum",
+            || Ok(plants::scene("double-pendulum")),
+            Method::new(0.02, 4, 1),
+            1_000_000,
+        ),
+        (
+            "double pendulum",
+            || Ok(plants::scene("double-pendulum")),
+            Method::new(0.02, 12, 3),
+            100_000,
+        ),
+        ("tree of 7", || Ok(plants::scene("tree-7")), Method::new(0.01, 6, 1), 100_000),
+        ("tumbling bodies", tumbling, Method::new(0.02, 6, 1), 100_000),
+        ("four-bar linkage", || Ok(plants::scene("four-bar")), Method::new(0.02, 8, 1), 100_000),
+        ("marionette", || Ok(plants::undamped("marionette")), Method::new(0.01, 4, 2), 10_000),
     ];
-    for (name, scene, time_step_s, long) in symplectic {
+    for (name, scene, method, long) in symplectic {
         let criterion = "|Aᵀ J A − J| on the tangent space ≤ 100 ε n |A|², all along the run";
         let run = move |setup: &Setup, finding: &mut Finding| {
-            let steps = setup.pick(10_000.min(long), long);
-            symplectic_form(&scene()?, time_step_s, steps, finding)
+            let steps = setup.pick((long / 100).max(500), long);
+            finding.method = Some((method.order, method.substeps));
+            symplectic_form(&scene()?, method, steps, finding)
         };
-        cases.push(Case::new(format!("symplectic: {name}"), criterion, run));
+        let method = method.name();
+        cases.push(Case::new(format!("symplectic: {name}{method}"), criterion, run));
     }
     let constrained: [(&str, Make, f64); 6] = [
         ("four-bar linkage", || Ok(plants::scene("four-bar")), 0.01),
@@ -146,14 +164,9 @@ fn form(model: &Model, p: &[f64]) -> DMatrix<f64> {
     form
 }
 
-fn symplectic_form(
-    scene: &Scene,
-    time_step_s: f64,
-    steps: u64,
-    finding: &mut Finding,
-) -> Result<()> {
+fn symplectic_form(scene: &Scene, method: Method, steps: u64, finding: &mut Finding) -> Result<()> {
     const SAMPLES: u64 = 50;
-    let mut plant = pushed(scene, time_step_s, 0.5)?;
+    let mut plant = pushed(scene, method, 0.5)?;
     let model = plant.model().clone();
     let (d, n) = (model.dimensions(), model.dimensions().dynamic);
     let rows: Vec<usize> = (0..n).chain(d.coordinates()..d.coordinates() + n).collect();

@@ -17,6 +17,7 @@ mod invariants;
 #[allow(dead_code, reason = "tests of the mechanics use all of it")]
 #[path = "../../../../models/tests/common/numbers.rs"]
 mod numbers;
+mod orders;
 mod parameters;
 mod plants;
 mod random;
@@ -63,6 +64,7 @@ fn main() -> Result<ExitCode> {
     let groups = [
         energy::cases(),
         invariants::cases(),
+        orders::cases(),
         parameters::cases(),
         stiffness::cases(),
         singular::cases(),

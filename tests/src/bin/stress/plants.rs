@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use anyhow::{Context as _, Result, anyhow};
-use plantd_models::{Initial, Model, Plant, Scene, Settings, StepError, StepReport, builtin};
+use plantd_models::{
+    HALVINGS_MAX, Initial, Model, Plant, Scene, Settings, StepError, StepReport, builtin,
+};
 
 use crate::case::Finding;
 
@@ -24,28 +26,68 @@ pub(crate) fn parse(text: &str) -> Result<Scene> {
     Ok(Scene::from_toml(&format!("format = 1\nname = \"stress\"\n{text}"))?)
 }
 
-/// How plants are stepped, unless a case says otherwise.
-pub(crate) fn settings(model: &Model, time_step_s: f64) -> Settings {
-    Settings { time_step_s, ..Settings::new(model) }
+/// How plants are stepped; a time step alone means order 2 in one step, halved where it must be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Method {
+    pub(crate) time_step_s: f64,
+    pub(crate) order: u32,
+    pub(crate) substeps: u32,
+    pub(crate) halvings: u32,
+}
+
+impl From<f64> for Method {
+    fn from(time_step_s: f64) -> Self {
+        Self { time_step_s, order: 2, substeps: 1, halvings: HALVINGS_MAX }
+    }
+}
+
+impl Method {
+    pub(crate) fn new(time_step_s: f64, order: u32, substeps: u32) -> Self {
+        Self { order, substeps, ..time_step_s.into() }
+    }
+
+    /// Order and substeps in a name; nothing for 2 and 1.
+    pub(crate) fn name(self) -> String {
+        match (self.order, self.substeps) {
+            (2, 1) => String::new(),
+            (order, 1) => format!(", order {order}"),
+            (order, substeps) => format!(", order {order} in {substeps} substeps"),
+        }
+    }
+
+    /// Refuses what it cannot do in one go.
+    pub(crate) fn unhalved(self) -> Self {
+        Self { halvings: 0, ..self }
+    }
+
+    pub(crate) fn settings(self, model: &Model) -> Settings {
+        let Self { time_step_s, order, substeps, halvings } = self;
+        Settings { time_step_s, order, substeps, halvings, ..Settings::new(model) }
+    }
 }
 
 /// A plant at the initial configuration of its scene.
-pub(crate) fn plant(scene: &Scene, time_step_s: f64) -> Result<Plant> {
+pub(crate) fn plant(scene: &Scene, method: impl Into<Method>) -> Result<Plant> {
     let model = Arc::new(Model::compile(scene)?);
-    let settings = settings(&model, time_step_s);
+    let settings = method.into().settings(&model);
     Ok(Plant::new(model, settings)?)
 }
 
 /// A plant with a velocity.
-pub(crate) fn moving(scene: &Scene, time_step_s: f64, q: &[f64], v: &[f64]) -> Result<Plant> {
-    let mut plant = plant(scene, time_step_s)?;
+pub(crate) fn moving(
+    scene: &Scene,
+    method: impl Into<Method>,
+    q: &[f64],
+    v: &[f64],
+) -> Result<Plant> {
+    let mut plant = plant(scene, method)?;
     plant.initialize(&Initial::Velocity { q: q.to_vec(), v: v.to_vec() })?;
     Ok(plant)
 }
 
 /// A plant in its initial configuration with unlike velocities.
-pub(crate) fn pushed(scene: &Scene, time_step_s: f64, size: f64) -> Result<Plant> {
-    let mut plant = plant(scene, time_step_s)?;
+pub(crate) fn pushed(scene: &Scene, method: impl Into<Method>, size: f64) -> Result<Plant> {
+    let mut plant = plant(scene, method)?;
     let d = plant.model().dimensions();
     let q = plant.q().to_vec();
     let speed = |i: usize| if i < d.dynamic { size * (1.0 + i as f64).sin() } else { 0.0 };

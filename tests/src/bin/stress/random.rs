@@ -4,12 +4,12 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use anyhow::Result;
-use plantd_models::{Initial, Model, Plant, Scene, State, StepError};
+use plantd_models::{Initial, Model, Plant, Scene, Settings, State, StepError};
 
 use crate::case::{Case, Finding, Line};
 use crate::geometry::Geometry;
 use crate::numbers::Numbers;
-use crate::plants::{hold, settings};
+use crate::plants::{Method, hold};
 use crate::random_scene::{self, Kind};
 
 const TIME_STEPS_S: [f64; 5] = [1e-4, 1e-3, 1e-2, 5e-2, 2e-1];
@@ -26,7 +26,7 @@ struct Count {
 }
 
 pub(crate) fn cases() -> Vec<Case> {
-    let criterion = "30 steps each: an accepted one is finite and violates no constraint by more than 1e-11; \
+    let criterion = "30 steps each of order 2 to 12 in 1 to 7 substeps: an accepted one is finite and violates no constraint by more than 1e-11; \
                      a refused one changes no byte, and either succeeds with steps up to 2¹⁴ times \
                      shorter, or stands where matrices are singular to 1e-6, or has constraints that depend \
                      on each other; linearizations of every \
@@ -71,10 +71,14 @@ fn run(
     // A scene may make no sense, or stand at a singular point; that has been refused by name.
     let Ok(model) = Model::compile(&scene) else { return Ok(None) };
     let model = Arc::new(model);
-    let Ok(mut plant) = Plant::new(model.clone(), settings(&model, time_step_s)) else {
-        return Ok(None);
-    };
     let (d, mut random) = (model.dimensions(), Numbers::new(!seed));
+    let order = [2, 2, 4, 6, 8, 12][random.below(6)];
+    let method = Method::new(time_step_s, order, [1, 1, 1, 2, 7][random.below(5)]);
+    // Not every scene has every order.
+    let mut plants = [method, time_step_s.into()]
+        .into_iter()
+        .map(|method| Plant::new(model.clone(), method.settings(&model)));
+    let Some(Ok(mut plant)) = plants.find(Result::is_ok) else { return Ok(None) };
     let q = plant.q().to_vec();
     let v = (0..d.coordinates())
         .map(|i| if i < d.dynamic { random.between(-speed, speed) } else { 0.0 })
@@ -132,7 +136,9 @@ fn judge(plant: &Plant, u: &[f64], error: StepError, finding: &mut Finding) -> &
         StepError::Singular { .. } => "singular",
         StepError::SingularConstraints { .. } => "singular constraints",
         StepError::InconsistentConstraints { .. } => "inconsistent",
-        StepError::Dimension { .. } | StepError::InputNotFinite { .. } => "input",
+        StepError::Dimension { .. }
+        | StepError::InputNotFinite { .. }
+        | StepError::TooManySteps { .. } => "input",
     };
     let found = plant.clone().diagnose();
     let condition =
@@ -152,7 +158,8 @@ fn shorter_step_succeeds(plant: &Plant, u: &[f64]) -> bool {
     let d = model.dimensions();
     (1..=HALVINGS).any(|m| {
         let part = 2_f64.powi(-m);
-        let settings = settings(model, plant.settings().time_step_s * part);
+        let settings =
+            Settings { time_step_s: plant.settings().time_step_s * part, ..*plant.settings() };
         let Ok(mut shorter) = Plant::new(model.clone(), settings) else { return false };
         let (q, p, v) = (state.q.clone(), state.p.clone(), state.v.clone());
         if shorter.initialize(&Initial::Momentum { q, p, v }).is_err() {

@@ -77,17 +77,18 @@ pub(crate) fn write(out: &Path, outcomes: &[Outcome]) -> Result<()> {
 
 fn markdown(outcomes: &[Outcome]) -> String {
     let mut text = String::from(
-        "| case | verdict | found | A, B: error, resolved | CPU s |\n| --- | --- | --- | --- | --- |\n",
+        "| case | order, substeps | verdict | found | A, B: error, resolved | CPU s |\n| --- | --- | --- | --- | --- | --- |\n",
     );
     for outcome in outcomes {
         let derivatives = outcome
             .finding
             .derivatives
             .map_or(String::new(), |error| format!("{:.0e}, {:.0e}", error.found, error.resolved));
+        let (order, substeps) = outcome.finding.method.unwrap_or((2, 1));
         let found = outcome.finding.text.replace('|', "\\|");
         let _ = writeln!(
             text,
-            "| {} | {} | {found} | {derivatives} | {:.1} |",
+            "| {} | {order}, {substeps} | {} | {found} | {derivatives} | {:.1} |",
             outcome.name,
             outcome.verdict.text(),
             outcome.cpu_s

@@ -4,7 +4,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use plantd_models::StepError;
 
 use crate::case::Case;
-use crate::plants::{self, coast, energy, hold, moving, parse};
+use crate::plants::{self, Method, coast, energy, hold, moving, parse};
 
 const RATE: f64 = 1e4;
 
@@ -16,9 +16,9 @@ fn body(joint: &str, inertia: [f64; 3]) -> anyhow::Result<plantd_models::Scene> 
 
 pub(crate) fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
-    for turn in [0.01, 1.0, 3.0] {
-        let criterion =
-            "10⁴ steps about a principal axis; the orientation is exp(ω t) within 8 ε ω t";
+    for turn in [0.01, 1.0, 3.0, 10.0] {
+        let criterion = "10⁴ steps about a principal axis, halved where one turns by more than half a turn; the \
+                         orientation is exp(ω t) within 8 ε ω t";
         let name = format!("spin about an axis, {turn} rad per step");
         cases.push(Case::new(name, criterion, move |setup, finding| {
             const STEPS: u64 = 10_000;
@@ -39,10 +39,11 @@ pub(crate) fn cases() -> Vec<Case> {
             Ok(())
         }));
     }
-    let criterion = "more than half a turn in a step is refused as too fast, and changes no byte";
+    let criterion = "without halvings more than half a turn in a step is refused as too fast, and changes no byte";
     cases.push(Case::new("spin beyond half a turn per step", criterion, |_, finding| {
         let scene = body("ball", [0.02, 0.03, 0.045])?;
-        let mut plant = moving(&scene, 3.5 / RATE, &[0.0; 3], &[0.0, 0.0, RATE])?;
+        let method = Method::from(3.5 / RATE).unhalved();
+        let mut plant = moving(&scene, method, &[0.0; 3], &[0.0, 0.0, RATE])?;
         let before = plant.snapshot().to_bytes();
         match plant.step(&[]) {
             Err(error @ StepError::TooFast { .. }) => finding.note(format!("refused: {error}")),

@@ -4,7 +4,7 @@ use anyhow::Result;
 use plantd_models::{ForceSplit, Initial, Plant, Settings};
 
 use crate::case::{Case, Finding, Setup};
-use crate::plants::{self, energy_error, largest, moving, parse, step};
+use crate::plants::{self, Method, energy_error, largest, moving, parse, step};
 
 pub(crate) fn cases() -> Vec<Case> {
     let mut cases = Vec::new();
@@ -18,7 +18,7 @@ pub(crate) fn cases() -> Vec<Case> {
                 "[[frames]]\nname = \"mass\"\njoint = {{ type = \"prismatic\", axis = [1.0, 0.0, 0.0] }}\nbody = {{ mass = 1.0 }}\n[[springs]]\ntype = \"coordinate\"\ncoordinate = \"mass\"\nstiffness = {:?}\n",
                 omega * omega
             ))?;
-            let mut plant = moving(&scene, h, &[1.0], &[0.0])?;
+            let mut plant = moving(&scene, Method::from(h).unhalved(), &[1.0], &[0.0])?;
             let phase = 2.0 * (0.5 * omega_h).atan();
             let mut worst = 0.0_f64;
             for k in 1..=STEPS {
