@@ -245,13 +245,10 @@ fn directions(
             next: vec![0.0; n],
         };
         let mut q = some(n);
-        match tangent {
-            Some(tangent) => {
-                q.truncate(d.dynamic);
-                q = (tangent * DVector::from_vec(q)).as_slice().to_vec();
-                q.resize(n, 0.0);
-            }
-            None => {}
+        if let Some(tangent) = tangent {
+            q.truncate(d.dynamic);
+            q = (tangent * DVector::from_vec(q)).as_slice().to_vec();
+            q.resize(n, 0.0);
         }
         directions.push(Direction { q, ..zero("q") });
         directions.push(Direction { p: some(d.dynamic), ..zero("p") });

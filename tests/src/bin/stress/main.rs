@@ -69,7 +69,7 @@ fn main() -> Result<ExitCode> {
         stiffness::cases(),
         singular::cases(),
         spin::cases(),
-        steps::cases(),
+        steps::cases(&setup),
         inputs::cases(),
         violent::cases(&setup),
         random::cases(),

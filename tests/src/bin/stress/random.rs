@@ -112,7 +112,7 @@ fn run(
             }
         }
     }
-    if seed % 10 == 0 {
+    if seed.is_multiple_of(10) {
         let still = hold(&plant);
         u[d.inputs..].copy_from_slice(&still[d.inputs..]);
         // The next step may be too violent, or its matrices too close to singular.

@@ -3,13 +3,13 @@
 use anyhow::Result;
 use plantd_models::{Initial, Plant};
 
-use crate::case::Case;
+use crate::case::{Case, Setup};
 use crate::plants::{
     self, apart, coast, energy, energy_error, hold, largest, moving, refused, until_refused,
     well_depth,
 };
 
-pub(crate) fn cases() -> Vec<Case> {
+pub(crate) fn cases(setup: &Setup) -> Vec<Case> {
     let mut cases = Vec::new();
     for time_step_s in [0.05, 0.2, 0.5, 0.63, 1.5, 5.0] {
         let criterion = "pendulum from 3 rad, 1000 steps; energy error ≤ (h/2)² g/l of the well depth while \
@@ -64,17 +64,13 @@ pub(crate) fn cases() -> Vec<Case> {
             Ok(())
         }));
     }
-    for (links, in_short) in [(128, true), (256, true), (512, false), (1024, false)] {
+    for links in setup.pick(&[128, 256][..], &[128, 256, 512, 1024]).iter().copied() {
         let criterion = "200 steps of its own; energy error ≤ 1 % of the well depth; hanging at rest it \
                          stays within 1e-12 rad";
         cases.push(Case::new(
             format!("chain of {links} rods"),
             criterion,
             move |setup, finding| {
-                if !in_short && !setup.long {
-                    finding.note("long form only");
-                    return Ok(());
-                }
                 let scene = plants::scene(&format!("chain-{links}"));
                 let mut plant = plants::plant(&scene, scene.time_step_s)?;
                 let error = energy_error(&mut plant, 200)?;
