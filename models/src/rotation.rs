@@ -5,6 +5,7 @@
 //! `t = |ξ|` and `ξ^ x = ξ × x` all maps are polynomials `1 + a ξ^ + b ξ^²` whose coefficients are even
 //! functions of `t`: series near zero, so that no direction and no rate is special.
 
+use crate::plant::two_sum;
 use crate::scalar::Scalar;
 use crate::spatial::{Mat3, Vec3};
 
@@ -43,14 +44,23 @@ impl Quaternion {
 
     /// `self · o`, normalised.
     pub(crate) fn times(self, o: Self) -> Self {
-        let ([a, b, c, d], [w, x, y, z]) = (self.0, o.0);
-        Self([
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ])
-        .normalized()
+        Self(product(self.0, o.0)).normalized()
+    }
+
+    /// `(self + low) exp(turn)`, and what rounding took from it: the increment, of which no digits cancel,
+    /// is added by compensated sums, so that turns do not drift.
+    pub(crate) fn turned(self, low: [f64; 4], turn: Vec3) -> (Self, [f64; 4]) {
+        let Self([_, x, y, z]) = Self::exp(turn);
+        // cos(t/2) − 1
+        let quarter = (0.25 * turn.norm()).sin();
+        let change = [-2.0 * quarter * quarter, x, y, z];
+        let (of_high, of_low) = (product(self.0, change), product(low, change));
+        let sums = [0, 1, 2, 3].map(|i| two_sum(self.0[i], of_high[i] + (low[i] + of_low[i])));
+        let (high, low) = (sums.map(|(high, _)| high), sums.map(|(_, low)| low));
+        // To length 1: that is no turn.
+        let dot = |a: [f64; 4], b: [f64; 4]| (0..4).map(|i| a[i] * b[i]).sum::<f64>();
+        let excess = 0.5 * (dot(high, high) - 1.0) + dot(high, low);
+        (Self(high), [0, 1, 2, 3].map(|i| low[i] - excess * high[i]))
     }
 
     pub(crate) fn inverse(self) -> Self {
@@ -72,6 +82,15 @@ impl Quaternion {
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
         ])
     }
+}
+
+fn product([a, b, c, d]: [f64; 4], [w, x, y, z]: [f64; 4]) -> [f64; 4] {
+    [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
 }
 
 /// Squares of angles below this are summed as series.

@@ -317,7 +317,8 @@ impl Workspace {
         for (o, &i) in model.orientations.iter().enumerate() {
             let orientation = &mut state.orientations[o];
             if i < model.dimensions.dynamic {
-                *orientation = orientation.times(Quaternion::exp(three(&self.increment, i)));
+                let low = &mut state.orientations_low[o];
+                (*orientation, *low) = orientation.turned(*low, three(&self.increment, i));
                 state.q[i..i + 3].copy_from_slice(&orientation.log().0);
                 state.q_low[i..i + 3].fill(0.0);
             } else {

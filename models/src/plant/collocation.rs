@@ -8,18 +8,21 @@
 //! ```
 //!
 //! Since `μ_ii = ½`, each stage is a step of the midpoint rule of length `h b_i`, from what the other
-//! stages give it to begin with: its Newton matrix is that of such a step. The stages are corrected one
-//! after the other, each with its own factors, until all residuals are at round-off. That fails where the
-//! coupling is stiff; then Newton's method takes all stages at once. `μ_ij + μ_ji = 1` makes the method
+//! stages give it to begin with: its Newton matrix is that of such a step.
+//!
+//! Few unknowns are corrected all at once, with the dense Jacobian of the guess. Many are corrected stage
+//! after stage, each with its own factors of O(n), until all residuals are at round-off; where that is slow,
+//! because the coupling is stiff, they are taken at once too. `μ_ij + μ_ji = 1` makes the method
 //! symplectic whatever the rounding of the weights.
 //!
 //! Prescribed coordinates move at a constant rate, `c_i` of the way at node `i`. Inputs that signals drive
 //! are taken at the nodes.
 
 mod linearize;
+mod stage;
 
 use crate::Model;
-use crate::plant::blocks::Blocks;
+use crate::plant::closure::larger;
 use crate::plant::newton::{At, CHORD_FLOOR, FLOOR, Factors, Workspace};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::predictor::Past;
@@ -28,9 +31,13 @@ use crate::plant::scheme::{Scheme, Tableau};
 use crate::plant::{PreciseState, Settings, StepError, StepReport};
 
 pub(crate) use linearize::StageTangents;
+use stage::Hessian;
 
 /// A residual that falls by less than this from one sweep to the next falls too slowly.
 const SLOW: f64 = 0.5;
+
+/// Unknowns up to which all stages are corrected at once.
+const AT_ONCE: usize = 48;
 
 /// The stages of a step, and all memory that they need.
 #[derive(Clone, Debug)]
@@ -43,7 +50,7 @@ pub(crate) struct Collocation {
     /// Velocities at the stages, one after the other, then forces `L_q + f`.
     motion: Vec<f64>,
     /// For Newton's method and derivatives; empty until they are needed.
-    pub(crate) system: Option<Box<System>>,
+    system: Option<Box<System>>,
 }
 
 /// A stage.
@@ -52,6 +59,8 @@ pub(crate) struct Stage {
     /// `Y_i` and `P_i`.
     increment: Vec<f64>,
     impulse: Vec<f64>,
+    /// `L_v`.
+    momentum: Vec<f64>,
     factors: Factors,
     /// `Q_i` and `V_i` of all coordinates, and the inputs.
     pub(crate) q: Vec<f64>,
@@ -63,10 +72,10 @@ pub(crate) struct Stage {
 #[derive(Clone, Debug)]
 pub(crate) struct System {
     /// Second derivatives at the stages.
-    pub(crate) blocks: Vec<Blocks>,
+    hessians: Vec<Hessian>,
     /// Derivatives of the residuals by all `Y`.
-    pub(crate) matrix: PivotedLu,
-    pub(crate) residual: Vec<f64>,
+    matrix: PivotedLu,
+    residual: Vec<f64>,
 }
 
 impl Collocation {
@@ -75,6 +84,7 @@ impl Collocation {
         let stage = || Stage {
             increment: vec![0.0; d.dynamic],
             impulse: vec![0.0; d.dynamic],
+            momentum: vec![0.0; d.dynamic],
             factors: Factors::new(model),
             q: vec![0.0; d.coordinates()],
             velocity: vec![0.0; d.coordinates()],
@@ -104,9 +114,13 @@ impl Collocation {
         start_s: f64,
     ) -> Result<StepReport, StepError> {
         self.begin(workspace, at, start_s)?;
-        let report = match self.sweep(workspace, at)? {
-            Some(report) => report,
-            None => self.correct_all(workspace, at)?,
+        let report = if self.stages.len() * at.model.dimensions.dynamic <= AT_ONCE {
+            self.correct_all(workspace, at)?
+        } else {
+            match self.sweep(workspace, at)? {
+                Some(report) => report,
+                None => self.correct_all(workspace, at)?,
+            }
         };
         self.finish(workspace, at, report)
     }
@@ -241,55 +255,89 @@ impl Collocation {
         Ok(None)
     }
 
-    /// Newton's method on all stages at once.
+    /// Chord Newton on all stages at once; the Jacobian is renewed where that saves corrections.
     fn correct_all(
         &mut self,
         workspace: &mut Workspace,
         at: At<'_>,
     ) -> Result<StepReport, StepError> {
+        let mut system = self.take_system(at.model);
+        let result = self.correct_with(&mut system, workspace, at);
+        self.system = Some(system);
+        result
+    }
+
+    fn correct_with(
+        &mut self,
+        system: &mut System,
+        workspace: &mut Workspace,
+        at: At<'_>,
+    ) -> Result<StepReport, StepError> {
         let At { model, settings, .. } = at;
+        let enough = settings.precision.residual();
         let mut report = StepReport::default();
         let mut previous = f64::INFINITY;
         let nd = model.dimensions.dynamic;
+        let mut fresh = true;
         for iteration in 1..=settings.max_iterations {
             report.iterations = iteration;
-            // Stages depend on the impulses of others, which are known after a first round alone.
+            let mut round_off = f64::MIN_POSITIVE;
             for i in 0..self.stages.len() {
                 self.evaluate(workspace, at, i);
-            }
-            let mut size: f64 = 0.0;
-            let mut system = self.take_system(model);
-            for i in 0..self.stages.len() {
-                let residual = self.evaluate(workspace, at, i);
-                if !residual.is_finite() {
-                    return Err(StepError::NotFinite { iterations: iteration });
+                round_off = round_off.max(workspace.round_off);
+                self.stages[i].momentum.copy_from_slice(&workspace.l_v);
+                if fresh {
+                    system.hessians[i].take(model, workspace);
                 }
-                size = size.max(residual);
-                system.residual[i * nd..][..nd].copy_from_slice(&workspace.residual);
             }
-            let converged =
-                size <= settings.precision.residual() || (size > SLOW * previous && size <= FLOOR);
-            self.fill_system(model, settings, &mut system);
-            system.matrix.factor();
-            report.factorizations += 1;
-            if system.matrix.deficiency() > 0 {
-                self.system = Some(system);
-                return Err(StepError::NotConverged { iterations: iteration, residual: size });
+            let largest = self.find_residuals(at, &mut system.residual);
+            let size = largest / (f64::EPSILON * round_off);
+            if !size.is_finite() {
+                return Err(StepError::NotFinite { iterations: iteration });
+            }
+            let stagnates = size > SLOW * previous;
+            let floor = if report.factorizations == iteration { FLOOR } else { CHORD_FLOOR };
+            let converged = size <= enough || (stagnates && size <= floor);
+            if fresh && !(converged && iteration > 1) {
+                self.fill_system(model, settings, system);
+                system.matrix.factor();
+                report.factorizations += 1;
+                if system.matrix.deficiency() > 0 {
+                    return Err(StepError::NotConverged { iterations: iteration, residual: size });
+                }
             }
             system.matrix.solve(&mut system.residual);
-            for (stage, correction) in
-                self.stages.iter_mut().zip(system.residual.chunks_exact(nd.max(1)))
-            {
+            let corrections = system.residual.chunks_exact(nd.max(1));
+            for (stage, correction) in self.stages.iter_mut().zip(corrections) {
                 stage.increment.iter_mut().zip(correction).for_each(|(y, c)| *y -= c);
             }
-            self.system = Some(system);
             report.residual = size;
             if converged {
                 return Ok(report);
             }
+            fresh = size > SLOW * previous;
             previous = size;
         }
         Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
+    }
+
+    /// Writes the residuals of all stages from their impulses and momenta; returns the largest entry.
+    fn find_residuals(&self, at: At<'_>, residual: &mut [f64]) -> f64 {
+        let state = at.state;
+        let (count, nd) = (self.stages.len(), state.p.len());
+        let mut largest = 0.0;
+        for (i, (residual, stage)) in
+            residual.chunks_exact_mut(nd.max(1)).zip(&self.stages).enumerate()
+        {
+            let coupling = &self.tableau.coupling[i * count..][..count];
+            for (k, residual) in residual.iter_mut().enumerate() {
+                let impulses = self.stages.iter().zip(coupling).map(|(s, m)| m * s.impulse[k]);
+                *residual =
+                    ((state.p[k] - stage.momentum[k]) + impulses.sum::<f64>()) + state.p_low[k];
+                largest = larger(largest, residual.abs());
+            }
+        }
+        largest
     }
 
     /// Checks the solution and sums it up in the workspace.
@@ -305,7 +353,7 @@ impl Collocation {
         workspace.impulse.fill(0.0);
         let (count, stages) = (model.dimensions.dynamic, self.stages.len());
         for (i, stage) in self.stages.iter().enumerate() {
-            model.check_turns(&stage.increment)?;
+            model.check_turns(&stage.increment, workspace.largest_turn())?;
             let rate = 1.0 / (settings.time_step_s * self.tableau.weights[i]);
             for k in 0..count {
                 workspace.increment[k] += stage.increment[k];
@@ -326,7 +374,7 @@ impl Collocation {
         let columns = padded(2 * d.coordinates() + d.inputs);
         self.system.take().unwrap_or_else(|| {
             Box::new(System {
-                blocks: (0..count).map(|_| Blocks::new(model)).collect(),
+                hessians: (0..count).map(|_| Hessian::new(model)).collect(),
                 matrix: PivotedLu::new(&vec![1.0; unknowns], columns),
                 residual: vec![0.0; unknowns],
             })
@@ -342,38 +390,42 @@ impl Collocation {
         let (count, nd) = (self.stages.len(), model.dimensions.dynamic);
         let n = model.dimensions.coordinates();
         let order = count * nd;
-        for (stage, blocks) in self.stages.iter().zip(&mut system.blocks) {
-            blocks.evaluate(model, (&stage.q, &[]), &stage.velocity, &stage.inputs);
-        }
         let coupling = |i: usize, j: usize| self.tableau.coupling[i * count + j];
         let length = |i: usize| settings.time_step_s * self.tableau.weights[i];
-        let System { blocks, matrix, .. } = system;
+        let System { hessians, matrix, .. } = system;
         for i in 0..count {
             for k in 0..count {
                 for a in 0..nd {
                     let target = &mut matrix.matrix[(i * nd + a) * order + k * nd..][..nd];
-                    target.fill(0.0);
-                    let row = a * n..a * n + nd;
-                    for (j, stage) in blocks.iter().enumerate() {
-                        let weight = coupling(i, j) * length(j) * coupling(j, k);
-                        let entries = stage.l_qq[row.clone()].iter().zip(&stage.f_q[row.clone()]);
-                        target
-                            .iter_mut()
-                            .zip(entries)
-                            .for_each(|(t, (l, f))| *t += weight * (l + f));
-                    }
                     let weight = coupling(i, k);
-                    let entries = blocks[k].l_qv[row.clone()].iter().zip(&blocks[k].f_v[row]);
-                    target.iter_mut().zip(entries).for_each(|(t, (l, f))| *t += weight * (l + f));
-                    for (b, target) in target.iter_mut().enumerate() {
-                        *target -= weight * blocks[i].l_qv[b * n + a];
-                        if i == k {
-                            *target -= blocks[i].l_vv[a * n + b] / length(i);
-                        }
+                    let rates = hessians[k].qv[a * n..][..nd].iter();
+                    let changes = rates.zip(&hessians[i].vq[a * n..][..nd]);
+                    target.iter_mut().zip(changes).for_each(|(t, (p, l))| *t = weight * (p - l));
+                    for (j, stage) in hessians.iter().enumerate() {
+                        let weight = coupling(i, j) * length(j) * coupling(j, k);
+                        let entries = &stage.qq[a * n..][..nd];
+                        target.iter_mut().zip(entries).for_each(|(t, l)| *t += weight * l);
+                    }
+                    if i == k {
+                        let inverse = 1.0 / length(i);
+                        let entries = &hessians[i].vv[a * n..][..nd];
+                        target.iter_mut().zip(entries).for_each(|(t, l)| *t -= inverse * l);
                     }
                 }
             }
         }
+    }
+}
+
+impl Stage {
+    /// Evaluates the Lagrangian and the forces at the stage.
+    fn place(&self, model: &Model, workspace: &mut Workspace) {
+        workspace.q_mid.copy_from_slice(&self.q);
+        workspace.velocity.copy_from_slice(&self.velocity);
+        if model.dimensions.inputs > 0 {
+            workspace.set_inputs(model, &self.inputs);
+        }
+        workspace.evaluate_lagrangian(model);
     }
 }
 

@@ -506,7 +506,12 @@ impl Workspace {
 impl Workspace {
     /// Second derivatives of the Lagrangian for a pair of joints on one path to the root.
     #[inline(always)]
-    fn pair(&self, model: &Model, ancestor: usize, descendant: usize) -> SecondDerivatives {
+    pub(crate) fn pair(
+        &self,
+        model: &Model,
+        ancestor: usize,
+        descendant: usize,
+    ) -> SecondDerivatives {
         match (&self.planar, &model.planar) {
             (Some(planar), Some(joints)) => planar.pair(joints, ancestor, descendant),
             _ => self.curvature.pair(&self.momenta, model.gravity, ancestor, descendant),

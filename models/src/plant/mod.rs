@@ -234,6 +234,8 @@ pub(crate) struct PreciseState {
     pub(crate) v: Vec<f64>,
     /// Orientations of ball joints; `q` has their rotation vectors.
     pub(crate) orientations: Vec<Quaternion>,
+    /// What they lost to rounding.
+    pub(crate) orientations_low: Vec<[f64; 4]>,
     pub(crate) multipliers: Vec<f64>,
     /// What the next step is guessed from.
     pub(crate) past: Past,
@@ -253,6 +255,7 @@ impl PreciseState {
             p_low: vec![0.0; nd],
             v: vec![0.0; nk],
             orientations: vec![Quaternion::default(); orientations],
+            orientations_low: vec![[0.0; 4]; orientations],
             multipliers: vec![0.0; nc],
             past,
             halvings: 0,
@@ -271,12 +274,14 @@ impl PreciseState {
         self.p_low.copy_from_slice(&other.p_low);
         self.v.copy_from_slice(&other.v);
         self.orientations.copy_from_slice(&other.orientations);
+        self.orientations_low.copy_from_slice(&other.orientations_low);
         self.multipliers.copy_from_slice(&other.multipliers);
         self.past.copy_from(&other.past);
     }
 
     /// Takes the orientations from `q`.
     fn orient(&mut self, model: &Model) {
+        self.orientations_low.fill([0.0; 4]);
         for (orientation, &i) in self.orientations.iter_mut().zip(&model.orientations) {
             *orientation = Quaternion::exp(three(&self.q, i));
             self.q[i..i + 3].copy_from_slice(&orientation.log().0);
@@ -515,7 +520,7 @@ impl Model {
 
 /// The sum of two numbers, and what rounding took from it.
 #[inline(always)]
-fn two_sum(a: f64, b: f64) -> (f64, f64) {
+pub(crate) fn two_sum(a: f64, b: f64) -> (f64, f64) {
     let sum = a + b;
     let b_in_sum = sum - a;
     (sum, (a - (sum - b_in_sum)) + (b - b_in_sum))

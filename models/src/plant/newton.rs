@@ -25,6 +25,10 @@ use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{PreciseState, Precision, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
 
+/// Corrections beyond which shorter steps are the better way, where there are any.
+const WORTHWHILE: u32 = 12;
+/// A turn beyond which they are, rad.
+const QUICK: f64 = 1.0;
 /// A residual this small, in units of round-off, is as good as zero.
 const CONVERGED: f64 = 4.0;
 /// A residual this small will do where precision is not asked for.
@@ -102,6 +106,8 @@ pub(crate) struct Workspace {
     /// Inputs, damping and forces at the midpoint.
     pub(crate) force: Vec<f64>,
     pub(crate) residual: Vec<f64>,
+    /// Magnitude of what the residual is the sum of.
+    pub(crate) round_off: f64,
     pub(crate) constraint_residual: Vec<f64>,
     /// What follows from configuration and velocity at the midpoint: in the plane where the scene allows
     /// it, else in space.
@@ -133,6 +139,8 @@ pub(crate) struct Workspace {
     pub(crate) stiffness: Vec<f64>,
     pub(crate) terms: Vec<Term>,
     pub(crate) estimates: Estimates,
+    /// There are no shorter steps to be tried.
+    pub(crate) is_last_resort: bool,
 }
 
 impl Precision {
@@ -187,6 +195,7 @@ impl Workspace {
             input_force: zeros(nd),
             force: zeros(nd),
             residual: zeros(nd),
+            round_off: 0.0,
             constraint_residual: zeros(nc),
             planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
             factors: Factors::new(model),
@@ -206,6 +215,7 @@ impl Workspace {
             stiffness: zeros(nd * nd),
             terms: Vec::with_capacity(nd.max(nc)),
             estimates: Estimates::NONE,
+            is_last_resort: true,
         }
     }
 
@@ -304,10 +314,10 @@ impl Workspace {
             }
             return;
         }
-        self.find_velocity(model, state);
+        let is_singular = self.find_velocity(model, state) < settings.singular_below;
         for (x, v) in self.increment.iter_mut().zip(&self.residual) {
             // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
-            *x = if v.is_finite() { settings.time_step_s * v } else { 0.0 };
+            *x = if v.is_finite() && !is_singular { settings.time_step_s * v } else { 0.0 };
         }
         self.multipliers.copy_from_slice(&state.multipliers);
         // The velocity was found with the prescribed velocities of the last step, not of this one.
@@ -336,7 +346,8 @@ impl Workspace {
         let enough = settings.precision.residual();
         let mut previous = f64::INFINITY;
         let (mut fresh, mut idle) = (false, false);
-        while report.iterations < settings.max_iterations {
+        let most = if self.is_last_resort { u32::MAX } else { WORTHWHILE };
+        while report.iterations < settings.max_iterations.min(most) {
             report.iterations += 1;
             report.residual = self.evaluate(model, settings, state);
             report.constraint_residual = self.evaluate_end(model, state);
@@ -412,6 +423,7 @@ impl Workspace {
             self.start.subtract_impulses(model, &self.multipliers, &mut self.residual);
         }
         let largest = self.residual.iter().fold(0.0, |m, r| larger(m, r.abs()));
+        self.round_off = round_off;
         largest / (f64::EPSILON * round_off)
     }
 
@@ -496,6 +508,17 @@ impl Workspace {
         Ok(())
     }
 
+    /// Prepares second derivatives of the Lagrangian at the last evaluation, for [`Workspace::pair`].
+    pub(crate) fn differentiate(&mut self, model: &Model) {
+        match (&mut self.planar, &model.planar) {
+            (Some(planar), Some(joints)) => {
+                planar.differentiate(joints);
+                planar.place(joints);
+            }
+            _ => self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta),
+        }
+    }
+
     /// Fills `K` at the last evaluation.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
         if !model.orientations.is_empty() {
@@ -506,11 +529,10 @@ impl Workspace {
         if model.potentials.couple_branches || model.forces.is_some() {
             self.factors.matrix.clear();
         }
+        self.differentiate(model);
         if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
-            planar.differentiate(joints);
             planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.factors.matrix);
         } else {
-            self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
             self.curvature.fill_newton_matrix(
                 &model.pairs,
                 &self.momenta,
@@ -681,8 +703,16 @@ impl Workspace {
 
     /// Whether the last correction is no more than the round-off of the coordinates.
     fn is_round_off_of_coordinates(&self) -> bool {
-        let mut corrections = self.residual.iter().zip(&self.q_mid);
-        corrections.all(|(x, q)| x.abs() <= 2.0 * f64::EPSILON * q.abs())
+        // The midpoint may be next to zero where start and end are not.
+        let size = |i: usize| self.q_mid[i].abs() + self.increment[i].abs();
+        let mut corrections = self.residual.iter().enumerate();
+        corrections.all(|(i, x)| x.abs() <= 2.0 * f64::EPSILON * size(i))
+    }
+
+    /// By how much a joint may turn in a step: beyond half a turn the solution is not the continuation of
+    /// the motion, and shorter steps, where there are any, are the better ones from a good deal less on.
+    pub(crate) fn largest_turn(&self) -> f64 {
+        if self.is_last_resort { std::f64::consts::PI } else { QUICK }
     }
 
     /// Checks the solution, and finds its impulse.
@@ -692,7 +722,7 @@ impl Workspace {
         settings: &Settings,
         mut report: StepReport,
     ) -> Result<StepReport, StepError> {
-        model.check_turns(&self.increment)?;
+        model.check_turns(&self.increment, self.largest_turn())?;
         for (i, impulse) in self.impulse.iter_mut().enumerate() {
             *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
         }
@@ -723,10 +753,10 @@ impl Workspace {
 }
 
 impl Model {
-    /// Refuses increments of more than half a turn.
-    pub(crate) fn check_turns(&self, increments: &[f64]) -> Result<(), StepError> {
+    /// Refuses turns by more than an angle.
+    pub(crate) fn check_turns(&self, increments: &[f64], largest: f64) -> Result<(), StepError> {
         for (coordinate, x) in self.coordinates.iter().zip(increments) {
-            if coordinate.is_angle && x.abs() > std::f64::consts::PI {
+            if coordinate.is_angle && x.abs() > largest {
                 let coordinate = coordinate.name.clone();
                 return Err(StepError::TooFast { coordinate, increment: *x });
             }

@@ -5,7 +5,7 @@
 //! the fraction `c` of the period ends with them at `(1 − c') k0 + c' k1`. The multipliers of a period are
 //! the sums of those of its steps: they stay impulses.
 //!
-//! **Halving.** A period that cannot be solved in one go is solved again in 2, 4, … 64 times as many steps.
+//! **Halving.** A period that cannot be solved in one go is solved again in 2, 4, … 256 times as many steps.
 //! The next period begins with as many; after four that went well, half as many are tried. How often a
 //! period was halved is in its report: it is another map then.
 
@@ -83,7 +83,7 @@ impl StepError {
 
 impl Plant {
     /// Solves the period, and linearizes it if asked to; stays where it is. The error is that of the
-    /// longest steps.
+    /// shortest steps.
     pub(crate) fn solve(
         &mut self,
         u: &[f64],
@@ -97,22 +97,18 @@ impl Plant {
         let PreciseState { halvings, calm, .. } = self.state;
         let first = halvings - u8::from(halvings > 0 && calm >= CALM);
         let most = self.most_halvings();
-        let mut failure = None;
+        let mut failed = false;
         for halvings in first.. {
+            self.workspace.is_last_resort = halvings >= most;
             match self.attempt(halvings, out.as_deref_mut()) {
                 Ok(report) => {
                     self.period.halvings = halvings;
-                    self.period.failed = failure.is_some();
+                    self.period.failed = failed;
                     let halvings = u32::from(halvings);
                     return Ok(StepReport { halvings, steps: report.steps.max(1), ..report });
                 }
-                Err(error) => {
-                    let is_last = halvings >= most || !error.may_be_too_long();
-                    let first = failure.get_or_insert(error);
-                    if is_last {
-                        return Err(first.clone());
-                    }
-                }
+                Err(error) if halvings >= most || !error.may_be_too_long() => return Err(error),
+                Err(_) => failed = true,
             }
         }
         unreachable!("the last attempt returns")
@@ -244,7 +240,7 @@ fn take(
     };
     let report = collocation.solve(workspace, at, start_s)?;
     if let Some(out) = out {
-        collocation.linearize(at, out);
+        collocation.linearize(workspace, at, out);
     }
     Ok(report)
 }

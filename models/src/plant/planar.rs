@@ -271,7 +271,6 @@ impl PlanarTree {
         step: f64,
         matrix: &mut TreeLu,
     ) {
-        self.place(joints);
         let (quarter, inverse) = (0.25 * step, 1.0 / step);
         for pair in pairs {
             let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);

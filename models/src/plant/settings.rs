@@ -7,7 +7,7 @@ use crate::plant::scheme::Scheme;
 /// Most substeps in a control period.
 pub const SUBSTEPS_MAX: u32 = 256;
 /// Most often that a period is halved.
-pub const HALVINGS_MAX: u32 = 6;
+pub const HALVINGS_MAX: u32 = 8;
 /// Most steps of any length in a period; it is not halved beyond that.
 pub(crate) const STEPS_MAX: usize = 8192;
 
@@ -35,7 +35,7 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// The model's time step, order 2 in one step that may be halved 6 times, exact, symmetric split, 40
+    /// The model's time step, order 2 in one step that may be halved 8 times, exact, symmetric split, 40
     /// iterations, singular below 1e-14.
     pub fn new(model: &Model) -> Self {
         Self {

@@ -77,7 +77,8 @@ impl PreciseState {
             &mut self.v,
             &mut self.multipliers,
         ];
-        vectors.into_iter().flatten().chain(self.past.numbers())
+        let turns = self.orientations_low.as_flattened_mut();
+        vectors.into_iter().flatten().chain(turns).chain(self.past.numbers())
     }
 }
 
@@ -163,7 +164,7 @@ impl Snapshot {
             return Err(malformed("a period was halved too often"));
         }
         let sizes = [nd, nk, nc, no];
-        let numbers = [4 * nd, 2 * nk, nc, 4 * no, past.length(nd)];
+        let numbers = [4 * nd, 2 * nk, nc, 8 * no, past.length(nd)];
         if reader.0.len() / 8 != numbers.iter().sum::<usize>() || reader.0.len() % 8 != 0 {
             return Err(malformed("sizes do not match"));
         }

@@ -10,7 +10,7 @@
 
 use super::Collocation;
 use crate::plant::linearize::Linearization;
-use crate::plant::newton::At;
+use crate::plant::newton::{At, Workspace};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{Term, add_rows, padded};
 
@@ -38,7 +38,12 @@ pub(crate) struct StageTangents {
 
 impl Collocation {
     /// Linearizes at the solution.
-    pub(crate) fn linearize(&mut self, at: At<'_>, out: &mut Linearization) {
+    pub(crate) fn linearize(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        out: &mut Linearization,
+    ) {
         let model = at.model;
         let d = model.dimensions;
         let (count, n, nd) = (self.stages.len(), d.coordinates(), d.dynamic);
@@ -46,6 +51,10 @@ impl Collocation {
         let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
         let stride = padded((next + d.prescribed).max(1));
         let mut system = self.take_system(model);
+        for (stage, hessian) in self.stages.iter().zip(&mut system.hessians) {
+            stage.place(model, workspace);
+            hessian.take(model, workspace);
+        }
         self.fill_system(model, at.settings, &mut system);
         system.matrix.factor();
         let mut tangents = out.take_stages().unwrap_or_else(|| {
@@ -68,16 +77,15 @@ impl Collocation {
         tangent.fill(0.0);
         impulses.fill(0.0);
         slopes.fill(0.0);
-        for (j, blocks) in system.blocks.iter().enumerate() {
+        for (j, hessian) in system.hessians.iter().enumerate() {
             let (weight, node) = (self.tableau.weights[j], self.tableau.nodes[j]);
             let length = h * weight;
             for a in 0..nd {
                 let row = &mut impulses[(j * nd + a) * stride..][..stride];
                 let own = &mut tangent[(j * nd + a) * stride..][..stride];
                 for b in 0..n {
-                    let q = length * (blocks.l_qq[a * n + b] + blocks.f_q[a * n + b]);
-                    let v = blocks.l_qv[a * n + b] + blocks.f_v[a * n + b];
-                    let (p_q, p_v) = (blocks.l_qv[b * n + a], blocks.l_vv[a * n + b]);
+                    let (q, v) = (length * hessian.qq[a * n + b], hessian.qv[a * n + b]);
+                    let (p_q, p_v) = (hessian.vq[a * n + b], hessian.vv[a * n + b]);
                     if b < nd {
                         row[b] = q;
                         own[b] = -p_q;
@@ -93,7 +101,7 @@ impl Collocation {
                     }
                 }
                 for input in 0..d.inputs {
-                    row[inputs + input] = length * blocks.f_u[a * d.inputs + input];
+                    row[inputs + input] = length * hessian.qu[a * d.inputs + input];
                 }
                 own[momentum + a] = 1.0;
             }
