@@ -42,8 +42,9 @@ pub use continuous::{
 };
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
 pub use plant::{
-    Contraction, Diagnostics, Energy, Equilibrium, ForceSplit, HALVINGS_MAX, Initial, InitialError,
-    Linearization, Plant, Precision, SUBSTEPS_MAX, SecondOrder, Settings, SettleError,
-    SettleRequest, Snapshot, SnapshotError, State, StepError, StepReport, TooLarge,
+    Choice, ChoiceError, Contraction, Diagnostics, Energy, Equilibrium, ErrorEstimate, ForceSplit,
+    HALVINGS_MAX, Initial, InitialError, Linearization, Plant, Precision, SUBSTEPS_MAX,
+    SecondOrder, Settings, SettleError, SettleRequest, Snapshot, SnapshotError, State, StepError,
+    StepReport, TooLarge,
 };
 pub use scene::{Problem, Scene, SceneError};

@@ -279,3 +279,59 @@ fn forced_and_damped_steps_are_of_their_order() {
         assert_order("forced pendulum", order, steps, |n| error(order, n));
     }
 }
+
+/// The choice keeps its promise, against the midpoint rule in many substeps, extrapolated.
+#[test]
+fn chosen_methods_reach_their_tolerance() {
+    for name in plantd_models::builtin::NAMES {
+        let scene = builtin(name);
+        let path = |order: u32, substeps: u32| {
+            let mut plant = plant(&scene, |s| (s.order, s.substeps) = (order, substeps));
+            let start = plant.q().to_vec();
+            let mut u = vec![0.0; plant.model().dimensions().input()];
+            let mut path = Vec::new();
+            for _ in 0..50 {
+                plant.hold_input(&mut u);
+                plant.step(&u).unwrap();
+                path.extend(plant.model().difference(&start, plant.q()));
+            }
+            path
+        };
+        let exact: Vec<f64> =
+            path(2, 256).iter().zip(path(2, 128)).map(|(a, b)| a + (a - b) / 3.0).collect();
+        for tolerance in [1e-3, 1e-6] {
+            let choice = plant(&scene, |_| ()).choose_method(tolerance).unwrap();
+            let found = path(choice.order, choice.substeps);
+            let errors = found.iter().zip(&exact).map(|(a, b)| (a - b).abs());
+            let error = errors.fold(0.0, f64::max);
+            println!("{name}, {tolerance:e}: {choice:?}, {error:e}");
+            assert!(error <= 3.0 * tolerance, "{name}: {choice:?} is off by {error:e}");
+            assert!(choice.error <= tolerance);
+        }
+    }
+}
+
+/// An estimate is what a period is off by, to a few per cent where the order shows.
+#[test]
+fn error_estimates_are_errors() {
+    for (name, order) in
+        [("pendulum", 2), ("pendulum", 4), ("double-pendulum", 6), ("four-bar", 2), ("four-bar", 4)]
+    {
+        let time_step_s = if order > 4 { 0.1 } else { 0.03 };
+        let mut coarse = plant(&builtin(name), |s| (s.time_step_s, s.order) = (time_step_s, order));
+        let case = RELEASED.iter().find(|case| case.scene == name).unwrap();
+        let start = Initial::Velocity { q: case.q.into(), v: case.v.into() };
+        coarse.initialize(&start).unwrap();
+        let mut fine = plant(&builtin(name), |s| {
+            (s.time_step_s, s.order, s.substeps) = (time_step_s, order.max(6), 32);
+        });
+        fine.initialize(&start).unwrap();
+        let u = vec![0.0; coarse.model().dimensions().input()];
+        let estimate = coarse.estimate_error(&u).unwrap();
+        coarse.step(&u).unwrap();
+        fine.step(&u).unwrap();
+        let errors = coarse.q().iter().zip(fine.q()).map(|(a, b)| (a - b).abs());
+        let ratio = estimate.configuration / errors.fold(0.0, f64::max);
+        assert!((0.8..1.25).contains(&ratio), "{name}, order {order}: {ratio}");
+    }
+}

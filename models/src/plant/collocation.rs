@@ -23,10 +23,9 @@ mod stage;
 
 use crate::Model;
 use crate::plant::closure::larger;
+use crate::plant::dense_lu::DenseLu;
 use crate::plant::newton::{At, CHORD_FLOOR, FLOOR, Factors, Workspace};
-use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::predictor::Past;
-use crate::plant::rows::padded;
 use crate::plant::scheme::{Scheme, Tableau};
 use crate::plant::{PreciseState, Settings, StepError, StepReport};
 
@@ -62,10 +61,7 @@ pub(crate) struct Stage {
     /// `L_v`.
     momentum: Vec<f64>,
     factors: Factors,
-    /// `Q_i` and `V_i` of all coordinates, and the inputs.
-    pub(crate) q: Vec<f64>,
-    pub(crate) velocity: Vec<f64>,
-    pub(crate) inputs: Vec<f64>,
+    inputs: Vec<f64>,
 }
 
 /// All stages at once.
@@ -74,8 +70,11 @@ pub(crate) struct System {
     /// Second derivatives at the stages.
     hessians: Vec<Hessian>,
     /// Derivatives of the residuals by all `Y`.
-    matrix: PivotedLu,
+    matrix: DenseLu,
     residual: Vec<f64>,
+    /// For the filling of `matrix`.
+    products: Vec<f64>,
+    rates: Vec<f64>,
 }
 
 impl Collocation {
@@ -86,8 +85,6 @@ impl Collocation {
             impulse: vec![0.0; d.dynamic],
             momentum: vec![0.0; d.dynamic],
             factors: Factors::new(model),
-            q: vec![0.0; d.coordinates()],
-            velocity: vec![0.0; d.coordinates()],
             inputs: vec![0.0; d.inputs],
         };
         Self {
@@ -168,6 +165,9 @@ impl Collocation {
         }
         self.base.q.copy_from_slice(&state.q);
         self.base.p.copy_from_slice(&state.p);
+        if d.inputs > 0 {
+            workspace.set_inputs(model, &u[..d.inputs]);
+        }
         Ok(())
     }
 
@@ -176,7 +176,7 @@ impl Collocation {
     fn evaluate(&mut self, workspace: &mut Workspace, at: At<'_>, i: usize) -> f64 {
         let At { model, state, u, .. } = at;
         let d = model.dimensions;
-        let Self { tableau, stages, base, input, .. } = self;
+        let Self { tableau, stages, base, input, .. } = &mut *self;
         base.q_low.copy_from_slice(&state.q_low);
         base.p_low.copy_from_slice(&state.p_low);
         let coupling = &tableau.coupling[i * stages.len()..][..stages.len()];
@@ -193,20 +193,21 @@ impl Collocation {
             base.q[d.dynamic + k] = start + (node - half) * way;
             input[d.inputs + k] = start + (node + half) * way;
         }
-        input[..d.inputs].copy_from_slice(&stages[i].inputs);
         let settings = stage_settings(at.settings, tableau.weights[i]);
-        if d.input() > 0 {
+        if d.prescribed > 0 || !model.signals.is_empty() {
+            input[..d.inputs].copy_from_slice(&stages[i].inputs);
             workspace.prepare(At { model, settings: &settings, state: base, u: input });
         }
         workspace.increment.copy_from_slice(&stages[i].increment);
-        let size = workspace.evaluate(model, &settings, base);
-        let stage = &mut stages[i];
-        for (k, impulse) in stage.impulse.iter_mut().enumerate() {
-            *impulse = settings.time_step_s * (workspace.l_q[k] + workspace.force[k]);
+        workspace.evaluate(model, &settings, base)
+    }
+
+    /// Takes the impulse of the last evaluation.
+    fn take_impulse(&mut self, workspace: &Workspace, settings: &Settings, i: usize) {
+        let length = settings.time_step_s * self.tableau.weights[i];
+        for (k, impulse) in self.stages[i].impulse.iter_mut().enumerate() {
+            *impulse = length * (workspace.l_q[k] + workspace.force[k]);
         }
-        stage.q.copy_from_slice(&workspace.q_mid);
-        stage.velocity.copy_from_slice(&workspace.velocity);
-        size
     }
 
     /// Corrects stage after stage until all are solved; `None` if that takes too long.
@@ -220,11 +221,12 @@ impl Collocation {
         let mut report = StepReport::default();
         let mut previous = f64::INFINITY;
         let mut slow = 0;
-        while report.iterations < settings.max_iterations {
+        while report.iterations < workspace.most_iterations(settings) {
             report.iterations += 1;
             let mut size: f64 = 0.0;
             for i in 0..self.stages.len() {
                 let residual = self.evaluate(workspace, at, i);
+                self.take_impulse(workspace, settings, i);
                 if !residual.is_finite() {
                     return Ok(None);
                 }
@@ -279,11 +281,12 @@ impl Collocation {
         let mut previous = f64::INFINITY;
         let nd = model.dimensions.dynamic;
         let mut fresh = true;
-        for iteration in 1..=settings.max_iterations {
+        for iteration in 1..=workspace.most_iterations(settings) {
             report.iterations = iteration;
             let mut round_off = f64::MIN_POSITIVE;
             for i in 0..self.stages.len() {
                 self.evaluate(workspace, at, i);
+                self.take_impulse(workspace, settings, i);
                 round_off = round_off.max(workspace.round_off);
                 self.stages[i].momentum.copy_from_slice(&workspace.l_v);
                 if fresh {
@@ -300,9 +303,8 @@ impl Collocation {
             let converged = size <= enough || (stagnates && size <= floor);
             if fresh && !(converged && iteration > 1) {
                 self.fill_system(model, settings, system);
-                system.matrix.factor();
                 report.factorizations += 1;
-                if system.matrix.deficiency() > 0 {
+                if !system.matrix.factor() {
                     return Err(StepError::NotConverged { iterations: iteration, residual: size });
                 }
             }
@@ -347,13 +349,22 @@ impl Collocation {
         at: At<'_>,
         mut report: StepReport,
     ) -> Result<StepReport, StepError> {
+        for stage in &self.stages {
+            at.model.check_turns(&stage.increment, workspace.largest_turn())?;
+        }
+        self.sum_up(workspace, at);
+        workspace.estimates.write(&mut report);
+        Ok(report)
+    }
+
+    /// Puts the solution into the workspace.
+    fn sum_up(&mut self, workspace: &mut Workspace, at: At<'_>) {
         let At { model, settings, .. } = at;
         workspace.prepare(at);
         workspace.increment.fill(0.0);
         workspace.impulse.fill(0.0);
         let (count, stages) = (model.dimensions.dynamic, self.stages.len());
         for (i, stage) in self.stages.iter().enumerate() {
-            model.check_turns(&stage.increment, workspace.largest_turn())?;
             let rate = 1.0 / (settings.time_step_s * self.tableau.weights[i]);
             for k in 0..count {
                 workspace.increment[k] += stage.increment[k];
@@ -362,21 +373,18 @@ impl Collocation {
                 self.motion[(stages + i) * count + k] = rate * stage.impulse[k];
             }
         }
-        workspace.estimates.write(&mut report);
-        Ok(report)
     }
 
     /// Room for all stages at once, made when it is first needed.
     fn take_system(&mut self, model: &Model) -> Box<System> {
-        let count = self.stages.len();
-        let unknowns = count * model.dimensions.dynamic;
-        let d = model.dimensions;
-        let columns = padded(2 * d.coordinates() + d.inputs);
+        let (count, nd) = (self.stages.len(), model.dimensions.dynamic);
         self.system.take().unwrap_or_else(|| {
             Box::new(System {
                 hessians: (0..count).map(|_| Hessian::new(model)).collect(),
-                matrix: PivotedLu::new(&vec![1.0; unknowns], columns),
-                residual: vec![0.0; unknowns],
+                matrix: DenseLu::new(count * nd),
+                residual: vec![0.0; count * nd],
+                products: vec![0.0; count * nd * count * nd],
+                rates: vec![0.0; nd * count * nd],
             })
         })
     }
@@ -392,40 +400,39 @@ impl Collocation {
         let order = count * nd;
         let coupling = |i: usize, j: usize| self.tableau.coupling[i * count + j];
         let length = |i: usize| settings.time_step_s * self.tableau.weights[i];
-        let System { hessians, matrix, .. } = system;
-        for i in 0..count {
-            for k in 0..count {
-                for a in 0..nd {
-                    let target = &mut matrix.matrix[(i * nd + a) * order + k * nd..][..nd];
-                    let weight = coupling(i, k);
-                    let rates = hessians[k].qv[a * n..][..nd].iter();
-                    let changes = rates.zip(&hessians[i].vq[a * n..][..nd]);
-                    target.iter_mut().zip(changes).for_each(|(t, (p, l))| *t = weight * (p - l));
-                    for (j, stage) in hessians.iter().enumerate() {
-                        let weight = coupling(i, j) * length(j) * coupling(j, k);
-                        let entries = &stage.qq[a * n..][..nd];
-                        target.iter_mut().zip(entries).for_each(|(t, l)| *t += weight * l);
-                    }
-                    if i == k {
-                        let inverse = 1.0 / length(i);
-                        let entries = &hessians[i].vv[a * n..][..nd];
-                        target.iter_mut().zip(entries).for_each(|(t, l)| *t -= inverse * l);
-                    }
+        let System { hessians, matrix, products, rates, .. } = system;
+        if nd == 0 {
+            return;
+        }
+        for (j, stage) in hessians.iter().enumerate() {
+            for a in 0..nd {
+                let product = &mut products[(j * nd + a) * order..][..order];
+                let entries = &stage.qq[a * n..][..nd];
+                for (k, target) in product.chunks_exact_mut(nd).enumerate() {
+                    let weight = length(j) * coupling(j, k);
+                    target.iter_mut().zip(entries).for_each(|(t, l)| *t = weight * l);
                 }
+                rates[a * order + j * nd..][..nd].copy_from_slice(&stage.qv[a * n..][..nd]);
             }
         }
-    }
-}
-
-impl Stage {
-    /// Evaluates the Lagrangian and the forces at the stage.
-    fn place(&self, model: &Model, workspace: &mut Workspace) {
-        workspace.q_mid.copy_from_slice(&self.q);
-        workspace.velocity.copy_from_slice(&self.velocity);
-        if model.dimensions.inputs > 0 {
-            workspace.set_inputs(model, &self.inputs);
+        for i in 0..count {
+            for a in 0..nd {
+                let row = &mut matrix.matrix[(i * nd + a) * order..][..order];
+                let by_position = &hessians[i].vq[a * n..][..nd];
+                let rates = rates[a * order..][..order].chunks_exact(nd);
+                for (k, (target, rates)) in row.chunks_exact_mut(nd).zip(rates).enumerate() {
+                    let (weight, changes) = (coupling(i, k), rates.iter().zip(by_position));
+                    target.iter_mut().zip(changes).for_each(|(t, (p, l))| *t = weight * (p - l));
+                }
+                for j in 0..count {
+                    let (weight, product) = (coupling(i, j), &products[(j * nd + a) * order..]);
+                    row.iter_mut().zip(product).for_each(|(t, l)| *t += weight * l);
+                }
+                let inverse = 1.0 / length(i);
+                let own = row[i * nd..][..nd].iter_mut().zip(&hessians[i].vv[a * n..]);
+                own.for_each(|(t, l)| *t -= inverse * l);
+            }
         }
-        workspace.evaluate_lagrangian(model);
     }
 }
 

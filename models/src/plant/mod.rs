@@ -5,14 +5,16 @@
 //! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
 //! [`linearize`]; [`scheme`], [`collocation`] and [`period`] (higher order, substeps); [`blocks`] and
 //! [`second_order`]; then
-//! [`known`], [`diagnose`], [`settle`], [`snapshot`].
+//! [`choice`] (accuracy mode), [`known`], [`diagnose`], [`settle`], [`snapshot`].
 
 pub(crate) mod balls;
 pub(crate) mod blocks;
+mod choice;
 pub(crate) mod closure;
 mod collocation;
 pub(crate) mod conditioning;
 mod curvature;
+mod dense_lu;
 mod diagnose;
 mod forces;
 mod initial;
@@ -50,6 +52,7 @@ use crate::signal::Target;
 use balls::three;
 use newton::Workspace;
 
+pub use choice::{Choice, ChoiceError, ErrorEstimate};
 pub use diagnose::Diagnostics;
 pub use initial::{Initial, InitialError};
 pub use linearize::Linearization;

@@ -346,8 +346,7 @@ impl Workspace {
         let enough = settings.precision.residual();
         let mut previous = f64::INFINITY;
         let (mut fresh, mut idle) = (false, false);
-        let most = if self.is_last_resort { u32::MAX } else { WORTHWHILE };
-        while report.iterations < settings.max_iterations.min(most) {
+        while report.iterations < self.most_iterations(settings) {
             report.iterations += 1;
             report.residual = self.evaluate(model, settings, state);
             report.constraint_residual = self.evaluate_end(model, state);
@@ -707,6 +706,12 @@ impl Workspace {
         let size = |i: usize| self.q_mid[i].abs() + self.increment[i].abs();
         let mut corrections = self.residual.iter().enumerate();
         corrections.all(|(i, x)| x.abs() <= 2.0 * f64::EPSILON * size(i))
+    }
+
+    /// Corrections before a step is given up.
+    pub(crate) fn most_iterations(&self, settings: &Settings) -> u32 {
+        let most = settings.max_iterations;
+        if self.is_last_resort { most } else { most.min(WORTHWHILE) }
     }
 
     /// By how much a joint may turn in a step: beyond half a turn the solution is not the continuation of

@@ -100,7 +100,12 @@ impl Plant {
         let mut failed = false;
         for halvings in first.. {
             self.workspace.is_last_resort = halvings >= most;
-            match self.attempt(halvings, out.as_deref_mut()) {
+            let result = self.attempt(halvings, out.as_deref_mut());
+            if self.period.is_reached {
+                // It holds what belongs to a step within the period.
+                self.workspace.forget();
+            }
+            match result {
                 Ok(report) => {
                     self.period.halvings = halvings;
                     self.period.failed = failed;
@@ -240,7 +245,7 @@ fn take(
     };
     let report = collocation.solve(workspace, at, start_s)?;
     if let Some(out) = out {
-        collocation.linearize(workspace, at, out);
+        collocation.linearize(workspace, at, out)?;
     }
     Ok(report)
 }

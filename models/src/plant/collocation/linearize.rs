@@ -9,9 +9,10 @@
 //! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
 
 use super::Collocation;
+use crate::plant::StepError;
+use crate::plant::dense_lu::DenseLu;
 use crate::plant::linearize::Linearization;
 use crate::plant::newton::{At, Workspace};
-use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{Term, add_rows, padded};
 
 /// The stages of a linearized step: what its second derivatives need.
@@ -32,7 +33,7 @@ pub(crate) struct StageTangents {
     /// `Σ ∂P_i/∂Y`, row-major, n by `s n`.
     pub(crate) slopes: Vec<f64>,
     /// The factors of `∂R/∂Y`.
-    pub(crate) matrix: PivotedLu,
+    pub(crate) matrix: DenseLu,
     terms: Vec<Term>,
 }
 
@@ -43,7 +44,7 @@ impl Collocation {
         workspace: &mut Workspace,
         at: At<'_>,
         out: &mut Linearization,
-    ) {
+    ) -> Result<(), StepError> {
         let model = at.model;
         let d = model.dimensions;
         let (count, n, nd) = (self.stages.len(), d.coordinates(), d.dynamic);
@@ -51,12 +52,6 @@ impl Collocation {
         let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
         let stride = padded((next + d.prescribed).max(1));
         let mut system = self.take_system(model);
-        for (stage, hessian) in self.stages.iter().zip(&mut system.hessians) {
-            stage.place(model, workspace);
-            hessian.take(model, workspace);
-        }
-        self.fill_system(model, at.settings, &mut system);
-        system.matrix.factor();
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {
                 time_step_s: h,
@@ -69,10 +64,23 @@ impl Collocation {
                 tangent: vec![0.0; count * nd * stride],
                 impulses: vec![0.0; count * nd * stride],
                 slopes: vec![0.0; nd * count * nd],
-                matrix: PivotedLu::new(&vec![1.0; count * nd], 1),
+                matrix: DenseLu::new(count * nd),
                 terms: Vec::new(),
             })
         });
+        for i in 0..count {
+            self.evaluate(workspace, at, i);
+            system.hessians[i].take(model, workspace);
+            tangents.q[i * n..][..n].copy_from_slice(&workspace.q_mid);
+            tangents.velocity[i * n..][..n].copy_from_slice(&workspace.velocity);
+            tangents.inputs[i * d.inputs..][..d.inputs].copy_from_slice(&self.stages[i].inputs);
+        }
+        self.sum_up(workspace, at);
+        self.fill_system(model, at.settings, &mut system);
+        if !system.matrix.factor() {
+            self.system = Some(system);
+            return Err(StepError::NotFinite { iterations: 0 });
+        }
         let StageTangents { coupling, tangent, impulses, slopes, terms, .. } = &mut *tangents;
         tangent.fill(0.0);
         impulses.fill(0.0);
@@ -136,13 +144,9 @@ impl Collocation {
         }
 
         tangents.time_step_s = h;
-        for (i, stage) in self.stages.iter().enumerate() {
-            tangents.q[i * n..][..n].copy_from_slice(&stage.q);
-            tangents.velocity[i * n..][..n].copy_from_slice(&stage.velocity);
-            tangents.inputs[i * d.inputs..][..d.inputs].copy_from_slice(&stage.inputs);
-        }
         tangents.matrix.take_factors_of(&system.matrix);
         out.keep_stages(tangents);
         self.system = Some(system);
+        Ok(())
     }
 }

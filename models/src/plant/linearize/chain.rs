@@ -40,7 +40,7 @@ impl Chain {
     /// Begins at the start of the period.
     pub(crate) fn begin(&mut self, model: &Model, out: &mut Linearization) {
         let (n, rows) = (out.nd + out.nk, out.next_columns() + out.nk);
-        self.stride = padded(rows + out.ni);
+        self.stride = padded((rows + out.ni).max(1));
         self.tangent.clear();
         self.tangent.resize(rows * self.stride, 0.0);
         self.next.clear();

@@ -75,8 +75,7 @@ impl Contraction {
             let slopes = z_p.iter().enumerate().map(|(a, z)| z * stages.slopes[a * count * nd + k]);
             *mu = -(z[k % nd] + slopes.sum::<f64>());
         }
-        let mut matrix = stages.matrix.clone();
-        matrix.solve_transposed(&mut adjoint);
+        stages.matrix.solve_transposed(&mut adjoint);
 
         self.quadratic.clear();
         let [mut tangent, mut product] = [0; 2].map(|_| vec![0.0; 2 * n * stride]);
