@@ -17,7 +17,7 @@ use crate::plants::largest;
 const MARGIN: f64 = 30.0;
 /// A derivative this much larger than what is resolved is told from zero.
 const RESOLVED: f64 = 1e3;
-/// Round-off to which a step is solved, in units.
+/// Round-off to which a step is solved at best, in units.
 const SOLVED: f64 = 4.0;
 /// Displacements, each half of the one before.
 const LEVELS: usize = 18;
@@ -148,10 +148,11 @@ pub(crate) fn check(plant: &Plant, u: &[f64], seed: u64) -> Result<Error> {
         by_x.row(row).columns(columns.start, columns.len()).abs().sum() * size
     };
     let (size_q, size_p) = (largest(&x.q), largest(&x.p));
+    let solved = SOLVED.max(report.residual).max(report.constraint_residual);
     let rounding: Vec<f64> = (0..ends.len())
         .map(|i| {
             let of_state = sum(i, 0..n, size_q) + sum(i, n..n + d.dynamic, size_p);
-            SOLVED * f64::EPSILON * (ends[i].abs() + of_state)
+            solved * f64::EPSILON * (ends[i].abs() + of_state)
         })
         .collect();
     let mut map = Map { plant, x, u: u.to_vec(), end, halvings: report.halvings };
