@@ -1,17 +1,17 @@
 /*
- * plantd_link.h: layout of the shared-memory link of plantd, version 2.
+ * plantd_link.h: layout of the shared-memory link of plantd, version 3.
  *
  * A message is one plantd_link_header (the user header of an iceoryx2 sample) and a slice of
  * double. Each open plant has, in the iceoryx2 domain of the server,
  *
- *     plantd/2/<plant>/input   publish-subscribe and event, drivers to server
- *     plantd/2/<plant>/state   publish-subscribe and event, server to drivers
+ *     plantd/3/<plant>/input   publish-subscribe and event, drivers to server
+ *     plantd/3/<plant>/state   publish-subscribe and event, server to drivers
  *
  * The domain is an iceoryx2 0.10 configuration with the server's root path and the prefix
- * plantd2_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
+ * plantd3_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
  * by exclusive or, as eight hexadecimal digits. The publish-subscribe services have the payload type
  * "f64" (dynamic), the user header type PLANTD_LINK_TYPE_NAME, and the attributes
- * plantd.layout = "2" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
+ * plantd.layout = "3" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
  *
  * Conversation:
  *
@@ -45,10 +45,10 @@
 extern "C" {
 #endif
 
-#define PLANTD_LINK_LAYOUT_VERSION 2u
+#define PLANTD_LINK_LAYOUT_VERSION 3u
 #define PLANTD_LINK_MAGIC 0x746e6c70u /* "plnt" */
-#define PLANTD_LINK_SCHEMA_HASH UINT64_C(0x6847a2fcb4d7d53d)
-#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader2"
+#define PLANTD_LINK_SCHEMA_HASH UINT64_C(0xbee0d064efdc6b31)
+#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader3"
 #define PLANTD_LINK_POLL_FOREVER_NS UINT64_MAX
 
 /* What a message is. */
@@ -117,6 +117,8 @@ struct plantd_link_header {
     uint32_t iterations;          /* residual evaluations of the step */
     uint32_t factorizations;      /* factorizations of the step */
     uint32_t redundant_constraints; /* constraint equations that follow from others */
+    uint32_t steps;               /* steps of the method in the time step */
+    uint32_t halvings;            /* how often the time step was halved */
     double residual;              /* final residual in units of its own round-off */
     double constraint_residual;   /* constraint violation in units of its own round-off */
     double reciprocal_condition;  /* estimate for the Newton matrix, at most 1 */

@@ -109,6 +109,10 @@ pub struct StateView<'a> {
     pub constraint_reciprocal_condition: f64,
     /// Constraint equations that follow from others.
     pub redundant_constraints: u32,
+    /// Steps of the method in the time step; the counts above are those of all of them.
+    pub steps: u32,
+    /// How often the time step was halved: 0 unless it could not be solved in longer steps.
+    pub halvings: u32,
 }
 
 /// A driver of one plant. It holds the plant's lease until it is dropped.
@@ -194,6 +198,8 @@ impl LinkDriver {
             reciprocal_condition: self.last.reciprocal_condition,
             constraint_reciprocal_condition: self.last.constraint_reciprocal_condition,
             redundant_constraints: self.last.redundant_constraints,
+            steps: self.last.steps,
+            halvings: self.last.halvings,
         }
     }
 

@@ -4,12 +4,12 @@
 //!
 //! | name | pattern | from | to |
 //! | --- | --- | --- | --- |
-//! | `plantd/2/<plant>/input` | publish-subscribe | drivers | server |
-//! | `plantd/2/<plant>/input` | event | drivers | server |
-//! | `plantd/2/<plant>/state` | publish-subscribe | server | drivers |
-//! | `plantd/2/<plant>/state` | event | server | drivers |
+//! | `plantd/3/<plant>/input` | publish-subscribe | drivers | server |
+//! | `plantd/3/<plant>/input` | event | drivers | server |
+//! | `plantd/3/<plant>/state` | publish-subscribe | server | drivers |
+//! | `plantd/3/<plant>/state` | event | server | drivers |
 //!
-//! The `2` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
+//! The `3` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
 //! slice of `f64`: the input `u` one way, `(q, p, v, multipliers)` the other way.
 //!
 //! # Conversation

@@ -8,7 +8,7 @@ use plantd_models::control::{StageWeights, TrajectoryWeights, Weights, WeightsEr
 use plantd_models::scene::Signal;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
-    Plant, Scene, SceneError, Settings, Snapshot, State, StepReport,
+    Plant, Precision, Scene, SceneError, Settings, Snapshot, State, StepReport,
 };
 use plantd_proto::v1;
 use v1::initial_state::Form as InitialForm;
@@ -117,7 +117,32 @@ pub fn settings(
         }
         settings.singular_below = given.singular_below;
     }
+    if given.order != 0 {
+        settings.order = given.order;
+    }
+    if given.substeps != 0 {
+        let (asked, limit) = (given.substeps as usize, limits.max_substeps);
+        LimitExceeded::check("max_substeps", limit, "substeps", asked)?;
+        settings.substeps = given.substeps;
+    }
+    settings.halvings = given.halvings.unwrap_or(settings.halvings);
+    settings.precision = match v1::Precision::try_from(given.precision) {
+        Ok(v1::Precision::Unspecified | v1::Precision::Exact) => Precision::Exact,
+        Ok(v1::Precision::Fast) => Precision::Fast,
+        Err(_) => return Err(Fault::field("settings.precision", "is not a precision")),
+    };
+    if settings.order > 2 {
+        // No method has more than six stages.
+        let unknowns = (settings.order as usize / 2).min(6) * model.dimensions().dynamic;
+        let (name, limit) = ("stage_coordinates", limits.stage_coordinates);
+        LimitExceeded::check(name, limit, "coordinates of all stages", unknowns)?;
+    }
     Ok(settings)
+}
+
+/// Coordinates that a control period moves, over its steps and stages: its time goes with them.
+pub fn period_work(settings: &Settings, d: Dimensions) -> usize {
+    d.coordinates() * settings.substeps as usize * (settings.order as usize - 1)
 }
 
 /// Settings as a message.
@@ -126,11 +151,19 @@ pub fn settings_message(settings: &Settings) -> v1::PlantSettings {
         ForceSplit::Symmetric => v1::ForceSplit::Symmetric,
         ForceSplit::Paper => v1::ForceSplit::Paper,
     };
+    let precision = match settings.precision {
+        Precision::Exact => v1::Precision::Exact,
+        Precision::Fast => v1::Precision::Fast,
+    };
     v1::PlantSettings {
         time_step_s: settings.time_step_s,
         force_split: force_split.into(),
         max_iterations: settings.max_iterations,
         singular_below: settings.singular_below,
+        order: settings.order,
+        substeps: settings.substeps,
+        halvings: Some(settings.halvings),
+        precision: precision.into(),
     }
 }
 
@@ -557,6 +590,8 @@ pub fn report(report: &StepReport) -> v1::StepReport {
         reciprocal_condition: report.reciprocal_condition,
         constraint_reciprocal_condition: report.constraint_reciprocal_condition,
         redundant_constraints: report.redundant_constraints,
+        steps: report.steps,
+        halvings: report.halvings,
     }
 }
 

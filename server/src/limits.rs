@@ -66,6 +66,10 @@ limits! {
     watchers_per_plant = 64 in 0..=1_000_000;
     /// Newton iterations that a plant may ask for.
     max_iterations = 1000 in 1..=1_000_000;
+    /// Substeps of a time step that a plant may ask for.
+    max_substeps = 256 in 1..=256;
+    /// Coordinates times stages of a plant of an order above 2, of which half the order are the stages.
+    stage_coordinates = 1024 in 1..=393_216;
     /// Steps of one Step call.
     steps_per_call = 100_000 in 1..=1_000_000_000;
     /// Steps of a trajectory, or of one rollout case.

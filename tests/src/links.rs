@@ -72,9 +72,14 @@ pub fn new_session(model: &str) -> Result<Arc<Session>> {
 
 /// A plant of a built-in model.
 pub fn new_plant(model: &str) -> Result<Plant> {
+    new_plant_of_order(model, 2)
+}
+
+/// The same, stepped by a method of this order.
+pub fn new_plant_of_order(model: &str, order: u32) -> Result<Plant> {
     let scene = builtin::scene(model).context("no such model")?;
     let model = Arc::new(Model::compile(&scene)?);
-    let settings = Settings::new(&model);
+    let settings = Settings { order, ..Settings::new(&model) };
     Ok(Plant::new(model, settings)?)
 }
 

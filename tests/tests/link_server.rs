@@ -7,11 +7,18 @@ use std::time::{Duration, Instant};
 use plantd_client::link::{LeaseHolder, LinkDriver, LinkError, LinkOptions, StateView};
 use plantd_client::{Client, Code, v1};
 use plantd_models::{Plant, Snapshot};
-use plantd_tests::links::{PATIENCE, files_of_domain, new_plant, wait_until, wiggle};
+use plantd_tests::links::{PATIENCE, files_of_domain, new_plant_of_order, wait_until, wiggle};
 use plantd_tests::server::ServerProcess;
 
-/// Models with and without inputs, prescribed coordinates and constraints.
-const MODELS: &[&str] = &["pendulum", "spherical-pendulum", "four-bar", "marionette"];
+/// Models with and without inputs, prescribed coordinates and constraints, and orders.
+const PLANTS: &[(&str, u32)] = &[
+    ("pendulum", 2),
+    ("spherical-pendulum", 2),
+    ("four-bar", 2),
+    ("marionette", 2),
+    ("cart-pole", 6),
+    ("marionette", 6),
+];
 
 /// A root path that outlives servers.
 fn new_root() -> (tempfile::TempDir, PathBuf) {
@@ -28,9 +35,19 @@ fn start_server(root: &Path) -> ServerProcess {
 }
 
 async fn create_plant(client: &Client, id: &str, model: &str, open_link: bool) {
+    create_plant_of_order(client, id, (model, 2), open_link).await;
+}
+
+async fn create_plant_of_order(
+    client: &Client,
+    id: &str,
+    (model, order): (&str, u32),
+    open_link: bool,
+) {
     let request = v1::CreatePlantRequest {
         id: id.to_owned(),
         model: model.to_owned(),
+        settings: Some(v1::PlantSettings { order, ..Default::default() }),
         open_link,
         ..Default::default()
     };
@@ -72,12 +89,12 @@ async fn in_process_over_shared_memory_and_over_grpc_the_motion_is_the_same_bit_
     let (_directory, root) = new_root();
     let mut server = start_server(&root);
     let client = server.client().await;
-    for model in MODELS {
-        let ids = [format!("{model}-link"), format!("{model}-drive"), format!("{model}-step")];
+    for &(model, order) in PLANTS {
+        let ids = ["link", "drive", "step"].map(|way| format!("{model}-{order}-{way}"));
         for (id, open_link) in ids.iter().zip([true, false, false]) {
-            create_plant(&client, id, model, open_link).await;
+            create_plant_of_order(&client, id, (model, order), open_link).await;
         }
-        let mut plant = new_plant(model).unwrap();
+        let mut plant = new_plant_of_order(model, order).unwrap();
         let mut link = connect(&ids[0], &root).unwrap();
         let mut stream = client.drive(&ids[1]).await.unwrap();
         let mut u = vec![0.0; plant.model().dimensions().input()];
@@ -85,24 +102,36 @@ async fn in_process_over_shared_memory_and_over_grpc_the_motion_is_the_same_bit_
             wiggle(&plant, k, &mut u);
             plant.step(&u).unwrap();
             let expected = bits_of_plant(&plant);
-            assert_eq!(bits_of_view(link.step(&u).unwrap()), expected, "{model} {k}, link");
+            assert_eq!(
+                bits_of_view(link.step(&u).unwrap()),
+                expected,
+                "{model} of order {order}, {k}, link"
+            );
             let step = stream.step(&u).await.unwrap();
-            assert_eq!(bits_of_message(&step.state.unwrap()), expected, "{model} {k}, stream");
+            assert_eq!(
+                bits_of_message(&step.state.unwrap()),
+                expected,
+                "{model} of order {order}, {k}, stream"
+            );
             let row = v1::Matrix { rows: 1, cols: u.len() as u32, data: u.clone() };
             let request =
                 v1::StepRequest { id: ids[2].clone(), u: Some(row), ..Default::default() };
             let stepped = client.step(request).await.unwrap();
-            assert_eq!(bits_of_message(&stepped.states[0]), expected, "{model} {k}, call");
+            assert_eq!(
+                bits_of_message(&stepped.states[0]),
+                expected,
+                "{model} of order {order}, {k}, call"
+            );
         }
 
         // A snapshot of the plant on the link goes on in process, over the link and over gRPC.
         let snapshot = client.snapshot(&ids[0]).await.unwrap();
         drop(link);
         stream.close().await.unwrap();
-        let mut plant = new_plant(model).unwrap();
+        let mut plant = new_plant_of_order(model, order).unwrap();
         plant.restore(&Snapshot::from_bytes(&snapshot).unwrap()).unwrap();
-        let restored = format!("{model}-restored");
-        create_plant(&client, &restored, model, true).await;
+        let restored = format!("{model}-{order}-restored");
+        create_plant_of_order(&client, &restored, (model, order), true).await;
         let state = client.restore(&restored, snapshot.clone()).await.unwrap();
         assert_eq!(bits_of_message(&state), bits_of_plant(&plant));
         when_free(|| client.restore(&ids[1], snapshot.clone())).await;
@@ -113,9 +142,17 @@ async fn in_process_over_shared_memory_and_over_grpc_the_motion_is_the_same_bit_
             wiggle(&plant, k, &mut u);
             plant.step(&u).unwrap();
             let expected = bits_of_plant(&plant);
-            assert_eq!(bits_of_view(link.step(&u).unwrap()), expected, "{model} {k}, link");
+            assert_eq!(
+                bits_of_view(link.step(&u).unwrap()),
+                expected,
+                "{model} of order {order}, {k}, link"
+            );
             let step = stream.step(&u).await.unwrap();
-            assert_eq!(bits_of_message(&step.state.unwrap()), expected, "{model} {k}, stream");
+            assert_eq!(
+                bits_of_message(&step.state.unwrap()),
+                expected,
+                "{model} of order {order}, {k}, stream"
+            );
         }
     }
     assert!(server.stop().unwrap().success());
@@ -146,7 +183,7 @@ async fn shared_memory_and_grpc_compete_for_one_lease() {
     let client = server.client().await;
     create_plant(&client, "one", "pendulum", false).await;
     let opened = client.open_link("one").await.unwrap();
-    assert_eq!((opened.service.as_str(), opened.layout_version), ("plantd/2/one", 2));
+    assert_eq!((opened.service.as_str(), opened.layout_version), ("plantd/3/one", 3));
     assert_eq!(Path::new(&opened.root_path), root);
     assert_eq!(client.open_link("one").await.unwrap(), opened);
 

@@ -83,6 +83,26 @@ fn a_plant_from_its_creation_to_its_end() {
 }
 
 #[test]
+fn a_plant_is_stepped_by_the_method_asked_for() {
+    let server = ServerProcess::start().unwrap();
+    let method = ["--order", "6", "--substeps", "3", "--halvings", "0", "--fast"];
+    let created = json(&server, &[&["create", "four-bar", "--id", "p1"], &method[..]].concat());
+    let settings = &created["settings"];
+    assert_eq!((&settings["order"], &settings["substeps"]), (&6.into(), &3.into()));
+    assert_eq!(
+        (&settings["halvings"], &settings["precision"]),
+        (&0.into(), &"PRECISION_FAST".into())
+    );
+    let shown = text(&server, &["show", "plant", "p1"]);
+    assert!(shown.contains("order 6, substeps 3, halvings 0 at most, fast"), "{shown}");
+    // Nine steps of the midpoint rule make one of order 6 where there are constraints.
+    assert!(text(&server, &["step", "p1"]).contains("in 27 steps, residual"));
+    assert_eq!(json(&server, &["step", "p1"])["report"]["steps"], 27);
+    let refused = run(&server, &["linearize", "--plant", "p1", "--order", "4"]);
+    assert!(stderr(&refused).contains("cannot be used with"), "{}", stderr(&refused));
+}
+
+#[test]
 fn linearizations_and_gains_are_printed_for_people_and_for_programs() {
     let server = ServerProcess::start().unwrap();
     let at = ["cart-pole", "--at", "upright"];

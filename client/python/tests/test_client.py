@@ -51,6 +51,22 @@ def test_every_way_to_step_gives_the_same_bits(client):
     assert along[-1].a.tobytes() == last.a.tobytes()
 
 
+def test_methods(client):
+    method = {"order": 6, "substeps": 2, "halvings": 1, "precision": "fast"}
+    plant = client.create_plant("cart-pole", **method)
+    assert {name: getattr(plant, name) for name in method} == method
+    with client.drive(plant.id) as driver:
+        state = driver.step(0.5)
+    assert (driver.report.steps, driver.report.halvings) == (2, 0)
+    here = client.linearize("cart-pole", state=plant.state, u=[0.5], **method)
+    assert here.next.x.tobytes() == state.x.tobytes()
+    with pytest.raises(plantd.PlantdError) as refused:
+        client.create_plant("four-bar", order=12)
+    assert refused.value.violations[0].field == "settings.order"
+    with pytest.raises(TypeError, match="odrer"):
+        client.create_plant("four-bar", odrer=4)
+
+
 def test_linearization_at_a_point(client):
     here = client.linearize("cart-pole", at="upright")
     assert here.a.shape == (4, 4) and here.b.shape == (4, 1) and here.c.shape == (0, 4)

@@ -3,7 +3,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 /// Version of the layout and of the conversation. Part of the services' names.
-pub const LAYOUT_VERSION: u32 = 2;
+pub const LAYOUT_VERSION: u32 = 3;
 
 /// First field of every header: `plnt` in ASCII, little-endian.
 pub const MAGIC: u32 = u32::from_le_bytes(*b"plnt");
@@ -43,7 +43,7 @@ header! {
     /// Fields that a kind of message does not use are zero.
     #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
     #[repr(C)]
-    #[type_name("PlantdLinkHeader2")]
+    #[type_name("PlantdLinkHeader3")]
     pub struct Header {
         /// [`MAGIC`].
         pub magic: u32,
@@ -96,6 +96,10 @@ header! {
         pub factorizations: u32,
         /// Constraint equations that follow from others.
         pub redundant_constraints: u32,
+        /// Steps of the method in the time step.
+        pub steps: u32,
+        /// How often the time step was halved.
+        pub halvings: u32,
         /// Final residual of the step in units of its own round-off.
         pub residual: f64,
         /// Largest constraint violation in units of its own round-off.
@@ -294,10 +298,10 @@ mod tests {
 
     /// Bindings in other languages repeat the layout; this pins it. A change needs a new version.
     #[test]
-    fn the_layout_of_version_2_is_pinned() {
-        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (2, 192));
+    fn the_layout_of_version_3_is_pinned() {
+        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (3, 200));
         assert_eq!(align_of::<Header>(), 8);
-        assert_eq!(SCHEMA_HASH, 0x6847_a2fc_b4d7_d53d);
+        assert_eq!(SCHEMA_HASH, 0xbee0_d064_efdc_6b31);
     }
 
     #[test]

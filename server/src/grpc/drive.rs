@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use futures::Stream;
-use plantd_models::Linearization;
+use plantd_models::{Linearization, Plant};
 use plantd_proto::v1;
 use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio_util::sync::WaitForCancellationFutureOwned;
@@ -27,8 +27,9 @@ use crate::status::Fault;
 
 /// Answers in a row after which the stream lets others on its thread run.
 const BURST_MAX: u32 = 32;
-/// Steps of larger models may take milliseconds, and run beside the other tasks of their thread.
-const INLINE_COORDINATES_MAX: usize = 64;
+/// Work of a control period above which it may take milliseconds, and runs beside the other tasks of its
+/// thread.
+const INLINE_WORK_MAX: usize = 64;
 
 /// The answers of one Drive stream.
 pub struct DriveStream {
@@ -121,7 +122,9 @@ impl Driving {
     fn step(&mut self, input: v1::DriveInput) -> Result<Answer, Fault> {
         let v1::DriveInput { sequence, u } = input;
         let (lease, linearization) = (&mut self.lease, &mut self.linearization);
-        let is_short = lease.session().model().dimensions().coordinates() <= INLINE_COORDINATES_MAX;
+        let work =
+            |plant: &Plant| convert::period_work(plant.settings(), plant.model().dimensions());
+        let is_short = lease.with_plant(work) <= INLINE_WORK_MAX;
         let mut advance = || match linearization {
             None => lease.step(&u),
             Some(out) => lease.step_and_linearize(&u, out),

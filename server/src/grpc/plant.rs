@@ -73,7 +73,8 @@ impl PlantService {
             LimitExceeded::check(name, limit, "numbers in all states", numbers)?;
         }
         let mut lease = session.acquire(DriverKind::Step)?;
-        if plan.steps.saturating_mul(dimensions.coordinates()) <= INLINE_WORK_MAX {
+        let work = lease.with_plant(|plant| convert::period_work(plant.settings(), dimensions));
+        if plan.steps.saturating_mul(work) <= INLINE_WORK_MAX {
             return plan.run(&mut lease, None);
         }
         let job = move |abandoned: &Abandoned| plan.run(&mut lease, Some(abandoned));

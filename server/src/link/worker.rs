@@ -353,6 +353,8 @@ fn with_report(header: Header, report: &StepReport) -> Header {
         reciprocal_condition: report.reciprocal_condition,
         constraint_reciprocal_condition: report.constraint_reciprocal_condition,
         redundant_constraints: report.redundant_constraints,
+        steps: report.steps,
+        halvings: report.halvings,
         ..header
     }
 }

@@ -50,7 +50,8 @@ async fn no_more_plants_models_and_watchers_than_allowed() {
 
 #[tokio::test]
 async fn no_more_work_in_one_call_than_allowed() {
-    let limits = "steps_per_call=10,horizon=10,rollout_cases=2,max_iterations=50";
+    let limits = "steps_per_call=10,horizon=10,rollout_cases=2,max_iterations=50,max_substeps=4,\
+                  stage_coordinates=9";
     let (_server, client) = server_with(&["--limit", limits]).await;
     let id = plant(&client, "pendulum").await.id;
     let step = |hold| v1::StepRequest { id: id.clone(), hold, ..Default::default() };
@@ -85,10 +86,18 @@ async fn no_more_work_in_one_call_than_allowed() {
         assert_limited(answer, limit);
     }
 
-    let request = v1::CreatePlantRequest {
-        model: "pendulum".to_owned(),
-        settings: Some(v1::PlantSettings { max_iterations: 51, ..Default::default() }),
-        ..Default::default()
+    let create = async |settings| {
+        let request = v1::CreatePlantRequest {
+            model: "double-pendulum".to_owned(),
+            settings: Some(settings),
+            ..Default::default()
+        };
+        client.create_plant(request).await
     };
-    assert_limited(client.create_plant(request).await, "max_iterations");
+    let settings = v1::PlantSettings { max_iterations: 51, ..Default::default() };
+    assert_limited(create(settings).await, "max_iterations");
+    let settings = |order, substeps| v1::PlantSettings { order, substeps, ..Default::default() };
+    create(settings(8, 4)).await.unwrap();
+    assert_limited(create(settings(8, 5)).await, "max_substeps");
+    assert_limited(create(settings(12, 4)).await, "stage_coordinates");
 }

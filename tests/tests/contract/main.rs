@@ -9,6 +9,7 @@ mod elements;
 mod feedback;
 mod kalman;
 mod limits;
+mod methods;
 mod optimise;
 mod parameters;
 mod refusals;

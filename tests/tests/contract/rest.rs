@@ -221,6 +221,7 @@ async fn singular_constraints_are_named() {
         settings: Some(v1::PlantSettings {
             time_step_s: 0.1,
             singular_below,
+            halvings: Some(0),
             ..Default::default()
         }),
         initial: Some(at_velocity(&[0.0, -3.0], &[3.0 * sine / 0.1, 0.0])),

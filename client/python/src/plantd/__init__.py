@@ -20,6 +20,7 @@ from ._errors import PlantdError, StepError, Violation
 from ._feedback import Follower, GainSchedule
 from ._kalman import Kalman, KalmanStep, TrajectoryKalman
 from ._optimize import Checkpoint, Optimum, Progress, ProjectedReference, Search
+from ._requests import Stepping
 from ._rotation import compose, difference, rotations
 from ._types import (
     Analysis,
@@ -74,6 +75,7 @@ __all__ = [
     "State",
     "StepError",
     "StepReport",
+    "Stepping",
     "Trajectory",
     "TrajectoryGain",
     "TrajectoryKalman",

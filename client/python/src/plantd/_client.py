@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import grpc
 import numpy as np
@@ -21,6 +21,7 @@ from ._kalman import Kalman, TrajectoryKalman
 from ._optimize import Checkpoint, Method, Optimum, ProjectedReference, Search, method_number
 from ._requests import (
     Bounds,
+    Stepping,
     bounds,
     constraints,
     initial_state,
@@ -59,6 +60,9 @@ from ._types import (
     vector,
     weight,
 )
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 #: Where a server listens unless it is told otherwise.
 DEFAULT_ADDRESS = "http://127.0.0.1:50051"
@@ -183,25 +187,23 @@ class Client:
         model: str,
         *,
         id: str = "",
-        dt: float = 0.0,
-        paper: bool = False,
         at: str | None = None,
         q: Vector | None = None,
         v: Vector | None = None,
         p: Vector | None = None,
         initial: common_pb2.InitialState | None = None,
         open_link: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Plant:
         """Creates a plant: at an operating point (``at``), at a configuration ``q`` with velocity
         ``v`` or momentum ``p``, in any other ``initial`` state, or where the scene says.
 
-        ``dt`` is the time step in seconds, 0 the scene's; ``paper`` puts all forces at the start of
-        a step.
+        The keywords of `Stepping` say how it is stepped.
         """
         request = plant_service_pb2.CreatePlantRequest(
             id=id,
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             initial=initial_state(at, q, v, p, initial),
             open_link=open_link,
         )
@@ -408,13 +410,12 @@ class Client:
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
-        dt: float = 0.0,
-        paper: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Linearization:
         """Linearizes the map of a model at an operating point, or at ``state`` with input ``u``; or
         that of a ``plant``, where it is."""
         request = control_service_pb2.LinearizeRequest(
-            model=model, settings=settings(dt, paper), point=point(at, state, u, plant)
+            model=model, settings=settings(**stepping), point=point(at, state, u, plant)
         )
         answer = self._call(self.control.Linearize, request)
         return Linearization._from(
@@ -434,12 +435,11 @@ class Client:
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
-        dt: float = 0.0,
-        paper: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> SecondOrder:
         """All second derivatives of the map at a point given as in `linearize`."""
         request = control_service_pb2.LinearizeSecondOrderRequest(
-            model=model, settings=settings(dt, paper), point=point(at, state, u, plant)
+            model=model, settings=settings(**stepping), point=point(at, state, u, plant)
         )
         return SecondOrder._from(self._call(self.control.LinearizeSecondOrder, request))
 
@@ -453,8 +453,7 @@ class Client:
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
-        dt: float = 0.0,
-        paper: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Contraction:
         """The Hessian of ``weights @ x[k+1] + multiplier_weights @ multipliers`` at such a point.
 
@@ -462,7 +461,7 @@ class Client:
         """
         request = control_service_pb2.LinearizeSecondOrderRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             point=point(at, state, u, plant),
             weights=common_pb2.ContractionWeights(
                 x=vector(weights), multipliers=vector(multiplier_weights)
@@ -506,9 +505,8 @@ class Client:
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
-        dt: float = 0.0,
-        paper: bool = False,
         full: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Analysis:
         """Controllability, observability, modes and frequency response at such a point.
 
@@ -518,7 +516,7 @@ class Client:
         """
         request = control_service_pb2.AnalyzeRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             point=point(at, state, u, plant),
             constraints=constraints(full),
             frequencies_hz=vector(frequencies),
@@ -539,9 +537,8 @@ class Client:
         at: str = "initial",
         state: State | None = None,
         u: Vector = (),
-        dt: float = 0.0,
-        paper: bool = False,
         full: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Regulator:
         """Infinite-horizon LQR about an equilibrium. Weights are diagonals or matrices, ``s`` is that
         of the cross term x' s u.
@@ -550,7 +547,7 @@ class Client:
         """
         request = control_service_pb2.SolveLqrRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             point=point(at, state, u),
             weights=weights(q, r, s=s),
             constraints=constraints(full),
@@ -562,13 +559,11 @@ class Client:
         model: str,
         initial: State | Trajectory,
         u: npt.ArrayLike | None = None,
-        *,
-        dt: float = 0.0,
-        paper: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Iterator[Linearization]:
         """Linearizes the map at every step of the trajectory that ``u`` drives from ``initial``."""
         request = control_service_pb2.LinearizeTrajectoryRequest(
-            model=model, settings=settings(dt, paper), trajectory=trajectory(initial, u)
+            model=model, settings=settings(**stepping), trajectory=trajectory(initial, u)
         )
         return self._messages(
             self.control.LinearizeTrajectory(request),
@@ -589,9 +584,8 @@ class Client:
         s: npt.ArrayLike | None = None,
         stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
         values: bool = False,
-        dt: float = 0.0,
-        paper: bool = False,
         full: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Iterator[TrajectoryGain]:
         """Time-varying LQR along a trajectory: one gain per step, then one with only the final
         reference state. `GainSchedule` makes a law of them.
@@ -601,7 +595,7 @@ class Client:
         """
         request = control_service_pb2.SolveTrajectoryLqrRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             trajectory=trajectory(initial, u),
             weights=_trajectory_weights(q, r, q_final, s),
             stages=stage_weights(stages),
@@ -640,8 +634,7 @@ class Client:
         projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         bound_tolerance: float = 0.0,
         checkpoint_every: int = 0,
-        dt: float = 0.0,
-        paper: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Search:
         """Finds a trajectory that costs least: an iterator over the iterations, with ``result``.
 
@@ -666,7 +659,7 @@ class Client:
             )
         request = control_service_pb2.OptimizeTrajectoryRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             cost=control_service_pb2.TrajectoryCost(
                 x=matrix_message(x),
                 u=None if u is None else matrix_message(u),
@@ -711,9 +704,8 @@ class Client:
         projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         tolerance: float = 0.0,
         strict: bool = False,
-        dt: float = 0.0,
-        paper: bool = False,
         full: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> ProjectedReference:
         """Compares configurations from any planner with the motions of the plant, and finds a motion
         that follows them, with its regulator if the weights ``q`` and ``r`` are given.
@@ -725,7 +717,7 @@ class Client:
         has_weights = q is not None and r is not None
         request = control_service_pb2.ProjectReferenceRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             q=matrix_message(reference),
             u=None if u is None else matrix_message(u),
             projection=None if projection is None else weights(*projection),
@@ -750,9 +742,8 @@ class Client:
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
-        dt: float = 0.0,
-        paper: bool = False,
         full: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Kalman:
         """Steady-state Kalman filter about an equilibrium, ready to ``correct`` and ``predict``.
 
@@ -762,7 +753,7 @@ class Client:
         """
         request = control_service_pb2.SolveKalmanRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             point=point(at, state, u, plant),
             measurement=measurement(outputs, output_u),
             noise=noise(process_noise, input_noise, measurement_noise),
@@ -783,15 +774,14 @@ class Client:
         input_noise: npt.ArrayLike | None = None,
         initial_covariance: npt.ArrayLike,
         covariances: bool = False,
-        dt: float = 0.0,
-        paper: bool = False,
         full: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> TrajectoryKalman:
         """Time-varying Kalman filter along a trajectory, as `solve_kalman`; ``initial_covariance`` is
         that of the error in the initial state. ``covariances`` also returns those of each step."""
         request = control_service_pb2.SolveTrajectoryKalmanRequest(
             model=model,
-            settings=settings(dt, paper),
+            settings=settings(**stepping),
             trajectory=trajectory(initial, u),
             measurement=measurement(outputs, output_u),
             noise=noise(process_noise, input_noise, measurement_noise),
@@ -808,12 +798,11 @@ class Client:
         cases: Iterable[control_service_pb2.RolloutCase],
         *,
         every: int = 0,
-        dt: float = 0.0,
-        paper: bool = False,
+        **stepping: Unpack[Stepping],
     ) -> Iterator[Rollout]:
         """Runs many simulations at once; answers come in the order in which they end."""
         request = control_service_pb2.RolloutRequest(
-            model=model, settings=settings(dt, paper), cases=cases, every=every
+            model=model, settings=settings(**stepping), cases=cases, every=every
         )
         return self._messages(self.control.Rollout(request), Rollout._from)
 

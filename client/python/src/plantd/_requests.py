@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Union
+from typing import Any, Literal, TypedDict, Union
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,41 @@ from ._types import Array, State, Trajectory, Vector, matrix_message, vector, we
 Bounds = Mapping[str, Union[float, tuple[Union[float, None], Union[float, None]]]]
 
 
-def settings(dt: float, paper: bool) -> plant_service_pb2.PlantSettings:
+class Stepping(TypedDict, total=False):
+    """How a plant is stepped: keywords of every call that makes a plant or looks at the map of a model."""
+
+    #: Time step in seconds, the control period; 0, if not given, is the scene's.
+    dt: float
+    #: Put all forces at the start of a step, as the paper does.
+    paper: bool
+    #: Order of accuracy: 2, if not given, or 4, 6, 8 and, without constraints and ball joints, 12.
+    order: int
+    #: Steps of the method in a time step, 1 to 256; 1 if not given.
+    substeps: int
+    #: How often a time step that cannot be solved is halved, 0 to 6; 6 if not given.
+    halvings: int
+    #: Where the solver stops: at round-off, if not given, or at about eleven digits.
+    precision: Literal["exact", "fast"]
+
+
+def settings(
+    *,
+    dt: float = 0.0,
+    paper: bool = False,
+    order: int = 0,
+    substeps: int = 0,
+    halvings: int | None = None,
+    precision: Literal["exact", "fast"] = "exact",
+) -> plant_service_pb2.PlantSettings:
     split = plant_service_pb2.FORCE_SPLIT_PAPER if paper else plant_service_pb2.FORCE_SPLIT_SYMMETRIC
-    return plant_service_pb2.PlantSettings(time_step_s=dt, force_split=split)
+    return plant_service_pb2.PlantSettings(
+        time_step_s=dt,
+        force_split=split,
+        order=order,
+        substeps=substeps,
+        halvings=halvings,
+        precision=plant_service_pb2.Precision.Value(f"PRECISION_{precision.upper()}"),
+    )
 
 
 def initial_state(

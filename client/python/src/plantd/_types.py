@@ -101,6 +101,10 @@ class StepReport:
     constraint_reciprocal_condition: float = 1.0
     #: Constraint equations that follow from others.
     redundant_constraints: int = 0
+    #: Steps of the method in the time step; the counts above are those of all of them.
+    steps: int = 1
+    #: How often the time step was halved: 0 unless it could not be solved in longer steps.
+    halvings: int = 0
 
     @classmethod
     def _from(cls, m: common_pb2.StepReport) -> StepReport:
@@ -112,6 +116,8 @@ class StepReport:
             m.reciprocal_condition,
             m.constraint_reciprocal_condition,
             m.redundant_constraints,
+            m.steps,
+            m.halvings,
         )
 
 
@@ -509,6 +515,14 @@ class Plant:
     feedback: Feedback | None = None
     #: Numbers of the scene that were changed for this plant, by path.
     parameters: Mapping[str, float] = field(default_factory=dict)
+    #: Order of accuracy.
+    order: int = 2
+    #: Steps of the method in a time step.
+    substeps: int = 1
+    #: How often a time step that cannot be solved is halved.
+    halvings: int = 6
+    #: Where the solver stops: ``exact`` or ``fast``.
+    precision: str = "exact"
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
@@ -522,6 +536,10 @@ class Plant:
             energy,
             Feedback._from(m.feedback) if m.HasField("feedback") else None,
             {parameter.path: parameter.value for parameter in m.parameters},
+            m.settings.order,
+            m.settings.substeps,
+            m.settings.halvings,
+            plant_service_pb2.Precision.Name(m.settings.precision)[10:].lower(),
         )
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from ._errors import PlantdError, StepError
 from ._types import Array, State, StepReport, Vector, vector
 
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
 MAGIC = int.from_bytes(b"plnt", "little")
 POLL_FOREVER_NS = 2**64 - 1
 
@@ -139,6 +139,8 @@ class Header(ctypes.Structure):
         ("iterations", ctypes.c_uint32),
         ("factorizations", ctypes.c_uint32),
         ("redundant_constraints", ctypes.c_uint32),
+        ("steps", ctypes.c_uint32),
+        ("halvings", ctypes.c_uint32),
         ("residual", ctypes.c_double),
         ("constraint_residual", ctypes.c_double),
         ("reciprocal_condition", ctypes.c_double),
@@ -151,7 +153,7 @@ class Header(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the service knows the type."""
-        return "PlantdLinkHeader2"
+        return "PlantdLinkHeader3"
 
 
 def _fnv1a(data: bytes) -> int:
@@ -235,6 +237,8 @@ class LinkDriver:
             h.reciprocal_condition,
             h.constraint_reciprocal_condition,
             h.redundant_constraints,
+            h.steps,
+            h.halvings,
         )
 
     @property

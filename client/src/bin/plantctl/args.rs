@@ -38,6 +38,10 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
   steps = 100
   time_step_s = 0.1                 # the scene's if not given
   paper = false                     # all forces at the start of a step
+  order = 2                         # of accuracy
+  substeps = 1                      # steps in a time step
+  halvings = 6                      # how often a time step that cannot be solved is halved
+  fast = false                      # stop the solver at eleven digits
 
   [initial]                         # the scene's initial configuration if not given
   q = [0.0]                         # with p and v; or an operating point: at = \"hanging\"
@@ -519,6 +523,18 @@ pub(crate) struct Settings {
     /// Put all forces at the start of a step, as the paper does.
     #[arg(long)]
     paper: bool,
+    /// Order of accuracy: 2, 4, 6, 8, or 12 without constraints and ball joints; 2 if not given.
+    #[arg(long, value_name = "ORDER")]
+    order: Option<u32>,
+    /// Steps of the method in a time step.
+    #[arg(long, value_name = "N")]
+    substeps: Option<u32>,
+    /// How often a time step that cannot be solved is halved; 6 if not given.
+    #[arg(long, value_name = "N")]
+    halvings: Option<u32>,
+    /// Stop the solver at eleven digits instead of at round-off.
+    #[arg(long)]
+    fast: bool,
     /// Newton iterations before a step is given up.
     #[arg(long, value_name = "N")]
     max_iterations: Option<u32>,
@@ -531,11 +547,17 @@ impl From<Settings> for v1::PlantSettings {
     fn from(settings: Settings) -> Self {
         let split =
             if settings.paper { v1::ForceSplit::Paper } else { v1::ForceSplit::Unspecified };
+        let precision =
+            if settings.fast { v1::Precision::Fast } else { v1::Precision::Unspecified };
         Self {
             time_step_s: settings.dt.unwrap_or(0.0),
             force_split: split.into(),
             max_iterations: settings.max_iterations.unwrap_or(0),
             singular_below: settings.singular_below.unwrap_or(0.0),
+            order: settings.order.unwrap_or(0),
+            substeps: settings.substeps.unwrap_or(0),
+            halvings: settings.halvings,
+            precision: precision.into(),
         }
     }
 }
@@ -586,7 +608,7 @@ pub(crate) struct Point {
     #[arg(long, value_name = "POINT", default_value = "initial")]
     pub(crate) at: String,
     /// Instead: the model, the settings and the present state of this plant.
-    #[arg(long, value_name = "ID", conflicts_with_all = ["model", "at", "dt", "paper", "max_iterations", "singular_below"])]
+    #[arg(long, value_name = "ID", conflicts_with_all = ["model", "at", "Settings"])]
     pub(crate) plant: Option<String>,
 }
 

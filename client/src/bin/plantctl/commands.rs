@@ -265,6 +265,7 @@ async fn show_plant(client: &Client, output: Output, id: String) -> Result<()> {
         let state = plant.and_then(|p| p.state.as_ref());
         [
             plant.map(|p| text::plants(std::slice::from_ref(p))),
+            plant.and_then(|p| p.settings.as_ref()).map(text::stepping),
             state.map(text::state),
             answer.energy.as_ref().map(text::energy),
             plant.map(text::parameters),

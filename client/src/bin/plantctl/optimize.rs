@@ -32,6 +32,13 @@ struct Problem {
     #[serde(default)]
     paper: bool,
     #[serde(default)]
+    order: u32,
+    #[serde(default)]
+    substeps: u32,
+    halvings: Option<u32>,
+    #[serde(default)]
+    fast: bool,
+    #[serde(default)]
     initial: Initial,
     cost: Cost,
     #[serde(default)]
@@ -225,9 +232,14 @@ impl Problem {
 
     fn settings(&self) -> v1::PlantSettings {
         let split = if self.paper { v1::ForceSplit::Paper } else { v1::ForceSplit::Unspecified };
+        let precision = if self.fast { v1::Precision::Fast } else { v1::Precision::Unspecified };
         v1::PlantSettings {
             time_step_s: self.time_step_s,
             force_split: split.into(),
+            order: self.order,
+            substeps: self.substeps,
+            halvings: self.halvings,
+            precision: precision.into(),
             ..Default::default()
         }
     }

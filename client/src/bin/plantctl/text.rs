@@ -182,6 +182,13 @@ pub(crate) fn plants(plants: &[v1::PlantInfo]) -> String {
     table(&head, &plants.iter().map(row).collect::<Vec<_>>())
 }
 
+/// By which method a plant is stepped.
+pub(crate) fn stepping(settings: &v1::PlantSettings) -> String {
+    let precision = if settings.precision() == v1::Precision::Fast { "fast" } else { "exact" };
+    let (order, substeps, halvings) = (settings.order, settings.substeps, settings.halvings());
+    format!("  order {order}, substeps {substeps}, halvings {halvings} at most, {precision}\n")
+}
+
 /// A state; vectors that the model does not have are left out.
 pub(crate) fn state(state: &v1::State) -> String {
     let mut text = format!("step {}, time {} s\n", state.step, number(state.time_s));
@@ -212,8 +219,13 @@ pub(crate) fn report(report: &v1::StepReport) -> String {
         0 => String::new(),
         count => format!(", {count} redundant constraints"),
     };
+    let steps = match (report.steps, report.halvings) {
+        (0 | 1, _) => String::new(),
+        (steps, 0) => format!(" in {steps} steps"),
+        (steps, halvings) => format!(" in {steps} steps, halved {halvings} times"),
+    };
     format!(
-        "  solver: {} iterations, {} factorizations, residual {} round-offs{redundant}\n",
+        "  solver: {} iterations, {} factorizations{steps}, residual {} round-offs{redundant}\n",
         report.iterations,
         report.factorizations,
         number(report.residual)
