@@ -94,6 +94,9 @@ fn error(case: &Released, order: u32, steps: u32, seconds: usize) -> f64 {
     largest
 }
 
+/// An order, and two numbers of steps that show it.
+type Steps = (u32, [u32; 2]);
+
 /// Asserts that errors fall with the step as an order says: by what they are at the numbers of steps.
 fn assert_order(what: &str, order: u32, steps: [u32; 2], error: impl Fn(u32) -> f64) {
     let [coarse, fine] = steps.map(error);
@@ -105,7 +108,7 @@ fn assert_order(what: &str, order: u32, steps: [u32; 2], error: impl Fn(u32) -> 
 
 #[test]
 fn steps_are_of_their_order() {
-    let pairs: [(&str, &[(u32, [u32; 2])]); 5] = [
+    let pairs: [(&str, &[Steps]); 5] = [
         ("pendulum", &[(2, [400, 800]), (4, [40, 80]), (6, [16, 32]), (8, [10, 16])]),
         ("double-pendulum", &[(2, [800, 1600]), (4, [160, 320]), (6, [64, 128]), (8, [48, 60])]),
         ("spherical-pendulum", &[(2, [400, 800]), (4, [80, 160]), (6, [32, 64]), (8, [16, 24])]),

@@ -8,7 +8,8 @@ use std::sync::Arc;
 use common::linearization::check_with;
 use common::{builtin, methods, model, plant, waving_input};
 use plantd_models::{
-    Initial, InitialError, Linearization, Plant, Precision, Scene, Settings, Snapshot, StepError,
+    Initial, InitialError, Linearization, Plant, Precision, Scene, Settings, Snapshot, State,
+    StepError,
 };
 
 const TIME_STEP_S: f64 = 0.01;
@@ -242,6 +243,56 @@ fn ball_joints_turn_in_any_order() {
         let scene = read(name);
         for settings in methods(&scene) {
             check_with(&scene, |s| *s = settings);
+        }
+    }
+}
+
+/// The projected momentum is `M q̇`, and its derivative that of its differences: along curves on the
+/// constraints, along momenta, and along velocities of prescribed joints.
+#[test]
+fn projected_momenta_have_exact_derivatives() {
+    for name in ["four-bar", "scissor-3", "marionette"] {
+        let mut plant = plant(&builtin(name), |_| ());
+        common::wave(&mut plant, 20);
+        let State { q, p, v, .. } = plant.state();
+        let d = plant.model().dimensions();
+        let n = d.coordinates();
+        let by_state = plant.projected_momentum_by_state();
+        let mut at = |q: &[f64], p: &[f64], v: &[f64]| {
+            let (q, p, v) = (q.to_vec(), p.to_vec(), v.to_vec());
+            plant.initialize(&Initial::Momentum { q, p, v }).unwrap();
+            plant.projected_momentum()
+        };
+        let size = at(&q, &p, &v).iter().fold(0.0_f64, |m, x| m.max(x.abs()));
+        let compare = |what: &str, dx: &[f64], found: &[f64]| {
+            let predicted = &by_state * nalgebra::DVector::from_row_slice(dx);
+            let allowed = 1e-7 * (size + predicted.amax());
+            for (i, (a, b)) in predicted.iter().zip(found).enumerate() {
+                assert!((a - b).abs() < allowed, "{name}, {what}: {i}: {a} {b}");
+            }
+        };
+        for i in 0..n {
+            let mut dx = vec![0.0; 2 * n];
+            dx[n + i] = 1.0;
+            let found = common::slope(1e-3, |s| {
+                let (mut p, mut v) = (p.clone(), v.clone());
+                *p.iter_mut().chain(&mut v).nth(i).unwrap() += s;
+                at(&q, &p, &v)
+            });
+            compare(&format!("p, v {i}"), &dx, &found);
+        }
+        let mut on_manifold = common::plant(&builtin(name), |_| ());
+        for i in 0..n {
+            let mut curve = |s: f64| {
+                let mut q = q.clone();
+                q[i] += s;
+                on_manifold.initialize(&Initial::Projection { q, hold: Vec::new() }).unwrap();
+                on_manifold.q().to_vec()
+            };
+            let mut dx = common::slope(1e-3, &mut curve);
+            let found = common::slope(1e-3, |s| at(&curve(s), &p, &v));
+            dx.resize(2 * n, 0.0);
+            compare(&format!("direction {i}"), &dx, &found);
         }
     }
 }

@@ -84,11 +84,8 @@ impl Plant {
         let mut best: Option<(u64, Choice)> = None;
         for order in ORDERS {
             let cheapest = best.as_ref().map_or(u64::MAX, |(cost, _)| *cost);
-            if let Some((cost, choice)) = probe.reach(order, tolerance, &reference, cheapest) {
-                if cost < cheapest {
-                    best = Some((cost, choice));
-                }
-            }
+            let reached = probe.reach(order, tolerance, &reference, cheapest);
+            best = reached.filter(|(cost, _)| *cost < cheapest).or(best);
         }
         best.map(|(_, choice)| choice).ok_or(out_of_reach)
     }

@@ -5,7 +5,7 @@
 //! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
 //! [`linearize`]; [`scheme`], [`collocation`] and [`period`] (higher order, substeps); [`blocks`] and
 //! [`second_order`]; then
-//! [`choice`] (accuracy mode), [`known`], [`diagnose`], [`settle`], [`snapshot`].
+//! [`choice`] (accuracy mode), [`projected`] (momentum), [`known`], [`diagnose`], [`settle`], [`snapshot`].
 
 pub(crate) mod balls;
 pub(crate) mod blocks;
@@ -28,6 +28,7 @@ pub(crate) mod pivoted_lu;
 mod planar;
 pub(crate) mod potentials;
 mod predictor;
+mod projected;
 pub(crate) mod rows;
 #[cfg(test)]
 pub(crate) mod samples;
