@@ -4,7 +4,7 @@
 //! start of the mechanism in the JSON file PATH, and answers each with the CPU seconds of its thread and
 //! the last configuration, or with `error:` and a reason. Methods: `midpoint`, `midpoint-ab` (a step
 //! with A and B of all joint torques), the same with `-moving` (without the first step of a pass, which
-//! finds the velocity that a momentum means), and `scalar`: the midpoint rule written by hand for a
+//! finds the velocity that a momentum means), `order-4` to `order-12` (Gauss collocation), and `scalar`: the midpoint rule written by hand for a
 //! pendulum.
 
 use std::collections::BTreeMap;
@@ -89,9 +89,9 @@ fn run(
     steps: u64,
     passes: u64,
 ) -> Result<(f64, Vec<f64>), Box<dyn Error>> {
-    let (method, order) = match method.strip_prefix("order-").map(|rest| rest.split_once('-')) {
-        Some(Some((order, rest))) => (rest, order.parse()?),
-        _ => (method, 2),
+    let (method, order) = match method.strip_prefix("order-") {
+        Some(order) => ("midpoint", order.parse()?),
+        None => (method, 2),
     };
     let settings = Settings { time_step_s, order, ..Settings::new(model) };
     let mut plant = Plant::new(Arc::clone(model), settings)?;

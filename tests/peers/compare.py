@@ -318,7 +318,9 @@ def measure_growth(plantd):
 
 ERRORS = [1e-2, 1e-4, 1e-6, 1e-8, 1e-10]
 CASES = [("P", 2), ("P", 10), ("D", 2), ("D", 10), ("S", 2), ("S", 10), ("C4", 2)]
-FIXED_STEP = [m for m in STEP_METHODS if m != BY_HAND and m[0] != "CasADi C"]
+HIGH_ORDERS = [("plantd", f"order-{order}") for order in (4, 6, 8, 12)]
+FIXED_STEP = [PLANTD, *HIGH_ORDERS]
+FIXED_STEP += [m for m in STEP_METHODS if m[0] not in ("plantd", "CasADi C")]
 ADAPTIVE = [("Pinocchio", "dop853"), ("Drake", "rk3"), ("Drake", "rk5")]
 LONGEST_SECONDS = 0.2
 
@@ -343,7 +345,8 @@ def curve(driver, name, method, end, reference):
     if method in ("dop853", "rk3", "rk5"):
         commands = [(f"{method}:{10 ** -(k / 2):.3e}", 0.1, round(end / 0.1)) for k in range(2, 28)]
     else:
-        commands = [(method, end / steps, steps) for steps in (end * 5 * 2**k for k in range(22))]
+        counts = [round(end * 2 * 2 ** (k / 2)) for k in range(46)]
+        commands = [(method, end / steps, steps) for steps in counts]
     for what, dt, steps in commands:
         try:
             seconds, q = repeated(driver, name, what, dt, steps)
@@ -372,6 +375,21 @@ def measure_accuracy(drivers):
                 curves.setdefault((name, end), {})[method] = points
         say(f"{name}, T = {end} s: done")
     return curves
+
+
+def table_of_best(curves):
+    """plantd's time, order free, over that of the best peer, at each error."""
+    lines = ["| plantd / best peer | " + " | ".join(f"{e:.0e}" for e in ERRORS) + " |"]
+    lines.append("| --- |" + " ---: |" * len(ERRORS))
+    for (name, end), methods in curves.items():
+        cells = []
+        for e in ERRORS:
+            times = {m: t for m, p in methods.items() if (t := time_to_reach(p, e))}
+            own = min((t for m, t in times.items() if m[0] == "plantd"), default=None)
+            peer = min((t for m, t in times.items() if m[0] != "plantd"), default=None)
+            cells.append(f"{own / peer:.2f}" if own and peer else "")
+        lines.append(f"| {name}, {end} s | " + " | ".join(cells) + " |")
+    return lines
 
 
 def table_of_accuracy(curves):
@@ -482,15 +500,16 @@ def main():
     parser.add_argument("--rounds", type=int, default=15, help="alternations per mechanism")
     parser.add_argument("--only", nargs="*", help="mechanisms, for example P C8 T30")
     parser.add_argument("--without-accuracy", action="store_true")
+    parser.add_argument("--accuracy-alone", action="store_true")
     parser.add_argument("--out", type=pathlib.Path, default=TARGET / "results")
     options = parser.parse_args()
     enter_environment()
     drivers = start_drivers()
     options.out.mkdir(parents=True, exist_ok=True)
-    names = options.only or TABLE
+    names = [] if options.accuracy_alone else options.only or TABLE
     steps = measure_calls(drivers, names, STEP_METHODS, options.rounds)
     derivatives = measure_calls(drivers, names, AB_METHODS, options.rounds)
-    growth = list(measure_growth(drivers["plantd"]))
+    growth = [] if options.accuracy_alone else list(measure_growth(drivers["plantd"]))
     curves = {} if options.without_accuracy else measure_accuracy(drivers)
     report = ["# plantd beside its peers", "", *conditions(), "", "## One step", ""]
     report += [*table_of_calls(steps, STEP_METHODS), "", "## One step, A and B", ""]
@@ -499,9 +518,11 @@ def main():
     report += ["| plantd's | exponent | |", "| --- | ---: | --- |", *growth, ""]
     if curves:
         report += ["## Run time against error", "", *table_of_accuracy(curves), ""]
+        report += [*table_of_best(curves), ""]
         plot_accuracy(curves, options.out / "accuracy.svg")
-    plot_calls(steps, options.out / "steps.svg", "One step of a chain")
-    plot_calls(derivatives, options.out / "derivatives.svg", "One step of a chain, A and B")
+    if names:
+        plot_calls(steps, options.out / "steps.svg", "One step of a chain")
+        plot_calls(derivatives, options.out / "derivatives.svg", "One step of a chain, A and B")
     write_csv(options.out / "results.csv", steps, derivatives, curves)
     (options.out / "results.md").write_text("\n".join(report))
     print("\n".join(report))
