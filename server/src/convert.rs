@@ -121,8 +121,6 @@ pub fn settings(
         settings.order = given.order;
     }
     if given.substeps != 0 {
-        let (asked, limit) = (given.substeps as usize, limits.max_substeps);
-        LimitExceeded::check("max_substeps", limit, "substeps", asked)?;
         settings.substeps = given.substeps;
     }
     settings.halvings = given.halvings.unwrap_or(settings.halvings);
@@ -131,13 +129,25 @@ pub fn settings(
         Ok(v1::Precision::Fast) => Precision::Fast,
         Err(_) => return Err(Fault::field("settings.precision", "is not a precision")),
     };
+    if given.tolerance != 0.0 {
+        let description = "is for CreatePlant: a method is chosen when a plant is created";
+        return Err(Fault::field("settings.tolerance", description));
+    }
+    check_method(&settings, model, limits)?;
+    Ok(settings)
+}
+
+/// Refuses methods that would take too long.
+fn check_method(settings: &Settings, model: &Model, limits: &Limits) -> Result<(), Fault> {
+    let (name, substeps) = ("max_substeps", settings.substeps as usize);
+    LimitExceeded::check(name, limits.max_substeps, "substeps", substeps)?;
     if settings.order > 2 {
         // No method has more than six stages.
         let unknowns = (settings.order as usize / 2).min(6) * model.dimensions().dynamic;
         let (name, limit) = ("stage_coordinates", limits.stage_coordinates);
         LimitExceeded::check(name, limit, "coordinates of all stages", unknowns)?;
     }
-    Ok(settings)
+    Ok(())
 }
 
 /// Coordinates that a control period moves, over its steps and stages: its time goes with them.
@@ -164,6 +174,7 @@ pub fn settings_message(settings: &Settings) -> v1::PlantSettings {
         substeps: settings.substeps,
         halvings: Some(settings.halvings),
         precision: precision.into(),
+        tolerance: 0.0,
     }
 }
 
@@ -235,6 +246,27 @@ pub fn plant(
         Start::Snapshot(snapshot) => plant.restore(snapshot)?,
     }
     Ok(plant)
+}
+
+/// A plant in its initial state, with the order and the substeps that a tolerance asks for.
+pub fn accurate_plant(
+    model: &Arc<Model>,
+    settings: Settings,
+    start: &Start,
+    tolerance: f64,
+    limits: &Limits,
+) -> Result<(Plant, v1::Accuracy), Fault> {
+    let (name, limit) = ("settle_coordinates", limits.settle_coordinates);
+    let count = model.dimensions().coordinates();
+    LimitExceeded::check(name, limit, "coordinates to choose a method for", count)?;
+    if let Start::Snapshot(_) = start {
+        return Err(Fault::field("initial.snapshot", "has its order and substeps already"));
+    }
+    let choice = plant(model, settings, start, "initial")?.choose_method(tolerance)?;
+    let settings = Settings { order: choice.order, substeps: choice.substeps, ..settings };
+    check_method(&settings, model, limits)?;
+    let accuracy = v1::Accuracy { tolerance, error: choice.error, periods: choice.periods };
+    Ok((plant(model, settings, start, "initial")?, accuracy))
 }
 
 /// A plant at a point, and the input there.

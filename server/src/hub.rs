@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use futures::{StreamExt, future, stream};
 use plantd_models::Plant;
+use plantd_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
@@ -99,11 +100,13 @@ impl Hub {
         id: String,
         model_name: String,
         plant: Plant,
+        accuracy: Option<v1::Accuracy>,
     ) -> Result<Arc<Session>, Fault> {
         let mut plants = self.plants();
         let id = if id.is_empty() { free_id(&plants) } else { id };
         self.admit(&plants, &id)?;
-        let session = Session::new(id.clone(), model_name, plant, Arc::clone(&self.metrics));
+        let metrics = Arc::clone(&self.metrics);
+        let session = Session::new(id.clone(), model_name, plant, accuracy, metrics);
         plants.insert(id, Arc::clone(&session));
         self.metrics.set_plants(plants.len());
         Ok(session)

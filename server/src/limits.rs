@@ -94,7 +94,7 @@ limits! {
     frequencies = 10_000 in 1..=1_000_000;
     /// Second derivatives of one call, formed or contracted: outputs times pairs of parameters.
     second_order_numbers = 64_000_000 in 1000..=10_000_000_000;
-    /// Coordinates of a model whose equilibrium is searched.
+    /// Coordinates of a model whose equilibrium is searched, or whose method is chosen by a tolerance.
     settle_coordinates = 128 in 1..=65_536;
     /// Heavy computations that may wait for a worker.
     queued_jobs = 256 in 1..=1_000_000;

@@ -141,6 +141,8 @@ pub struct Session {
     model: Arc<Model>,
     start: Snapshot,
     start_state: State,
+    /// Why the method is as it is, if it was chosen by a tolerance.
+    accuracy: Option<v1::Accuracy>,
     core: Mutex<Core>,
     /// Held by whoever replaces the plant; taken before the core's lock.
     replacing: Mutex<()>,
@@ -158,7 +160,13 @@ pub struct Session {
 
 impl Session {
     /// A session around a plant in its initial state, to which a reset returns.
-    pub fn new(id: String, model_name: String, plant: Plant, metrics: Arc<Metrics>) -> Arc<Self> {
+    pub fn new(
+        id: String,
+        model_name: String,
+        plant: Plant,
+        accuracy: Option<v1::Accuracy>,
+        metrics: Arc<Metrics>,
+    ) -> Arc<Self> {
         let model = Arc::clone(plant.model());
         let mut input = vec![0.0; model.dimensions().input()];
         plant.hold_input(&mut input);
@@ -167,6 +175,7 @@ impl Session {
             model_name,
             start: plant.snapshot(),
             start_state: plant.state(),
+            accuracy,
             model,
             core: Mutex::new(Core {
                 plant,
@@ -204,6 +213,11 @@ impl Session {
     /// names and sizes.
     pub fn model(&self) -> &Arc<Model> {
         &self.model
+    }
+
+    /// What was promised when the method was chosen by a tolerance.
+    pub fn accuracy(&self) -> Option<v1::Accuracy> {
+        self.accuracy
     }
 
     /// The model and the settings in force.

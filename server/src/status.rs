@@ -9,6 +9,7 @@
 //! | INVALID_ARGUMENT | `INVALID_SCENE` | BadRequest, one entry per error of the scene while they fit a trailer | a scene does not compile |
 //! | INVALID_ARGUMENT | `INPUT_DIMENSION`, `INPUT_NOT_FINITE` | BadRequest | the input of a step |
 //! | INVALID_ARGUMENT | `OFF_CONSTRAINT`, `DEGENERATE`, `PROJECTION_FAILED` | BadRequest | an initial configuration cannot satisfy the constraints |
+//! | INVALID_ARGUMENT | `TOLERANCE_OUT_OF_REACH` | BadRequest | no order and substeps reach the tolerance of a plant |
 //! | INVALID_ARGUMENT | `NOT_SETTLED` | BadRequest | no equilibrium was found from a guess |
 //! | INVALID_ARGUMENT | `INVALID_SNAPSHOT`, `SNAPSHOT_MISMATCH` | BadRequest | damaged, or of another model or other settings |
 //! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
@@ -41,7 +42,8 @@ use plantd_models::control::{AnalysisError, KalmanError, NoiseError, RiccatiErro
 use plantd_models::optimize::{OptimizeError, Stuck};
 use plantd_models::reference::ReferenceError;
 use plantd_models::{
-    ContinuousError, InitialError, SceneError, SettleError, SnapshotError, StepError, TooLarge,
+    ChoiceError, ContinuousError, InitialError, SceneError, SettleError, SnapshotError, StepError,
+    TooLarge,
 };
 use plantd_proto::v1;
 use tonic::{Code, Status};
@@ -319,6 +321,23 @@ impl Fault {
             }
             SettleError::Unbounded { .. } | SettleError::NotConverged { .. } => {
                 Self::field_because("NOT_SETTLED", field, message)
+            }
+        }
+    }
+}
+
+impl From<ChoiceError> for Fault {
+    fn from(error: ChoiceError) -> Self {
+        let (field, message) = ("settings.tolerance", error.to_string());
+        match error {
+            ChoiceError::Tolerance(_) => Self::field(field, message),
+            ChoiceError::Initial(error) => Self::from_initial(error, "initial"),
+            ChoiceError::Step { period, error } => {
+                Self::precondition(step_error_reason(&error), "initial", message)
+                    .with("step", period)
+            }
+            ChoiceError::OutOfReach { .. } => {
+                Self::field_because("TOLERANCE_OUT_OF_REACH", field, message)
             }
         }
     }

@@ -67,7 +67,7 @@ impl LinkFixture {
 /// A session of a plant of a built-in model.
 pub fn new_session(model: &str) -> Result<Arc<Session>> {
     let plant = new_plant(model)?;
-    Ok(Session::new(PLANT.to_owned(), model.to_owned(), plant, Arc::new(Metrics::default())))
+    Ok(Session::new(PLANT.to_owned(), model.to_owned(), plant, None, Arc::new(Metrics::default())))
 }
 
 /// A plant of a built-in model.

@@ -152,7 +152,7 @@ fn steps_with_feedback_allocate_nothing() {
         (Mode::Guard, vec![bound(0.1)]),
     ] {
         let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("it starts");
-        let session = Session::new("a".to_owned(), "b".to_owned(), plant, Arc::default());
+        let session = Session::new("a".to_owned(), "b".to_owned(), plant, None, Arc::default());
         let spec = Spec {
             reference: Reference::Gain(stage(0)),
             weights: None,

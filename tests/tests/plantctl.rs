@@ -98,6 +98,10 @@ fn a_plant_is_stepped_by_the_method_asked_for() {
     // Nine steps of the midpoint rule make one of order 6 where there are constraints.
     assert!(text(&server, &["step", "p1"]).contains("in 27 steps, residual"));
     assert_eq!(json(&server, &["step", "p1"])["report"]["steps"], 27);
+    let chosen = json(&server, &["create", "pendulum", "--tolerance", "1e-6"]);
+    assert!(chosen["accuracy"]["error"].as_f64().unwrap() <= 1e-6, "{chosen}");
+    let id = chosen["id"].as_str().unwrap();
+    assert!(text(&server, &["show", "plant", id]).contains(" over 50 steps"));
     let refused = run(&server, &["linearize", "--plant", "p1", "--order", "4"]);
     assert!(stderr(&refused).contains("cannot be used with"), "{}", stderr(&refused));
 }

@@ -60,6 +60,10 @@ def test_methods(client):
     assert (driver.report.steps, driver.report.halvings) == (2, 0)
     here = client.linearize("cart-pole", state=plant.state, u=[0.5], **method)
     assert here.next.x.tobytes() == state.x.tobytes()
+    chosen = client.create_plant("cart-pole", tolerance=1e-6)
+    assert chosen.accuracy.error <= chosen.accuracy.tolerance == 1e-6
+    assert (chosen.order, chosen.substeps) != (2, 1)
+    assert plant.accuracy is None
     with pytest.raises(plantd.PlantdError) as refused:
         client.create_plant("four-bar", order=12)
     assert refused.value.violations[0].field == "settings.order"

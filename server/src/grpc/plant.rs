@@ -36,15 +36,30 @@ impl PlantService {
             convert::check_name("id", &id)?;
         }
         self.hub.check_new_plant(&id)?;
+        let mut settings = settings.unwrap_or_default();
+        let tolerance = std::mem::take(&mut settings.tolerance);
+        let is_chosen = tolerance != 0.0;
+        for (name, given) in [("order", settings.order), ("substeps", settings.substeps)] {
+            if is_chosen && given != 0 {
+                return Err(Fault::field(format!("settings.{name}"), "is chosen by `tolerance`"));
+            }
+        }
         let hub = Arc::clone(&self.hub);
         let job = move |_: &_| {
             let entry = hub.catalog.get(&model)?;
-            let settings = convert::settings(settings, &entry.model, &hub.limits)?;
+            let settings = convert::settings(Some(settings), &entry.model, &hub.limits)?;
             let start = convert::start(initial, &entry.model, &hub.limits)?;
-            let plant = convert::plant(&entry.model, settings, &start, "initial")?;
-            hub.insert(id, entry.name, plant)
+            let (model, limits) = (&entry.model, &hub.limits);
+            let (plant, accuracy) = if is_chosen {
+                let chosen = convert::accurate_plant(model, settings, &start, tolerance, limits)?;
+                (chosen.0, Some(chosen.1))
+            } else {
+                (convert::plant(model, settings, &start, "initial")?, None)
+            };
+            hub.insert(id, entry.name, plant, accuracy)
         };
-        let session = self.hub.attendants.run(job).await?;
+        let workers = if is_chosen { &self.hub.workers } else { &self.hub.attendants };
+        let session = workers.run(job).await?;
         if open_link && let Err(fault) = self.hub.open_link(Arc::clone(&session)).await {
             self.hub.delete(session.id()).await?;
             return Err(fault);
@@ -149,6 +164,7 @@ pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
         driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
         link_open: session.link_open(),
         feedback: view.feedback,
+        accuracy: session.accuracy(),
         parameters: view
             .parameters
             .iter()

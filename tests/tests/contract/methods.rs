@@ -1,6 +1,7 @@
 //! Orders, substeps, halving and precision: what plants are given, what they say, and what they do.
 
 use plantd_client::{Client, Code, MatrixExt as _, StateExt as _, v1};
+use plantd_models::HALVINGS_MAX;
 
 use crate::support::*;
 
@@ -41,7 +42,7 @@ async fn run(client: &Client, id: &str) -> Vec<(u64, Vec<u64>)> {
 async fn settings_come_back_and_go_with_snapshots() {
     let (_server, client) = server().await;
     let plain = plant(&client, "cart-pole").await.settings.unwrap();
-    assert_eq!((plain.order, plain.substeps, plain.halvings), (2, 1, Some(6)));
+    assert_eq!((plain.order, plain.substeps, plain.halvings), (2, 1, Some(HALVINGS_MAX)));
     assert_eq!(plain.precision(), v1::Precision::Exact);
 
     let given = v1::PlantSettings {
@@ -87,7 +88,7 @@ async fn methods_that_are_not_there_are_refused() {
     create("four-bar", order(8)).await.unwrap();
     let paper = v1::PlantSettings { force_split: v1::ForceSplit::Paper.into(), ..order(4) };
     assert_bad_field(create("pendulum", paper).await, "settings.order");
-    let often = v1::PlantSettings { halvings: Some(7), ..Default::default() };
+    let often = v1::PlantSettings { halvings: Some(HALVINGS_MAX + 1), ..Default::default() };
     assert_bad_field(create("pendulum", often).await, "settings.halvings");
     let vague = v1::PlantSettings { precision: 9, ..Default::default() };
     assert_bad_field(create("pendulum", vague).await, "settings.precision");
@@ -163,4 +164,59 @@ async fn a_halved_period_says_so_and_is_linearized_as_it_was_taken() {
             assert!(error < 1e-6 * (1.0 + exact.abs()), "{row}, {column}: {error:e} of {exact}");
         }
     }
+}
+
+/// Against order 12 in many substeps.
+#[tokio::test]
+async fn a_tolerance_chooses_the_method() {
+    let (_server, client) = server().await;
+    let tolerance = |tolerance| v1::PlantSettings { tolerance, ..Default::default() };
+    let path = async |settings| {
+        let request = v1::CreatePlantRequest {
+            initial: Some(at_velocity(&[2.0, 1.0], &[1.0, -2.0])),
+            ..with("double-pendulum", settings)
+        };
+        let plant = client.create_plant(request).await.unwrap();
+        let id = plant.id.clone();
+        let request = v1::StepRequest { id, hold: 50, all_states: true, ..Default::default() };
+        let states = client.step(request).await.unwrap().states;
+        (plant, states.into_iter().flat_map(|state| state.q).collect::<Vec<_>>())
+    };
+    let (_, exact) = path(v1::PlantSettings { substeps: 16, ..order(12) }).await;
+    let error =
+        |path: &[f64]| path.iter().zip(&exact).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    let wanted = 1e-8;
+    let (chosen, found) = path(tolerance(wanted)).await;
+    let accuracy = chosen.accuracy.unwrap();
+    assert_eq!((accuracy.tolerance, accuracy.periods), (wanted, 50));
+    assert!(accuracy.error <= wanted && error(&found) <= 1.2 * wanted, "{accuracy:?}");
+    let settings = chosen.settings.unwrap();
+    assert!(settings.order > 2 && settings.substeps > 0 && settings.tolerance == 0.0);
+    let (plain, found) = path(v1::PlantSettings::default()).await;
+    assert!(plain.accuracy.is_none() && error(&found) > 100.0 * wanted);
+    let shown = client.get_plant(&chosen.id).await.unwrap().plant.unwrap();
+    assert_eq!((shown.accuracy, shown.settings), (chosen.accuracy, Some(settings)));
+
+    let create = async |model: &str, settings| client.create_plant(with(model, settings)).await;
+    for bad in [-1.0, f64::NAN, f64::INFINITY, 1e-20] {
+        assert_bad_field(create("pendulum", tolerance(bad)).await, "settings.tolerance");
+    }
+    let both = v1::PlantSettings { order: 4, ..tolerance(wanted) };
+    assert_bad_field(create("pendulum", both).await, "settings.order");
+    let both = v1::PlantSettings { substeps: 1, ..tolerance(wanted) };
+    assert_bad_field(create("pendulum", both).await, "settings.substeps");
+    let snapshot = client.snapshot(&chosen.id).await.unwrap();
+    let fork = from_snapshot("double-pendulum", tolerance(wanted), snapshot);
+    assert_bad_field(client.create_plant(fork).await, "initial.snapshot");
+    let large = create("chain-129", tolerance(wanted)).await;
+    assert_refused(large, Code::ResourceExhausted, "LIMIT_EXCEEDED", "");
+    let request = v1::LinearizeRequest {
+        model: "pendulum".to_owned(),
+        settings: Some(tolerance(wanted)),
+        point: Some(plantd_client::operating_point("upright")),
+    };
+    assert_bad_field(client.linearize(request).await, "settings.tolerance");
+    let fast = v1::PlantSettings { time_step_s: 1e3, ..tolerance(1e-12) };
+    let refused = create("double-pendulum", fast).await;
+    assert!(refused.is_err(), "{refused:?}");
 }

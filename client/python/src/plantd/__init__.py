@@ -23,6 +23,7 @@ from ._optimize import Checkpoint, Optimum, Progress, ProjectedReference, Search
 from ._requests import Stepping
 from ._rotation import compose, difference, rotations
 from ._types import (
+    Accuracy,
     Analysis,
     Contraction,
     Diagnostics,
@@ -46,6 +47,7 @@ from ._types import (
 )
 
 __all__ = [
+    "Accuracy",
     "Analysis",
     "Checkpoint",
     "Client",

@@ -27,7 +27,7 @@ class Stepping(TypedDict, total=False):
     order: int
     #: Steps of the method in a time step, 1 to 256; 1 if not given.
     substeps: int
-    #: How often a time step that cannot be solved is halved, 0 to 6; 6 if not given.
+    #: How often a time step that cannot be solved is halved, 0 to 8; 8 if not given.
     halvings: int
     #: Where the solver stops: at round-off, if not given, or at about eleven digits.
     precision: Literal["exact", "fast"]

@@ -495,6 +495,22 @@ FEEDBACK_MODES = {
 }
 
 
+@dataclass(frozen=True)
+class Accuracy:
+    """What was promised when order and substeps were chosen."""
+
+    #: The tolerance asked for, rad or m.
+    tolerance: float
+    #: Largest error of a coordinate that was found, rad or m.
+    error: float
+    #: Time steps over which it was found.
+    periods: int
+
+    @classmethod
+    def _from(cls, m: plant_service_pb2.Accuracy) -> Accuracy:
+        return cls(m.tolerance, m.error, m.periods)
+
+
 @dataclass(frozen=True, eq=False)
 class Plant:
     """A plant as the server described it."""
@@ -520,9 +536,11 @@ class Plant:
     #: Steps of the method in a time step.
     substeps: int = 1
     #: How often a time step that cannot be solved is halved.
-    halvings: int = 6
+    halvings: int = 8
     #: Where the solver stops: ``exact`` or ``fast``.
     precision: str = "exact"
+    #: What was promised, if order and substeps were chosen by a tolerance.
+    accuracy: Accuracy | None = None
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
@@ -540,6 +558,7 @@ class Plant:
             m.settings.substeps,
             m.settings.halvings,
             plant_service_pb2.Precision.Name(m.settings.precision)[10:].lower(),
+            Accuracy._from(m.accuracy) if m.HasField("accuracy") else None,
         )
 
 

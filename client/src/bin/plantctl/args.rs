@@ -40,7 +40,7 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
   paper = false                     # all forces at the start of a step
   order = 2                         # of accuracy
   substeps = 1                      # steps in a time step
-  halvings = 6                      # how often a time step that cannot be solved is halved
+  halvings = 8                      # how often a time step that cannot be solved is halved
   fast = false                      # stop the solver at eleven digits
 
   [initial]                         # the scene's initial configuration if not given
@@ -117,6 +117,9 @@ pub(crate) enum Command {
         id: Option<String>,
         #[command(flatten)]
         settings: Settings,
+        /// Choose order and substeps: largest error of a coordinate over the next 50 steps, rad or m.
+        #[arg(long, value_name = "ERROR", conflicts_with_all = ["order", "substeps"])]
+        tolerance: Option<f64>,
         #[command(flatten)]
         initial: Initial,
         /// Open the shared-memory link at once.
@@ -529,7 +532,7 @@ pub(crate) struct Settings {
     /// Steps of the method in a time step.
     #[arg(long, value_name = "N")]
     substeps: Option<u32>,
-    /// How often a time step that cannot be solved is halved; 6 if not given.
+    /// How often a time step that cannot be solved is halved; 8 if not given.
     #[arg(long, value_name = "N")]
     halvings: Option<u32>,
     /// Stop the solver at eleven digits instead of at round-off.
@@ -558,6 +561,7 @@ impl From<Settings> for v1::PlantSettings {
             substeps: settings.substeps.unwrap_or(0),
             halvings: settings.halvings,
             precision: precision.into(),
+            tolerance: 0.0,
         }
     }
 }

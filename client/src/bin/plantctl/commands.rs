@@ -33,18 +33,19 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
             let model = client.create_model_as(request).await?;
             output.print(|| json::message("Model", &model), || text::model(&model))?;
         }
-        Command::Create { model, id, settings, initial, link } => {
+        Command::Create { model, id, settings, tolerance, initial, link } => {
+            let tolerance = tolerance.unwrap_or(0.0);
             let request = v1::CreatePlantRequest {
                 id: id.unwrap_or_default(),
                 model,
-                settings: Some(settings.into()),
+                settings: Some(v1::PlantSettings { tolerance, ..settings.into() }),
                 initial: initial.into(),
                 open_link: link,
             };
             let plant = client.create_plant(request).await?;
             output.print(
                 || json::message("PlantInfo", &plant),
-                || text::plants(std::slice::from_ref(&plant)),
+                || text::plants(std::slice::from_ref(&plant)) + &text::stepping(&plant),
             )?;
         }
         Command::Step { id, u, count, all } => {
@@ -265,7 +266,7 @@ async fn show_plant(client: &Client, output: Output, id: String) -> Result<()> {
         let state = plant.and_then(|p| p.state.as_ref());
         [
             plant.map(|p| text::plants(std::slice::from_ref(p))),
-            plant.and_then(|p| p.settings.as_ref()).map(text::stepping),
+            plant.map(text::stepping),
             state.map(text::state),
             answer.energy.as_ref().map(text::energy),
             plant.map(text::parameters),

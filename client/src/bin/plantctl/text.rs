@@ -183,10 +183,16 @@ pub(crate) fn plants(plants: &[v1::PlantInfo]) -> String {
 }
 
 /// By which method a plant is stepped.
-pub(crate) fn stepping(settings: &v1::PlantSettings) -> String {
+pub(crate) fn stepping(plant: &v1::PlantInfo) -> String {
+    let settings = plant.settings.unwrap_or_default();
     let precision = if settings.precision() == v1::Precision::Fast { "fast" } else { "exact" };
     let (order, substeps, halvings) = (settings.order, settings.substeps, settings.halvings());
-    format!("  order {order}, substeps {substeps}, halvings {halvings} at most, {precision}\n")
+    let accuracy = plant.accuracy.as_ref().map_or(String::new(), |accuracy| {
+        format!("; off by {} over {} steps", number(accuracy.error), accuracy.periods)
+    });
+    format!(
+        "  order {order}, substeps {substeps}, halvings {halvings} at most, {precision}{accuracy}\n"
+    )
 }
 
 /// A state; vectors that the model does not have are left out.
