@@ -29,7 +29,7 @@ def say(text):
     print(text, file=sys.stderr, flush=True)
 
 
-def enter_environment():
+def enter_environment(script=__file__):
     """Makes the environment if it is not there, and goes on in it."""
     python = TARGET / "venv" / "bin" / "python"
     if pathlib.Path(sys.executable) == python:
@@ -43,7 +43,7 @@ def enter_environment():
             if done.returncode:
                 say(f"{package} does not install here: compared without it")
         marker.touch()
-    os.execv(python, [python, __file__, *sys.argv[1:]])
+    os.execv(python, [python, script, *sys.argv[1:]])
 
 
 # Drivers

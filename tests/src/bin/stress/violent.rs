@@ -37,6 +37,26 @@ pub(crate) fn cases(setup: &Setup) -> Vec<Case> {
             released(name, method, steps, setup, finding)
         }));
     }
+    let coarse =
+        Some("so long a step is halved where the motion is fastest, and is another map then");
+    let long = [
+        ("double-pendulum", 2, 100_000, None),
+        ("double-pendulum", 8, 100_000, None),
+        ("chain-4", 2, 20_000, coarse),
+        ("chain-4", 8, 20_000, None),
+        ("four-bar", 2, 20_000, None),
+        ("four-bar", 8, 20_000, None),
+    ];
+    for (name, order, steps, limit) in long {
+        let method = Method::new(0.01, order, 1);
+        let criterion =
+            "every step accepted; energy error ≤ 10 % of the well depth; violation ≤ 1e-12";
+        let title = format!("violent: {name} at 0.01 s for {steps} steps{}", method.name());
+        let case = Case::new(title, criterion, move |setup, finding| {
+            released(name, method, steps, setup, finding)
+        });
+        cases.push(case.known_limit(limit));
+    }
     for (method, criterion) in [0.7, 1.0].into_iter().flat_map(|h| {
         [2, 4, 8, 12]
             .map(|order| (Method::new(h, order, 1), "1000 steps from q = 3, p = 1 accepted"))
@@ -62,10 +82,10 @@ pub(crate) fn cases(setup: &Setup) -> Vec<Case> {
     cases
 }
 
-/// From horizontal, or from the initial configuration of a scissor.
+/// From horizontal; scissors and four-bar linkages from their initial configuration.
 fn start(scene: &Scene, method: Method) -> Result<Plant> {
     let mut plant = plants::plant(scene, method)?;
-    if scene.name.starts_with("chain") {
+    if scene.name.starts_with("chain") || scene.name == "double-pendulum" {
         let mut q = vec![0.0; plant.q().len()];
         q[0] = FRAC_PI_2;
         let v = vec![0.0; q.len()];
@@ -86,7 +106,9 @@ fn released(
     let mut plant = start(&scene, method)?;
     let geometry = Geometry::new(plant.model());
     let depth = match name.split_once('-') {
-        Some(("chain", _)) => well_depth(&scene)?,
+        Some(("chain" | "double", _)) => well_depth(&scene)?,
+        // Its rods once hanging and once upright, crank and coupler in line.
+        Some(("four", _)) => 2.0 * 9.8 * (0.5 * 0.25 + 1.2 * (0.5 + 0.6) + 1.0 * 0.5),
         // A stack that opens: each of its links of 1 kg falls by up to the height of all.
         _ => {
             let links = (scene.frames.len() - 1) as f64;
