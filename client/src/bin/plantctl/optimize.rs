@@ -457,6 +457,8 @@ mod tests {
         assert_eq!(options.first_method(), v1::DescentMethod::QuasiNewton);
         assert_eq!(options.first_iterations, 4);
         assert_eq!(bounds(&problem.bounds.input)[0].max, Some(5.0));
+        let settings = problem.settings();
+        assert_eq!((settings.order, settings.substeps, settings.halvings), (2, 1, Some(8)));
     }
 
     #[test]
