@@ -6,6 +6,7 @@ use crate::Scene;
 use crate::scene::{
     Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Point,
 };
+use crate::trigonometry::sin_cos_of;
 
 /// Names of the built-in scenes. `chain-N`, `tree-N` and `scissor-N` stand for whole families.
 pub const NAMES: &[&str] = &[
@@ -154,7 +155,7 @@ fn tree(n: usize) -> Scene {
                 inertia: vec![0.003712, 0.003488, 0.0008],
             }),
         });
-        scene.coordinates.push(dynamic(name.clone(), 0.6 * (0.7 + 1.3 * i as f64).sin()));
+        scene.coordinates.push(dynamic(name.clone(), 0.6 * sin_cos_of(0.7 + 1.3 * i as f64).0));
         scene.inputs.push(Input { name: format!("torque{i}"), coordinate: Some(name), gain: 1.0 });
     }
     scene
@@ -187,7 +188,7 @@ fn scissor(n: usize) -> Scene {
         joint: Some(Joint::Prismatic { axis: [1.0, 0.0, 0.0], coordinate: None }),
         body: Some(Body { mass: 1.0, center_of_mass: [0.0; 3], inertia: Vec::new() }),
     });
-    scene.coordinates.push(dynamic("slider".to_owned(), LENGTH * OPENING.cos()));
+    scene.coordinates.push(dynamic("slider".to_owned(), LENGTH * sin_cos_of(OPENING).1));
     // Seen from its parent link, every link but the first of a strand folds back by twice the opening.
     for (start, first_is_right) in [("slider", true), ("world", false)] {
         let mut parent = start.to_owned();

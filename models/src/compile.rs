@@ -18,6 +18,7 @@ use crate::scene::{self, CoordinateKind, Motion, Problem, Scene, SceneError, Spr
 use crate::spatial::{Mat3, Sym3, Vec3};
 use crate::spline::Spline;
 use crate::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
+use crate::trigonometry::sin_cos_of;
 
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.
@@ -590,17 +591,17 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
 }
 
 fn about_x(angle: f64) -> Mat3 {
-    let (s, c) = angle.sin_cos();
+    let (s, c) = sin_cos_of(angle);
     Mat3::from_rows([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 }
 
 fn about_y(angle: f64) -> Mat3 {
-    let (s, c) = angle.sin_cos();
+    let (s, c) = sin_cos_of(angle);
     Mat3::from_rows([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 }
 
 fn about_z(angle: f64) -> Mat3 {
-    let (s, c) = angle.sin_cos();
+    let (s, c) = sin_cos_of(angle);
     Mat3::from_rows([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 }
 

@@ -8,6 +8,7 @@
 use crate::plant::two_sum;
 use crate::scalar::Scalar;
 use crate::spatial::{Mat3, Vec3};
+use crate::trigonometry::sin_cos_of;
 
 /// An orientation, as a unit quaternion `[w, x, y, z]`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,7 +24,7 @@ impl Quaternion {
     /// `exp(v)`: the rotation about the direction of `v` by its length.
     pub(crate) fn exp(v: Vec3) -> Self {
         let angle = v.norm();
-        let (sine, cosine) = (0.5 * angle).sin_cos();
+        let (sine, cosine) = sin_cos_of(0.5 * angle);
         // sin(t/2)/t to round-off where the quotient would be 0/0.
         let scale = if angle < 1e-4 { 0.5 - angle * angle / 48.0 } else { sine / angle };
         Self([cosine, scale * v[0], scale * v[1], scale * v[2]])
@@ -38,7 +39,7 @@ impl Quaternion {
             return Vec3::ZERO;
         }
         // `atan2` keeps all digits near half a turn, where the cosine alone would lose them.
-        let angle = 2.0 * sine.atan2(w.abs());
+        let angle = 2.0 * libm::atan2(sine, w.abs());
         vector * (angle.copysign(w) / sine)
     }
 
@@ -52,7 +53,7 @@ impl Quaternion {
     pub(crate) fn turned(self, low: [f64; 4], turn: Vec3) -> (Self, [f64; 4]) {
         let Self([_, x, y, z]) = Self::exp(turn);
         // cos(t/2) − 1
-        let quarter = (0.25 * turn.norm()).sin();
+        let quarter = sin_cos_of(0.25 * turn.norm()).0;
         let change = [-2.0 * quarter * quarter, x, y, z];
         let (of_high, of_low) = (product(self.0, change), product(low, change));
         let sums = [0, 1, 2, 3].map(|i| two_sum(self.0[i], of_high[i] + (low[i] + of_low[i])));

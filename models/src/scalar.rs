@@ -6,6 +6,8 @@
 use std::fmt::Debug;
 use std::ops::{Add, AddAssign, Mul, MulAssign, Neg, Sub, SubAssign};
 
+use crate::trigonometry;
+
 /// A real number, or one that carries derivatives.
 pub(crate) trait Scalar:
     Copy
@@ -53,7 +55,7 @@ impl Scalar for f64 {
     }
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
-        self.sin_cos()
+        trigonometry::sin_cos_of(self)
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
@@ -65,7 +67,7 @@ impl Scalar for f64 {
     }
     #[inline(always)]
     fn tanh(self) -> Self {
-        self.tanh()
+        libm::tanh(self)
     }
 }
 

@@ -6,6 +6,7 @@ use std::f64::consts::TAU;
 
 use crate::scene::{self, Interpolation};
 use crate::spline::Spline;
+use crate::trigonometry::sin_cos_of;
 
 /// A signal with what it drives.
 #[derive(Clone, Debug)]
@@ -113,12 +114,12 @@ impl Shape {
         match self {
             Self::Constant(value) => *value,
             Self::Sinusoid { amplitude, frequency, phase, offset } => {
-                offset + amplitude * (frequency * t + phase).sin()
+                offset + amplitude * sin_cos_of(frequency * t + phase).0
             }
             Self::Chirp { amplitude, frequency, rate, duration, offset } => {
                 let swept = t.min(*duration);
                 let phase = frequency * t + rate * swept * (t - 0.5 * swept);
-                offset + amplitude * phase.sin()
+                offset + amplitude * sin_cos_of(phase).0
             }
             Self::Spline { spline, first, last } => spline.value(t.clamp(*first, *last)),
             Self::Table { times, values, linear, repeat } => {

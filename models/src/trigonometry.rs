@@ -7,7 +7,7 @@
 
 use std::f64::consts::FRAC_2_PI;
 
-/// Angles up to this are reduced here; larger ones, and what is not finite, by the standard library.
+/// Angles up to this are reduced here; larger ones, and what is not finite, by `libm`.
 const LARGEST: f64 = 1e6;
 
 /// `π/2` in parts of 33 bits, and the rest.
@@ -45,10 +45,16 @@ pub(crate) fn sin_cos(angles: &[f64], out: &mut [[f64; 2]]) {
     if !all_small {
         for (angle, out) in angles.iter().zip(out) {
             if !(angle.abs() <= LARGEST) {
-                *out = angle.sin_cos().into();
+                *out = libm::sincos(*angle).into();
             }
         }
     }
+}
+
+/// The sine and the cosine of one angle.
+#[inline(always)]
+pub(crate) fn sin_cos_of(angle: f64) -> (f64, f64) {
+    if angle.abs() <= LARGEST { reduced(angle).into() } else { libm::sincos(angle) }
 }
 
 #[inline(always)]

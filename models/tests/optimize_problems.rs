@@ -161,9 +161,10 @@ fn newton_converges_quadratically() {
     let mut search = swing.search(&Bounds::default(), None, options);
     let rows = run(&mut search);
     assert_eq!(search.status(), Status::Converged, "{rows:#?}");
-    let ends: Vec<f64> = rows.iter().rev().take(4).map(|row| -row.directional_derivative).collect();
+    let ends: Vec<f64> = rows.iter().rev().take(6).map(|row| -row.directional_derivative).collect();
+    // Down to the round-off of slopes.
     for (after, before) in ends.iter().zip(&ends[1..]) {
-        assert!(*after <= 10.0 * before * before, "{ends:?}");
+        assert!(*after <= 10.0 * before * before + 1e-14, "{ends:?}");
     }
     // Nothing is to be gained anywhere.
     let slopes = swing.gradient(&search).0;

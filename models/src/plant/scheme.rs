@@ -15,6 +15,7 @@
 //! and the nine and seventeen of Kahan and Li (Math. Comp. 66, 1997).
 
 use crate::Model;
+use crate::trigonometry::sin_cos_of;
 
 /// Stages at most.
 pub(crate) const STAGES_MAX: usize = 6;
@@ -125,7 +126,7 @@ impl Tableau {
         // Roots of P_s, by Newton's method from a classical guess; P_s' = s (x P_s − P_{s−1}) / (x² − 1).
         let slope = |x: f64, p: &[f64]| count * (x * p[stages] - p[stages - 1]) / (x * x - 1.0);
         let root = |i: usize| {
-            let mut x = (std::f64::consts::PI * (i as f64 + 0.75) / (count + 0.5)).cos();
+            let mut x = sin_cos_of(std::f64::consts::PI * (i as f64 + 0.75) / (count + 0.5)).1;
             for _ in 0..10 {
                 let p = legendre(x);
                 x -= p[stages] / slope(x, &p);
