@@ -34,7 +34,7 @@ pub(crate) fn cases() -> Vec<Case> {
     vec![Case::new("random scenes", criterion, |setup, finding| {
         let mut counts = BTreeMap::new();
         let mut errors: BTreeMap<&str, u32> = BTreeMap::new();
-        let scenes = setup.pick(300, 30_000);
+        let scenes = setup.pick(300, 6_000);
         for seed in (setup.seed << 32..).take(scenes) {
             let mut one = Finding::default();
             let mut random = Numbers::new(seed);
