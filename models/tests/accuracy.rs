@@ -303,7 +303,7 @@ fn chosen_methods_reach_their_tolerance() {
         let exact: Vec<f64> =
             path(2, 256).iter().zip(path(2, 128)).map(|(a, b)| a + (a - b) / 3.0).collect();
         for tolerance in [1e-3, 1e-6] {
-            let choice = plant(&scene, |_| ()).choose_method(tolerance).unwrap();
+            let choice = plant(&scene, |_| ()).choose_method(tolerance, &mut || true).unwrap();
             let found = path(choice.order, choice.substeps);
             let errors = found.iter().zip(&exact).map(|(a, b)| (a - b).abs());
             let error = errors.fold(0.0, f64::max);

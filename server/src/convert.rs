@@ -17,6 +17,7 @@ use v1::weight::Form as WeightForm;
 
 use crate::limits::{LimitExceeded, Limits};
 use crate::status::Fault;
+use crate::workers::Abandoned;
 
 /// How a plant starts.
 #[derive(Clone, Debug)]
@@ -255,6 +256,7 @@ pub fn accurate_plant(
     start: &Start,
     tolerance: f64,
     limits: &Limits,
+    abandoned: &Abandoned,
 ) -> Result<(Plant, v1::Accuracy), Fault> {
     let (name, limit) = ("settle_coordinates", limits.settle_coordinates);
     let count = model.dimensions().coordinates();
@@ -262,7 +264,8 @@ pub fn accurate_plant(
     if let Start::Snapshot(_) = start {
         return Err(Fault::field("initial.snapshot", "has its order and substeps already"));
     }
-    let choice = plant(model, settings, start, "initial")?.choose_method(tolerance)?;
+    let choice = plant(model, settings, start, "initial")?
+        .choose_method(tolerance, &mut || abandoned.check().is_ok())?;
     let settings = Settings { order: choice.order, substeps: choice.substeps, ..settings };
     check_method(&settings, model, limits)?;
     let accuracy = v1::Accuracy { tolerance, error: choice.error, periods: choice.periods };

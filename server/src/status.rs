@@ -336,7 +336,8 @@ impl From<ChoiceError> for Fault {
                 Self::precondition(step_error_reason(&error), "initial", message)
                     .with("step", period)
             }
-            ChoiceError::OutOfReach { .. } => {
+            ChoiceError::Cancelled => Self::cancelled(),
+            ChoiceError::OutOfReach { .. } | ChoiceError::TooLong => {
                 Self::field_because("TOLERANCE_OUT_OF_REACH", field, message)
             }
         }

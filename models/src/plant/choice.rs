@@ -19,8 +19,8 @@ const PERIODS: u32 = 50;
 const ORDERS: [u32; 5] = [2, 4, 6, 8, 12];
 /// Tolerances below are not told from round-off.
 const LEAST: f64 = 1e-13;
-/// Evaluations after which the probe is given up.
-const MOST_EVALUATIONS: u64 = 2_000_000;
+/// Evaluations of coordinates after which the probe is given up.
+const MOST_EVALUATIONS: u64 = 100_000_000;
 
 /// What was chosen, and why.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -52,6 +52,12 @@ pub enum ChoiceError {
         /// Why.
         error: StepError,
     },
+    /// The probe takes too long.
+    #[error("the probe takes more evaluations than are worth it; take a shorter time step")]
+    TooLong,
+    /// It was told not to go on.
+    #[error("nobody waits for the choice")]
+    Cancelled,
     /// No order reaches the tolerance, or no reference does.
     #[error(
         "no order with up to {SUBSTEPS_MAX} substeps reaches {tolerance:e} over the probe; take a shorter time step"
@@ -67,24 +73,29 @@ struct Probe<'a> {
     plant: &'a Plant,
     state: State,
     evaluations: u64,
+    go_on: &'a mut dyn FnMut() -> bool,
 }
 
 impl Plant {
     /// Finds the order and the substeps that keep the error of every coordinate below a tolerance, rad or m,
     /// over 50 control periods from the present state. The plant's own order and substeps do not count.
     ///
-    /// Simulates the probe some tens of times.
-    pub fn choose_method(&self, tolerance: f64) -> Result<Choice, ChoiceError> {
+    /// Simulates the probe some tens of times; asks `go_on` in every period whether to.
+    pub fn choose_method(
+        &self,
+        tolerance: f64,
+        go_on: &mut dyn FnMut() -> bool,
+    ) -> Result<Choice, ChoiceError> {
         if !(tolerance.is_finite() && tolerance >= LEAST) {
             return Err(ChoiceError::Tolerance(tolerance));
         }
-        let mut probe = Probe { plant: self, state: self.state(), evaluations: 0 };
+        let mut probe = Probe { plant: self, state: self.state(), evaluations: 0, go_on };
         let out_of_reach = ChoiceError::OutOfReach { tolerance };
         let reference = probe.reference(tolerance)?.ok_or(out_of_reach.clone())?;
         let mut best: Option<(u64, Choice)> = None;
         for order in ORDERS {
             let cheapest = best.as_ref().map_or(u64::MAX, |(cost, _)| *cost);
-            let reached = probe.reach(order, tolerance, &reference, cheapest);
+            let reached = probe.reach(order, tolerance, &reference, cheapest)?;
             best = reached.filter(|(cost, _)| *cost < cheapest).or(best);
         }
         best.map(|(_, choice)| choice).ok_or(out_of_reach)
@@ -107,15 +118,23 @@ impl Probe<'_> {
         let start = plant.q().to_vec();
         let mut u = vec![0.0; plant.model().dimensions().input()];
         let (mut path, mut cost) = (Vec::new(), 0);
+        let coordinates = start.len() as u64;
         for period in 0..PERIODS {
+            if !(self.go_on)() {
+                return Err(ChoiceError::Cancelled);
+            }
+            if self.evaluations > MOST_EVALUATIONS {
+                return Err(ChoiceError::TooLong);
+            }
             plant.hold_input(&mut u);
             let report = plant.step(&u).map_err(|error| ChoiceError::Step { period, error })?;
             // A factorization costs about as much as three evaluations.
-            cost +=
+            let evaluations =
                 stages * u64::from(report.iterations + 3) + 3 * u64::from(report.factorizations);
+            cost += evaluations;
+            self.evaluations += coordinates * evaluations;
             path.extend(plant.model().difference(&start, plant.q()));
         }
-        self.evaluations += cost;
         Ok((path, cost))
     }
 
@@ -128,7 +147,7 @@ impl Probe<'_> {
         let order = ORDERS.iter().rev().find(exists).copied().unwrap_or(2);
         let mut substeps = 2;
         let mut before = self.run(order, substeps).map(|(path, _)| path);
-        while 2 * substeps <= SUBSTEPS_MAX && self.evaluations < MOST_EVALUATIONS {
+        while 2 * substeps <= SUBSTEPS_MAX {
             substeps *= 2;
             let path = self.run(order, substeps)?.0;
             if before.is_ok_and(|before| distance(&before, &path) <= 0.1 * tolerance) {
@@ -146,27 +165,29 @@ impl Probe<'_> {
         tolerance: f64,
         reference: &[f64],
         cheapest: u64,
-    ) -> Option<(u64, Choice)> {
+    ) -> Result<Option<(u64, Choice)>, ChoiceError> {
         let mut substeps = 1;
-        while substeps <= SUBSTEPS_MAX && self.evaluations < MOST_EVALUATIONS {
+        while substeps <= SUBSTEPS_MAX {
             let raise = match self.run(order, substeps) {
                 Ok((path, cost)) => {
                     let error = distance(&path, reference);
                     if error <= tolerance {
-                        return Some((cost, Choice { order, substeps, error, periods: PERIODS }));
+                        let choice = Choice { order, substeps, error, periods: PERIODS };
+                        return Ok(Some((cost, choice)));
                     }
                     if cost > cheapest {
-                        return None;
+                        return Ok(None);
                     }
                     // No more than fourfold at once: far from the limit an order is not what it will be.
                     (error / tolerance).powf(1.0 / f64::from(order)).min(4.0)
                 }
-                Err(ChoiceError::Initial(_)) => return None,
-                Err(_) => 2.0,
+                Err(ChoiceError::Initial(_)) => return Ok(None),
+                Err(ChoiceError::Step { .. }) => 2.0,
+                Err(error) => return Err(error),
             };
             substeps = ((f64::from(substeps) * raise) as u32).max(substeps + 1);
         }
-        None
+        Ok(None)
     }
 }
 

@@ -35,6 +35,8 @@ use stage::Hessian;
 /// A residual that falls by less than this from one sweep to the next falls too slowly.
 const SLOW: f64 = 0.5;
 
+/// Rounds of corrections of all stages beyond which shorter steps are the better way.
+const ROUNDS: u32 = 16;
 /// Unknowns up to which all stages are corrected at once.
 const AT_ONCE: usize = 48;
 
@@ -221,7 +223,7 @@ impl Collocation {
         let mut report = StepReport::default();
         let mut previous = f64::INFINITY;
         let mut slow = 0;
-        while report.iterations < workspace.most_iterations(settings) {
+        while report.iterations < settings.max_iterations {
             report.iterations += 1;
             let mut size: f64 = 0.0;
             for i in 0..self.stages.len() {
@@ -281,7 +283,7 @@ impl Collocation {
         let mut previous = f64::INFINITY;
         let nd = model.dimensions.dynamic;
         let mut fresh = true;
-        for iteration in 1..=workspace.most_iterations(settings) {
+        for iteration in 1..=settings.max_iterations.min(ROUNDS) {
             report.iterations = iteration;
             let mut round_off = f64::MIN_POSITIVE;
             for i in 0..self.stages.len() {
@@ -350,7 +352,7 @@ impl Collocation {
         mut report: StepReport,
     ) -> Result<StepReport, StepError> {
         for stage in &self.stages {
-            at.model.check_turns(&stage.increment, workspace.largest_turn())?;
+            at.model.check_turns(&stage.increment)?;
         }
         self.sum_up(workspace, at);
         workspace.estimates.write(&mut report);

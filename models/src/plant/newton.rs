@@ -25,10 +25,6 @@ use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{PreciseState, Precision, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
 
-/// Corrections beyond which shorter steps are the better way, where there are any.
-const WORTHWHILE: u32 = 12;
-/// A turn beyond which they are, rad.
-const QUICK: f64 = 1.0;
 /// A residual this small, in units of round-off, is as good as zero.
 const CONVERGED: f64 = 4.0;
 /// A residual this small will do where precision is not asked for.
@@ -139,8 +135,6 @@ pub(crate) struct Workspace {
     pub(crate) stiffness: Vec<f64>,
     pub(crate) terms: Vec<Term>,
     pub(crate) estimates: Estimates,
-    /// There are no shorter steps to be tried.
-    pub(crate) is_last_resort: bool,
 }
 
 impl Precision {
@@ -215,7 +209,6 @@ impl Workspace {
             stiffness: zeros(nd * nd),
             terms: Vec::with_capacity(nd.max(nc)),
             estimates: Estimates::NONE,
-            is_last_resort: true,
         }
     }
 
@@ -346,7 +339,7 @@ impl Workspace {
         let enough = settings.precision.residual();
         let mut previous = f64::INFINITY;
         let (mut fresh, mut idle) = (false, false);
-        while report.iterations < self.most_iterations(settings) {
+        while report.iterations < settings.max_iterations {
             report.iterations += 1;
             report.residual = self.evaluate(model, settings, state);
             report.constraint_residual = self.evaluate_end(model, state);
@@ -708,18 +701,6 @@ impl Workspace {
         corrections.all(|(i, x)| x.abs() <= 2.0 * f64::EPSILON * size(i))
     }
 
-    /// Corrections before a step is given up.
-    pub(crate) fn most_iterations(&self, settings: &Settings) -> u32 {
-        let most = settings.max_iterations;
-        if self.is_last_resort { most } else { most.min(WORTHWHILE) }
-    }
-
-    /// By how much a joint may turn in a step: beyond half a turn the solution is not the continuation of
-    /// the motion, and shorter steps, where there are any, are the better ones from a good deal less on.
-    pub(crate) fn largest_turn(&self) -> f64 {
-        if self.is_last_resort { std::f64::consts::PI } else { QUICK }
-    }
-
     /// Checks the solution, and finds its impulse.
     fn accept(
         &mut self,
@@ -727,7 +708,7 @@ impl Workspace {
         settings: &Settings,
         mut report: StepReport,
     ) -> Result<StepReport, StepError> {
-        model.check_turns(&self.increment, self.largest_turn())?;
+        model.check_turns(&self.increment)?;
         for (i, impulse) in self.impulse.iter_mut().enumerate() {
             *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
         }
@@ -758,10 +739,10 @@ impl Workspace {
 }
 
 impl Model {
-    /// Refuses turns by more than an angle.
-    pub(crate) fn check_turns(&self, increments: &[f64], largest: f64) -> Result<(), StepError> {
+    /// Refuses increments of more than half a turn.
+    pub(crate) fn check_turns(&self, increments: &[f64]) -> Result<(), StepError> {
         for (coordinate, x) in self.coordinates.iter().zip(increments) {
-            if coordinate.is_angle && x.abs() > largest {
+            if coordinate.is_angle && x.abs() > std::f64::consts::PI {
                 let coordinate = coordinate.name.clone();
                 return Err(StepError::TooFast { coordinate, increment: *x });
             }

@@ -99,7 +99,6 @@ impl Plant {
         let most = self.most_halvings();
         let mut failed = false;
         for halvings in first.. {
-            self.workspace.is_last_resort = halvings >= most;
             let result = self.attempt(halvings, out.as_deref_mut());
             if self.period.is_reached {
                 // It holds what belongs to a step within the period.

@@ -45,13 +45,14 @@ impl PlantService {
             }
         }
         let hub = Arc::clone(&self.hub);
-        let job = move |_: &_| {
+        let job = move |abandoned: &Abandoned| {
             let entry = hub.catalog.get(&model)?;
             let settings = convert::settings(Some(settings), &entry.model, &hub.limits)?;
             let start = convert::start(initial, &entry.model, &hub.limits)?;
             let (model, limits) = (&entry.model, &hub.limits);
             let (plant, accuracy) = if is_chosen {
-                let chosen = convert::accurate_plant(model, settings, &start, tolerance, limits)?;
+                let chosen =
+                    convert::accurate_plant(model, settings, &start, tolerance, limits, abandoned)?;
                 (chosen.0, Some(chosen.1))
             } else {
                 (convert::plant(model, settings, &start, "initial")?, None)
