@@ -172,9 +172,11 @@ pub(crate) fn cases() -> Vec<Case> {
                      median oscillation of the energy in the second half ≤ 1.5 of the first";
     RUNS.iter()
         .map(|run| {
+            let limit = "round-off of constraints is not a walk: about 2e-19 of the energy a step";
             Case::new(format!("energy: {}", run.name), criterion, move |setup, finding| {
                 long_run(run, setup, finding)
             })
+            .known_limit(run.name.starts_with("four-bar").then_some(limit))
         })
         .collect()
 }
