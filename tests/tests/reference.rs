@@ -111,7 +111,8 @@ impl Case {
             energy(&at("midpoint energy"), found, golden.energy_midpoint[k])?;
             plant.step(&[&golden.u[k][..], &golden.k2[k]].concat()).with_context(|| at("step"))?;
             let multipliers = plant.multipliers();
-            close(&at("λ"), multipliers, &golden.lambda1[k], tolerance * lambda_scale)?;
+            // The constraints' stiffness makes a unit in the last place of a sine this much of an impulse.
+            close(&at("λ"), multipliers, &golden.lambda1[k], 2.0 * tolerance * lambda_scale)?;
         }
         Ok(())
     }
