@@ -3,6 +3,8 @@
 //! Only the holder of the lease moves the plant. Others lock the core to copy a state or a plant
 //! out of it, which takes microseconds; energies, linearizations and gains are computed on copies.
 
+mod core;
+
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
@@ -21,7 +23,9 @@ use crate::metrics::Metrics;
 use crate::parameters::{self, ChangeError, Parameters};
 use crate::regulator::Spec;
 use crate::status::{Fault, step_error_reason};
-use crate::watch::{Subscription, Watchers};
+use crate::watch::{Frame, Subscription, Watchers};
+
+pub use self::core::{Core, Mechanics};
 
 /// One step in this many is timed for the histogram of step times.
 const TIMED_STEP_INTERVAL: u64 = 64;
@@ -84,30 +88,6 @@ pub enum DriveError {
     Step(#[from] StepError),
 }
 
-/// What the lock protects.
-struct Core {
-    plant: Plant,
-    /// Input of the last step; before the first one, the input that holds the plant.
-    input: Vec<f64>,
-    /// Report of the last step.
-    report: StepReport,
-    feedback: Option<Box<Feedback>>,
-    /// Room for an input that the feedback makes.
-    applied: Vec<f64>,
-    /// Numbers of the scene that were changed.
-    parameters: Arc<Parameters>,
-    /// Counts the changes of parameters and time step.
-    generation: u64,
-    /// Counts the computations of laws.
-    revision: u64,
-}
-
-impl Core {
-    fn state(&self) -> (State, f64) {
-        (self.plant.state(), self.plant.time_s())
-    }
-}
-
 /// A plant as it is, to be shown.
 pub struct View {
     /// State.
@@ -120,17 +100,6 @@ pub struct View {
     pub feedback: Option<v1::FeedbackInfo>,
     /// Numbers of the scene that were changed.
     pub parameters: Arc<Parameters>,
-}
-
-/// A model with settings, and which of a plant's it is: the number goes up with each change.
-#[derive(Clone)]
-pub struct Mechanics {
-    /// The model.
-    pub model: Arc<Model>,
-    /// The settings.
-    pub settings: Settings,
-    /// Number of changes that led to them.
-    pub generation: u64,
 }
 
 /// A plant with everything that belongs to it, shared by all who use it.
@@ -167,26 +136,14 @@ impl Session {
         accuracy: Option<v1::Accuracy>,
         metrics: Arc<Metrics>,
     ) -> Arc<Self> {
-        let model = Arc::clone(plant.model());
-        let mut input = vec![0.0; model.dimensions().input()];
-        plant.hold_input(&mut input);
         Arc::new(Self {
             id,
             model_name,
             start: plant.snapshot(),
             start_state: plant.state(),
             accuracy,
-            model,
-            core: Mutex::new(Core {
-                plant,
-                applied: input.clone(),
-                input,
-                report: StepReport::default(),
-                feedback: None,
-                parameters: Arc::default(),
-                generation: 0,
-                revision: 0,
-            }),
+            model: Arc::clone(plant.model()),
+            core: Mutex::new(Core::new(plant)),
             replacing: Mutex::default(),
             in_force: watch::Sender::new(None),
             is_recomputing: AtomicBool::new(false),
@@ -222,9 +179,7 @@ impl Session {
 
     /// The model and the settings in force.
     pub fn mechanics(&self) -> Mechanics {
-        let core = self.core();
-        let (model, settings) = (Arc::clone(core.plant.model()), *core.plant.settings());
-        Mechanics { model, settings, generation: core.generation }
+        self.with_core(|core| core.mechanics())
     }
 
     /// Metrics of the server.
@@ -234,47 +189,55 @@ impl Session {
 
     /// The state as it is.
     pub fn state(&self) -> State {
-        self.core().plant.state()
+        self.with_core(|core| core.plant.state())
     }
 
     /// The plant as it is.
     pub fn view(&self) -> View {
-        let core = self.core();
-        let (state, time_s) = core.state();
-        View {
-            state,
-            time_s,
-            settings: *core.plant.settings(),
-            feedback: core.feedback.as_ref().map(|feedback| feedback.info()),
-            parameters: Arc::clone(&core.parameters),
-        }
+        self.with_core(|core| {
+            let (state, time_s) = core.state();
+            View {
+                state,
+                time_s,
+                settings: *core.plant.settings(),
+                feedback: core.feedback.as_ref().map(|feedback| feedback.info()),
+                parameters: Arc::clone(&core.parameters),
+            }
+        })
+    }
+
+    /// The last step.
+    pub fn frame(&self) -> Frame {
+        self.with_core(|core| {
+            let mut frame = Frame::default();
+            frame.copy_from(&core.published());
+            frame
+        })
     }
 
     /// The present step.
     pub fn step_index(&self) -> u64 {
-        self.core().plant.step_index()
+        self.with_core(|core| core.plant.step_index())
     }
 
     /// A snapshot of the plant as it is.
     pub fn snapshot(&self) -> Snapshot {
-        self.core().plant.snapshot()
+        self.with_core(|core| core.plant.snapshot())
     }
 
     /// A copy of the plant as it is, to compute on.
     pub fn copy_plant(&self) -> Plant {
-        self.core().plant.clone()
+        self.with_core(|core| core.plant.clone())
     }
 
     /// The same with the number of changes of its parameters so far.
     pub fn copy_plant_and_generation(&self) -> (Plant, u64) {
-        let core = self.core();
-        (core.plant.clone(), core.generation)
+        self.with_core(|core| (core.plant.clone(), core.generation))
     }
 
     /// The same with the input of its last step; before the first one, the input that holds it.
     pub fn copy_plant_and_input(&self) -> (Plant, Vec<f64>) {
-        let core = self.core();
-        (core.plant.clone(), core.input.clone())
+        self.with_core(|core| (core.plant.clone(), core.input.clone()))
     }
 
     /// Who drives the plant.
@@ -319,8 +282,7 @@ impl Session {
             .compare_exchange(0, kind.code(), Ordering::AcqRel, Ordering::Acquire)
             .map_err(|code| LeaseHeld { by: DriverKind::from_code(code).unwrap_or(kind) })?;
         self.metrics.driver_started(kind);
-        let applied = vec![0.0; self.model.dimensions().input()];
-        Ok(Lease { session: Arc::clone(self), kind, untimed_steps: 0, applied, has_applied: false })
+        Ok(Lease { session: Arc::clone(self), kind, untimed_steps: 0 })
     }
 
     /// Subscribes to every `every`-th state. Starts with the state as it is, if its step counts.
@@ -329,16 +291,26 @@ impl Session {
         every: u64,
         watchers_max: u64,
     ) -> Result<Subscription, LimitExceeded> {
-        // Under the core's lock no step falls between the registration and the first frame.
-        let core = self.core();
-        let subscription = Subscription::new(Arc::clone(self), every, watchers_max)?;
-        subscription.offer(core.plant_frame());
-        Ok(subscription)
+        let session = Arc::clone(self);
+        // In the core's hands no step falls between the registration and the first frame.
+        self.with_core(move |core| {
+            let subscription = Subscription::new(session, every, watchers_max)?;
+            subscription.offer(&core.published());
+            Ok(subscription)
+        })
     }
 
     /// The watchers of the plant.
     pub fn watchers(&self) -> &Watchers {
         &self.watchers
+    }
+
+    /// Does something with the core, between two steps: keep it short.
+    pub fn with_core<R: Send + 'static>(
+        &self,
+        act: impl FnOnce(&mut Core) -> R + Send + 'static,
+    ) -> R {
+        act(&mut self.core())
     }
 
     fn core(&self) -> MutexGuard<'_, Core> {
@@ -347,12 +319,14 @@ impl Session {
 
     /// Replaces the plant by a copy of it that was put into another state. The caller holds
     /// `replacing`.
-    fn replace_plant(&self, plant: Plant) {
-        let mut core = self.core();
-        plant.hold_input(&mut core.input);
-        core.plant = plant;
-        core.report = StepReport::default();
-        self.watchers.publish(core.plant_frame());
+    fn replace_plant(self: &Arc<Self>, plant: Plant) {
+        let session = Arc::clone(self);
+        // The former plant is dropped here, not in the core's hands.
+        drop(self.with_core(move |core| {
+            let former = core.replace_plant(plant);
+            session.watchers.publish(&core.published());
+            former
+        }));
     }
 
     /// Changes numbers of the scene, and the time step if one is given, between two steps: the state
@@ -365,7 +339,8 @@ impl Session {
         parameters_max: u64,
     ) -> Result<bool, ParametersError> {
         let _replacing = lock(&self.replacing);
-        let (before, parameters) = (self.mechanics(), Arc::clone(&self.core().parameters));
+        let (before, parameters) =
+            self.with_core(|core| (core.mechanics(), Arc::clone(&core.parameters)));
         let (model, parameters) = if changes.is_empty() {
             (before.model, parameters)
         } else {
@@ -378,97 +353,97 @@ impl Session {
             time_step_s: time_step_s.unwrap_or(before.settings.time_step_s),
             ..before.settings
         };
-        let mut plant = Plant::new(model, settings)?;
-        let mut core = self.core();
-        let (State { step, q, p, v, .. }, time_s) = core.state();
-        plant.initialize(&Initial::Momentum { q, p, v })?;
-        plant.set_step_index(step);
-        plant.set_time_s(time_s);
-        std::mem::swap(&mut core.plant, &mut plant);
-        core.parameters = parameters;
-        core.generation += 1;
-        let generation = core.generation;
-        let is_outdated = match &mut core.feedback {
-            // A gain that was given holds as it is.
-            Some(feedback) if feedback.spec.is_fixed() => {
-                feedback.generation = generation;
-                false
-            }
-            feedback => feedback.is_some(),
-        };
-        drop(core);
-        // The former plant is dropped without the lock.
-        drop(plant);
+        let plant = Plant::new(model, settings)?;
+        let changed = self.with_core(move |core| {
+            let former = core.change_plant(plant, parameters)?;
+            let is_outdated = match &mut core.feedback {
+                // A gain that was given holds as it is.
+                Some(feedback) if feedback.spec.is_fixed() => {
+                    feedback.generation = core.generation;
+                    false
+                }
+                feedback => feedback.is_some(),
+            };
+            Ok::<_, InitialError>((is_outdated, former))
+        });
+        // The former plant is dropped here, not in the core's hands.
+        let (is_outdated, _former) = changed?;
         Ok(is_outdated)
     }
 
     /// Puts a feedback in force. `generation` is that of the mechanics for which its law was computed;
     /// true when it is to be computed anew.
     pub fn set_feedback(
-        &self,
+        self: &Arc<Self>,
         mut feedback: Box<Feedback>,
         generation: u64,
         first_step: Option<u64>,
     ) -> (v1::FeedbackInfo, bool) {
-        let mut core = self.core();
-        core.revision += 1;
-        let present = core.plant.step_index();
-        feedback.revision = core.revision;
-        feedback.since_step = present;
-        feedback.first_step = match feedback.law.end {
-            Some(_) => first_step.unwrap_or(present),
-            None => present,
-        };
-        let is_outdated = generation != core.generation && !feedback.spec.is_fixed();
-        feedback.generation = if is_outdated { generation } else { core.generation };
-        let info = feedback.info();
-        self.in_force.send_replace(Some(feedback.in_force()));
-        let former = core.feedback.replace(feedback);
-        drop(core);
-        drop(former);
+        let session = Arc::clone(self);
+        let (info, is_outdated, _former) = self.with_core(move |core| {
+            core.revision += 1;
+            let present = core.plant.step_index();
+            feedback.revision = core.revision;
+            feedback.since_step = present;
+            feedback.first_step = match feedback.law.end {
+                Some(_) => first_step.unwrap_or(present),
+                None => present,
+            };
+            let is_outdated = generation != core.generation && !feedback.spec.is_fixed();
+            feedback.generation = if is_outdated { generation } else { core.generation };
+            let info = feedback.info();
+            session.in_force.send_replace(Some(feedback.in_force()));
+            (info, is_outdated, core.feedback.replace(feedback))
+        });
         (info, is_outdated)
     }
 
     /// Takes the feedback away; false when there is none.
-    pub fn clear_feedback(&self) -> bool {
-        let mut core = self.core();
-        let former = core.feedback.take();
-        self.in_force.send_replace(None);
-        drop(core);
+    pub fn clear_feedback(self: &Arc<Self>) -> bool {
+        let session = Arc::clone(self);
+        let former = self.with_core(move |core| {
+            session.in_force.send_replace(None);
+            core.feedback.take()
+        });
         former.is_some()
     }
 
     /// What the feedback's law is to be computed from anew, if its parameters have changed since.
     pub fn outdated_feedback(&self) -> Option<(Arc<Spec>, Mechanics)> {
-        let spec = {
-            let core = self.core();
+        self.with_core(|core| {
             let feedback = core.feedback.as_ref()?;
             let is_outdated = feedback.generation != core.generation && !feedback.spec.is_fixed();
-            is_outdated.then(|| Arc::clone(&feedback.spec))?
-        };
-        Some((spec, self.mechanics()))
+            is_outdated.then(|| (Arc::clone(&feedback.spec), core.mechanics()))
+        })
     }
 
     /// Puts a law in force that was computed anew; a failure leaves the former one in force and is
     /// shown. What belongs to a feedback that is gone is dropped.
-    pub fn renew_feedback(&self, spec: &Arc<Spec>, generation: u64, outcome: Result<Law, Fault>) {
-        let mut core = self.core();
-        let core = &mut *core;
-        let Some(feedback) = core.feedback.as_mut().filter(|f| Arc::ptr_eq(&f.spec, spec)) else {
-            return;
-        };
-        feedback.generation = generation;
-        match outcome {
-            Ok(law) => {
-                core.revision += 1;
-                feedback.revision = core.revision;
-                feedback.since_step = core.plant.step_index();
-                feedback.law = Arc::new(law);
-                feedback.failure = None;
+    pub fn renew_feedback(
+        self: &Arc<Self>,
+        spec: &Arc<Spec>,
+        generation: u64,
+        outcome: Result<Law, Fault>,
+    ) {
+        let (session, spec) = (Arc::clone(self), Arc::clone(spec));
+        self.with_core(move |core| {
+            let Some(feedback) = core.feedback.as_mut().filter(|f| Arc::ptr_eq(&f.spec, &spec))
+            else {
+                return;
+            };
+            feedback.generation = generation;
+            match outcome {
+                Ok(law) => {
+                    core.revision += 1;
+                    feedback.revision = core.revision;
+                    feedback.since_step = core.plant.step_index();
+                    feedback.law = Arc::new(law);
+                    feedback.failure = None;
+                }
+                Err(fault) => feedback.failure = Some(fault.into()),
             }
-            Err(fault) => feedback.failure = Some(fault.into()),
-        }
-        self.in_force.send_replace(Some(feedback.in_force()));
+            session.in_force.send_replace(Some(feedback.in_force()));
+        });
     }
 
     /// Claims the task of computing the feedback's law anew; false when somebody is at it.
@@ -483,21 +458,17 @@ impl Session {
 
     /// Tells of the feedback's law and of each that replaces it.
     pub fn watch_gains(
-        &self,
+        self: &Arc<Self>,
         watchers_max: u64,
     ) -> Result<Receiver<Option<InForce>>, LimitExceeded> {
         let (name, what) = ("watchers_per_plant", "watchers of gains");
-        // The lock makes counting and subscribing one.
-        let _core = self.core();
-        let count = self.in_force.receiver_count() + 1;
-        LimitExceeded::check(name, watchers_max, what, count)?;
-        Ok(self.in_force.subscribe())
-    }
-}
-
-impl Core {
-    fn plant_frame(&self) -> (&Plant, &StepReport, &[f64], u64) {
-        (&self.plant, &self.report, &self.input, self.generation)
+        let session = Arc::clone(self);
+        // In the core's hands counting and subscribing are one.
+        self.with_core(move |_| {
+            let count = session.in_force.receiver_count() + 1;
+            LimitExceeded::check(name, watchers_max, what, count)?;
+            Ok(session.in_force.subscribe())
+        })
     }
 }
 
@@ -545,9 +516,6 @@ pub struct Lease {
     session: Arc<Session>,
     kind: DriverKind,
     untimed_steps: u64,
-    /// Input that a feedback gave the last step.
-    applied: Vec<f64>,
-    has_applied: bool,
 }
 
 impl Lease {
@@ -558,7 +526,7 @@ impl Lease {
 
     /// Takes one step.
     pub fn step(&mut self, u: &[f64]) -> Result<StepReport, DriveError> {
-        self.step_by(u, |plant, u| plant.step(u))
+        self.step_and(u, None, |core| core.report)
     }
 
     /// Takes one step and linearizes it.
@@ -567,17 +535,37 @@ impl Lease {
         u: &[f64],
         out: &mut Linearization,
     ) -> Result<StepReport, DriveError> {
-        self.step_by(u, |plant, u| plant.step_and_linearize(u, out))
+        self.step_and(u, Some(out), |core| core.report)
     }
 
-    /// Input of the last step, when a feedback had a say in it.
-    pub fn applied_input(&self) -> Option<&[f64]> {
-        self.has_applied.then_some(&self.applied)
-    }
-
-    /// Looks at the plant, which nobody else moves meanwhile.
-    pub fn with_plant<R>(&self, look: impl FnOnce(&Plant) -> R) -> R {
-        look(&self.session.core().plant)
+    /// Takes one step, linearizes it when asked to, and looks at the core before anybody else does.
+    pub fn step_and<R>(
+        &mut self,
+        u: &[f64],
+        linearization: Option<&mut Linearization>,
+        look: impl FnOnce(&Core) -> R,
+    ) -> Result<R, DriveError> {
+        if self.session.is_closed() {
+            return Err(DriveError::Closed);
+        }
+        let started = self.is_step_timed().then(Instant::now);
+        let mut core = self.session.core();
+        let outcome = core.step(u, linearization);
+        let metrics = &self.session.metrics;
+        if let Some(started) = started {
+            metrics.step_timed(started.elapsed());
+        }
+        match outcome {
+            Ok(_) => {
+                self.session.watchers.publish(&core.published());
+                metrics.stepped(self.kind);
+                Ok(look(&core))
+            }
+            Err(error) => {
+                metrics.step_failed(step_error_reason(&error));
+                Err(error.into())
+            }
+        }
     }
 
     /// Puts the plant back into the state in which the session began. Changed parameters stay changed.
@@ -610,49 +598,6 @@ impl Lease {
         plant.restore(snapshot)?;
         self.session.replace_plant(plant);
         Ok(())
-    }
-
-    fn step_by(
-        &mut self,
-        u: &[f64],
-        advance: impl FnOnce(&mut Plant, &[f64]) -> Result<StepReport, StepError>,
-    ) -> Result<StepReport, DriveError> {
-        if self.session.is_closed() {
-            return Err(DriveError::Closed);
-        }
-        let started = self.is_step_timed().then(Instant::now);
-        let mut core = self.session.core();
-        let core = &mut *core;
-        let has_say = match &mut core.feedback {
-            None => Ok(false),
-            Some(feedback) => feedback.input(&core.plant, u, &mut core.applied),
-        };
-        let outcome = has_say.and_then(|has_say| {
-            self.has_applied = has_say;
-            let u = if has_say { &core.applied[..] } else { u };
-            advance(&mut core.plant, u)
-        });
-        if let Some(started) = started {
-            self.session.metrics.step_timed(started.elapsed());
-        }
-        match outcome {
-            Ok(report) => {
-                if self.has_applied {
-                    core.input.copy_from_slice(&core.applied);
-                    self.applied.copy_from_slice(&core.applied);
-                } else {
-                    core.input.copy_from_slice(u);
-                }
-                core.report = report;
-                self.session.watchers.publish(core.plant_frame());
-                self.session.metrics.stepped(self.kind);
-                Ok(report)
-            }
-            Err(error) => {
-                self.session.metrics.step_failed(step_error_reason(&error));
-                Err(error.into())
-            }
-        }
     }
 
     fn is_step_timed(&mut self) -> bool {

@@ -7,14 +7,26 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use plantd_models::{Plant, State, StepReport};
+use plantd_models::{State, StepReport};
 use tokio::sync::Notify;
 
 use crate::limits::LimitExceeded;
 use crate::session::Session;
 
-/// A plant, the report and the input of its last step, and the number of changes of its parameters.
-pub(crate) type Published<'a> = (&'a Plant, &'a StepReport, &'a [f64], u64);
+/// What a plant publishes after a step; a [`Frame`] without memory of its own.
+pub(crate) struct Published<'a> {
+    pub(crate) step: u64,
+    pub(crate) time_s: f64,
+    pub(crate) q: &'a [f64],
+    pub(crate) p: &'a [f64],
+    pub(crate) v: &'a [f64],
+    pub(crate) multipliers: &'a [f64],
+    pub(crate) input: &'a [f64],
+    pub(crate) report: StepReport,
+    pub(crate) generation: u64,
+    pub(crate) time_step_s: f64,
+    pub(crate) model_digest: u64,
+}
 
 /// A state with the step that led to it.
 #[derive(Clone, Debug, Default)]
@@ -29,24 +41,47 @@ pub struct Frame {
     pub report: StepReport,
     /// Input of the step; before the first one, the input that holds the plant.
     pub input: Vec<f64>,
+    /// Time step of the plant, s.
+    pub time_step_s: f64,
+    /// Digest of its model.
+    pub model_digest: u64,
 }
 
 impl Frame {
     /// Copies into memory that is allocated at the first call only.
-    fn copy_from(&mut self, (plant, report, input, generation): Published<'_>) {
+    pub(crate) fn copy_from(&mut self, published: &Published<'_>) {
         fn copy(target: &mut Vec<f64>, source: &[f64]) {
             target.clear();
             target.extend_from_slice(source);
         }
-        self.state.step = plant.step_index();
-        self.time_s = plant.time_s();
-        self.generation = generation;
-        copy(&mut self.state.q, plant.q());
-        copy(&mut self.state.p, plant.p());
-        copy(&mut self.state.v, plant.v());
-        copy(&mut self.state.multipliers, plant.multipliers());
-        copy(&mut self.input, input);
-        self.report = *report;
+        self.state.step = published.step;
+        self.time_s = published.time_s;
+        self.generation = published.generation;
+        copy(&mut self.state.q, published.q);
+        copy(&mut self.state.p, published.p);
+        copy(&mut self.state.v, published.v);
+        copy(&mut self.state.multipliers, published.multipliers);
+        copy(&mut self.input, published.input);
+        self.report = published.report;
+        self.time_step_s = published.time_step_s;
+        self.model_digest = published.model_digest;
+    }
+
+    /// The frame as what was published.
+    pub(crate) fn published(&self) -> Published<'_> {
+        Published {
+            step: self.state.step,
+            time_s: self.time_s,
+            q: &self.state.q,
+            p: &self.state.p,
+            v: &self.state.v,
+            multipliers: &self.state.multipliers,
+            input: &self.input,
+            report: self.report,
+            generation: self.generation,
+            time_step_s: self.time_step_s,
+            model_digest: self.model_digest,
+        }
     }
 }
 
@@ -64,7 +99,7 @@ impl Watchers {
     }
 
     /// Offers a state to all watchers whose turn it is.
-    pub(crate) fn publish(&self, published: Published<'_>) {
+    pub(crate) fn publish(&self, published: &Published<'_>) {
         if self.count() == 0 {
             return;
         }
@@ -103,8 +138,8 @@ struct Cell {
 }
 
 impl Slot {
-    fn offer(&self, published: Published<'_>) {
-        if !published.0.step_index().is_multiple_of(self.every) {
+    fn offer(&self, published: &Published<'_>) {
+        if !published.step.is_multiple_of(self.every) {
             return;
         }
         let mut cell = lock(&self.cell);
@@ -140,7 +175,7 @@ impl Subscription {
         Ok(Self { session, slot, frame: Frame::default(), dropped: 0 })
     }
 
-    pub(crate) fn offer(&self, published: Published<'_>) {
+    pub(crate) fn offer(&self, published: &Published<'_>) {
         self.slot.offer(published);
     }
 

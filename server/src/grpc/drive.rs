@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use futures::Stream;
-use plantd_models::{Linearization, Plant};
+use plantd_models::Linearization;
 use plantd_proto::v1;
 use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio_util::sync::WaitForCancellationFutureOwned;
@@ -53,6 +53,8 @@ struct Driving {
     lease: Lease,
     deleted: Pin<Box<WaitForCancellationFutureOwned>>,
     linearization: Option<Linearization>,
+    /// A step takes so little time that nobody minds waiting for it.
+    is_short: bool,
 }
 
 impl DriveStream {
@@ -115,41 +117,39 @@ impl Driving {
         }
         let lease = session.acquire(DriverKind::Drive)?;
         let linearization = open.linearization.then(|| Linearization::new(session.model()));
-        Ok(Self { deleted: Box::pin(session.closed()), lease, linearization })
+        let work = convert::period_work(&session.mechanics().settings, dimensions);
+        let is_short = work <= INLINE_WORK_MAX;
+        Ok(Self { deleted: Box::pin(session.closed()), lease, linearization, is_short })
     }
 
     /// A step; its own failures are answers, those of the stream are errors.
     fn step(&mut self, input: v1::DriveInput) -> Result<Answer, Fault> {
         let v1::DriveInput { sequence, u } = input;
         let (lease, linearization) = (&mut self.lease, &mut self.linearization);
-        let work =
-            |plant: &Plant| convert::period_work(plant.settings(), plant.model().dimensions());
-        let is_short = lease.with_plant(work) <= INLINE_WORK_MAX;
-        let mut advance = || match linearization {
-            None => lease.step(&u),
-            Some(out) => lease.step_and_linearize(&u, out),
+        let is_short = self.is_short;
+        let mut advance = || {
+            lease.step_and(&u, linearization.as_mut(), |core| v1::DriveStep {
+                sequence,
+                state: Some(convert::plant_state(core.plant())),
+                report: Some(convert::report(core.report())),
+                linearization: None,
+                u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
+            })
         };
         let outcome = if is_short { advance() } else { beside_other_tasks(advance) };
-        let report = match outcome {
-            Ok(report) => report,
+        let mut step = match outcome {
+            Ok(step) => step,
             Err(DriveError::Step(error)) => {
                 let failure = Some(Fault::from(error).into());
                 return Ok(Answer::Failure(v1::DriveFailure { sequence, failure }));
             }
             Err(error) => return Err(Fault::from_drive(error, self.lease.session().id())),
         };
-        let state = self.lease.with_plant(convert::plant_state);
-        let linearization = self
-            .linearization
-            .as_ref()
-            .map(|linearization| convert::linearization(state.step - 1, linearization));
-        Ok(Answer::Step(v1::DriveStep {
-            sequence,
-            state: Some(state),
-            report: Some(convert::report(&report)),
-            linearization,
-            u: self.lease.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
-        }))
+        if let Some(linearization) = &self.linearization {
+            let from = step.state.as_ref().map_or(0, |state| state.step - 1);
+            step.linearization = Some(convert::linearization(from, linearization));
+        }
+        Ok(Answer::Step(step))
     }
 }
 

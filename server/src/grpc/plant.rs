@@ -11,7 +11,7 @@ use super::{Answers, cut_page, feedback, watch};
 use crate::convert::{self, Inputs, Start};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
-use crate::session::{DriverKind, Lease, Session};
+use crate::session::{Core, DriverKind, Lease, Session};
 use crate::status::Fault;
 use crate::workers::Abandoned;
 
@@ -89,7 +89,7 @@ impl PlantService {
             LimitExceeded::check(name, limit, "numbers in all states", numbers)?;
         }
         let mut lease = session.acquire(DriverKind::Step)?;
-        let work = lease.with_plant(|plant| convert::period_work(plant.settings(), dimensions));
+        let work = convert::period_work(&session.mechanics().settings, dimensions);
         if plan.steps.saturating_mul(work) <= INLINE_WORK_MAX {
             return plan.run(&mut lease, None);
         }
@@ -106,7 +106,7 @@ impl PlantService {
         let mut lease = self.hub.session(id)?.acquire(DriverKind::Step)?;
         let job = move |_: &_| {
             change(&mut lease)?;
-            Ok(lease.with_plant(convert::plant_state))
+            Ok(lease.session().with_core(|core| convert::plant_state(core.plant())))
         };
         self.hub.attendants.run(job).await
     }
@@ -127,29 +127,31 @@ impl StepPlan {
     ) -> Result<v1::StepResponse, Fault> {
         let held = match self.inputs.last() {
             Some(last) => last.to_vec(),
-            None => lease.with_plant(convert::hold_input),
+            None => lease.session().with_core(|core| convert::hold_input(core.plant())),
         };
-        let mut states = Vec::with_capacity(if self.all_states { self.steps } else { 1 });
-        let mut report = None;
+        let mut response = v1::StepResponse::default();
+        response.states.reserve(if self.all_states { self.steps } else { 1 });
         for k in 0..self.steps {
             if let Some(abandoned) = abandoned {
                 abandoned.check()?;
             }
             let u = if k < self.inputs.count() { self.inputs.get(k) } else { &held };
-            let taken = lease.step(u).map_err(|error| {
-                let session = lease.session();
-                Fault::from_drive(error, session.id()).with("steps_taken", k)
+            let is_last = k + 1 == self.steps;
+            let look = |core: &Core| {
+                if self.all_states || is_last {
+                    response.states.push(convert::plant_state(core.plant()));
+                }
+                if is_last {
+                    response.report = Some(convert::report(core.report()));
+                    response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
+                }
+            };
+            let taken = lease.step_and(u, None, look);
+            taken.map_err(|error| {
+                Fault::from_drive(error, lease.session().id()).with("steps_taken", k)
             })?;
-            report = Some(convert::report(&taken));
-            if self.all_states {
-                states.push(lease.with_plant(convert::plant_state));
-            }
         }
-        if !self.all_states {
-            states.push(lease.with_plant(convert::plant_state));
-        }
-        let u = lease.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
-        Ok(v1::StepResponse { states, report, u })
+        Ok(response)
     }
 }
 

@@ -13,6 +13,7 @@ use plantd_proto::link::{
 
 use super::LinkConfig;
 use crate::session::{DriveError, DriverKind, Lease, Session};
+use crate::watch::Published;
 
 /// How often the thread looks whether it shall end and whether its driver lives, ns.
 const CHECK_PERIOD_NS: u64 = 100_000_000;
@@ -179,17 +180,28 @@ impl Worker {
             tracing::info!(plant = self.session.id(), pid = request.pid, "driver attached");
             self.driver = Some(Driver::new(request, sender, lease));
         }
-        self.answer(request, Kind::Attached, &StepReport::default())
+        let frame = self.session.frame();
+        let (endpoint, common) = (&mut self.endpoint, self.header);
+        answer(endpoint, common, request, Kind::Attached, &frame.published())
     }
 
     fn step(&mut self, request: &Header, u: &[f64]) -> Result<(), DomainError> {
-        match self.try_step(request, u) {
-            Ok(report) => self.answer(request, Kind::State, &report),
-            Err(failure) => self.refuse(request, failure),
-        }
+        let outcome = self.accept_input(request, u).and_then(|()| {
+            let Some(driver) = &mut self.driver else { return Ok(Ok(())) };
+            let (endpoint, common) = (&mut self.endpoint, self.header);
+            let sent = driver.lease.step_and(&self.input, None, |core| {
+                answer(endpoint, common, request, Kind::State, &core.published())
+            });
+            sent.map_err(|error| match error {
+                DriveError::Closed => Failure::new(Code::PlantDeleted),
+                DriveError::Step(error) => Failure::step(&error, driver.lease.session()),
+            })
+        });
+        outcome.unwrap_or_else(|failure| self.refuse(request, failure))
     }
 
-    fn try_step(&mut self, request: &Header, u: &[f64]) -> Result<StepReport, Failure> {
+    /// Copies the input out of the memory that the driver can write to.
+    fn accept_input(&mut self, request: &Header, u: &[f64]) -> Result<(), Failure> {
         let driver = self
             .driver
             .as_mut()
@@ -206,37 +218,7 @@ impl Worker {
             return Err(Failure { a, b, ..Failure::new(Code::Dimension) });
         }
         self.input.copy_from_slice(u);
-        let lease = &mut driver.lease;
-        lease.step(&self.input).map_err(|error| match error {
-            DriveError::Closed => Failure::new(Code::PlantDeleted),
-            DriveError::Step(error) => Failure::step(&error, lease.session()),
-        })
-    }
-
-    /// Sends the state of the plant to its driver.
-    fn answer(
-        &mut self,
-        request: &Header,
-        kind: Kind,
-        report: &StepReport,
-    ) -> Result<(), DomainError> {
-        let Some(driver) = &self.driver else { return Ok(()) };
-        let (endpoint, common) = (&mut self.endpoint, self.header);
-        driver.lease.with_plant(|plant| {
-            let header = Header {
-                kind: kind as u32,
-                driver: request.driver,
-                sequence: request.sequence,
-                // They may have changed since the link was opened.
-                time_step_s: plant.settings().time_step_s,
-                model_digest: plant.model().digest(),
-                step: plant.step_index(),
-                time_s: plant.time_s(),
-                ..with_report(common, report)
-            };
-            let parts = [plant.q(), plant.p(), plant.v(), plant.multipliers()];
-            endpoint.send(header, &parts, request.poll_end_ns())
-        })
+        Ok(())
     }
 
     fn refuse(&mut self, request: &Header, failure: Failure) -> Result<(), DomainError> {
@@ -342,6 +324,30 @@ impl Failure {
             }
         }
     }
+}
+
+/// Sends the state of the plant to its driver.
+fn answer(
+    endpoint: &mut Endpoint,
+    common: Header,
+    request: &Header,
+    kind: Kind,
+    published: &Published<'_>,
+) -> Result<(), DomainError> {
+    let header = Header {
+        kind: kind as u32,
+        driver: request.driver,
+        sequence: request.sequence,
+        // They may have changed since the link was opened.
+        time_step_s: published.time_step_s,
+        model_digest: published.model_digest,
+        step: published.step,
+        time_s: published.time_s,
+        ..common
+    };
+    let header = if kind == Kind::State { with_report(header, &published.report) } else { header };
+    let parts = [published.q, published.p, published.v, published.multipliers];
+    endpoint.send(header, &parts, request.poll_end_ns())
 }
 
 fn with_report(header: Header, report: &StepReport) -> Header {

@@ -1,0 +1,147 @@
+//! The core of a session: the plant and all that has a say in its steps.
+
+use std::sync::Arc;
+
+use plantd_models::{
+    Initial, InitialError, Linearization, Model, Plant, Settings, State, StepError, StepReport,
+};
+
+use crate::feedback::Feedback;
+use crate::parameters::Parameters;
+use crate::watch::Published;
+
+/// A plant with what its steps need. One owner at a time: whoever holds the session's lock, or the loop
+/// that runs the plant.
+pub struct Core {
+    pub(crate) plant: Plant,
+    /// Input of the last step; before the first one, the input that holds the plant.
+    pub(crate) input: Vec<f64>,
+    /// Report of the last step.
+    pub(crate) report: StepReport,
+    pub(crate) feedback: Option<Box<Feedback>>,
+    /// Room for an input that is not the driver's alone.
+    applied: Vec<f64>,
+    /// It was in force in the last step.
+    has_applied: bool,
+    /// Numbers of the scene that were changed.
+    pub(crate) parameters: Arc<Parameters>,
+    /// Counts the changes of parameters and time step.
+    pub(crate) generation: u64,
+    /// Counts the computations of laws.
+    pub(crate) revision: u64,
+}
+
+/// A model with settings, and which of a plant's it is: the number goes up with each change.
+#[derive(Clone)]
+pub struct Mechanics {
+    /// The model.
+    pub model: Arc<Model>,
+    /// The settings.
+    pub settings: Settings,
+    /// Number of changes that led to them.
+    pub generation: u64,
+}
+
+impl Core {
+    pub(crate) fn new(plant: Plant) -> Self {
+        let mut input = vec![0.0; plant.model().dimensions().input()];
+        plant.hold_input(&mut input);
+        Self {
+            plant,
+            applied: input.clone(),
+            input,
+            has_applied: false,
+            report: StepReport::default(),
+            feedback: None,
+            parameters: Arc::default(),
+            generation: 0,
+            revision: 0,
+        }
+    }
+
+    /// Takes one step, and linearizes it when asked to: the only place where a plant moves, whoever
+    /// drives it. A failed step changes nothing. Allocates nothing, takes no lock.
+    pub(crate) fn step(
+        &mut self,
+        driver: &[f64],
+        linearization: Option<&mut Linearization>,
+    ) -> Result<StepReport, StepError> {
+        let has_say = match &mut self.feedback {
+            None => false,
+            Some(feedback) => feedback.input(&self.plant, driver, &mut self.applied)?,
+        };
+        let u = if has_say { &self.applied[..] } else { driver };
+        let report = match linearization {
+            None => self.plant.step(u)?,
+            Some(out) => self.plant.step_and_linearize(u, out)?,
+        };
+        self.has_applied = has_say;
+        self.input.copy_from_slice(u);
+        self.report = report;
+        Ok(report)
+    }
+
+    /// The plant.
+    pub fn plant(&self) -> &Plant {
+        &self.plant
+    }
+
+    /// Report of the last step.
+    pub fn report(&self) -> &StepReport {
+        &self.report
+    }
+
+    /// Input of the last step, when somebody besides the driver had a say in it.
+    pub fn applied_input(&self) -> Option<&[f64]> {
+        self.has_applied.then_some(&self.input)
+    }
+
+    pub(crate) fn state(&self) -> (State, f64) {
+        (self.plant.state(), self.plant.time_s())
+    }
+
+    pub(crate) fn mechanics(&self) -> Mechanics {
+        let (model, settings) = (Arc::clone(self.plant.model()), *self.plant.settings());
+        Mechanics { model, settings, generation: self.generation }
+    }
+
+    pub(crate) fn published(&self) -> Published<'_> {
+        Published {
+            step: self.plant.step_index(),
+            time_s: self.plant.time_s(),
+            q: self.plant.q(),
+            p: self.plant.p(),
+            v: self.plant.v(),
+            multipliers: self.plant.multipliers(),
+            input: &self.input,
+            report: self.report,
+            generation: self.generation,
+            time_step_s: self.plant.settings().time_step_s,
+            model_digest: self.plant.model().digest(),
+        }
+    }
+
+    /// Puts a copy of the plant in its place that is in another state.
+    pub(crate) fn replace_plant(&mut self, plant: Plant) -> Plant {
+        plant.hold_input(&mut self.input);
+        self.has_applied = false;
+        self.report = StepReport::default();
+        std::mem::replace(&mut self.plant, plant)
+    }
+
+    /// Puts a plant of changed parameters or another time step in its place: state and count of steps
+    /// stay, time goes on. The plant that was there comes back.
+    pub(crate) fn change_plant(
+        &mut self,
+        mut plant: Plant,
+        parameters: Arc<Parameters>,
+    ) -> Result<Plant, InitialError> {
+        let (State { step, q, p, v, .. }, time_s) = self.state();
+        plant.initialize(&Initial::Momentum { q, p, v })?;
+        plant.set_step_index(step);
+        plant.set_time_s(time_s);
+        self.parameters = parameters;
+        self.generation += 1;
+        Ok(std::mem::replace(&mut self.plant, plant))
+    }
+}
