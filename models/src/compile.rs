@@ -13,6 +13,7 @@ use crate::model::{
 };
 use crate::planar::planar;
 use crate::plant::conditioning::Conditioning;
+use crate::plant::{Site, SiteJoint};
 use crate::rotation::Quaternion;
 use crate::scene::{self, CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
 use crate::spatial::{Mat3, Sym3, Vec3};
@@ -104,6 +105,27 @@ fn compile(scene: &Scene) -> Model {
     };
     model.conditioning = Conditioning::new(&model);
     model
+}
+
+/// The site at a point of a frame of a scene that compiles.
+pub(crate) fn site(scene: &Scene, frame: &str, at: [f64; 3]) -> Option<Site> {
+    let layout = Layout::new(scene);
+    let placement = layout.frames.get(frame)?;
+    let mut joints = Vec::new();
+    let mut index = placement.joint;
+    while let Some(joint) = layout.joints.get(index) {
+        joints.push(SiteJoint {
+            kind: joint.kind,
+            coordinate: joint.coordinate,
+            orientation: joint.orientation,
+            rotation: joint.rotation,
+            translation: joint.translation,
+        });
+        index = joint.parent;
+    }
+    joints.reverse();
+    let point = layout.fixed(frame, at).point;
+    Some(Site { joints, rotation: placement.rotation, point })
 }
 
 fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {

@@ -43,8 +43,8 @@ pub use continuous::{
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
 pub use plant::{
     Choice, ChoiceError, Contraction, Diagnostics, Energy, Equilibrium, ErrorEstimate, ForceSplit,
-    HALVINGS_MAX, Initial, InitialError, Linearization, Plant, Precision, SUBSTEPS_MAX,
-    SecondOrder, Settings, SettleError, SettleRequest, Snapshot, SnapshotError, State, StepError,
-    StepReport, TooLarge,
+    HALVINGS_MAX, Initial, InitialError, Linearization, Plant, Pose, Precision, SUBSTEPS_MAX,
+    SecondOrder, Settings, SettleError, SettleRequest, Site, Snapshot, SnapshotError, State,
+    StepError, StepReport, TooLarge,
 };
 pub use scene::{Problem, Scene, SceneError};

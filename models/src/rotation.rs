@@ -30,6 +30,27 @@ impl Quaternion {
         Self([cosine, scale * v[0], scale * v[1], scale * v[2]])
     }
 
+    /// Of a rotation matrix: from its largest component, which loses no digits.
+    pub(crate) fn of_matrix(Mat3([x, y, z]): &Mat3) -> Self {
+        let squares = [
+            1.0 + x[0] + y[1] + z[2],
+            1.0 + x[0] - y[1] - z[2],
+            1.0 - x[0] + y[1] - z[2],
+            1.0 - x[0] - y[1] + z[2],
+        ];
+        let largest = (1..4).fold(0, |m, i| if squares[i] > squares[m] { i } else { m });
+        let square = squares[largest];
+        let (a, b, c) = (y[2] - z[1], z[0] - x[2], x[1] - y[0]);
+        let (d, e, f) = (x[1] + y[0], z[0] + x[2], y[2] + z[1]);
+        let components = match largest {
+            0 => [square, a, b, c],
+            1 => [a, square, d, e],
+            2 => [b, d, square, f],
+            _ => [c, e, f, square],
+        };
+        Self(components).normalized()
+    }
+
     /// The rotation vector, at most half a turn long.
     pub(crate) fn log(self) -> Vec3 {
         let [w, x, y, z] = self.0;

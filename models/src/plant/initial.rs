@@ -10,7 +10,7 @@ use crate::plant::newton::{Workspace, fill_schur};
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::padded;
 use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, potentials};
-use crate::rotation;
+use crate::rotation::{self, Quaternion};
 use crate::spatial::Vec3;
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
@@ -274,12 +274,14 @@ impl Plant {
     }
 
     fn check_constraints(&mut self, q: &[f64]) -> Result<(), InitialError> {
-        let closure = &mut self.workspace.end;
         self.workspace.end_is_exact = false;
-        let orientations = orientations(&self.model, q);
-        closure.evaluate(&self.model, q, &orientations);
+        let Workspace { end: closure, orientations_end: orientations, .. } = &mut self.workspace;
+        for (orientation, &i) in orientations.iter_mut().zip(&self.model.orientations) {
+            *orientation = Quaternion::exp(three(q, i)).matrix();
+        }
+        closure.evaluate(&self.model, q, orientations);
         closure.differentiate(&self.model, q);
-        closure.evaluate(&self.model, q, &orientations);
+        closure.evaluate(&self.model, q, orientations);
         for (c, (value, round_off)) in closure.value.iter().zip(&closure.round_off).enumerate() {
             if !(value.abs() <= round_off / f64::EPSILON * CONSTRAINT_TOLERANCE) {
                 let constraint = self.model.constraint_names[c].clone();
@@ -358,10 +360,32 @@ impl Plant {
         [&self.workspace.residual[..], &self.state.v].concat()
     }
 
-    /// Energy of the state, with the projected momentum.
+    /// Energy of the state, with the projected momentum. Costs the factorization of a mass matrix;
+    /// allocates nothing.
     pub fn energy(&mut self) -> Energy {
-        let velocity = self.velocity();
-        self.workspace.energy_of(&self.model, &self.state, &velocity)
+        self.workspace.find_velocity(&self.model, &self.state);
+        let mut velocity = std::mem::take(&mut self.workspace.velocity);
+        let (dynamic, prescribed) = velocity.split_at_mut(self.workspace.residual.len());
+        dynamic.copy_from_slice(&self.workspace.residual);
+        prescribed.copy_from_slice(&self.state.v);
+        let energy = self.workspace.energy_of(&self.model, &self.state, &velocity);
+        self.workspace.velocity = velocity;
+        energy
+    }
+
+    /// Takes over the state of another plant, of the same coordinates, inputs, constraints and settings, to
+    /// the last bit: masses, lengths or gravity change between two steps. Refused, and nothing changed,
+    /// where the state violates the constraints of this plant. Allocates nothing.
+    pub fn go_on_from(&mut self, other: &Self) -> Result<(), InitialError> {
+        let sizes = |plant: &Self| (plant.model.dimensions, plant.model.orientations.len());
+        if sizes(self) != sizes(other) || self.settings != other.settings {
+            let (expected, actual) = (self.state.q.len(), other.state.q.len());
+            return Err(InitialError::Dimension { name: "state", expected, actual });
+        }
+        self.check_constraints(&other.state.q)?;
+        self.state.copy_from(&other.state);
+        self.workspace.forget();
+        Ok(())
     }
 
     /// Energy `T(q, v) + V(q)` at any configuration and velocity, both nd + nk, whether they satisfy

@@ -5,7 +5,7 @@
 //! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
 //! [`linearize`]; [`scheme`], [`collocation`] and [`period`] (higher order, substeps); [`blocks`] and
 //! [`second_order`]; then
-//! [`choice`] (accuracy mode), [`projected`] (momentum), [`known`], [`diagnose`], [`settle`], [`snapshot`].
+//! [`choice`] (accuracy mode), [`projected`] (momentum), [`known`], [`diagnose`], [`settle`], [`site`], [`snapshot`].
 
 pub(crate) mod balls;
 pub(crate) mod blocks;
@@ -36,6 +36,7 @@ mod scheme;
 mod second_order;
 mod settings;
 mod settle;
+mod site;
 mod snapshot;
 pub(crate) mod tree_lu;
 mod vectors;
@@ -60,6 +61,8 @@ pub use linearize::Linearization;
 pub use second_order::{Contraction, SecondOrder, TooLarge};
 pub use settings::{ForceSplit, HALVINGS_MAX, Precision, SUBSTEPS_MAX, Settings};
 pub use settle::{Equilibrium, SettleError, SettleRequest};
+pub(crate) use site::SiteJoint;
+pub use site::{Pose, Site};
 pub use snapshot::{Snapshot, SnapshotError};
 
 /// A state, by value.

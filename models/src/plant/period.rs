@@ -39,6 +39,8 @@ pub(crate) struct Period {
     input: Vec<f64>,
     /// Multipliers of the steps, summed.
     multipliers: Vec<f64>,
+    /// Momentum before an impulse, and what it had lost to rounding.
+    pub(crate) before_impulse: Vec<[f64; 2]>,
     chain: Chain,
 }
 
@@ -59,6 +61,7 @@ impl Period {
             held: input.clone(),
             input,
             multipliers: vec![0.0; model.dimensions.constraints],
+            before_impulse: vec![[0.0; 2]; model.dimensions.dynamic],
             chain: Chain::default(),
         }
     }
