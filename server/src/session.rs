@@ -18,12 +18,13 @@ use tokio::sync::watch::{self, Receiver};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
 use crate::feedback::{Feedback, InForce, Law};
+use crate::frame::Frame;
 use crate::limits::LimitExceeded;
 use crate::metrics::Metrics;
 use crate::parameters::{self, ChangeError, Parameters};
 use crate::regulator::Spec;
 use crate::status::{Fault, step_error_reason};
-use crate::watch::{Frame, Subscription, Watchers};
+use crate::watch::{Subscription, Watchers};
 
 pub use self::core::{Core, Mechanics};
 
@@ -557,6 +558,7 @@ impl Lease {
         }
         match outcome {
             Ok(_) => {
+                core.write_ring();
                 self.session.watchers.publish(&core.published());
                 metrics.stepped(self.kind);
                 Ok(look(&core))

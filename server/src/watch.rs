@@ -7,83 +7,11 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use plantd_models::{State, StepReport};
 use tokio::sync::Notify;
 
+use crate::frame::{Frame, Published};
 use crate::limits::LimitExceeded;
 use crate::session::Session;
-
-/// What a plant publishes after a step; a [`Frame`] without memory of its own.
-pub(crate) struct Published<'a> {
-    pub(crate) step: u64,
-    pub(crate) time_s: f64,
-    pub(crate) q: &'a [f64],
-    pub(crate) p: &'a [f64],
-    pub(crate) v: &'a [f64],
-    pub(crate) multipliers: &'a [f64],
-    pub(crate) input: &'a [f64],
-    pub(crate) report: StepReport,
-    pub(crate) generation: u64,
-    pub(crate) time_step_s: f64,
-    pub(crate) model_digest: u64,
-}
-
-/// A state with the step that led to it.
-#[derive(Clone, Debug, Default)]
-pub struct Frame {
-    /// The state.
-    pub state: State,
-    /// Its time, s.
-    pub time_s: f64,
-    /// Number of changes of the plant's parameters and time step so far.
-    pub generation: u64,
-    /// Report of the step.
-    pub report: StepReport,
-    /// Input of the step; before the first one, the input that holds the plant.
-    pub input: Vec<f64>,
-    /// Time step of the plant, s.
-    pub time_step_s: f64,
-    /// Digest of its model.
-    pub model_digest: u64,
-}
-
-impl Frame {
-    /// Copies into memory that is allocated at the first call only.
-    pub(crate) fn copy_from(&mut self, published: &Published<'_>) {
-        fn copy(target: &mut Vec<f64>, source: &[f64]) {
-            target.clear();
-            target.extend_from_slice(source);
-        }
-        self.state.step = published.step;
-        self.time_s = published.time_s;
-        self.generation = published.generation;
-        copy(&mut self.state.q, published.q);
-        copy(&mut self.state.p, published.p);
-        copy(&mut self.state.v, published.v);
-        copy(&mut self.state.multipliers, published.multipliers);
-        copy(&mut self.input, published.input);
-        self.report = published.report;
-        self.time_step_s = published.time_step_s;
-        self.model_digest = published.model_digest;
-    }
-
-    /// The frame as what was published.
-    pub(crate) fn published(&self) -> Published<'_> {
-        Published {
-            step: self.state.step,
-            time_s: self.time_s,
-            q: &self.state.q,
-            p: &self.state.p,
-            v: &self.state.v,
-            multipliers: &self.state.multipliers,
-            input: &self.input,
-            report: self.report,
-            generation: self.generation,
-            time_step_s: self.time_step_s,
-            model_digest: self.model_digest,
-        }
-    }
-}
 
 /// The watchers of one plant.
 #[derive(Default)]

@@ -14,11 +14,12 @@ use v1::WatchField;
 
 use super::{Answers, Messages};
 use crate::convert;
+use crate::frame::Frame;
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
 use crate::session::Session;
 use crate::status::Fault;
-use crate::watch::{Frame, Subscription};
+use crate::watch::Subscription;
 
 /// What a watcher has asked for.
 #[derive(Clone, Copy, Debug, Default)]

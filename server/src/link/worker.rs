@@ -12,8 +12,8 @@ use plantd_proto::link::{
 };
 
 use super::LinkConfig;
+use crate::frame::Published;
 use crate::session::{DriveError, DriverKind, Lease, Session};
-use crate::watch::Published;
 
 /// How often the thread looks whether it shall end and whether its driver lives, ns.
 const CHECK_PERIOD_NS: u64 = 100_000_000;

@@ -7,8 +7,9 @@ use plantd_models::{
 };
 
 use crate::feedback::Feedback;
+use crate::frame::{Published, Timing};
 use crate::parameters::Parameters;
-use crate::watch::Published;
+use crate::ring::Ring;
 
 /// A plant with what its steps need. One owner at a time: whoever holds the session's lock, or the loop
 /// that runs the plant.
@@ -19,10 +20,16 @@ pub struct Core {
     /// Report of the last step.
     pub(crate) report: StepReport,
     pub(crate) feedback: Option<Box<Feedback>>,
+    /// What the driver asked for in the last step; empty when it sent nothing.
+    driver_input: Vec<f64>,
     /// Room for an input that is not the driver's alone.
     applied: Vec<f64>,
     /// It was in force in the last step.
     has_applied: bool,
+    /// When the last step was taken.
+    pub(crate) timing: Timing,
+    /// Where each step is written, as long as somebody reads it.
+    pub(crate) ring: Option<Arc<Ring>>,
     /// Numbers of the scene that were changed.
     pub(crate) parameters: Arc<Parameters>,
     /// Counts the changes of parameters and time step.
@@ -48,8 +55,11 @@ impl Core {
         plant.hold_input(&mut input);
         Self {
             plant,
+            driver_input: input.clone(),
             applied: input.clone(),
             input,
+            timing: Timing::default(),
+            ring: None,
             has_applied: false,
             report: StepReport::default(),
             feedback: None,
@@ -77,8 +87,18 @@ impl Core {
         };
         self.has_applied = has_say;
         self.input.copy_from_slice(u);
+        // The law of a feedback does without a driver's input: then there is none.
+        self.driver_input.clear();
+        self.driver_input.extend_from_slice(driver);
         self.report = report;
         Ok(report)
+    }
+
+    /// Writes the last step into the ring, if somebody reads it.
+    pub(crate) fn write_ring(&self) {
+        if let Some(ring) = &self.ring {
+            ring.write(self.published().record());
+        }
     }
 
     /// The plant.
@@ -114,10 +134,13 @@ impl Core {
             v: self.plant.v(),
             multipliers: self.plant.multipliers(),
             input: &self.input,
+            driver_input: &self.driver_input,
+            outputs: &[],
             report: self.report,
             generation: self.generation,
             time_step_s: self.plant.settings().time_step_s,
             model_digest: self.plant.model().digest(),
+            timing: self.timing,
         }
     }
 
