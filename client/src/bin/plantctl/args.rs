@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 
 use clap::{Args as Group, Parser, Subcommand, ValueEnum};
-use plantd_client::{DEFAULT_ADDRESS, v1};
+use plantd_client::v1;
+
+use crate::test;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -20,6 +22,7 @@ Examples:
   plantctl feedback set p1 --at upright --q 100,1 --r 1 --mode replace
   plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
   plantctl validate arm.toml                        all errors of a scene, with their paths
+  plantctl test scenarios --junit junit.xml         scenarios with their expectations
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
 const EXIT_CODES: &str = "\
@@ -77,8 +80,9 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
 #[command(version, before_help = EXAMPLES, after_help = EXIT_CODES, max_term_width = 100)]
 pub(crate) struct Args {
     /// Server: http://host:port or unix:/path.
-    #[arg(long, global = true, env = "PLANTD_ADDRESS", default_value = DEFAULT_ADDRESS)]
-    pub(crate) address: String,
+    /// http://127.0.0.1:50051 if not given; `test` then starts a server of its own.
+    #[arg(long, global = true, env = "PLANTD_ADDRESS")]
+    pub(crate) address: Option<String>,
     /// Print JSON, in the field names of the contract; streams print one object per line.
     #[arg(long, global = true)]
     pub(crate) json: bool,
@@ -384,6 +388,9 @@ pub(crate) enum Command {
         /// File.
         file: PathBuf,
     },
+    /// Runs scenarios and judges them, for tests of controllers.
+    #[command(after_help = test::EXAMPLE)]
+    Test(test::Options),
     /// Deletes a plant or an uploaded model.
     Delete {
         /// What it is.

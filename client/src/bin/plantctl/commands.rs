@@ -5,19 +5,24 @@ use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::{Context as _, Result};
-use plantd_client::{Answers, Client, MatrixExt as _, v1};
+use plantd_client::{Answers, Client, DEFAULT_ADDRESS, MatrixExt as _, v1};
 use serde_json::{Value, json};
 
 use crate::args::{
     Args, Assignment, Command, Field, Numbers, Plural, Point, Settings, Singular, Weights,
 };
-use crate::{FAILED, feedback, json, optimize, text};
+use crate::{FAILED, feedback, json, optimize, test, text};
 
 /// Runs a command; the code is that of a command which ran.
 pub(crate) async fn run(args: Args) -> Result<ExitCode> {
-    let client = Client::connect(&args.address).await?;
     let output = Output { json: args.json };
-    match args.command {
+    let command = match args.command {
+        Command::Test(options) => return test::run(args.address, output, options).await,
+        command => command,
+    };
+    let address = args.address.as_deref().unwrap_or(DEFAULT_ADDRESS);
+    let client = Client::connect(address).await?;
+    match command {
         Command::List { what } => list(&client, output, what).await?,
         Command::Show { what: Singular::Model, name } => {
             let model = client.get_model(name).await?;
@@ -201,6 +206,7 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
             client.delete_model(&name).await?;
             output.done(json!({ "deleted": { "model": name } }))?;
         }
+        Command::Test(_) => unreachable!("has been run above"),
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -5,6 +5,8 @@ mod commands;
 mod feedback;
 mod json;
 mod optimize;
+mod own_server;
+mod test;
 mod text;
 
 use std::process::ExitCode;

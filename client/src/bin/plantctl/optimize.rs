@@ -420,7 +420,7 @@ fn read_table(file: &Path) -> Result<v1::Matrix> {
     table(&read_text(file)?).with_context(|| file.display().to_string())
 }
 
-fn table(text: &str) -> Result<v1::Matrix> {
+pub(crate) fn table(text: &str) -> Result<v1::Matrix> {
     let mut rows: Vec<Vec<f64>> = Vec::new();
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     for (index, (number, line)) in lines.enumerate() {
