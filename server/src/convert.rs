@@ -156,6 +156,14 @@ pub fn period_work(settings: &Settings, d: Dimensions) -> usize {
     d.coordinates() * settings.substeps as usize * (settings.order as usize - 1)
 }
 
+/// What output channels deliver, if there are any; flags are 1 where numbers stand for lost ones.
+pub fn outputs(y: &[f64], lost: &[f64]) -> Option<v1::Outputs> {
+    let is_lost = |&(_, flag): &(usize, &f64)| *flag != 0.0;
+    let lost_channels = lost.iter().enumerate().filter(is_lost).map(|(index, _)| index as u32);
+    let outputs = || v1::Outputs { y: y.to_vec(), lost: lost_channels.collect() };
+    (!lost.is_empty()).then(outputs)
+}
+
 /// Settings as a message.
 pub fn settings_message(settings: &Settings) -> v1::PlantSettings {
     let force_split = match settings.force_split {

@@ -4,7 +4,7 @@ use plantd_models::{Dimensions, State, StepReport};
 
 /// Room for the numbers of a frame that are neither state nor input.
 const FIXED_WORDS: usize = 32;
-/// Most output values of a plant: a frame has room for them.
+/// Most output values and flags of a plant: a frame has room for them.
 pub const OUTPUTS_MAX: usize = 256;
 
 /// When a step was due, and when it was taken, ns on the system's monotonic clock.
@@ -46,8 +46,10 @@ pub struct Frame {
     pub input: Vec<f64>,
     /// What the driver asked for.
     pub driver_input: Vec<f64>,
-    /// What the sensors say.
+    /// What the output channels deliver.
     pub outputs: Vec<f64>,
+    /// A flag for each of these channels: 1 where it delivers once more what it did before, else 0.
+    pub lost: Vec<f64>,
     /// Time step of the plant, s.
     pub time_step_s: f64,
     /// Digest of its model.
@@ -68,6 +70,7 @@ pub(crate) struct Published<'a> {
     pub(crate) input: &'a [f64],
     pub(crate) driver_input: &'a [f64],
     pub(crate) outputs: &'a [f64],
+    pub(crate) lost: &'a [f64],
     pub(crate) report: StepReport,
     pub(crate) generation: u64,
     pub(crate) time_step_s: f64,
@@ -107,8 +110,8 @@ impl Published<'_> {
             report.reciprocal_condition.to_bits(),
             report.constraint_reciprocal_condition.to_bits(),
         ];
-        let vectors =
-            [self.q, self.p, self.v, self.multipliers, self.input, self.driver_input, self.outputs];
+        let Self { q, p, v, multipliers, input, driver_input, outputs, lost, .. } = *self;
+        let vectors = [q, p, v, multipliers, input, driver_input, outputs, lost];
         let sizes = vectors.map(|vector| vector.len() as u64);
         let numbers = vectors.into_iter().flatten().map(|number| number.to_bits());
         fixed.into_iter().chain(sizes).chain(numbers)
@@ -133,6 +136,7 @@ impl Frame {
             (&mut self.input, published.input),
             (&mut self.driver_input, published.driver_input),
             (&mut self.outputs, published.outputs),
+            (&mut self.lost, published.lost),
         ] {
             target.clear();
             target.extend_from_slice(source);
@@ -168,7 +172,7 @@ impl Frame {
             reciprocal_condition: number(next()),
             constraint_reciprocal_condition: number(next()),
         };
-        let sizes: [usize; 7] = std::array::from_fn(|_| next() as usize);
+        let sizes: [usize; 8] = std::array::from_fn(|_| next() as usize);
         let vectors = [
             &mut self.state.q,
             &mut self.state.p,
@@ -177,6 +181,7 @@ impl Frame {
             &mut self.input,
             &mut self.driver_input,
             &mut self.outputs,
+            &mut self.lost,
         ];
         for (vector, size) in vectors.into_iter().zip(sizes) {
             vector.clear();
@@ -196,6 +201,7 @@ impl Frame {
             input: &self.input,
             driver_input: &self.driver_input,
             outputs: &self.outputs,
+            lost: &self.lost,
             report: self.report,
             generation: self.generation,
             time_step_s: self.time_step_s,
@@ -235,6 +241,7 @@ mod tests {
             input: vec![6.0, 7.0],
             driver_input: vec![8.0],
             outputs: vec![f64::INFINITY],
+            lost: vec![1.0],
             time_step_s: 0.01,
             model_digest: u64::MAX,
             timing: Timing {
@@ -251,6 +258,6 @@ mod tests {
         back.read(&record);
         assert_eq!(format!("{back:?}"), format!("{frame:?}"));
         let d = Dimensions { dynamic: 2, prescribed: 1, inputs: 1, constraints: 1 };
-        assert!(record.len() - 1 + OUTPUTS_MAX <= record_words(d));
+        assert!(record.len() - 2 + OUTPUTS_MAX <= record_words(d));
     }
 }

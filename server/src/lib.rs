@@ -11,6 +11,7 @@
 //! [`serve::run`] is the whole server; [`daemon`] makes a process of it.
 
 pub mod catalog;
+pub mod channels;
 pub mod cli;
 pub mod config;
 pub mod convert;

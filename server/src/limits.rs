@@ -86,6 +86,14 @@ limits! {
     feedback_numbers = 64_000_000 in 1000..=10_000_000_000;
     /// Numbers of its scene that may be changed for one plant.
     parameters = 1024 in 0..=1_000_000;
+    /// Input and output channels of a plant.
+    channels = 256 in 0..=65_536;
+    /// Numbers of the outputs of a plant, with a flag for each channel; frames and the shared-memory link have room for them.
+    outputs = 256 in 0..=256;
+    /// Numbers that channels and faults of a plant keep, above all of what is late (8 bytes each).
+    channel_numbers = 1_000_000 in 0..=1_000_000_000;
+    /// Faults of a plant; those that are over make room for new ones.
+    faults = 256 in 0..=65_536;
     /// Iterations of one trajectory optimisation.
     optimization_iterations = 100_000 in 1..=4_000_000_000;
     /// Shortenings of one step of a trajectory optimisation.

@@ -18,11 +18,13 @@ use tonic::transport::server::Router;
 use tonic_health::server::HealthReporter;
 use tonic_web::GrpcWebLayer;
 use tower::layer::util::{Identity, Stack};
+use v1::channel_service_server::ChannelServiceServer;
 use v1::control_service_server::ControlServiceServer;
 use v1::model_service_server::ModelServiceServer;
 use v1::plant_service_server::PlantServiceServer;
 
 use crate::config::{Config, Listen};
+use crate::grpc::channels::ChannelService;
 use crate::grpc::control::ControlService;
 use crate::grpc::model::ModelService;
 use crate::grpc::observe::ObserveLayer;
@@ -102,6 +104,7 @@ impl RunningServer {
         health.set_serving::<ModelServiceServer<ModelService>>().await;
         health.set_serving::<PlantServiceServer<PlantService>>().await;
         health.set_serving::<ControlServiceServer<ControlService>>().await;
+        health.set_serving::<ChannelServiceServer<ChannelService>>().await;
         let mut server = Self {
             addresses: Addresses { link_root, pid: std::process::id(), ..Addresses::default() },
             health,
@@ -157,6 +160,10 @@ impl RunningServer {
                 ControlServiceServer::new(ControlService::new(hub()))
                     .max_decoding_message_size(message_bytes),
             )
+            .add_service(
+                ChannelServiceServer::new(ChannelService::new(hub()))
+                    .max_decoding_message_size(message_bytes),
+            )
             .add_service(reflection))
     }
 
@@ -208,6 +215,7 @@ impl RunningServer {
         self.health.set_not_serving::<ModelServiceServer<ModelService>>().await;
         self.health.set_not_serving::<PlantServiceServer<PlantService>>().await;
         self.health.set_not_serving::<ControlServiceServer<ControlService>>().await;
+        self.health.set_not_serving::<ChannelServiceServer<ChannelService>>().await;
         self.closing.cancel();
         let hub = Arc::clone(&self.hub);
         let links_closed = tokio::task::spawn_blocking(move || hub.shut_down());

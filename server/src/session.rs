@@ -19,7 +19,7 @@ use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
 use crate::feedback::{Feedback, InForce, Law};
 use crate::frame::Frame;
-use crate::limits::LimitExceeded;
+use crate::limits::{LimitExceeded, Limits};
 use crate::metrics::Metrics;
 use crate::parameters::{self, ChangeError, Parameters};
 use crate::regulator::Spec;
@@ -314,6 +314,11 @@ impl Session {
         act(&mut self.core())
     }
 
+    /// Held by whoever replaces the plant or what belongs to its steps.
+    pub(crate) fn replacing(&self) -> MutexGuard<'_, ()> {
+        lock(&self.replacing)
+    }
+
     fn core(&self) -> MutexGuard<'_, Core> {
         lock(&self.core)
     }
@@ -337,7 +342,7 @@ impl Session {
         &self,
         changes: &[(String, f64)],
         time_step_s: Option<f64>,
-        parameters_max: u64,
+        limits: &Limits,
     ) -> Result<bool, ParametersError> {
         let _replacing = lock(&self.replacing);
         let (before, parameters) =
@@ -347,16 +352,18 @@ impl Session {
         } else {
             let changed = parameters::change(&before.model, &parameters, changes)?;
             let (what, count) = ("numbers of the scene changed", changed.parameters.len());
-            LimitExceeded::check("parameters", parameters_max, what, count)?;
+            LimitExceeded::check("parameters", limits.parameters, what, count)?;
             (Arc::new(changed.model), Arc::new(changed.parameters))
         };
         let settings = Settings {
             time_step_s: time_step_s.unwrap_or(before.settings.time_step_s),
             ..before.settings
         };
+        let renewed = self.renewed_channels(&model, settings, limits)?;
         let plant = Plant::new(model, settings)?;
         let changed = self.with_core(move |core| {
             let former = core.change_plant(plant, parameters)?;
+            let former = (former, core.renew_channels(renewed));
             let is_outdated = match &mut core.feedback {
                 // A gain that was given holds as it is.
                 Some(feedback) if feedback.spec.is_fixed() => {
@@ -482,6 +489,14 @@ pub enum ParametersError {
     Limit(LimitExceeded),
     /// The state does not satisfy the changed constraints.
     State(InitialError),
+    /// Channels do not fit the changed time step.
+    Channels(Fault),
+}
+
+impl From<Fault> for ParametersError {
+    fn from(fault: Fault) -> Self {
+        Self::Channels(fault)
+    }
 }
 
 impl From<ChangeError> for ParametersError {
@@ -508,6 +523,7 @@ impl From<ParametersError> for Fault {
             ParametersError::Change(error) => error.into(),
             ParametersError::Limit(error) => error.into(),
             ParametersError::State(error) => Self::from_initial(error, "parameters"),
+            ParametersError::Channels(fault) => fault,
         }
     }
 }

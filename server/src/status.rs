@@ -15,7 +15,7 @@
 //! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `INVALID_COVARIANCE` | BadRequest | a covariance of noise has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice |
-//! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED` | ResourceInfo | no such thing, or deleted meanwhile |
+//! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED`, `FAULT_NOT_FOUND` | ResourceInfo | no such thing, or deleted meanwhile |
 //! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS` | ResourceInfo | the name is taken |
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
@@ -107,6 +107,12 @@ impl Fault {
     /// There is no such model.
     pub fn model_not_found(name: &str) -> Self {
         Self::resource(Code::NotFound, "MODEL_NOT_FOUND", "model", name, "there is no model")
+    }
+
+    /// The plant has no such fault.
+    pub fn fault_not_found(id: u64) -> Self {
+        let (reason, sentence) = ("FAULT_NOT_FOUND", "there is no fault");
+        Self::resource(Code::NotFound, reason, "fault", &id.to_string(), sentence)
     }
 
     /// There is no such plant.

@@ -134,6 +134,7 @@ impl Driving {
                 report: Some(convert::report(core.report())),
                 linearization: None,
                 u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
+                outputs: core.outputs(),
             })
         };
         let outcome = if is_short { advance() } else { beside_other_tasks(advance) };

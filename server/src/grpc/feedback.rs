@@ -43,9 +43,9 @@ pub(super) async fn set_parameters(
     LimitExceeded::check("parameters", limit, "numbers of the scene to change", count)?;
     let changes: Vec<_> = request.parameters.into_iter().map(|p| (p.path, p.value)).collect();
     let job = {
-        let session = Arc::clone(&session);
+        let (hub, session) = (Arc::clone(hub), Arc::clone(&session));
         move |_: &_| {
-            let is_outdated = session.change_parameters(&changes, time_step_s, limit)?;
+            let is_outdated = session.change_parameters(&changes, time_step_s, &hub.limits)?;
             Ok((is_outdated, plant_info(&session)))
         }
     };

@@ -2,6 +2,7 @@
 //! done by sessions, the catalog and the workers.
 
 mod analysis;
+pub mod channels;
 pub mod control;
 mod derivatives;
 pub mod drive;

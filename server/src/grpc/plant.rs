@@ -144,6 +144,7 @@ impl StepPlan {
                 if is_last {
                     response.report = Some(convert::report(core.report()));
                     response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
+                    response.outputs = core.outputs();
                 }
             };
             let taken = lease.step_and(u, None, look);

@@ -30,6 +30,7 @@ struct Wanted {
     linearization: bool,
     gain: bool,
     input: bool,
+    outputs: bool,
 }
 
 impl Wanted {
@@ -43,6 +44,7 @@ impl Wanted {
                 Ok(WatchField::Linearization) => wanted.linearization = true,
                 Ok(WatchField::Gain) => wanted.gain = true,
                 Ok(WatchField::Input) => wanted.input = true,
+                Ok(WatchField::Outputs) => wanted.outputs = true,
                 Ok(WatchField::Unspecified) | Err(_) => {
                     let problem = format!("{field} is nothing to watch");
                     return Err(Fault::field(format!("fields[{index}]"), problem));
@@ -123,6 +125,9 @@ impl Messages for Watcher {
         }
         if self.wanted.input {
             response.u.clone_from(&frame.input);
+        }
+        if self.wanted.outputs {
+            response.outputs = convert::outputs(&frame.outputs, &frame.lost);
         }
         if !self.wanted.needs_analysis() {
             return Ok(response);

@@ -5,7 +5,10 @@ use std::sync::Arc;
 use plantd_models::{
     Initial, InitialError, Linearization, Model, Plant, Settings, State, StepError, StepReport,
 };
+use plantd_proto::v1;
 
+use crate::channels::Channels;
+use crate::convert;
 use crate::feedback::Feedback;
 use crate::frame::{Published, Timing};
 use crate::parameters::Parameters;
@@ -20,6 +23,9 @@ pub struct Core {
     /// Report of the last step.
     pub(crate) report: StepReport,
     pub(crate) feedback: Option<Box<Feedback>>,
+    pub(crate) channels: Option<Box<Channels>>,
+    /// Faults injected so far.
+    pub(crate) faults: u64,
     /// What the driver asked for in the last step; empty when it sent nothing.
     driver_input: Vec<f64>,
     /// Room for an input that is not the driver's alone.
@@ -63,6 +69,8 @@ impl Core {
             has_applied: false,
             report: StepReport::default(),
             feedback: None,
+            channels: None,
+            faults: 0,
             parameters: Arc::default(),
             generation: 0,
             revision: 0,
@@ -80,10 +88,27 @@ impl Core {
             None => false,
             Some(feedback) => feedback.input(&self.plant, driver, &mut self.applied)?,
         };
+        let has_say = match &mut self.channels {
+            None => has_say,
+            Some(channels) => {
+                let (expected, actual) = (self.applied.len(), driver.len());
+                if !has_say {
+                    if actual != expected {
+                        return Err(StepError::Dimension { expected, actual });
+                    }
+                    self.applied.copy_from_slice(driver);
+                }
+                channels.actuate(&self.plant, &mut self.applied) || has_say
+            }
+        };
         let u = if has_say { &self.applied[..] } else { driver };
-        let report = match linearization {
-            None => self.plant.step(u)?,
-            Some(out) => self.plant.step_and_linearize(u, out)?,
+        let advance = |plant: &mut Plant| match linearization {
+            None => plant.step(u),
+            Some(out) => plant.step_and_linearize(u, out),
+        };
+        let report = match &self.channels {
+            None => advance(&mut self.plant)?,
+            Some(channels) => channels.advance(&mut self.plant, advance)?,
         };
         self.has_applied = has_say;
         self.input.copy_from_slice(u);
@@ -91,6 +116,9 @@ impl Core {
         self.driver_input.clear();
         self.driver_input.extend_from_slice(driver);
         self.report = report;
+        if let Some(channels) = &mut self.channels {
+            channels.measure(&mut self.plant, &self.input);
+        }
         Ok(report)
     }
 
@@ -104,6 +132,12 @@ impl Core {
     /// The plant.
     pub fn plant(&self) -> &Plant {
         &self.plant
+    }
+
+    /// What the output channels deliver, if there are any.
+    pub fn outputs(&self) -> Option<v1::Outputs> {
+        let published = self.published();
+        convert::outputs(published.outputs, published.lost)
     }
 
     /// Report of the last step.
@@ -135,7 +169,8 @@ impl Core {
             multipliers: self.plant.multipliers(),
             input: &self.input,
             driver_input: &self.driver_input,
-            outputs: &[],
+            outputs: self.channels.as_ref().map_or(&[], |channels| channels.output()),
+            lost: self.channels.as_ref().map_or(&[], |channels| channels.lost()),
             report: self.report,
             generation: self.generation,
             time_step_s: self.plant.settings().time_step_s,
@@ -149,7 +184,11 @@ impl Core {
         plant.hold_input(&mut self.input);
         self.has_applied = false;
         self.report = StepReport::default();
-        std::mem::replace(&mut self.plant, plant)
+        let former = std::mem::replace(&mut self.plant, plant);
+        if let Some(channels) = &mut self.channels {
+            channels.begin(&mut self.plant, &self.input);
+        }
+        former
     }
 
     /// Puts a plant of changed parameters or another time step in its place: state and count of steps
