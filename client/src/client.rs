@@ -1,7 +1,8 @@
 //! The client: one method per thing that a controller's author wants.
 
 use plantd_proto::v1::{
-    self, control_service_client::ControlServiceClient, model_service_client::ModelServiceClient,
+    self, channel_service_client::ChannelServiceClient,
+    control_service_client::ControlServiceClient, model_service_client::ModelServiceClient,
     plant_service_client::PlantServiceClient,
 };
 use tonic::transport::Channel;
@@ -46,6 +47,11 @@ impl Client {
     /// The generated client of `ControlService`.
     pub fn control(&self) -> ControlServiceClient<Channel> {
         ControlServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
+    }
+
+    /// The generated client of `ChannelService`.
+    pub fn channels(&self) -> ChannelServiceClient<Channel> {
+        ChannelServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
     /// The channel itself, for services that are not plantd's own (health, reflection).
@@ -377,5 +383,47 @@ impl Client {
     ) -> Result<Answers<v1::RolloutResponse>> {
         let mut stub = self.control();
         self.open(stub.rollout(request)).await
+    }
+}
+
+/// Sensors, actuators and faults.
+impl Client {
+    /// Declares the channels of a plant, in place of those before; tells what is in force.
+    pub async fn set_channels(
+        &self,
+        plant: impl Into<String>,
+        channels: v1::Channels,
+    ) -> Result<v1::SetChannelsResponse> {
+        let request = v1::SetChannelsRequest { id: plant.into(), channels: Some(channels) };
+        Ok(self.channels().set_channels(self.limited(request)).await?.into_inner())
+    }
+
+    /// The channels of a plant, with what they deliver.
+    pub async fn get_channels(&self, plant: impl Into<String>) -> Result<v1::GetChannelsResponse> {
+        let request = v1::GetChannelsRequest { id: plant.into() };
+        Ok(self.channels().get_channels(self.limited(request)).await?.into_inner())
+    }
+
+    /// Lets something go wrong.
+    pub async fn inject_fault(
+        &self,
+        plant: impl Into<String>,
+        fault: v1::FaultSpec,
+    ) -> Result<v1::FaultInfo> {
+        let request = v1::InjectFaultRequest { id: plant.into(), fault: Some(fault) };
+        let answer = self.channels().inject_fault(self.limited(request)).await?.into_inner();
+        answer.fault.ok_or(Error::Protocol("an answer without a fault"))
+    }
+
+    /// Ends a fault, or with 0 all of them; tells how many.
+    pub async fn clear_fault(&self, plant: impl Into<String>, fault: u64) -> Result<u32> {
+        let request = v1::ClearFaultRequest { id: plant.into(), fault_id: fault };
+        Ok(self.channels().clear_fault(self.limited(request)).await?.into_inner().cleared)
+    }
+
+    /// The faults of a plant.
+    pub async fn list_faults(&self, plant: impl Into<String>) -> Result<Vec<v1::FaultInfo>> {
+        let request = v1::ListFaultsRequest { id: plant.into() };
+        Ok(self.channels().list_faults(self.limited(request)).await?.into_inner().faults)
     }
 }
