@@ -275,17 +275,19 @@ impl InForce {
     }
 }
 
-/// Room in memory for the laws of all plants.
+/// Room in memory for what all plants or watchers together hold.
 #[derive(Debug)]
 pub struct Room {
+    name: &'static str,
+    what: &'static str,
     used: AtomicU64,
     limit: u64,
 }
 
 impl Room {
-    /// Room for so many numbers.
-    pub fn new(limit: u64) -> Arc<Self> {
-        Arc::new(Self { used: AtomicU64::new(0), limit })
+    /// Room for so many numbers: the limit of that name, for what it is.
+    pub fn new(name: &'static str, what: &'static str, limit: u64) -> Arc<Self> {
+        Arc::new(Self { name, what, used: AtomicU64::new(0), limit })
     }
 
     /// Takes room for so many numbers.
@@ -295,9 +297,9 @@ impl Room {
         match self.used.fetch_update(Ordering::AcqRel, Ordering::Acquire, take) {
             Ok(_) => Ok(Reservation { room: Arc::clone(self), numbers }),
             Err(used) => Err(LimitExceeded {
-                name: "feedback_numbers",
+                name: self.name,
                 limit: self.limit,
-                what: "numbers in the feedbacks of all plants",
+                what: self.what,
                 actual: used.saturating_add(numbers),
             }),
         }
@@ -323,7 +325,7 @@ mod tests {
 
     #[test]
     fn room_is_given_back() {
-        let room = Room::new(10);
+        let room = Room::new("feedback_numbers", "numbers", 10);
         let first = room.reserve(6).unwrap();
         let refused = room.reserve(5).unwrap_err();
         assert_eq!((refused.name, refused.actual), ("feedback_numbers", 11));
@@ -334,7 +336,7 @@ mod tests {
 
     #[test]
     fn a_trajectory_holds_before_its_beginning_and_after_its_end() {
-        let room = Room::new(10).reserve(1).unwrap();
+        let room = Room::new("feedback_numbers", "numbers", 10).reserve(1).unwrap();
         let stage = |x: f64| Stage { x: vec![x], u: vec![0.0], k: vec![1.0], ..Stage::default() };
         let law = Law { stages: vec![stage(0.0), stage(1.0)], end: Some(vec![2.0]), room };
         let reference = |step| law.at(step).1[0];

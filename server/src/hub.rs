@@ -40,6 +40,8 @@ pub struct Hub {
     pub trajectory_solves: Arc<Semaphore>,
     /// Room in memory for the laws of feedbacks.
     pub feedback_room: Arc<Room>,
+    /// Room in memory for the queues of watchers.
+    pub watch_room: Arc<Room>,
     /// Cancelled when the server begins to shut down: streams end.
     pub ending: CancellationToken,
     links: Option<Arc<LinkHost>>,
@@ -65,7 +67,16 @@ impl Hub {
             ),
             catalog: Catalog::new(limits.models, Arc::clone(&metrics)),
             trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
-            feedback_room: Room::new(limits.feedback_numbers),
+            feedback_room: Room::new(
+                "feedback_numbers",
+                "numbers in the feedbacks of all plants",
+                limits.feedback_numbers,
+            ),
+            watch_room: Room::new(
+                "watch_numbers",
+                "numbers in the queues of all watchers",
+                limits.watch_numbers,
+            ),
             ending: CancellationToken::new(),
             links: links.map(Arc::new),
             plants: Mutex::default(),

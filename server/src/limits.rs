@@ -64,6 +64,8 @@ limits! {
     plants = 1024 in 0..=1_000_000;
     /// Watch streams of one plant, and WatchGains streams.
     watchers_per_plant = 64 in 0..=1_000_000;
+    /// Numbers held in the queues of all watchers together (8 bytes each).
+    watch_numbers = 16_000_000 in 0..=10_000_000_000;
     /// Newton iterations that a plant may ask for.
     max_iterations = 1000 in 1..=1_000_000;
     /// Substeps of a time step that a plant may ask for.

@@ -290,12 +290,19 @@ impl Session {
     pub fn subscribe(
         self: &Arc<Self>,
         every: u64,
+        queue: usize,
         watchers_max: u64,
     ) -> Result<Subscription, LimitExceeded> {
         let session = Arc::clone(self);
+        let like = self.with_core(|core| {
+            let mut frame = Frame::default();
+            frame.copy_from(&core.published());
+            frame
+        });
+        let frames = vec![like; queue];
         // In the core's hands no step falls between the registration and the first frame.
         self.with_core(move |core| {
-            let subscription = Subscription::new(session, every, watchers_max)?;
+            let subscription = Subscription::new(session, every, frames, watchers_max)?;
             subscription.offer(&core.published());
             Ok(subscription)
         })

@@ -1,7 +1,8 @@
-//! What a plant publishes to its watchers: per watcher one slot, in which the latest frame wins.
+//! What a plant publishes to its watchers: per watcher a queue, of one frame unless it asks for more, in
+//! which the latest frames win.
 //!
-//! The driver copies the state into the slot of each watcher whose turn it is and goes on; a frame
-//! that was not fetched is overwritten and counted. Without watchers this costs one load. A watcher
+//! The driver copies the state into the queue of each watcher whose turn it is and goes on; of a full
+//! queue the oldest frame is overwritten and counted. Without watchers this costs one load. A watcher
 //! takes its frame by swapping buffers, so the driver never waits for more than that.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -58,11 +59,38 @@ struct Slot {
     filled: Notify,
 }
 
-#[derive(Default)]
+/// A queue of frames, in memory that is there from the beginning.
 struct Cell {
-    frame: Frame,
-    is_fresh: bool,
+    frames: Vec<Frame>,
+    /// Index of the oldest that waits.
+    first: usize,
+    /// How many wait.
+    count: usize,
     dropped: u64,
+}
+
+impl Cell {
+    fn push(&mut self, published: &Published<'_>) {
+        if self.count == self.frames.len() {
+            self.first = (self.first + 1) % self.frames.len();
+            self.count -= 1;
+            self.dropped += 1;
+        }
+        let next = (self.first + self.count) % self.frames.len();
+        self.frames[next].copy_from(published);
+        self.count += 1;
+    }
+
+    /// Takes the oldest, and leaves `frame`'s memory in its place.
+    fn pop(&mut self, frame: &mut Frame) -> bool {
+        if self.count == 0 {
+            return false;
+        }
+        std::mem::swap(&mut self.frames[self.first], frame);
+        self.first = (self.first + 1) % self.frames.len();
+        self.count -= 1;
+        true
+    }
 }
 
 impl Slot {
@@ -71,12 +99,10 @@ impl Slot {
             return;
         }
         let mut cell = lock(&self.cell);
-        cell.frame.copy_from(published);
-        if cell.is_fresh {
-            cell.dropped += 1;
-        } else {
-            cell.is_fresh = true;
-            drop(cell);
+        let was_empty = cell.count == 0;
+        cell.push(published);
+        drop(cell);
+        if was_empty {
             self.filled.notify_one();
         }
     }
@@ -94,13 +120,15 @@ impl Subscription {
     pub(crate) fn new(
         session: Arc<Session>,
         every: u64,
+        frames: Vec<Frame>,
         watchers_max: u64,
     ) -> Result<Self, LimitExceeded> {
-        let slot =
-            Arc::new(Slot { every: every.max(1), cell: Mutex::default(), filled: Notify::new() });
+        let frame = frames.first().cloned().unwrap_or_default();
+        let cell = Mutex::new(Cell { frames, first: 0, count: 0, dropped: 0 });
+        let slot = Arc::new(Slot { every: every.max(1), cell, filled: Notify::new() });
         session.watchers().add(Arc::clone(&slot), watchers_max)?;
         session.metrics().watcher_started();
-        Ok(Self { session, slot, frame: Frame::default(), dropped: 0 })
+        Ok(Self { session, slot, frame, dropped: 0 })
     }
 
     pub(crate) fn offer(&self, published: &Published<'_>) {
@@ -123,11 +151,9 @@ impl Subscription {
     /// Fetches the frame in the slot, if it is a new one.
     fn take(&mut self) -> bool {
         let mut cell = lock(&self.slot.cell);
-        if !cell.is_fresh {
+        if !cell.pop(&mut self.frame) {
             return false;
         }
-        cell.is_fresh = false;
-        std::mem::swap(&mut cell.frame, &mut self.frame);
         let lost = cell.dropped - self.dropped;
         self.dropped = cell.dropped;
         drop(cell);

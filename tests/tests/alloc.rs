@@ -136,7 +136,7 @@ fn steps_with_feedback_allocate_nothing() {
     let scene = builtin::scene("cart-pole").expect("the scene is built in");
     let model = Arc::new(Model::compile(&scene).expect("it compiles"));
     let d = model.dimensions();
-    let room = Room::new(1_000_000);
+    let room = Room::new("feedback_numbers", "numbers", 1_000_000);
     let stage = |k: usize| Stage {
         k: vec![0.1 * k as f64; d.input() * d.state()],
         x: vec![0.0; d.state()],

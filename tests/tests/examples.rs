@@ -1,10 +1,10 @@
 //! The Rust client's examples run and check themselves; Python's are run by its own tests.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
-use plantd_tests::server::ServerProcess;
+use plantd_tests::server::{ServerProcess, binary};
 
 /// Builds the examples with the binaries, so that Cargo sees the same dependencies as for these and
 /// builds none of them a second time.
@@ -69,4 +69,24 @@ fn optimize_marionette() {
 #[test]
 fn cart_pole_lqg() {
     assert!(run("cart_pole_lqg").contains("estimated to"));
+}
+
+/// Those with controllers in Python are run by its own tests.
+#[test]
+fn starter_scenarios() {
+    let examples = example("balance_link");
+    let path = std::env::var("PATH").unwrap();
+    let path = format!("{}:{path}", examples.parent().unwrap().display());
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../client/scenarios");
+    let files = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let scenarios: Vec<PathBuf> = files
+        .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
+        .filter(|path| !std::fs::read_to_string(path).unwrap().contains("\"python3\""))
+        .collect();
+    assert!(scenarios.len() >= 4);
+    let mut command = Command::new(binary("plantctl").unwrap());
+    command.arg("test").args(scenarios).env("PATH", path).env_remove("PLANTD_ADDRESS");
+    let output = command.stdin(Stdio::null()).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
 }

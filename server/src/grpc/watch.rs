@@ -1,7 +1,7 @@
 //! The stream of `PlantService.Watch`.
 //!
 //! The stream asks for the next frame when the transport has taken the last message, so a slow reader
-//! loses frames at the plant, where they are counted, and never holds more than one. Energies,
+//! loses frames at the plant, where they are counted, and never holds more than its queue. Energies,
 //! linearizations and gains are computed on a worker, from a plant of the watcher's own.
 
 use std::collections::HashSet;
@@ -14,7 +14,8 @@ use v1::WatchField;
 
 use super::{Answers, Messages};
 use crate::convert;
-use crate::frame::Frame;
+use crate::feedback::Reservation;
+use crate::frame::{Frame, record_words};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
 use crate::session::Session;
@@ -80,8 +81,13 @@ pub(super) fn stream(
         false => None,
     };
     let every = u64::from(request.every.max(1));
+    let queue = request.queue.max(1) as usize;
+    // The one frame that every watcher has is covered by the limit of watchers.
+    let numbers = (queue - 1).saturating_mul(record_words(session.model().dimensions()));
+    let room = hub.watch_room.reserve(numbers)?;
     let watcher = Watcher {
-        subscription: session.subscribe(every, hub.limits.watchers_per_plant)?,
+        subscription: session.subscribe(every, queue, hub.limits.watchers_per_plant)?,
+        _room: room,
         hub: Arc::clone(hub),
         wanted,
         mask,
@@ -94,6 +100,7 @@ pub(super) fn stream(
 struct Watcher {
     hub: Arc<Hub>,
     subscription: Subscription,
+    _room: Reservation,
     wanted: Wanted,
     mask: Option<Mask>,
     weights: Option<Arc<Weights>>,

@@ -134,3 +134,34 @@ async fn a_stalled_watcher_loses_messages_and_stops_nobody() {
     assert!(last.dropped > 0, "20 000 messages cannot have been kept");
     assert_eq!(received + last.dropped, STEPS, "what was lost is counted");
 }
+
+#[tokio::test]
+async fn a_queue_keeps_what_the_latest_would_have_won_over() {
+    let (_server, client) = server().await;
+    let id = plant(&client, "pendulum").await.id;
+    let steps = 5000;
+    let watched = async |queue: u32| {
+        client.reset(&id).await.unwrap();
+        let watch = watch(&client, &id, &[v1::WatchField::State]).await;
+        let mut stream = client.watch(v1::WatchRequest { queue, ..watch }).await.unwrap();
+        let request = v1::StepRequest { id: id.clone(), hold: steps, ..Default::default() };
+        client.step(request).await.unwrap();
+        let (mut seen, mut dropped) = (Vec::new(), 0);
+        while seen.last() != Some(&u64::from(steps)) {
+            let message = next(&mut stream).await;
+            seen.push(message.step);
+            dropped = message.dropped;
+        }
+        (seen, dropped)
+    };
+    let (all, dropped) = watched(steps + 1).await;
+    assert_eq!((all, dropped), ((0..=u64::from(steps)).collect(), 0));
+    let (some, dropped) = watched(4).await;
+    assert!(some.is_sorted_by(|a, b| a < b));
+    assert_eq!(some.len() as u64 + dropped, u64::from(steps) + 1);
+
+    let watch = watch(&client, &id, &[v1::WatchField::State]).await;
+    let refused = client.watch(v1::WatchRequest { queue: u32::MAX, ..watch }).await.unwrap_err();
+    assert_eq!(refused.code(), Some(plantd_client::Code::ResourceExhausted));
+    assert!(refused.to_string().contains("watch_numbers"), "{refused}");
+}

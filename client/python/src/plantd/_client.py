@@ -273,8 +273,10 @@ class Client:
         coordinates: Sequence[str] = (),
         q: npt.ArrayLike | None = None,
         r: npt.ArrayLike | None = None,
+        queue: int = 1,
     ) -> Iterator[Watched]:
-        """What a plant does while somebody drives it. Latest wins: a slow reader loses messages.
+        """What a plant does while somebody drives it. A slow reader loses messages: ``queue`` of them
+        may wait, the latest ones.
 
         ``q`` and ``r`` are the weights for the field ``gain``. Leaving the loop ends the watch.
         """
@@ -287,6 +289,7 @@ class Client:
             every=every,
             coordinates=coordinates,
             weights=None if q is None or r is None else weights(q, r),
+            queue=queue,
         )
         # Asked for now rather than at the first message, so that nothing in between is missed.
         return self._messages(self.plants.Watch(request), Watched._from)

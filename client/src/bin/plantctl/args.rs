@@ -161,6 +161,9 @@ pub(crate) enum Command {
         /// End after this many messages.
         #[arg(long, short = 'n')]
         count: Option<u64>,
+        /// Messages that may wait to be printed; of more, the oldest are lost.
+        #[arg(long, value_name = "N", default_value_t = 1)]
+        queue: u32,
         #[command(flatten)]
         weights: Weights,
     },

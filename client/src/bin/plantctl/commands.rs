@@ -57,13 +57,14 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
             let rows: Vec<_> = u.into_iter().map(|row| row.0).collect();
             step(&client, output, id, &rows, count, all).await?;
         }
-        Command::Watch { id, fields, every, coordinates, count, weights } => {
+        Command::Watch { id, fields, every, coordinates, count, queue, weights } => {
             let request = v1::WatchRequest {
                 fields: fields.iter().map(|&f| v1::WatchField::from(f).into()).collect(),
                 weights: None,
                 id,
                 every,
                 coordinates,
+                queue,
             };
             watch(&client, output, request, &fields, &weights, count).await?;
         }

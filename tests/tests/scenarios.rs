@@ -1,0 +1,192 @@
+//! `plantctl test` against scenarios whose motion is known in closed form: what must come true does,
+//! and what must break breaks at the right time.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use plantd_tests::server::{ServerProcess, binary};
+use serde_json::Value;
+
+fn scenarios(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("scenarios").join(path)
+}
+
+/// With `plantctl` in PATH, for controllers and commands that are made of it.
+fn with_path(command: &mut Command) -> &mut Command {
+    let program = binary("plantctl").unwrap();
+    let path = std::env::var("PATH").unwrap();
+    let path = format!("{}:{path}", program.parent().unwrap().display());
+    command.env("PATH", path).env_remove("PLANTD_ADDRESS").stdin(Stdio::null())
+}
+
+fn plantctl(arguments: &[&str]) -> Output {
+    let mut command = Command::new(binary("plantctl").unwrap());
+    with_path(command.args(arguments)).output().unwrap()
+}
+
+fn test(path: &str, arguments: &[&str]) -> Output {
+    let path = scenarios(path);
+    plantctl(&[&["test", path.to_str().unwrap()], arguments].concat())
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+/// The cases of a suite, and its exit code.
+#[track_caller]
+fn cases(path: &str, arguments: &[&str]) -> (Vec<Value>, i32) {
+    let output = test(path, &[arguments, &["--json"]].concat());
+    let text = stdout(&output);
+    let lines = text.lines().map(|line| serde_json::from_str(line).unwrap());
+    let mut all: Vec<Value> = lines.collect();
+    let summary =
+        all.pop().unwrap_or_else(|| panic!("{}", String::from_utf8_lossy(&output.stderr)));
+    assert!(summary["passed"].is_u64(), "{summary}");
+    (all, output.status.code().unwrap())
+}
+
+#[test]
+fn what_must_come_true_does() {
+    let (cases, code) = cases("met", &[]);
+    for case in &cases {
+        assert_eq!(case["status"], "passed", "{case}");
+    }
+    assert_eq!((cases.len(), code), (7, 0));
+}
+
+#[test]
+fn every_expectation_breaks_at_its_time() {
+    let (cases, code) = cases("broken/slider.toml", &[]);
+    assert_eq!((cases.len(), code), (1, 1));
+    assert_eq!((&cases[0]["status"], &cases[0]["steps"]), (&"failed".into(), &200.into()));
+    let step = |x: f64| (x.sqrt() / 0.01).ceil() * 0.01;
+    let at = |time_s: f64| (Some(time_s), Some(time_s * time_s));
+    let mean_square = (0..=200).map(|k| (4.0 * f64::from(k) * 0.01).powi(2)).sum::<f64>() / 201.0;
+    let expected = [
+        at(step(1.1)),
+        at(step(1.2)),
+        at(step(2.0)),
+        (Some(0.01), Some(4.0)),
+        at(2.0),
+        at(2.0),
+        (None, Some(mean_square.sqrt())),
+        (None, None),
+    ];
+    let verdicts = cases[0]["expectations"].as_array().unwrap();
+    assert_eq!(verdicts.len(), expected.len());
+    for (verdict, (time_s, value)) in verdicts.iter().zip(expected) {
+        assert_eq!(verdict["passed"], false, "{verdict}");
+        for (actual, expected) in [(&verdict["time_s"], time_s), (&verdict["value"], value)] {
+            match (actual.as_f64(), expected) {
+                (Some(actual), Some(x)) => assert!((actual - x).abs() < 1e-9, "{verdict}: {x}"),
+                (actual, expected) => assert_eq!(actual, expected, "{verdict}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn a_step_that_is_refused_ends_the_run() {
+    let (cases, code) = cases("broken/not-a-number.toml", &[]);
+    assert_eq!((code, &cases[0]["steps"]), (1, &30.into()));
+    let ended = cases[0]["ended"].as_str().unwrap();
+    assert!(ended.contains("step 31") && ended.contains("INPUT_NOT_FINITE"), "{ended}");
+    let verdicts = &cases[0]["expectations"];
+    assert!((verdicts[0]["time_s"].as_f64().unwrap() - 0.3).abs() < 1e-9, "{verdicts}");
+    // Of what was seen, the last is judged.
+    assert_eq!(verdicts[1]["passed"], true);
+}
+
+#[test]
+fn a_controller_that_dies_or_falls_silent_is_told_of() {
+    let (dead, _) = cases("broken/dies.toml", &[]);
+    assert_eq!((&dead[0]["status"], &dead[0]["steps"]), (&"failed".into(), &20.into()));
+    assert_eq!(dead[0]["ended"], "the controller ended after step 20 of 50: exit status: 7");
+    assert_eq!(dead[0]["output"], "I am dying\n");
+    for (file, ended, steps) in [
+        ("broken/silent.toml", "step 20 of 50 when 3 s were over", 20),
+        ("broken/absent.toml", "no step was taken in 0.5 s", 0),
+    ] {
+        let (cases, code) = cases(file, &[]);
+        assert_eq!((&cases[0]["ended"], code), (&ended.into(), 1), "{file}");
+        assert_eq!(cases[0]["steps"], steps, "{file}");
+    }
+}
+
+#[test]
+fn a_failure_is_replayed_by_its_command() {
+    let (first, code) = cases("broken/random.toml", &["--seed", "11"]);
+    let failed: Vec<_> = first.iter().filter(|case| case["status"] == "failed").collect();
+    assert!(code == 1 && !failed.is_empty() && failed.len() < 8, "{} of 8 failed", failed.len());
+    let replay = failed[0]["replay"].as_str().unwrap();
+    assert!(replay.contains("--seed 11 --case random-"), "{replay}");
+    let again = format!("{replay} --json");
+    let again = with_path(Command::new("sh").args(["-c", &again])).output().unwrap();
+    let text = stdout(&again);
+    let again: Value = serde_json::from_str(text.lines().next().unwrap()).unwrap();
+    assert_eq!(again["expectations"], failed[0]["expectations"]);
+    assert_eq!(text.lines().count(), 2);
+    // Other seeds make other cases.
+    let (other, _) = cases("broken/random.toml", &[]);
+    assert_ne!(other[0]["expectations"], first[0]["expectations"]);
+}
+
+#[test]
+fn what_cannot_be_run_is_no_failure_of_the_controller() {
+    let (cases, code) = cases("unusable", &[]);
+    assert_eq!((cases.len(), code), (4, 2));
+    for (file, part) in [
+        ("signal.toml", "expect[0].final: there is no signal `y`"),
+        ("program.toml", "cannot start no-such-controller"),
+        ("parameter.toml", "plant.parameters: INVALID_ARGUMENT"),
+        ("scene.toml", "plant.scene: cannot read"),
+    ] {
+        let is_it = |case: &&Value| case["file"].as_str().unwrap().ends_with(file);
+        let case = cases.iter().find(is_it).unwrap();
+        assert_eq!(case["status"], "error", "{case}");
+        assert!(case["error"].as_str().unwrap().contains(part), "{case}");
+    }
+    // Bound and dropped: a port that nobody listens on.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let nowhere = format!("http://127.0.0.1:{port}");
+    for (path, arguments) in [
+        ("no-such-file.toml", &[][..]),
+        ("met", &["--case", "no-such-case"]),
+        ("met", &["--address", &nowhere]),
+        ("met", &["--server", "/no/such/server"]),
+    ] {
+        assert_eq!(test(path, arguments).status.code(), Some(2), "{path} {arguments:?}");
+    }
+}
+
+#[test]
+fn reports_say_what_the_console_says() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (xml, html) = (file("junit.xml"), file("report.html"));
+    let output = test("broken/slider.toml", &["--junit", &xml, "--html", &html]);
+    assert_eq!(output.status.code(), Some(1));
+    let (text, xml) = (stdout(&output), std::fs::read_to_string(xml).unwrap());
+    let html = std::fs::read_to_string(html).unwrap();
+    assert!(text.starts_with("FAIL   slider  200 steps"), "{text}");
+    assert!(text.ends_with("0 passed, 1 failed, 0 not run\n"), "{text}");
+    let line = "x settles within 0.1 of 1 by 1 s: at 1.05 s it is 1.1025, above 1.1";
+    for (what, place) in [("console", &text), ("JUnit", &xml), ("page", &html)] {
+        assert!(place.contains(line), "{what}: {place}");
+        assert!(place.contains("--seed 0"), "{what}");
+    }
+    assert!(xml.contains("tests=\"1\" failures=\"1\" errors=\"0\""), "{xml}");
+    assert_eq!(html.matches("<svg").count(), 7, "a plot for each expectation with a signal");
+    assert!(!html.contains("http://") && !html.contains("https://"), "it needs nothing else");
+}
+
+#[test]
+fn a_server_that_is_there_is_left_without_plants() {
+    let server = ServerProcess::start().unwrap();
+    let (cases, code) = cases("met", &["--address", server.address(), "--jobs", "3"]);
+    assert_eq!((cases.len(), code), (7, 0));
+    let plants = plantctl(&["--address", server.address(), "list", "plants", "--json"]);
+    let plants: Value = serde_json::from_str(&stdout(&plants)).unwrap();
+    assert_eq!(plants["plants"], Value::Array(Vec::new()));
+}
