@@ -1,17 +1,17 @@
 /*
- * plantd_link.h: layout of the shared-memory link of plantd, version 3.
+ * plantd_link.h: layout of the shared-memory link of plantd, version 4.
  *
  * A message is one plantd_link_header (the user header of an iceoryx2 sample) and a slice of
  * double. Each open plant has, in the iceoryx2 domain of the server,
  *
- *     plantd/3/<plant>/input   publish-subscribe and event, drivers to server
- *     plantd/3/<plant>/state   publish-subscribe and event, server to drivers
+ *     plantd/4/<plant>/input   publish-subscribe and event, drivers to server
+ *     plantd/4/<plant>/state   publish-subscribe and event, server to drivers
  *
  * The domain is an iceoryx2 0.10 configuration with the server's root path and the prefix
- * plantd3_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
+ * plantd4_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
  * by exclusive or, as eight hexadecimal digits. The publish-subscribe services have the payload type
  * "f64" (dynamic), the user header type PLANTD_LINK_TYPE_NAME, and the attributes
- * plantd.layout = "3" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
+ * plantd.layout = "4" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
  *
  * Conversation:
  *
@@ -45,10 +45,10 @@
 extern "C" {
 #endif
 
-#define PLANTD_LINK_LAYOUT_VERSION 3u
+#define PLANTD_LINK_LAYOUT_VERSION 4u
 #define PLANTD_LINK_MAGIC 0x746e6c70u /* "plnt" */
 #define PLANTD_LINK_SCHEMA_HASH UINT64_C(0xbee0d064efdc6b31)
-#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader3"
+#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader4"
 #define PLANTD_LINK_POLL_FOREVER_NS UINT64_MAX
 
 /* What a message is. */
@@ -58,7 +58,8 @@ enum plantd_link_kind {
     PLANTD_LINK_DETACH = 3,    /* driver: gives the lease back; no payload, no answer */
     PLANTD_LINK_ATTACHED = 16, /* server: the lease is the driver's; payload as in STATE */
     PLANTD_LINK_STATE = 17,    /* server: a step was taken; payload q (nd + nk), p (nd), v (nk),
-                                  multipliers (nc) */
+                                  multipliers (nc), outputs (ny), and for each output channel
+                                  1 where its numbers stand for lost ones, else 0 */
     PLANTD_LINK_FAILURE = 18,  /* server: refused or failed, see code; the plant is as it was */
     PLANTD_LINK_CLOSED = 19    /* server: the link ends, see code */
 };
@@ -119,6 +120,8 @@ struct plantd_link_header {
     uint32_t redundant_constraints; /* constraint equations that follow from others */
     uint32_t steps;               /* steps of the method in the time step */
     uint32_t halvings;            /* how often the time step was halved */
+    uint32_t outputs;             /* numbers of the output channels, ny */
+    uint32_t output_channels;     /* output channels, with a flag each */
     double residual;              /* final residual in units of its own round-off */
     double constraint_residual;   /* constraint violation in units of its own round-off */
     double reciprocal_condition;  /* estimate for the Newton matrix, at most 1 */

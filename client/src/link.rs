@@ -95,6 +95,10 @@ pub struct StateView<'a> {
     pub multipliers: &'a [f64],
     /// `x = (q, p, v)`, 2 nd + 2 nk.
     pub x: &'a [f64],
+    /// What the output channels deliver; empty without channels.
+    pub outputs: &'a [f64],
+    /// For each output channel, 1 where its numbers stand for lost ones, else 0.
+    pub lost: &'a [f64],
     /// Residual evaluations.
     pub iterations: u32,
     /// Factorizations of the Newton matrix.
@@ -178,9 +182,11 @@ impl LinkDriver {
 
     /// The last state: of the last step, or of the time of the connection.
     pub fn state(&self) -> StateView<'_> {
-        let LinkDimensions { dynamic, prescribed, .. } = self.dimensions();
+        let LinkDimensions { dynamic, prescribed, constraints, .. } = self.dimensions();
         let coordinates = dynamic + prescribed;
-        let (x, multipliers) = self.state.split_at(2 * coordinates);
+        let (x, rest) = self.state.split_at(2 * coordinates);
+        let (multipliers, rest) = rest.split_at(constraints);
+        let (outputs, lost) = rest.split_at(self.last.outputs as usize);
         let (q, momenta) = x.split_at(coordinates);
         let (p, v) = momenta.split_at(dynamic);
         StateView {
@@ -191,6 +197,8 @@ impl LinkDriver {
             v,
             multipliers,
             x,
+            outputs,
+            lost,
             iterations: self.last.iterations,
             factorizations: self.last.factorizations,
             residual: self.last.residual,
@@ -285,16 +293,17 @@ impl LinkDriver {
         self.server = ProcessIdentity { pid: answer.pid, start: answer.process_start };
         self.is_server_visible = self.server.is_running();
         self.server_port = Some(message.origin());
-        self.state.resize(answer.state_len(), 0.0);
         self.note_state(answer, message.payload())
     }
 
     fn note_state(&mut self, answer: &Header, payload: &[f64]) -> Result<(), LinkError> {
         self.server_poll_end_ns = answer.poll_end_ns();
-        if payload.len() != self.state.len() {
+        if payload.len() != answer.state_len() {
             return Err(DomainError::OtherLayout { plant: self.plant.clone() }.into());
         }
         self.last = *answer;
+        // Allocates where channels were added.
+        self.state.resize(payload.len(), 0.0);
         self.state.copy_from_slice(payload);
         Ok(())
     }

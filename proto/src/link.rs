@@ -4,13 +4,13 @@
 //!
 //! | name | pattern | from | to |
 //! | --- | --- | --- | --- |
-//! | `plantd/3/<plant>/input` | publish-subscribe | drivers | server |
-//! | `plantd/3/<plant>/input` | event | drivers | server |
-//! | `plantd/3/<plant>/state` | publish-subscribe | server | drivers |
-//! | `plantd/3/<plant>/state` | event | server | drivers |
+//! | `plantd/4/<plant>/input` | publish-subscribe | drivers | server |
+//! | `plantd/4/<plant>/input` | event | drivers | server |
+//! | `plantd/4/<plant>/state` | publish-subscribe | server | drivers |
+//! | `plantd/4/<plant>/state` | event | server | drivers |
 //!
-//! The `3` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
-//! slice of `f64`: the input `u` one way, `(q, p, v, multipliers)` the other way.
+//! The `4` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
+//! slice of `f64`: the input `u` one way, `(q, p, v, multipliers, outputs, lost)` the other way.
 //!
 //! # Conversation
 //!

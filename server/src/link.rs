@@ -16,6 +16,7 @@ use std::time::Duration;
 
 use plantd_proto::link::{Domain, DomainError, LAYOUT_VERSION, LinkNode, Wait, default_root};
 
+use crate::frame::OUTPUTS_MAX;
 use crate::session::Session;
 use worker::Worker;
 
@@ -159,7 +160,8 @@ impl LinkHost {
     /// Starts the thread of a link and waits until its ports exist.
     fn start_worker(&self, session: Arc<Session>) -> Result<Thread, LinkError> {
         let plant = session.id().to_owned();
-        self.domain.check_shared_memory(3 * session.model().dimensions().state())?;
+        self.domain
+            .check_shared_memory(3 * (session.model().dimensions().state() + OUTPUTS_MAX))?;
         let services = self.node.create_services(&plant)?;
         let stop = Arc::new(AtomicBool::new(false));
         let (report, reported) = mpsc::sync_channel(1);

@@ -29,7 +29,7 @@ const SHARED_MEMORY_FREE_MIN: u64 = 8 << 20;
 const ROOT_LENGTH_MAX: usize = 107 - PREFIX_LENGTH - 39 - ".event".len() - 1;
 
 /// Length of [`Domain::prefix`].
-const PREFIX_LENGTH: usize = "plantd3_00000000_".len();
+const PREFIX_LENGTH: usize = "plantd4_00000000_".len();
 
 /// Drivers, connected or trying to, that one link has room for.
 const DRIVERS_MAX: usize = 8;

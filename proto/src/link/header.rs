@@ -3,7 +3,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 /// Version of the layout and of the conversation. Part of the services' names.
-pub const LAYOUT_VERSION: u32 = 3;
+pub const LAYOUT_VERSION: u32 = 4;
 
 /// First field of every header: `plnt` in ASCII, little-endian.
 pub const MAGIC: u32 = u32::from_le_bytes(*b"plnt");
@@ -43,7 +43,7 @@ header! {
     /// Fields that a kind of message does not use are zero.
     #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
     #[repr(C)]
-    #[type_name("PlantdLinkHeader3")]
+    #[type_name("PlantdLinkHeader4")]
     pub struct Header {
         /// [`MAGIC`].
         pub magic: u32,
@@ -100,6 +100,10 @@ header! {
         pub steps: u32,
         /// How often the time step was halved.
         pub halvings: u32,
+        /// Numbers of the plant's output channels, ny.
+        pub outputs: u32,
+        /// Output channels, with a flag each.
+        pub output_channels: u32,
         /// Final residual of the step in units of its own round-off.
         pub residual: f64,
         /// Largest constraint violation in units of its own round-off.
@@ -194,7 +198,8 @@ numbered! {
         /// Server: the lease is the driver's; the payload is the current state.
         Attached = 16,
         /// Server: a step was taken; the payload is the state after it: `q` (nd + nk), `p` (nd),
-        /// `v` (nk), `multipliers` (nc).
+        /// `v` (nk), `multipliers` (nc), what the output channels deliver (ny), and for each of these
+        /// channels 1 where its numbers stand for lost ones, else 0.
         State = 17,
         /// Server: refused or failed, `code` says why; the plant is as it was. No payload.
         Failure = 18,
@@ -281,9 +286,11 @@ impl Header {
         self.inputs as usize + self.prescribed as usize
     }
 
-    /// Entries of a state message: `q`, `p`, `v` and the multipliers.
+    /// Entries of a state message: `q`, `p`, `v`, the multipliers, the outputs and their flags.
     pub fn state_len(&self) -> usize {
-        2 * (self.dynamic as usize + self.prescribed as usize) + self.constraints as usize
+        let coordinates = self.dynamic as usize + self.prescribed as usize;
+        let outputs = self.outputs as usize + self.output_channels as usize;
+        2 * coordinates + self.constraints as usize + outputs
     }
 
     /// When the sender stops polling, ns on the system's monotonic clock.
@@ -298,8 +305,8 @@ mod tests {
 
     /// Bindings in other languages repeat the layout; this pins it. A change needs a new version.
     #[test]
-    fn the_layout_of_version_3_is_pinned() {
-        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (3, 200));
+    fn the_layout_of_version_4_is_pinned() {
+        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (4, 208));
         assert_eq!(align_of::<Header>(), 8);
         assert_eq!(SCHEMA_HASH, 0xbee0_d064_efdc_6b31);
     }

@@ -12,7 +12,7 @@ use plantd_proto::link::{
 };
 
 use super::LinkConfig;
-use crate::frame::Published;
+use crate::frame::{OUTPUTS_MAX, Published};
 use crate::session::{DriveError, DriverKind, Lease, Session};
 
 /// How often the thread looks whether it shall end and whether its driver lives, ns.
@@ -76,7 +76,7 @@ impl Worker {
             constraints: dimensions.constraints as u32,
             ..Header::new(Kind::State)
         };
-        let endpoint = Endpoint::server(services, header.state_len(), config.wait)?;
+        let endpoint = Endpoint::server(services, header.state_len() + OUTPUTS_MAX, config.wait)?;
         session.set_link_open(true);
         tracing::info!(plant = session.id(), "shared-memory link is open");
         Ok(Self {
@@ -343,10 +343,13 @@ fn answer(
         model_digest: published.model_digest,
         step: published.step,
         time_s: published.time_s,
+        outputs: published.outputs.len() as u32,
+        output_channels: published.lost.len() as u32,
         ..common
     };
     let header = if kind == Kind::State { with_report(header, &published.report) } else { header };
-    let parts = [published.q, published.p, published.v, published.multipliers];
+    let Published { q, p, v, multipliers, outputs, lost, .. } = *published;
+    let parts = [q, p, v, multipliers, outputs, lost];
     endpoint.send(header, &parts, request.poll_end_ns())
 }
 

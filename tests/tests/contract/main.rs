@@ -3,6 +3,7 @@
 
 mod analysis;
 mod answers;
+mod channels;
 mod derivatives;
 mod drive;
 mod elements;

@@ -25,6 +25,7 @@ from ._rotation import compose, difference, rotations
 from ._types import (
     Accuracy,
     Analysis,
+    Channels,
     Contraction,
     Diagnostics,
     Dynamics,
@@ -33,6 +34,7 @@ from ._types import (
     Gain,
     Linearization,
     Mode,
+    Outputs,
     Plant,
     Regulator,
     Rollout,
@@ -49,6 +51,7 @@ from ._types import (
 __all__ = [
     "Accuracy",
     "Analysis",
+    "Channels",
     "Checkpoint",
     "Client",
     "Contraction",
@@ -65,6 +68,7 @@ __all__ = [
     "Linearization",
     "Mode",
     "Optimum",
+    "Outputs",
     "Plant",
     "PlantdError",
     "Progress",

@@ -9,7 +9,14 @@ import grpc
 import numpy as np
 import numpy.typing as npt
 
-from plantd.v1 import common_pb2, control_service_pb2, model_service_pb2, plant_service_pb2
+from plantd.v1 import (
+    channel_service_pb2,
+    common_pb2,
+    control_service_pb2,
+    model_service_pb2,
+    plant_service_pb2,
+)
+from plantd.v1.channel_service_pb2_grpc import ChannelServiceStub
 from plantd.v1.control_service_pb2_grpc import ControlServiceStub
 from plantd.v1.model_service_pb2_grpc import ModelServiceStub
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
@@ -37,6 +44,7 @@ from ._requests import (
 from ._types import (
     FEEDBACK_MODES,
     Analysis,
+    Channels,
     Contraction,
     Diagnostics,
     Dynamics,
@@ -67,7 +75,7 @@ if TYPE_CHECKING:
 #: Where a server listens unless it is told otherwise.
 DEFAULT_ADDRESS = "http://127.0.0.1:50051"
 
-Field = Literal["state", "report", "energy", "linearization", "gain", "input"]
+Field = Literal["state", "report", "energy", "linearization", "gain", "input", "outputs"]
 
 #: Answers hold no more than a request asked for; this only stops a runaway peer.
 _MAX_RECEIVE_BYTES = 256 << 20
@@ -88,7 +96,8 @@ def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
 class Client:
     """A connection to a server. Use it in a ``with`` statement, or call ``close``.
 
-    ``models``, ``plants`` and ``control`` are the generated stubs, for what is not wrapped.
+    ``models``, ``plants``, ``control`` and ``channels`` are the generated stubs, for what is not
+    wrapped.
     """
 
     def __init__(self, address: str, *, timeout: float = 60.0):
@@ -106,6 +115,7 @@ class Client:
         self.models = ModelServiceStub(self._channel)
         self.plants = PlantServiceStub(self._channel)
         self.control = ControlServiceStub(self._channel)
+        self.channels = ChannelServiceStub(self._channel)
 
     def close(self) -> None:
         """Closes the connection; streams end."""
@@ -391,6 +401,55 @@ class Client:
     def clear_feedback(self, id: str) -> None:
         """Takes the reference away; the driver's input acts alone again."""
         self._call(self.plants.ClearFeedback, plant_service_pb2.ClearFeedbackRequest(id=id))
+
+    def set_channels(
+        self,
+        id: str,
+        outputs: Iterable[Mapping[str, Any]] = (),
+        inputs: Iterable[Mapping[str, Any]] = (),
+        *,
+        seed: int = 0,
+    ) -> Channels:
+        """Declares the sensors and actuators of a plant, in place of those before.
+
+        Each is a mapping with the fields of ``OutputChannel`` or ``InputChannel`` of the contract:
+        ``dict(name="encoder", coordinate="theta", noise=0.001, latency_s=0.02)``,
+        ``dict(input="tau", delay_s=0.01, max=5.0)``. Times become whole steps.
+        """
+        channels = channel_service_pb2.Channels(
+            outputs=[channel_service_pb2.OutputChannel(**output) for output in outputs],
+            inputs=[channel_service_pb2.InputChannel(**input) for input in inputs],
+            seed=seed,
+        )
+        request = channel_service_pb2.SetChannelsRequest(id=id, channels=channels)
+        answer = self._call(self.channels.SetChannels, request)
+        return Channels._from(answer.info, common_pb2.Outputs(y=answer.y))
+
+    def get_channels(self, id: str) -> Channels:
+        """The channels of a plant, with what they deliver now."""
+        request = channel_service_pb2.GetChannelsRequest(id=id)
+        answer = self._call(self.channels.GetChannels, request)
+        return Channels._from(answer.info, common_pb2.Outputs(y=answer.y, lost=answer.lost))
+
+    def inject_fault(self, id: str, **fault: Any) -> channel_service_pb2.FaultInfo:
+        """Lets something go wrong: the fields of ``FaultSpec`` of the contract.
+
+            client.inject_fault("p1", input="tau", stuck=True, start_s=2.0, duration_s=0.5)
+            client.inject_fault("p1", push=dict(point=dict(frame="rod"), force=[5, 0, 0]), duration_s=0.1)
+        """
+        spec = channel_service_pb2.FaultSpec(**fault)
+        request = channel_service_pb2.InjectFaultRequest(id=id, fault=spec)
+        return self._call(self.channels.InjectFault, request).fault
+
+    def clear_fault(self, id: str, fault_id: int = 0) -> int:
+        """Ends a fault, or all; how many."""
+        request = channel_service_pb2.ClearFaultRequest(id=id, fault_id=fault_id)
+        return self._call(self.channels.ClearFault, request).cleared
+
+    def list_faults(self, id: str) -> list[channel_service_pb2.FaultInfo]:
+        """The faults of a plant, in the order in which they were injected."""
+        request = channel_service_pb2.ListFaultsRequest(id=id)
+        return list(self._call(self.channels.ListFaults, request).faults)
 
     def watch_gains(self, id: str) -> Iterator[WatchedGain]:
         """The gains of a plant's feedback: along a trajectory those of every step from the present one

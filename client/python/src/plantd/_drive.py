@@ -9,7 +9,7 @@ from plantd.v1 import plant_service_pb2 as pb
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
 from ._errors import PlantdError, from_failure, translate
-from ._types import Array, Linearization, Plant, State, StepReport, Vector, array, vector
+from ._types import Array, Linearization, Outputs, Plant, State, StepReport, Vector, array, vector
 
 
 class Driver:
@@ -24,8 +24,10 @@ class Driver:
         self.report: StepReport | None = None
         #: Linearization of the last step, if the driver was opened with it.
         self.linearization: Linearization | None = None
-        #: Input of the last step, if a feedback in the plant's loop had a say in it.
+        #: Input of the last step, if a feedback, a channel or a fault had a say in it.
         self.u: Array | None = None
+        #: What the output channels delivered after the last step, if there are any.
+        self.outputs: Outputs | None = None
         #: The plant as it was when the driver opened it.
         self.plant = Plant._from(self._next().opened.plant)
 
@@ -52,6 +54,8 @@ class Driver:
             raise from_failure(answer.failure.failure)
         self.report = StepReport._from(answer.step.report)
         self.u = array(answer.step.u) if answer.step.u else None
+        has_outputs = answer.step.HasField("outputs")
+        self.outputs = Outputs._from(answer.step.outputs) if has_outputs else None
         if answer.step.HasField("linearization"):
             self.linearization = Linearization._from(answer.step.linearization)
         return State._from(answer.step.state)

@@ -10,7 +10,13 @@ from typing import Any, Union
 import numpy as np
 import numpy.typing as npt
 
-from plantd.v1 import common_pb2, control_service_pb2, model_service_pb2, plant_service_pb2
+from plantd.v1 import (
+    channel_service_pb2,
+    common_pb2,
+    control_service_pb2,
+    model_service_pb2,
+    plant_service_pb2,
+)
 
 from ._rotation import difference
 
@@ -563,6 +569,36 @@ class Plant:
 
 
 @dataclass(frozen=True, eq=False)
+class Outputs:
+    """What the output channels of a plant deliver."""
+
+    #: Their numbers, in the order of ``Channels.names``.
+    y: Array
+    #: Indices of the channels whose numbers stand for lost ones.
+    lost: tuple[int, ...] = ()
+
+    @classmethod
+    def _from(cls, m: common_pb2.Outputs) -> Outputs:
+        return cls(array(m.y), tuple(m.lost))
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """The sensors and actuators of a plant."""
+
+    #: Names of the numbers of the outputs.
+    names: tuple[str, ...]
+    #: What they deliver.
+    outputs: Outputs
+    #: As declared, with times in whole steps.
+    declared: channel_service_pb2.Channels
+
+    @classmethod
+    def _from(cls, m: channel_service_pb2.ChannelsInfo, outputs: common_pb2.Outputs) -> Channels:
+        return cls(tuple(m.names), Outputs._from(outputs), m.channels)
+
+
+@dataclass(frozen=True, eq=False)
 class Watched:
     """One message of a watch; what was not asked for is None."""
 
@@ -578,6 +614,8 @@ class Watched:
     dropped: int
     #: Input last applied.
     u: Array | None = None
+    #: What the output channels deliver.
+    outputs: Outputs | None = None
 
     @classmethod
     def _from(cls, m: plant_service_pb2.WatchResponse) -> Watched:
@@ -594,6 +632,7 @@ class Watched:
             failure_text(m),
             m.dropped,
             array(m.u) if m.u else None,
+            part("outputs", Outputs),
         )
 
 

@@ -21,11 +21,12 @@ from pathlib import Path
 
 import iceoryx2 as iox2
 import numpy as np
+import numpy.typing as npt
 
 from ._errors import PlantdError, StepError
 from ._types import Array, State, StepReport, Vector, vector
 
-LAYOUT_VERSION = 3
+LAYOUT_VERSION = 4
 MAGIC = int.from_bytes(b"plnt", "little")
 POLL_FOREVER_NS = 2**64 - 1
 
@@ -141,6 +142,8 @@ class Header(ctypes.Structure):
         ("redundant_constraints", ctypes.c_uint32),
         ("steps", ctypes.c_uint32),
         ("halvings", ctypes.c_uint32),
+        ("outputs", ctypes.c_uint32),
+        ("output_channels", ctypes.c_uint32),
         ("residual", ctypes.c_double),
         ("constraint_residual", ctypes.c_double),
         ("reciprocal_condition", ctypes.c_double),
@@ -153,7 +156,7 @@ class Header(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the service knows the type."""
-        return "PlantdLinkHeader3"
+        return "PlantdLinkHeader4"
 
 
 def _fnv1a(data: bytes) -> int:
@@ -245,6 +248,16 @@ class LinkDriver:
     def state(self) -> State:
         """The last state: of the last step, or of the time of the connection."""
         return self._state
+
+    @property
+    def y(self) -> Array:
+        """What the output channels delivered after the last step; empty without channels."""
+        return self._y
+
+    @property
+    def lost(self) -> npt.NDArray[np.bool_]:
+        """For each output channel, whether its numbers stand for lost ones."""
+        return self._lost
 
     @property
     def input_len(self) -> int:
@@ -458,7 +471,9 @@ class LinkDriver:
 
     def _note_state(self, header: Header, payload: Array) -> State:
         nd, nq = header.dynamic, header.dynamic + header.prescribed
-        if len(payload) != 2 * nq + header.constraints:
+        outputs = 2 * nq + header.constraints
+        flags = outputs + header.outputs
+        if len(payload) != flags + header.output_channels:
             raise LinkError("INTERNAL", "the server sent a state of the wrong length")
         self._last = header
         self._server_poll_end_ns = header.stamp_ns + header.poll_ns
@@ -468,8 +483,10 @@ class LinkDriver:
             q=payload[:nq],
             p=payload[nq : nq + nd],
             v=payload[nq + nd : 2 * nq],
-            multipliers=payload[2 * nq :],
+            multipliers=payload[2 * nq : outputs],
         )
+        self._y = payload[outputs:flags]
+        self._lost = payload[flags:] != 0.0
         return self._state
 
 

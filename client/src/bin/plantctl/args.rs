@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args as Group, Parser, Subcommand, ValueEnum};
 use plantd_client::v1;
 
-use crate::test;
+use crate::{channels, test};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -20,6 +20,8 @@ Examples:
   plantctl kalman cart-pole --at upright --outputs x,theta --measurement 1e-4 --process 1e-6
   plantctl set-parameter p1 'frames[pole].body.mass=1.2'
   plantctl feedback set p1 --at upright --q 100,1 --r 1 --mode replace
+  plantctl channels set p1 sensors.toml             sensors and actuators of a plant
+  plantctl fault inject p1 input=tau stuck=true start_s=2 duration_s=0.5
   plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
   plantctl validate arm.toml                        all errors of a scene, with their paths
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
@@ -74,6 +76,43 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
   first_iterations = 4
   max_iterations = 50
   projection = { q = [1.0, 1.0], r = [1.0] }";
+
+const CHANNELS: &str = "\
+The file, in the field names of the contract, TOML or JSON; here for a pendulum:
+
+  seed = 7                          # of all noise and chance
+
+  [[outputs]]
+  name = \"encoder\"                  # source -> sampled -> + bias + noise -> quantised -> limited
+  coordinate = \"theta\"              #   -> lost at times -> late
+  sample_period_s = 0.1
+  latency_s = 0.2
+  noise = 0.001                     # standard deviation
+  quantum = 0.0015
+  drop_out = 0.01                   # probability
+
+  [[outputs]]
+  name = \"tip\"                      # others: velocity, acceleration, orientation,
+  position = { frame = \"rod\", at = [0.0, -1.0, 0.0] }     # constraint_force, input, energy
+
+  [[inputs]]
+  input = \"tau\"                     # sampled and held -> late -> dead band -> limited
+  delay_s = 0.1                     #   -> rate limited -> quantised
+  min = -5.0
+  max = 5.0
+  max_rate = 50.0
+
+Times become whole steps; the answer says which.";
+
+const FAULTS: &str = "\
+Examples:
+  plantctl fault inject p1 input=tau stuck=true
+  plantctl fault inject p1 input=tau offset.value=0.3 start_s=2 duration_s=0.5
+  plantctl fault inject p1 output=encoder noise.deviation=0.05 chance.window_s=1 chance.probability=0.2
+  plantctl fault inject p1 output=encoder loss.probability=0.1
+  plantctl fault inject p1 push.point.frame=rod 'push.force=[5, 0, 0]' start_step=100 duration_s=0.1
+  plantctl fault list p1
+  plantctl fault clear p1 3";
 
 /// Looks at, drives and asks a plantd server.
 #[derive(Debug, Parser)]
@@ -320,6 +359,12 @@ pub(crate) enum Command {
     /// Gives a plant a reference with its regulator, or takes it away.
     #[command(subcommand)]
     Feedback(Feedback),
+    /// Sensors and actuators of a plant.
+    #[command(subcommand)]
+    Channels(ChannelsCommand),
+    /// Lets something go wrong on a plant.
+    #[command(subcommand, after_help = FAULTS)]
+    Fault(FaultCommand),
     /// Prints the gains of a plant's feedback. Ends with Ctrl-C or after `--count`.
     Gains {
         /// Plant.
@@ -433,6 +478,57 @@ pub(crate) enum Feedback {
     },
 }
 
+#[derive(Debug, Subcommand)]
+pub(crate) enum ChannelsCommand {
+    /// Declares the channels, in place of those before.
+    #[command(after_help = CHANNELS)]
+    Set {
+        /// Plant.
+        id: String,
+        /// File; `-` reads standard input.
+        file: PathBuf,
+    },
+    /// Shows the channels with their present numbers.
+    Show {
+        /// Plant.
+        id: String,
+    },
+    /// Takes the channels away.
+    Clear {
+        /// Plant.
+        id: String,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum FaultCommand {
+    /// Injects a fault; it begins with the next step if no start is given.
+    #[command(after_help = FAULTS)]
+    Inject {
+        /// Plant.
+        id: String,
+        /// Fields of the fault, in the names of the contract.
+        #[arg(value_name = "FIELD=VALUE", value_parser = channels::assignment, required = true)]
+        fault: Vec<String>,
+    },
+    /// Lists the faults.
+    List {
+        /// Plant.
+        id: String,
+    },
+    /// Ends a fault.
+    Clear {
+        /// Plant.
+        id: String,
+        /// Its number.
+        #[arg(required_unless_present = "all")]
+        fault: Option<u64>,
+        /// All faults.
+        #[arg(long, conflicts_with = "fault")]
+        all: bool,
+    },
+}
+
 /// What a feedback keeps a plant at.
 #[derive(Debug, Group)]
 #[group(required = true, multiple = false)]
@@ -512,6 +608,7 @@ pub(crate) enum Field {
     Linearization,
     Gain,
     Input,
+    Outputs,
 }
 
 impl From<Field> for v1::WatchField {
@@ -523,6 +620,7 @@ impl From<Field> for v1::WatchField {
             Field::Linearization => Self::Linearization,
             Field::Gain => Self::Gain,
             Field::Input => Self::Input,
+            Field::Outputs => Self::Outputs,
         }
     }
 }

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use crate::args::{
     Args, Assignment, Command, Field, Numbers, Plural, Point, Settings, Singular, Weights,
 };
-use crate::{FAILED, feedback, json, optimize, test, text};
+use crate::{FAILED, channels, feedback, json, optimize, test, text};
 
 /// Runs a command; the code is that of a command which ran.
 pub(crate) async fn run(args: Args) -> Result<ExitCode> {
@@ -153,6 +153,8 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
                 || text::plants(std::slice::from_ref(&plant)) + &text::parameters(&plant),
             )?;
         }
+        Command::Channels(command) => channels::run(&client, output, command).await?,
+        Command::Fault(command) => channels::fault(&client, output, command).await?,
         Command::Feedback(command) => feedback::run(&client, output, command).await?,
         Command::Gains { id, count } => feedback::gains(&client, output, id, count).await?,
         Command::Settle { model, hold, guess, inputs, constraints, toml } => {
@@ -361,6 +363,7 @@ fn watched(message: &v1::WatchResponse, model: &v1::Model) -> String {
     let parts = [
         Some(head),
         input,
+        message.outputs.as_ref().map(channels::outputs),
         message.report.as_ref().map(text::report),
         message.energy.as_ref().map(text::energy),
         message.linearization.as_ref().map(|l| text::linearization(l, model)),

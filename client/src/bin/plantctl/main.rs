@@ -1,6 +1,7 @@
 //! `plantctl`: looks at, drives and asks a plantd server from a shell.
 
 mod args;
+mod channels;
 mod commands;
 mod feedback;
 mod json;
