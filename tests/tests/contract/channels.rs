@@ -77,8 +77,11 @@ fn y(step: &v1::DriveStep) -> &[f64] {
     &step.outputs.as_ref().unwrap().y
 }
 
-/// The bits of what a drive has seen.
-fn seen(steps: &[v1::DriveStep]) -> Vec<(u64, Vec<u64>, Vec<u64>, Vec<u32>)> {
+/// Step, bits of the state and of `y`, and lost channels.
+type Seen = (u64, Vec<u64>, Vec<u64>, Vec<u32>);
+
+/// What a drive has seen.
+fn seen(steps: &[v1::DriveStep]) -> Vec<Seen> {
     let bits_of = |step: &v1::DriveStep| {
         let (k, state) = bits(step.state.as_ref().unwrap());
         let outputs = step.outputs.clone().unwrap_or_default();
