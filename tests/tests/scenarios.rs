@@ -52,7 +52,7 @@ fn what_must_come_true_does() {
     for case in &cases {
         assert_eq!(case["status"], "passed", "{case}");
     }
-    assert_eq!((cases.len(), code), (7, 0));
+    assert_eq!((cases.len(), code), (8, 0));
 }
 
 #[test]
@@ -185,7 +185,7 @@ fn reports_say_what_the_console_says() {
 fn a_server_that_is_there_is_left_without_plants() {
     let server = ServerProcess::start().unwrap();
     let (cases, code) = cases("met", &["--address", server.address(), "--jobs", "3"]);
-    assert_eq!((cases.len(), code), (7, 0));
+    assert_eq!((cases.len(), code), (8, 0));
     let plants = plantctl(&["--address", server.address(), "list", "plants", "--json"]);
     let plants: Value = serde_json::from_str(&stdout(&plants)).unwrap();
     assert_eq!(plants["plants"], Value::Array(Vec::new()));

@@ -14,7 +14,7 @@ use super::expect::{Curve, Facts, Verdict};
 use super::expression::Expression;
 use super::samples::{Columns, Sample, Samples};
 use super::scenario::{Case, Controller, Event, Inputs, Lqr, Plant, Reference, Scenario};
-use crate::optimize;
+use crate::{json, optimize};
 
 /// Part of a time step by which a time may miss a step and still mean it.
 const STEP_ROUNDING: f64 = 1e-6;
@@ -38,6 +38,8 @@ pub(crate) struct Prepared {
     model: v1::Model,
     columns: Columns,
     reference: Option<Motion>,
+    channels: Option<v1::Channels>,
+    faults: Vec<Vec<v1::FaultSpec>>,
     /// Rows of inputs, as far as they are given; the last one holds on.
     inputs: Vec<Vec<Option<f64>>>,
     uses_energy: bool,
@@ -110,6 +112,8 @@ struct Run<'a> {
     time_step_s: f64,
     samples: Samples,
     facts: Facts,
+    /// What sensors deliver at the start.
+    y: Vec<f64>,
     last_step: u64,
     lost: u64,
     ended: Option<String>,
@@ -131,7 +135,12 @@ impl Prepared {
         };
         let all = || scenario.expect.iter().flat_map(|e| e.expressions()).chain(&scenario.plot);
         let uses_energy = all().any(Expression::uses_energy);
-        let columns = Columns::new(&model, reference.is_some(), uses_energy);
+        let channels = match scenario.channels.is_empty() {
+            true => None,
+            false => Some(message("Channels", &scenario.channels).context("channels")?),
+        };
+        let outputs = channels.as_ref().map(outputs).unwrap_or_default();
+        let columns = Columns::new(&model, &outputs, reference.is_some(), uses_energy);
         let nothing = columns.empty();
         for (i, expectation) in scenario.expect.iter().enumerate() {
             for expression in expectation.expressions() {
@@ -143,20 +152,27 @@ impl Prepared {
             let known = expression.values(&nothing).map_err(anyhow::Error::msg);
             known.with_context(|| format!("plot[{i}]"))?;
         }
-        for (i, Event { inputs, .. }) in scenario.events.iter().enumerate() {
-            for name in inputs.keys() {
-                ensure!(
-                    model.inputs.contains(name),
-                    "events[{i}].inputs: {}",
-                    no_input(name, &model)
-                );
-            }
-        }
+        let faults = scenario.events.iter().enumerate().map(|(i, event)| {
+            faults(event, &model, time_step_s).with_context(|| format!("events[{i}]"))
+        });
+        let faults = faults.collect::<Result<_>>()?;
         let inputs = match &scenario.controller {
             Controller::Inputs(inputs) => rows(inputs, &model, folder)?,
             _ => Vec::new(),
         };
-        Ok(Self { file, name, scenario, model, columns, reference, inputs, uses_energy, steps })
+        Ok(Self {
+            file,
+            name,
+            scenario,
+            model,
+            columns,
+            reference,
+            channels,
+            faults,
+            inputs,
+            uses_energy,
+            steps,
+        })
     }
 
     fn folder(&self) -> &Path {
@@ -175,6 +191,7 @@ impl Prepared {
             time_step_s: 0.0,
             samples: self.columns.empty(),
             facts: Facts::default(),
+            y: Vec::new(),
             last_step: 0,
             lost: 0,
             ended: None,
@@ -287,6 +304,17 @@ impl Run<'_> {
             let request = v1::ResetRequest { id: id.to_owned(), initial };
             state = client.reset_to(request).await.context("plant.initial")?;
         }
+        if let Some(channels) = &self.prepared.channels {
+            let seed = if channels.seed == 0 { case.seed } else { channels.seed };
+            let channels = v1::Channels { seed, ..channels.clone() };
+            self.y = client.set_channels(id, channels).await.context("channels")?.y;
+        }
+        for (i, faults) in self.prepared.faults.iter().enumerate() {
+            for fault in faults {
+                let injected = client.inject_fault(id, fault.clone()).await;
+                injected.with_context(|| format!("events[{i}]"))?;
+            }
+        }
         Ok(state)
     }
 
@@ -315,7 +343,8 @@ impl Run<'_> {
         rest.extend_from_slice(&initial.q[dynamic..]);
         let mut driver = client.drive(id).await?;
         let mut energy = self.energy(id).await?;
-        self.push(&initial, &rest, energy.as_ref());
+        let y = std::mem::take(&mut self.y);
+        self.push(&initial, &rest, &y, energy.as_ref());
         let start = Instant::now();
         for k in 0..*steps {
             if let Some(speed) = scenario.speed {
@@ -323,7 +352,7 @@ impl Run<'_> {
                 sleep_until(self.deadline.min(start + elapsed)).await;
             }
             for event in &scenario.events {
-                if self.begins(event) == k {
+                if begins(event, self.time_step_s) == k {
                     self.change(id, &event.parameters).await.context("events")?;
                 }
             }
@@ -334,7 +363,6 @@ impl Run<'_> {
             {
                 *u = given.unwrap_or(*u);
             }
-            self.disturb(k, &mut u);
             let step = match timeout_at(self.deadline, driver.step(&u)).await {
                 Err(_) => return self.time_out(),
                 Ok(Ok(step)) => step,
@@ -351,7 +379,8 @@ impl Run<'_> {
                 energy = self.energy(id).await?;
             }
             let u = if step.u.is_empty() { &u } else { &step.u };
-            self.push(&state, u, energy.as_ref());
+            let y = step.outputs.as_ref().map_or(&[][..], |outputs| &outputs.y);
+            self.push(&state, u, y, energy.as_ref());
         }
         driver.close().await?;
         Ok(())
@@ -364,26 +393,11 @@ impl Run<'_> {
         }
     }
 
-    /// Step with which an event begins.
-    fn begins(&self, event: &Event) -> u64 {
-        (event.at_s / self.time_step_s - STEP_ROUNDING).ceil().max(0.0) as u64
-    }
-
-    /// Adds the forces of events that act in step `k`.
-    fn disturb(&self, k: u64, u: &mut [f64]) {
-        let Prepared { scenario, model, .. } = self.prepared;
-        for event in scenario.events.iter().filter(|event| self.begins(event) <= k) {
-            let end_s = event.for_s.map_or(f64::INFINITY, |for_s| event.at_s + for_s);
-            if (k as f64) < end_s / self.time_step_s - STEP_ROUNDING {
-                for (u, name) in u.iter_mut().zip(&model.inputs) {
-                    *u += event.inputs.get(name).copied().unwrap_or(0.0);
-                }
-            }
-        }
-    }
-
     async fn watch(&self, id: &str) -> Result<plantd_client::Answers<v1::WatchResponse>> {
         let mut fields = vec![v1::WatchField::State.into(), v1::WatchField::Input.into()];
+        if self.prepared.channels.is_some() {
+            fields.push(v1::WatchField::Outputs.into());
+        }
         if self.prepared.uses_energy {
             fields.push(v1::WatchField::Energy.into());
         }
@@ -458,13 +472,14 @@ impl Run<'_> {
             u = vec![0.0; self.prepared.model.inputs.len()];
             u.extend_from_slice(&state.q[state.p.len()..]);
         }
-        self.push(&state.clone(), &u, message.energy.as_ref());
+        let y = message.outputs.as_ref().map_or(&[][..], |outputs| &outputs.y);
+        self.push(state, &u, y, message.energy.as_ref());
         Ok(())
     }
 
-    fn push(&mut self, state: &v1::State, u: &[f64], energy: Option<&v1::Energy>) {
+    fn push(&mut self, state: &v1::State, u: &[f64], y: &[f64], energy: Option<&v1::Energy>) {
         let reference = self.prepared.reference.as_ref().map(|motion| motion.at(state.step));
-        let sample = Sample { state, time_step_s: self.time_step_s, u, energy, reference };
+        let sample = Sample { state, time_step_s: self.time_step_s, u, y, energy, reference };
         self.prepared.columns.push(&mut self.samples, sample);
         self.last_step = state.step;
     }
@@ -527,6 +542,52 @@ fn settings(plant: &Plant) -> v1::PlantSettings {
     }
 }
 
+/// Step with which an event begins.
+fn begins(event: &Event, time_step_s: f64) -> u64 {
+    (event.at_s / time_step_s - STEP_ROUNDING).ceil().max(0.0) as u64
+}
+
+/// A message of the contract from its fields as the file has them.
+fn message<M: prost::Message + Default>(name: &str, fields: &toml::Table) -> Result<M> {
+    json::read(name, &serde_json::to_string(fields)?)
+}
+
+/// Names of the numbers that output channels deliver.
+fn outputs(channels: &v1::Channels) -> Vec<String> {
+    use v1::output_channel::Source;
+    let names = |output: &v1::OutputChannel| {
+        let suffixes: &[&str] = match output.source {
+            Some(Source::Position(_)) => &[".x", ".y", ".z"],
+            Some(Source::Orientation(_)) => &[".rx", ".ry", ".rz"],
+            _ => &[""],
+        };
+        suffixes.iter().map(|suffix| format!("{}{suffix}", output.name)).collect::<Vec<_>>()
+    };
+    channels.outputs.iter().flat_map(names).collect()
+}
+
+/// What an event lets go wrong.
+fn faults(event: &Event, model: &v1::Model, time_step_s: f64) -> Result<Vec<v1::FaultSpec>> {
+    use v1::fault_spec::{Kind, Start, Target};
+    let mut faults = Vec::new();
+    for (name, value) in &event.inputs {
+        ensure!(model.inputs.contains(name), "inputs: {}", no_input(name, model));
+        faults.push(v1::FaultSpec {
+            target: Some(Target::Input(name.clone())),
+            kind: Some(Kind::Offset(v1::Offset { value: *value })),
+            ..Default::default()
+        });
+    }
+    if !event.fault.is_empty() {
+        faults.push(message("FaultSpec", &event.fault).context("fault")?);
+    }
+    for fault in &mut faults {
+        fault.start = Some(Start::StartStep(begins(event, time_step_s)));
+        fault.duration_s = event.for_s.unwrap_or(0.0);
+    }
+    Ok(faults)
+}
+
 /// The reference, state by state.
 async fn motion(
     place: &Place,
@@ -567,7 +628,7 @@ async fn motion(
     }
 }
 
-/// The regulator about the reference, beside which the inputs of events act.
+/// The regulator about the reference.
 async fn feedback(
     client: &Client,
     scenario: &Scenario,
@@ -607,7 +668,7 @@ async fn feedback(
         id: id.to_owned(),
         reference: Some(form),
         weights: Some(weights),
-        mode: v1::FeedbackMode::Add.into(),
+        mode: v1::FeedbackMode::Replace.into(),
         ..Default::default()
     })
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use plantd_client::v1;
 
 /// Columns of equal length: `q(theta)`, `p(theta)`, `v(lift)`, `u(tau)`, `force(pin.x)`, `kinetic`,
-/// `potential`; with a reference also `ref.q(theta)` and `error.q(theta)`, and so on.
+/// `potential`, `y(tip.x)`; with a reference also `ref.q(theta)` and `error.q(theta)`, and so on.
 ///
 /// A column of inputs holds at each sample the input of the step that led there.
 #[derive(Clone, Debug, Default)]
@@ -84,6 +84,7 @@ pub(crate) struct Columns {
     v: Vec<String>,
     u: Vec<String>,
     force: Vec<String>,
+    y: Vec<String>,
     rotations: Vec<u32>,
     has_reference: bool,
     has_energy: bool,
@@ -96,14 +97,21 @@ pub(crate) struct Sample<'a> {
     pub(crate) time_step_s: f64,
     /// Input of the step that led here.
     pub(crate) u: &'a [f64],
+    /// What sensors deliver.
+    pub(crate) y: &'a [f64],
     pub(crate) energy: Option<&'a v1::Energy>,
     /// State and input of the reference.
     pub(crate) reference: Option<(&'a [f64], &'a [f64])>,
 }
 
 impl Columns {
-    /// The columns of a model.
-    pub(crate) fn new(model: &v1::Model, has_reference: bool, has_energy: bool) -> Self {
+    /// The columns of a model, with outputs of these names.
+    pub(crate) fn new(
+        model: &v1::Model,
+        outputs: &[String],
+        has_reference: bool,
+        has_energy: bool,
+    ) -> Self {
         let named = |quantity: &str, names: &mut dyn Iterator<Item = &String>| {
             names.map(|name| format!("{quantity}({name})")).collect::<Vec<_>>()
         };
@@ -120,6 +128,7 @@ impl Columns {
             v: named("v", &mut prescribed()),
             u: named("u", &mut model.inputs.iter().chain(prescribed())),
             force: named("force", &mut model.constraints.iter()),
+            y: named("y", &mut outputs.iter()),
             rotations: rotations.collect(),
             has_reference,
             has_energy,
@@ -133,7 +142,7 @@ impl Columns {
     /// Samples that have all columns and no rows.
     pub(crate) fn empty(&self) -> Samples {
         let mut samples = Samples::default();
-        for name in self.x().chain(&self.u).chain(&self.force) {
+        for name in self.x().chain(&self.u).chain(&self.force).chain(&self.y) {
             samples.put(name, Vec::new());
         }
         if self.has_energy {
@@ -154,7 +163,7 @@ impl Columns {
 
     /// Adds a sample. What the server did not send is NaN, which no expectation takes for good.
     pub(crate) fn push(&self, samples: &mut Samples, sample: Sample<'_>) {
-        let Sample { state, time_step_s, u, energy, reference } = sample;
+        let Sample { state, time_step_s, u, y, energy, reference } = sample;
         let entry = |values: &[f64], i: usize| values.get(i).copied().unwrap_or(f64::NAN);
         samples.push_time(state.time_s);
         let x = [state.q.as_slice(), &state.p, &state.v].concat();
@@ -163,6 +172,9 @@ impl Columns {
         }
         for (i, name) in self.u.iter().enumerate() {
             samples.push(name, entry(u, i));
+        }
+        for (i, name) in self.y.iter().enumerate() {
+            samples.push(name, entry(y, i));
         }
         for (i, name) in self.force.iter().enumerate() {
             // Before the first step there are none.
@@ -212,7 +224,7 @@ mod tests {
 
     #[test]
     fn every_entry_of_a_sample_has_its_name() {
-        let columns = Columns::new(&model(), true, true);
+        let columns = Columns::new(&model(), &["tip.x".to_owned()], true, true);
         let mut samples = columns.empty();
         let state = v1::State {
             time_s: 0.5,
@@ -228,6 +240,7 @@ mod tests {
             state: &state,
             time_step_s: 0.1,
             u: &[8.0, 8.5],
+            y: &[1.5],
             energy: Some(&energy),
             reference: Some((&reference.0, &reference.1)),
         };
@@ -241,6 +254,8 @@ mod tests {
             ("pin.x", 50.0),
             ("tau", 8.0),
             ("u(lift)", 8.5),
+            ("y(tip.x)", 1.5),
+            ("tip.x", 1.5),
             ("kinetic", 6.0),
             ("energy", 13.0),
             ("error.theta", 0.5),
@@ -256,11 +271,17 @@ mod tests {
 
     #[test]
     fn what_was_not_sent_is_not_a_number() {
-        let columns = Columns::new(&model(), false, true);
+        let columns = Columns::new(&model(), &[], false, true);
         let mut samples = columns.empty();
         let state = v1::State { q: vec![1.0], ..Default::default() };
-        let sample =
-            Sample { state: &state, time_step_s: 0.1, u: &[], energy: None, reference: None };
+        let sample = Sample {
+            state: &state,
+            time_step_s: 0.1,
+            u: &[],
+            y: &[],
+            energy: None,
+            reference: None,
+        };
         columns.push(&mut samples, sample);
         for name in ["lift", "p(theta)", "tau", "energy"] {
             assert!(samples.signal(name).unwrap()[0].is_nan(), "{name}");

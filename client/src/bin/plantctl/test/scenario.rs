@@ -43,6 +43,10 @@ pub(crate) struct Scenario {
     /// Who gives the inputs; nobody if not given.
     #[serde(default)]
     pub(crate) controller: Controller,
+    /// Sensors and actuators: a message `Channels` of the contract. Its seed is the case's unless given.
+    #[serde(default)]
+    #[schemars(with = "BTreeMap<String, serde_json::Value>")]
+    pub(crate) channels: toml::Table,
     /// What happens on the way.
     #[serde(default)]
     pub(crate) events: Vec<Event>,
@@ -189,13 +193,13 @@ pub(crate) struct External {
     pub(crate) may_lose_samples: bool,
 }
 
-/// Something that happens at a time: new parameters, or forces that add to the inputs.
+/// Something that happens at a time: new parameters, forces that add to the inputs, or a fault.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Event {
     /// When, s of plant time; from the step that begins then.
     pub(crate) at_s: f64,
-    /// For how long, s; only of inputs. To the end if not given.
+    /// For how long, s; not of parameters. To the end if not given.
     pub(crate) for_s: Option<f64>,
     /// Numbers of the scene by their paths.
     #[serde(default)]
@@ -203,6 +207,11 @@ pub(crate) struct Event {
     /// Forces that are added to inputs.
     #[serde(default)]
     pub(crate) inputs: BTreeMap<String, f64>,
+    /// A fault of a sensor or an actuator, or a push: a message `FaultSpec` of the contract without its
+    /// times.
+    #[serde(default)]
+    #[schemars(with = "BTreeMap<String, serde_json::Value>")]
+    pub(crate) fault: toml::Table,
 }
 
 /// What differs in one case.
@@ -311,7 +320,7 @@ impl Scenario {
             expectation.check(self.duration_s).map_err(anyhow::Error::msg).with_context(key)?;
         }
         for (i, event) in self.events.iter().enumerate() {
-            let Event { at_s, for_s, parameters, inputs } = event;
+            let Event { at_s, for_s, parameters, inputs, fault } = event;
             let is_inside = |t: f64| (0.0..=self.duration_s).contains(&t);
             ensure!(
                 is_inside(*at_s),
@@ -321,9 +330,10 @@ impl Scenario {
                 for_s.is_none_or(|for_s| for_s > 0.0),
                 "events[{i}].for_s must be greater than zero"
             );
+            let given = [parameters.is_empty(), inputs.is_empty(), fault.is_empty()];
             ensure!(
-                parameters.is_empty() != inputs.is_empty(),
-                "events[{i}]: give either `parameters` or `inputs`"
+                given.into_iter().filter(|is_empty| !is_empty).count() == 1,
+                "events[{i}]: give one of `parameters`, `inputs` and `fault`"
             );
             ensure!(
                 for_s.is_none() || parameters.is_empty(),
@@ -350,9 +360,13 @@ impl Scenario {
         Ok(())
     }
 
-    /// A plant that somebody else drives has no schedule yet.
+    /// What cannot be done between the steps of somebody else.
     fn check_driven(&self, key: &str) -> Result<()> {
-        ensure!(self.events.is_empty(), "{key}: events need a built-in controller");
+        let is_change = |event: &Event| !event.parameters.is_empty();
+        ensure!(
+            !self.events.iter().any(is_change),
+            "{key}: events with parameters need a built-in controller"
+        );
         ensure!(self.speed.is_none(), "{key}: speed needs a built-in controller");
         Ok(())
     }
@@ -462,7 +476,11 @@ mod tests {
                 "controller.command: speed needs a built-in",
             ),
             ("events = [{ at_s = 3, inputs = { tau = 1 } }]", "events[0].at_s is 3"),
-            ("events = [{ at_s = 1 }]", "events[0]: give either"),
+            ("events = [{ at_s = 1 }]", "events[0]: give one of"),
+            (
+                "events = [{ at_s = 1, inputs = { a = 1 }, fault = { stuck = true } }]",
+                "events[0]: give one of",
+            ),
             ("events = [{ at_s = 1, for_s = 1, parameters = { a = 1 } }]", "events[0].for_s"),
             ("cases = [{ name = 'a' }, { name = 'b' }, { name = 'a' }]", "`a` is the name of two"),
             ("cases = [{ q = { theta = 1 } }]", "every case needs a name"),
