@@ -6,8 +6,15 @@ use prost::Message as _;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo:rerun-if-changed=plantd");
-    let files = ["model_service", "plant_service", "control_service", "channel_service"]
-        .map(|name| format!("plantd/v1/{name}.proto"));
+    let names = [
+        "model_service",
+        "plant_service",
+        "control_service",
+        "channel_service",
+        "recording",
+        "recording_service",
+    ];
+    let files = names.map(|name| format!("plantd/v1/{name}.proto"));
     let descriptors = protox::compile(files, ["."])?;
     let out = std::env::var("OUT_DIR")?;
     std::fs::write(Path::new(&out).join("descriptors.bin"), descriptors.encode_to_vec())?;

@@ -3,7 +3,7 @@
 use plantd_proto::v1::{
     self, channel_service_client::ChannelServiceClient,
     control_service_client::ControlServiceClient, model_service_client::ModelServiceClient,
-    plant_service_client::PlantServiceClient,
+    plant_service_client::PlantServiceClient, recording_service_client::RecordingServiceClient,
 };
 use tonic::transport::Channel;
 
@@ -52,6 +52,12 @@ impl Client {
     /// The generated client of `ChannelService`.
     pub fn channels(&self) -> ChannelServiceClient<Channel> {
         ChannelServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
+    }
+
+    /// The generated client of `RecordingService`.
+    pub fn recordings(&self) -> RecordingServiceClient<Channel> {
+        RecordingServiceClient::new(self.channel.clone())
+            .max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
     /// The channel itself, for services that are not plantd's own (health, reflection).
@@ -425,5 +431,55 @@ impl Client {
     pub async fn list_faults(&self, plant: impl Into<String>) -> Result<Vec<v1::FaultInfo>> {
         let request = v1::ListFaultsRequest { id: plant.into() };
         Ok(self.channels().list_faults(self.limited(request)).await?.into_inner().faults)
+    }
+}
+
+/// Recordings.
+impl Client {
+    /// Starts to record a plant into a file of the server.
+    pub async fn start_recording(
+        &self,
+        request: v1::StartRecordingRequest,
+    ) -> Result<v1::Recording> {
+        let answer = self.recordings().start_recording(self.limited(request)).await?.into_inner();
+        answer.recording.ok_or(Error::Protocol("an answer without a recording"))
+    }
+
+    /// Ends a recording; its file is complete when the answer comes.
+    pub async fn stop_recording(&self, name: impl Into<String>) -> Result<v1::Recording> {
+        let request = v1::StopRecordingRequest { name: name.into() };
+        let answer = self.recordings().stop_recording(self.limited(request)).await?.into_inner();
+        answer.recording.ok_or(Error::Protocol("an answer without a recording"))
+    }
+
+    /// All recordings of the server.
+    pub async fn list_recordings(&self) -> Result<Vec<v1::Recording>> {
+        let mut all = Vec::new();
+        let mut page_token = String::new();
+        loop {
+            let request = v1::ListRecordingsRequest { page_size: 0, page_token };
+            let page = self.recordings().list_recordings(self.limited(request)).await?.into_inner();
+            all.extend(page.recordings);
+            if page.next_page_token.is_empty() {
+                return Ok(all);
+            }
+            page_token = page.next_page_token;
+        }
+    }
+
+    /// The bytes of a recording's file, piece by piece.
+    pub async fn get_recording(
+        &self,
+        name: impl Into<String>,
+    ) -> Result<Answers<v1::GetRecordingResponse>> {
+        let request = v1::GetRecordingRequest { name: name.into() };
+        self.open(self.recordings().get_recording(request)).await
+    }
+
+    /// Deletes a recording that has ended.
+    pub async fn delete_recording(&self, name: impl Into<String>) -> Result<()> {
+        let request = v1::DeleteRecordingRequest { name: name.into() };
+        self.recordings().delete_recording(self.limited(request)).await?;
+        Ok(())
     }
 }

@@ -1,6 +1,7 @@
 //! What can go wrong, with the details that the server sends.
 
 use std::fmt;
+use std::path::PathBuf;
 
 use plantd_proto::v1;
 use tonic::Code;
@@ -55,6 +56,14 @@ pub enum Error {
     /// Gains from which no feedback law can be made.
     #[error("these gains make no schedule: {0}")]
     Gains(&'static str),
+    /// A recording's file cannot be read, or is damaged.
+    #[error("recording {}: {problem}", .path.display())]
+    Recording {
+        /// File.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
     /// The server sent something that the contract does not allow: versions do not fit.
     #[error("unexpected answer from the server: {0}")]
     Protocol(&'static str),

@@ -57,6 +57,7 @@ mod estimator;
 mod follower;
 pub mod link;
 mod matrix;
+mod recording;
 mod rotation;
 mod stream;
 
@@ -70,6 +71,7 @@ pub use matrix::{
     GainExt, MatrixExt, StateExt, WeightsExt, diagonal, full, operating_point, present_state,
     weights,
 };
+pub use recording::{RecordingEntry, RecordingReader};
 pub use rotation::{compose, difference, rotations};
 pub use stream::Answers;
 

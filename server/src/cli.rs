@@ -55,6 +55,15 @@ pub struct Settings {
     /// Directory of scenes to load as models.
     #[arg(long, env = "PLANTD_SCENES", value_name = "DIRECTORY")]
     pub scenes: Option<PathBuf>,
+    /// Directory in which plants survive the server.
+    #[arg(long, env = "PLANTD_STATE_DIRECTORY", value_name = "DIRECTORY")]
+    pub state_directory: Option<PathBuf>,
+    /// Seconds between two savings of the plants that change; 0 means only at the end.
+    #[arg(long, env = "PLANTD_STATE_INTERVAL_S", value_name = "SECONDS")]
+    pub state_interval_s: Option<f64>,
+    /// Directory of recordings.
+    #[arg(long, env = "PLANTD_RECORDINGS", value_name = "DIRECTORY")]
+    pub recordings: Option<PathBuf>,
     /// File to write the addresses into, as JSON, once the server serves.
     #[arg(long, env = "PLANTD_READY_FILE", value_name = "FILE")]
     pub ready_file: Option<PathBuf>,
@@ -118,12 +127,15 @@ impl Settings {
         replace(&mut config.workers, self.workers);
         replace(&mut config.worker_priority, self.worker_priority);
         replace(&mut config.shutdown_grace_s, self.shutdown_grace_s);
+        replace(&mut config.state_interval_s, self.state_interval_s);
         replace(&mut config.log.filter, self.log);
         replace(&mut config.log.format, self.log_format);
         replace(&mut config.link.enabled, self.link.map(|switch| switch == Switch::On));
         config.unix = self.unix.or(config.unix);
         config.link.root = self.link_root.or(config.link.root);
         config.scenes = self.scenes.or(config.scenes);
+        config.state_directory = self.state_directory.or(config.state_directory);
+        config.recordings = self.recordings.or(config.recordings);
         config.ready_file = self.ready_file.or(config.ready_file);
         for (name, value) in &self.limits {
             config.limits.set(name, *value)?;

@@ -33,6 +33,14 @@ pub struct Config {
     /// Directory of scenes (`*.toml`, `*.json`) to load as models at the start.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scenes: Option<PathBuf>,
+    /// Directory in which plants survive the server; not given means none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub state_directory: Option<PathBuf>,
+    /// Time between two savings of the plants that change, s; 0 means only at the end.
+    pub state_interval_s: f64,
+    /// Directory of recordings; not given means that nothing can be recorded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recordings: Option<PathBuf>,
     /// File to write the addresses into, as JSON, once the server serves.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ready_file: Option<PathBuf>,
@@ -59,6 +67,9 @@ impl Default for Config {
             unix: None,
             metrics: Listen::Off,
             scenes: None,
+            state_directory: None,
+            state_interval_s: 2.0,
+            recordings: None,
             ready_file: None,
             threads: 0,
             workers: 0,
@@ -237,6 +248,7 @@ impl Config {
         self.limits.check()?;
         for (key, value) in [
             ("shutdown_grace_s", self.shutdown_grace_s),
+            ("state_interval_s", self.state_interval_s),
             ("link.idle_timeout_s", self.link.idle_timeout_s),
         ] {
             if !(0.0..=DURATION_MAX_S).contains(&value) {
@@ -252,6 +264,11 @@ impl Config {
     /// Time for open calls to end at shutdown.
     pub fn shutdown_grace(&self) -> Duration {
         Duration::from_secs_f64(self.shutdown_grace_s)
+    }
+
+    /// Time between two savings of the plants that change.
+    pub fn state_interval(&self) -> Duration {
+        Duration::from_secs_f64(self.state_interval_s)
     }
 
     /// Number of workers.

@@ -16,6 +16,7 @@ use v1::point::Source as PointSource;
 use v1::weight::Form as WeightForm;
 
 use crate::limits::{LimitExceeded, Limits};
+use crate::parameters::Parameters;
 use crate::status::Fault;
 use crate::workers::Abandoned;
 
@@ -636,6 +637,13 @@ pub fn report(report: &StepReport) -> v1::StepReport {
         steps: report.steps,
         halvings: report.halvings,
     }
+}
+
+/// Changed numbers of a scene as messages.
+pub fn parameters(parameters: &Parameters) -> Vec<v1::Parameter> {
+    let message =
+        |(path, value): (&String, &f64)| v1::Parameter { path: path.clone(), value: *value };
+    parameters.iter().map(message).collect()
 }
 
 /// Names of the entries of `x = (q, p, v)`: `theta`, `p(theta)`, `v(lift)`.

@@ -29,6 +29,8 @@ impl Timing {
     pub const LATE: u64 = 1;
     /// The safe input was in force: none had come, or none for longer than the policy allows.
     pub const SAFE: u64 = 2;
+    /// Something besides the input pushed the plant.
+    pub const PUSHED: u64 = 4;
 }
 
 /// A state with the step that led to it.

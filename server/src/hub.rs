@@ -19,7 +19,9 @@ use crate::limits::{LimitExceeded, Limits};
 use crate::link::{LinkError, LinkHost, LinkInfo};
 use crate::metrics::Metrics;
 use crate::priority::Priority;
+use crate::record::Recordings;
 use crate::session::Session;
+use crate::state::StateDirectory;
 use crate::status::Fault;
 use crate::workers::Workers;
 
@@ -44,6 +46,10 @@ pub struct Hub {
     pub watch_room: Arc<Room>,
     /// Cancelled when the server begins to shut down: streams end.
     pub ending: CancellationToken,
+    /// Recordings of plants.
+    pub recordings: Option<Recordings>,
+    /// Directory in which plants survive the server.
+    pub state: Option<StateDirectory>,
     links: Option<Arc<LinkHost>>,
     plants: Mutex<BTreeMap<String, Arc<Session>>>,
 }
@@ -78,6 +84,8 @@ impl Hub {
                 limits.watch_numbers,
             ),
             ending: CancellationToken::new(),
+            recordings: None,
+            state: None,
             links: links.map(Arc::new),
             plants: Mutex::default(),
             limits,
@@ -138,6 +146,10 @@ impl Hub {
             let mut plants = hub.plants();
             plants.remove(session.id());
             hub.metrics.set_plants(plants.len());
+            drop(plants);
+            if let Some(state) = &hub.state {
+                state.remove(session.id());
+            }
         });
         end.await.map_err(|error| Fault::internal(error.to_string()))
     }
@@ -203,6 +215,9 @@ impl Hub {
         self.ending.cancel();
         if let Some(links) = &self.links {
             links.shutdown();
+        }
+        if let Some(recordings) = &self.recordings {
+            recordings.stop_all();
         }
     }
 

@@ -106,6 +106,12 @@ limits! {
     second_order_numbers = 64_000_000 in 1000..=10_000_000_000;
     /// Coordinates of a model whose equilibrium is searched, or whose method is chosen by a tolerance.
     settle_coordinates = 128 in 1..=65_536;
+    /// Recordings in the server's directory.
+    recordings = 1000 in 0..=1_000_000;
+    /// Recordings in progress at a time.
+    active_recordings = 64 in 0..=10_000;
+    /// Bytes of a recording, which ends there.
+    recording_bytes = 17_179_869_184 in 1_048_576..=1_000_000_000_000_000;
     /// Heavy computations that may wait for a worker.
     queued_jobs = 256 in 1..=1_000_000;
 }

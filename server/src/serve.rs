@@ -3,6 +3,7 @@
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use futures::future;
@@ -22,6 +23,7 @@ use v1::channel_service_server::ChannelServiceServer;
 use v1::control_service_server::ControlServiceServer;
 use v1::model_service_server::ModelServiceServer;
 use v1::plant_service_server::PlantServiceServer;
+use v1::recording_service_server::RecordingServiceServer;
 
 use crate::config::{Config, Listen};
 use crate::grpc::channels::ChannelService;
@@ -29,12 +31,15 @@ use crate::grpc::control::ControlService;
 use crate::grpc::model::ModelService;
 use crate::grpc::observe::ObserveLayer;
 use crate::grpc::plant::PlantService;
+use crate::grpc::record::RecordingService;
 use crate::grpc::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT};
 use crate::hub::Hub;
 use crate::limits::Limits;
 use crate::link::LinkHost;
 use crate::listen::{UnixSocket, admit, bind_tcp};
 use crate::metrics_http;
+use crate::record::Recordings;
+use crate::state::StateDirectory;
 
 /// Where a server can be reached.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
@@ -60,6 +65,8 @@ pub struct RunningServer {
     listeners: JoinSet<Result<(), tonic::transport::Error>>,
     /// Cancelled when listeners stop accepting.
     closing: CancellationToken,
+    /// Saves plants that change.
+    saver: tokio::task::JoinHandle<()>,
     metrics: Option<tokio::task::JoinHandle<()>>,
     /// Removed from the file system when dropped.
     unix: Option<UnixSocket>,
@@ -91,25 +98,37 @@ impl RunningServer {
         let links = config.link.host_config().map(LinkHost::new).transpose();
         let links = links.context("shared-memory links (turn them off with `--link off`)")?;
         let link_root = config.link.host_config().filter(|_| links.is_some()).map(|link| link.root);
-        let hub = Arc::new(Hub::new(
-            config.limits.clone(),
-            config.worker_count(),
-            config.worker_priority,
-            links,
-        ));
+        let mut hub =
+            Hub::new(config.limits.clone(), config.worker_count(), config.worker_priority, links);
+        if let Some(path) = &config.state_directory {
+            let state = StateDirectory::open(path);
+            hub.state = Some(state.with_context(|| format!("plants in {}", path.display()))?);
+        }
+        if let Some(path) = &config.recordings {
+            let recordings = Recordings::open(path, config.limits.clone());
+            let recordings =
+                recordings.with_context(|| format!("recordings in {}", path.display()));
+            hub.recordings = Some(recordings?);
+        }
+        let hub = Arc::new(hub);
         if let Some(directory) = &config.scenes {
             load_scenes(&hub, directory)?;
+        }
+        if let Some(state) = &hub.state {
+            state.load(&hub).await.context("saved plants")?;
         }
         let (health, health_service) = tonic_health::server::health_reporter();
         health.set_serving::<ModelServiceServer<ModelService>>().await;
         health.set_serving::<PlantServiceServer<PlantService>>().await;
         health.set_serving::<ControlServiceServer<ControlService>>().await;
         health.set_serving::<ChannelServiceServer<ChannelService>>().await;
+        health.set_serving::<RecordingServiceServer<RecordingService>>().await;
         let mut server = Self {
             addresses: Addresses { link_root, pid: std::process::id(), ..Addresses::default() },
             health,
             listeners: JoinSet::new(),
             closing: CancellationToken::new(),
+            saver: tokio::spawn(save_plants(Arc::clone(&hub), config.state_interval())),
             metrics: None,
             unix: None,
             hub,
@@ -164,6 +183,10 @@ impl RunningServer {
                 ChannelServiceServer::new(ChannelService::new(hub()))
                     .max_decoding_message_size(message_bytes),
             )
+            .add_service(
+                RecordingServiceServer::new(RecordingService::new(hub()))
+                    .max_decoding_message_size(message_bytes),
+            )
             .add_service(reflection))
     }
 
@@ -216,6 +239,7 @@ impl RunningServer {
         self.health.set_not_serving::<PlantServiceServer<PlantService>>().await;
         self.health.set_not_serving::<ControlServiceServer<ControlService>>().await;
         self.health.set_not_serving::<ChannelServiceServer<ChannelService>>().await;
+        self.health.set_not_serving::<RecordingServiceServer<RecordingService>>().await;
         self.closing.cancel();
         let hub = Arc::clone(&self.hub);
         let links_closed = tokio::task::spawn_blocking(move || hub.shut_down());
@@ -228,9 +252,30 @@ impl RunningServer {
         if let Err(error) = links_closed.await {
             tracing::error!(%error, "shared-memory links were not closed");
         }
+        self.saver.abort();
+        save_once(&self.hub).await;
         if let Some(metrics) = &self.metrics {
             metrics.abort();
         }
+    }
+}
+
+/// Saves the plants that change, over and over; without an interval never.
+async fn save_plants(hub: Arc<Hub>, interval: Duration) {
+    if hub.state.is_none() || interval.is_zero() {
+        return;
+    }
+    loop {
+        tokio::time::sleep(interval).await;
+        save_once(&hub).await;
+    }
+}
+
+async fn save_once(hub: &Arc<Hub>) {
+    let hub = Arc::clone(hub);
+    let save = move || hub.state.as_ref().map(|state| state.save(&hub));
+    if let Err(error) = tokio::task::spawn_blocking(save).await {
+        tracing::error!(%error, "plants were not saved");
     }
 }
 

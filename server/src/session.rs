@@ -4,6 +4,8 @@
 //! out of it, which takes microseconds; energies, linearizations and gains are computed on copies.
 
 mod core;
+mod saved;
+pub(crate) mod tap;
 
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -13,7 +15,7 @@ use plantd_models::{
     Initial, InitialError, Linearization, Model, Plant, Settings, Snapshot, SnapshotError, State,
     StepError, StepReport,
 };
-use plantd_proto::v1;
+use plantd_proto::v1::{self, MarkReason};
 use tokio::sync::watch::{self, Receiver};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
@@ -111,6 +113,7 @@ pub struct Session {
     model: Arc<Model>,
     start: Snapshot,
     start_state: State,
+    start_settings: Settings,
     /// Why the method is as it is, if it was chosen by a tolerance.
     accuracy: Option<v1::Accuracy>,
     core: Mutex<Core>,
@@ -142,6 +145,7 @@ impl Session {
             model_name,
             start: plant.snapshot(),
             start_state: plant.state(),
+            start_settings: *plant.settings(),
             accuracy,
             model: Arc::clone(plant.model()),
             core: Mutex::new(Core::new(plant)),
@@ -337,6 +341,7 @@ impl Session {
         // The former plant is dropped here, not in the core's hands.
         drop(self.with_core(move |core| {
             let former = core.replace_plant(plant);
+            core.mark(MarkReason::Reset);
             session.watchers.publish(&core.published());
             former
         }));
@@ -371,6 +376,7 @@ impl Session {
         let changed = self.with_core(move |core| {
             let former = core.change_plant(plant, parameters)?;
             let former = (former, core.renew_channels(renewed));
+            core.mark(MarkReason::Parameters);
             let is_outdated = match &mut core.feedback {
                 // A gain that was given holds as it is.
                 Some(feedback) if feedback.spec.is_fixed() => {
@@ -584,7 +590,13 @@ impl Lease {
                 core.write_ring();
                 self.session.watchers.publish(&core.published());
                 metrics.stepped(self.kind);
-                Ok(look(&core))
+                let (seen, full) = (look(&core), core.full_tap());
+                drop(core);
+                // Whoever steps a plant waits for its recorder; a plant that runs by itself does not.
+                if let Some(tap) = full {
+                    tap.wait();
+                }
+                Ok(seen)
             }
             Err(error) => {
                 metrics.step_failed(step_error_reason(&error));

@@ -15,8 +15,8 @@
 //! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `INVALID_COVARIANCE` | BadRequest | a covariance of noise has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice |
-//! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED`, `FAULT_NOT_FOUND` | ResourceInfo | no such thing, or deleted meanwhile |
-//! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS` | ResourceInfo | the name is taken |
+//! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED`, `FAULT_NOT_FOUND`, `RECORDING_NOT_FOUND` | ResourceInfo | no such thing, or deleted meanwhile |
+//! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS`, `RECORDING_EXISTS` | ResourceInfo | the name is taken |
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
 //! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
@@ -30,9 +30,12 @@
 //! | FAILED_PRECONDITION | `TIME_STEP_CHANGED` | PreconditionFailure | the trajectory of a feedback was given for another time step: set a new one |
 //! | FAILED_PRECONDITION | `POLE` | PreconditionFailure; metadata `frequency_hz` | the frequency response is infinite |
 //! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
+//! | FAILED_PRECONDITION | `RECORDINGS_DISABLED` | PreconditionFailure | the server has no directory for recordings |
+//! | FAILED_PRECONDITION | `RECORDING_ACTIVE` | PreconditionFailure | the plant is being recorded, or the recording is in progress |
 //! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::limits`] |
 //! | UNAVAILABLE | `SHUTTING_DOWN` | | the server ends; try again |
 //! | UNAVAILABLE | `LINK_FAILED` | | shared memory could not be set up |
+//! | UNAVAILABLE | `RECORDING_FAILED` | | a recording's file could not be read or written |
 //! | CANCELLED | `CANCELLED` | | the caller has gone away |
 //! | INTERNAL | `INTERNAL` | | a defect of the server |
 
@@ -139,6 +142,24 @@ impl Fault {
     /// A plant's id is taken.
     pub fn plant_exists(id: &str) -> Self {
         Self::resource(Code::AlreadyExists, "PLANT_EXISTS", "plant", id, "there already is a plant")
+    }
+
+    /// There is no such recording.
+    pub fn recording_not_found(name: &str) -> Self {
+        let (reason, sentence) = ("RECORDING_NOT_FOUND", "there is no recording");
+        Self::resource(Code::NotFound, reason, "recording", name, sentence)
+    }
+
+    /// A recording's name is taken.
+    pub fn recording_exists(name: &str) -> Self {
+        let (reason, sentence) = ("RECORDING_EXISTS", "there already is a recording");
+        Self::resource(Code::AlreadyExists, reason, "recording", name, sentence)
+    }
+
+    /// A recording is in progress.
+    pub fn recording_active(subject: String) -> Self {
+        let message = "a recording is in progress: end it first";
+        Self::precondition("RECORDING_ACTIVE", subject, message)
     }
 
     fn resource(

@@ -18,7 +18,10 @@ fn read(path: &str) -> String {
 
 /// The annotated configuration with the keys that are commented out.
 fn full_configuration() -> String {
-    read("deploy/plantd.toml").replace("\n#scenes", "\nscenes").replace("\n#ready", "\nready")
+    let keys = ["scenes", "ready_file", "state_directory", "recordings"];
+    keys.iter().fold(read("deploy/plantd.toml"), |text, key| {
+        text.replace(&format!("\n#{key}"), &format!("\n{key}"))
+    })
 }
 
 /// Dotted names of all keys of a table.
@@ -45,6 +48,7 @@ fn the_annotated_configuration_has_every_key() {
     let config: Config = toml::from_str(&text).expect("it is read");
     assert!(config.unix.is_some() && config.scenes.is_some() && config.ready_file.is_some());
     assert!(config.link.root.is_some());
+    assert!(config.state_directory.is_some() && config.recordings.is_some());
     let known: toml::Table = config.to_toml().expect("it is written").parse().expect("as TOML");
     let annotated: toml::Table = text.parse().expect("it is TOML");
     assert_eq!(keys(&annotated, ""), keys(&known, ""));

@@ -21,6 +21,7 @@ def addresses(tmp_path_factory):
     # Other tests share the processors; workers that take what others leave would starve.
     environment = {**os.environ, "PLANTD_WORKER_PRIORITY": "normal"}
     arguments = ["serve", "--grpc", "127.0.0.1:0", "--unix", str(folder / "plantd.sock")]
+    arguments += ["--recordings", str(folder / "recordings")]
     with log.open("w") as output:
         server = subprocess.Popen(
             [binary, *arguments, "--ready-file", str(ready)],

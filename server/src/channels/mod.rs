@@ -160,6 +160,11 @@ impl Channels {
         acts
     }
 
+    /// Pushes fell into the last step.
+    pub(crate) fn pushes(&self) -> bool {
+        self.has_impulse
+    }
+
     /// Takes the step, with the pushes that fall into it.
     pub(crate) fn advance<T>(
         &self,

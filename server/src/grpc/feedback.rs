@@ -101,7 +101,7 @@ fn solve(
 }
 
 /// Answers a SetFeedback call.
-pub(super) async fn set_feedback(
+pub(crate) async fn set_feedback(
     hub: &Arc<Hub>,
     request: v1::SetFeedbackRequest,
 ) -> Result<v1::SetFeedbackResponse, Fault> {

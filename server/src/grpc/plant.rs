@@ -169,11 +169,7 @@ pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
         link_open: session.link_open(),
         feedback: view.feedback,
         accuracy: session.accuracy(),
-        parameters: view
-            .parameters
-            .iter()
-            .map(|(path, value)| v1::Parameter { path: path.clone(), value: *value })
-            .collect(),
+        parameters: convert::parameters(&view.parameters),
     }
 }
 

@@ -7,6 +7,7 @@ use plantd_models::{
 };
 use plantd_proto::v1;
 
+use super::tap::Tap;
 use crate::channels::Channels;
 use crate::convert;
 use crate::feedback::Feedback;
@@ -36,6 +37,8 @@ pub struct Core {
     pub(crate) timing: Timing,
     /// Where each step is written, as long as somebody reads it.
     pub(crate) ring: Option<Arc<Ring>>,
+    /// Where the recorder learns what happens between steps.
+    pub(super) tap: Option<Arc<Tap>>,
     /// Numbers of the scene that were changed.
     pub(crate) parameters: Arc<Parameters>,
     /// Counts the changes of parameters and time step.
@@ -66,6 +69,7 @@ impl Core {
             input,
             timing: Timing::default(),
             ring: None,
+            tap: None,
             has_applied: false,
             report: StepReport::default(),
             feedback: None,
@@ -175,8 +179,14 @@ impl Core {
             generation: self.generation,
             time_step_s: self.plant.settings().time_step_s,
             model_digest: self.plant.model().digest(),
-            timing: self.timing,
+            timing: Timing { flags: self.timing.flags | self.pushed(), ..self.timing },
         }
+    }
+
+    /// The flag of a last step that was pushed.
+    fn pushed(&self) -> u64 {
+        let is_pushed = self.channels.as_ref().is_some_and(|channels| channels.pushes());
+        if is_pushed { Timing::PUSHED } else { 0 }
     }
 
     /// Puts a copy of the plant in its place that is in another state.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
 
 import grpc
@@ -15,11 +16,13 @@ from plantd.v1 import (
     control_service_pb2,
     model_service_pb2,
     plant_service_pb2,
+    recording_service_pb2,
 )
 from plantd.v1.channel_service_pb2_grpc import ChannelServiceStub
 from plantd.v1.control_service_pb2_grpc import ControlServiceStub
 from plantd.v1.model_service_pb2_grpc import ModelServiceStub
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
+from plantd.v1.recording_service_pb2_grpc import RecordingServiceStub
 
 from ._drive import Driver
 from ._errors import PlantdError, translate, translated
@@ -53,6 +56,7 @@ from ._types import (
     Gain,
     Linearization,
     Plant,
+    Recording,
     Regulator,
     Rollout,
     SecondOrder,
@@ -96,8 +100,8 @@ def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
 class Client:
     """A connection to a server. Use it in a ``with`` statement, or call ``close``.
 
-    ``models``, ``plants``, ``control`` and ``channels`` are the generated stubs, for what is not
-    wrapped.
+    ``models``, ``plants``, ``control``, ``channels`` and ``recordings`` are the generated stubs, for
+    what is not wrapped.
     """
 
     def __init__(self, address: str, *, timeout: float = 60.0):
@@ -116,6 +120,7 @@ class Client:
         self.plants = PlantServiceStub(self._channel)
         self.control = ControlServiceStub(self._channel)
         self.channels = ChannelServiceStub(self._channel)
+        self.recordings = RecordingServiceStub(self._channel)
 
     def close(self) -> None:
         """Closes the connection; streams end."""
@@ -327,6 +332,52 @@ class Client:
         """Restores a snapshot of a plant of the same model and settings, step count included."""
         request = plant_service_pb2.RestoreRequest(id=id, snapshot=snapshot)
         return State._from(self._call(self.plants.Restore, request).state)
+
+    # ---- recordings ----
+
+    def start_recording(
+        self, id: str, name: str = "", *, checkpoint_interval: float = 0.0
+    ) -> Recording:
+        """Starts to record a plant into a file of the server, until `stop_recording`.
+
+        A replay can begin every ``checkpoint_interval`` seconds; 0 means 5.
+        """
+        request = recording_service_pb2.StartRecordingRequest(
+            id=id, name=name, checkpoint_interval_s=checkpoint_interval
+        )
+        return Recording._from(self._call(self.recordings.StartRecording, request).recording)
+
+    def stop_recording(self, name: str) -> Recording:
+        """Ends a recording; its file is complete then."""
+        request = recording_service_pb2.StopRecordingRequest(name=name)
+        return Recording._from(self._call(self.recordings.StopRecording, request).recording)
+
+    def list_recordings(self) -> list[Recording]:
+        """All recordings of the server, by name."""
+        recordings: list[Recording] = []
+        token = ""
+        while True:
+            request = recording_service_pb2.ListRecordingsRequest(page_token=token)
+            page = self._call(self.recordings.ListRecordings, request)
+            recordings.extend(map(Recording._from, page.recordings))
+            token = page.next_page_token
+            if not token:
+                return recordings
+
+    @translate
+    def get_recording(self, name: str, path: str | PathLike[str]) -> None:
+        """Fetches the file of a recording, which is MCAP."""
+        request = recording_service_pb2.GetRecordingRequest(name=name)
+        with open(path, "wb") as file:
+            for piece in self.recordings.GetRecording(request):
+                file.write(piece.data)
+
+    def delete_recording(self, name: str) -> None:
+        """Deletes a recording that has ended."""
+        request = recording_service_pb2.DeleteRecordingRequest(name=name)
+        self._call(self.recordings.DeleteRecording, request)
+
+    # ---- parameters and feedback ----
 
     def set_parameters(
         self, id: str, parameters: Mapping[str, float] | None = None, *, dt: float = 0.0

@@ -16,6 +16,7 @@ from plantd.v1 import (
     control_service_pb2,
     model_service_pb2,
     plant_service_pb2,
+    recording_service_pb2,
 )
 
 from ._rotation import difference
@@ -290,6 +291,30 @@ class Analysis:
             State._from(m.state),
             array(m.u),
         )
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording of a plant. What is not known of files of an earlier server is empty."""
+
+    name: str
+    plant: str
+    #: ``active``, ``done`` or ``failed``.
+    status: str
+    #: Why it has failed.
+    failure: str
+    #: Steps written.
+    steps: int
+    #: Steps lost, because the disk did not follow.
+    lost: int
+    #: Bytes written.
+    bytes: int
+
+    @classmethod
+    def _from(cls, m: recording_service_pb2.Recording) -> Recording:
+        status = recording_service_pb2.RecordingStatus.Name(m.status)
+        status = status.removeprefix("RECORDING_STATUS_").lower()
+        return cls(m.name, m.plant, status, m.failure, m.steps, m.lost, m.bytes)
 
 
 @dataclass(frozen=True, eq=False)

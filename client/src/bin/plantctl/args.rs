@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args as Group, Parser, Subcommand, ValueEnum};
 use plantd_client::v1;
 
+use crate::replay::RecordCommand;
 use crate::{channels, test};
 
 const EXAMPLES: &str = "\
@@ -24,6 +25,9 @@ Examples:
   plantctl fault inject p1 input=tau stuck=true start_s=2 duration_s=0.5
   plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
   plantctl validate arm.toml                        all errors of a scene, with their paths
+  plantctl record start p1 --name trial             then `record stop trial`, `record get trial`
+  plantctl replay trial.mcap                        the same steps again, compared bit for bit
+  plantctl export trial.mcap --csv trial.csv
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
@@ -32,7 +36,7 @@ Data goes to standard output, messages to standard error.
 
 Exit codes:
   0  done
-  1  refused by the server, or failed; `validate`: the scene has errors
+  1  refused by the server, or failed; `validate`: the scene has errors; `replay`: a step differs
   2  wrong usage
   3  no server at the address";
 
@@ -414,6 +418,25 @@ pub(crate) enum Command {
     Explain {
         /// File of a scene, or name of a model.
         scene: String,
+    },
+    /// Records plants into files of the server.
+    #[command(subcommand)]
+    Record(RecordCommand),
+    /// Takes the steps of a recording again and compares them, bit for bit.
+    ///
+    /// The server that it starts for this has no other plants; with an address, the one there is used. The
+    /// exit code is 1 when a step differs, and when no step could be compared.
+    Replay {
+        /// Recording.
+        file: PathBuf,
+    },
+    /// Writes the steps of a recording as a table.
+    Export {
+        /// Recording.
+        file: PathBuf,
+        /// Table with comma-separated values; `-` is standard output.
+        #[arg(long, value_name = "FILE")]
+        csv: PathBuf,
     },
     /// Puts a plant back to step 0.
     Reset {

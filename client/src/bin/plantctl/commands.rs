@@ -11,13 +11,18 @@ use serde_json::{Value, json};
 use crate::args::{
     Args, Assignment, Command, Field, Numbers, Plural, Point, Settings, Singular, Weights,
 };
-use crate::{FAILED, channels, feedback, json, optimize, test, text};
+use crate::{FAILED, channels, feedback, json, optimize, replay, test, text};
 
 /// Runs a command; the code is that of a command which ran.
 pub(crate) async fn run(args: Args) -> Result<ExitCode> {
     let output = Output { json: args.json };
     let command = match args.command {
         Command::Test(options) => return test::run(args.address, output, options).await,
+        Command::Replay { file } => return replay::replay(args.address, output, &file).await,
+        Command::Export { file, csv } => {
+            replay::export(output, &file, &csv)?;
+            return Ok(ExitCode::SUCCESS);
+        }
         command => command,
     };
     let address = args.address.as_deref().unwrap_or(DEFAULT_ADDRESS);
@@ -209,7 +214,10 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
             client.delete_model(&name).await?;
             output.done(json!({ "deleted": { "model": name } }))?;
         }
-        Command::Test(_) => unreachable!("has been run above"),
+        Command::Record(command) => replay::record(&client, output, command).await?,
+        Command::Test(_) | Command::Replay { .. } | Command::Export { .. } => {
+            unreachable!("has been run above")
+        }
     }
     Ok(ExitCode::SUCCESS)
 }

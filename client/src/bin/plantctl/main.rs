@@ -7,6 +7,7 @@ mod feedback;
 mod json;
 mod optimize;
 mod own_server;
+mod replay;
 mod test;
 mod text;
 

@@ -182,6 +182,33 @@ pub(crate) fn plants(plants: &[v1::PlantInfo]) -> String {
     table(&head, &plants.iter().map(row).collect::<Vec<_>>())
 }
 
+/// Recordings as a table, with the reasons of those that failed.
+pub(crate) fn recordings(recordings: &[v1::Recording]) -> String {
+    let row = |r: &v1::Recording| {
+        let status = match r.status() {
+            v1::RecordingStatus::Unspecified => "-",
+            v1::RecordingStatus::Active => "active",
+            v1::RecordingStatus::Done => "done",
+            v1::RecordingStatus::Failed => "failed",
+        };
+        let plant = if r.plant.is_empty() { "-" } else { &r.plant };
+        vec![
+            r.name.clone(),
+            plant.to_owned(),
+            status.to_owned(),
+            r.steps.to_string(),
+            r.lost.to_string(),
+            r.bytes.to_string(),
+        ]
+    };
+    let head = ["recording", "plant", "status", "steps", "lost", "bytes"];
+    let mut text = table(&head, &recordings.iter().map(row).collect::<Vec<_>>());
+    for recording in recordings.iter().filter(|recording| !recording.failure.is_empty()) {
+        let _ = writeln!(text, "{}: {}", recording.name, recording.failure);
+    }
+    text
+}
+
 /// By which method a plant is stepped.
 pub(crate) fn stepping(plant: &v1::PlantInfo) -> String {
     let settings = plant.settings.unwrap_or_default();

@@ -1,0 +1,528 @@
+//! Recordings: `record`, `replay` and `export`.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs::File;
+use std::io::{BufWriter, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context as _, Result};
+use clap::Subcommand;
+use plantd_client::{Client, Error, MatrixExt as _, RecordingEntry, RecordingReader, v1};
+use serde_json::{Value, json};
+
+use crate::commands::Output;
+use crate::own_server::OwnServer;
+use crate::{FAILED, json, text};
+
+/// Most numbers in the answer to one call, and most steps.
+const REPLY_NUMBERS: usize = 200_000;
+const STEPS_PER_CALL: usize = 1000;
+
+/// What can be done with the recordings of a server.
+#[derive(Debug, Subcommand)]
+pub(crate) enum RecordCommand {
+    /// Starts to record a plant.
+    Start {
+        /// Plant.
+        id: String,
+        /// Name of the recording; the plant's id and the time if not given.
+        #[arg(long)]
+        name: Option<String>,
+        /// Time between snapshots, from which a replay can begin, s.
+        #[arg(long, value_name = "SECONDS", default_value_t = 0.0, hide_default_value = true)]
+        checkpoint_interval: f64,
+    },
+    /// Ends a recording.
+    Stop {
+        /// Name of the recording.
+        name: String,
+    },
+    /// Lists recordings.
+    List,
+    /// Fetches the file of a recording.
+    Get {
+        /// Name of the recording.
+        name: String,
+        /// File; NAME.mcap if not given.
+        file: Option<PathBuf>,
+    },
+    /// Deletes a recording.
+    Delete {
+        /// Name of the recording.
+        name: String,
+    },
+}
+
+/// Runs `record`.
+pub(crate) async fn record(client: &Client, output: Output, command: RecordCommand) -> Result<()> {
+    let print = |recording: &v1::Recording| {
+        let one = std::slice::from_ref(recording);
+        output.print(|| json::message("Recording", recording), || text::recordings(one))
+    };
+    match command {
+        RecordCommand::Start { id, name, checkpoint_interval } => {
+            let request = v1::StartRecordingRequest {
+                id,
+                name: name.unwrap_or_default(),
+                checkpoint_interval_s: checkpoint_interval,
+            };
+            print(&client.start_recording(request).await?)?;
+        }
+        RecordCommand::Stop { name } => print(&client.stop_recording(name).await?)?,
+        RecordCommand::List => {
+            let all = client.list_recordings().await?;
+            output.print(|| json::messages("Recording", &all), || text::recordings(&all))?;
+        }
+        RecordCommand::Get { name, file } => {
+            let path = file.unwrap_or_else(|| PathBuf::from(&name).with_extension("mcap"));
+            let mut pieces = client.get_recording(&name).await?;
+            let cannot_write = || format!("cannot write {}", path.display());
+            let mut file = BufWriter::new(File::create(&path).with_context(cannot_write)?);
+            let mut bytes = 0;
+            while let Some(piece) = pieces.next().await? {
+                file.write_all(&piece.data).with_context(cannot_write)?;
+                bytes += piece.data.len();
+            }
+            file.flush().with_context(cannot_write)?;
+            output.done(json!({ "recording": name, "file": path, "bytes": bytes }))?;
+        }
+        RecordCommand::Delete { name } => {
+            client.delete_recording(&name).await?;
+            output.done(json!({ "deleted": { "recording": name } }))?;
+        }
+    }
+    Ok(())
+}
+
+/// Runs `replay`: on the server at the address, or on one of its own.
+pub(crate) async fn replay(
+    address: Option<String>,
+    output: Output,
+    file: &Path,
+) -> Result<ExitCode> {
+    let mut recording = RecordingReader::open(file)?;
+    let (server, address) = match address {
+        Some(address) => (None, address),
+        None => {
+            let server = OwnServer::start(None).await?;
+            let address = server.address().to_owned();
+            (Some(server), address)
+        }
+    };
+    let client = Client::connect(&address).await?;
+    let outcome = replay_on(&client, &mut recording).await;
+    if let Some(server) = server {
+        server.stop().await;
+    }
+    let outcome = outcome?;
+    output.print(|| outcome.to_json(), || outcome.to_text())?;
+    let is_good = outcome.difference.is_none() && outcome.steps > 0;
+    Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::from(FAILED) })
+}
+
+async fn replay_on(client: &Client, recording: &mut RecordingReader) -> Result<Outcome> {
+    let id = format!("replay-{}-{}", std::process::id(), nanoseconds());
+    let mut twin = Twin::create(client, &id, recording.plant()).await?;
+    let outcome = twin.follow(recording).await;
+    // The names are random and the server may be somebody else's: nothing is to stay there.
+    let tidied = twin.delete().await;
+    let outcome = outcome?;
+    tidied?;
+    Ok(outcome)
+}
+
+fn nanoseconds() -> u32 {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    now.map_or(0, |now| now.subsec_nanos())
+}
+
+/// What a replay has found.
+#[derive(Debug, Default)]
+struct Outcome {
+    /// Steps that were compared.
+    steps: u64,
+    /// Recorded steps that could not be.
+    skipped: u64,
+    /// Steps that the recording has lost.
+    lost: u64,
+    /// The file ends in the middle.
+    is_cut: bool,
+    difference: Option<Difference>,
+}
+
+/// Where the plant went another way.
+#[derive(Debug)]
+struct Difference {
+    /// Step of the plant.
+    step: u64,
+    /// Which steps of the recording were the same before it.
+    what: What,
+}
+
+#[derive(Debug)]
+enum What {
+    /// A number.
+    Number { entry: String, recorded: f64, replayed: f64 },
+    /// The step failed.
+    Failure(String),
+    /// All that shows is equal, but not what the plant keeps between steps.
+    Snapshot,
+}
+
+impl Outcome {
+    fn to_json(&self) -> Value {
+        let difference = self.difference.as_ref().map(|difference| {
+            let step = difference.step;
+            match &difference.what {
+                What::Number { entry, recorded, replayed } => json!({
+                    "step": step,
+                    "entry": entry,
+                    "recorded": recorded,
+                    "recorded_bits": format!("{:016x}", recorded.to_bits()),
+                    "replayed": replayed,
+                    "replayed_bits": format!("{:016x}", replayed.to_bits()),
+                }),
+                What::Failure(message) => json!({ "step": step, "failure": message }),
+                What::Snapshot => json!({ "step": step, "entry": "snapshot" }),
+            }
+        });
+        json!({
+            "steps": self.steps,
+            "identical": self.difference.is_none(),
+            "not_compared": self.skipped,
+            "lost": self.lost,
+            "cut_short": self.is_cut,
+            "difference": difference,
+        })
+    }
+
+    fn to_text(&self) -> String {
+        let mut text = String::new();
+        let steps = self.steps;
+        let _ = match &self.difference {
+            None => writeln!(text, "{steps} steps, identical"),
+            Some(Difference { step, what }) => match what {
+                What::Number { entry, recorded, replayed } => writeln!(
+                    text,
+                    "step {step} differs in {entry}, after {steps} identical steps\n  \
+                     recorded  {:016x}  {recorded:e}\n  replayed  {:016x}  {replayed:e}",
+                    recorded.to_bits(),
+                    replayed.to_bits(),
+                ),
+                What::Failure(message) => {
+                    writeln!(text, "step {step} fails, after {steps} identical steps: {message}")
+                }
+                What::Snapshot => writeln!(
+                    text,
+                    "the snapshot after step {step} differs, after {steps} identical steps"
+                ),
+            },
+        };
+        if self.lost > 0 {
+            let _ = writeln!(text, "{} steps were lost when they were recorded", self.lost);
+        }
+        if self.skipped > 0 {
+            let _ = writeln!(
+                text,
+                "{} recorded steps were not compared: steps were lost before them, or something \
+                 besides the inputs acted on the plant",
+                self.skipped
+            );
+        }
+        if self.is_cut {
+            text.push_str("the file ends in the middle: its writer did not come to the end\n");
+        }
+        text
+    }
+}
+
+/// The plant that takes the recorded steps again.
+struct Twin<'a> {
+    client: &'a Client,
+    id: String,
+    names: Vec<String>,
+    width: usize,
+    batch_max: usize,
+    parameters: BTreeMap<String, f64>,
+    time_step_s: f64,
+    /// Recorded steps that are still to be taken.
+    batch: Vec<v1::StepRecord>,
+    outcome: Outcome,
+}
+
+impl<'a> Twin<'a> {
+    async fn create(client: &'a Client, id: &str, record: &v1::PlantRecord) -> Result<Self> {
+        let missing = || Error::Protocol("a recording without a plant and its model");
+        let plant = record.plant.as_ref().ok_or_else(missing)?;
+        let model = record.model.as_ref().ok_or_else(missing)?;
+        let of = || format!("a plant recorded by plantd {}", record.version);
+        let request = v1::CreateModelRequest {
+            name: id.to_owned(),
+            scene: model.scene_toml.clone(),
+            format: v1::SceneFormat::Toml.into(),
+        };
+        client.create_model_as(request).await.with_context(of)?;
+        let snapshot = v1::initial_state::Form::Snapshot(record.snapshot.clone());
+        let request = v1::CreatePlantRequest {
+            id: id.to_owned(),
+            model: id.to_owned(),
+            settings: plant.settings,
+            initial: Some(v1::InitialState { form: Some(snapshot) }),
+            open_link: false,
+        };
+        if let Err(error) = client.create_plant(request).await {
+            client.delete_model(id).await?;
+            return Err(error).with_context(of);
+        }
+        let names = state_names(model);
+        let batch_max = (REPLY_NUMBERS / names.len().max(1)).clamp(1, STEPS_PER_CALL);
+        Ok(Self {
+            client,
+            id: id.to_owned(),
+            width: input_names(model).len(),
+            names,
+            batch_max,
+            parameters: plant.parameters.iter().map(|p| (p.path.clone(), p.value)).collect(),
+            time_step_s: plant.settings.map_or(0.0, |settings| settings.time_step_s),
+            batch: Vec::new(),
+            outcome: Outcome::default(),
+        })
+    }
+
+    async fn delete(&self) -> Result<()> {
+        self.client.delete_plant(&self.id).await?;
+        Ok(self.client.delete_model(&self.id).await?)
+    }
+
+    /// Takes the recorded steps until one differs.
+    async fn follow(&mut self, recording: &mut RecordingReader) -> Result<Outcome> {
+        let mut is_lost = false;
+        while self.outcome.difference.is_none() {
+            // What is damaged shows as a step that differs, if there is one.
+            let entry = match recording.next_entry() {
+                Ok(entry) => entry,
+                Err(error) => {
+                    self.take_steps().await?;
+                    if self.outcome.difference.is_some() {
+                        break;
+                    }
+                    return Err(error.into());
+                }
+            };
+            match entry {
+                None => {
+                    self.take_steps().await?;
+                    break;
+                }
+                Some(RecordingEntry::Step(_)) if is_lost => self.outcome.skipped += 1,
+                Some(RecordingEntry::Step(step)) => {
+                    self.batch.push(*step);
+                    if self.batch.len() >= self.batch_max {
+                        self.take_steps().await?;
+                    }
+                }
+                Some(RecordingEntry::Mark(mark)) => {
+                    self.take_steps().await?;
+                    if self.outcome.difference.is_none() {
+                        is_lost = self.take_mark(mark, is_lost).await?;
+                    }
+                }
+            }
+        }
+        self.outcome.is_cut = recording.is_cut();
+        Ok(std::mem::take(&mut self.outcome))
+    }
+
+    async fn take_steps(&mut self) -> Result<()> {
+        let batch = std::mem::take(&mut self.batch);
+        if batch.is_empty() {
+            return Ok(());
+        }
+        let before = self.client.snapshot(&self.id).await?;
+        if self.take(&batch).await?.is_ok() {
+            return Ok(());
+        }
+        // A step failed, which may come of one that went another way before: one at a time they show.
+        self.client.restore(&self.id, before).await?;
+        for step in &batch {
+            if let Err(failure) = self.take(std::slice::from_ref(step)).await? {
+                let step = step.state.as_ref().map_or(0, |state| state.step);
+                let what = What::Failure(failure);
+                self.outcome.difference = Some(Difference { step, what });
+            }
+            if self.outcome.difference.is_some() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes steps and compares them. The inner error is that of a step that failed.
+    async fn take(&mut self, steps: &[v1::StepRecord]) -> Result<Result<(), String>> {
+        let rows: Vec<_> = steps.iter().map(|step| step.u.clone()).collect();
+        let width = self.width;
+        anyhow::ensure!(
+            rows.iter().all(|row| row.len() == width),
+            "an input without {width} entries"
+        );
+        let (u, hold) = match width {
+            // A matrix without columns has no rows that could be counted.
+            0 => (None, rows.len() as u32),
+            _ => (Some(v1::Matrix::from_rows(&rows)), 0),
+        };
+        let request = v1::StepRequest { id: self.id.clone(), u, hold, all_states: true };
+        let replayed = match self.client.step(request).await {
+            Ok(answer) => answer.states,
+            Err(Error::Rpc(refusal)) => return Ok(Err(refusal.to_string())),
+            Err(error) => return Err(error.into()),
+        };
+        for (step, replayed) in steps.iter().zip(&replayed) {
+            let recorded = step.state.clone().unwrap_or_default();
+            if let Some(what) = self.difference(&recorded, replayed) {
+                self.outcome.difference = Some(Difference { step: recorded.step, what });
+                break;
+            }
+            self.outcome.steps += 1;
+        }
+        Ok(Ok(()))
+    }
+
+    fn difference(&self, recorded: &v1::State, replayed: &v1::State) -> Option<What> {
+        let number = |entry: &str, recorded: f64, replayed: f64| {
+            let entry = entry.to_owned();
+            (recorded.to_bits() != replayed.to_bits()).then_some(What::Number {
+                entry,
+                recorded,
+                replayed,
+            })
+        };
+        number("step", recorded.step as f64, replayed.step as f64)
+            .or_else(|| number("time_s", recorded.time_s, replayed.time_s))
+            .or_else(|| {
+                let (a, b) = (numbers(recorded), numbers(replayed));
+                let length = number("the number of entries", a.len() as f64, b.len() as f64);
+                let entry = |(i, (a, b)): (usize, (&f64, &f64))| {
+                    number(self.names.get(i).map_or("?", String::as_str), *a, *b)
+                };
+                length.or_else(|| a.iter().zip(&b).enumerate().find_map(entry))
+            })
+    }
+
+    /// Goes on from a mark. True when the steps after it cannot be taken again.
+    async fn take_mark(&mut self, mark: v1::MarkRecord, is_lost: bool) -> Result<bool> {
+        self.outcome.lost += mark.lost;
+        if mark.snapshot.is_empty() {
+            return Ok(true);
+        }
+        let changes: Vec<_> = mark
+            .parameters
+            .iter()
+            .filter(|p| {
+                self.parameters.get(&p.path).map(|v| v.to_bits()) != Some(p.value.to_bits())
+            })
+            .cloned()
+            .collect();
+        let is_time_step_new = mark.time_step_s.to_bits() != self.time_step_s.to_bits();
+        if !changes.is_empty() || is_time_step_new {
+            self.parameters.extend(changes.iter().map(|p| (p.path.clone(), p.value)));
+            self.time_step_s = mark.time_step_s;
+            let request = v1::SetParametersRequest {
+                id: self.id.clone(),
+                parameters: changes,
+                time_step_s: if is_time_step_new { mark.time_step_s } else { 0.0 },
+            };
+            self.client.set_parameters(request).await?;
+        }
+        let goes_on = !is_lost && mark.lost == 0 && mark.reason() != v1::MarkReason::Reset;
+        if goes_on && self.client.snapshot(&self.id).await? != mark.snapshot {
+            let what = What::Snapshot;
+            self.outcome.difference = Some(Difference { step: mark.step, what });
+        }
+        self.client.restore(&self.id, mark.snapshot).await?;
+        Ok(false)
+    }
+}
+
+/// All numbers of a state.
+fn numbers(state: &v1::State) -> Vec<f64> {
+    [&state.q[..], &state.p, &state.v, &state.multipliers].concat()
+}
+
+/// Names of these numbers.
+fn state_names(model: &v1::Model) -> Vec<String> {
+    let all = model.coordinates.iter().map(|c| c.name.clone());
+    let (dynamic, prescribed): (Vec<_>, Vec<_>) =
+        model.coordinates.iter().partition(|coordinate| !coordinate.prescribed);
+    all.chain(dynamic.iter().map(|c| format!("p({})", c.name)))
+        .chain(prescribed.iter().map(|c| format!("v({})", c.name)))
+        .chain(model.constraints.iter().map(|name| format!("impulse({name})")))
+        .collect()
+}
+
+/// Names of the entries of u.
+fn input_names(model: &v1::Model) -> Vec<String> {
+    let prescribed = model.coordinates.iter().filter(|coordinate| coordinate.prescribed);
+    let inputs = model.inputs.iter().cloned();
+    inputs.chain(prescribed.map(|coordinate| coordinate.name.clone())).collect()
+}
+
+/// Runs `export`: one line per step, the first one with the names of its columns.
+pub(crate) fn export(output: Output, file: &Path, csv: &Path) -> Result<()> {
+    let mut recording = RecordingReader::open(file)?;
+    let record = recording.plant().clone();
+    let model = record.model.unwrap_or_default();
+    let cannot_write = || format!("cannot write {}", csv.display());
+    let sink: Box<dyn std::io::Write> = match csv.to_str() {
+        Some("-") => Box::new(std::io::stdout().lock()),
+        _ => Box::new(File::create(csv).with_context(cannot_write)?),
+    };
+    let mut sink = BufWriter::new(sink);
+    let (states, inputs) = (state_names(&model), input_names(&model));
+    let inputs = inputs.iter().map(|name| format!("u({name})"));
+    let names = ["step", "time_s"].into_iter().map(str::to_owned).chain(states.clone());
+    let head: Vec<_> = names.chain(inputs.clone()).map(|name| quoted(&name)).collect();
+    writeln!(sink, "{}", head.join(",")).with_context(cannot_write)?;
+    let mut line = |state: &v1::State, u: &[f64]| {
+        let _ = write!(sink, "{},{}", state.step, state.time_s);
+        let state = padded(numbers(state), states.len());
+        for cell in state.into_iter().chain(padded(u.to_vec(), inputs.len())) {
+            match cell {
+                // Rust prints as many digits as bring the number back.
+                Some(number) => write!(sink, ",{number}")?,
+                None => write!(sink, ",")?,
+            }
+        }
+        writeln!(sink)
+    };
+    let mut steps = 0;
+    if let Some(state) = record.plant.and_then(|plant| plant.state) {
+        line(&state, &[]).with_context(cannot_write)?;
+    }
+    while let Some(entry) = recording.next_entry()? {
+        let RecordingEntry::Step(step) = entry else { continue };
+        line(&step.state.clone().unwrap_or_default(), &step.u).with_context(cannot_write)?;
+        steps += 1;
+    }
+    sink.flush().with_context(cannot_write)?;
+    drop(sink);
+    if csv.to_str() != Some("-") {
+        output.done(json!({ "file": csv, "steps": steps, "cut_short": recording.is_cut() }))?;
+    }
+    Ok(())
+}
+
+/// The numbers, and nothing where there are too few.
+fn padded(numbers: Vec<f64>, count: usize) -> impl Iterator<Item = Option<f64>> {
+    numbers.into_iter().map(Some).chain(std::iter::repeat(None)).take(count)
+}
+
+/// A cell of a table.
+fn quoted(text: &str) -> String {
+    if text.contains([',', '"', '\n', '\r']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text.to_owned()
+    }
+}

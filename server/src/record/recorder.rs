@@ -1,0 +1,589 @@
+//! The thread that writes a recording, away from the plant.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant, SystemTime};
+
+use mcap::McapError;
+use plantd_models::Plant;
+use plantd_proto::v1::{self, MarkReason, RecordingStatus};
+
+use super::file::{Times, Writer};
+use crate::convert;
+use crate::frame::{Frame, Timing};
+use crate::ring::Reader;
+use crate::session::Session;
+use crate::session::tap::{Mark, Tap};
+
+/// How often the ring is looked at.
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
+/// How often what was written is handed to the system.
+const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
+/// Least time between two snapshots, where disturbances ask for many.
+const SNAPSHOT_INTERVAL_MIN: Duration = Duration::from_millis(50);
+
+/// What is asked for.
+pub(super) struct Options {
+    /// Name.
+    pub(super) name: String,
+    /// Time between two snapshots.
+    pub(super) checkpoint_interval: Duration,
+    /// Most bytes of the file.
+    pub(super) bytes_max: u64,
+}
+
+/// A recording in progress, or one that has ended.
+pub(super) struct Recorder {
+    shared: Arc<Shared>,
+    tap: Arc<Tap>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+struct Shared {
+    is_ending: AtomicBool,
+    bytes: Arc<AtomicU64>,
+    info: Mutex<v1::Recording>,
+}
+
+impl Shared {
+    fn info(&self) -> MutexGuard<'_, v1::Recording> {
+        self.info.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Why a recording was not started.
+pub(super) enum StartError {
+    /// The plant is being recorded.
+    Active,
+    /// The file could not be written.
+    File(McapError),
+}
+
+impl Recorder {
+    /// Starts to record a plant into a file.
+    pub(super) fn start(
+        session: &Arc<Session>,
+        file: File,
+        options: Options,
+    ) -> Result<Self, StartError> {
+        let (tap, mark, plant) = session.open_tap().ok_or(StartError::Active)?;
+        let first = plant_record(session, &mark, &plant);
+        let started = SystemTime::now();
+        let info = v1::Recording {
+            name: options.name.clone(),
+            plant: session.id().to_owned(),
+            status: RecordingStatus::Active.into(),
+            started_unix_ns: unix_ns(started),
+            ..Default::default()
+        };
+        let shared = Arc::new(Shared {
+            is_ending: AtomicBool::new(false),
+            bytes: Arc::default(),
+            info: Mutex::new(info),
+        });
+        let outcome =
+            Loop::new(session, &tap, &mark, &first, file, options, &shared).and_then(|run| {
+                let name = format!("record {}", session.id());
+                let thread = thread::Builder::new().name(name).spawn(move || run.run());
+                thread.map_err(McapError::Io)
+            });
+        match outcome {
+            Ok(thread) => {
+                tap.set_recorder(thread.thread().clone());
+                Ok(Self { shared, tap, thread: Mutex::new(Some(thread)) })
+            }
+            Err(error) => {
+                session.close_tap();
+                Err(StartError::File(error))
+            }
+        }
+    }
+
+    /// What is to be said of it.
+    pub(super) fn info(&self) -> v1::Recording {
+        let bytes = self.shared.bytes.load(Ordering::Relaxed);
+        v1::Recording { bytes, ..self.shared.info().clone() }
+    }
+
+    /// It is in progress.
+    pub(super) fn is_active(&self) -> bool {
+        self.shared.info().status() == RecordingStatus::Active
+    }
+
+    /// Ends it, and waits until the file is complete.
+    pub(super) fn stop(&self) {
+        self.shared.is_ending.store(true, Ordering::Release);
+        self.tap.wake();
+        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(thread) = thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!("a recorder panicked");
+        }
+    }
+}
+
+/// Counts what goes into a file.
+struct Counted {
+    file: File,
+    bytes: Arc<AtomicU64>,
+}
+
+impl Write for Counted {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.file.write(bytes)?;
+        self.bytes.fetch_add(written as u64, Ordering::Relaxed);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// What the thread has.
+struct Loop {
+    session: Arc<Session>,
+    tap: Arc<Tap>,
+    reader: Reader,
+    writer: Writer<BufWriter<Counted>>,
+    options: Options,
+    shared: Arc<Shared>,
+    clock: Clock,
+    frame: Frame,
+    record: v1::StepRecord,
+    /// Step and generation from which the next frame follows; none where it follows from nothing.
+    at: Option<(u64, u64)>,
+    lost: u64,
+    steps: u64,
+    last_snapshot: Instant,
+    /// Steps were written since.
+    has_moved: bool,
+}
+
+impl Loop {
+    fn new(
+        session: &Arc<Session>,
+        tap: &Arc<Tap>,
+        mark: &Mark,
+        first: &v1::PlantRecord,
+        file: File,
+        options: Options,
+        shared: &Arc<Shared>,
+    ) -> Result<Self, McapError> {
+        let mut clock = Clock::new();
+        let times = Times { log_ns: clock.now_ns(0), plant_s: mark.time_s };
+        let counted = Counted { file, bytes: Arc::clone(&shared.bytes) };
+        let writer = Writer::new(BufWriter::new(counted), first, times)?;
+        Ok(Self {
+            session: Arc::clone(session),
+            tap: Arc::clone(tap),
+            reader: Reader::from(Arc::clone(&tap.ring), mark.at),
+            writer,
+            options,
+            shared: Arc::clone(shared),
+            clock,
+            frame: Frame::default(),
+            record: v1::StepRecord::default(),
+            at: Some((mark.step, mark.generation)),
+            lost: 0,
+            steps: 0,
+            last_snapshot: Instant::now(),
+            has_moved: false,
+        })
+    }
+
+    /// Writes until the recording is to end, or cannot go on.
+    fn run(mut self) {
+        let outcome = self.record();
+        let Self { session, reader, writer, shared, options, .. } = self;
+        // The ring goes with its last reader.
+        drop(reader);
+        session.close_tap();
+        let finished = outcome.and_then(|why| {
+            let file = writer.finish()?.into_inner().map_err(|error| error.into_error())?;
+            file.file.sync_all()?;
+            Ok(why)
+        });
+        let why = finished.unwrap_or_else(|error| Some(sentence(&error)));
+        let mut info = shared.info();
+        info.status = match why {
+            None => RecordingStatus::Done.into(),
+            Some(_) => RecordingStatus::Failed.into(),
+        };
+        let (steps, lost) = (info.steps, info.lost);
+        let name = options.name;
+        match &why {
+            None => tracing::info!(recording = name, steps, lost, "recording ended"),
+            Some(why) => tracing::error!(recording = name, steps, lost, why, "recording failed"),
+        }
+        info.failure = why.unwrap_or_default();
+    }
+
+    /// Writes until the recording is to end; says why it ends before its time.
+    fn record(&mut self) -> Result<Option<String>, McapError> {
+        let (mut flushed, mut flushed_steps) = (Instant::now(), 0);
+        loop {
+            // Looked at first: what was there by then is written below.
+            let is_ending =
+                self.shared.is_ending.load(Ordering::Acquire) || self.session.is_closed();
+            if self.is_snapshot_due() {
+                self.session.checkpoint();
+                self.last_snapshot = Instant::now();
+                self.has_moved = false;
+            }
+            self.drain()?;
+            {
+                let mut info = self.shared.info();
+                (info.steps, info.lost) = (self.steps, self.lost);
+            }
+            if is_ending {
+                return Ok(None);
+            }
+            if self.shared.bytes.load(Ordering::Relaxed) > self.options.bytes_max {
+                let max = self.options.bytes_max;
+                return Ok(Some(format!("it has {max} bytes, the limit `recording_bytes`")));
+            }
+            if flushed.elapsed() >= FLUSH_INTERVAL && flushed_steps != self.steps {
+                self.writer.flush()?;
+                (flushed, flushed_steps) = (Instant::now(), self.steps);
+            }
+            thread::park_timeout(POLL_INTERVAL);
+        }
+    }
+
+    fn is_snapshot_due(&self) -> bool {
+        let interval = match self.at {
+            Some(_) => self.options.checkpoint_interval,
+            None => SNAPSHOT_INTERVAL_MIN,
+        };
+        (self.has_moved || self.at.is_none()) && self.last_snapshot.elapsed() >= interval
+    }
+
+    /// Writes what there is.
+    fn drain(&mut self) -> Result<(), McapError> {
+        // No more than there is now: who ends a recording shall not wait for a plant that runs.
+        let until = self.tap.ring.written();
+        loop {
+            let next = self.reader.read_next().map(|(n, record)| {
+                self.frame.read(record);
+                n
+            });
+            let Some(n) = next.filter(|n| *n < until) else {
+                // A frame beyond `until` is not lost: it is written in its place below.
+                while let Some(mark) = self.tap.mark_before(next.unwrap_or(until)) {
+                    self.mark(&mark)?;
+                }
+                if let Some(n) = next {
+                    self.step(n)?;
+                }
+                return Ok(());
+            };
+            while let Some(mark) = self.tap.mark_before(n) {
+                self.mark(&mark)?;
+            }
+            self.step(n)?;
+        }
+    }
+
+    fn mark(&mut self, mark: &Mark) -> Result<(), McapError> {
+        let lost = self.take_lost();
+        let message = v1::MarkRecord {
+            reason: mark.reason.into(),
+            step: mark.step,
+            snapshot: mark.snapshot.to_bytes(),
+            parameters: convert::parameters(&mark.parameters),
+            time_step_s: mark.time_step_s,
+            lost,
+        };
+        let times = Times { log_ns: self.clock.now_ns(0), plant_s: mark.time_s };
+        self.writer.mark(&message, times)?;
+        self.at = Some((mark.step, mark.generation));
+        Ok(())
+    }
+
+    /// Writes the step in `frame`, which is the ring's record `n`.
+    fn step(&mut self, n: u64) -> Result<(), McapError> {
+        let frame = &self.frame;
+        let follows = |(step, generation)| {
+            frame.state.step == step + 1
+                && frame.generation == generation
+                && frame.timing.flags & Timing::PUSHED == 0
+        };
+        let is_lost = self.reader.lost() > self.lost;
+        if is_lost || self.at.is_some_and(|at| !follows(at)) {
+            self.break_off(is_lost)?;
+        }
+        if self.at.is_some() {
+            self.at = Some((self.frame.state.step, self.frame.generation));
+        }
+        let times = Times {
+            log_ns: self.clock.now_ns(self.frame.timing.ended_ns),
+            plant_s: self.frame.time_s,
+        };
+        fill(&mut self.record, &self.frame);
+        self.writer.step(&self.record, times)?;
+        self.steps += 1;
+        self.has_moved = true;
+        self.tap.set_read(n + 1);
+        Ok(())
+    }
+
+    /// Notes that the step in `frame` does not follow from what was written.
+    fn break_off(&mut self, is_lost: bool) -> Result<(), McapError> {
+        let lost = self.take_lost();
+        let reason = if is_lost { MarkReason::Gap } else { MarkReason::Disturbance };
+        let step = self.frame.state.step.saturating_sub(1);
+        let message = v1::MarkRecord { reason: reason.into(), step, lost, ..Default::default() };
+        let times = Times { log_ns: self.clock.now_ns(0), plant_s: self.frame.time_s };
+        self.at = None;
+        self.writer.mark(&message, times)
+    }
+
+    /// Steps lost since the last call.
+    fn take_lost(&mut self) -> u64 {
+        let lost = self.reader.lost() - self.lost;
+        self.lost += lost;
+        lost
+    }
+}
+
+/// The wall clock, which does not go back here.
+struct Clock {
+    /// Wall clock less monotonic clock, ns.
+    offset_ns: u64,
+    last_ns: u64,
+}
+
+impl Clock {
+    fn new() -> Self {
+        let offset_ns = unix_ns(SystemTime::now()).saturating_sub(monotonic_ns());
+        Self { offset_ns, last_ns: 0 }
+    }
+
+    /// The wall clock at a time of the monotonic one; 0 means now.
+    fn now_ns(&mut self, monotonic: u64) -> u64 {
+        let monotonic = if monotonic == 0 { monotonic_ns() } else { monotonic };
+        self.last_ns = self.last_ns.max(self.offset_ns.saturating_add(monotonic));
+        self.last_ns
+    }
+}
+
+fn monotonic_ns() -> u64 {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
+}
+
+fn unix_ns(time: SystemTime) -> u64 {
+    let since = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// The plant at the beginning of a recording.
+fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecord {
+    let (model, plan) = (plant.model(), String::new());
+    let info = v1::PlantInfo {
+        id: session.id().to_owned(),
+        model: session.model_name().to_owned(),
+        settings: Some(convert::settings_message(plant.settings())),
+        state: Some(convert::plant_state(plant)),
+        accuracy: session.accuracy(),
+        parameters: convert::parameters(&mark.parameters),
+        ..Default::default()
+    };
+    v1::PlantRecord {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        plant: Some(info),
+        model_digest: model.digest(),
+        model: Some(v1::Model { plan, ..convert::model(session.model_name(), false, model, true) }),
+        snapshot: mark.snapshot.to_bytes(),
+        ..Default::default()
+    }
+}
+
+/// Puts a frame into a message, whose memory is kept.
+fn fill(record: &mut v1::StepRecord, frame: &Frame) {
+    let state = record.state.get_or_insert_default();
+    state.step = frame.state.step;
+    state.time_s = frame.time_s;
+    for (target, source) in [
+        (&mut state.q, &frame.state.q),
+        (&mut state.p, &frame.state.p),
+        (&mut state.v, &frame.state.v),
+        (&mut state.multipliers, &frame.state.multipliers),
+        (&mut record.u, &frame.input),
+        (&mut record.driver, &frame.driver_input),
+    ] {
+        target.clone_from(source);
+    }
+    record.outputs = convert::outputs(&frame.outputs, &frame.lost);
+    record.report = Some(convert::report(&frame.report));
+    let timing = &frame.timing;
+    record.timing = (timing.began_ns != 0).then_some(v1::RecordTiming {
+        due_ns: timing.due_ns,
+        began_ns: timing.began_ns,
+        ended_ns: timing.ended_ns,
+        input_sequence: timing.input_sequence,
+        input_age_ns: timing.input_age_ns,
+        input_late: timing.flags & Timing::LATE != 0,
+        input_safe: timing.flags & Timing::SAFE != 0,
+    });
+}
+
+/// An error with its cause.
+pub(super) fn sentence(error: &McapError) -> String {
+    match error {
+        McapError::Io(error) => error.to_string(),
+        other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use plantd_models::{Model, builtin};
+    use prost::Message as _;
+
+    use super::*;
+    use crate::metrics::Metrics;
+    use crate::session::DriverKind;
+
+    fn session() -> Arc<Session> {
+        let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
+        let settings = plantd_models::Settings::new(&model);
+        let plant = Plant::new(model, settings).unwrap();
+        Session::new("p".into(), "pendulum".into(), plant, None, Arc::new(Metrics::default()))
+    }
+
+    fn options() -> Options {
+        let checkpoint_interval = Duration::from_secs(3600);
+        Options { name: "r".to_owned(), checkpoint_interval, bytes_max: u64::MAX }
+    }
+
+    /// A recorder whose thread is this one.
+    fn recorder(session: &Arc<Session>, file: &File) -> Loop {
+        let (tap, mark, plant) = session.open_tap().unwrap();
+        let first = plant_record(session, &mark, &plant);
+        let info = Mutex::new(v1::Recording::default());
+        let shared = Shared { is_ending: AtomicBool::new(true), bytes: Arc::default(), info };
+        let file = file.try_clone().unwrap();
+        Loop::new(session, &tap, &mark, &first, file, options(), &Arc::new(shared)).unwrap()
+    }
+
+    /// Steps as a plant that runs by itself takes them: without waiting for anybody.
+    fn run(session: &Session, steps: usize) {
+        session.with_core(move |core| {
+            for _ in 0..steps {
+                core.step(&[0.1], None).unwrap();
+                core.write_ring();
+            }
+        });
+    }
+
+    /// Topics of a file with the steps of their messages, and the marks.
+    fn entries(path: &std::path::Path) -> (Vec<u64>, Vec<v1::MarkRecord>) {
+        let bytes = std::fs::read(path).unwrap();
+        let (mut steps, mut marks) = (Vec::new(), Vec::new());
+        for message in mcap::MessageStream::new(&bytes).unwrap() {
+            let message = message.unwrap();
+            match message.channel.topic.as_str() {
+                "/step" => {
+                    let step = v1::StepRecord::decode(&*message.data).unwrap();
+                    steps.push(step.state.unwrap().step);
+                }
+                "/mark" => marks.push(v1::MarkRecord::decode(&*message.data).unwrap()),
+                _ => {}
+            }
+        }
+        (steps, marks)
+    }
+
+    #[test]
+    fn a_plant_that_does_not_wait_loses_steps_and_the_file_says_so() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("r.mcap");
+        let file = File::create(&path).unwrap();
+        let session = session();
+        let mut recorder = recorder(&session, &file);
+        let capacity = recorder.tap.ring.capacity();
+        run(&session, 10);
+        recorder.drain().unwrap();
+        run(&session, 2 * capacity);
+        recorder.drain().unwrap();
+        assert!(recorder.at.is_none());
+        session.checkpoint();
+        run(&session, 5);
+        recorder.drain().unwrap();
+        let lost = recorder.lost;
+        let total = (10 + 2 * capacity + 5) as u64;
+        assert_eq!(recorder.steps + lost, total);
+        assert!(lost >= capacity as u64, "{lost}");
+        recorder.run();
+        let (steps, marks) = entries(&path);
+        assert_eq!(steps.len() as u64 + lost, total);
+        assert_eq!(steps[..10], (1..=10).collect::<Vec<_>>());
+        assert_eq!((steps[10], *steps.last().unwrap()), (11 + lost, total));
+        let gap = v1::MarkRecord {
+            reason: MarkReason::Gap.into(),
+            step: 10 + lost,
+            lost,
+            ..Default::default()
+        };
+        assert_eq!(marks[0], gap);
+        assert_eq!((marks[1].reason(), marks[1].step), (MarkReason::Checkpoint, total - 5));
+        assert!(!marks[1].snapshot.is_empty() && marks.len() == 2);
+    }
+
+    #[test]
+    fn marks_stand_between_the_steps_where_they_happened() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("r.mcap");
+        let session = session();
+        let recorder = recorder(&session, &File::create(&path).unwrap());
+        let mut lease = session.acquire(DriverKind::Step).unwrap();
+        for _ in 0..3 {
+            lease.step(&[0.2]).unwrap();
+        }
+        lease.reset().unwrap();
+        lease.step(&[0.3]).unwrap();
+        let limits = crate::limits::Limits::default();
+        session.change_parameters(&[("gravity[1]".to_owned(), -1.0)], None, &limits).unwrap();
+        lease.reset().unwrap();
+        lease.step(&[0.3]).unwrap();
+        recorder.run();
+        let (steps, marks) = entries(&path);
+        assert_eq!(steps, [1, 2, 3, 1, 1]);
+        let marks: Vec<_> = marks.iter().map(|mark| (mark.reason(), mark.step)).collect();
+        let (reset, parameters) = (MarkReason::Reset, MarkReason::Parameters);
+        assert_eq!(marks, [(reset, 0), (parameters, 1), (reset, 0)]);
+    }
+
+    #[test]
+    fn a_full_disk_is_told_and_the_plant_can_be_recorded_again() {
+        let session = session();
+        let full = File::options().write(true).open("/dev/full").unwrap();
+        match Recorder::start(&session, full, options()) {
+            Err(StartError::File(error)) => {
+                assert!(sentence(&error).contains("No space left"), "{}", sentence(&error));
+            }
+            _ => panic!("a recording on a full disk"),
+        }
+        let mut lease = session.acquire(DriverKind::Step).unwrap();
+        lease.step(&[0.2]).unwrap();
+        assert!(session.with_core(|core| core.ring.is_none()));
+        let directory = tempfile::tempdir().unwrap();
+        let file = File::create(directory.path().join("r.mcap")).unwrap();
+        let Ok(recorder) = Recorder::start(&session, file, options()) else {
+            panic!("no recording")
+        };
+        let again = File::create(directory.path().join("s.mcap")).unwrap();
+        assert!(matches!(Recorder::start(&session, again, options()), Err(StartError::Active)));
+        lease.step(&[0.2]).unwrap();
+        recorder.stop();
+        let info = recorder.info();
+        assert_eq!((info.status(), info.steps), (RecordingStatus::Done, 1));
+        assert!(session.with_core(|core| core.ring.is_none()));
+    }
+}

@@ -1,0 +1,161 @@
+//! Where a recorder gets what it writes: the ring of steps, and marks of what happens between them.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::thread::Thread;
+use std::time::{Duration, Instant};
+
+use plantd_models::{Plant, Snapshot};
+use plantd_proto::v1::MarkReason;
+
+use super::{Core, Session};
+use crate::frame::record_words;
+use crate::parameters::Parameters;
+use crate::ring::Ring;
+
+/// Bytes of a plant's ring.
+const RING_BYTES: usize = 4 << 20;
+/// Fewest and most steps in it.
+const RING_STEPS: (usize, usize) = (64, 8192);
+/// Marks that may wait to be written. Whoever resets a plant more often than that loses steps.
+const MARKS_MAX: usize = 256;
+/// Longest wait of a step for the recorder, and how often it looks.
+const WAIT_MAX: Duration = Duration::from_secs(5);
+const WAIT_STEP: Duration = Duration::from_micros(100);
+
+/// The plant as it is between two steps.
+pub(crate) struct Mark {
+    /// Number of the ring's record that comes next.
+    pub(crate) at: u64,
+    pub(crate) reason: MarkReason,
+    pub(crate) snapshot: Snapshot,
+    pub(crate) step: u64,
+    pub(crate) time_s: f64,
+    pub(crate) time_step_s: f64,
+    pub(crate) generation: u64,
+    pub(crate) parameters: Arc<Parameters>,
+}
+
+/// What a plant and its recorder share.
+pub(crate) struct Tap {
+    pub(crate) ring: Arc<Ring>,
+    /// Number of the record that the recorder reads next.
+    read: AtomicU64,
+    marks: Mutex<VecDeque<Mark>>,
+    recorder: OnceLock<Thread>,
+}
+
+impl Tap {
+    /// Notes how far the recorder has come.
+    pub(crate) fn set_read(&self, next: u64) {
+        self.read.store(next, Ordering::Release);
+    }
+
+    /// Names the thread that reads.
+    pub(crate) fn set_recorder(&self, thread: Thread) {
+        let _ = self.recorder.set(thread);
+    }
+
+    /// Takes the first mark, if it comes before the ring's record of this number.
+    pub(crate) fn mark_before(&self, record: u64) -> Option<Mark> {
+        let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
+        if marks.front()?.at <= record { marks.pop_front() } else { None }
+    }
+
+    fn push(&self, mark: Mark) {
+        let mut marks = self.marks.lock().unwrap_or_else(PoisonError::into_inner);
+        // A mark that is missing shows as steps that do not follow from each other.
+        if marks.len() < MARKS_MAX {
+            marks.push_back(mark);
+        }
+    }
+
+    fn is_half_full(&self) -> bool {
+        let waiting = self.ring.written().saturating_sub(self.read.load(Ordering::Acquire));
+        waiting > self.ring.capacity() as u64 / 2
+    }
+
+    /// Waits until the recorder has caught up: for steps that somebody asks for, one by one. A disk that
+    /// does not answer holds nobody for ever; steps are lost then, and counted.
+    pub(super) fn wait(&self) {
+        let started = Instant::now();
+        while self.is_half_full() && started.elapsed() < WAIT_MAX {
+            self.wake();
+            std::thread::sleep(WAIT_STEP);
+        }
+    }
+
+    /// Wakes the recorder.
+    pub(crate) fn wake(&self) {
+        if let Some(thread) = self.recorder.get() {
+            thread.unpark();
+        }
+    }
+}
+
+impl Core {
+    /// The recorder's tap, if there is one and a step had better wait for it.
+    pub(super) fn full_tap(&self) -> Option<Arc<Tap>> {
+        self.tap.as_ref().filter(|tap| tap.is_half_full()).map(Arc::clone)
+    }
+
+    /// Tells the recorder, if there is one, what happens between two steps.
+    pub(super) fn mark(&self, reason: MarkReason) {
+        if let Some(tap) = &self.tap {
+            tap.push(self.marked(tap.ring.written(), reason));
+        }
+    }
+
+    fn marked(&self, at: u64, reason: MarkReason) -> Mark {
+        Mark {
+            at,
+            reason,
+            snapshot: self.plant.snapshot(),
+            step: self.plant.step_index(),
+            time_s: self.plant.time_s(),
+            time_step_s: self.plant.settings().time_step_s,
+            generation: self.generation,
+            parameters: Arc::clone(&self.parameters),
+        }
+    }
+}
+
+impl Session {
+    /// Begins to record: what is written from now on, and the plant as it is now. None when there is a
+    /// recorder already.
+    pub(crate) fn open_tap(&self) -> Option<(Arc<Tap>, Mark, Plant)> {
+        let words = record_words(self.model.dimensions());
+        let steps = (RING_BYTES / (8 * words)).clamp(RING_STEPS.0, RING_STEPS.1);
+        let ring = Arc::new(Ring::new(steps, words));
+        self.with_core(move |core| {
+            if core.tap.is_some() {
+                return None;
+            }
+            let ring = Arc::clone(core.ring.get_or_insert(ring));
+            let at = ring.written();
+            let (read, marks) = (AtomicU64::new(at), Mutex::default());
+            let tap = Arc::new(Tap { ring, read, marks, recorder: OnceLock::new() });
+            core.tap = Some(Arc::clone(&tap));
+            let mark = core.marked(at, MarkReason::Checkpoint);
+            Some((tap, mark, core.plant.clone()))
+        })
+    }
+
+    /// Marks the plant as it is.
+    pub(crate) fn checkpoint(&self) {
+        self.with_core(|core| core.mark(MarkReason::Checkpoint));
+    }
+
+    /// Ends the recording. The ring goes when nobody else reads it.
+    pub(crate) fn close_tap(&self) {
+        let former = self.with_core(|core| {
+            let tap = core.tap.take();
+            // One in the core, one in the tap.
+            let is_last = core.ring.as_ref().is_some_and(|ring| Arc::strong_count(ring) <= 2);
+            (tap, if is_last { core.ring.take() } else { None })
+        });
+        // Dropped here, not in the core's hands.
+        drop(former);
+    }
+}

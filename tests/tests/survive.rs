@@ -1,0 +1,219 @@
+//! Plants survive their server, ended or killed, and go on bit for bit.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use plantd_client::{Client, MatrixExt as _, diagonal, operating_point, v1, weights};
+use plantd_tests::server::ServerProcess;
+
+const SCENE: &str = r#"
+format = 1
+name = "arm"
+gravity = [0.0, -9.81, 0.0]
+
+[[frames]]
+name = "upper"
+joint = { type = "revolute", axis = [0.0, 0.0, 1.0] }
+body = { mass = 2.0, center_of_mass = [0.5, 0.0, 0.0], inertia = [0.1, 0.1, 0.1] }
+
+[[inputs]]
+name = "torque"
+coordinate = "upper"
+"#;
+
+fn serve(state: &Path) -> ServerProcess {
+    ServerProcess::start_with(|command| {
+        command.arg("--state-directory").arg(state).args(["--state-interval-s", "0.05"]);
+    })
+    .unwrap()
+}
+
+async fn step(client: &Client, id: &str, from: u64, count: u64) -> Vec<v1::State> {
+    let rows: Vec<_> = (from..from + count).map(|k| vec![(k as f64 * 0.1).sin()]).collect();
+    let u = Some(v1::Matrix::from_rows(&rows));
+    let request = v1::StepRequest { id: id.to_owned(), u, all_states: true, hold: 0 };
+    client.step(request).await.unwrap().states
+}
+
+async fn create(client: &Client, id: &str, model: &str) -> v1::PlantInfo {
+    let (id, model) = (id.to_owned(), model.to_owned());
+    let request = v1::CreatePlantRequest { id, model, ..Default::default() };
+    client.create_plant(request).await.unwrap()
+}
+
+/// A cart-pole in its own loop, of other gravity and another time step than it began with.
+async fn create_changed(client: &Client, id: &str) {
+    let upright = v1::initial_state::Form::OperatingPoint("upright".to_owned());
+    let request = v1::CreatePlantRequest {
+        id: id.to_owned(),
+        model: "cart-pole".to_owned(),
+        initial: Some(v1::InitialState { form: Some(upright) }),
+        ..Default::default()
+    };
+    client.create_plant(request).await.unwrap();
+    let gravity = v1::Parameter { path: "gravity[1]".to_owned(), value: -3.25 };
+    let change = v1::SetParametersRequest {
+        id: id.to_owned(),
+        parameters: vec![gravity],
+        time_step_s: 0.004,
+    };
+    client.set_parameters(change).await.unwrap();
+    let feedback = v1::SetFeedbackRequest {
+        id: id.to_owned(),
+        reference: Some(v1::set_feedback_request::Reference::Point(operating_point("upright"))),
+        weights: Some(weights(diagonal([10.0, 100.0, 1.0, 1.0]), diagonal([0.1]))),
+        mode: v1::FeedbackMode::Add.into(),
+        ..Default::default()
+    };
+    client.set_feedback(feedback).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_server_that_was_ended_has_its_plants_again() {
+    let state = tempfile::tempdir().unwrap();
+    let mut server = serve(state.path());
+    let client = server.client().await;
+    client.create_model(SCENE).await.unwrap();
+    create(&client, "arm", "arm").await;
+    let start = client.snapshot("arm").await.unwrap();
+    create_changed(&client, "changed").await;
+    create(&client, "gone", "pendulum").await;
+    for id in ["arm", "changed", "gone"] {
+        step(&client, id, 0, 150).await;
+    }
+    client.delete_plant("gone").await.unwrap();
+    let ids = ["arm", "changed"];
+    let mut snapshots = Vec::new();
+    let mut plants = Vec::new();
+    for id in ids {
+        snapshots.push(client.snapshot(id).await.unwrap());
+        plants.push(client.get_plant(id).await.unwrap().plant.unwrap());
+    }
+    assert!(server.stop().unwrap().success());
+
+    // What the first server would have gone on with.
+    let mut expected = Vec::new();
+    for round in 0..2 {
+        let mut server = serve(state.path());
+        let client = server.client().await;
+        assert_eq!(client.list_plants().await.unwrap().len(), 2, "{}", server.log());
+        for (i, id) in ids.into_iter().enumerate() {
+            if round == 0 {
+                assert_eq!(client.snapshot(id).await.unwrap(), snapshots[i], "{id}");
+                let plant = client.get_plant(id).await.unwrap().plant.unwrap();
+                assert_eq!(plant.parameters, plants[i].parameters);
+                assert_eq!(plant.settings, plants[i].settings);
+                assert_eq!(plant.state, plants[i].state);
+                let mode = |plant: &v1::PlantInfo| plant.feedback.as_ref().map(|f| f.mode());
+                assert_eq!(mode(&plant), mode(&plants[i]));
+                expected.push(step(&client, id, 150, 50).await);
+            } else {
+                // The same from the state that the second server has saved.
+                client.restore(id, snapshots[i].clone()).await.unwrap();
+                assert_eq!(step(&client, id, 150, 50).await, expected[i], "{id}");
+            }
+        }
+        if round == 1 {
+            // The model that was uploaded is there, and the state to which a reset returns.
+            assert_eq!(client.get_model("arm").await.unwrap().inputs, ["torque"]);
+            client.reset("arm").await.unwrap();
+            assert_eq!(client.snapshot("arm").await.unwrap(), start);
+            client.reset("changed").await.unwrap();
+        }
+        assert!(server.stop().unwrap().success());
+    }
+}
+
+#[tokio::test]
+async fn the_trajectory_over_a_restart_is_the_uninterrupted_one() {
+    let mut whole = Vec::new();
+    for is_killed in [None, Some(false), Some(true)] {
+        let state = tempfile::tempdir().unwrap();
+        let mut server = serve(state.path());
+        let mut client = server.client().await;
+        create(&client, "free", "cart-pole").await;
+        create_changed(&client, "changed").await;
+        let ids = ["free", "changed"];
+        let mut states = [Vec::new(), Vec::new()];
+        for (i, id) in ids.into_iter().enumerate() {
+            states[i] = step(&client, id, 0, 100).await;
+        }
+        if let Some(is_killed) = is_killed {
+            for id in ids {
+                wait_until_saved(state.path(), id).await;
+            }
+            if is_killed {
+                server.kill().unwrap();
+            } else {
+                assert!(server.stop().unwrap().success());
+            }
+            server = serve(state.path());
+            client = server.client().await;
+        }
+        for (i, id) in ids.into_iter().enumerate() {
+            // A server that was killed had saved some state, not always the last one.
+            let plant = client.get_plant(id).await.unwrap().plant.unwrap();
+            let saved = plant.state.unwrap();
+            assert!(is_killed == Some(true) || saved.step == 100);
+            if let Some(before) = (saved.step as usize).checked_sub(1) {
+                assert_eq!(saved, states[i][before]);
+            }
+            states[i].truncate(saved.step as usize);
+            states[i].extend(step(&client, id, saved.step, 200 - saved.step).await);
+        }
+        match whole.is_empty() {
+            true => whole = states.to_vec(),
+            false => assert_eq!(states.to_vec(), whole, "killed: {is_killed:?}"),
+        }
+        drop(server);
+    }
+}
+
+/// Waits until there is a file of a plant.
+async fn wait_until_saved(state: &Path, id: &str) {
+    let path = state.join(id).with_extension("plant");
+    let started = Instant::now();
+    while !path.exists() {
+        assert!(started.elapsed() < Duration::from_secs(30), "{} is not there", path.display());
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+#[tokio::test]
+async fn broken_files_are_named_and_left_alone() {
+    let state = tempfile::tempdir().unwrap();
+    let mut server = serve(state.path());
+    let client = server.client().await;
+    for id in ["a", "b", "c", "d"] {
+        create(&client, id, "pendulum").await;
+        step(&client, id, 0, 10).await;
+    }
+    assert!(server.stop().unwrap().success());
+    let path = |id: &str| state.path().join(id).with_extension("plant");
+    let good = std::fs::read(path("b")).unwrap();
+    let mut flipped = good.clone();
+    flipped[good.len() / 2] ^= 4;
+    std::fs::write(path("b"), &flipped).unwrap();
+    std::fs::write(path("c"), &good[..good.len() / 3]).unwrap();
+    // Another plant's file.
+    std::fs::copy(path("a"), path("d")).unwrap();
+    std::fs::write(state.path().join("e.plant"), "").unwrap();
+    std::fs::write(state.path().join("f.partial"), "cut").unwrap();
+
+    let mut server = serve(state.path());
+    let client = server.client().await;
+    let plants = client.list_plants().await.unwrap();
+    assert_eq!(plants.iter().map(|plant| plant.id.as_str()).collect::<Vec<_>>(), ["a"]);
+    for id in ["b", "c", "d", "e"] {
+        let name = format!("{id}.plant");
+        let log = server.log();
+        assert!(log.lines().any(|l| l.contains("not restored") && l.contains(&name)), "{log}");
+    }
+    // A new plant of that name lives, but does not take the place of the file.
+    create(&client, "b", "pendulum").await;
+    step(&client, "b", 0, 3).await;
+    assert!(server.stop().unwrap().success());
+    assert_eq!(std::fs::read(path("b")).unwrap(), flipped);
+    assert_eq!(std::fs::read(path("c")).unwrap(), &good[..good.len() / 3]);
+    assert!(server.log().contains("plant not saved"), "{}", server.log());
+}
