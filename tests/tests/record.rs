@@ -171,6 +171,58 @@ async fn a_feedback_in_the_loop_and_a_driver_are_replayed_by_what_acted() {
 }
 
 #[tokio::test]
+async fn disturbed_inputs_are_replayed_and_pushed_steps_left_out() {
+    use v1::fault_spec::{Kind, Start, Target};
+    let setup = setup(&[]).await;
+    let plant = setup.plant("cart-pole").await;
+    let (id, h) = (plant.id, plant.settings.unwrap().time_step_s);
+    let angle = v1::OutputChannel {
+        name: "angle".to_owned(),
+        source: Some(v1::output_channel::Source::Coordinate("theta".to_owned())),
+        noise: 0.01,
+        ..Default::default()
+    };
+    let channels = v1::Channels { seed: 3, outputs: vec![angle], ..Default::default() };
+    setup.client.set_channels(&id, channels).await.unwrap();
+    setup.record(&id, "pushed").await;
+    let input = setup.client.get_model("cart-pole").await.unwrap().inputs.remove(0);
+    let noise = v1::FaultSpec {
+        target: Some(Target::Input(input)),
+        kind: Some(Kind::Noise(v1::ExtraNoise { deviation: 1.0 })),
+        ..Default::default()
+    };
+    setup.client.inject_fault(&id, noise).await.unwrap();
+    let point = v1::FramePoint { frame: "pole".to_owned(), ..Default::default() };
+    let push = v1::Push { point: Some(point), force: vec![1.0, 0.0, 0.0], torque: Vec::new() };
+    let push = v1::FaultSpec {
+        kind: Some(Kind::Push(push)),
+        start: Some(Start::StartStep(20)),
+        duration_s: 5.0 * h,
+        ..Default::default()
+    };
+    setup.client.inject_fault(&id, push).await.unwrap();
+    setup.step(&id, 50, 1).await;
+    // Long enough for the snapshot that follows a push.
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    setup.step(&id, 30, 2).await;
+    setup.client.stop_recording("pushed").await.unwrap();
+    let (code, outcome) = replay(&setup.file("pushed"));
+    assert_eq!((code, &outcome["identical"]), (Some(0), &true.into()), "{outcome}");
+    let count = |name: &str| outcome[name].as_u64().unwrap();
+    assert_eq!((count("steps") + count("not_compared"), count("lost")), (80, 0), "{outcome}");
+    assert!(count("steps") >= 50 && count("not_compared") >= 5, "{outcome}");
+    // What the sensor said is in the file, and in the table.
+    let output = plantctl("export", &setup.file("pushed"), &["--csv", "-"]);
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.lines().next().unwrap().ends_with(",y(angle)"), "{text}");
+    for line in text.lines().skip(2) {
+        let cells: Vec<f64> = line.split(',').map(|cell| cell.parse().unwrap()).collect();
+        let (theta, measured) = (cells[3], cells[7]);
+        assert!(measured != theta && (measured - theta).abs() < 0.1, "{line}");
+    }
+}
+
+#[tokio::test]
 async fn nothing_is_lost_however_fast_somebody_steps() {
     let setup = setup(&[]).await;
     let id = setup.plant("pendulum").await.id;

@@ -400,6 +400,7 @@ fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecor
         model_digest: model.digest(),
         model: Some(v1::Model { plan, ..convert::model(session.model_name(), false, model, true) }),
         snapshot: mark.snapshot.to_bytes(),
+        outputs: session.channels().0.names.clone(),
         ..Default::default()
     }
 }

@@ -40,14 +40,13 @@ impl Session {
         let record = v1::PlantRecord {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             plant: Some(info),
-            model: None,
             model_digest: model.digest(),
             snapshot: plant.snapshot().to_bytes(),
             start_snapshot: self.start.to_bytes(),
             start_settings: Some(convert::settings_message(&self.start_settings)),
-            start_model: None,
             feedback: feedback.flatten(),
             channels: channels.map(Arc::unwrap_or_clone),
+            ..Default::default()
         };
         (record, model)
     }

@@ -69,6 +69,9 @@ impl Tap {
         if marks.len() < MARKS_MAX {
             marks.push_back(mark);
         }
+        if marks.len() == MARKS_MAX / 2 {
+            self.wake();
+        }
     }
 
     fn is_half_full(&self) -> bool {

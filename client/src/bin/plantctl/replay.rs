@@ -481,13 +481,15 @@ pub(crate) fn export(output: Output, file: &Path, csv: &Path) -> Result<()> {
     let mut sink = BufWriter::new(sink);
     let (states, inputs) = (state_names(&model), input_names(&model));
     let inputs = inputs.iter().map(|name| format!("u({name})"));
+    let outputs = record.outputs.iter().map(|name| format!("y({name})"));
     let names = ["step", "time_s"].into_iter().map(str::to_owned).chain(states.clone());
-    let head: Vec<_> = names.chain(inputs.clone()).map(|name| quoted(&name)).collect();
+    let names = names.chain(inputs.clone()).chain(outputs.clone());
+    let head: Vec<_> = names.map(|name| quoted(&name)).collect();
     writeln!(sink, "{}", head.join(",")).with_context(cannot_write)?;
-    let mut line = |state: &v1::State, u: &[f64]| {
-        let _ = write!(sink, "{},{}", state.step, state.time_s);
-        let state = padded(numbers(state), states.len());
-        for cell in state.into_iter().chain(padded(u.to_vec(), inputs.len())) {
+    let mut line = |state: &v1::State, u: &[f64], y: &[f64]| {
+        write!(sink, "{},{}", state.step, state.time_s)?;
+        let (u, y) = (padded(u.to_vec(), inputs.len()), padded(y.to_vec(), outputs.len()));
+        for cell in padded(numbers(state), states.len()).chain(u).chain(y) {
             match cell {
                 // Rust prints as many digits as bring the number back.
                 Some(number) => write!(sink, ",{number}")?,
@@ -498,11 +500,12 @@ pub(crate) fn export(output: Output, file: &Path, csv: &Path) -> Result<()> {
     };
     let mut steps = 0;
     if let Some(state) = record.plant.and_then(|plant| plant.state) {
-        line(&state, &[]).with_context(cannot_write)?;
+        line(&state, &[], &[]).with_context(cannot_write)?;
     }
     while let Some(entry) = recording.next_entry()? {
         let RecordingEntry::Step(step) = entry else { continue };
-        line(&step.state.clone().unwrap_or_default(), &step.u).with_context(cannot_write)?;
+        let y = step.outputs.as_ref().map_or(&[][..], |outputs| &outputs.y);
+        line(&step.state.clone().unwrap_or_default(), &step.u, y).with_context(cannot_write)?;
         steps += 1;
     }
     sink.flush().with_context(cannot_write)?;
