@@ -462,7 +462,7 @@ async fn a_table_has_the_numbers_of_the_steps() {
     let inputs = setup.client.get_model("cart-pole").await.unwrap().inputs;
     let head = format!("step,time_s,x,theta,p(x),p(theta),u({})", inputs[0]);
     assert_eq!(lines.next(), Some(head.as_str()));
-    assert!(lines.next().unwrap().starts_with("0,0,"));
+    assert!(lines.next().unwrap().starts_with("0,0.0,"));
     for (k, (line, state)) in (0..).zip(lines.by_ref().zip(&states)) {
         let cells: Vec<f64> = line.split(',').map(|cell| cell.parse().unwrap()).collect();
         let input = [noise(8, k, 0)];

@@ -308,6 +308,11 @@ impl Loop {
     /// Writes the step in `frame`, which is the ring's record `n`.
     fn step(&mut self, n: u64) -> Result<(), McapError> {
         let frame = &self.frame;
+        self.tap.set_read(n + 1);
+        if self.at == Some((frame.state.step, frame.generation)) {
+            // A watchdog has put the plant into another state after the step: the mark tells it.
+            return Ok(());
+        }
         let follows = |(step, generation)| {
             frame.state.step == step + 1
                 && frame.generation == generation
@@ -328,7 +333,6 @@ impl Loop {
         self.writer.step(&self.record, times)?;
         self.steps += 1;
         self.has_moved = true;
-        self.tap.set_read(n + 1);
         Ok(())
     }
 

@@ -8,53 +8,56 @@ use v1::set_feedback_request::Reference;
 
 use super::Session;
 use crate::convert;
-use crate::feedback::{Feedback, GuardBound, Trip};
+use crate::feedback::{GuardBound, InForce, Trip};
 use crate::parameters::Parameters;
 
 impl Session {
     /// Everything from which the plant can be made again but its models, and the model in force.
     pub fn saved(&self) -> (v1::PlantRecord, Arc<Model>) {
-        let rotations = convert::rotations(&self.model);
-        let (plant, parameters, feedback, channels) = self.with_core(move |core| {
-            let feedback = core.feedback.as_ref().map(|feedback| {
-                let info = feedback.info();
-                (feedback_request(feedback, &info, &rotations), info)
+        // No more than copies in the core's hands: a plant may be running.
+        let (mechanics, snapshot, state, parameters, feedback, channels) =
+            self.with_core(move |core| {
+                let feedback = core.feedback.as_ref();
+                let feedback = feedback.map(|f| (f.in_force(), f.guard.clone(), f.info()));
+                let channels =
+                    core.channels.as_ref().map(|channels| Arc::clone(&channels.declared));
+                let (mechanics, snapshot) = (core.mechanics(), core.plant.snapshot());
+                let parameters = Arc::clone(&core.parameters);
+                (mechanics, snapshot, core.state(), parameters, feedback, channels)
             });
-            let channels = core.channels.as_ref().map(|channels| Arc::clone(&channels.declared));
-            (core.plant.clone(), Arc::clone(&core.parameters), feedback, channels)
-        });
-        let (feedback, feedback_info) = feedback.unzip();
-        let settings = convert::settings_message(plant.settings());
+        let rotations = convert::rotations(&self.model);
+        let (feedback, feedback_info) = feedback
+            .map(|(law, guard, info)| (feedback_request(&law, &guard, &info, &rotations), info))
+            .unzip();
         let info = v1::PlantInfo {
             id: self.id.clone(),
             model: self.model_name.clone(),
-            settings: Some(settings),
-            state: Some(convert::plant_state(&plant)),
+            settings: Some(convert::settings_message(&mechanics.settings)),
+            state: Some(convert::state(&state.0, state.1)),
             link_open: self.link_open(),
             feedback: feedback_info,
             accuracy: self.accuracy,
             parameters: convert::parameters(&parameters),
             ..Default::default()
         };
-        let model = Arc::clone(plant.model());
         let record = v1::PlantRecord {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             plant: Some(info),
-            model_digest: model.digest(),
-            snapshot: plant.snapshot().to_bytes(),
+            model_digest: mechanics.model.digest(),
+            snapshot: snapshot.to_bytes(),
             start_snapshot: self.start.to_bytes(),
             start_settings: Some(convert::settings_message(&self.start_settings)),
             feedback: feedback.flatten(),
             channels: channels.map(Arc::unwrap_or_clone),
             ..Default::default()
         };
-        (record, model)
+        (record, mechanics.model)
     }
 
     /// Puts a plant of the session's model in its place, with the numbers that were changed in it.
     pub fn resume(self: &Arc<Self>, plant: Plant, parameters: Parameters) {
         self.with_core(move |core| {
-            core.plant.hold_input(&mut core.input);
+            plant.hold_input(&mut core.input);
             core.parameters = Arc::new(parameters);
             core.plant = plant;
         });
@@ -74,11 +77,12 @@ impl Session {
 /// The request that puts a feedback's present law in force as it stands; none for a law along a
 /// trajectory.
 fn feedback_request(
-    feedback: &Feedback,
+    in_force: &InForce,
+    guard: &[GuardBound],
     info: &v1::FeedbackInfo,
     rotations: &[u32],
 ) -> Option<v1::SetFeedbackRequest> {
-    if feedback.law.end.is_some() {
+    if in_force.law.end.is_some() {
         return None;
     }
     let finite = |value: f64| value.is_finite().then_some(value);
@@ -88,9 +92,9 @@ fn feedback_request(
         max: finite(bound.max),
     };
     Some(v1::SetFeedbackRequest {
-        reference: Some(Reference::Gain(feedback.in_force().gain(0, rotations))),
+        reference: Some(Reference::Gain(in_force.gain(0, rotations))),
         mode: info.mode,
-        guard: feedback.guard.iter().map(bound).collect(),
+        guard: guard.iter().map(bound).collect(),
         ..Default::default()
     })
 }

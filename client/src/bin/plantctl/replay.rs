@@ -487,12 +487,12 @@ pub(crate) fn export(output: Output, file: &Path, csv: &Path) -> Result<()> {
     let head: Vec<_> = names.map(|name| quoted(&name)).collect();
     writeln!(sink, "{}", head.join(",")).with_context(cannot_write)?;
     let mut line = |state: &v1::State, u: &[f64], y: &[f64]| {
-        write!(sink, "{},{}", state.step, state.time_s)?;
+        write!(sink, "{},{:?}", state.step, state.time_s)?;
         let (u, y) = (padded(u.to_vec(), inputs.len()), padded(y.to_vec(), outputs.len()));
         for cell in padded(numbers(state), states.len()).chain(u).chain(y) {
             match cell {
                 // Rust prints as many digits as bring the number back.
-                Some(number) => write!(sink, ",{number}")?,
+                Some(number) => write!(sink, ",{number:?}")?,
                 None => write!(sink, ",")?,
             }
         }
