@@ -17,7 +17,8 @@ const HEIGHT: f64 = 220.0;
 /// Room for numbers.
 const LEFT: f64 = 64.0;
 const BOTTOM: f64 = 24.0;
-const MARGIN: f64 = 8.0;
+const TOP: f64 = 8.0;
+const RIGHT: f64 = 16.0;
 
 const STYLE: &str = "\
 :root{color-scheme:light dark;--line:#0b62c4;--band:#2e8b57;--bad:#c62828;--grid:#8886}\
@@ -200,8 +201,8 @@ fn svg(time_s: &[f64], curve: &Curve, broken: Option<(f64, f64)>) -> String {
     let bounds = [&curve.low, &curve.high];
     let of_bounds = bounded.iter().flat_map(|&k| bounds.map(|bound| bound[k]));
     let values = Axis::over(shown.iter().map(|&k| curve.values[k]).chain(of_bounds)).padded();
-    let x = |t: f64| LEFT + times.fraction(t) * (WIDTH - LEFT - MARGIN);
-    let y = |v: f64| MARGIN + (1.0 - values.fraction(v)) * (HEIGHT - BOTTOM - MARGIN);
+    let x = |t: f64| LEFT + times.fraction(t) * (WIDTH - LEFT - RIGHT);
+    let y = |v: f64| TOP + (1.0 - values.fraction(v)) * (HEIGHT - BOTTOM - TOP);
     let mut svg = format!("<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" width=\"{WIDTH}\" role=\"img\">");
     for mark in values.marks() {
         let y = y(mark);
@@ -209,7 +210,7 @@ fn svg(time_s: &[f64], curve: &Curve, broken: Option<(f64, f64)>) -> String {
             svg,
             "<path class=\"grid\" d=\"M{LEFT} {y:.1}H{:.1}\"/><text x=\"{:.1}\" y=\"{:.1}\" \
              text-anchor=\"end\">{}</text>",
-            WIDTH - MARGIN,
+            WIDTH - RIGHT,
             LEFT - 6.0,
             y + 4.0,
             short(mark)
@@ -219,7 +220,7 @@ fn svg(time_s: &[f64], curve: &Curve, broken: Option<(f64, f64)>) -> String {
         let x = x(mark);
         let _ = write!(
             svg,
-            "<path class=\"grid\" d=\"M{x:.1} {MARGIN}V{:.1}\"/><text x=\"{x:.1}\" y=\"{:.1}\" \
+            "<path class=\"grid\" d=\"M{x:.1} {TOP}V{:.1}\"/><text x=\"{x:.1}\" y=\"{:.1}\" \
              text-anchor=\"middle\">{} s</text>",
             HEIGHT - BOTTOM,
             HEIGHT - 8.0,
