@@ -4,9 +4,11 @@
 //!  plant ── ring of steps, marks ──► recorder, a thread ──► NAME.mcap
 //! ```
 //!
-//! A step writes into the ring, whether somebody reads it or not; a recorder that does not follow loses
-//! steps and says so in the file. What happens between steps (a reset, changed parameters) comes as marks,
-//! each with a snapshot; so do checkpoints, every few seconds. A replay begins at any mark that has one.
+//! While a plant is recorded, its steps write into the ring. Those that somebody asks for, one by one, wait
+//! where the recorder does not follow; those of a plant that runs by itself do not, and the recorder counts
+//! what it has lost and says so in the file. What happens between steps (a reset, changed parameters) comes
+//! as marks, each with a snapshot; so do checkpoints, every few seconds. A replay begins at any mark that
+//! has one.
 
 mod file;
 mod recorder;

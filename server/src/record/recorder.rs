@@ -199,10 +199,11 @@ impl Loop {
     /// Writes until the recording is to end, or cannot go on.
     fn run(mut self) {
         let outcome = self.record();
-        let Self { session, reader, writer, shared, options, .. } = self;
+        let Self { session, tap, reader, writer, shared, options, .. } = self;
         // The ring goes with its last reader.
         drop(reader);
         session.close_tap();
+        tap.close();
         let finished = outcome.and_then(|why| {
             let file = writer.finish()?.into_inner().map_err(|error| error.into_error())?;
             file.file.sync_all()?;
@@ -238,7 +239,7 @@ impl Loop {
             self.drain()?;
             {
                 let mut info = self.shared.info();
-                (info.steps, info.lost) = (self.steps, self.lost);
+                (info.steps, info.lost) = (self.steps, self.reader.lost());
             }
             if is_ending {
                 return Ok(None);
@@ -267,26 +268,36 @@ impl Loop {
     fn drain(&mut self) -> Result<(), McapError> {
         // No more than there is now: who ends a recording shall not wait for a plant that runs.
         let until = self.tap.ring.written();
-        loop {
-            let next = self.reader.read_next().map(|(n, record)| {
-                self.frame.read(record);
-                n
-            });
-            let Some(n) = next.filter(|n| *n < until) else {
-                // A frame beyond `until` is not lost: it is written in its place below.
-                while let Some(mark) = self.tap.mark_before(next.unwrap_or(until)) {
-                    self.mark(&mark)?;
-                }
-                if let Some(n) = next {
-                    self.step(n)?;
-                }
-                return Ok(());
-            };
-            while let Some(mark) = self.tap.mark_before(n) {
+        while let Some((n, record)) = self.reader.read_next() {
+            self.frame.read(record);
+            self.take(n)?;
+            if n + 1 >= until {
+                break;
+            }
+        }
+        // Marks after lost steps wait for the step that comes next.
+        if self.reader.lost() == self.lost {
+            while let Some(mark) = self.tap.mark_before(until) {
                 self.mark(&mark)?;
             }
-            self.step(n)?;
         }
+        Ok(())
+    }
+
+    /// Writes the step in `frame`, the ring's record `n`, and what was before it.
+    fn take(&mut self, n: u64) -> Result<(), McapError> {
+        let is_lost = self.reader.lost() > self.lost;
+        if is_lost {
+            self.break_off(MarkReason::Gap)?;
+        }
+        while let Some(mark) = self.tap.mark_before(n) {
+            // From one among lost steps nothing follows.
+            if !is_lost || mark.at == n {
+                self.mark(&mark)?;
+            }
+        }
+        self.tap.set_read(n + 1);
+        self.step()
     }
 
     fn mark(&mut self, mark: &Mark) -> Result<(), McapError> {
@@ -305,25 +316,22 @@ impl Loop {
         Ok(())
     }
 
-    /// Writes the step in `frame`, which is the ring's record `n`.
-    fn step(&mut self, n: u64) -> Result<(), McapError> {
+    /// Writes the step in `frame`.
+    fn step(&mut self) -> Result<(), McapError> {
         let frame = &self.frame;
-        self.tap.set_read(n + 1);
-        if self.at == Some((frame.state.step, frame.generation)) {
+        let now = (frame.state.step, frame.generation);
+        if self.at == Some(now) {
             // A watchdog has put the plant into another state after the step: the mark tells it.
             return Ok(());
         }
-        let follows = |(step, generation)| {
-            frame.state.step == step + 1
-                && frame.generation == generation
-                && frame.timing.flags & Timing::PUSHED == 0
-        };
-        let is_lost = self.reader.lost() > self.lost;
-        if is_lost || self.at.is_some_and(|at| !follows(at)) {
-            self.break_off(is_lost)?;
-        }
-        if self.at.is_some() {
-            self.at = Some((self.frame.state.step, self.frame.generation));
+        let is_pushed = frame.timing.flags & Timing::PUSHED != 0;
+        let follows = |(step, generation)| now == (step + 1, generation) && !is_pushed;
+        if let Some(at) = self.at {
+            if follows(at) {
+                self.at = Some(now);
+            } else {
+                self.break_off(MarkReason::Disturbance)?;
+            }
         }
         let times = Times {
             log_ns: self.clock.now_ns(self.frame.timing.ended_ns),
@@ -337,9 +345,8 @@ impl Loop {
     }
 
     /// Notes that the step in `frame` does not follow from what was written.
-    fn break_off(&mut self, is_lost: bool) -> Result<(), McapError> {
+    fn break_off(&mut self, reason: MarkReason) -> Result<(), McapError> {
         let lost = self.take_lost();
-        let reason = if is_lost { MarkReason::Gap } else { MarkReason::Disturbance };
         let step = self.frame.state.step.saturating_sub(1);
         let message = v1::MarkRecord { reason: reason.into(), step, lost, ..Default::default() };
         let times = Times { log_ns: self.clock.now_ns(0), plant_s: self.frame.time_s };
@@ -539,6 +546,47 @@ mod tests {
         assert_eq!(marks[0], gap);
         assert_eq!((marks[1].reason(), marks[1].step), (MarkReason::Checkpoint, total - 5));
         assert!(!marks[1].snapshot.is_empty() && marks.len() == 2);
+    }
+
+    #[test]
+    fn marks_among_lost_steps_are_lost_with_them() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("r.mcap");
+        let session = session();
+        let recorder = recorder(&session, &File::create(&path).unwrap());
+        let capacity = recorder.tap.ring.capacity();
+        session.checkpoint();
+        run(&session, 10);
+        session.checkpoint();
+        run(&session, 2 * capacity);
+        let total = 10 + 2 * capacity as u64;
+        // What is there is written, with a checkpoint at its end.
+        session.checkpoint();
+        recorder.run();
+        let (steps, marks) = entries(&path);
+        let lost = total - steps.len() as u64;
+        assert_eq!(*steps.last().unwrap(), total);
+        let marks: Vec<_> =
+            marks.iter().map(|mark| (mark.reason(), mark.step, mark.lost)).collect();
+        let (gap, checkpoint) = (MarkReason::Gap, MarkReason::Checkpoint);
+        assert_eq!(marks, [(gap, lost, lost), (checkpoint, total, 0)]);
+    }
+
+    #[test]
+    fn nobody_waits_twice_for_a_recorder_that_stands_still() {
+        let session = session();
+        let directory = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&session, &File::create(directory.path().join("r")).unwrap());
+        let capacity = recorder.tap.ring.capacity();
+        run(&session, capacity);
+        assert!(session.with_core(|core| core.full_tap().is_some()));
+        recorder.tap.wait();
+        assert!(session.with_core(|core| core.full_tap().is_none()));
+        // It goes on, and is waited for again.
+        recorder.drain().unwrap();
+        assert!(session.with_core(|core| core.full_tap().is_none()));
+        run(&session, capacity);
+        assert!(session.with_core(|core| core.full_tap().is_some()));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Where a recorder gets what it writes: the ring of steps, and marks of what happens between them.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::thread::Thread;
 use std::time::{Duration, Instant};
@@ -21,7 +21,7 @@ const RING_STEPS: (usize, usize) = (64, 8192);
 /// Marks that may wait to be written. Whoever resets a plant more often than that loses steps.
 const MARKS_MAX: usize = 256;
 /// Longest wait of a step for the recorder, and how often it looks.
-const WAIT_MAX: Duration = Duration::from_secs(5);
+const WAIT_MAX: Duration = Duration::from_millis(if cfg!(test) { 50 } else { 5000 });
 const WAIT_STEP: Duration = Duration::from_micros(100);
 
 /// The plant as it is between two steps.
@@ -42,6 +42,8 @@ pub(crate) struct Tap {
     pub(crate) ring: Arc<Ring>,
     /// Number of the record that the recorder reads next.
     read: AtomicU64,
+    /// A step has waited in vain; the next ones do not, until the recorder goes on.
+    is_stalled: AtomicBool,
     marks: Mutex<VecDeque<Mark>>,
     recorder: OnceLock<Thread>,
 }
@@ -50,6 +52,12 @@ impl Tap {
     /// Notes how far the recorder has come.
     pub(crate) fn set_read(&self, next: u64) {
         self.read.store(next, Ordering::Release);
+        self.is_stalled.store(false, Ordering::Release);
+    }
+
+    /// Nobody reads any more, and nobody shall wait.
+    pub(crate) fn close(&self) {
+        self.set_read(u64::MAX);
     }
 
     /// Names the thread that reads.
@@ -76,14 +84,17 @@ impl Tap {
 
     fn is_half_full(&self) -> bool {
         let waiting = self.ring.written().saturating_sub(self.read.load(Ordering::Acquire));
-        waiting > self.ring.capacity() as u64 / 2
+        waiting > self.ring.capacity() as u64 / 2 && !self.is_stalled.load(Ordering::Acquire)
     }
 
     /// Waits until the recorder has caught up: for steps that somebody asks for, one by one. A disk that
     /// does not answer holds nobody for ever; steps are lost then, and counted.
-    pub(super) fn wait(&self) {
+    pub(crate) fn wait(&self) {
         let started = Instant::now();
-        while self.is_half_full() && started.elapsed() < WAIT_MAX {
+        while self.is_half_full() {
+            if started.elapsed() > WAIT_MAX {
+                self.is_stalled.store(true, Ordering::Release);
+            }
             self.wake();
             std::thread::sleep(WAIT_STEP);
         }
@@ -99,7 +110,7 @@ impl Tap {
 
 impl Core {
     /// The recorder's tap, if there is one and a step had better wait for it.
-    pub(super) fn full_tap(&self) -> Option<Arc<Tap>> {
+    pub(crate) fn full_tap(&self) -> Option<Arc<Tap>> {
         self.tap.as_ref().filter(|tap| tap.is_half_full()).map(Arc::clone)
     }
 
@@ -137,8 +148,13 @@ impl Session {
             }
             let ring = Arc::clone(core.ring.get_or_insert(ring));
             let at = ring.written();
-            let (read, marks) = (AtomicU64::new(at), Mutex::default());
-            let tap = Arc::new(Tap { ring, read, marks, recorder: OnceLock::new() });
+            let tap = Arc::new(Tap {
+                ring,
+                read: AtomicU64::new(at),
+                is_stalled: AtomicBool::new(false),
+                marks: Mutex::default(),
+                recorder: OnceLock::new(),
+            });
             core.tap = Some(Arc::clone(&tap));
             let mark = core.marked(at, MarkReason::Checkpoint);
             Some((tap, mark, core.plant.clone()))
