@@ -82,9 +82,17 @@ enum plantd_link_code {
                                               more than half a turn */
     PLANTD_LINK_CODE_SINGULAR_CONSTRAINTS = 14, /* detail_a: first constraint equation; detail_b: how
                                                    many; detail_value: reciprocal condition */
-    PLANTD_LINK_CODE_INCONSISTENT_CONSTRAINTS = 15 /* detail_a, detail_b: as above; detail_value: the
-                                                      largest violation */
+    PLANTD_LINK_CODE_INCONSISTENT_CONSTRAINTS = 15, /* detail_a, detail_b: as above; detail_value: the
+                                                       largest violation */
+    PLANTD_LINK_CODE_WATCHDOG = 16         /* a watchdog holds the plant; detail_a: its index;
+                                              detail_value: its quantity */
 };
+
+/* In code of a STATE: the plant runs by itself, the message answers no input, and sequence is that of the
+   input in force; no new input had come; there was no valid input. */
+#define PLANTD_LINK_LIVE 0x80000000u
+#define PLANTD_LINK_LIVE_INPUT_LATE 1u
+#define PLANTD_LINK_LIVE_INPUT_SAFE 2u
 
 /* Who holds a lease. */
 enum plantd_link_holder {

@@ -242,6 +242,44 @@ impl Client {
         answer.plant.ok_or(Error::Protocol("an answer without a plant"))
     }
 
+    /// Runs a plant: by the wall clock, as fast as possible, or in lockstep; with `steps` of 0 for good.
+    pub async fn run(&self, request: v1::RunRequest) -> Result<v1::RunInfo> {
+        let answer = self.plants().run(self.limited(request)).await?.into_inner();
+        answer.run.ok_or(Error::Protocol("an answer without what was asked"))
+    }
+
+    /// Pauses a plant between two steps; says how it is run, and in which state it stands.
+    pub async fn pause(&self, id: impl Into<String>) -> Result<v1::PauseResponse> {
+        let request = v1::PauseRequest { id: id.into() };
+        Ok(self.plants().pause(self.limited(request)).await?.into_inner())
+    }
+
+    /// Sets the bounds that protect a plant, in place of those before.
+    pub async fn set_safety(&self, request: v1::SetSafetyRequest) -> Result<()> {
+        self.plants().set_safety(self.limited(request)).await?;
+        Ok(())
+    }
+
+    /// What the loop of a plant that runs by itself has counted; `clear` begins anew.
+    pub async fn timing(
+        &self,
+        id: impl Into<String>,
+        clear: bool,
+    ) -> Result<v1::GetTimingResponse> {
+        let request = v1::GetTimingRequest { id: id.into(), clear };
+        Ok(self.plants().get_timing(self.limited(request)).await?.into_inner())
+    }
+
+    /// What happens to a plant besides its steps, from event `from` on; `None` means from now on.
+    pub async fn watch_events(
+        &self,
+        id: impl Into<String>,
+        from: Option<u64>,
+    ) -> Result<Answers<v1::WatchEventsResponse>> {
+        let (mut stub, request) = (self.plants(), v1::WatchEventsRequest { id: id.into(), from });
+        self.open(stub.watch_events(request)).await
+    }
+
     /// Gives a plant a reference with its regulator: for [`Client::watch_gains`], and for the plant's
     /// own loop if the request's mode says so. The gains hold when the answer comes.
     pub async fn set_feedback(&self, request: v1::SetFeedbackRequest) -> Result<v1::FeedbackInfo> {

@@ -9,7 +9,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use crate::channel::within;
 use crate::{Client, Error, Result};
 
-/// Holds the lease of a plant and steps it in lockstep.
+/// Holds the lease of a plant: steps it in lockstep, or gives inputs to one that runs by itself.
 ///
 /// The lease ends when the driver is dropped; [`Driver::close`] also waits for the server to have
 /// noticed, so that the next driver is sure to be let in.
@@ -19,6 +19,8 @@ pub struct Driver {
     responses: tonic::Streaming<v1::DriveResponse>,
     plant: v1::PlantInfo,
     sequence: u64,
+    /// When the last state was there, on the server's clock.
+    answers_ns: u64,
     step_timeout: Duration,
 }
 
@@ -43,7 +45,7 @@ impl Driver {
             return Err(Error::Protocol("Drive did not begin with `opened`"));
         };
         let plant = opened.plant.ok_or(Error::Protocol("`opened` without a plant"))?;
-        Ok(Self { requests, responses, plant, sequence: 0, step_timeout })
+        Ok(Self { requests, responses, plant, sequence: 0, answers_ns: 0, step_timeout })
     }
 
     /// The plant as it was when the driver opened it.
@@ -51,21 +53,48 @@ impl Driver {
         &self.plant
     }
 
-    /// Takes one step with the input `u` (input forces, then next prescribed positions).
+    /// Takes one step with the input `u` (input forces, then next prescribed positions). Of a plant that
+    /// runs by itself: waits for the first step on which the input acted, so that the same loop drives
+    /// both.
     ///
     /// # Errors
     /// [`Error::Step`] if the step was refused or failed: the plant is where it was and the driver
     /// goes on. Any other error means that the driver has lost the plant.
     pub async fn step(&mut self, u: &[f64]) -> Result<v1::DriveStep> {
         self.sequence += 1;
-        let input = v1::DriveInput { sequence: self.sequence, u: u.to_vec() };
+        self.send(u).await?;
+        let answer = answer(&mut self.responses, self.sequence);
+        let step = within(self.step_timeout, answer).await?;
+        self.answers_ns = step.clocks.map_or(0, |clocks| clocks.monotonic_ns);
+        Ok(step)
+    }
+
+    /// Gives a plant that runs by itself an input, which acts from its next step on, and does not wait.
+    pub async fn offer(&mut self, u: &[f64]) -> Result<()> {
+        self.sequence += 1;
+        self.send(u).await
+    }
+
+    /// Waits for the next state of a plant that runs by itself: the latest, with the number of those
+    /// that were passed over.
+    ///
+    /// # Errors
+    /// [`Error::Step`] if an input was refused. Any other error means that the driver has lost the plant.
+    pub async fn next(&mut self) -> Result<v1::DriveStep> {
+        let step = within(self.step_timeout, next_state(&mut self.responses)).await?;
+        self.answers_ns = step.clocks.map_or(0, |clocks| clocks.monotonic_ns);
+        Ok(step)
+    }
+
+    async fn send(&mut self, u: &[f64]) -> Result<()> {
+        let (sequence, answers_ns) = (self.sequence, self.answers_ns);
+        let input = v1::DriveInput { sequence, u: u.to_vec(), answers_ns };
         let request = v1::drive_request::Request::Input(input);
-        let sent = self.requests.send(v1::DriveRequest { request: Some(request) }).await;
-        if sent.is_err() {
+        match self.requests.send(v1::DriveRequest { request: Some(request) }).await {
+            Ok(()) => Ok(()),
             // The server has hung up; its last message says why.
-            return Err(self.ending().await);
+            Err(_) => Err(self.ending().await),
         }
-        within(self.step_timeout, answer(&mut self.responses, self.sequence)).await
     }
 
     /// Gives the lease back and waits until the server has done so.
@@ -87,6 +116,19 @@ impl Driver {
                 Err(error) => return error,
             }
         }
+    }
+}
+
+/// Waits for a state, whatever input acted.
+async fn next_state(responses: &mut tonic::Streaming<v1::DriveResponse>) -> Result<v1::DriveStep> {
+    use v1::drive_response::Response;
+    match responses.message().await?.ok_or(Error::StreamClosed)?.response {
+        Some(Response::Step(step)) => Ok(step),
+        Some(Response::Failure(v1::DriveFailure { failure, .. })) => {
+            let failure = failure.ok_or(Error::Protocol("a failed step without a cause"))?;
+            Err(Error::Step(Box::new(failure.into())))
+        }
+        _ => Err(Error::Protocol("Drive answered what was not asked")),
     }
 }
 

@@ -20,7 +20,7 @@ use std::time::Duration;
 
 use iceoryx2::identifiers::UniquePublisherId;
 use plantd_proto::link::{
-    Code, Domain, DomainError, Endpoint, Header, Kind, LinkNode, Message, ProcessIdentity,
+    Code, Domain, DomainError, Endpoint, Header, Kind, LIVE, LinkNode, Message, ProcessIdentity,
     default_root, monotonic_ns, random_instance,
 };
 
@@ -168,15 +168,38 @@ impl LinkDriver {
     /// When a step fails ([`LinkError::Step`]) the plant stays where it was, and the next call goes
     /// on from there. After [`LinkError::Timeout`] the step may still be taken; the step count of the
     /// next state tells.
+    ///
+    /// Of a plant that runs by itself it waits for the latest state on which the input acted, so that
+    /// the same loop drives both.
     pub fn step(&mut self, u: &[f64]) -> Result<StateView<'_>, LinkError> {
+        self.offer(u)?;
+        self.wait_for_answer(after(self.options.timeout))?;
+        Ok(self.state())
+    }
+
+    /// Gives a plant that runs by itself an input, which acts from its next step on, and does not wait.
+    pub fn offer(&mut self, u: &[f64]) -> Result<(), LinkError> {
         let expected = self.last.input_len();
         if u.len() != expected {
             return Err(LinkError::Dimension { expected, actual: u.len() });
         }
         self.sequence += 1;
-        let header = Header { kind: Kind::Input as u32, sequence: self.sequence, ..self.header };
+        let header = Header {
+            kind: Kind::Input as u32,
+            sequence: self.sequence,
+            detail_a: self.last.stamp_ns,
+            ..self.header
+        };
         self.endpoint.send(header, &[u], self.server_poll_end_ns)?;
-        self.wait_for_answer(after(self.options.timeout))?;
+        Ok(())
+    }
+
+    /// Waits for the next state of a plant that runs by itself, whatever input acted: the latest.
+    pub fn next_state(&mut self) -> Result<StateView<'_>, LinkError> {
+        let seen = self.last.stamp_ns;
+        while self.last.stamp_ns == seen || self.last.code & LIVE == 0 {
+            self.wait_for(after(self.options.timeout), |answer, _| answer.code & LIVE != 0)?;
+        }
         Ok(self.state())
     }
 
@@ -309,10 +332,19 @@ impl LinkDriver {
     }
 
     fn wait_for_answer(&mut self, deadline_ns: u64) -> Result<(), LinkError> {
+        self.wait_for(deadline_ns, |answer, sequence| answer.sequence == sequence)
+    }
+
+    /// Waits for a message that is `wanted`; given are its header and the number of the last input.
+    fn wait_for(
+        &mut self,
+        deadline_ns: u64,
+        wanted: impl Fn(&Header, u64) -> bool,
+    ) -> Result<(), LinkError> {
         loop {
             let check_ns = (monotonic_ns() + CHECK_PERIOD_NS).min(deadline_ns);
             while let Some(message) = self.endpoint.receive(check_ns)? {
-                if self.is_answer(&message)? {
+                if self.is_answer(&message, &wanted)? {
                     return Ok(());
                 }
             }
@@ -325,7 +357,11 @@ impl LinkDriver {
 
     /// Whether a message answers the last input. The server's messages reach all drivers, and
     /// answers that came too late are still there.
-    fn is_answer(&mut self, message: &Message) -> Result<bool, LinkError> {
+    fn is_answer(
+        &mut self,
+        message: &Message,
+        wanted: impl Fn(&Header, u64) -> bool,
+    ) -> Result<bool, LinkError> {
         let answer = *message.user_header();
         if answer.server != self.header.server {
             return Err(LinkError::ServerRestarted);
@@ -335,12 +371,15 @@ impl LinkDriver {
             let is_deleted = answer.code == Code::PlantDeleted as u32;
             return Err(LinkError::Closed { is_deleted });
         }
-        if answer.driver != self.header.driver || answer.sequence != self.sequence {
+        if answer.driver != self.header.driver {
             return Ok(false);
         }
-        if kind != Some(Kind::State) {
+        if kind == Some(Kind::Failure) && answer.sequence == self.sequence {
             self.server_poll_end_ns = answer.poll_end_ns();
             return Err(error::from_failure(&answer));
+        }
+        if kind != Some(Kind::State) || !wanted(&answer, self.sequence) {
+            return Ok(false);
         }
         self.note_state(&answer, message.payload())?;
         Ok(true)

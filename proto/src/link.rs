@@ -23,6 +23,11 @@
 //!    A failed step leaves the plant as it was, and the conversation goes on.
 //! 3. The driver sends [`Kind::Detach`], or dies: the server notices and takes the lease back.
 //!
+//! While the plant runs by itself (`Run` of `PlantService`), inputs and states go their own ways: an input
+//! is not answered, the latest acts from the plant's next step on; each state is sent as a
+//! [`Kind::State`] with [`LIVE`] set in `code`, the latest wins. A paused plant in lockstep answers an
+//! input when it goes on.
+//!
 //! The server broadcasts; a driver ignores what carries another `driver` number than its own, except
 //! [`Kind::Closed`].
 //!
@@ -45,7 +50,7 @@ pub use domain::{
 };
 pub use endpoint::{Endpoint, Message, Wait};
 pub use header::{
-    Code, Field, HEADER_FIELDS, Header, Holder, Kind, LAYOUT_VERSION, MAGIC, POLL_FOREVER_NS,
-    SCHEMA_HASH,
+    Code, Field, HEADER_FIELDS, Header, Holder, Kind, LAYOUT_VERSION, LIVE, LIVE_INPUT_LATE,
+    LIVE_INPUT_SAFE, MAGIC, POLL_FOREVER_NS, SCHEMA_HASH,
 };
 pub use process::{ProcessIdentity, monotonic_ns, random_instance};

@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::limits::{LimitError, Limits};
 use crate::link::LinkConfig;
 use crate::priority::Priority;
+use crate::realtime::RealTimeSettings;
 
 /// Port of gRPC over TCP unless another one is given.
 pub const DEFAULT_PORT: u16 = 50051;
@@ -56,6 +57,8 @@ pub struct Config {
     pub log: LogConfig,
     /// Shared-memory links.
     pub link: LinkSettings,
+    /// Plants that follow the wall clock.
+    pub realtime: RealTimeSettings,
     /// Limits.
     pub limits: Limits,
 }
@@ -77,6 +80,7 @@ impl Default for Config {
             shutdown_grace_s: 5.0,
             log: LogConfig::default(),
             link: LinkSettings::default(),
+            realtime: RealTimeSettings::default(),
             limits: Limits::default(),
         }
     }

@@ -10,13 +10,16 @@ use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
     Plant, Precision, Scene, SceneError, Settings, Snapshot, State, StepReport,
 };
+use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
 use v1::initial_state::Form as InitialForm;
 use v1::point::Source as PointSource;
 use v1::weight::Form as WeightForm;
 
+use crate::frame::Timing;
 use crate::limits::{LimitExceeded, Limits};
 use crate::parameters::Parameters;
+use crate::realtime::utc_ns;
 use crate::status::Fault;
 use crate::workers::Abandoned;
 
@@ -163,6 +166,25 @@ pub fn outputs(y: &[f64], lost: &[f64]) -> Option<v1::Outputs> {
     let lost_channels = lost.iter().enumerate().filter(is_lost).map(|(index, _)| index as u32);
     let outputs = || v1::Outputs { y: y.to_vec(), lost: lost_channels.collect() };
     (!lost.is_empty()).then(outputs)
+}
+
+/// When a state was there; `monotonic_ns` 0 means now.
+pub fn clocks(plant_s: f64, monotonic_ns: u64) -> v1::Clocks {
+    let monotonic_ns = if monotonic_ns == 0 { self::monotonic_ns() } else { monotonic_ns };
+    v1::Clocks { plant_s, monotonic_ns, utc_ns: utc_ns(monotonic_ns) }
+}
+
+/// Times of a step in the plant's own loop; none in lockstep.
+pub fn step_timing(timing: &Timing) -> Option<v1::StepTiming> {
+    (timing.ended_ns != 0).then_some(v1::StepTiming {
+        due_ns: timing.due_ns,
+        began_ns: timing.began_ns,
+        ended_ns: timing.ended_ns,
+        input_sequence: timing.input_sequence,
+        input_age_ns: timing.input_age_ns,
+        input_late: timing.flags & Timing::LATE != 0,
+        input_safe: timing.flags & Timing::SAFE != 0,
+    })
 }
 
 /// Settings as a message.

@@ -19,6 +19,7 @@ use crate::limits::{LimitExceeded, Limits};
 use crate::link::{LinkError, LinkHost, LinkInfo};
 use crate::metrics::Metrics;
 use crate::priority::Priority;
+use crate::realtime::{RealTime, RealTimeSettings};
 use crate::record::Recordings;
 use crate::session::Session;
 use crate::state::StateDirectory;
@@ -50,6 +51,7 @@ pub struct Hub {
     pub recordings: Option<Recordings>,
     /// Directory in which plants survive the server.
     pub state: Option<StateDirectory>,
+    realtime: Arc<RealTime>,
     links: Option<Arc<LinkHost>>,
     plants: Mutex<BTreeMap<String, Arc<Session>>>,
 }
@@ -60,9 +62,11 @@ impl Hub {
         limits: Limits,
         worker_count: usize,
         priority: Priority,
+        realtime: RealTimeSettings,
         links: Option<LinkHost>,
     ) -> Self {
         let metrics = Arc::new(Metrics::default());
+        let realtime = RealTime::new(realtime, &metrics);
         Self {
             workers: Workers::new("worker", worker_count, limits.queued_jobs, priority),
             attendants: Workers::new(
@@ -86,6 +90,7 @@ impl Hub {
             ending: CancellationToken::new(),
             recordings: None,
             state: None,
+            realtime,
             links: links.map(Arc::new),
             plants: Mutex::default(),
             limits,
@@ -125,7 +130,8 @@ impl Hub {
         let id = if id.is_empty() { free_id(&plants) } else { id };
         self.admit(&plants, &id)?;
         let metrics = Arc::clone(&self.metrics);
-        let session = Session::new(id.clone(), model_name, plant, accuracy, metrics);
+        let realtime = Arc::clone(&self.realtime);
+        let session = Session::new(id.clone(), model_name, plant, accuracy, metrics, realtime);
         plants.insert(id, Arc::clone(&session));
         self.metrics.set_plants(plants.len());
         Ok(session)
@@ -143,6 +149,7 @@ impl Hub {
             if let Some(links) = &hub.links {
                 links.close(session.id());
             }
+            session.pause();
             let mut plants = hub.plants();
             plants.remove(session.id());
             hub.metrics.set_plants(plants.len());
@@ -219,6 +226,8 @@ impl Hub {
         if let Some(recordings) = &self.recordings {
             recordings.stop_all();
         }
+        let plants: Vec<Arc<Session>> = self.plants().values().cloned().collect();
+        plants.iter().for_each(|session| session.pause());
     }
 
     fn plants(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Session>>> {

@@ -27,6 +27,7 @@ pub mod metrics;
 pub mod metrics_http;
 pub mod parameters;
 pub mod priority;
+pub mod realtime;
 pub mod record;
 pub mod regulator;
 pub mod ring;

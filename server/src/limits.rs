@@ -62,6 +62,8 @@ limits! {
     models = 256 in 0..=1_000_000;
     /// Plants.
     plants = 1024 in 0..=1_000_000;
+    /// Plants that run by themselves at a time.
+    running_plants = 256 in 0..=1_000_000;
     /// Watch streams of one plant, and WatchGains streams.
     watchers_per_plant = 64 in 0..=1_000_000;
     /// Numbers held in the queues of all watchers together (8 bytes each).

@@ -11,21 +11,32 @@
 //! | `plantd_step_failures_total` | counter | `reason` |
 //! | `plantd_step_duration_seconds` | histogram of one step in 64 | |
 //! | `plantd_watch_dropped_total` | counter | |
+//! | `plantd_running_plants` | gauge (plants that run by themselves) | |
+//! | `plantd_loop_lateness_seconds` | histogram: how late paced steps began | |
+//! | `plantd_loop_step_seconds` | histogram: how long steps of these plants took | |
+//! | `plantd_loop_input_age_seconds` | histogram: age of their inputs | |
+//! | `plantd_loop_round_trip_seconds` | histogram: from a state to its driver's answer | |
+//! | `plantd_loop_steps_total`, `_overruns_total`, `_slips_total` | counters | |
+//! | `plantd_loop_late_inputs_total`, `_safe_inputs_total` | counters | |
 //! | `plantd_rpcs_total` | counter of finished calls | `method`, `code` |
 //!
 //! No plant's id is ever a label: the number of time series is bounded.
 
 use std::fmt;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use prometheus_client::encoding::EncodeLabelSet;
+use prometheus_client::collector::Collector;
 use prometheus_client::encoding::text::encode;
-use prometheus_client::metrics::counter::Counter;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric as _};
+use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Registry, Unit};
 
+use crate::realtime::TimingCounts;
 use crate::session::DriverKind;
 
 /// Shortest step that the histogram tells apart, s, and its number of buckets, each twice as wide:
@@ -67,6 +78,10 @@ pub struct Metrics {
     step_failures: Family<ReasonLabel, Counter>,
     step_duration: Histogram,
     watch_dropped: Counter,
+    /// Plants that run by themselves.
+    pub(crate) running: Gauge,
+    /// What their loops count.
+    pub(crate) loops: Arc<TimingCounts>,
     rpcs: Family<RpcLabel, Counter>,
 }
 
@@ -95,6 +110,8 @@ impl Default for Metrics {
                 STEP_BUCKETS,
             )),
             watch_dropped: Counter::default(),
+            running: Gauge::default(),
+            loops: Arc::default(),
             rpcs: Family::default(),
             registry: Registry::default(),
         };
@@ -116,6 +133,21 @@ impl Default for Metrics {
             "States that slow watchers lost",
             metrics.watch_dropped.clone(),
         );
+        registry.register(
+            "running_plants",
+            "Plants that run by themselves",
+            metrics.running.clone(),
+        );
+        let loops = &metrics.loops;
+        for (name, help, histogram) in [
+            ("loop_lateness", "How late paced steps began", &loops.lateness),
+            ("loop_step", "Time of a step of a plant that runs by itself", &loops.step),
+            ("loop_input_age", "Age of the input of such a step", &loops.input_age),
+            ("loop_round_trip", "From a state to its driver's answer", &loops.round_trip),
+        ] {
+            registry.register_with_unit(name, help, Unit::Seconds, histogram.clone());
+        }
+        registry.register_collector(Box::new(LoopCounters(Arc::clone(loops))));
         registry.register("rpcs", "Calls that ended", metrics.rpcs.clone());
         Self { registry, ..metrics }
     }
@@ -202,6 +234,28 @@ impl Metrics {
             DriverKind::Drive => &self.by_driver[1],
             DriverKind::Link => &self.by_driver[2],
         }
+    }
+}
+
+/// The counters of the loops, which count by themselves.
+#[derive(Debug)]
+struct LoopCounters(Arc<TimingCounts>);
+
+impl Collector for LoopCounters {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let counts = &self.0;
+        for (name, help, count) in [
+            ("plantd_loop_steps", "Steps of plants that run by themselves", &counts.steps),
+            ("plantd_loop_overruns", "Steps that ended after the next was due", &counts.overruns),
+            ("plantd_loop_slips", "Times that a schedule was given up", &counts.slips),
+            ("plantd_loop_late_inputs", "Steps without a new input", &counts.late_inputs),
+            ("plantd_loop_safe_inputs", "Steps without a valid input", &counts.safe_inputs),
+        ] {
+            let counter = ConstCounter::new(count.load(Ordering::Relaxed));
+            let metric = encoder.encode_descriptor(name, help, None, counter.metric_type())?;
+            counter.encode(metric)?;
+        }
+        Ok(())
     }
 }
 

@@ -31,6 +31,70 @@ impl Priority {
     }
 }
 
+/// Scheduling of the threads that run paced plants.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Scheduling {
+    /// As every other thread.
+    #[default]
+    Normal,
+    /// SCHED_FIFO at this priority, 1 to 99: before all threads of the usual kind. Needs the right to it
+    /// (CAP_SYS_NICE, or `LimitRTPRIO` of a service).
+    Fifo(u8),
+}
+
+impl Scheduling {
+    /// Schedules the calling thread so. Where the system refuses, the thread stays as it is, and the log
+    /// says so.
+    pub fn apply(self) {
+        let Self::Fifo(priority) = self else { return };
+        if let Err(error) = schedule_first_come(priority) {
+            tracing::warn!(priority, %error, "paced plants run without SCHED_FIFO: steps may be late");
+        }
+    }
+}
+
+/// Lets the calling thread run on these processors alone; on all when there are none.
+pub fn allow_cpus(cpus: &[usize]) {
+    if cpus.is_empty() {
+        return;
+    }
+    let mut set = rustix::thread::CpuSet::new();
+    cpus.iter().filter(|cpu| **cpu < rustix::thread::CpuSet::MAX_CPU).for_each(|cpu| set.set(*cpu));
+    if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
+        tracing::warn!(?cpus, %error, "paced plants run on any processor");
+    }
+}
+
+/// Lets sleeps of the calling thread end as soon as the system can, not up to 50 µs later.
+pub fn sharpen_timers() {
+    let slack_ns = std::num::NonZeroU64::MIN;
+    if let Err(error) = rustix::thread::set_current_timer_slack(Some(slack_ns)) {
+        tracing::warn!(%error, "sleeps of paced plants may end 50 µs late");
+    }
+}
+
+/// Keeps all memory of the process, present and future, from being paged out.
+pub fn lock_memory() -> std::io::Result<()> {
+    use rustix::mm::{MlockAllFlags, mlockall};
+    Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)?)
+}
+
+#[cfg(target_os = "linux")]
+fn schedule_first_come(priority: u8) -> std::io::Result<()> {
+    let parameters = libc::sched_param { sched_priority: priority.into() };
+    // SAFETY: the call reads `parameters`, which lives until it returns; 0 is the calling thread.
+    match unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const parameters) } {
+        0 => Ok(()),
+        _ => Err(std::io::Error::last_os_error()),
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn schedule_first_come(_: u8) -> std::io::Result<()> {
+    Err(std::io::ErrorKind::Unsupported.into())
+}
+
 #[cfg(target_os = "linux")]
 fn schedule_when_idle() -> std::io::Result<()> {
     let parameters = libc::sched_param { sched_priority: 0 };

@@ -98,8 +98,13 @@ impl RunningServer {
         let links = config.link.host_config().map(LinkHost::new).transpose();
         let links = links.context("shared-memory links (turn them off with `--link off`)")?;
         let link_root = config.link.host_config().filter(|_| links.is_some()).map(|link| link.root);
-        let mut hub =
-            Hub::new(config.limits.clone(), config.worker_count(), config.worker_priority, links);
+        let mut hub = Hub::new(
+            config.limits.clone(),
+            config.worker_count(),
+            config.worker_priority,
+            config.realtime.clone(),
+            links,
+        );
         if let Some(path) = &config.state_directory {
             let state = StateDirectory::open(path);
             hub.state = Some(state.with_context(|| format!("plants in {}", path.display()))?);

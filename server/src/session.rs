@@ -4,31 +4,44 @@
 //! out of it, which takes microseconds; energies, linearizations and gains are computed on copies.
 
 mod core;
+mod gate;
 mod saved;
 pub(crate) mod tap;
 
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
+use std::time::{Duration, Instant};
 
 use plantd_models::{
     Initial, InitialError, Linearization, Model, Plant, Settings, Snapshot, SnapshotError, State,
     StepError, StepReport,
 };
+use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1::{self, MarkReason};
 use tokio::sync::watch::{self, Receiver};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
 use crate::feedback::{Feedback, InForce, Law};
-use crate::frame::Frame;
+use crate::frame::{Frame, record_words};
 use crate::limits::{LimitExceeded, Limits};
 use crate::metrics::Metrics;
 use crate::parameters::{self, ChangeError, Parameters};
+use crate::realtime::event::{EventKind, Events};
+use crate::realtime::slot::Arrival;
+use crate::realtime::watchdog::{Safety, Trip, WatchdogAction};
+use crate::realtime::{Act, Handle, Live, Pace, RealTime, RunSettings, Runner, Stop, TimingCounts};
 use crate::regulator::Spec;
+use crate::ring::{Reader, Ring};
 use crate::status::{Fault, step_error_reason};
 use crate::watch::{Subscription, Watchers};
 
 pub use self::core::{Core, Mechanics};
+use self::gate::Gate;
+
+/// Records that the ring of a plant keeps: a quarter of a second at 1 kHz.
+const RING_RECORDS: usize = 256;
+/// Pause between two looks for a core that a loop is about to put back.
+const PUT_BACK_PERIOD: Duration = Duration::from_micros(50);
 
 /// One step in this many is timed for the histogram of step times.
 const TIMED_STEP_INTERVAL: u64 = 64;
@@ -62,7 +75,8 @@ impl DriverKind {
         }
     }
 
-    fn from_code(code: u8) -> Option<Self> {
+    /// The kind with that number, 0 for none.
+    pub fn from_code(code: u8) -> Option<Self> {
         match code {
             1 => Some(Self::Step),
             2 => Some(Self::Drive),
@@ -89,6 +103,51 @@ pub enum DriveError {
     /// The step failed; the plant is where it was.
     #[error(transparent)]
     Step(#[from] StepError),
+    /// The plant takes its steps in a loop of its own.
+    #[error("the plant runs by itself")]
+    Running,
+    /// The plant is paused, and this driver waits until it may go on.
+    #[error("the plant is paused")]
+    Paused,
+    /// The plant keeps a speed, and the next step is due later, ns on the monotonic clock.
+    #[error("the next step is due later")]
+    NotDue(u64),
+    /// A watchdog holds the plant.
+    #[error("a watchdog holds the plant")]
+    Frozen(Trip),
+    /// A watchdog took the lease away.
+    #[error("a watchdog took the lease away")]
+    Revoked,
+}
+
+/// Where the core is.
+enum Place {
+    /// Here, for whoever holds the lock.
+    Rest(Box<Core>),
+    /// In a loop.
+    Running { key: u64, handle: Handle },
+}
+
+/// How a plant is being run, in short.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RunStatus {
+    /// Who decides when it takes a step.
+    pub pace: Pace,
+    /// It may take steps.
+    pub is_running: bool,
+    /// Number of the last lease that a watchdog has taken away.
+    pub revoked: u64,
+}
+
+/// How a plant is being run.
+#[derive(Clone, Debug, Default)]
+pub struct Run {
+    /// How.
+    pub settings: RunSettings,
+    /// It may take steps.
+    pub is_running: bool,
+    /// Why it stands still although nobody has paused it.
+    pub stopped_by: Option<v1::Failure>,
 }
 
 /// A plant as it is, to be shown.
@@ -116,7 +175,24 @@ pub struct Session {
     start_settings: Settings,
     /// Why the method is as it is, if it was chosen by a tolerance.
     accuracy: Option<v1::Accuracy>,
-    core: Mutex<Core>,
+    place: Mutex<Place>,
+    /// How the plant is run; never held while a loop is waited for.
+    run: Mutex<Run>,
+    /// Held by whoever changes how the plant is run.
+    changing_run: Mutex<()>,
+    run_status: watch::Sender<RunStatus>,
+    /// When the driver of a plant in lockstep may step.
+    gate: Gate,
+    /// Made when the plant runs by itself for the first time.
+    live: OnceLock<Arc<Live>>,
+    realtime: Arc<RealTime>,
+    events: Arc<Events>,
+    /// Counts the leases.
+    leases: AtomicU64,
+    /// Number of the lease under which inputs come; 0 for none.
+    input_lease: AtomicU64,
+    /// Number of the last lease that was taken away.
+    revoked: AtomicU64,
     /// Held by whoever replaces the plant; taken before the core's lock.
     replacing: Mutex<()>,
     /// The feedback's law for watchers of gains.
@@ -139,7 +215,9 @@ impl Session {
         plant: Plant,
         accuracy: Option<v1::Accuracy>,
         metrics: Arc<Metrics>,
+        realtime: Arc<RealTime>,
     ) -> Arc<Self> {
+        let events = Arc::new(Events::default());
         Arc::new(Self {
             id,
             model_name,
@@ -148,7 +226,17 @@ impl Session {
             start_settings: *plant.settings(),
             accuracy,
             model: Arc::clone(plant.model()),
-            core: Mutex::new(Core::new(plant)),
+            place: Mutex::new(Place::Rest(Box::new(Core::new(plant, Arc::clone(&events))))),
+            run: Mutex::new(Run { is_running: true, ..Run::default() }),
+            changing_run: Mutex::default(),
+            run_status: watch::Sender::new(RunStatus { is_running: true, ..RunStatus::default() }),
+            gate: Gate::default(),
+            live: OnceLock::new(),
+            realtime,
+            events,
+            leases: AtomicU64::new(0),
+            input_lease: AtomicU64::new(0),
+            revoked: AtomicU64::new(0),
             replacing: Mutex::default(),
             in_force: watch::Sender::new(None),
             is_recomputing: AtomicBool::new(false),
@@ -287,7 +375,15 @@ impl Session {
             .compare_exchange(0, kind.code(), Ordering::AcqRel, Ordering::Acquire)
             .map_err(|code| LeaseHeld { by: DriverKind::from_code(code).unwrap_or(kind) })?;
         self.metrics.driver_started(kind);
-        Ok(Lease { session: Arc::clone(self), kind, untimed_steps: 0 })
+        let number = self.leases.fetch_add(1, Ordering::Relaxed) + 1;
+        let lease = Lease { session: Arc::clone(self), kind, number, untimed_steps: 0 };
+        if kind != DriverKind::Step {
+            self.with_core(move |core| {
+                core.note(EventKind::DriverAttached, kind.code().into(), 0.0)
+            });
+            self.input_lease.store(number, Ordering::Release);
+        }
+        Ok(lease)
     }
 
     /// Subscribes to every `every`-th state. Starts with the state as it is, if its step counts.
@@ -305,11 +401,13 @@ impl Session {
         });
         let frames = vec![like; queue];
         // In the core's hands no step falls between the registration and the first frame.
-        self.with_core(move |core| {
+        let subscribed = self.with_core(move |core| {
             let subscription = Subscription::new(session, every, frames, watchers_max)?;
             subscription.offer(&core.published());
             Ok(subscription)
-        })
+        });
+        self.realtime.ring_pump();
+        subscribed
     }
 
     /// The watchers of the plant.
@@ -317,12 +415,33 @@ impl Session {
         &self.watchers
     }
 
-    /// Does something with the core, between two steps: keep it short.
+    /// Does something with the core, between two steps: keep it short. Not from within itself.
     pub fn with_core<R: Send + 'static>(
         &self,
-        act: impl FnOnce(&mut Core) -> R + Send + 'static,
+        mut act: impl FnOnce(&mut Core) -> R + Send + 'static,
     ) -> R {
-        act(&mut self.core())
+        loop {
+            let (key, handle) = match &mut *lock(&self.place) {
+                Place::Rest(core) => return act(core),
+                Place::Running { key, handle } => (*key, handle.clone()),
+            };
+            let (give, taken) = mpsc::sync_channel(1);
+            let in_loop: Act = Box::new(move |core| {
+                let outcome = match core {
+                    Some(core) => Ok(act(core)),
+                    None => Err(act),
+                };
+                // The receiver waits for it.
+                let _ = give.send(outcome);
+            });
+            handle.act(key, in_loop);
+            match taken.recv().expect("a loop does what it is told") {
+                Ok(outcome) => return outcome,
+                // The loop has just let go of the plant, and is about to put it back.
+                Err(back) => act = back,
+            }
+            std::thread::sleep(PUT_BACK_PERIOD);
+        }
     }
 
     /// Held by whoever replaces the plant or what belongs to its steps.
@@ -330,21 +449,18 @@ impl Session {
         lock(&self.replacing)
     }
 
-    fn core(&self) -> MutexGuard<'_, Core> {
-        lock(&self.core)
-    }
-
-    /// Replaces the plant by a copy of it that was put into another state. The caller holds
-    /// `replacing`.
-    fn replace_plant(self: &Arc<Self>, plant: Plant) {
+    /// Replaces the plant by a copy of it that was put into another state, which comes back with its
+    /// time. The caller holds `replacing`.
+    fn replace_plant(self: &Arc<Self>, plant: Plant) -> (State, f64) {
         let session = Arc::clone(self);
         // The former plant is dropped here, not in the core's hands.
-        drop(self.with_core(move |core| {
+        let (put, _former) = self.with_core(move |core| {
             let former = core.replace_plant(plant);
             core.mark(MarkReason::Reset);
             session.watchers.publish(&core.published());
-            former
-        }));
+            (core.state(), former)
+        });
+        put
     }
 
     /// Changes numbers of the scene, and the time step if one is given, between two steps: the state
@@ -493,6 +609,232 @@ impl Session {
     }
 }
 
+/// Running.
+impl Session {
+    /// Runs the plant, with new settings if some are given, until it is paused or `steps` are taken; 0
+    /// means without end.
+    pub fn run(
+        self: &Arc<Self>,
+        settings: Option<RunSettings>,
+        steps: u64,
+        running_max: u64,
+    ) -> Result<(), Fault> {
+        let _changing = lock(&self.changing_run);
+        if self.is_closed() {
+            return Err(Fault::plant_deleted(&self.id));
+        }
+        let settings = settings.unwrap_or_else(|| lock(&self.run).settings.clone());
+        let runs_by_itself = settings.pace != Pace::Lockstep;
+        let was_in_loop = self.halt();
+        let place = if runs_by_itself {
+            self.realtime.admit(running_max)?;
+            let assigned = self.realtime.assign(settings.pace);
+            Some(assigned.inspect_err(|_| self.realtime.leave()).map_err(Fault::no_loop)?)
+        } else {
+            None
+        };
+        let keep = runs_by_itself && lock(&self.run).settings.pace != Pace::Lockstep;
+        *lock(&self.run) = Run { settings: settings.clone(), is_running: true, stopped_by: None };
+        let speed = settings.speed;
+        let is_slowed = !runs_by_itself && speed > 0.0;
+        let period_s = if is_slowed { self.mechanics().settings.time_step_s / speed } else { 0.0 };
+        self.gate.open(if runs_by_itself { 0 } else { steps }, period_s);
+        self.with_core(move |core| {
+            core.release();
+            core.keep_loop_input(keep || was_in_loop && runs_by_itself);
+            if runs_by_itself {
+                core.note(EventKind::Started, 0, speed);
+            }
+        });
+        if let Some((key, handle)) = place {
+            self.ring();
+            self.enter_loop(key, handle, &settings, steps)?;
+        }
+        self.tell_run_status();
+        Ok(())
+    }
+
+    /// Pauses the plant between two steps.
+    pub fn pause(&self) {
+        let _changing = lock(&self.changing_run);
+        self.halt();
+        lock(&self.run).is_running = false;
+        self.gate.close();
+        self.with_core(|core| core.note(EventKind::Paused, 0, 0.0));
+        self.tell_run_status();
+    }
+
+    /// How the plant is being run, and the steps after which it pauses; 0 means never.
+    pub fn run_info(&self) -> (Run, u64) {
+        let run = lock(&self.run).clone();
+        let steps_left = match run.settings.pace {
+            Pace::Lockstep => self.gate.steps_left(),
+            _ => self.live().steps_left.load(Ordering::Relaxed),
+        };
+        (run, steps_left)
+    }
+
+    /// The same in short, and each change of it.
+    pub fn run_status(&self) -> Receiver<RunStatus> {
+        self.run_status.subscribe()
+    }
+
+    /// The plant takes its steps in a loop of its own, or would if it were not paused: inputs go there.
+    pub fn runs_by_itself(&self) -> bool {
+        self.run_status.borrow().pace != Pace::Lockstep
+    }
+
+    /// It runs in a loop at this moment.
+    pub(crate) fn is_running(&self) -> bool {
+        matches!(*lock(&self.place), Place::Running { .. })
+    }
+
+    pub(crate) fn is_paced(&self) -> bool {
+        self.run_status.borrow().pace == Pace::Paced
+    }
+
+    /// What the plant's own loop shares.
+    pub fn live(&self) -> &Arc<Live> {
+        self.live.get_or_init(|| Arc::new(Live::new(self.model.dimensions())))
+    }
+
+    /// What the loops of the server have counted.
+    pub(crate) fn loop_counts(&self) -> &Arc<TimingCounts> {
+        &self.realtime.counts
+    }
+
+    /// Number of the lease under which inputs come; 0 for none.
+    pub(crate) fn input_lease(&self) -> u64 {
+        self.input_lease.load(Ordering::Acquire)
+    }
+
+    /// Takes the lease away from the driver, who is told so when it acts next.
+    pub(crate) fn revoke_lease(&self) {
+        let lease = self.input_lease();
+        if lease != 0 {
+            self.revoked.store(lease, Ordering::Release);
+            self.tell_run_status();
+        }
+    }
+
+    /// The events of the plant.
+    pub fn events(&self) -> &Arc<Events> {
+        &self.events
+    }
+
+    /// Sets what protects the plant.
+    pub fn set_safety(self: &Arc<Self>, safety: Safety) -> Result<(), InitialError> {
+        let _replacing = lock(&self.replacing);
+        let resets = |action: WatchdogAction| action == WatchdogAction::Reset;
+        let needs_home = safety.watchdogs.iter().any(|dog| resets(dog.action))
+            || safety.on_step_failure.is_some_and(resets);
+        let home = if needs_home { Some(Box::new(self.plant_at_start()?)) } else { None };
+        // The former guard is dropped here, not in the core's hands.
+        drop(self.with_core(move |core| core.protect(safety, home)));
+        Ok(())
+    }
+
+    /// A copy of the plant, put back into the state in which the session began; changed parameters stay.
+    fn plant_at_start(&self) -> Result<Plant, InitialError> {
+        let mut plant = self.copy_plant();
+        if plant.restore(&self.start).is_err() {
+            // Of other parameters or another time step: what can be kept is x.
+            let State { step, q, p, v, .. } = self.start_state.clone();
+            plant.initialize(&Initial::Momentum { q, p, v })?;
+            plant.set_step_index(step);
+        }
+        Ok(plant)
+    }
+
+    /// The ring into which each step is written; made at the first call.
+    pub fn ring(&self) -> Arc<Ring> {
+        let words = record_words(self.model.dimensions());
+        let ring = Arc::new(Ring::new(RING_RECORDS, words));
+        self.with_core(move |core| Arc::clone(core.ring.get_or_insert(ring)))
+    }
+
+    /// A reader of the ring, from its last record on.
+    pub(crate) fn read_ring(&self) -> Reader {
+        let ring = self.ring();
+        let last = ring.written().saturating_sub(1);
+        Reader::from(ring, last)
+    }
+
+    /// Takes the plant out of its loop, if it is in one.
+    fn halt(&self) -> bool {
+        let (key, handle) = match &*lock(&self.place) {
+            Place::Rest(_) => return false,
+            Place::Running { key, handle } => (*key, handle.clone()),
+        };
+        match handle.stop(key) {
+            Some(core) => {
+                *lock(&self.place) = Place::Rest(core);
+                self.realtime.leave();
+            }
+            // The loop has just let go of it, and is about to put it back.
+            None => {
+                while self.is_running() {
+                    std::thread::sleep(PUT_BACK_PERIOD);
+                }
+            }
+        }
+        true
+    }
+
+    fn enter_loop(
+        self: &Arc<Self>,
+        key: u64,
+        handle: Handle,
+        settings: &RunSettings,
+        steps: u64,
+    ) -> Result<(), Fault> {
+        let pump = self.realtime.pump().map_err(Fault::no_loop)?;
+        let mut place = lock(&self.place);
+        let running = Place::Running { key, handle: handle.clone() };
+        match std::mem::replace(&mut *place, running) {
+            Place::Rest(core) => {
+                let runner = Runner::new(key, core, Arc::clone(self), settings, steps);
+                handle.run(runner);
+            }
+            // Nobody else starts loops while `changing_run` is held.
+            former @ Place::Running { .. } => *place = former,
+        }
+        drop(place);
+        pump.add(Arc::clone(self));
+        Ok(())
+    }
+
+    /// A loop lets go of the plant.
+    pub(crate) fn loop_ended(&self, core: Box<Core>, stop: Stop) {
+        let stopped_by = match stop {
+            Stop::StepsTaken => {
+                core.note(EventKind::StepsTaken, 0, 0.0);
+                None
+            }
+            Stop::Closed => None,
+            Stop::Fault(fault) => Some(fault.into()),
+        };
+        self.live().due_ns.store(0, Ordering::Relaxed);
+        {
+            let mut run = lock(&self.run);
+            run.is_running = false;
+            run.stopped_by = stopped_by;
+        }
+        self.realtime.leave();
+        *lock(&self.place) = Place::Rest(core);
+        self.tell_run_status();
+    }
+
+    fn tell_run_status(&self) {
+        let (pace, is_running) = {
+            let run = lock(&self.run);
+            (run.settings.pace, run.is_running)
+        };
+        let revoked = self.revoked.load(Ordering::Acquire);
+        self.run_status.send_replace(RunStatus { pace, is_running, revoked });
+    }
+}
+
 /// Why parameters were not changed.
 #[derive(Debug)]
 pub enum ParametersError {
@@ -545,6 +887,7 @@ impl From<ParametersError> for Fault {
 pub struct Lease {
     session: Arc<Session>,
     kind: DriverKind,
+    number: u64,
     untimed_steps: u64,
 }
 
@@ -579,7 +922,14 @@ impl Lease {
             return Err(DriveError::Closed);
         }
         let started = self.is_step_timed().then(Instant::now);
-        let mut core = self.session.core();
+        if self.is_revoked() {
+            return Err(DriveError::Revoked);
+        }
+        if self.kind != DriverKind::Step {
+            self.session.gate.pass()?;
+        }
+        let mut place = lock(&self.session.place);
+        let Place::Rest(core) = &mut *place else { return Err(DriveError::Running) };
         let outcome = core.step(u, linearization);
         let metrics = &self.session.metrics;
         if let Some(started) = started {
@@ -590,8 +940,13 @@ impl Lease {
                 core.write_ring();
                 self.session.watchers.publish(&core.published());
                 metrics.stepped(self.kind);
-                let (seen, full) = (look(&core), core.full_tap());
-                drop(core);
+                if let Some(trip) = core.take_trip()
+                    && trip.action == WatchdogAction::Disconnect
+                {
+                    self.session.revoke_lease();
+                }
+                let (seen, full) = (look(core), core.full_tap());
+                drop(place);
                 // Whoever steps a plant waits for its recorder; a plant that runs by itself does not.
                 if let Some(tap) = full {
                     tap.wait();
@@ -599,42 +954,61 @@ impl Lease {
                 Ok(seen)
             }
             Err(error) => {
-                metrics.step_failed(step_error_reason(&error));
-                Err(error.into())
+                if let DriveError::Step(error) = &error {
+                    metrics.step_failed(step_error_reason(error));
+                }
+                Err(error)
             }
         }
     }
 
-    /// Puts the plant back into the state in which the session began. Changed parameters stay changed.
-    pub fn reset(&mut self) -> Result<(), InitialError> {
-        let _replacing = lock(&self.session.replacing);
-        let mut plant = self.session.copy_plant();
-        if plant.restore(&self.session.start).is_err() {
-            // Of other parameters or another time step: what can be kept is x.
-            let State { step, q, p, v, .. } = self.session.start_state.clone();
-            plant.initialize(&Initial::Momentum { q, p, v })?;
-            plant.set_step_index(step);
+    /// Gives the plant's own loop an input, which acts from its next step on. `answers_ns` is when the
+    /// state was there that the input answers, 0 if that is not known.
+    pub fn offer(&mut self, sequence: u64, u: &[f64], answers_ns: u64) -> Result<(), DriveError> {
+        if self.session.is_closed() {
+            return Err(DriveError::Closed);
         }
-        self.session.replace_plant(plant);
+        if self.is_revoked() {
+            return Err(DriveError::Revoked);
+        }
+        self.session.model.check_input(u)?;
+        let (live, arrived_ns) = (self.session.live(), monotonic_ns());
+        live.slot.put(Arrival { lease: self.number, sequence, arrived_ns }, u);
+        for counts in [&live.counts, &*self.session.realtime.counts] {
+            counts.inputs.fetch_add(1, Ordering::Relaxed);
+            if answers_ns != 0 && answers_ns <= arrived_ns {
+                counts.round_trip.record(arrived_ns - answers_ns);
+            }
+        }
         Ok(())
     }
 
-    /// Puts the plant into a state, step 0.
-    pub fn initialize(&mut self, initial: &Initial) -> Result<(), InitialError> {
+    /// A watchdog has taken it away.
+    pub fn is_revoked(&self) -> bool {
+        self.session.revoked.load(Ordering::Acquire) >= self.number
+    }
+
+    /// Puts the plant back into the state in which the session began, and tells it. Changed parameters stay changed.
+    pub fn reset(&mut self) -> Result<(State, f64), InitialError> {
+        let _replacing = lock(&self.session.replacing);
+        let plant = self.session.plant_at_start()?;
+        Ok(self.session.replace_plant(plant))
+    }
+
+    /// Puts the plant into a state, step 0, and tells it.
+    pub fn initialize(&mut self, initial: &Initial) -> Result<(State, f64), InitialError> {
         let _replacing = lock(&self.session.replacing);
         let mut plant = self.session.copy_plant();
         plant.initialize(initial)?;
-        self.session.replace_plant(plant);
-        Ok(())
+        Ok(self.session.replace_plant(plant))
     }
 
     /// Puts the plant into the state of a snapshot: one of the same parameters and time step.
-    pub fn restore(&mut self, snapshot: &Snapshot) -> Result<(), SnapshotError> {
+    pub fn restore(&mut self, snapshot: &Snapshot) -> Result<(State, f64), SnapshotError> {
         let _replacing = lock(&self.session.replacing);
         let mut plant = self.session.copy_plant();
         plant.restore(snapshot)?;
-        self.session.replace_plant(plant);
-        Ok(())
+        Ok(self.session.replace_plant(plant))
     }
 
     fn is_step_timed(&mut self) -> bool {
@@ -646,8 +1020,14 @@ impl Lease {
 
 impl Drop for Lease {
     fn drop(&mut self) {
-        self.session.metrics.driver_ended(self.kind);
-        self.session.driver.store(0, Ordering::Release);
+        let (session, kind) = (&self.session, self.kind);
+        if kind != DriverKind::Step {
+            session.input_lease.store(0, Ordering::Release);
+            session
+                .with_core(move |core| core.note(EventKind::DriverLeft, kind.code().into(), 0.0));
+        }
+        session.metrics.driver_ended(kind);
+        session.driver.store(0, Ordering::Release);
     }
 }
 

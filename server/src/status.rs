@@ -18,6 +18,10 @@
 //! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED`, `FAULT_NOT_FOUND`, `RECORDING_NOT_FOUND` | ResourceInfo | no such thing, or deleted meanwhile |
 //! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS`, `RECORDING_EXISTS` | ResourceInfo | the name is taken |
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
+//! | FAILED_PRECONDITION | `RUNNING`, `PAUSED` | PreconditionFailure | the plant runs by itself, or is paused |
+//! | FAILED_PRECONDITION | `WATCHDOG`, `INPUT_LOST` | PreconditionFailure | the plant stands still because it left bounds, or had no valid input |
+//! | ABORTED | `LEASE_REVOKED` | | a watchdog has taken the lease away |
+//! | UNAVAILABLE | `LOOP_FAILED` | | the system gave no thread for plants that run |
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
 //! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
 //! | FAILED_PRECONDITION | `TOO_MANY_STEPS` | PreconditionFailure | second derivatives of a period of so many substeps take too much memory |
@@ -53,7 +57,8 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::limits::LimitExceeded;
-use crate::session::{DriveError, LeaseHeld};
+use crate::realtime::watchdog::Trip;
+use crate::session::{DriveError, LeaseHeld, Session};
 
 /// Longest text of one message, name or description, bytes. Statuses travel in trailers, of which
 /// clients accept about 8 KiB.
@@ -425,7 +430,48 @@ impl Fault {
         match error {
             DriveError::Closed => Self::plant_deleted(id),
             DriveError::Step(error) => error.into(),
+            DriveError::Running => Self::running(id),
+            DriveError::Paused | DriveError::NotDue(_) => {
+                Self::precondition("PAUSED", id, format!("plant `{id}` is paused"))
+            }
+            DriveError::Frozen(trip) => {
+                let why = format!(
+                    "a watchdog has stopped plant `{id}` at step {}: {} left its bounds",
+                    trip.step, trip.value
+                );
+                Self::precondition("WATCHDOG", id, why)
+            }
+            DriveError::Revoked => {
+                let why = format!("a watchdog has taken the lease of plant `{id}` away");
+                Self::new(Code::Aborted, "LEASE_REVOKED", why)
+            }
         }
+    }
+
+    /// The plant takes its steps in a loop of its own.
+    pub fn running(id: &str) -> Self {
+        let why = format!("plant `{id}` runs by itself: pause it first");
+        Self::precondition("RUNNING", id, why)
+    }
+
+    /// A watchdog has stopped the plant.
+    pub fn watchdog(session: &Session, trip: &Trip) -> Self {
+        Self::from_drive(DriveError::Frozen(*trip), session.id())
+    }
+
+    /// The plant was to stop without a valid input.
+    pub fn input_lost(id: &str) -> Self {
+        let why = format!("plant `{id}` has no valid input, and was to stop then");
+        Self::precondition("INPUT_LOST", id, why)
+    }
+
+    /// No thread for a loop.
+    pub fn no_loop(error: std::io::Error) -> Self {
+        Self::new(
+            Code::Unavailable,
+            "LOOP_FAILED",
+            format!("no thread for plants that run: {error}"),
+        )
     }
 }
 

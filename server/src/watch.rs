@@ -5,10 +5,12 @@
 //! queue the oldest frame is overwritten and counted. Without watchers this costs one load. A watcher
 //! takes its frame by swapping buffers, so the driver never waits for more than that.
 
+use std::future::poll_fn;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
 
-use tokio::sync::Notify;
+use futures::task::AtomicWaker;
 
 use crate::frame::{Frame, Published};
 use crate::limits::LimitExceeded;
@@ -56,7 +58,7 @@ impl Watchers {
 struct Slot {
     every: u64,
     cell: Mutex<Cell>,
-    filled: Notify,
+    filled: AtomicWaker,
 }
 
 /// A queue of frames, in memory that is there from the beginning.
@@ -103,7 +105,7 @@ impl Slot {
         cell.push(published);
         drop(cell);
         if was_empty {
-            self.filled.notify_one();
+            self.filled.wake();
         }
     }
 }
@@ -125,7 +127,7 @@ impl Subscription {
     ) -> Result<Self, LimitExceeded> {
         let frame = frames.first().cloned().unwrap_or_default();
         let cell = Mutex::new(Cell { frames, first: 0, count: 0, dropped: 0 });
-        let slot = Arc::new(Slot { every: every.max(1), cell, filled: Notify::new() });
+        let slot = Arc::new(Slot { every: every.max(1), cell, filled: AtomicWaker::new() });
         session.watchers().add(Arc::clone(&slot), watchers_max)?;
         session.metrics().watcher_started();
         Ok(Self { session, slot, frame, dropped: 0 })
@@ -142,10 +144,22 @@ impl Subscription {
 
     /// Waits for the next frame; returns it with the number of frames lost so far.
     pub async fn next(&mut self) -> (&Frame, u64) {
-        while !self.take() {
-            self.slot.filled.notified().await;
-        }
+        poll_fn(|context| self.poll_taken(context)).await;
         (&self.frame, self.dropped)
+    }
+
+    /// The next frame, with the number of frames lost so far.
+    pub fn poll_next(&mut self, context: &mut Context<'_>) -> Poll<(&Frame, u64)> {
+        self.poll_taken(context).map(|()| (&self.frame, self.dropped))
+    }
+
+    fn poll_taken(&mut self, context: &mut Context<'_>) -> Poll<()> {
+        if self.take() {
+            return Poll::Ready(());
+        }
+        self.slot.filled.register(context.waker());
+        // A frame may have come in between.
+        if self.take() { Poll::Ready(()) } else { Poll::Pending }
     }
 
     /// Fetches the frame in the slot, if it is a new one.

@@ -80,7 +80,8 @@ impl Drive {
     }
 
     async fn step(&mut self, sequence: u64, u: f64) -> DriveAnswer {
-        self.send(DriveMessage::Input(v1::DriveInput { sequence, u: vec![u] })).await;
+        self.send(DriveMessage::Input(v1::DriveInput { sequence, u: vec![u], answers_ns: 0 }))
+            .await;
         self.answer().await.unwrap()
     }
 }

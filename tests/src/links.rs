@@ -12,6 +12,7 @@ use plantd_models::{Model, Plant, Settings, builtin};
 use plantd_proto::link::{Domain, SHARED_MEMORY_DIRECTORY};
 use plantd_server::link::{LinkConfig, LinkHost};
 use plantd_server::metrics::Metrics;
+use plantd_server::realtime::{RealTime, RealTimeSettings};
 use plantd_server::session::Session;
 
 /// Longest wait for something that takes a fraction of a second.
@@ -67,7 +68,9 @@ impl LinkFixture {
 /// A session of a plant of a built-in model.
 pub fn new_session(model: &str) -> Result<Arc<Session>> {
     let plant = new_plant(model)?;
-    Ok(Session::new(PLANT.to_owned(), model.to_owned(), plant, None, Arc::new(Metrics::default())))
+    let metrics = Arc::new(Metrics::default());
+    let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
+    Ok(Session::new(PLANT.to_owned(), model.to_owned(), plant, None, metrics, realtime))
 }
 
 /// A plant of a built-in model.

@@ -10,6 +10,8 @@ use plantd_models::{
 use plantd_proto::v1;
 use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
 use plantd_server::limits::Limits;
+use plantd_server::metrics::Metrics;
+use plantd_server::realtime::{RealTime, RealTimeSettings};
 use plantd_server::regulator::{Constraints, Reference, Spec};
 use plantd_server::session::{DriverKind, Session};
 
@@ -154,7 +156,7 @@ fn steps_with_feedback_allocate_nothing() {
         (Mode::Guard, vec![bound(0.1)]),
     ] {
         let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("it starts");
-        let session = Session::new("a".to_owned(), "b".to_owned(), plant, None, Arc::default());
+        let session = new_session(plant);
         let spec = Spec {
             reference: Reference::Gain(stage(0)),
             weights: None,
@@ -193,7 +195,7 @@ fn steps_with_channels_allocate_nothing() {
     let model = Arc::new(Model::compile(&scene).expect("it compiles"));
     let d = model.dimensions();
     let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("it starts");
-    let session = Session::new("a".to_owned(), "b".to_owned(), plant, None, Arc::default());
+    let session = new_session(plant);
     let h = Settings::new(&model).time_step_s;
     let (coordinate, string) = (&model.coordinates()[0].name, &model.coordinates()[d.dynamic].name);
     let frame = &scene.frames.last().expect("it has frames").name;
@@ -254,6 +256,13 @@ fn steps_with_channels_allocate_nothing() {
     });
     assert_eq!(count, 0);
     assert!(session.faults().iter().all(|fault| fault.beginnings > 0));
+}
+
+/// A session around a plant.
+fn new_session(plant: Plant) -> Arc<Session> {
+    let metrics = Arc::new(Metrics::default());
+    let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
+    Session::new("a".to_owned(), "b".to_owned(), plant, None, metrics, realtime)
 }
 
 #[test]

@@ -136,6 +136,14 @@ pub enum StepFailure {
         /// Largest violation.
         violation: f64,
     },
+    /// A watchdog holds the plant.
+    #[error("watchdog {watchdog} holds the plant: its quantity is {value}")]
+    Watchdog {
+        /// Index of the watchdog.
+        watchdog: usize,
+        /// Value of its quantity.
+        value: f64,
+    },
 }
 
 /// Who drives a plant.
@@ -185,6 +193,7 @@ pub(super) fn from_failure(answer: &Header) -> LinkError {
         Some(Code::InconsistentConstraints) => {
             StepFailure::InconsistentConstraints { constraint: a, count: b, violation: value }
         }
+        Some(Code::Watchdog) => StepFailure::Watchdog { watchdog: a, value },
         Some(Code::Dimension) => return LinkError::Dimension { expected: a, actual: b },
         Some(Code::Sequence) => return LinkError::Sequence { expected: answer.detail_a },
         Some(Code::LeaseHeld) => return LinkError::LeaseHeld { by: holder(answer) },

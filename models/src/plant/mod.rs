@@ -507,7 +507,7 @@ impl Plant {
 
 impl Model {
     /// Refuses an input of the wrong length, or with a number that is not finite.
-    pub(crate) fn check_input(&self, u: &[f64]) -> Result<(), StepError> {
+    pub fn check_input(&self, u: &[f64]) -> Result<(), StepError> {
         let d = self.dimensions;
         if u.len() != d.input() {
             return Err(StepError::Dimension { expected: d.input(), actual: u.len() });

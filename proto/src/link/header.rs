@@ -8,6 +8,16 @@ pub const LAYOUT_VERSION: u32 = 4;
 /// First field of every header: `plnt` in ASCII, little-endian.
 pub const MAGIC: u32 = u32::from_le_bytes(*b"plnt");
 
+/// In `code` of a `State`: the plant runs by itself, and the message answers no input. `sequence` is that
+/// of the input in force.
+pub const LIVE: u32 = 1 << 31;
+
+/// In `code` of such a `State`: no new input had come since the step before.
+pub const LIVE_INPUT_LATE: u32 = 1;
+
+/// In `code` of such a `State`: there was no valid input, and what the plant's policy says was in force.
+pub const LIVE_INPUT_SAFE: u32 = 2;
+
 /// `poll_ns` of a party that never sleeps.
 pub const POLL_FOREVER_NS: u64 = u64::MAX;
 
@@ -80,7 +90,8 @@ header! {
         pub pid: u32,
         /// What the message is: a [`Kind`].
         pub kind: u32,
-        /// Why a `Failure` or `Closed`: a [`Code`]; otherwise zero.
+        /// Why a `Failure` or `Closed`: a [`Code`]. Of a `State`: zero in lockstep, otherwise [`LIVE`]
+        /// and what is to be said of the input. Zero in other messages.
         pub code: u32,
         /// Dynamic coordinates of the plant, nd.
         pub dynamic: u32,
@@ -112,7 +123,8 @@ header! {
         pub reciprocal_condition: f64,
         /// The same for the constraints, without redundant ones; 1 without constraints.
         pub constraint_reciprocal_condition: f64,
-        /// First detail of a failure, see [`Code`].
+        /// First detail of a failure, see [`Code`]. Of an `Input`: `stamp_ns` of the state that it
+        /// answers, 0 if that is not known.
         pub detail_a: u64,
         /// Second detail of a failure.
         pub detail_b: u64,
@@ -247,6 +259,8 @@ numbered! {
         /// Constraint equations contradict each other: `detail_a` is the index of the first
         /// concerned, `detail_b` their number, `detail_value` the largest violation.
         InconsistentConstraints = 15,
+        /// A watchdog holds the plant: `detail_a` is its index, `detail_value` the value of its quantity.
+        Watchdog = 16,
     }
 }
 

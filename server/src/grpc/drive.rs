@@ -1,17 +1,22 @@
-//! The stream of `PlantService.Drive`: lockstep, one answer per input.
+//! The stream of `PlantService.Drive`.
 //!
-//! The step runs in the task that reads the request and writes the answer, without a queue or a
-//! thread in between: that is what keeps the round trip short.
+//! In lockstep there is one answer per input. The step runs in the task that reads the request and
+//! writes the answer, without a queue or a thread in between: that is what keeps the round trip short.
+//! While the plant runs by itself, inputs go into its slot and states come from its watchers' slots.
 
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
+use std::time::Duration;
 
-use futures::Stream;
+use futures::{Stream, StreamExt as _};
 use plantd_models::Linearization;
+use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
 use tokio::runtime::{Handle, RuntimeFlavor};
+use tokio::time::Sleep;
+use tokio_stream::wrappers::WatchStream;
 use tokio_util::sync::WaitForCancellationFutureOwned;
 use tonic::{Code, Status, Streaming};
 use v1::drive_request::Request as Message;
@@ -22,8 +27,9 @@ use super::plant::plant_info;
 use crate::convert;
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
-use crate::session::{DriveError, DriverKind, Lease};
+use crate::session::{DriveError, DriverKind, Lease, RunStatus};
 use crate::status::Fault;
+use crate::watch::Subscription;
 
 /// Answers in a row after which the stream lets others on its thread run.
 const BURST_MAX: u32 = 32;
@@ -55,6 +61,20 @@ struct Driving {
     linearization: Option<Linearization>,
     /// A step takes so little time that nobody minds waiting for it.
     is_short: bool,
+    /// Changes of how the plant is run.
+    status: WatchStream<RunStatus>,
+    /// An input that waits for its step in lockstep: the plant is paused, or slowed.
+    held: Option<Held>,
+    /// The states of the plant while it runs by itself.
+    states: Option<Subscription>,
+}
+
+struct Held {
+    input: v1::DriveInput,
+    /// When the step is due.
+    until: Option<Pin<Box<Sleep>>>,
+    /// Worth another try.
+    is_ready: bool,
 }
 
 impl DriveStream {
@@ -64,7 +84,7 @@ impl DriveStream {
         Self { hub, requests, ending, phase: Phase::Opening, burst: 0 }
     }
 
-    fn answer(&mut self, request: v1::DriveRequest) -> Result<v1::DriveResponse, Fault> {
+    fn answer(&mut self, request: v1::DriveRequest) -> Result<Option<v1::DriveResponse>, Fault> {
         let response = match (&mut self.phase, request.request) {
             (Phase::Opening, Some(Message::Open(open))) => {
                 let driving = Driving::open(&self.hub, &open)?;
@@ -72,25 +92,53 @@ impl DriveStream {
                 self.phase = Phase::Driving(Box::new(driving));
                 Answer::Opened(v1::DriveOpened { plant })
             }
-            (Phase::Driving(driving), Some(Message::Input(input))) => driving.step(input)?,
+            (Phase::Driving(driving), Some(Message::Input(input))) => match driving.input(input)? {
+                Some(answer) => answer,
+                None => return Ok(None),
+            },
             (Phase::Opening, _) => return Err(protocol("the first message must be `open`")),
             (_, Some(Message::Open(_))) => return Err(protocol("the stream is open already")),
             (_, _) => return Err(protocol("the message is empty")),
         };
-        Ok(v1::DriveResponse { response: Some(response) })
+        Ok(Some(v1::DriveResponse { response: Some(response) }))
     }
 
-    /// The reason to end the stream while it waits for the client.
-    fn poll_end(&mut self, context: &mut Context<'_>) -> Poll<Fault> {
+    /// The reason to end the stream while it waits for the client, or a change of how the plant is run:
+    /// then there is something to do.
+    fn poll_news(&mut self, context: &mut Context<'_>) -> Poll<Option<Fault>> {
         if self.ending.as_mut().poll(context).is_ready() {
-            return Poll::Ready(Fault::shutting_down());
+            return Poll::Ready(Some(Fault::shutting_down()));
         }
-        if let Phase::Driving(driving) = &mut self.phase
-            && driving.deleted.as_mut().poll(context).is_ready()
-        {
-            return Poll::Ready(Fault::plant_deleted(driving.lease.session().id()));
+        let Phase::Driving(driving) = &mut self.phase else { return Poll::Pending };
+        if driving.deleted.as_mut().poll(context).is_ready() {
+            return Poll::Ready(Some(Fault::plant_deleted(driving.lease.session().id())));
+        }
+        if driving.status.poll_next_unpin(context).is_ready() {
+            let revoked = || Fault::from_drive(DriveError::Revoked, driving.lease.session().id());
+            return Poll::Ready(driving.lease.is_revoked().then(revoked));
         }
         Poll::Pending
+    }
+
+    /// The next message of the client, unless one is still waiting for its step.
+    fn poll_request(
+        &mut self,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<v1::DriveRequest, Status>>> {
+        if let Phase::Driving(driving) = &mut self.phase
+            && let Some(held) = &mut driving.held
+        {
+            if let Some(sleep) = &mut held.until {
+                std::task::ready!(sleep.as_mut().poll(context));
+                held.is_ready = true;
+            }
+            if !held.is_ready {
+                return Poll::Pending;
+            }
+            let input = driving.held.take().map(|held| Message::Input(held.input));
+            return Poll::Ready(Some(Ok(v1::DriveRequest { request: input })));
+        }
+        Pin::new(&mut self.requests).poll_next(context)
     }
 }
 
@@ -119,38 +167,92 @@ impl Driving {
         let linearization = open.linearization.then(|| Linearization::new(session.model()));
         let work = convert::period_work(&session.mechanics().settings, dimensions);
         let is_short = work <= INLINE_WORK_MAX;
-        Ok(Self { deleted: Box::pin(session.closed()), lease, linearization, is_short })
+        Ok(Self {
+            deleted: Box::pin(session.closed()),
+            status: WatchStream::from_changes(session.run_status()),
+            lease,
+            linearization,
+            is_short,
+            held: None,
+            states: None,
+        })
     }
 
-    /// A step; its own failures are answers, those of the stream are errors.
-    fn step(&mut self, input: v1::DriveInput) -> Result<Answer, Fault> {
-        let v1::DriveInput { sequence, u } = input;
-        let (lease, linearization) = (&mut self.lease, &mut self.linearization);
-        let is_short = self.is_short;
-        let mut advance = || {
-            lease.step_and(&u, linearization.as_mut(), |core| v1::DriveStep {
-                sequence,
-                state: Some(convert::plant_state(core.plant())),
-                report: Some(convert::report(core.report())),
-                linearization: None,
-                u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
-                outputs: core.outputs(),
-            })
+    /// An input; failures of its own are answers, those of the stream are errors. No answer yet when
+    /// the plant runs by itself, or the step has to wait.
+    fn input(&mut self, input: v1::DriveInput) -> Result<Option<Answer>, Fault> {
+        let sequence = input.sequence;
+        let outcome = if self.lease.session().runs_by_itself() {
+            self.lease.offer(sequence, &input.u, input.answers_ns).map(|()| None)
+        } else {
+            self.step(sequence, &input.u).map(Some)
         };
-        let outcome = if is_short { advance() } else { beside_other_tasks(advance) };
-        let mut step = match outcome {
-            Ok(step) => step,
-            Err(DriveError::Step(error)) => {
-                let failure = Some(Fault::from(error).into());
-                return Ok(Answer::Failure(v1::DriveFailure { sequence, failure }));
+        let until = match outcome {
+            Ok(step) => return Ok(step.map(Answer::Step)),
+            // How the plant is run may have changed in between.
+            Err(DriveError::Paused | DriveError::Running) => None,
+            Err(DriveError::NotDue(due_ns)) => {
+                let wait = Duration::from_nanos(due_ns.saturating_sub(monotonic_ns()));
+                Some(Box::pin(tokio::time::sleep(wait)))
+            }
+            Err(error @ (DriveError::Step(_) | DriveError::Frozen(_))) => {
+                let fault = Fault::from_drive(error, self.lease.session().id());
+                let failure = Some(fault.into());
+                return Ok(Some(Answer::Failure(v1::DriveFailure { sequence, failure })));
             }
             Err(error) => return Err(Fault::from_drive(error, self.lease.session().id())),
         };
+        self.held = Some(Held { input, until, is_ready: false });
+        Ok(None)
+    }
+
+    /// A state of the plant's own loop.
+    fn poll_state(&mut self, hub: &Hub, context: &mut Context<'_>) -> Poll<Result<Answer, Fault>> {
+        let states = match &mut self.states {
+            Some(states) => states,
+            none => {
+                let watchers_max = hub.limits.watchers_per_plant;
+                none.insert(self.lease.session().subscribe(1, 1, watchers_max)?)
+            }
+        };
+        let (frame, dropped) = std::task::ready!(states.poll_next(context));
+        Poll::Ready(Ok(Answer::Step(v1::DriveStep {
+            sequence: frame.timing.input_sequence,
+            state: Some(convert::state(&frame.state, frame.time_s)),
+            report: Some(convert::report(&frame.report)),
+            linearization: None,
+            u: frame.input.clone(),
+            outputs: convert::outputs(&frame.outputs, &frame.lost),
+            clocks: Some(convert::clocks(frame.time_s, frame.timing.ended_ns)),
+            timing: convert::step_timing(&frame.timing),
+            dropped,
+        })))
+    }
+
+    /// A step in lockstep.
+    fn step(&mut self, sequence: u64, u: &[f64]) -> Result<v1::DriveStep, DriveError> {
+        let (lease, linearization) = (&mut self.lease, &mut self.linearization);
+        let is_short = self.is_short;
+        let mut advance = || {
+            lease.step_and(u, linearization.as_mut(), |core| {
+                let state = convert::plant_state(core.plant());
+                v1::DriveStep {
+                    sequence,
+                    clocks: Some(convert::clocks(state.time_s, 0)),
+                    state: Some(state),
+                    report: Some(convert::report(core.report())),
+                    u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
+                    outputs: core.outputs(),
+                    ..Default::default()
+                }
+            })
+        };
+        let mut step = if is_short { advance() } else { beside_other_tasks(advance) }?;
         if let Some(linearization) = &self.linearization {
             let from = step.state.as_ref().map_or(0, |state| state.step - 1);
             step.linearization = Some(convert::linearization(from, linearization));
         }
-        Ok(Answer::Step(step))
+        Ok(step)
     }
 }
 
@@ -162,30 +264,55 @@ impl Stream for DriveStream {
         if matches!(this.phase, Phase::Ended) {
             return Poll::Ready(None);
         }
-        if this.burst >= BURST_MAX {
-            this.burst = 0;
-            // A client that sends faster than the plant steps must not keep the thread, nor miss
-            // that the stream shall end.
-            if let Poll::Ready(fault) = this.poll_end(context) {
-                this.phase = Phase::Ended;
-                return Poll::Ready(Some(Err(fault.into())));
-            }
-            context.waker().wake_by_ref();
-            return Poll::Pending;
-        }
-        let item = match Pin::new(&mut this.requests).poll_next(context) {
-            Poll::Pending => {
+        let item = loop {
+            if this.burst >= BURST_MAX {
                 this.burst = 0;
-                let Poll::Ready(fault) = this.poll_end(context) else { return Poll::Pending };
-                Some(Err(fault.into()))
+                // A client that sends faster than the plant steps must not keep the thread, nor miss
+                // that the stream shall end.
+                if let Poll::Ready(Some(fault)) = this.poll_news(context) {
+                    break Some(Err(fault.into()));
+                }
+                context.waker().wake_by_ref();
+                return Poll::Pending;
             }
-            Poll::Ready(None) => None,
-            Poll::Ready(Some(Err(status))) => {
-                Some(Err(with_limit_details(status, &this.hub.limits)))
+            match this.poll_request(context) {
+                Poll::Ready(None) => break None,
+                Poll::Ready(Some(Err(status))) => {
+                    break Some(Err(with_limit_details(status, &this.hub.limits)));
+                }
+                Poll::Ready(Some(Ok(request))) => {
+                    this.burst += 1;
+                    match this.answer(request) {
+                        Ok(Some(answer)) => break Some(Ok(answer)),
+                        Ok(None) => continue,
+                        Err(fault) => break Some(Err(fault.into())),
+                    }
+                }
+                Poll::Pending => {}
             }
-            Poll::Ready(Some(Ok(request))) => {
-                this.burst += 1;
-                Some(this.answer(request).map_err(Status::from))
+            if let Phase::Driving(driving) = &mut this.phase {
+                if driving.lease.session().runs_by_itself() {
+                    if let Poll::Ready(state) = driving.poll_state(&this.hub, context) {
+                        let answer =
+                            state.map(|answer| v1::DriveResponse { response: Some(answer) });
+                        break Some(answer.map_err(Status::from));
+                    }
+                } else {
+                    driving.states = None;
+                }
+            }
+            this.burst = 0;
+            match this.poll_news(context) {
+                Poll::Pending => return Poll::Pending,
+                Poll::Ready(Some(fault)) => break Some(Err(fault.into())),
+                // How the plant is run has changed: an input that waits may have its turn.
+                Poll::Ready(None) => {
+                    if let Phase::Driving(driving) = &mut this.phase
+                        && let Some(held) = &mut driving.held
+                    {
+                        held.is_ready = true;
+                    }
+                }
             }
         };
         if !matches!(item, Some(Ok(_))) {

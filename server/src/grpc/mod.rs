@@ -15,6 +15,7 @@ pub mod plant;
 pub mod record;
 mod reference;
 mod rollout;
+mod run;
 mod settle;
 pub mod watch;
 

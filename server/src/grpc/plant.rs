@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
-use plantd_models::{Initial, Snapshot};
+use plantd_models::{Initial, Snapshot, State};
 use plantd_proto::v1;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::drive::DriveStream;
-use super::{Answers, cut_page, feedback, watch};
+use super::{Answers, cut_page, feedback, run, watch};
 use crate::convert::{self, Inputs, Start};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
@@ -101,12 +101,12 @@ impl PlantService {
     async fn put(
         &self,
         id: &str,
-        change: impl FnOnce(&mut Lease) -> Result<(), Fault> + Send + 'static,
+        change: impl FnOnce(&mut Lease) -> Result<(State, f64), Fault> + Send + 'static,
     ) -> Result<v1::State, Fault> {
         let mut lease = self.hub.session(id)?.acquire(DriverKind::Step)?;
         let job = move |_: &_| {
-            change(&mut lease)?;
-            Ok(lease.session().with_core(|core| convert::plant_state(core.plant())))
+            let (state, time_s) = change(&mut lease)?;
+            Ok(convert::state(&state, time_s))
         };
         self.hub.attendants.run(job).await
     }
@@ -143,6 +143,7 @@ impl StepPlan {
                 }
                 if is_last {
                     response.report = Some(convert::report(core.report()));
+                    response.clocks = Some(convert::clocks(core.plant().time_s(), 0));
                     response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
                     response.outputs = core.outputs();
                 }
@@ -169,6 +170,7 @@ pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
         link_open: session.link_open(),
         feedback: view.feedback,
         accuracy: session.accuracy(),
+        run: Some(run::run_info(session)),
         parameters: convert::parameters(&view.parameters),
     }
 }
@@ -178,6 +180,48 @@ impl v1::plant_service_server::PlantService for PlantService {
     type DriveStream = DriveStream;
     type WatchStream = Answers<v1::WatchResponse>;
     type WatchGainsStream = Answers<v1::WatchGainsResponse>;
+    type WatchEventsStream = Answers<v1::WatchEventsResponse>;
+
+    async fn run(
+        &self,
+        request: Request<v1::RunRequest>,
+    ) -> Result<Response<v1::RunResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| run::run(&hub, request);
+        Ok(Response::new(self.hub.attendants.run(job).await?))
+    }
+
+    async fn pause(
+        &self,
+        request: Request<v1::PauseRequest>,
+    ) -> Result<Response<v1::PauseResponse>, Status> {
+        let (hub, id) = (Arc::clone(&self.hub), request.into_inner().id);
+        let job = move |_: &_| run::pause(&hub, &id);
+        Ok(Response::new(self.hub.attendants.run(job).await?))
+    }
+
+    async fn set_safety(
+        &self,
+        request: Request<v1::SetSafetyRequest>,
+    ) -> Result<Response<v1::SetSafetyResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| run::set_safety(&hub, request);
+        Ok(Response::new(self.hub.attendants.run(job).await?))
+    }
+
+    async fn get_timing(
+        &self,
+        request: Request<v1::GetTimingRequest>,
+    ) -> Result<Response<v1::GetTimingResponse>, Status> {
+        Ok(Response::new(run::get_timing(&self.hub, &request.into_inner())?))
+    }
+
+    async fn watch_events(
+        &self,
+        request: Request<v1::WatchEventsRequest>,
+    ) -> Result<Response<Self::WatchEventsStream>, Status> {
+        Ok(Response::new(run::watch_events(&self.hub, &request.into_inner())?))
+    }
 
     async fn create_plant(
         &self,
@@ -355,6 +399,6 @@ impl v1::plant_service_server::PlantService for PlantService {
     }
 }
 
-fn initialize(lease: &mut Lease, initial: &Initial) -> Result<(), Fault> {
+fn initialize(lease: &mut Lease, initial: &Initial) -> Result<(State, f64), Fault> {
     lease.initialize(initial).map_err(|error| Fault::from_initial(error, "initial"))
 }

@@ -32,6 +32,7 @@ struct Wanted {
     gain: bool,
     input: bool,
     outputs: bool,
+    timing: bool,
 }
 
 impl Wanted {
@@ -46,6 +47,7 @@ impl Wanted {
                 Ok(WatchField::Gain) => wanted.gain = true,
                 Ok(WatchField::Input) => wanted.input = true,
                 Ok(WatchField::Outputs) => wanted.outputs = true,
+                Ok(WatchField::Timing) => wanted.timing = true,
                 Ok(WatchField::Unspecified) | Err(_) => {
                     let problem = format!("{field} is nothing to watch");
                     return Err(Fault::field(format!("fields[{index}]"), problem));
@@ -120,6 +122,10 @@ impl Messages for Watcher {
         };
         let mut response =
             v1::WatchResponse { dropped, step: frame.state.step, ..Default::default() };
+        response.clocks = Some(convert::clocks(frame.time_s, frame.timing.ended_ns));
+        if self.wanted.timing {
+            response.timing = convert::step_timing(&frame.timing);
+        }
         if self.wanted.report {
             response.report = Some(convert::report(&frame.report));
         }

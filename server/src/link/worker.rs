@@ -7,12 +7,13 @@ use std::time::Duration;
 use iceoryx2::identifiers::UniquePublisherId;
 use plantd_models::{StepError, StepReport};
 use plantd_proto::link::{
-    Code, DomainError, Endpoint, Header, Holder, Kind, LinkServices, Message, ProcessIdentity,
-    monotonic_ns, random_instance,
+    Code, DomainError, Endpoint, Header, Holder, Kind, LIVE, LinkServices, Message,
+    ProcessIdentity, monotonic_ns, random_instance,
 };
 
 use super::LinkConfig;
-use crate::frame::{OUTPUTS_MAX, Published};
+use crate::frame::{Frame, OUTPUTS_MAX, Published};
+use crate::ring::Reader;
 use crate::session::{DriveError, DriverKind, Lease, Session};
 
 /// How often the thread looks whether it shall end and whether its driver lives, ns.
@@ -20,6 +21,13 @@ const CHECK_PERIOD_NS: u64 = 100_000_000;
 
 /// Pause after an error of the transport, so that one that lasts does not take a processor.
 const PAUSE_AFTER_ERROR: Duration = Duration::from_millis(10);
+
+/// How long after a step of a plant that runs by itself is due it is looked for, and how soon again, ns.
+const AFTER_DUE_NS: u64 = 15_000;
+const LOOK_AGAIN_NS: u64 = 50_000;
+
+/// How soon an input of a paused plant is tried again, ns.
+const HELD_PERIOD_NS: u64 = 1_000_000;
 
 /// One link and its driver.
 pub(super) struct Worker {
@@ -46,6 +54,12 @@ struct Driver {
     sequence: u64,
     last_heard_ns: u64,
     lease: Lease,
+    /// When it stops polling for what the server sends.
+    poll_end_ns: u64,
+    /// An input that waits for its step in lockstep, and when it is tried again, ns.
+    held: Option<(Header, u64)>,
+    /// The states of the plant while it runs by itself.
+    states: Option<(Reader, Frame)>,
 }
 
 /// A failure of one input or attachment: goes to the driver, the link goes on.
@@ -95,11 +109,12 @@ impl Worker {
     /// Serves drivers until the link is closed or the plant deleted.
     pub(super) fn run(mut self) {
         while !self.stop.load(Ordering::Acquire) && !self.session.is_closed() {
-            let outcome = match self.endpoint.receive(monotonic_ns() + CHECK_PERIOD_NS) {
+            let outcome = match self.endpoint.receive(self.next_look_ns()) {
                 Ok(Some(message)) => self.handle(&message),
                 Ok(None) => Ok(()),
                 Err(error) => Err(error),
             };
+            let outcome = outcome.and_then(|()| self.attend_driver());
             let outcome = outcome.and_then(|()| {
                 if monotonic_ns() < self.next_check_ns {
                     return Ok(());
@@ -114,6 +129,67 @@ impl Worker {
                 self.note_transport_error(&error);
             }
         }
+    }
+
+    /// Until when there is nothing to do unless a message comes, ns.
+    fn next_look_ns(&self) -> u64 {
+        let now_ns = monotonic_ns();
+        let check_ns = now_ns + CHECK_PERIOD_NS;
+        let Some(driver) = &self.driver else { return check_ns };
+        if let Some((_, again_ns)) = driver.held {
+            return again_ns.min(check_ns);
+        }
+        if driver.states.is_none() {
+            return check_ns;
+        }
+        let due_ns = self.session.live().due_ns.load(Ordering::Relaxed);
+        match due_ns + AFTER_DUE_NS {
+            // Free-running, late, or paused a moment ago.
+            look_ns if look_ns <= now_ns => now_ns + LOOK_AGAIN_NS,
+            look_ns => look_ns.min(check_ns),
+        }
+    }
+
+    /// Brings the driver what it has not asked for: the answer to an input that had to wait, or the
+    /// states of a plant that runs by itself.
+    fn attend_driver(&mut self) -> Result<(), DomainError> {
+        let Some(driver) = &mut self.driver else { return Ok(()) };
+        if driver.lease.is_revoked() {
+            let request =
+                Header { driver: driver.instance, sequence: driver.sequence, ..self.header };
+            self.driver = None;
+            return self.refuse(&request, Failure::new(Code::NotAttached));
+        }
+        if let Some((request, again_ns)) = driver.held
+            && again_ns <= monotonic_ns()
+        {
+            driver.held = None;
+            return self.step(&request);
+        }
+        if !self.session.runs_by_itself() {
+            driver.states = None;
+            return Ok(());
+        }
+        let (reader, frame) =
+            driver.states.get_or_insert_with(|| (self.session.read_ring(), Frame::default()));
+        reader.skip_to_last();
+        let Some((_, record)) = reader.read_next() else { return Ok(()) };
+        frame.read(record);
+        let request = Header {
+            driver: driver.instance,
+            sequence: frame.timing.input_sequence,
+            ..self.header
+        };
+        let common = Header { code: LIVE | frame.timing.flags as u32, ..self.header };
+        let published = frame.published();
+        send_state(
+            &mut self.endpoint,
+            common,
+            &request,
+            driver.poll_end_ns,
+            Kind::State,
+            &published,
+        )
     }
 
     /// A dying driver can make a port fail once; the link goes on.
@@ -151,7 +227,10 @@ impl Worker {
             return self.refuse(&request, Failure::new(Code::Layout));
         }
         match Kind::from_number(request.kind) {
-            Some(Kind::Input) => self.step(&request, message.payload()),
+            Some(Kind::Input) => match self.accept_input(&request, message.payload()) {
+                Ok(()) => self.step(&request),
+                Err(failure) => self.refuse(&request, failure),
+            },
             Some(Kind::Attach) => self.attach(&request, message.origin()),
             Some(Kind::Detach) => {
                 if self.driver.take_if(|driver| driver.instance == request.driver).is_some() {
@@ -182,22 +261,45 @@ impl Worker {
         }
         let frame = self.session.frame();
         let (endpoint, common) = (&mut self.endpoint, self.header);
-        answer(endpoint, common, request, Kind::Attached, &frame.published())
+        let (poll_end_ns, published) = (request.poll_end_ns(), frame.published());
+        send_state(endpoint, common, request, poll_end_ns, Kind::Attached, &published)
     }
 
-    fn step(&mut self, request: &Header, u: &[f64]) -> Result<(), DomainError> {
-        let outcome = self.accept_input(request, u).and_then(|()| {
-            let Some(driver) = &mut self.driver else { return Ok(Ok(())) };
+    /// Takes a step with the input that was accepted, or hands it to the plant's own loop.
+    fn step(&mut self, request: &Header) -> Result<(), DomainError> {
+        let Some(driver) = &mut self.driver else { return Ok(()) };
+        let outcome = if self.session.runs_by_itself() {
+            // What an input answers stands where messages of the server say when they were sent.
+            driver.lease.offer(request.sequence, &self.input, request.detail_a).map(Ok)
+        } else {
             let (endpoint, common) = (&mut self.endpoint, self.header);
-            let sent = driver.lease.step_and(&self.input, None, |core| {
-                answer(endpoint, common, request, Kind::State, &core.published())
-            });
-            sent.map_err(|error| match error {
-                DriveError::Closed => Failure::new(Code::PlantDeleted),
-                DriveError::Step(error) => Failure::step(&error, driver.lease.session()),
+            let poll_end_ns = request.poll_end_ns();
+            driver.lease.step_and(&self.input, None, |core| {
+                let published = core.published();
+                send_state(endpoint, common, request, poll_end_ns, Kind::State, &published)
             })
-        });
-        outcome.unwrap_or_else(|failure| self.refuse(request, failure))
+        };
+        let failure = match outcome {
+            Ok(sent) => return sent,
+            // How the plant is run may have changed in between.
+            Err(DriveError::Paused | DriveError::Running) => {
+                driver.held = Some((*request, monotonic_ns() + HELD_PERIOD_NS));
+                return Ok(());
+            }
+            Err(DriveError::NotDue(due_ns)) => {
+                driver.held = Some((*request, due_ns));
+                return Ok(());
+            }
+            Err(DriveError::Closed) => Failure::new(Code::PlantDeleted),
+            Err(DriveError::Revoked) => Failure::new(Code::NotAttached),
+            Err(DriveError::Frozen(trip)) => Failure {
+                a: trip.watchdog as u64,
+                value: trip.value,
+                ..Failure::new(Code::Watchdog)
+            },
+            Err(DriveError::Step(error)) => Failure::step(&error, &self.session),
+        };
+        self.refuse(request, failure)
     }
 
     /// Copies the input out of the memory that the driver can write to.
@@ -208,6 +310,7 @@ impl Worker {
             .filter(|d| d.instance == request.driver && request.server == self.header.server)
             .ok_or(Failure::new(Code::NotAttached))?;
         driver.last_heard_ns = monotonic_ns();
+        driver.poll_end_ns = request.poll_end_ns();
         let expected = driver.sequence + 1;
         driver.sequence = request.sequence;
         if request.sequence != expected {
@@ -261,6 +364,9 @@ impl Driver {
             sequence: 0,
             last_heard_ns: monotonic_ns(),
             lease,
+            poll_end_ns: request.poll_end_ns(),
+            held: None,
+            states: None,
         }
     }
 
@@ -327,10 +433,11 @@ impl Failure {
 }
 
 /// Sends the state of the plant to its driver.
-fn answer(
+fn send_state(
     endpoint: &mut Endpoint,
     common: Header,
     request: &Header,
+    poll_end_ns: u64,
     kind: Kind,
     published: &Published<'_>,
 ) -> Result<(), DomainError> {
@@ -350,7 +457,7 @@ fn answer(
     let header = if kind == Kind::State { with_report(header, &published.report) } else { header };
     let Published { q, p, v, multipliers, outputs, lost, .. } = *published;
     let parts = [q, p, v, multipliers, outputs, lost];
-    endpoint.send(header, &parts, request.poll_end_ns())
+    endpoint.send(header, &parts, poll_end_ns)
 }
 
 fn with_report(header: Header, report: &StepReport) -> Header {

@@ -460,13 +460,16 @@ mod tests {
 
     use super::*;
     use crate::metrics::Metrics;
+    use crate::realtime::{RealTime, RealTimeSettings};
     use crate::session::DriverKind;
 
     fn session() -> Arc<Session> {
         let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
         let settings = plantd_models::Settings::new(&model);
         let plant = Plant::new(model, settings).unwrap();
-        Session::new("p".into(), "pendulum".into(), plant, None, Arc::new(Metrics::default()))
+        let metrics = Arc::new(Metrics::default());
+        let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
+        Session::new("p".into(), "pendulum".into(), plant, None, metrics, realtime)
     }
 
     fn options() -> Options {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use plantd_models::{
     Initial, InitialError, Linearization, Model, Plant, Settings, State, StepError, StepReport,
 };
-use plantd_proto::v1;
+use plantd_proto::v1::{self, MarkReason};
 
 use super::tap::Tap;
 use crate::channels::Channels;
@@ -13,7 +13,10 @@ use crate::convert;
 use crate::feedback::Feedback;
 use crate::frame::{Published, Timing};
 use crate::parameters::Parameters;
+use crate::realtime::event::{EventKind, Events};
+use crate::realtime::watchdog::{Guard, Safety, Trip, WatchdogAction};
 use crate::ring::Ring;
+use crate::session::DriveError;
 
 /// A plant with what its steps need. One owner at a time: whoever holds the session's lock, or the loop
 /// that runs the plant.
@@ -39,6 +42,15 @@ pub struct Core {
     pub(crate) ring: Option<Arc<Ring>>,
     /// Where the recorder learns what happens between steps.
     pub(super) tap: Option<Arc<Tap>>,
+    /// What happens besides.
+    events: Arc<Events>,
+    guard: Option<Box<Guard>>,
+    /// A bound was left in the last step.
+    trip: Option<Trip>,
+    /// The bound because of which the plant stands still.
+    frozen: Option<Trip>,
+    /// The last input is one with which the plant's own loop goes on.
+    has_loop_input: bool,
     /// Numbers of the scene that were changed.
     pub(crate) parameters: Arc<Parameters>,
     /// Counts the changes of parameters and time step.
@@ -59,7 +71,7 @@ pub struct Mechanics {
 }
 
 impl Core {
-    pub(crate) fn new(plant: Plant) -> Self {
+    pub(crate) fn new(plant: Plant, events: Arc<Events>) -> Self {
         let mut input = vec![0.0; plant.model().dimensions().input()];
         plant.hold_input(&mut input);
         Self {
@@ -70,6 +82,11 @@ impl Core {
             timing: Timing::default(),
             ring: None,
             tap: None,
+            events,
+            guard: None,
+            trip: None,
+            frozen: None,
+            has_loop_input: false,
             has_applied: false,
             report: StepReport::default(),
             feedback: None,
@@ -87,7 +104,13 @@ impl Core {
         &mut self,
         driver: &[f64],
         linearization: Option<&mut Linearization>,
-    ) -> Result<StepReport, StepError> {
+    ) -> Result<StepReport, DriveError> {
+        if let Some(trip) = self.frozen {
+            return Err(DriveError::Frozen(trip));
+        }
+        if let Some(guard) = &mut self.guard {
+            guard.begin(&self.plant);
+        }
         let has_say = match &mut self.feedback {
             None => false,
             Some(feedback) => feedback.input(&self.plant, driver, &mut self.applied)?,
@@ -98,7 +121,7 @@ impl Core {
                 let (expected, actual) = (self.applied.len(), driver.len());
                 if !has_say {
                     if actual != expected {
-                        return Err(StepError::Dimension { expected, actual });
+                        return Err(StepError::Dimension { expected, actual }.into());
                     }
                     self.applied.copy_from_slice(driver);
                 }
@@ -123,7 +146,94 @@ impl Core {
         if let Some(channels) = &mut self.channels {
             channels.measure(&mut self.plant, &self.input);
         }
+        self.timing = Timing::default();
+        if let Some(guard) = &mut self.guard
+            && let Some(trip) = guard.check(&mut self.plant)
+        {
+            self.act_on(trip);
+        }
         Ok(report)
+    }
+
+    /// A bound was left: what can be done here is done, the rest is the driver's to find in `trip`.
+    fn act_on(&mut self, trip: Trip) {
+        self.trip = Some(trip);
+        let quantity = self.guard.as_ref().map(|guard| &guard.safety.watchdogs[trip.watchdog]);
+        let code = quantity.map_or(0, |watchdog| watchdog.quantity.code());
+        self.note(EventKind::Watchdog, code, trip.value);
+        match trip.action {
+            WatchdogAction::Freeze => self.frozen = Some(trip),
+            WatchdogAction::Reset => {
+                self.go_home();
+            }
+            WatchdogAction::Disconnect => {}
+        }
+    }
+
+    /// Puts the plant into the state that it was created in. False when it cannot: nothing has changed.
+    /// Allocates nothing.
+    pub(crate) fn go_home(&mut self) -> bool {
+        let Some(home) = self.guard.as_ref().and_then(|guard| guard.home.as_deref()) else {
+            return false;
+        };
+        let is_home = self.plant.go_on_from(home).is_ok();
+        if is_home {
+            self.plant.hold_input(&mut self.input);
+            if let Some(channels) = &mut self.channels {
+                channels.begin(&mut self.plant, &self.input);
+            }
+            self.mark(MarkReason::Reset);
+            self.note(EventKind::StateSet, 0, 0.0);
+        }
+        is_home
+    }
+
+    /// What happens when a step fails in the plant's own loop.
+    pub(crate) fn on_step_failure(&self) -> Option<WatchdogAction> {
+        self.guard.as_ref().and_then(|guard| guard.safety.on_step_failure)
+    }
+
+    /// What protects the plant from now on; `home` is a plant in the state to which a reset returns.
+    pub(crate) fn protect(
+        &mut self,
+        safety: Safety,
+        home: Option<Box<Plant>>,
+    ) -> Option<Box<Guard>> {
+        self.release();
+        let is_needed = !safety.watchdogs.is_empty() || safety.on_step_failure.is_some();
+        let guard = is_needed.then(|| Box::new(Guard::new(safety, &self.plant, home)));
+        std::mem::replace(&mut self.guard, guard)
+    }
+
+    /// Lets a plant go on that stands still because of a watchdog.
+    pub(crate) fn release(&mut self) {
+        self.frozen = None;
+        self.trip = None;
+    }
+
+    /// The bound that was left in the last step.
+    pub(crate) fn take_trip(&mut self) -> Option<Trip> {
+        self.trip.take()
+    }
+
+    /// Notes that something has happened.
+    pub(crate) fn note(&self, kind: EventKind, index: u64, value: f64) {
+        self.events.note(kind, self.plant.step_index(), index, value);
+    }
+
+    /// The input with which the plant's own loop begins, and whether it is a driver's.
+    pub(crate) fn first_input(&self) -> (Vec<f64>, bool) {
+        if self.has_loop_input && self.driver_input.len() == self.input.len() {
+            return (self.driver_input.clone(), true);
+        }
+        let mut held = self.input.clone();
+        self.plant.hold_input(&mut held);
+        (held, false)
+    }
+
+    /// Whether the last driver's input is kept for the plant's own loop to go on with.
+    pub(crate) fn keep_loop_input(&mut self, keep: bool) {
+        self.has_loop_input = keep;
     }
 
     /// Writes the last step into the ring, if somebody reads it.
@@ -192,12 +302,14 @@ impl Core {
     /// Puts a copy of the plant in its place that is in another state.
     pub(crate) fn replace_plant(&mut self, plant: Plant) -> Plant {
         plant.hold_input(&mut self.input);
+        self.release();
         self.has_applied = false;
         self.report = StepReport::default();
         let former = std::mem::replace(&mut self.plant, plant);
         if let Some(channels) = &mut self.channels {
             channels.begin(&mut self.plant, &self.input);
         }
+        self.note(EventKind::StateSet, 0, 0.0);
         former
     }
 
@@ -214,6 +326,8 @@ impl Core {
         plant.set_time_s(time_s);
         self.parameters = parameters;
         self.generation += 1;
-        Ok(std::mem::replace(&mut self.plant, plant))
+        let former = std::mem::replace(&mut self.plant, plant);
+        self.note(EventKind::ParametersSet, 0, self.plant.settings().time_step_s);
+        Ok(former)
     }
 }

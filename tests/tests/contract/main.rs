@@ -13,6 +13,7 @@ mod limits;
 mod methods;
 mod optimise;
 mod parameters;
+mod realtime;
 mod refusals;
 mod rest;
 mod support;

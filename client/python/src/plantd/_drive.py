@@ -9,17 +9,36 @@ from plantd.v1 import plant_service_pb2 as pb
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
 from ._errors import PlantdError, from_failure, translate
-from ._types import Array, Linearization, Outputs, Plant, State, StepReport, Vector, array, vector
+from ._types import (
+    Array,
+    Linearization,
+    Outputs,
+    Plant,
+    State,
+    StepReport,
+    StepTiming,
+    Vector,
+    array,
+    vector,
+)
 
 
 class Driver:
-    """Holds the lease of a plant and steps it in lockstep. Use it in a ``with`` statement."""
+    """Holds the lease of a plant: steps it in lockstep, or gives inputs to one that runs by itself.
+
+    Use it in a ``with`` statement.
+    """
 
     def __init__(self, stub: PlantServiceStub, id: str, linearization: bool):
         self._requests: queue.SimpleQueue[pb.DriveRequest | None] = queue.SimpleQueue()
         self._requests.put(pb.DriveRequest(open=pb.DriveOpen(id=id, linearization=linearization)))
         self._answers: Any = stub.Drive(iter(self._requests.get, None))
         self._sequence = 0
+        self._answers_ns = 0
+        #: Times of the last step, if the plant runs by itself.
+        self.timing: StepTiming | None = None
+        #: States of such a plant that were passed over, because newer ones were there.
+        self.dropped = 0
         #: What the solver did in the last step.
         self.report: StepReport | None = None
         #: Linearization of the last step, if the driver was opened with it.
@@ -41,17 +60,37 @@ class Driver:
     def step(self, u: Vector = ()) -> State:
         """Takes one step with the input ``u`` (input forces, then next prescribed positions).
 
+        Of a plant that runs by itself it waits for the first step on which the input acted, so that
+        the same loop drives both.
+
         Raises `StepError` if the step failed: the plant is where it was and the driver goes on.
         """
-        self._sequence += 1
-        input = pb.DriveInput(sequence=self._sequence, u=vector(u))
-        self._requests.put(pb.DriveRequest(input=input))
+        self.offer(u)
         # An earlier answer belongs to a step that was interrupted, for example by Ctrl-C.
         answer = self._next()
         while getattr(answer, answer.WhichOneof("response")).sequence < self._sequence:
             answer = self._next()
+        return self._note(answer)
+
+    def offer(self, u: Vector) -> None:
+        """Gives a plant that runs by itself an input, which acts from its next step on."""
+        self._sequence += 1
+        input = pb.DriveInput(sequence=self._sequence, u=vector(u), answers_ns=self._answers_ns)
+        self._requests.put(pb.DriveRequest(input=input))
+
+    def next(self) -> State:
+        """Waits for the next state of a plant that runs by itself: the latest, whatever input acted.
+
+        `timing` says what became of the inputs. Raises `StepError` if an input was refused.
+        """
+        return self._note(self._next())
+
+    def _note(self, answer: pb.DriveResponse) -> State:
         if answer.HasField("failure"):
             raise from_failure(answer.failure.failure)
+        self._answers_ns = answer.step.clocks.monotonic_ns
+        self.timing = StepTiming._from(answer.step.timing) if answer.step.timing.ended_ns else None
+        self.dropped = answer.step.dropped
         self.report = StepReport._from(answer.step.report)
         self.u = array(answer.step.u) if answer.step.u else None
         has_outputs = answer.step.HasField("outputs")

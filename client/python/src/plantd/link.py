@@ -49,7 +49,11 @@ ATTACHED, STATE, FAILURE, CLOSED = 16, 17, 18, 19
     CODE_TOO_FAST,
     CODE_SINGULAR_CONSTRAINTS,
     CODE_INCONSISTENT_CONSTRAINTS,
-) = range(1, 16)
+    CODE_WATCHDOG,
+) = range(1, 17)
+
+# In `code` of a state: the plant runs by itself, and the message answers no input.
+LIVE, LIVE_INPUT_LATE, LIVE_INPUT_SAFE = 1 << 31, 1, 2
 
 # Codes and reasons are those of gRPC; the message takes the header `h`.
 _STEP_ERRORS = {
@@ -89,6 +93,11 @@ _STEP_ERRORS = {
         "SINGULAR_CONSTRAINTS",
         "singular constraints: {h.detail_b} from equation {h.detail_a} on (reciprocal condition "
         "{h.detail_value:g})",
+    ),
+    CODE_WATCHDOG: (
+        "FAILED_PRECONDITION",
+        "WATCHDOG",
+        "watchdog {h.detail_a} holds the plant: its quantity is {h.detail_value:g}",
     ),
     CODE_INCONSISTENT_CONSTRAINTS: (
         "FAILED_PRECONDITION",
@@ -272,13 +281,20 @@ class LinkDriver:
     def step(self, u: Vector = ()) -> State:
         """Takes one step with the input ``u`` (input forces, then next prescribed positions).
 
+        Of a plant that runs by itself it waits for the latest state on which the input acted, so
+        that the same loop drives both.
+
         Raises `StepError` if the step failed: the plant is where it was and the driver goes on.
         """
         if not self._is_open:
             raise _not_open("the driver is closed")
+        self.offer(u)
+        return self._wait_for_answer(_after(self._timeout_s))
+
+    def offer(self, u: Vector) -> None:
+        """Gives a plant that runs by itself an input, which acts from its next step on."""
         self._sequence += 1
         self._send(INPUT, vector(u), self._server_poll_end_ns)
-        return self._wait_for_answer(_after(self._timeout_s))
 
     def close(self) -> None:
         """Gives the lease back and leaves the domain."""

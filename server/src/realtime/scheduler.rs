@@ -1,0 +1,389 @@
+//! The loop that runs plants.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
+
+use plantd_proto::link::monotonic_ns;
+
+use super::alarm::Alarm;
+use super::event::EventKind;
+use super::input::{Change, LoopInput};
+use super::watchdog::WatchdogAction;
+use super::{Live, Pace, RealTimeSettings, RunSettings, TimingCounts};
+use crate::frame::Timing;
+use crate::priority::{Priority, allow_cpus, sharpen_timers};
+use crate::session::{Core, DriveError, Session};
+use crate::status::Fault;
+
+/// A paced plant that is late by up to this long takes its steps one after the other until it has caught
+/// up; beyond it goes on from where it is, and the schedule has slipped.
+const CATCH_UP_NS: u64 = 100_000_000;
+
+/// What is done with the core of a running plant between two steps. Without a core the plant does not
+/// run here.
+pub(crate) type Act = Box<dyn FnOnce(Option<&mut Core>) + Send>;
+
+/// What a loop is told.
+enum Command {
+    Start(Box<Runner>),
+    Act(u64, Act),
+    /// Gives the core back.
+    Stop(u64, Sender<Option<Box<Core>>>),
+}
+
+/// A loop, for those who tell it something.
+#[derive(Clone)]
+pub(crate) struct Handle {
+    commands: Sender<Command>,
+    alarm: Alarm,
+}
+
+impl Handle {
+    /// A loop for plants that follow the wall clock.
+    pub(super) fn start_paced(index: usize, settings: &RealTimeSettings) -> std::io::Result<Self> {
+        let (settings, name) = (settings.clone(), format!("pace-{index}"));
+        Self::start(name, move |scheduler| {
+            allow_cpus(&settings.cpus);
+            settings.scheduling.apply();
+            sharpen_timers();
+            scheduler.run(settings.spin_us * 1000);
+        })
+    }
+
+    /// A loop for plants that take one step after the other.
+    pub(super) fn start_free() -> std::io::Result<Self> {
+        Self::start("free".to_owned(), |scheduler| {
+            Priority::Nice.apply("free-running plants");
+            scheduler.run(0);
+        })
+    }
+
+    fn start(name: String, body: impl FnOnce(Scheduler) + Send + 'static) -> std::io::Result<Self> {
+        let (commands, inbox) = channel();
+        let alarm = Alarm::default();
+        let scheduler = Scheduler {
+            inbox,
+            alarm: alarm.clone(),
+            // No plant that is taken in makes it grow beyond what `Scheduler::obey` has reserved.
+            due: BinaryHeap::new(),
+            runners: Vec::new(),
+        };
+        std::thread::Builder::new().name(name).spawn(move || body(scheduler))?;
+        Ok(Self { commands, alarm })
+    }
+
+    /// Begins to run a plant.
+    pub(crate) fn run(&self, runner: Box<Runner>) {
+        self.tell(Command::Start(runner));
+    }
+
+    /// Does something with the core of a plant between two steps.
+    pub(crate) fn act(&self, key: u64, act: Act) {
+        self.tell(Command::Act(key, act));
+    }
+
+    /// Takes a plant's core back, if the plant still runs here.
+    pub(crate) fn stop(&self, key: u64) -> Option<Box<Core>> {
+        let (give, taken) = channel();
+        self.tell(Command::Stop(key, give));
+        taken.recv().ok().flatten()
+    }
+
+    fn tell(&self, command: Command) {
+        // The loop ends when its last handle is gone: it is there.
+        let _ = self.commands.send(command);
+        self.alarm.ring();
+    }
+}
+
+/// A loop with its plants.
+struct Scheduler {
+    inbox: Receiver<Command>,
+    alarm: Alarm,
+    /// When which plant is due, the earliest first.
+    due: BinaryHeap<Reverse<(u64, usize)>>,
+    runners: Vec<Option<Box<Runner>>>,
+}
+
+impl Scheduler {
+    /// Runs until nobody can tell it anything any more.
+    fn run(mut self, spin_ns: u64) {
+        loop {
+            if self.alarm.take() || self.due.is_empty() {
+                if !self.obey_all() {
+                    return;
+                }
+                continue;
+            }
+            let Some(&Reverse((due_ns, _))) = self.due.peek() else { continue };
+            let mut now_ns = monotonic_ns();
+            if now_ns + spin_ns < due_ns {
+                self.alarm.sleep_until(due_ns - spin_ns);
+                continue;
+            }
+            while now_ns < due_ns {
+                std::hint::spin_loop();
+                now_ns = monotonic_ns();
+            }
+            self.step_first(now_ns);
+        }
+    }
+
+    /// The step of the plant that is due first.
+    fn step_first(&mut self, now_ns: u64) {
+        let Some(Reverse((_, slot))) = self.due.pop() else { return };
+        let Some(runner) = &mut self.runners[slot] else { return };
+        match runner.step(now_ns) {
+            Ok(due_ns) => self.due.push(Reverse((due_ns, slot))),
+            Err(stop) => {
+                if let Some(runner) = self.runners[slot].take() {
+                    runner.session.loop_ended(runner.core, stop);
+                }
+            }
+        }
+    }
+
+    /// Does what it was told; waits for a command when there is no plant. False at the end.
+    fn obey_all(&mut self) -> bool {
+        if self.due.is_empty() {
+            match self.inbox.recv() {
+                Ok(command) => self.obey(command),
+                Err(_) => return false,
+            }
+        }
+        loop {
+            match self.inbox.try_recv() {
+                Ok(command) => self.obey(command),
+                Err(TryRecvError::Empty) => return true,
+                Err(TryRecvError::Disconnected) => return !self.due.is_empty(),
+            }
+        }
+    }
+
+    fn obey(&mut self, command: Command) {
+        match command {
+            Command::Start(runner) => {
+                let slot = self.runners.iter().position(Option::is_none).unwrap_or_else(|| {
+                    self.runners.push(None);
+                    self.runners.len() - 1
+                });
+                self.due.push(Reverse((runner.due_ns(), slot)));
+                self.runners[slot] = Some(runner);
+            }
+            Command::Act(key, act) => {
+                let runner = self.runners.iter_mut().flatten().find(|runner| runner.key == key);
+                act(runner.map(|runner| &mut *runner.core));
+            }
+            Command::Stop(key, give) => {
+                let has_key = |runner: &Option<Box<Runner>>| {
+                    runner.as_ref().is_some_and(|runner| runner.key == key)
+                };
+                let slot = self.runners.iter().position(has_key);
+                let runner = slot.and_then(|slot| {
+                    self.due.retain(|Reverse((_, other))| *other != slot);
+                    self.runners[slot].take()
+                });
+                // The receiver waits for it.
+                let _ = give.send(runner.map(|runner| runner.core));
+            }
+        }
+    }
+}
+
+/// Why a loop lets go of a plant.
+pub(crate) enum Stop {
+    /// The steps that were asked for are taken.
+    StepsTaken,
+    /// The plant was deleted.
+    Closed,
+    /// It may not go on.
+    Fault(Fault),
+}
+
+/// A plant that a loop runs.
+pub(crate) struct Runner {
+    key: u64,
+    core: Box<Core>,
+    session: Arc<Session>,
+    live: Arc<Live>,
+    all: Arc<TimingCounts>,
+    input: LoopInput,
+    /// Steps that may still be taken.
+    steps_left: u64,
+    is_paced: bool,
+    speed: f64,
+    /// Deadlines are `origin + k period`, so that they do not drift.
+    origin_ns: u64,
+    ticks: u64,
+    time_step_s: f64,
+    period_ns: f64,
+}
+
+impl Runner {
+    /// A plant that begins to run now; `steps` 0 means without end.
+    pub(crate) fn new(
+        key: u64,
+        core: Box<Core>,
+        session: Arc<Session>,
+        settings: &RunSettings,
+        steps: u64,
+    ) -> Box<Self> {
+        let live = Arc::clone(session.live());
+        let forces = session.model().dimensions().inputs;
+        let (held, is_valid) = core.first_input();
+        let mut runner = Box::new(Self {
+            key,
+            live,
+            all: Arc::clone(session.loop_counts()),
+            session,
+            input: LoopInput::new(settings.input.clone(), held, forces, is_valid),
+            steps_left: if steps == 0 { u64::MAX } else { steps },
+            is_paced: settings.pace == Pace::Paced,
+            speed: settings.speed,
+            origin_ns: monotonic_ns(),
+            ticks: 0,
+            time_step_s: 0.0,
+            period_ns: 0.0,
+            core,
+        });
+        runner.set_period();
+        runner.live.steps_left.store(steps, Ordering::Relaxed);
+        // Also the first step has a time step to wait for.
+        runner.ticks = 1;
+        runner
+    }
+
+    /// The period of the plant's time step, which may change while it runs.
+    fn set_period(&mut self) {
+        let time_step_s = self.core.plant().settings().time_step_s;
+        if time_step_s != self.time_step_s {
+            self.origin_ns = self.due_ns();
+            self.ticks = 0;
+            self.time_step_s = time_step_s;
+            self.period_ns = if self.is_paced { time_step_s / self.speed * 1e9 } else { 0.0 };
+        }
+    }
+
+    fn due_ns(&self) -> u64 {
+        self.origin_ns + (self.ticks as f64 * self.period_ns) as u64
+    }
+
+    /// Takes the step that is due; when the next one is due.
+    fn step(&mut self, began_ns: u64) -> Result<u64, Stop> {
+        if self.session.is_closed() {
+            return Err(Stop::Closed);
+        }
+        let due_ns = self.due_ns();
+        let mut timing = Timing { due_ns, began_ns, ..Timing::default() };
+        self.find_input(began_ns, &mut timing)?;
+        if let Err(error) = self.core.step(self.input.u(), None) {
+            return self.step_failed(error);
+        }
+        timing.ended_ns = monotonic_ns();
+        self.core.timing = timing;
+        self.core.write_ring();
+        self.set_period();
+        self.ticks += 1;
+        let next_ns = self.due_ns();
+        self.count(&timing, next_ns);
+        self.live.due_ns.store(next_ns, Ordering::Relaxed);
+        if let Some(trip) = self.core.take_trip() {
+            match trip.action {
+                WatchdogAction::Freeze => {
+                    return Err(Stop::Fault(Fault::watchdog(&self.session, &trip)));
+                }
+                WatchdogAction::Disconnect => self.session.revoke_lease(),
+                WatchdogAction::Reset => {}
+            }
+        }
+        if self.steps_left == u64::MAX {
+            return Ok(next_ns);
+        }
+        self.steps_left -= 1;
+        self.live.steps_left.store(self.steps_left, Ordering::Relaxed);
+        if self.steps_left == 0 { Err(Stop::StepsTaken) } else { Ok(next_ns) }
+    }
+
+    fn find_input(&mut self, now_ns: u64, timing: &mut Timing) -> Result<(), Stop> {
+        let lease = self.session.input_lease();
+        let (input, slot) = (&mut self.input, &self.live.slot);
+        let change = input.next(slot, lease, now_ns, self.time_step_s, timing);
+        let age_s = input.age_s(self.time_step_s);
+        match change {
+            Change::None => {}
+            Change::Lost => self.core.note(EventKind::InputLost, 0, age_s),
+            Change::Back => self.core.note(EventKind::InputBack, 0, 0.0),
+            Change::Stop => {
+                self.core.note(EventKind::InputLost, 0, age_s);
+                return Err(Stop::Fault(Fault::input_lost(self.session.id())));
+            }
+        }
+        for counts in [&self.live.counts, &*self.all] {
+            if timing.flags & Timing::LATE == 0 {
+                counts.used_inputs.fetch_add(1, Ordering::Relaxed);
+            } else if lease != 0 {
+                counts.late_inputs.fetch_add(1, Ordering::Relaxed);
+            }
+            if timing.flags & Timing::SAFE != 0 {
+                counts.safe_inputs.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+        Ok(())
+    }
+
+    fn step_failed(&mut self, error: DriveError) -> Result<u64, Stop> {
+        let residual = match &error {
+            DriveError::Step(plantd_models::StepError::NotConverged { residual, .. }) => *residual,
+            _ => 0.0,
+        };
+        self.core.note(EventKind::StepFailed, 0, residual);
+        match self.core.on_step_failure() {
+            Some(WatchdogAction::Reset) if self.core.go_home() => {
+                self.ticks += 1;
+                Ok(self.due_ns())
+            }
+            action => {
+                if action == Some(WatchdogAction::Disconnect) {
+                    self.session.revoke_lease();
+                }
+                Err(Stop::Fault(Fault::from_drive(error, self.session.id())))
+            }
+        }
+    }
+
+    /// Counts the times of a step, and gives the schedule up when it cannot be caught up with.
+    fn count(&mut self, timing: &Timing, next_ns: u64) {
+        let lateness_ns = timing.began_ns.saturating_sub(timing.due_ns);
+        let behind_ns = timing.ended_ns.saturating_sub(next_ns);
+        let is_overrun = self.is_paced && behind_ns > 0;
+        let has_slipped = self.is_paced && behind_ns > CATCH_UP_NS;
+        for counts in [&self.live.counts, &*self.all] {
+            counts.steps.fetch_add(1, Ordering::Relaxed);
+            counts.step.record(timing.ended_ns.saturating_sub(timing.began_ns));
+            if self.is_paced {
+                counts.lateness.record(lateness_ns);
+            }
+            if timing.input_sequence != 0 {
+                counts.input_age.record(timing.input_age_ns);
+            }
+            if is_overrun {
+                counts.overruns.fetch_add(1, Ordering::Relaxed);
+            }
+            if has_slipped {
+                counts.slips.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+        if !self.is_paced {
+            // The others of this loop take their turns first.
+            self.origin_ns = timing.ended_ns;
+            self.ticks = 0;
+        } else if has_slipped {
+            self.core.note(EventKind::Slipped, 0, behind_ns as f64 * 1e-9);
+            self.origin_ns = timing.ended_ns;
+            self.ticks = 1;
+        }
+    }
+}
