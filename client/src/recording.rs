@@ -22,6 +22,8 @@ pub enum RecordingEntry {
     Step(Box<v1::StepRecord>),
     /// What is between two steps.
     Mark(v1::MarkRecord),
+    /// What happened to the plant besides its steps.
+    Event(v1::Event),
 }
 
 /// Reads a recording (MCAP), entry by entry.
@@ -85,6 +87,7 @@ impl RecordingReader {
                     v1::StepRecord::decode(bytes).map(|step| RecordingEntry::Step(Box::new(step)))
                 }
                 "/mark" => v1::MarkRecord::decode(bytes).map(RecordingEntry::Mark),
+                "/event" => v1::Event::decode(bytes).map(RecordingEntry::Event),
                 // Of a later version.
                 _ => continue,
             };

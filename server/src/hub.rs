@@ -227,6 +227,9 @@ impl Hub {
             recordings.stop_all();
         }
         let plants: Vec<Arc<Session>> = self.plants().values().cloned().collect();
+        if let Some(state) = &self.state {
+            state.note_running(&plants);
+        }
         plants.iter().for_each(|session| session.pause());
     }
 

@@ -3,11 +3,11 @@
 //! A file `ID.plant` is a `PlantRecord` in protobuf and the FNV-1a hash (u64, little-endian) of it. It is
 //! written aside and renamed: what is there is complete.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use anyhow::{Context as _, Result, bail};
 use plantd_models::{Model, Plant, Snapshot};
@@ -17,6 +17,7 @@ use prost::Message as _;
 use crate::convert::{self, Start};
 use crate::grpc::feedback::set_feedback;
 use crate::grpc::model::compile;
+use crate::grpc::run::{run, run_info};
 use crate::hub::Hub;
 use crate::session::Session;
 use crate::status::Fault;
@@ -27,6 +28,8 @@ const EXTENSION: &str = "plant";
 pub struct StateDirectory {
     path: PathBuf,
     saved: Mutex<BTreeMap<String, Saved>>,
+    /// Ids of the plants that were not paused when the server began to pause them all.
+    running: OnceLock<BTreeSet<String>>,
 }
 
 /// What is known of a file.
@@ -46,7 +49,7 @@ impl StateDirectory {
     /// The directory at a path, made if there is none.
     pub fn open(path: &Path) -> io::Result<Self> {
         fs::create_dir_all(path)?;
-        Ok(Self { path: path.to_owned(), saved: Mutex::default() })
+        Ok(Self { path: path.to_owned(), saved: Mutex::default(), running: OnceLock::new() })
     }
 
     /// Makes the plants anew that the directory holds. What cannot be used is named in the log and
@@ -75,6 +78,13 @@ impl StateDirectory {
         Ok(())
     }
 
+    /// Notes which plants are not paused: they go on with the next server.
+    pub fn note_running(&self, plants: &[Arc<Session>]) {
+        let is_running = |session: &&Arc<Session>| run_info(session).running;
+        let ids = plants.iter().filter(is_running).map(|session| session.id().to_owned());
+        let _ = self.running.set(ids.collect());
+    }
+
     /// Saves all plants that have changed since they were saved.
     pub fn save(&self, hub: &Hub) {
         let mut after = String::new();
@@ -95,6 +105,13 @@ impl StateDirectory {
 
     fn save_plant(&self, hub: &Hub, session: &Session) -> Result<()> {
         let (mut record, model) = session.saved();
+        if let Some(plant) = &mut record.plant {
+            let mut run = run_info(session);
+            if let Some(running) = self.running.get() {
+                run.running = running.contains(session.id());
+            }
+            plant.run = Some(run);
+        }
         let bytes = record.encode_to_vec();
         let hash = hash(&bytes);
         // Whoever deletes the plant waits here, and removes what is written.
@@ -201,7 +218,23 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     {
         tracing::warn!(plant = id, error = %sentence(fault), "shared-memory link not opened");
     }
+    if let Some(info) = info.run
+        && let Err(fault) = resume_run(hub, &session, info)
+    {
+        tracing::warn!(plant = id, error = %sentence(fault), "the plant does not run by itself");
+    }
     Ok(session)
+}
+
+/// Lets a plant run that ran by itself; one that was paused stands still in lockstep.
+fn resume_run(hub: &Hub, session: &Arc<Session>, info: v1::RunInfo) -> Result<(), Fault> {
+    if !info.running {
+        session.pause();
+        return Ok(());
+    }
+    let id = session.id().to_owned();
+    run(hub, v1::RunRequest { id, settings: info.settings, steps: info.steps_left })?;
+    Ok(())
 }
 
 /// Puts the feedback in force that the plant had. Without it the plant is still worth having.

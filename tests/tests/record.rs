@@ -235,6 +235,107 @@ async fn nothing_is_lost_however_fast_somebody_steps() {
     assert_identical(&setup.file("fast"), 60_000);
 }
 
+/// Runs a plant for so many steps and waits for them.
+async fn run(client: &Client, id: &str, pace: v1::Pace, speed: f64, steps: u64) {
+    let settings = v1::RunSettings { pace: pace.into(), speed, input: None };
+    let id = id.to_owned();
+    let before = client.get_plant(&id).await.unwrap().plant.unwrap().state.unwrap().step;
+    let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps };
+    client.run(request).await.unwrap();
+    let end = async {
+        while client.get_plant(&id).await.unwrap().plant.unwrap().state.unwrap().step
+            < before + steps
+        {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(60), end).await.expect("the steps are taken");
+}
+
+#[tokio::test]
+async fn plants_that_run_by_themselves_are_recorded_with_times_and_events() {
+    let setup = setup(&[]).await;
+    let id = setup.plant("cart-pole").await.id;
+    setup.record(&id, "paced").await;
+    run(&setup.client, &id, v1::Pace::Paced, 10.0, 500).await;
+    // A reset while it runs.
+    let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), speed: 10.0, input: None };
+    let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0 };
+    setup.client.run(request).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    setup.client.pause(&id).await.unwrap();
+    setup.client.reset(&id).await.unwrap();
+    run(&setup.client, &id, v1::Pace::Paced, 10.0, 100).await;
+    let ended = setup.client.stop_recording("paced").await.unwrap();
+    assert_eq!((ended.status(), ended.lost), (v1::RecordingStatus::Done, 0));
+    assert!(ended.steps > 600, "{}", ended.steps);
+    assert_identical(&setup.file("paced"), ended.steps);
+    let mut recording = RecordingReader::open(setup.file("paced")).unwrap();
+    let (mut last_ns, mut kinds) = (0, Vec::new());
+    while let Some(entry) = recording.next_entry().unwrap() {
+        match entry {
+            RecordingEntry::Step(step) => {
+                let timing = step.timing.expect("times of a paced step");
+                assert!(last_ns <= timing.began_ns && timing.began_ns <= timing.ended_ns);
+                assert!(0 < timing.due_ns && timing.due_ns <= timing.began_ns);
+                last_ns = timing.ended_ns;
+            }
+            RecordingEntry::Event(event) => kinds.push(event.kind()),
+            RecordingEntry::Mark(_) => {}
+        }
+    }
+    for kind in [v1::EventKind::Started, v1::EventKind::Paused, v1::EventKind::StateSet] {
+        assert!(kinds.contains(&kind), "{kinds:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_free_running_plant_is_not_held_up_and_every_step_is_accounted_for() {
+    const STEPS: u64 = 60_000;
+    let setup = setup(&[]).await;
+    let id = setup.plant("pendulum").await.id;
+    setup.record(&id, "free").await;
+    run(&setup.client, &id, v1::Pace::Free, 0.0, STEPS).await;
+    let ended = setup.client.stop_recording("free").await.unwrap();
+    assert_eq!((ended.status(), ended.steps + ended.lost), (v1::RecordingStatus::Done, STEPS));
+    let (code, outcome) = replay(&setup.file("free"));
+    let count = |name: &str| outcome[name].as_u64().unwrap();
+    assert_eq!((code, &outcome["identical"]), (Some(0), &true.into()), "{outcome}");
+    assert_eq!((count("steps") + count("not_compared"), count("lost")), (ended.steps, ended.lost));
+}
+
+#[tokio::test]
+async fn a_plant_that_its_watchdog_resets_is_replayed() {
+    let setup = setup(&[]).await;
+    let request = v1::CreatePlantRequest {
+        model: "cart-pole".to_owned(),
+        initial: Some(v1::InitialState {
+            form: Some(v1::initial_state::Form::OperatingPoint("upright".to_owned())),
+        }),
+        ..Default::default()
+    };
+    let id = setup.client.create_plant(request).await.unwrap().id;
+    let watchdog = v1::Watchdog {
+        quantity: "x".to_owned(),
+        min: Some(-0.1),
+        max: Some(0.1),
+        action: v1::WatchdogAction::Reset.into(),
+    };
+    let request =
+        v1::SetSafetyRequest { id: id.clone(), watchdogs: vec![watchdog], ..Default::default() };
+    setup.client.set_safety(request).await.unwrap();
+    setup.record(&id, "reset").await;
+    // One push after the other to the same side.
+    let u = Some(v1::Matrix::from_rows(&vec![vec![5.0]; 400]));
+    let request = v1::StepRequest { id: id.clone(), u, hold: 0, all_states: true };
+    let states = setup.client.step(request).await.unwrap().states;
+    let resets = states.iter().filter(|state| state.step == 0).count() as u64;
+    assert!(resets > 1, "{resets}");
+    setup.client.stop_recording("reset").await.unwrap();
+    // The step after which it was reset is not among them.
+    assert_identical(&setup.file("reset"), 400 - resets);
+}
+
 /// Where eight bytes are in a file.
 fn places(bytes: &[u8], number: f64) -> Vec<usize> {
     let pattern = number.to_le_bytes();

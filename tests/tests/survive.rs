@@ -217,3 +217,41 @@ async fn broken_files_are_named_and_left_alone() {
     assert_eq!(std::fs::read(path("c")).unwrap(), &good[..good.len() / 3]);
     assert!(server.log().contains("plant not saved"), "{}", server.log());
 }
+
+#[tokio::test]
+async fn a_plant_that_ran_runs_again_and_one_that_was_paused_does_not() {
+    let state = tempfile::tempdir().unwrap();
+    let mut server = serve(state.path());
+    let client = server.client().await;
+    for id in ["runs", "stands", "waits"] {
+        create(&client, id, "pendulum").await;
+    }
+    let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), speed: 2.0, input: None };
+    let request =
+        v1::RunRequest { id: "runs".to_owned(), settings: Some(settings.clone()), steps: 0 };
+    client.run(request).await.unwrap();
+    step(&client, "stands", 0, 5).await;
+    client.pause("stands").await.unwrap();
+    assert!(server.stop().unwrap().success());
+
+    let server = serve(state.path());
+    let client = server.client().await;
+    let plant = async |id: &str| client.get_plant(id).await.unwrap().plant.unwrap();
+    let stands = plant("stands").await;
+    assert!(!stands.run.unwrap().running);
+    assert_eq!(stands.state.unwrap().step, 5);
+    // One that waits for its driver does so again.
+    assert!(plant("waits").await.run.unwrap().running);
+    let mut driver = client.drive("waits").await.unwrap();
+    assert_eq!(driver.step(&[0.0]).await.unwrap().state.unwrap().step, 1);
+    let first = plant("runs").await;
+    let run = first.run.unwrap();
+    assert!(run.running);
+    let again = run.settings.unwrap();
+    assert_eq!((again.pace, again.speed), (settings.pace, settings.speed));
+    let started = Instant::now();
+    while plant("runs").await.state.unwrap().step <= first.state.as_ref().unwrap().step {
+        assert!(started.elapsed() < Duration::from_secs(30), "it does not move");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}

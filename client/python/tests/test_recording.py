@@ -27,7 +27,8 @@ def test_a_recording_is_read_with_the_schemas_in_it(client, tmp_path):
         reader = make_reader(source, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
         names = {schema.name for schema in summary.schemas.values()}
-        assert names == {"plantd.v1.PlantRecord", "plantd.v1.StepRecord", "plantd.v1.MarkRecord"}
+        kinds = ("PlantRecord", "StepRecord", "MarkRecord", "Event")
+        assert names == {f"plantd.v1.{kind}" for kind in kinds}
         assert summary.statistics.message_count >= 51
         messages = [
             (channel.topic, message.log_time, message.publish_time, decoded)

@@ -15,7 +15,7 @@ pub mod plant;
 pub mod record;
 mod reference;
 mod rollout;
-mod run;
+pub(crate) mod run;
 mod settle;
 pub mod watch;
 

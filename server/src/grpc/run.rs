@@ -30,7 +30,7 @@ const WATCHDOGS_MAX: usize = 256;
 const EVENTS_PERIOD: Duration = Duration::from_millis(10);
 
 /// Answers a Run call. Blocks for as long as a step takes: call it on a worker.
-pub(super) fn run(hub: &Hub, request: v1::RunRequest) -> Result<v1::RunResponse, Fault> {
+pub(crate) fn run(hub: &Hub, request: v1::RunRequest) -> Result<v1::RunResponse, Fault> {
     let session = hub.session(&request.id)?;
     let settings = request.settings.map(|settings| run_settings(settings, session.model()));
     session.run(settings.transpose()?, request.steps, hub.limits.running_plants)?;
@@ -46,7 +46,7 @@ pub(super) fn pause(hub: &Hub, id: &str) -> Result<v1::PauseResponse, Fault> {
 }
 
 /// How a plant is being run.
-pub(super) fn run_info(session: &Session) -> v1::RunInfo {
+pub(crate) fn run_info(session: &Session) -> v1::RunInfo {
     let (run, steps_left) = session.run_info();
     let RunSettings { pace, speed, input } = run.settings;
     let (action, ramp_s) = match input.action {
@@ -258,7 +258,8 @@ impl Messages for EventWatcher {
     }
 }
 
-fn event_message(number: u64, event: &Event, model: &Model) -> v1::Event {
+/// An event with names.
+pub(crate) fn event_message(number: u64, event: &Event, model: &Model) -> v1::Event {
     let (subject, value) = match event.kind {
         EventKind::DriverAttached | EventKind::DriverLeft => {
             let driver = DriverKind::from_code(event.index as u8);

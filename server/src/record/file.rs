@@ -19,6 +19,7 @@ pub(super) struct Writer<W: Write> {
     mcap: mcap::Writer<NoSeek<W>>,
     step: Topic,
     mark: Topic,
+    event: Topic,
     buffer: Vec<u8>,
 }
 
@@ -47,18 +48,25 @@ impl<W: Write> Writer<W> {
             .disable_seeking(true)
             .create(NoSeek::new(file))?;
         mcap.write_metadata(&Metadata { name: "plantd".to_owned(), metadata: metadata(plant) })?;
-        let (mut step, mut mark, mut first) = (0, 0, 0);
+        let (mut step, mut mark, mut event, mut first) = (0, 0, 0, 0);
         for (id, topic, message) in [
             (&mut first, "/plant", "PlantRecord"),
             (&mut step, "/step", "StepRecord"),
             (&mut mark, "/mark", "MarkRecord"),
+            (&mut event, "/event", "Event"),
         ] {
             let (name, data) = (format!("plantd.v1.{message}"), descriptors(message));
             let schema = mcap.add_schema(&name, "protobuf", &data)?;
             *id = mcap.add_channel(schema, topic, "protobuf", &BTreeMap::new())?;
         }
         let topic = |id| Topic { id, sequence: 0 };
-        let mut writer = Self { mcap, step: topic(step), mark: topic(mark), buffer: Vec::new() };
+        let mut writer = Self {
+            mcap,
+            step: topic(step),
+            mark: topic(mark),
+            event: topic(event),
+            buffer: Vec::new(),
+        };
         write(&mut writer.mcap, &mut topic(first), &mut writer.buffer, plant, times)?;
         writer.flush()?;
         Ok(writer)
@@ -72,6 +80,11 @@ impl<W: Write> Writer<W> {
     /// Writes a mark.
     pub(super) fn mark(&mut self, mark: &v1::MarkRecord, times: Times) -> Result<(), McapError> {
         write(&mut self.mcap, &mut self.mark, &mut self.buffer, mark, times)
+    }
+
+    /// Writes an event.
+    pub(super) fn event(&mut self, event: &v1::Event, times: Times) -> Result<(), McapError> {
+        write(&mut self.mcap, &mut self.event, &mut self.buffer, event, times)
     }
 
     /// Hands what was written to the system: it stays when the server is killed.

@@ -14,6 +14,8 @@ use plantd_proto::v1::{self, MarkReason, RecordingStatus};
 use super::file::{Times, Writer};
 use crate::convert;
 use crate::frame::{Frame, Timing};
+use crate::grpc::run::{event_message, run_info};
+use crate::realtime::event::EventReader;
 use crate::ring::Reader;
 use crate::session::Session;
 use crate::session::tap::{Mark, Tap};
@@ -149,6 +151,7 @@ struct Loop {
     session: Arc<Session>,
     tap: Arc<Tap>,
     reader: Reader,
+    events: EventReader,
     writer: Writer<BufWriter<Counted>>,
     options: Options,
     shared: Arc<Shared>,
@@ -182,6 +185,7 @@ impl Loop {
             session: Arc::clone(session),
             tap: Arc::clone(tap),
             reader: Reader::from(Arc::clone(&tap.ring), mark.at),
+            events: session.events().reader(session.events().next_number()),
             writer,
             options,
             shared: Arc::clone(shared),
@@ -237,6 +241,7 @@ impl Loop {
                 self.has_moved = false;
             }
             self.drain()?;
+            self.drain_events()?;
             {
                 let mut info = self.shared.info();
                 (info.steps, info.lost) = (self.steps, self.reader.lost());
@@ -280,6 +285,16 @@ impl Loop {
             while let Some(mark) = self.tap.mark_before(until) {
                 self.mark(&mark)?;
             }
+        }
+        Ok(())
+    }
+
+    /// Writes what has happened besides steps.
+    fn drain_events(&mut self) -> Result<(), McapError> {
+        while let Some((number, event)) = self.events.read_next() {
+            let message = event_message(number, &event, self.session.model());
+            let log_ns = self.clock.now_ns(event.at_ns);
+            self.writer.event(&message, Times { log_ns, plant_s: self.frame.time_s })?;
         }
         Ok(())
     }
@@ -403,6 +418,7 @@ fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecor
         state: Some(convert::plant_state(plant)),
         accuracy: session.accuracy(),
         parameters: convert::parameters(&mark.parameters),
+        run: Some(run_info(session)),
         ..Default::default()
     };
     v1::PlantRecord {
@@ -434,7 +450,7 @@ fn fill(record: &mut v1::StepRecord, frame: &Frame) {
     record.outputs = convert::outputs(&frame.outputs, &frame.lost);
     record.report = Some(convert::report(&frame.report));
     let timing = &frame.timing;
-    record.timing = (timing.began_ns != 0).then_some(v1::RecordTiming {
+    record.timing = (timing.began_ns != 0).then_some(v1::StepTiming {
         due_ns: timing.due_ns,
         began_ns: timing.began_ns,
         ended_ns: timing.ended_ns,

@@ -323,6 +323,7 @@ impl<'a> Twin<'a> {
                         self.take_steps().await?;
                     }
                 }
+                Some(RecordingEntry::Event(_)) => {}
                 Some(RecordingEntry::Mark(mark)) => {
                     self.take_steps().await?;
                     if self.outcome.difference.is_none() {
