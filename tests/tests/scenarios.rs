@@ -52,7 +52,7 @@ fn what_must_come_true_does() {
     for case in &cases {
         assert_eq!(case["status"], "passed", "{case}");
     }
-    assert_eq!((cases.len(), code), (8, 0));
+    assert_eq!((cases.len(), code), (9, 0));
 }
 
 #[test]
@@ -102,11 +102,12 @@ fn a_step_that_is_refused_ends_the_run() {
 fn a_controller_that_dies_or_falls_silent_is_told_of() {
     let (dead, _) = cases("broken/dies.toml", &[]);
     assert_eq!((&dead[0]["status"], &dead[0]["steps"]), (&"failed".into(), &20.into()));
-    assert_eq!(dead[0]["ended"], "the controller ended after step 20 of 50: exit status: 7");
+    assert_eq!(dead[0]["ended"], "step 20 of 50: the controller ended: exit status: 7");
     assert_eq!(dead[0]["output"], "I am dying\n");
     for (file, ended, steps) in [
         ("broken/silent.toml", "step 20 of 50 when 3 s were over", 20),
         ("broken/absent.toml", "no step was taken in 0.5 s", 0),
+        ("broken/absent-paced.toml", "no step was taken in 0.5 s", 0),
     ] {
         let (cases, code) = cases(file, &[]);
         assert_eq!((&cases[0]["ended"], code), (&ended.into(), 1), "{file}");
@@ -185,7 +186,7 @@ fn reports_say_what_the_console_says() {
 fn a_server_that_is_there_is_left_without_plants() {
     let server = ServerProcess::start().unwrap();
     let (cases, code) = cases("met", &["--address", server.address(), "--jobs", "3"]);
-    assert_eq!((cases.len(), code), (8, 0));
+    assert_eq!((cases.len(), code), (9, 0));
     let plants = plantctl(&["--address", server.address(), "list", "plants", "--json"]);
     let plants: Value = serde_json::from_str(&stdout(&plants)).unwrap();
     assert_eq!(plants["plants"], Value::Array(Vec::new()));

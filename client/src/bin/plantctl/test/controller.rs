@@ -182,7 +182,6 @@ mod tests {
             run: ["/bin/sh", "-c", script].map(str::to_owned).to_vec(),
             link: false,
             env: Default::default(),
-            may_lose_samples: false,
         };
         let told = Assignment {
             address: "unix:/a",

@@ -133,7 +133,11 @@ impl TryFrom<NumberOrText> for Expression {
 
     fn try_from(given: NumberOrText) -> Result<Self, String> {
         match given {
-            NumberOrText::Number(x) => Ok(Self { text: x.to_string(), node: Node::Number(x) }),
+            NumberOrText::Number(x) => {
+                let is_plain = x == 0.0 || (1e-4..1e7).contains(&x.abs());
+                let text = if is_plain { x.to_string() } else { format!("{x:e}") };
+                Ok(Self { text, node: Node::Number(x) })
+            }
             NumberOrText::Text(text) => Self::parse(&text),
         }
     }

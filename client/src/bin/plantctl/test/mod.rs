@@ -26,7 +26,7 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use self::expect::short;
 use self::run::{Outcome, Place, Prepared, Status, lock, summary};
-use self::scenario::{Case, Controller, Scenario};
+use self::scenario::{Case, Controller, Pace, Scenario};
 use crate::FAILED;
 use crate::commands::Output;
 use crate::own_server::OwnServer;
@@ -87,7 +87,7 @@ pub(crate) struct Options {
     /// Seed in place of the scenarios' own.
     #[arg(long)]
     seed: Option<u64>,
-    /// Cases at a time; as many as there are processors if not given.
+    /// Cases at a time; as many as there are processors if not given. Paced ones run one at a time.
     #[arg(long, short, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     jobs: Option<u16>,
     /// The server to start; the `plantd` beside this program or in PATH if not given.
@@ -305,12 +305,19 @@ async fn run_all(
     let finished = {
         let tested = &tested;
         let counter = &counter;
-        let runs = cases.into_iter().enumerate().map(|(order, (index, case))| async move {
+        let run = |(order, (index, case)): (usize, (usize, Case))| async move {
             let prepared = &tested[index].prepared;
             let plant = plant_id(prepared, &case, counter.fetch_add(1, Ordering::Relaxed));
             (order, index, prepared.run(place, &case, &plant).await)
-        });
-        let mut running = stream::iter(runs).buffer_unordered(jobs);
+        };
+        let is_paced = |(_, (index, _)): &(usize, (usize, Case))| {
+            tested[*index].prepared.scenario.pace == Pace::Paced
+        };
+        let (paced, rest): (Vec<_>, Vec<_>) = cases.into_iter().enumerate().partition(is_paced);
+        // Plants that follow the clock must not disturb each other.
+        let paced = stream::iter(paced.into_iter().map(run)).buffer_unordered(1);
+        let mut running =
+            stream::iter(rest.into_iter().map(run)).buffer_unordered(jobs).chain(paced);
         let mut finished = Vec::new();
         while let Some((order, index, outcome)) = running.next().await {
             let prepared = &tested[index].prepared;

@@ -13,13 +13,19 @@ use super::controller::{Assignment, Controller as Process};
 use super::expect::{Curve, Facts, Verdict};
 use super::expression::Expression;
 use super::samples::{Columns, Sample, Samples};
-use super::scenario::{Case, Controller, Event, Inputs, Lqr, Plant, Reference, Scenario};
+use super::scenario::{Case, Controller, Event, Inputs, Lqr, Pace, Plant, Reference, Scenario};
 use crate::{json, optimize};
 
 /// Part of a time step by which a time may miss a step and still mean it.
 const STEP_ROUNDING: f64 = 1e-6;
 /// Samples that may wait to be read.
 const WATCH_QUEUE: u32 = 2048;
+/// Steps that a driver in lockstep is let take before they have all been seen.
+const STEPS_AHEAD: u64 = WATCH_QUEUE as u64 / 2;
+/// How often a plant that nobody steps is looked at.
+const LOOK_PERIOD: Duration = Duration::from_millis(100);
+/// How often it is looked whether a driver has come.
+const DRIVER_PERIOD: Duration = Duration::from_millis(2);
 
 /// Where cases run.
 pub(crate) struct Place {
@@ -42,6 +48,7 @@ pub(crate) struct Prepared {
     faults: Vec<Vec<v1::FaultSpec>>,
     /// Rows of inputs, as far as they are given; the last one holds on.
     inputs: Vec<Vec<Option<f64>>>,
+    policy: Option<v1::InputPolicy>,
     uses_energy: bool,
     steps: u64,
 }
@@ -115,6 +122,8 @@ struct Run<'a> {
     /// What sensors deliver at the start.
     y: Vec<f64>,
     last_step: u64,
+    /// Step up to which the plant may go.
+    until: u64,
     lost: u64,
     ended: Option<String>,
     output: String,
@@ -155,10 +164,23 @@ impl Prepared {
         let faults = scenario.events.iter().enumerate().map(|(i, event)| {
             faults(event, &model, time_step_s).with_context(|| format!("events[{i}]"))
         });
-        let faults = faults.collect::<Result<_>>()?;
-        let inputs = match &scenario.controller {
-            Controller::Inputs(inputs) => rows(inputs, &model, folder)?,
-            _ => Vec::new(),
+        let mut faults: Vec<_> = faults.collect::<Result<_>>()?;
+        let mut inputs = Vec::new();
+        match &scenario.controller {
+            Controller::Inputs(given) if scenario.is_stepped() => {
+                inputs = rows(given, &model, folder)?;
+            }
+            Controller::Inputs(Inputs { constant, .. }) => {
+                // Nobody drives a plant that runs by itself: the forces act from the beginning.
+                let event = Event { inputs: constant.clone(), ..Event::default() };
+                let forces = self::faults(&event, &model, time_step_s);
+                faults.push(forces.context("controller.inputs.constant")?);
+            }
+            _ => {}
+        }
+        let policy = match scenario.input_policy.is_empty() {
+            true => None,
+            false => Some(message("InputPolicy", &scenario.input_policy).context("input_policy")?),
         };
         Ok(Self {
             file,
@@ -170,6 +192,7 @@ impl Prepared {
             channels,
             faults,
             inputs,
+            policy,
             uses_energy,
             steps,
         })
@@ -193,6 +216,7 @@ impl Prepared {
             facts: Facts::default(),
             y: Vec::new(),
             last_step: 0,
+            until: 0,
             lost: 0,
             ended: None,
             output: String::new(),
@@ -243,8 +267,14 @@ impl Run<'_> {
         let scenario = &self.prepared.scenario;
         let mut state = self.create(case, plant).await?;
         state.step = 0;
-        match &scenario.controller {
-            Controller::Inputs(_) | Controller::Lqr(_) => self.step(plant, state).await,
+        if scenario.is_stepped() {
+            return self.step(plant, state).await;
+        }
+        let messages = self.watch(plant).await?;
+        if scenario.pace == Pace::Lockstep {
+            self.let_run(plant, 0).await?;
+        }
+        let mut process = match &scenario.controller {
             Controller::Command(command) => {
                 let told = Assignment {
                     address: &self.place.address,
@@ -254,19 +284,20 @@ impl Run<'_> {
                     steps: self.prepared.steps,
                     duration_s: scenario.duration_s,
                 };
-                let messages = self.watch(plant).await?;
-                let mut process = Process::start(command, self.prepared.folder(), &told)?;
-                let seen = self.follow(plant, messages, Some(&mut process)).await;
-                self.output = process.stop().await;
-                seen?;
-                self.check_lost(command.may_lose_samples)
+                Some(Process::start(command, self.prepared.folder(), &told)?)
             }
-            Controller::External(external) => {
-                let messages = self.watch(plant).await?;
-                self.follow(plant, messages, None).await?;
-                self.check_lost(external.may_lose_samples)
-            }
+            _ => None,
+        };
+        let seen = self.follow(plant, messages, process.as_mut()).await;
+        if let Some(process) = process {
+            self.output = process.stop().await;
         }
+        seen?;
+        if scenario.pace == Pace::Paced {
+            let timing = self.place.client.timing(plant, false).await?;
+            self.facts.deadline_misses = Some(timing.overruns);
+        }
+        self.check_lost(scenario.may_lose_samples)
     }
 
     /// Makes the plant as the case wants it, and returns its state.
@@ -406,19 +437,65 @@ impl Run<'_> {
         Ok(self.place.client.watch(request).await?)
     }
 
-    /// Watches a plant that somebody else drives, until it has taken all its steps.
+    /// Lets the plant go on from `step`: to the next change of parameters or to the end, and in lockstep
+    /// no further than what can wait to be seen.
+    async fn let_run(&mut self, id: &str, step: u64) -> Result<()> {
+        let Prepared { scenario, policy, steps, .. } = self.prepared;
+        let mut until = *steps;
+        for event in scenario.events.iter().filter(|event| !event.parameters.is_empty()) {
+            match begins(event, self.time_step_s) {
+                begin if begin == step => {
+                    self.change(id, &event.parameters).await.context("events")?
+                }
+                begin if begin > step => until = until.min(begin),
+                _ => {}
+            }
+        }
+        let pace = match scenario.pace {
+            Pace::Lockstep => v1::Pace::Lockstep,
+            Pace::Paced => v1::Pace::Paced,
+        };
+        if scenario.pace == Pace::Lockstep {
+            until = until.min(step + STEPS_AHEAD);
+        }
+        let settings = v1::RunSettings {
+            pace: pace.into(),
+            speed: scenario.speed.unwrap_or(0.0),
+            input: policy.clone(),
+        };
+        let steps = until - step;
+        let request = v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps };
+        self.place.client.run(request).await?;
+        self.until = until;
+        Ok(())
+    }
+
+    /// Watches a plant that is driven by somebody else, or runs by itself, until it has taken all its
+    /// steps.
     async fn follow(
         &mut self,
         id: &str,
         mut messages: plantd_client::Answers<v1::WatchResponse>,
         mut process: Option<&mut Process>,
     ) -> Result<()> {
-        let mut goal = self.prepared.steps;
-        let mut exit = None;
+        let Prepared { scenario, steps, .. } = self.prepared;
+        let has_driver =
+            matches!(scenario.controller, Controller::Command(_) | Controller::External(_));
+        let is_paced = scenario.pace == Pace::Paced;
+        let mut is_begun = !is_paced;
+        let mut goal = *steps;
+        let mut stopped = None;
+        let mut look = tokio::time::interval(LOOK_PERIOD);
+        if is_paced && !has_driver {
+            self.let_run(id, 0).await?;
+            is_begun = true;
+        } else if is_paced {
+            look = tokio::time::interval(DRIVER_PERIOD);
+        }
         loop {
             let ends = async {
                 match process.as_mut() {
-                    Some(process) if exit.is_none() => process.wait().await,
+                    Some(process) if stopped.is_none() => process.wait().await,
                     _ => std::future::pending().await,
                 }
             };
@@ -428,10 +505,23 @@ impl Run<'_> {
                     self.see(&message)?;
                 }
                 status = ends => {
-                    exit = Some(status?);
-                    let plant = self.place.client.get_plant(id).await?.plant;
-                    let step = plant.and_then(|plant| plant.state).map_or(0, |state| state.step);
-                    goal = goal.min(step);
+                    goal = goal.min(self.plant_step(id).await?.1);
+                    stopped = Some(format!("the controller ended: {}", status?));
+                }
+                _ = look.tick(), if is_paced && stopped.is_none() => {
+                    let (plant, step) = self.plant_step(id).await?;
+                    if !is_begun && !plant.driver.is_empty() {
+                        // The plant runs from here, with its driver.
+                        self.let_run(id, 0).await?;
+                        is_begun = true;
+                        look = tokio::time::interval(LOOK_PERIOD);
+                    }
+                    if let Some(failure) = plant.run.and_then(|run| run.stopped_by) {
+                        let time_s = step as f64 * self.time_step_s;
+                        self.facts.failures.push((time_s, failure.message.clone()));
+                        goal = goal.min(step);
+                        stopped = Some(failure.message);
+                    }
                 }
                 () = sleep_until(self.deadline) => return self.time_out(),
             }
@@ -441,12 +531,32 @@ impl Run<'_> {
             if self.samples.len() > 0 && self.last_step >= goal {
                 break;
             }
+            if is_begun && stopped.is_none() && self.last_step >= self.until {
+                ensure!(
+                    self.last_step == self.until || !self.changes_at(self.until),
+                    "the controller does not wait for changes of parameters: it calls Step"
+                );
+                self.let_run(id, self.last_step).await?;
+            }
         }
-        if let Some(status) = exit.filter(|_| self.last_step < self.prepared.steps) {
-            let (at, of) = (self.last_step, self.prepared.steps);
-            self.ended = Some(format!("the controller ended after step {at} of {of}: {status}"));
+        if let Some(reason) = stopped.filter(|_| self.last_step < *steps) {
+            self.ended = Some(format!("step {} of {steps}: {reason}", self.last_step));
         }
         Ok(())
+    }
+
+    /// Whether parameters change at a step.
+    fn changes_at(&self, step: u64) -> bool {
+        let is_it =
+            |event: &Event| !event.parameters.is_empty() && begins(event, self.time_step_s) == step;
+        self.prepared.scenario.events.iter().any(is_it)
+    }
+
+    /// The plant and its step.
+    async fn plant_step(&self, id: &str) -> Result<(v1::PlantInfo, u64)> {
+        let plant = self.place.client.get_plant(id).await?.plant.context("no plant")?;
+        let step = plant.state.as_ref().map_or(0, |state| state.step);
+        Ok((plant, step))
     }
 
     /// Takes a message of the watch.

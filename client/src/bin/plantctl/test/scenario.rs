@@ -33,9 +33,19 @@ pub(crate) struct Scenario {
     /// Time on the clock after which a case is given up, s.
     #[serde(default = "default_timeout")]
     pub(crate) timeout_s: f64,
-    /// Not faster than so many seconds of plant time in a second on the clock; as fast as possible if
-    /// not given.
+    /// Who decides when the plant takes a step.
+    #[serde(default)]
+    pub(crate) pace: Pace,
+    /// Seconds of plant time in a second on the clock. If not given: in lockstep as fast as possible, else
+    /// 1.
     pub(crate) speed: Option<f64>,
+    /// What a paced plant does without a valid input: a message `InputPolicy` of the contract.
+    #[serde(default)]
+    #[schemars(with = "BTreeMap<String, serde_json::Value>")]
+    pub(crate) input_policy: toml::Table,
+    /// Judge a run although samples of it were lost.
+    #[serde(default)]
+    pub(crate) may_lose_samples: bool,
     /// The plant.
     pub(crate) plant: Plant,
     /// What the motion is compared with: the signals `ref(...)` and `error(...)`.
@@ -64,6 +74,17 @@ pub(crate) struct Scenario {
 
 fn default_timeout() -> f64 {
     60.0
+}
+
+/// Who decides when a plant takes a step.
+#[derive(Clone, Copy, Debug, Default, Deserialize, JsonSchema, PartialEq, Eq)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Pace {
+    /// Its driver: the plant waits for each input.
+    #[default]
+    Lockstep,
+    /// The wall clock: the plant waits for nobody.
+    Paced,
 }
 
 /// The plant.
@@ -176,9 +197,6 @@ pub(crate) struct Command {
     /// Further environment variables.
     #[serde(default)]
     pub(crate) env: BTreeMap<String, String>,
-    /// Judge the run although samples of it were lost.
-    #[serde(default)]
-    pub(crate) may_lose_samples: bool,
 }
 
 /// A controller that is there already.
@@ -188,13 +206,10 @@ pub(crate) struct External {
     /// Open the shared-memory link of the plant.
     #[serde(default)]
     pub(crate) link: bool,
-    /// Judge the run although samples of it were lost.
-    #[serde(default)]
-    pub(crate) may_lose_samples: bool,
 }
 
 /// Something that happens at a time: new parameters, forces that add to the inputs, or a fault.
-#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Event {
     /// When, s of plant time; from the step that begins then.
@@ -309,11 +324,21 @@ impl Scenario {
             }
             Controller::Command(command) => {
                 ensure!(!command.run.is_empty(), "controller.command.run: a program is needed");
-                self.check_driven("controller.command")?;
             }
-            Controller::External(_) => self.check_driven("controller.external")?,
-            Controller::Inputs(_) => {}
+            Controller::Inputs(inputs) => ensure!(
+                self.pace == Pace::Lockstep || inputs.table.is_none(),
+                "controller.inputs.table: a table needs lockstep"
+            ),
+            Controller::External(_) => {}
         }
+        let is_paced = self.pace == Pace::Paced;
+        ensure!(is_paced || self.input_policy.is_empty(), "input_policy: is for paced plants");
+        let wall_s = self.duration_s / self.speed.unwrap_or(1.0);
+        ensure!(
+            !(is_paced || self.speed.is_some()) || wall_s < self.timeout_s,
+            "timeout_s is {}; the run takes {wall_s} s on the clock",
+            self.timeout_s
+        );
         ensure!(!self.expect.is_empty(), "expect: at least one expectation is needed");
         for (i, expectation) in self.expect.iter().enumerate() {
             let key = || format!("expect[{i}].{}", expectation.key());
@@ -360,15 +385,10 @@ impl Scenario {
         Ok(())
     }
 
-    /// What cannot be done between the steps of somebody else.
-    fn check_driven(&self, key: &str) -> Result<()> {
-        let is_change = |event: &Event| !event.parameters.is_empty();
-        ensure!(
-            !self.events.iter().any(is_change),
-            "{key}: events with parameters need a built-in controller"
-        );
-        ensure!(self.speed.is_none(), "{key}: speed needs a built-in controller");
-        Ok(())
+    /// Whether the plant is stepped by the one who runs the scenario, rather than watched.
+    pub(crate) fn is_stepped(&self) -> bool {
+        let is_own = matches!(self.controller, Controller::Inputs(_) | Controller::Lqr(_));
+        is_own && self.pace == Pace::Lockstep
     }
 
     /// Number of steps of so many seconds.
@@ -471,9 +491,13 @@ mod tests {
             ("controller.lqr = { q = [1], r = [1] }", "a `reference` is needed"),
             ("controller.command = { run = [] }", "a program is needed"),
             ("controller.pid = { k = 1 }", "unknown variant `pid`"),
+            ("pace = 'slow'", "pace: unknown variant"),
+            ("pace = 'paced'\ntimeout_s = 2", "the run takes 2 s"),
+            ("speed = 0.01", "the run takes 200 s"),
+            ("input_policy = { timeout_s = 1 }", "input_policy: is for paced"),
             (
-                "speed = 2\ncontroller.command = { run = ['a'] }",
-                "controller.command: speed needs a built-in",
+                "pace = 'paced'\ncontroller.inputs.table = 'a.csv'",
+                "controller.inputs.table: a table needs lockstep",
             ),
             ("events = [{ at_s = 3, inputs = { tau = 1 } }]", "events[0].at_s is 3"),
             ("events = [{ at_s = 1 }]", "events[0]: give one of"),
