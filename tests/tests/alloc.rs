@@ -12,6 +12,7 @@ use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
 use plantd_server::limits::Limits;
 use plantd_server::metrics::Metrics;
 use plantd_server::realtime::{RealTime, RealTimeSettings};
+use plantd_server::record::Recordings;
 use plantd_server::regulator::{Constraints, Reference, Spec};
 use plantd_server::session::{DriverKind, Session};
 
@@ -256,6 +257,28 @@ fn steps_with_channels_allocate_nothing() {
     });
     assert_eq!(count, 0);
     assert!(session.faults().iter().all(|fault| fault.beginnings > 0));
+}
+
+#[test]
+fn a_recorded_step_allocates_nothing() {
+    let scene = builtin::scene("cart-pole").expect("a built-in scene");
+    let model = Arc::new(Model::compile(&scene).expect("it compiles"));
+    let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("a plant");
+    let session = new_session(plant);
+    let directory = tempfile::tempdir().expect("a directory");
+    let recordings = Recordings::open(directory.path(), Limits::default()).expect("opened");
+    recordings.start(&session, "steps".to_owned(), 0.0).expect("it can be recorded");
+    let mut lease = session.acquire(DriverKind::Step).expect("nobody has it");
+    // More than the ring holds, so that some steps wait for the recorder.
+    let steps = 20_000;
+    let count = allocations(|| {
+        for _ in 0..steps {
+            lease.step(&[0.2]).expect("a step succeeds");
+        }
+    });
+    assert_eq!(count, 0);
+    let recording = recordings.stop("steps").expect("it ends");
+    assert_eq!((recording.steps, recording.lost), (steps, 0));
 }
 
 /// A session around a plant.
