@@ -447,3 +447,17 @@ fn print_summary(output: Output, report: &Report) -> Result<()> {
         || format!("{passed} passed, {failed} failed, {errors} not run\n"),
     )?)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_word_survives_a_shell() {
+        for word in ["plain-1", "two words", "it's", "$HOME", "", "a[b]"] {
+            let echo = format!("printf %s {}", quoted(word));
+            let output = std::process::Command::new("sh").args(["-c", &echo]).output().unwrap();
+            assert_eq!(String::from_utf8(output.stdout).unwrap(), word);
+        }
+    }
+}

@@ -547,6 +547,18 @@ mod tests {
     }
 
     #[test]
+    fn the_scenarios_in_the_help_and_in_the_guide_are_some() {
+        let (_, help) = super::super::EXAMPLE.split_once(":\n\n").unwrap();
+        let (help, _) = help.split_once("\n\nExamples").unwrap();
+        assert_eq!(Scenario::parse(help).unwrap().cases().len(), 20);
+        let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/TESTING.md");
+        let guide = std::fs::read_to_string(guide).unwrap();
+        let (_, block) = guide.split_once("```toml\n").unwrap();
+        let (block, _) = block.split_once("```").unwrap();
+        assert_eq!(Scenario::parse(block).unwrap().cases().len(), 12);
+    }
+
+    #[test]
     fn steps_are_whole() {
         let scenario = parse("");
         assert_eq!(scenario.steps(0.1).unwrap(), 20);
