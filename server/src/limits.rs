@@ -98,6 +98,8 @@ limits! {
     channel_numbers = 1_000_000 in 0..=1_000_000_000;
     /// Faults of a plant; those that are over make room for new ones.
     faults = 256 in 0..=65_536;
+    /// Sets of changed parameters, by faults of a plant, that can be in force together; each takes a plant's memory.
+    parameter_sets = 32 in 1..=4096;
     /// Iterations of one trajectory optimisation.
     optimization_iterations = 100_000 in 1..=4_000_000_000;
     /// Shortenings of one step of a trajectory optimisation.

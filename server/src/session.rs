@@ -323,6 +323,11 @@ impl Session {
         self.with_core(|core| core.plant.clone())
     }
 
+    /// Copies of all plants that can be in force; the first is the one without changes that faults make.
+    pub(crate) fn copy_plants(&self) -> Vec<Plant> {
+        self.with_core(|core| core.copy_plants())
+    }
+
     /// The same with the number of changes of its parameters so far.
     pub fn copy_plant_and_generation(&self) -> (Plant, u64) {
         self.with_core(|core| (core.plant.clone(), core.generation))
@@ -736,8 +741,10 @@ impl Session {
 
     /// A copy of the plant, put back into the state in which the session began; changed parameters stay.
     fn plant_at_start(&self) -> Result<Plant, InitialError> {
-        let mut plant = self.copy_plant();
-        if plant.restore(&self.start).is_err() {
+        let mut plants = self.copy_plants();
+        let restored = plants.iter_mut().position(|plant| plant.restore(&self.start).is_ok());
+        let mut plant = plants.swap_remove(restored.unwrap_or(0));
+        if restored.is_none() {
             // Of other parameters or another time step: what can be kept is x.
             let State { step, q, p, v, .. } = self.start_state.clone();
             plant.initialize(&Initial::Momentum { q, p, v })?;
@@ -998,7 +1005,7 @@ impl Lease {
     /// Puts the plant into a state, step 0, and tells it.
     pub fn initialize(&mut self, initial: &Initial) -> Result<(State, f64), InitialError> {
         let _replacing = lock(&self.session.replacing);
-        let mut plant = self.session.copy_plant();
+        let mut plant = self.session.copy_plants().swap_remove(0);
         plant.initialize(initial)?;
         Ok(self.session.replace_plant(plant))
     }
@@ -1006,7 +1013,9 @@ impl Lease {
     /// Puts the plant into the state of a snapshot: one of the same parameters and time step.
     pub fn restore(&mut self, snapshot: &Snapshot) -> Result<(State, f64), SnapshotError> {
         let _replacing = lock(&self.session.replacing);
-        let mut plant = self.session.copy_plant();
+        let mut plants = self.session.copy_plants();
+        let fits = plants.iter_mut().position(|plant| plant.restore(snapshot).is_ok());
+        let mut plant = plants.swap_remove(fits.unwrap_or(0));
         plant.restore(snapshot)?;
         Ok(self.session.replace_plant(plant))
     }

@@ -31,6 +31,7 @@
 //! | FAILED_PRECONDITION | `MAX_ITERATIONS`, `NO_DESCENT`, `NOT_CONVEX`, `BOUNDS_NOT_MET` | in the result of an optimisation | the search got stuck |
 //! | FAILED_PRECONDITION | `INFEASIBLE_REFERENCE` | PreconditionFailure; metadata `unexplained_acceleration`, `unexplained_coordinate`, `unexplained_step`, `constraint_violation`, `constraint_violation_step` | a reference is no motion of the plant, and `strict` was asked for |
 //! | FAILED_PRECONDITION | `NO_FEEDBACK` | PreconditionFailure | the plant has no feedback whose gains could be watched |
+//! | FAILED_PRECONDITION | `PARAMETERS_SCHEDULED` | PreconditionFailure | faults of the plant change its parameters: clear them first |
 //! | FAILED_PRECONDITION | `TIME_STEP_CHANGED` | PreconditionFailure | the trajectory of a feedback was given for another time step: set a new one |
 //! | FAILED_PRECONDITION | `POLE` | PreconditionFailure; metadata `frequency_hz` | the frequency response is infinite |
 //! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
@@ -198,6 +199,12 @@ impl Fault {
     pub fn no_feedback(id: &str) -> Self {
         let message = format!("plant `{id}` has no feedback; SetFeedback gives it one");
         Self::precondition("NO_FEEDBACK", format!("plant:{id}"), message)
+    }
+
+    /// Faults change the parameters of the plant.
+    pub fn parameters_scheduled(id: &str) -> Self {
+        let message = format!("faults of plant `{id}` change its parameters; ClearFault ends them");
+        Self::precondition("PARAMETERS_SCHEDULED", format!("plant:{id}"), message)
     }
 
     /// A trajectory belongs to another time step than the plant's.

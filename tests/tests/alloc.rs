@@ -246,6 +246,9 @@ fn steps_with_channels_allocate_nothing() {
     inject(on_output("output-1"), Kind::Loss(v1::PacketLoss { probability: 0.5 }), None);
     let push = v1::Push { point: Some(point()), force: vec![0.1; 3], torque: vec![0.01; 3] };
     inject(None, Kind::Push(push), blink);
+    let lighter = v1::Parameter { path: "gravity[1]".to_owned(), value: -1.0 };
+    let change = v1::ParameterChange { parameters: vec![lighter] };
+    inject(None, Kind::Parameters(change), blink);
 
     let mut lease = session.acquire(DriverKind::Step).expect("nobody has it");
     let mut u = vec![0.0; d.input()];

@@ -12,37 +12,56 @@ use v1::output_channel::Source;
 
 use super::Channels;
 use super::declare::{self, check_numbers};
-use super::fault::{Effect, Injected, Start};
+use super::fault::{Effect, Injected, Schedule, Start};
+use super::timeline::{Base, Change, Timeline};
 use crate::limits::{LimitExceeded, Limits};
 use crate::session::{Core, Session};
 use crate::status::Fault;
 
 /// What a session's channels and faults were made from.
-#[derive(Default)]
 struct Present {
     declared: Arc<v1::Channels>,
     info: Arc<v1::ChannelsInfo>,
     faults: Vec<PresentFault>,
     numbers: usize,
     is_there: bool,
+    base: Base,
+    is_scheduled: bool,
 }
 
 struct PresentFault {
     id: u64,
     given: Arc<v1::FaultSpec>,
     start: Start,
+    schedule: Schedule,
     is_over: bool,
 }
 
 impl Present {
     fn of(core: &Core) -> Self {
-        let Some(channels) = &core.channels else { return Self::default() };
+        let mechanics = core.mechanics();
+        let base = Base {
+            model: mechanics.model,
+            parameters: Arc::clone(&core.parameters),
+            settings: mechanics.settings,
+        };
+        let Some(channels) = &core.channels else {
+            let (declared, info) = (Arc::default(), Arc::default());
+            let faults = Vec::new();
+            return Self {
+                declared,
+                info,
+                faults,
+                numbers: 0,
+                is_there: false,
+                base,
+                is_scheduled: false,
+            };
+        };
         let step = core.plant.step_index();
         let fault = |fault: &Injected| PresentFault {
-            id: fault.id,
-            given: Arc::clone(&fault.given),
-            start: fault.start,
             is_over: fault.schedule.is_over(step),
+            ..PresentFault::of(fault)
         };
         Self {
             declared: Arc::clone(&channels.declared),
@@ -50,6 +69,21 @@ impl Present {
             faults: channels.faults.iter().map(fault).collect(),
             numbers: channels.numbers(),
             is_there: true,
+            base: channels.timeline.as_ref().map_or(base, |timeline| timeline.base().clone()),
+            is_scheduled: channels.timeline.is_some(),
+        }
+    }
+}
+
+impl PresentFault {
+    /// As it will be, once it is injected.
+    fn of(fault: &Injected) -> Self {
+        Self {
+            id: fault.id,
+            given: Arc::clone(&fault.given),
+            start: fault.start,
+            schedule: fault.schedule,
+            is_over: false,
         }
     }
 }
@@ -73,7 +107,10 @@ impl Session {
     ) -> Result<(Arc<v1::ChannelsInfo>, Vec<f64>), Fault> {
         let _replacing = self.replacing();
         let present = self.with_core(|core| Present::of(core));
-        let mut channels = declare::channels(declared, &mut self.copy_plant(), limits)?;
+        let mut plant = self.copy_plants().swap_remove(0);
+        let mut channels = declare::channels(declared, &mut plant, limits)?;
+        channels.timeline =
+            timeline(&present.base, &channels.declared, present.faults.iter(), limits)?;
         // Where the faults of outputs go.
         let places: Vec<Option<(usize, Range<usize>)>> = present
             .faults
@@ -99,6 +136,7 @@ impl Session {
                 }
                 channels.faults.push(fault);
             }
+            number_changes(&mut channels.faults);
             channels.begin(&mut core.plant, &core.input);
             let output = channels.output().to_vec();
             core.channels = (!channels.is_empty()).then(|| Box::new(channels));
@@ -123,61 +161,75 @@ impl Session {
         limits: &Limits,
     ) -> Result<v1::FaultInfo, Fault> {
         let _replacing = self.replacing();
-        let (present, id, mechanics) =
-            self.with_core(|core| (Present::of(core), core.faults + 1, core.mechanics()));
+        let (present, id, step, time_s) = self.with_core(|core| {
+            let plant = &core.plant;
+            (Present::of(core), core.faults + 1, plant.step_index(), plant.time_s())
+        });
         let is_over = |fault: &&PresentFault| fault.is_over;
         let count = present.faults.len() + 1;
         let excess = count.saturating_sub(Limits::size(limits.faults));
         let gone: Vec<u64> =
             present.faults.iter().filter(is_over).take(excess).map(|fault| fault.id).collect();
         LimitExceeded::check("faults", limits.faults, "faults", count - gone.len())?;
-        let time_step_s = mechanics.settings.time_step_s;
-        let fault =
-            declare::fault(id, given, &mechanics.model, time_step_s, &present.info, limits)?;
+        let time_step_s = present.base.settings.time_step_s;
+        let (model, info) = (&present.base.model, &present.info);
+        let mut fault = declare::fault(id, given, model, time_step_s, info, limits)?;
+        fault.schedule(step, time_s, time_step_s);
+        let next = PresentFault::of(&fault);
+        let stay = present.faults.iter().filter(|fault| !gone.contains(&fault.id));
+        let all = stay.chain(std::iter::once(&next));
+        let timeline = timeline(&present.base, &present.declared, all, limits)?;
         check_numbers(present.numbers.saturating_add(fault.numbers()), limits)?;
         let spare = if present.is_there {
             None
         } else {
             let none = v1::Channels::default();
-            Some(Box::new(declare::channels(none, &mut self.copy_plant(), limits)?))
+            let mut plant = self.copy_plants().swap_remove(0);
+            Some(Box::new(declare::channels(none, &mut plant, limits)?))
         };
         let room = Vec::with_capacity(count);
-        let (info, former) = self
+        let (info, former, spent) = self
             .with_core(move |core| {
                 core.faults = id;
-                let channels = match &mut core.channels {
-                    Some(channels) => channels,
-                    none => none.insert(spare?),
-                };
+                if core.channels.is_none() {
+                    core.channels = spare;
+                }
+                let spent = core.install(timeline);
+                let channels = core.channels.as_mut()?;
                 let mut former = std::mem::replace(&mut channels.faults, room);
                 // Those that are over stay behind.
                 for kept in former.extract_if(.., |fault| !gone.contains(&fault.id)) {
                     channels.faults.push(kept);
                 }
-                let mut fault = fault;
                 fault.place(&core.plant, &core.input, channels.output());
                 let info = fault.info(core.plant.step_index(), time_step_s);
                 channels.faults.push(fault);
-                Some((info, former))
+                number_changes(&mut channels.faults);
+                Some((info, former, spent))
             })
             .ok_or_else(|| Fault::internal("channels are gone"))?;
-        drop(former);
+        drop((former, spent));
         Ok(info)
     }
 
     /// Clears a fault, or with 0 all of them; returns how many.
-    pub fn clear_fault(&self, id: u64) -> Result<u32, Fault> {
+    pub fn clear_fault(&self, id: u64, limits: &Limits) -> Result<u32, Fault> {
         let _replacing = self.replacing();
-        let count = self.with_core(|core| core.channels.as_ref().map_or(0, |c| c.faults.len()));
-        let room = Vec::with_capacity(count);
+        let present = self.with_core(|core| Present::of(core));
+        let stay = present.faults.iter().filter(|fault| id != 0 && fault.id != id);
+        let timeline = timeline(&present.base, &present.declared, stay, limits)?;
+        let room = Vec::with_capacity(present.faults.len());
         let (former, spent) = self.with_core(move |core| {
-            let Some(channels) = &mut core.channels else { return (Vec::new(), None) };
+            // Changes end while the frames of all pushes are there.
+            let timeline = core.install(timeline);
+            let Some(channels) = &mut core.channels else { return (Vec::new(), (None, timeline)) };
             let mut former = std::mem::replace(&mut channels.faults, room);
             for kept in former.extract_if(.., |fault| id != 0 && fault.id != id) {
                 channels.faults.push(kept);
             }
+            number_changes(&mut channels.faults);
             let spent = if channels.is_empty() { core.channels.take() } else { None };
-            (former, spent)
+            (former, (spent, timeline))
         });
         drop(spent);
         if former.is_empty() && id != 0 {
@@ -190,8 +242,13 @@ impl Session {
     pub fn faults(&self) -> Vec<v1::FaultInfo> {
         self.with_core(|core| {
             let (step, h) = (core.plant.step_index(), core.plant.settings().time_step_s);
-            let faults = core.channels.iter().flat_map(|channels| &channels.faults);
-            faults.map(|fault| fault.info(step, h)).collect()
+            let Some(channels) = &core.channels else { return Vec::new() };
+            let is_refused = channels.timeline.as_ref().is_some_and(|timeline| timeline.is_refused);
+            let info = |fault: &Injected| {
+                let changes = matches!(fault.effect, Effect::Parameters { .. }) && fault.is_active;
+                v1::FaultInfo { refused: changes && is_refused, ..fault.info(step, h) }
+            };
+            channels.faults.iter().map(info).collect()
         })
     }
 
@@ -207,8 +264,11 @@ impl Session {
         if !present.is_there {
             return Ok(Renewed::Nothing);
         }
+        if present.is_scheduled {
+            return Err(Fault::parameters_scheduled(self.id()));
+        }
         if settings.time_step_s == time_step_s {
-            return Ok(Renewed::Sites(sites(model, &present)));
+            return Ok(Renewed::Sites(sites(model, &present.declared, present.faults.iter())));
         }
         let mut plant = Plant::new(Arc::clone(model), settings)
             .map_err(|error| Fault::from_initial(error, "parameters"))?;
@@ -224,18 +284,53 @@ impl Session {
     }
 }
 
+/// Plants for the changes of parameters among faults, if there are any.
+fn timeline<'a>(
+    base: &Base,
+    declared: &v1::Channels,
+    faults: impl Iterator<Item = &'a PresentFault> + Clone,
+    limits: &Limits,
+) -> Result<Option<Box<Timeline>>, Fault> {
+    let change = |fault: &'a PresentFault| {
+        let Some(Kind::Parameters(change)) = &fault.given.kind else { return None };
+        let numbers = change.parameters.iter().map(|p| (p.path.clone(), p.value)).collect();
+        Some(Change { schedule: fault.schedule, numbers })
+    };
+    let changes: Vec<Change> = faults.clone().filter_map(change).collect();
+    if changes.is_empty() {
+        return Ok(None);
+    }
+    let sites = |model: &Model| sites(model, declared, faults.clone());
+    Ok(Some(Box::new(Timeline::new(base, &changes, sites, limits)?)))
+}
+
+/// Numbers the changes of parameters in the order of their faults, as [`timeline`] does.
+fn number_changes(faults: &mut [Injected]) {
+    let bits = faults.iter_mut().filter_map(|fault| match &mut fault.effect {
+        Effect::Parameters { bit } => Some(bit),
+        _ => None,
+    });
+    for (number, bit) in (0..).zip(bits) {
+        *bit = number;
+    }
+}
+
 /// The sites of all outputs and pushes, in the order of [`Channels::sites_mut`].
-fn sites(model: &Model, present: &Present) -> Vec<Site> {
+fn sites<'a>(
+    model: &Model,
+    declared: &v1::Channels,
+    faults: impl Iterator<Item = &'a PresentFault>,
+) -> Vec<Site> {
     let point = |point: &v1::FramePoint| {
         let at = <[f64; 3]>::try_from(&point.at[..]).unwrap_or_default();
         model.site(&point.frame, at)
     };
-    let outputs = present.declared.outputs.iter().filter_map(|output| match &output.source {
+    let outputs = declared.outputs.iter().filter_map(|output| match &output.source {
         Some(Source::Position(at)) => point(at),
         Some(Source::Orientation(frame)) => model.site(frame, [0.0; 3]),
         _ => None,
     });
-    let pushes = present.faults.iter().filter_map(|fault| match &fault.given.kind {
+    let pushes = faults.filter_map(|fault| match &fault.given.kind {
         Some(Kind::Push(push)) => push.point.as_ref().and_then(point),
         _ => None,
     });

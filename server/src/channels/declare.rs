@@ -316,6 +316,13 @@ pub(crate) fn fault(
                 torque: vector(format!("{field}.torque"), torque)?,
             }
         }
+        Kind::Parameters(change) => {
+            no_target(&given)?;
+            if change.parameters.is_empty() {
+                return Err(Fault::field("fault.parameters.parameters", "are missing"));
+            }
+            Effect::Parameters { bit: 0 }
+        }
         kind => {
             let disturbance = disturbance(kind, clock, limits)?;
             disturbed(&given, disturbance, model, info)?
@@ -375,7 +382,7 @@ fn disturbance(kind: &Kind, clock: Clock, limits: &Limits) -> Result<Disturbance
         Kind::Loss(loss) => {
             Disturbance::DropOut(probability("fault.loss.probability", loss.probability)?)
         }
-        Kind::Push(_) => {
+        Kind::Push(_) | Kind::Parameters(_) => {
             return Err(Fault::field("fault", "has no numbers to disturb"));
         }
     })

@@ -90,6 +90,8 @@ pub(crate) enum Effect {
     Output { line: Line, channel: usize },
     /// A force and a torque in world axes.
     Push { site: Box<Site>, force: [f64; 3], torque: [f64; 3] },
+    /// Numbers of the scene: the change of that number in the plant's [`super::timeline::Timeline`].
+    Parameters { bit: u32 },
 }
 
 /// When a fault begins.
@@ -100,6 +102,26 @@ pub(crate) enum Start {
     Step(u64),
     /// s.
     Time(f64),
+}
+
+impl Start {
+    /// The step that is meant at a step and time of the plant.
+    fn step(self, present: u64, time_s: f64, time_step_s: f64, is_output: bool) -> u64 {
+        match self {
+            // The present outputs have been delivered.
+            Self::Next => present + u64::from(is_output),
+            Self::Step(step) => step,
+            Self::Time(start_s) => {
+                let ahead = (start_s - time_s) / time_step_s;
+                // Casts saturate.
+                if ahead < 0.0 {
+                    present.saturating_sub(ahead.abs().round() as u64)
+                } else {
+                    present.saturating_add(ahead.round() as u64)
+                }
+            }
+        }
+    }
 }
 
 /// A disturbance of neighbouring numbers, with what it keeps of them.
@@ -227,28 +249,21 @@ impl Injected {
         }
     }
 
-    /// Binds it to steps of a plant, and begins at its state.
+    /// Binds it to steps of a plant that is at a step and time.
+    pub(crate) fn schedule(&mut self, step: u64, time_s: f64, time_step_s: f64) {
+        let is_output = matches!(self.effect, Effect::Output { .. });
+        self.schedule.start = self.start.step(step, time_s, time_step_s, is_output);
+        self.schedule.end = self.duration.map(|steps| self.schedule.start.saturating_add(steps));
+    }
+
+    /// Binds it to steps of a plant for good, and begins at its state.
     pub(crate) fn place(&mut self, plant: &Plant, input: &[f64], output: &[f64]) {
-        let present = plant.step_index();
-        self.schedule.start = match self.start {
-            // The present outputs have been delivered.
-            Start::Next => present + u64::from(matches!(self.effect, Effect::Output { .. })),
-            Start::Step(step) => step,
-            Start::Time(time_s) => {
-                let ahead = (time_s - plant.time_s()) / plant.settings().time_step_s;
-                // Casts saturate.
-                if ahead < 0.0 {
-                    present.saturating_sub(ahead.abs().round() as u64)
-                } else {
-                    present.saturating_add(ahead.round() as u64)
-                }
-            }
-        };
+        let h = plant.settings().time_step_s;
+        self.schedule(plant.step_index(), plant.time_s(), h);
         self.start = match self.start {
             Start::Next => Start::Step(self.schedule.start),
             start => start,
         };
-        self.schedule.end = self.duration.map(|steps| self.schedule.start.saturating_add(steps));
         self.begin(input, output);
     }
 
@@ -266,7 +281,7 @@ impl Injected {
         match &mut self.effect {
             Effect::Input(line) => line.begin(input),
             Effect::Output { line, .. } => line.begin(output),
-            Effect::Push { .. } => {}
+            Effect::Push { .. } | Effect::Parameters { .. } => {}
         }
     }
 
@@ -276,7 +291,7 @@ impl Injected {
             Effect::Input(line) | Effect::Output { line, .. } => {
                 line.held.len() + line.next.len() + line.late.len()
             }
-            Effect::Push { .. } => 0,
+            Effect::Push { .. } | Effect::Parameters { .. } => 0,
         }
     }
 
@@ -320,6 +335,7 @@ impl Injected {
             fault: Some(fault),
             phase: phase.into(),
             beginnings: self.beginnings,
+            refused: false,
         }
     }
 

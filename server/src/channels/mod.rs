@@ -12,6 +12,7 @@ pub(crate) mod declare;
 pub(crate) mod fault;
 pub(crate) mod noise;
 pub(crate) mod sensor;
+pub(crate) mod timeline;
 
 use std::sync::Arc;
 
@@ -21,6 +22,8 @@ use plantd_proto::v1;
 use self::actuator::Actuator;
 use self::fault::{Effect, Injected};
 use self::sensor::{Instant, Sensor};
+use self::timeline::{Set, Timeline};
+use crate::parameters::Parameters;
 
 /// The channels and faults of a plant.
 #[derive(Clone, Debug)]
@@ -29,6 +32,8 @@ pub struct Channels {
     pub(crate) sensors: Vec<Sensor>,
     pub(crate) actuators: Vec<Actuator>,
     pub(crate) faults: Vec<Injected>,
+    /// Of faults that change parameters.
+    pub(crate) timeline: Option<Box<Timeline>>,
     /// What they were made from.
     pub(crate) declared: Arc<v1::Channels>,
     /// The same with times in whole steps.
@@ -78,6 +83,7 @@ impl Channels {
             sensors,
             actuators,
             faults: Vec::new(),
+            timeline: None,
             declared: Arc::new(declared),
             info: Arc::new(info),
             rates,
@@ -127,6 +133,24 @@ impl Channels {
         for fault in &mut self.faults {
             fault.begin(input, &self.output);
         }
+    }
+
+    /// Puts the changes of parameters in force that belong to the next step; returns the numbers that are
+    /// changed then, if they are others than before.
+    pub(crate) fn change_on_schedule(&mut self, plant: &mut Plant) -> Option<Arc<Parameters>> {
+        let mut timeline = self.timeline.take()?;
+        let set = self.wanted_set(plant.step_index());
+        let has_changed = timeline.ask(set, plant, self.sites_mut());
+        let parameters = has_changed.then(|| timeline.parameters()).flatten();
+        self.timeline = Some(timeline);
+        parameters
+    }
+
+    fn wanted_set(&self, step: u64) -> Set {
+        self.faults.iter().fold(0, |set, fault| match fault.effect {
+            Effect::Parameters { bit } if fault.is_active_at(step, self.seed) => set | 1 << bit,
+            _ => set,
+        })
     }
 
     /// Turns what is given as input into what acts on the plant in its next step. Until

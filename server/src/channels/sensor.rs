@@ -124,8 +124,8 @@ impl Sensor {
         self.line.fill((self.reading, false));
     }
 
-    /// What it delivers after a step, and whether that stands for a lost sample.
-    pub(crate) fn measure(&mut self, at: &mut Instant<'_>) -> ([f64; 3], bool) {
+    /// Measures after a step.
+    pub(crate) fn measure(&mut self, at: &mut Instant<'_>) {
         let step = at.plant.step_index();
         if step.is_multiple_of(self.settings.period) {
             let chance = self.settings.drop_out;
@@ -136,10 +136,9 @@ impl Sensor {
         }
         let length = self.line.len() as u64;
         self.line[(step % length) as usize] = (self.reading, self.lost);
-        self.line[((step + 1) % length) as usize]
     }
 
-    /// What it delivers now.
+    /// What it delivers at a step, and whether that stands for a lost sample.
     pub(crate) fn present(&self, step: u64) -> ([f64; 3], bool) {
         self.line[((step + 1) % self.line.len() as u64) as usize]
     }

@@ -75,8 +75,9 @@ impl v1::channel_service_server::ChannelService for ChannelService {
         request: Request<v1::ClearFaultRequest>,
     ) -> Result<Response<v1::ClearFaultResponse>, Status> {
         let v1::ClearFaultRequest { id, fault_id } = request.into_inner();
-        let clear = move |_: &Hub, session: &Session| {
-            Ok(v1::ClearFaultResponse { cleared: session.clear_fault(fault_id)? })
+        let clear = move |hub: &Hub, session: &Session| {
+            let cleared = session.clear_fault(fault_id, &hub.limits)?;
+            Ok(v1::ClearFaultResponse { cleared })
         };
         self.act(&id, clear).await
     }

@@ -9,6 +9,7 @@ use plantd_proto::v1::{self, MarkReason};
 
 use super::tap::Tap;
 use crate::channels::Channels;
+use crate::channels::timeline::Timeline;
 use crate::convert;
 use crate::feedback::Feedback;
 use crate::frame::{Published, Timing};
@@ -107,6 +108,11 @@ impl Core {
     ) -> Result<StepReport, DriveError> {
         if let Some(trip) = self.frozen {
             return Err(DriveError::Frozen(trip));
+        }
+        if let Some(channels) = &mut self.channels
+            && let Some(parameters) = channels.change_on_schedule(&mut self.plant)
+        {
+            self.note_changed(parameters);
         }
         if let Some(guard) = &mut self.guard {
             guard.begin(&self.plant);
@@ -236,6 +242,39 @@ impl Core {
         self.has_loop_input = keep;
     }
 
+    /// Notes that a fault has changed parameters. The feedback stays as it is.
+    fn note_changed(&mut self, parameters: Arc<Parameters>) {
+        let former = self.generation;
+        self.parameters = parameters;
+        self.generation += 1;
+        if let Some(feedback) = self.feedback.as_mut().filter(|f| f.generation == former) {
+            feedback.generation = self.generation;
+        }
+    }
+
+    /// Plants that can be in force: the first is the one without changes that faults make.
+    pub(crate) fn copy_plants(&self) -> Vec<Plant> {
+        let timeline = self.channels.as_ref().and_then(|channels| channels.timeline.as_ref());
+        timeline.map_or_else(|| vec![self.plant.clone()], |timeline| timeline.copies(&self.plant))
+    }
+
+    /// Gives the plants of changed parameters their places: `timeline` knows the changes of the faults that
+    /// are there. Without one the changes end at once.
+    pub(crate) fn install(&mut self, timeline: Option<Box<Timeline>>) -> Option<Box<Timeline>> {
+        let channels = self.channels.as_mut()?;
+        let mut former = channels.timeline.take();
+        if timeline.is_none()
+            && let Some(former) = &mut former
+            && former.ask(0, &mut self.plant, channels.sites_mut())
+            && let Some(parameters) = former.parameters()
+        {
+            self.note_changed(parameters);
+        }
+        let channels = self.channels.as_mut()?;
+        channels.timeline = timeline;
+        former
+    }
+
     /// Writes the last step into the ring, if somebody reads it.
     pub(crate) fn write_ring(&self) {
         if let Some(ring) = &self.ring {
@@ -305,8 +344,12 @@ impl Core {
         self.release();
         self.has_applied = false;
         self.report = StepReport::default();
-        let former = std::mem::replace(&mut self.plant, plant);
+        let mut former = std::mem::replace(&mut self.plant, plant);
         if let Some(channels) = &mut self.channels {
+            if let Some(timeline) = &mut channels.timeline {
+                former = timeline.replaced(former);
+                self.generation += 1;
+            }
             channels.begin(&mut self.plant, &self.input);
         }
         self.note(EventKind::StateSet, 0, 0.0);

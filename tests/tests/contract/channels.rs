@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use plantd_client::{Client, Code, Error, v1};
-use plantd_models::{Model, Plant, Settings, builtin};
+use plantd_models::{Initial, Model, Plant, Scene, Settings, builtin};
 use v1::fault_spec::{Kind, Pattern, Start, Target};
 use v1::output_channel::Source;
 
@@ -381,6 +381,119 @@ async fn pushes_are_impulses() {
         assert_eq!((state.q.as_slice(), state.p.as_slice()), (plain.q(), plain.p()), "step {k}");
     }
     assert_eq!(client.list_faults(&id).await.unwrap()[0].beginnings, 1);
+}
+
+fn change(path: &str, value: f64) -> v1::FaultSpec {
+    let parameters = vec![v1::Parameter { path: path.to_owned(), value }];
+    let kind = Some(Kind::Parameters(v1::ParameterChange { parameters }));
+    v1::FaultSpec { kind, ..Default::default() }
+}
+
+/// Changes of parameters come and go at their steps, alone and together, and a push knows the lengths.
+#[tokio::test]
+async fn parameters_change_on_schedule() {
+    let (_server, client) = server().await;
+    let id = plant(&client, "cart-pole").await.id;
+    client.inject_fault(&id, from_step(10, 10.0, change("gravity[1]", -1.0))).await.unwrap();
+    let kind = Some(push("pole", [5.0, 0.0, 0.0], [0.0; 3]));
+    let push = v1::FaultSpec { kind, ..Default::default() };
+    client.inject_fault(&id, from_step(12, 5.0, push)).await.unwrap();
+    // From there on until it is cleared.
+    let higher = change("frames[pole].translation[1]", 0.5);
+    client.inject_fault(&id, from_step(15, 0.0, higher)).await.unwrap();
+
+    let text = builtin::scene("cart-pole").unwrap().to_toml();
+    let of = |light: bool, high: bool| {
+        let mut table: toml::Table = text.parse().unwrap();
+        if light {
+            table["gravity"].as_array_mut().unwrap()[1] = (-1.0).into();
+        }
+        if high {
+            let pole = table["frames"].as_array_mut().unwrap()[1].as_table_mut().unwrap();
+            pole.insert("translation".to_owned(), vec![0.0, 0.5, 0.0].into());
+        }
+        let model = Model::compile(&Scene::from_toml(&table.to_string()).unwrap()).unwrap();
+        let settings = Settings::new(&model);
+        Plant::new(Arc::new(model), settings).unwrap()
+    };
+    let expected = |steps: u64| -> Vec<(Vec<f64>, Vec<f64>)> {
+        let mut plain = of(false, false);
+        let step = |k: u64| {
+            let mut plant = of((10..20).contains(&k), k >= 15);
+            plant.go_on_from(&plain).unwrap();
+            let mut impulse = [0.0; 2];
+            if (12..17).contains(&k) {
+                let site = plant.model().site("pole", [0.0, -0.5, 0.0]).unwrap();
+                plant.add_wrench(&site, [H * 5.0, 0.0, 0.0], [0.0; 3], &mut impulse);
+            }
+            plant.with_impulse(&impulse, |plant| plant.step(&[force(k)])).unwrap();
+            plain = plant;
+            (plain.q().to_vec(), plain.p().to_vec())
+        };
+        (0..steps).map(step).collect()
+    };
+    let expected = expected(30);
+    let found = |steps: Vec<v1::DriveStep>| -> Vec<(Vec<f64>, Vec<f64>)> {
+        steps.into_iter().map(|step| step.state.unwrap()).map(|s| (s.q, s.p)).collect()
+    };
+    let mut steps = drive(&client, &id, 18).await;
+    let snapshot = client.snapshot(&id).await.unwrap();
+    let parameters = async || client.get_plant(&id).await.unwrap().plant.unwrap().parameters.len();
+    assert_eq!(parameters().await, 2);
+    let refused = client.set_parameters(v1::SetParametersRequest {
+        id: id.clone(),
+        time_step_s: 0.5 * H,
+        ..Default::default()
+    });
+    let precondition = Code::FailedPrecondition;
+    assert_refused(refused.await, precondition, "PARAMETERS_SCHEDULED", "");
+    steps.extend(drive(&client, &id, 12).await);
+    assert_eq!(found(steps), expected);
+    assert_eq!(parameters().await, 1);
+    client.restore(&id, snapshot).await.unwrap();
+    assert_eq!(found(drive(&client, &id, 12).await), expected[18..], "after a restore");
+    client.reset(&id).await.unwrap();
+    assert_eq!(found(drive(&client, &id, 30).await), expected, "after a reset");
+    let faults = client.list_faults(&id).await.unwrap();
+    assert!(faults.iter().all(|fault| fault.beginnings == 1 && !fault.refused));
+
+    client.clear_fault(&id, 0).await.unwrap();
+    assert_eq!(parameters().await, 0);
+    let last = drive(&client, &id, 1).await.remove(0).state.unwrap();
+    let mut plain = of(false, false);
+    let mut before = of(false, true);
+    let (q, p) = expected[29].clone();
+    before.initialize(&Initial::Momentum { q, p, v: vec![] }).unwrap();
+    before.set_step_index(30);
+    plain.go_on_from(&before).unwrap();
+    plain.step(&[force(30)]).unwrap();
+    assert!(last.q.iter().zip(plain.q()).all(|(a, b)| (a - b).abs() < 1e-13));
+    assert!(last.p.iter().zip(plain.p()).all(|(a, b)| (a - b).abs() < 1e-13));
+}
+
+/// Where the state does not satisfy the changed constraints, nothing changes, and it is said.
+#[tokio::test]
+async fn a_change_that_cannot_be_is_told() {
+    let (_server, client) = server().await;
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/scenes/elements/distance.toml");
+    client.create_model(std::fs::read_to_string(path).unwrap()).await.unwrap();
+    let id = plant(&client, "distance").await.id;
+    // The rod's ends move up: it fits where the scene begins, and not where the plant will be.
+    let number =
+        |end: &str, value| v1::Parameter { path: format!("constraints[rod].{end}.at[2]"), value };
+    let parameters = vec![number("a", -0.9), number("b", -0.3)];
+    let kind = Some(Kind::Parameters(v1::ParameterChange { parameters }));
+    let fault = v1::FaultSpec { kind, ..Default::default() };
+    client.inject_fault(&id, from_step(30, 10.0, fault)).await.unwrap();
+    let refused = client.inject_fault(&id, change("frames[nobody].body.mass", 1.0)).await;
+    assert_bad_field(refused, "fault.parameters.parameters[0].path");
+    let step = v1::StepRequest { id: id.clone(), hold: 35, ..Default::default() };
+    let state = client.step(step.clone()).await.unwrap().states.remove(0);
+    let fault = client.list_faults(&id).await.unwrap().remove(0);
+    assert!(fault.refused && fault.phase() == v1::FaultPhase::Active);
+    let plain = plant(&client, "distance").await.id;
+    let expected = client.step(v1::StepRequest { id: plain, ..step }).await.unwrap();
+    assert_eq!(bits(&state), bits(&expected.states[0]));
 }
 
 #[tokio::test]

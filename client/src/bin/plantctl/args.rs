@@ -115,6 +115,7 @@ Examples:
   plantctl fault inject p1 output=encoder noise.deviation=0.05 chance.window_s=1 chance.probability=0.2
   plantctl fault inject p1 output=encoder loss.probability=0.1
   plantctl fault inject p1 push.point.frame=rod 'push.force=[5, 0, 0]' start_step=100 duration_s=0.1
+  plantctl fault inject p1 'parameters.parameters=[{path=\"gravity[1]\", value=-1.6}]' start_s=3
   plantctl fault list p1
   plantctl fault clear p1 3";
 

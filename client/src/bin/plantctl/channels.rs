@@ -123,6 +123,7 @@ fn faults(faults: &[v1::FaultInfo]) -> String {
             Some(Kind::Delay(_)) => "delay",
             Some(Kind::Loss(_)) => "loss",
             Some(Kind::Push(_)) => "push",
+            Some(Kind::Parameters(_)) => "parameters",
             None => "",
         };
         let start = match fault.start {
