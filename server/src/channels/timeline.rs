@@ -142,13 +142,21 @@ impl Timeline {
         self.entries.iter().enumerate().map(plant).collect()
     }
 
-    /// Another plant has taken the place of the one in force, which is `former`; returns what is left.
-    pub(crate) fn replaced(&mut self, former: Plant) -> Plant {
+    /// A copy of one of the plants has taken the place of the one in force, which is `former`. Returns what is
+    /// left, and the numbers that are changed now.
+    pub(crate) fn replaced(
+        &mut self,
+        former: Plant,
+        present: &Plant,
+    ) -> (Plant, Option<Arc<Parameters>>) {
         self.asked = None;
-        match self.current.take() {
+        let rest = match self.current.take() {
             Some(current) => std::mem::replace(&mut self.entries[current].plant, former),
             None => former,
-        }
+        };
+        let is_it = |entry: &&Entry| Arc::ptr_eq(entry.plant.model(), present.model());
+        let parameters = self.entries.iter().find(is_it).map(|entry| Arc::clone(&entry.parameters));
+        (rest, parameters)
     }
 }
 

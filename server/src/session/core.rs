@@ -269,6 +269,7 @@ impl Core {
             && let Some(parameters) = former.parameters()
         {
             self.note_changed(parameters);
+            self.mark(v1::MarkReason::Parameters);
         }
         let channels = self.channels.as_mut()?;
         channels.timeline = timeline;
@@ -347,7 +348,11 @@ impl Core {
         let mut former = std::mem::replace(&mut self.plant, plant);
         if let Some(channels) = &mut self.channels {
             if let Some(timeline) = &mut channels.timeline {
-                former = timeline.replaced(former);
+                let (rest, parameters) = timeline.replaced(former, &self.plant);
+                former = rest;
+                if let Some(parameters) = parameters {
+                    self.parameters = parameters;
+                }
                 self.generation += 1;
             }
             channels.begin(&mut self.plant, &self.input);
