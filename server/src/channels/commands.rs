@@ -15,6 +15,7 @@ use super::declare::{self, check_numbers};
 use super::fault::{Effect, Injected, Schedule, Start};
 use super::timeline::{Base, Change, Timeline};
 use crate::limits::{LimitExceeded, Limits};
+use crate::realtime::event::EventKind;
 use crate::session::{Core, Session};
 use crate::status::Fault;
 
@@ -229,6 +230,9 @@ impl Session {
             }
             number_changes(&mut channels.faults);
             let spent = if channels.is_empty() { core.channels.take() } else { None };
+            for fault in former.iter().filter(|fault| fault.is_active) {
+                core.note(EventKind::FaultEnded, fault.id, 0.0);
+            }
             (former, (spent, timeline))
         });
         drop(spent);

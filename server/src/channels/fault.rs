@@ -223,6 +223,8 @@ pub(crate) struct Injected {
     stream: Stream,
     /// It was active in the last step.
     pub(crate) is_active: bool,
+    /// It was not in the one before, or the other way round.
+    pub(crate) has_changed: bool,
     /// How often it has begun since the plant began.
     pub(crate) beginnings: u64,
 }
@@ -245,6 +247,7 @@ impl Injected {
             given: Arc::new(given),
             stream: Stream::of("fault").part(id as usize),
             is_active: false,
+            has_changed: false,
             beginnings: 0,
         }
     }
@@ -277,11 +280,19 @@ impl Injected {
 
     /// Begins at a state.
     pub(crate) fn begin(&mut self, input: &[f64], output: &[f64]) {
-        (self.is_active, self.beginnings) = (false, 0);
+        (self.is_active, self.has_changed, self.beginnings) = (false, false, 0);
         match &mut self.effect {
             Effect::Input(line) => line.begin(input),
             Effect::Output { line, .. } => line.begin(output),
             Effect::Push { .. } | Effect::Parameters { .. } => {}
+        }
+    }
+
+    /// The last of its steps that has been taken at a step of the plant.
+    pub(crate) fn last_step(&self, step: u64) -> u64 {
+        match self.effect {
+            Effect::Output { .. } => step,
+            _ => step.saturating_sub(1),
         }
     }
 

@@ -215,14 +215,19 @@ impl Channels {
         for fault in &mut self.faults {
             fault.commit_input();
             fault.disturb_output(&mut self.output, &mut self.lost, step, self.seed);
-            let at = match fault.effect {
-                Effect::Output { .. } => step,
-                _ => step.saturating_sub(1),
-            };
+            let at = fault.last_step(step);
             let is_active = fault.is_active_at(at, self.seed);
-            fault.beginnings += u64::from(is_active && !fault.is_active);
+            fault.has_changed = is_active != fault.is_active;
+            fault.beginnings += u64::from(is_active && fault.has_changed);
             fault.is_active = is_active;
         }
+    }
+
+    /// The faults that began (true) or ended with the last step, which led to `step`: their numbers, and
+    /// the step in which they did.
+    pub(crate) fn changes(&self, step: u64) -> impl Iterator<Item = (u64, u64, bool)> {
+        let changed = self.faults.iter().filter(|fault| fault.has_changed);
+        changed.map(move |fault| (fault.id, fault.last_step(step), fault.is_active))
     }
 
     fn write_output(&mut self, step: u64) {

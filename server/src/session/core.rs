@@ -151,6 +151,10 @@ impl Core {
         self.report = report;
         if let Some(channels) = &mut self.channels {
             channels.measure(&mut self.plant, &self.input);
+            for (id, step, began) in channels.changes(self.plant.step_index()) {
+                let kind = if began { EventKind::FaultBegan } else { EventKind::FaultEnded };
+                self.events.note(kind, step, id, 0.0);
+            }
         }
         self.timing = Timing::default();
         if let Some(guard) = &mut self.guard

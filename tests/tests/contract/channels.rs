@@ -341,6 +341,17 @@ async fn faults_of_outputs_begin_and_end_at_their_steps() {
         let expected = if (10..15).contains(&k) { angle(9) } else { angle(k) };
         assert_eq!(y(step)[1], expected, "step {k}");
     }
+    // It is told, too.
+    let mut events = client.watch_events(&id, Some(0)).await.unwrap();
+    let mut told = Vec::new();
+    while told.len() < 2 {
+        let event = soon(events.next()).await.unwrap().unwrap().event.unwrap();
+        if let v1::EventKind::FaultBegan | v1::EventKind::FaultEnded = event.kind() {
+            told.push((event.kind(), event.step, event.value));
+        }
+    }
+    let began = (v1::EventKind::FaultBegan, 10, 1.0);
+    assert_eq!(told, [began, (v1::EventKind::FaultEnded, 15, 1.0)]);
     // From now on: the next measurement is the first.
     let fault = v1::FaultSpec { duration_s: 2.0 * H, ..on_output("angle", Kind::Off(true)) };
     let info = client.inject_fault(&id, fault).await.unwrap();
