@@ -196,13 +196,19 @@ impl Client {
 
     /// Takes the lease of a plant, to step it in lockstep.
     pub async fn drive(&self, id: impl Into<String>) -> Result<Driver> {
-        let open = v1::DriveOpen { id: id.into(), linearization: false };
+        let open = v1::DriveOpen { id: id.into(), ..Default::default() };
         Driver::open(self, open, self.options.request_timeout).await
     }
 
     /// The same with the linearization of each step in its answer.
     pub async fn drive_linearized(&self, id: impl Into<String>) -> Result<Driver> {
-        let open = v1::DriveOpen { id: id.into(), linearization: true };
+        let open = v1::DriveOpen { id: id.into(), linearization: true, ..Default::default() };
+        Driver::open(self, open, self.options.request_timeout).await
+    }
+
+    /// The same with all that can be asked for: a lease that outlives a broken connection
+    /// (`grace_s`), or one that did (`resume`, with [`Driver::lease_token`]).
+    pub async fn drive_as(&self, open: v1::DriveOpen) -> Result<Driver> {
         Driver::open(self, open, self.options.request_timeout).await
     }
 
@@ -270,13 +276,13 @@ impl Client {
         Ok(self.plants().get_timing(self.limited(request)).await?.into_inner())
     }
 
-    /// What happens to a plant besides its steps, from event `from` on; `None` means from now on.
+    /// What happens to a plant besides its steps, from event `since` on; `None` means from now on.
     pub async fn watch_events(
         &self,
         id: impl Into<String>,
-        from: Option<u64>,
+        since: Option<u64>,
     ) -> Result<Answers<v1::WatchEventsResponse>> {
-        let (mut stub, request) = (self.plants(), v1::WatchEventsRequest { id: id.into(), from });
+        let (mut stub, request) = (self.plants(), v1::WatchEventsRequest { id: id.into(), since });
         self.open(stub.watch_events(request)).await
     }
 

@@ -18,6 +18,7 @@ pub struct Driver {
     requests: mpsc::Sender<v1::DriveRequest>,
     responses: tonic::Streaming<v1::DriveResponse>,
     plant: v1::PlantInfo,
+    lease_token: String,
     sequence: u64,
     /// When the last state was there, on the server's clock.
     answers_ns: u64,
@@ -45,12 +46,26 @@ impl Driver {
             return Err(Error::Protocol("Drive did not begin with `opened`"));
         };
         let plant = opened.plant.ok_or(Error::Protocol("`opened` without a plant"))?;
-        Ok(Self { requests, responses, plant, sequence: 0, answers_ns: 0, step_timeout })
+        let lease_token = opened.lease_token;
+        Ok(Self {
+            requests,
+            responses,
+            plant,
+            lease_token,
+            sequence: 0,
+            answers_ns: 0,
+            step_timeout,
+        })
     }
 
     /// The plant as it was when the driver opened it.
     pub fn plant(&self) -> &v1::PlantInfo {
         &self.plant
+    }
+
+    /// Names the lease, to go on with it after the connection broke; empty if no grace was asked for.
+    pub fn lease_token(&self) -> &str {
+        &self.lease_token
     }
 
     /// Takes one step with the input `u` (input forces, then next prescribed positions). Of a plant that

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::{LimitError, Limits};
 use crate::link::LinkConfig;
-use crate::priority::Priority;
+use crate::priority::{Priority, Scheduling};
 use crate::realtime::RealTimeSettings;
 
 /// Port of gRPC over TCP unless another one is given.
@@ -230,6 +230,18 @@ pub enum ConfigError {
         /// Largest value allowed.
         max: f64,
     },
+    /// A number of a key is out of range.
+    #[error("`{key}` is {value}; it must lie between {low} and {high}")]
+    NotBetween {
+        /// Key.
+        key: &'static str,
+        /// Value.
+        value: u64,
+        /// Smallest value.
+        low: u64,
+        /// Largest value.
+        high: u64,
+    },
     /// A limit is unknown or out of range.
     #[error(transparent)]
     Limit(#[from] LimitError),
@@ -257,6 +269,20 @@ impl Config {
         ] {
             if !(0.0..=DURATION_MAX_S).contains(&value) {
                 return Err(ConfigError::OutOfRange { key, value, max: DURATION_MAX_S });
+            }
+        }
+        let realtime = &self.realtime;
+        let priority = match realtime.scheduling {
+            Scheduling::Normal => 1,
+            Scheduling::Fifo(priority) => priority,
+        };
+        for (key, value, low, high) in [
+            ("realtime.threads", realtime.threads as u64, 1, 64),
+            ("realtime.spin_us", realtime.spin_us, 0, 1000),
+            ("realtime.scheduling.fifo", priority.into(), 1, 99),
+        ] {
+            if !(low..=high).contains(&value) {
+                return Err(ConfigError::NotBetween { key, value, low, high });
             }
         }
         if self.grpc == Listen::Off && self.unix.is_none() {
@@ -349,6 +375,9 @@ mod tests {
         assert!(config("grpc = \"off\"").check().is_err());
         assert!(config("grpc = \"off\"\nunix = \"/s\"").check().is_ok());
         assert!(config("[limits]\nconnections = 0").check().is_err());
+        assert!(config("[realtime]\nthreads = 0").check().is_err());
+        assert!(config("[realtime]\nscheduling = { fifo = 100 }").check().is_err());
+        assert!(config("[realtime]\nscheduling = { fifo = 80 }\nspin_us = 200").check().is_ok());
         assert!(toml::from_str::<Config>("grpc = \"localhost\"").is_err());
     }
 }

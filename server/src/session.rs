@@ -193,6 +193,8 @@ pub struct Session {
     input_lease: AtomicU64,
     /// Number of the last lease that was taken away.
     revoked: AtomicU64,
+    /// The lease of a driver whose connection broke, with its name.
+    parked: Mutex<Option<(String, Lease)>>,
     /// Held by whoever replaces the plant; taken before the core's lock.
     replacing: Mutex<()>,
     /// The feedback's law for watchers of gains.
@@ -237,6 +239,7 @@ impl Session {
             leases: AtomicU64::new(0),
             input_lease: AtomicU64::new(0),
             revoked: AtomicU64::new(0),
+            parked: Mutex::default(),
             replacing: Mutex::default(),
             in_force: watch::Sender::new(None),
             is_recomputing: AtomicBool::new(false),
@@ -720,6 +723,17 @@ impl Session {
             self.revoked.store(lease, Ordering::Release);
             self.tell_run_status();
         }
+    }
+
+    /// Keeps the lease of a driver whose connection broke, under a name.
+    pub fn park(&self, token: String, lease: Lease) {
+        *lock(&self.parked) = Some((token, lease));
+    }
+
+    /// The lease that is kept under that name.
+    pub fn take_parked(&self, token: &str) -> Option<Lease> {
+        let parked = lock(&self.parked).take_if(|(name, _)| name == token);
+        parked.map(|(_, lease)| lease)
     }
 
     /// The events of the plant.

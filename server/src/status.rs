@@ -18,6 +18,7 @@
 //! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED`, `FAULT_NOT_FOUND`, `RECORDING_NOT_FOUND` | ResourceInfo | no such thing, or deleted meanwhile |
 //! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS`, `RECORDING_EXISTS` | ResourceInfo | the name is taken |
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
+//! | FAILED_PRECONDITION | `LEASE_LOST` | PreconditionFailure | the lease that a driver wants to go on with has ended |
 //! | FAILED_PRECONDITION | `RUNNING`, `PAUSED` | PreconditionFailure | the plant runs by itself, or is paused |
 //! | FAILED_PRECONDITION | `WATCHDOG`, `INPUT_LOST` | PreconditionFailure | the plant stands still because it left bounds, or had no valid input |
 //! | ABORTED | `LEASE_REVOKED` | | a watchdog has taken the lease away |

@@ -11,9 +11,11 @@ use plantd_proto::v1;
 use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
 use plantd_server::limits::Limits;
 use plantd_server::metrics::Metrics;
-use plantd_server::realtime::{RealTime, RealTimeSettings};
+use plantd_server::realtime::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
+use plantd_server::realtime::{Pace, RealTime, RealTimeSettings, RunSettings};
 use plantd_server::record::Recordings;
 use plantd_server::regulator::{Constraints, Reference, Spec};
+use plantd_server::ring::Reader;
 use plantd_server::session::{DriverKind, Session};
 
 /// Counts the allocations of each thread, so that tests in other threads do not disturb.
@@ -282,6 +284,46 @@ fn a_recorded_step_allocates_nothing() {
     assert_eq!(count, 0);
     let recording = recordings.stop("steps").expect("it ends");
     assert_eq!((recording.steps, recording.lost), (steps, 0));
+}
+
+/// The loop of a paced plant does not either: inputs of a driver, watchdogs, channels and readers of its
+/// states included.
+#[test]
+fn paced_steps_allocate_nothing() {
+    let scene = builtin::scene("cart-pole").expect("the scene is built in");
+    let model = Arc::new(Model::compile(&scene).expect("it compiles"));
+    let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("it starts");
+    let session = new_session(plant);
+    let dog = |quantity| Watchdog { quantity, min: -1e9, max: 1e9, action: WatchdogAction::Reset };
+    let watchdogs = vec![dog(Quantity::Velocity(1)), dog(Quantity::Energy)];
+    session.set_safety(Safety { watchdogs, on_step_failure: None }).expect("it can be protected");
+    let source = Some(v1::output_channel::Source::Coordinate("theta".to_owned()));
+    let sensor = v1::OutputChannel { name: "encoder".to_owned(), source, ..Default::default() };
+    let channels = v1::Channels { outputs: vec![sensor], ..Default::default() };
+    session.set_channels(channels, &Limits::default()).expect("they can be declared");
+    let settings = RunSettings { pace: Pace::Paced, speed: 20.0, ..RunSettings::default() };
+    session.run(Some(settings), 0, 1).expect("it runs");
+    let mut reader = Reader::new(session.ring());
+    let mut lease = session.acquire(DriverKind::Link).expect("nobody has it");
+    let of_the_loop =
+        || session.with_core(|core| (ALLOCATIONS.with(Cell::get), core.plant().step_index()));
+    // The first answer of the loop is on its way when the second one is counted.
+    of_the_loop();
+    let (before, first) = of_the_loop();
+    let (mut read, mut sequence) = (0, 0);
+    while read < STEPS {
+        while reader.read_next().is_some() {
+            read += 1;
+        }
+        sequence += 1;
+        lease.offer(sequence, &[0.1], 1).expect("a good input");
+        std::thread::yield_now();
+    }
+    let (after, last) = of_the_loop();
+    assert!(last - first >= 50, "{first} to {last}");
+    // What the loop is asked may cost it an allocation; its steps do not.
+    assert!(after - before <= 1, "{} allocations in {} steps", after - before, last - first);
+    session.pause();
 }
 
 /// A session around a plant.

@@ -9,6 +9,7 @@ const DOCUMENTS: &[&str] = &[
     "CONTRIBUTING.md",
     "client/python/README.md",
     "client/TESTING.md",
+    "server/REALTIME.md",
 ];
 
 fn root() -> PathBuf {

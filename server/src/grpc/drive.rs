@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use futures::{Stream, StreamExt as _};
 use plantd_models::Linearization;
-use plantd_proto::link::monotonic_ns;
+use plantd_proto::link::{monotonic_ns, random_instance};
 use plantd_proto::v1;
 use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::time::Sleep;
@@ -36,6 +36,8 @@ const BURST_MAX: u32 = 32;
 /// Work of a control period above which it may take milliseconds, and runs beside the other tasks of its
 /// thread.
 const INLINE_WORK_MAX: usize = 64;
+/// Longest time for which a lease is kept, s.
+const GRACE_MAX_S: f64 = 3600.0;
 
 /// The answers of one Drive stream.
 pub struct DriveStream {
@@ -59,6 +61,8 @@ struct Driving {
     lease: Lease,
     deleted: Pin<Box<WaitForCancellationFutureOwned>>,
     linearization: Option<Linearization>,
+    /// Under which name the lease is kept when the connection breaks, and for how long.
+    keep: Option<(String, Duration)>,
     /// A step takes so little time that nobody minds waiting for it.
     is_short: bool,
     /// Changes of how the plant is run.
@@ -89,8 +93,9 @@ impl DriveStream {
             (Phase::Opening, Some(Message::Open(open))) => {
                 let driving = Driving::open(&self.hub, &open)?;
                 let plant = Some(plant_info(driving.lease.session()));
+                let token = driving.keep.as_ref().map(|(token, _)| token.clone());
                 self.phase = Phase::Driving(Box::new(driving));
-                Answer::Opened(v1::DriveOpened { plant })
+                Answer::Opened(v1::DriveOpened { plant, lease_token: token.unwrap_or_default() })
             }
             (Phase::Driving(driving), Some(Message::Input(input))) => match driving.input(input)? {
                 Some(answer) => answer,
@@ -120,6 +125,27 @@ impl DriveStream {
         Poll::Pending
     }
 
+    /// The connection broke: keeps the lease for its driver to come back, if that was agreed.
+    fn keep_lease(&mut self) {
+        let Phase::Driving(driving) = std::mem::replace(&mut self.phase, Phase::Ended) else {
+            return;
+        };
+        let Driving { lease, keep: Some((token, grace)), .. } = *driving else { return };
+        // Without a runtime the server ends.
+        let Ok(runtime) = Handle::try_current() else { return };
+        let (session, ending) = (Arc::clone(lease.session()), self.hub.ending.clone());
+        session.park(token.clone(), lease);
+        runtime.spawn(async move {
+            tokio::select! {
+                () = tokio::time::sleep(grace) => {}
+                () = session.closed() => {}
+                () = ending.cancelled() => {}
+            }
+            // If it is still there.
+            drop(session.take_parked(&token));
+        });
+    }
+
     /// The next message of the client, unless one is still waiting for its step.
     fn poll_request(
         &mut self,
@@ -139,6 +165,12 @@ impl DriveStream {
             return Poll::Ready(Some(Ok(v1::DriveRequest { request: input })));
         }
         Pin::new(&mut self.requests).poll_next(context)
+    }
+}
+
+impl Drop for DriveStream {
+    fn drop(&mut self) {
+        self.keep_lease();
     }
 }
 
@@ -163,7 +195,20 @@ impl Driving {
             let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?;
         }
-        let lease = session.acquire(DriverKind::Drive)?;
+        if !(0.0..=GRACE_MAX_S).contains(&open.grace_s) {
+            let problem = format!("is {}; it must lie between 0 and {GRACE_MAX_S}", open.grace_s);
+            return Err(Fault::field("grace_s", problem));
+        }
+        let lease = if open.resume.is_empty() {
+            session.acquire(DriverKind::Drive)?
+        } else {
+            session.take_parked(&open.resume).ok_or_else(|| {
+                let why = format!("the lease of plant `{}` has ended", session.id());
+                Fault::precondition("LEASE_LOST", session.id(), why)
+            })?
+        };
+        let grace = Duration::from_secs_f64(open.grace_s);
+        let keep = (!grace.is_zero()).then(|| (format!("{:016x}", random_instance()), grace));
         let linearization = open.linearization.then(|| Linearization::new(session.model()));
         let work = convert::period_work(&session.mechanics().settings, dimensions);
         let is_short = work <= INLINE_WORK_MAX;
@@ -172,6 +217,7 @@ impl Driving {
             status: WatchStream::from_changes(session.run_status()),
             lease,
             linearization,
+            keep,
             is_short,
             held: None,
             states: None,
@@ -278,6 +324,7 @@ impl Stream for DriveStream {
             match this.poll_request(context) {
                 Poll::Ready(None) => break None,
                 Poll::Ready(Some(Err(status))) => {
+                    this.keep_lease();
                     break Some(Err(with_limit_details(status, &this.hub.limits)));
                 }
                 Poll::Ready(Some(Ok(request))) => {

@@ -223,7 +223,7 @@ pub(super) fn watch_events(
     request: &v1::WatchEventsRequest,
 ) -> Result<Answers<v1::WatchEventsResponse>, Fault> {
     let session = hub.session(&request.id)?;
-    let from = request.from.unwrap_or_else(|| session.events().next_number());
+    let from = request.since.unwrap_or_else(|| session.events().next_number());
     let reader = session.events().reader(from);
     let watcher = EventWatcher { hub: Arc::clone(hub), session, reader, waiting: VecDeque::new() };
     Ok(watcher.into_answers())

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use plantd_client::link::{LinkDriver, LinkOptions};
 use plantd_client::{Client, Code, Error, v1};
+use plantd_tests::server::ServerProcess;
 
 use crate::support::*;
 
@@ -416,4 +417,63 @@ async fn what_cannot_be_run_is_refused_by_name() {
         assert_refused(client.set_safety(request).await, invalid, "INVALID_FIELD", field);
     }
     assert_refused(client.timing("nobody", false).await, Code::NotFound, "PLANT_NOT_FOUND", "");
+}
+
+/// A driver that takes a step, and whose connection then breaks; the name of its lease.
+async fn broken_driver(server: &ServerProcess, open: v1::DriveOpen) -> String {
+    use v1::drive_request::Request;
+    use v1::drive_response::Response;
+    let client = Client::connect(server.address()).await.unwrap();
+    let (requests, queue) = tokio::sync::mpsc::channel(2);
+    let send = |request| requests.try_send(v1::DriveRequest { request: Some(request) }).unwrap();
+    send(Request::Open(open));
+    send(Request::Input(v1::DriveInput { sequence: 1, u: vec![0.1], answers_ns: 0 }));
+    let call = client.plants().drive(tokio_stream::wrappers::ReceiverStream::new(queue)).await;
+    let mut answers = call.unwrap().into_inner();
+    let opened = answers.message().await.unwrap().unwrap().response;
+    let Some(Response::Opened(opened)) = opened else { panic!("{opened:?}") };
+    let step = answers.message().await.unwrap().unwrap().response;
+    assert!(matches!(step, Some(Response::Step(_))), "{step:?}");
+    // The sender stays: the stream is not ended, it is cut off.
+    drop((answers, client));
+    std::mem::forget(requests);
+    opened.lease_token
+}
+
+/// A driver whose connection breaks keeps its lease for a while, and goes on with it; one that ends its
+/// stream gives it back at once.
+#[tokio::test]
+async fn a_lease_outlives_a_broken_connection_for_its_grace() {
+    let (server, client) = server().await;
+    let id = plant(&client, "pendulum").await.id;
+    let with_grace = |grace_s| v1::DriveOpen { id: id.clone(), grace_s, ..Default::default() };
+    let token = broken_driver(&server, with_grace(3600.0)).await;
+    for _ in 0..20 {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+        let held = client.drive(&id).await;
+        assert_refused(held, Code::FailedPrecondition, "LEASE_HELD", "");
+    }
+    let resume = |token: &str| v1::DriveOpen { resume: token.to_owned(), ..with_grace(0.0) };
+    let wrong = client.drive_as(resume("0123")).await;
+    assert_refused(wrong, Code::FailedPrecondition, "LEASE_LOST", "");
+    let mut driver = client.drive_as(resume(&token)).await.unwrap();
+    assert_eq!(driver.step(&[0.1]).await.unwrap().state.unwrap().step, 2);
+    assert_eq!(driver.lease_token(), "");
+    driver.close().await.unwrap();
+    assert_refused(
+        client.drive_as(resume(&token)).await,
+        Code::FailedPrecondition,
+        "LEASE_LOST",
+        "",
+    );
+    // A short grace ends by itself.
+    broken_driver(&server, with_grace(0.01)).await;
+    let again = async {
+        while client.drive(&id).await.is_err() {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    };
+    soon(again).await;
+    let refused = client.drive_as(with_grace(-1.0)).await;
+    assert_refused(refused, Code::InvalidArgument, "INVALID_FIELD", "grace_s");
 }

@@ -18,6 +18,7 @@ const TOOLS: &[Tool] = &[
         probe: ("valgrind", &["--version"]),
         package: "valgrind",
     },
+    Tool { purpose: "system calls of paced plants", probe: ("strace", &["-V"]), package: "strace" },
     Tool {
         purpose: "checks of the systemd unit",
         probe: ("systemd-analyze", &["--version"]),

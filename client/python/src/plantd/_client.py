@@ -16,6 +16,7 @@ from plantd.v1 import (
     control_service_pb2,
     model_service_pb2,
     plant_service_pb2,
+    realtime_pb2,
     recording_service_pb2,
 )
 from plantd.v1.channel_service_pb2_grpc import ChannelServiceStub
@@ -52,6 +53,7 @@ from ._types import (
     Diagnostics,
     Dynamics,
     Energy,
+    Event,
     Feedback,
     Gain,
     Linearization,
@@ -275,9 +277,18 @@ class Client:
         )
         return [State._from(state) for state in self._call(self.plants.Step, request).states]
 
-    def drive(self, id: str, *, linearization: bool = False) -> Driver:
-        """Takes the lease of a plant, to step it in lockstep."""
-        return Driver(self.plants, id, linearization)
+    def drive(
+        self, id: str, *, linearization: bool = False, grace: float = 0.0, resume: str = ""
+    ) -> Driver:
+        """Takes the lease of a plant, to step it or to give it inputs.
+
+        The lease is kept for ``grace`` seconds when the connection breaks; ``resume`` goes on with
+        it (`Driver.lease_token`).
+        """
+        open = plant_service_pb2.DriveOpen(
+            id=id, linearization=linearization, grace_s=grace, resume=resume
+        )
+        return Driver(self.plants, open)
 
     def watch(
         self,
@@ -452,6 +463,86 @@ class Client:
     def clear_feedback(self, id: str) -> None:
         """Takes the reference away; the driver's input acts alone again."""
         self._call(self.plants.ClearFeedback, plant_service_pb2.ClearFeedbackRequest(id=id))
+
+    def run(
+        self,
+        id: str,
+        pace: str = "",
+        *,
+        speed: float = 0.0,
+        steps: int = 0,
+        timeout: float = 0.0,
+        action: str = "hold",
+        ramp: float = 0.0,
+        safe: Vector = (),
+        latch: bool = False,
+    ) -> realtime_pb2.RunInfo:
+        """Runs a plant: ``"paced"`` by the wall clock, ``"free"`` as fast as possible, or in
+        ``"lockstep"``; without a pace as before. ``steps`` of 0 means until it is paused.
+
+        A plant that runs by itself waits for nobody: its driver's latest input acts. ``timeout``
+        (seconds on the plant's clock, 0 for never), ``action`` (``"hold"``, ``"safe"``, ``"ramp"``
+        within ``ramp`` seconds, ``"stop"``), ``safe`` and ``latch`` say what happens without one.
+        """
+        settings = None
+        if pace:
+            policy = realtime_pb2.InputPolicy(
+                timeout_s=timeout,
+                action=realtime_pb2.InputAction.Value(f"INPUT_ACTION_{action.upper()}"),
+                ramp_s=ramp,
+                safe=vector(safe),
+                latch=latch,
+            )
+            settings = realtime_pb2.RunSettings(
+                pace=realtime_pb2.Pace.Value(f"PACE_{pace.upper()}"),
+                speed=speed,
+                input=None if pace == "lockstep" else policy,
+            )
+        request = realtime_pb2.RunRequest(id=id, settings=settings, steps=steps)
+        return self._call(self.plants.Run, request).run
+
+    def pause(self, id: str) -> State:
+        """Pauses a plant between two steps, and returns the state in which it stands."""
+        return State._from(self._call(self.plants.Pause, realtime_pb2.PauseRequest(id=id)).state)
+
+    def set_safety(
+        self,
+        id: str,
+        watchdogs: Iterable[Mapping[str, Any]] = (),
+        *,
+        on_step_failure: str = "unspecified",
+    ) -> None:
+        """Sets bounds that protect a plant, in place of those before.
+
+        Each is a mapping: ``dict(quantity="x", max=2.0, action="reset")``. Quantities are
+        coordinates, ``v(coordinate)``, ``force(constraint)`` and ``energy``; actions ``freeze``
+        (the default), ``reset`` and ``disconnect``.
+        """
+
+        def act(name: str) -> realtime_pb2.WatchdogAction:
+            return realtime_pb2.WatchdogAction.Value(f"WATCHDOG_ACTION_{name.upper()}")
+
+        dogs = [
+            realtime_pb2.Watchdog(**{**dog, "action": act(dog.get("action", "freeze"))})
+            for dog in watchdogs
+        ]
+        request = realtime_pb2.SetSafetyRequest(
+            id=id, watchdogs=dogs, on_step_failure=act(on_step_failure)
+        )
+        self._call(self.plants.SetSafety, request)
+
+    def timing(self, id: str, *, clear: bool = False) -> realtime_pb2.GetTimingResponse:
+        """What the loop of a plant that runs by itself has counted; ``clear`` begins anew."""
+        request = realtime_pb2.GetTimingRequest(id=id, clear=clear)
+        return self._call(self.plants.GetTiming, request)
+
+    def watch_events(self, id: str, since: int | None = None) -> Iterator[Event]:
+        """What happens to a plant besides its steps, from event ``since`` on; a plant keeps 256.
+
+        Without ``since``: from now on. Leaving the loop ends the watch.
+        """
+        request = realtime_pb2.WatchEventsRequest(id=id, since=since)
+        return self._messages(self.plants.WatchEvents(request), Event._from)
 
     def set_channels(
         self,

@@ -29,9 +29,9 @@ class Driver:
     Use it in a ``with`` statement.
     """
 
-    def __init__(self, stub: PlantServiceStub, id: str, linearization: bool):
+    def __init__(self, stub: PlantServiceStub, open: pb.DriveOpen):
         self._requests: queue.SimpleQueue[pb.DriveRequest | None] = queue.SimpleQueue()
-        self._requests.put(pb.DriveRequest(open=pb.DriveOpen(id=id, linearization=linearization)))
+        self._requests.put(pb.DriveRequest(open=open))
         self._answers: Any = stub.Drive(iter(self._requests.get, None))
         self._sequence = 0
         self._answers_ns = 0
@@ -47,8 +47,11 @@ class Driver:
         self.u: Array | None = None
         #: What the output channels delivered after the last step, if there are any.
         self.outputs: Outputs | None = None
+        opened = self._next().opened
         #: The plant as it was when the driver opened it.
-        self.plant = Plant._from(self._next().opened.plant)
+        self.plant = Plant._from(opened.plant)
+        #: Names the lease, for ``resume`` after the connection broke; empty without ``grace``.
+        self.lease_token: str = opened.lease_token
 
     @translate
     def _next(self) -> pb.DriveResponse:

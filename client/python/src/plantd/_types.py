@@ -16,6 +16,7 @@ from plantd.v1 import (
     control_service_pb2,
     model_service_pb2,
     plant_service_pb2,
+    realtime_pb2,
     recording_service_pb2,
 )
 
@@ -607,6 +608,64 @@ class Outputs:
         return cls(array(m.y), tuple(m.lost))
 
 
+@dataclass(frozen=True)
+class StepTiming:
+    """Times of one step of a plant that runs by itself, on the server's monotonic clock."""
+
+    #: When it was due, ns; 0 when nothing was.
+    due_ns: int
+    #: When it began, ns.
+    began_ns: int
+    #: When it was over, ns.
+    ended_ns: int
+    #: Number of the driver's input in force; 0 for none.
+    input_sequence: int
+    #: Age of that input when the step began, ns.
+    input_age_ns: int
+    #: No new input had come since the step before.
+    input_late: bool
+    #: There was no valid input: what the policy says was in force.
+    input_safe: bool
+
+    @classmethod
+    def _from(cls, m: realtime_pb2.StepTiming) -> StepTiming:
+        return cls(
+            m.due_ns,
+            m.began_ns,
+            m.ended_ns,
+            m.input_sequence,
+            m.input_age_ns,
+            m.input_late,
+            m.input_safe,
+        )
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened to a plant besides its steps."""
+
+    #: Number, from 0 for the plant.
+    number: int
+    #: What: ``started``, ``input_lost``, ``watchdog``, ... as in the contract's ``EventKind``.
+    kind: str
+    #: Step of the plant.
+    step: int
+    #: To whom or what.
+    subject: str
+    #: A quantity, see the contract.
+    value: float
+    #: When, ns on the server's monotonic clock.
+    monotonic_ns: int
+    #: When, UTC, ns since 1970.
+    utc_ns: int
+
+    @classmethod
+    def _from(cls, m: realtime_pb2.WatchEventsResponse) -> Event:
+        e = m.event
+        kind = realtime_pb2.EventKind.Name(e.kind)[11:].lower()
+        return cls(e.number, kind, e.step, e.subject, e.value, e.monotonic_ns, e.utc_ns)
+
+
 @dataclass(frozen=True, eq=False)
 class Channels:
     """The sensors and actuators of a plant."""
@@ -641,6 +700,8 @@ class Watched:
     u: Array | None = None
     #: What the output channels deliver.
     outputs: Outputs | None = None
+    #: Times of the step, of a plant that runs by itself.
+    timing: StepTiming | None = None
 
     @classmethod
     def _from(cls, m: plant_service_pb2.WatchResponse) -> Watched:
@@ -658,6 +719,7 @@ class Watched:
             m.dropped,
             array(m.u) if m.u else None,
             part("outputs", Outputs),
+            part("timing", StepTiming),
         )
 
 

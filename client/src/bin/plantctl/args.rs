@@ -6,7 +6,7 @@ use clap::{Args as Group, Parser, Subcommand, ValueEnum};
 use plantd_client::v1;
 
 use crate::replay::RecordCommand;
-use crate::{channels, test};
+use crate::{channels, run, test};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -107,6 +107,21 @@ The file, in the field names of the contract, TOML or JSON; here for a pendulum:
   max_rate = 50.0
 
 Times become whole steps; the answer says which.";
+
+const RUN: &str = "\
+Examples:
+  plantctl run arm --pace paced                     by the wall clock; its driver's latest input acts
+  plantctl run arm --pace paced --speed 0.1         ten times slower
+  plantctl run arm --pace paced --timeout 0.05 --action ramp --ramp 0.2 --safe 0,0
+  plantctl pause arm
+  plantctl run arm -n 1                             a single step";
+
+const GUARD: &str = "\
+Quantities are coordinates, v(coordinate), force(constraint) and energy; actions are freeze (if none is
+given), reset and disconnect.
+Examples:
+  plantctl guard cart 'x<2' 'x>-2' 'energy<50:reset'
+  plantctl guard cart";
 
 const FAULTS: &str = "\
 Examples:
@@ -367,6 +382,43 @@ pub(crate) enum Command {
     /// Sensors and actuators of a plant.
     #[command(subcommand)]
     Channels(ChannelsCommand),
+    /// Runs a plant: by the wall clock, as fast as possible, or in lockstep. `plantctl run ID` goes on
+    /// after a pause.
+    #[command(after_help = RUN)]
+    Run(RunArgs),
+    /// Pauses a plant between two steps.
+    Pause {
+        /// Plant.
+        id: String,
+    },
+    /// Sets bounds that protect a plant, in place of those before.
+    #[command(after_help = GUARD)]
+    Guard {
+        /// Plant.
+        id: String,
+        /// Bounds; none takes the protection away.
+        #[arg(value_name = "QUANTITY<VALUE[:ACTION]", value_parser = run::watchdog)]
+        bounds: Vec<WatchdogArg>,
+    },
+    /// Prints what the loop of a plant that runs by itself has counted.
+    Timing {
+        /// Plant.
+        id: String,
+        /// Begin to count anew.
+        #[arg(long)]
+        clear: bool,
+    },
+    /// Prints what happens to a plant besides its steps. Ends with Ctrl-C or after `--count`.
+    Events {
+        /// Plant.
+        id: String,
+        /// Begin with the event of this number; a plant keeps 256 of them. From now on if not given.
+        #[arg(long)]
+        since: Option<u64>,
+        /// End after this many events.
+        #[arg(long, short = 'n')]
+        count: Option<u64>,
+    },
     /// Lets something go wrong on a plant.
     #[command(subcommand, after_help = FAULTS)]
     Fault(FaultCommand),
@@ -501,6 +553,65 @@ pub(crate) enum Feedback {
         id: String,
     },
 }
+
+/// Arguments of `run`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct RunArgs {
+    /// Plant.
+    pub(crate) id: String,
+    /// Who decides when it takes a step; as before if not given.
+    #[arg(long, value_enum)]
+    pub(crate) pace: Option<Pace>,
+    /// Seconds of the plant's clock in a second of the wall clock.
+    #[arg(long, requires = "pace")]
+    pub(crate) speed: Option<f64>,
+    /// Pause again after this many steps.
+    #[arg(long, short = 'n')]
+    pub(crate) steps: Option<u64>,
+    /// How long an input is valid, seconds on the plant's clock; for ever if not given.
+    #[arg(long, value_name = "SECONDS", requires = "pace")]
+    pub(crate) timeout: Option<f64>,
+    /// What to do without a valid input.
+    #[arg(long, value_enum, requires = "pace")]
+    pub(crate) action: Option<InputAction>,
+    /// Duration of a ramp, seconds on the plant's clock.
+    #[arg(long, value_name = "SECONDS", requires = "action")]
+    pub(crate) ramp: Option<f64>,
+    /// The safe input, comma-separated.
+    #[arg(long, value_parser = numbers, allow_hyphen_values = true, requires = "pace")]
+    pub(crate) safe: Option<Numbers>,
+    /// Once the safe input acts, it acts until `run` is called again.
+    #[arg(long, requires = "pace")]
+    pub(crate) latch: bool,
+}
+
+/// Who decides when a plant takes a step.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub(crate) enum Pace {
+    /// The driver, one step for each input.
+    Lockstep,
+    /// The wall clock.
+    Paced,
+    /// Nobody: as fast as possible.
+    Free,
+}
+
+/// What to do without a valid input.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub(crate) enum InputAction {
+    /// The last input acts on.
+    Hold,
+    /// The safe input acts at once.
+    Safe,
+    /// The safe input acts after a ramp.
+    Ramp,
+    /// The plant stands still.
+    Stop,
+}
+
+/// A watchdog.
+#[derive(Clone, Debug)]
+pub(crate) struct WatchdogArg(pub(crate) v1::Watchdog);
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ChannelsCommand {

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use crate::args::{
     Args, Assignment, Command, Field, Numbers, Plural, Point, Settings, Singular, Weights,
 };
-use crate::{FAILED, channels, feedback, json, optimize, replay, test, text};
+use crate::{FAILED, channels, feedback, json, optimize, replay, run, test, text};
 
 /// Runs a command; the code is that of a command which ran.
 pub(crate) async fn run(args: Args) -> Result<ExitCode> {
@@ -159,6 +159,13 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
             )?;
         }
         Command::Channels(command) => channels::run(&client, output, command).await?,
+        Command::Run(args) => run::run(&client, output, args).await?,
+        Command::Pause { id } => run::pause(&client, output, id).await?,
+        Command::Guard { id, bounds } => run::guard(&client, output, id, bounds).await?,
+        Command::Timing { id, clear } => run::timing(&client, output, id, clear).await?,
+        Command::Events { id, since, count } => {
+            run::events(&client, output, id, since, count).await?;
+        }
         Command::Fault(command) => channels::fault(&client, output, command).await?,
         Command::Feedback(command) => feedback::run(&client, output, command).await?,
         Command::Gains { id, count } => feedback::gains(&client, output, id, count).await?,

@@ -8,6 +8,7 @@ mod json;
 mod optimize;
 mod own_server;
 mod replay;
+mod run;
 mod test;
 mod text;
 

@@ -1,0 +1,387 @@
+//! What the two links cost beside what they are made of, in one run: a closed-loop round trip of a plant
+//! over shared memory beside a bare iceoryx2 ping-pong, and over gRPC beside a bare tonic stream echo of
+//! the same messages, both between two processes, taking turns. Prints the ratio; asserts nothing.
+
+use std::convert::Infallible;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result};
+use clap::Parser;
+use futures::future::BoxFuture;
+use futures::stream::BoxStream;
+use futures::{FutureExt as _, StreamExt as _};
+use hdrhistogram::Histogram;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::*;
+use plantd_client::link::{LinkDriver, LinkOptions, Wait};
+use plantd_client::{Client, Driver, v1};
+use plantd_proto::link::Header;
+use plantd_tests::links::{ChildProcess, PLANT, new_plant};
+use plantd_tests::server::ServerProcess;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::body::Body;
+use tonic::codegen::{Service, http};
+use tonic::server::{Grpc, NamedService, StreamingService};
+use tonic::{Request, Response, Status, Streaming};
+use tonic_prost::ProstCodec;
+
+/// Measures the round trips of both links beside bare ones.
+#[derive(Parser)]
+struct Arguments {
+    /// Built-in model.
+    #[arg(long, default_value = "pendulum")]
+    model: String,
+    /// Round trips in a turn.
+    #[arg(long, default_value_t = 5_000)]
+    steps: u64,
+    /// Turns.
+    #[arg(long, default_value_t = 8)]
+    turns: u32,
+    /// Serves as the other end of a bare link: `iceoryx` or `grpc`.
+    #[arg(long, hide = true)]
+    echo: Option<String>,
+    /// Where the other end finds what it needs.
+    #[arg(long, hide = true)]
+    at: Option<PathBuf>,
+}
+
+type Times = Histogram<u64>;
+
+/// Largest time that is told from longer ones, ns.
+const LONGEST_NS: u64 = 10_000_000_000;
+/// Longest wait for the other end.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+fn main() -> Result<()> {
+    let arguments = Arguments::parse();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    match arguments.echo.as_deref() {
+        Some("iceoryx") => echo_iceoryx(arguments.at.as_deref().context("no path")?),
+        Some("grpc") => runtime.block_on(serve_echo(arguments.at.context("no path")?)),
+        Some(other) => anyhow::bail!("no echo `{other}`"),
+        None => runtime.block_on(measure(&arguments)),
+    }
+}
+
+async fn measure(arguments: &Arguments) -> Result<()> {
+    let mut rows: [(&str, Times); 5] = [
+        ("step in process", times()?),
+        ("bare iceoryx2 ping-pong", times()?),
+        ("plant over shared memory", times()?),
+        ("bare tonic stream echo", times()?),
+        ("plant over gRPC", times()?),
+    ];
+    let directory = tempfile::Builder::new().prefix("plantd-").tempdir()?;
+    let mut bare = BareIceoryx::start(&arguments.model)?;
+    let mut link = SharedMemory::start(&directory.path().join("link"), &arguments.model)?;
+    let mut echo = BareGrpc::start(&directory.path().join("echo.sock")).await?;
+    let mut grpc = PlantOverGrpc::start(&arguments.model).await?;
+    let mut plant = new_plant(&arguments.model)?;
+    let mut u = vec![0.0; plant.model().dimensions().input()];
+    plant.hold_input(&mut u);
+    for turn in 0..=arguments.turns {
+        // The first turn warms up.
+        let is_counted = turn > 0;
+        for _ in 0..arguments.steps {
+            note(&mut rows[0].1, is_counted, || Ok(plant.step(&u).map(drop)?))?;
+        }
+        for _ in 0..arguments.steps {
+            note(&mut rows[1].1, is_counted, || bare.round_trip(&u))?;
+        }
+        for _ in 0..arguments.steps {
+            note(&mut rows[2].1, is_counted, || Ok(link.driver.step(&u).map(drop)?))?;
+        }
+        for _ in 0..arguments.steps {
+            let started = Instant::now();
+            echo.round_trip(&u).await?;
+            count(&mut rows[3].1, is_counted, started)?;
+        }
+        for _ in 0..arguments.steps {
+            let started = Instant::now();
+            grpc.driver.step(&u).await?;
+            count(&mut rows[4].1, is_counted, started)?;
+        }
+    }
+    println!("{}, {} round trips each, us", arguments.model, rows[0].1.len());
+    println!("{:28} {:>8} {:>8} {:>8}", "", "p50", "p99", "p99.9");
+    let us = |times: &Times, quantile| times.value_at_quantile(quantile) as f64 * 1e-3;
+    for (name, times) in &rows {
+        println!(
+            "{name:28} {:8.2} {:8.2} {:8.2}",
+            us(times, 0.5),
+            us(times, 0.99),
+            us(times, 0.999)
+        );
+    }
+    let p50 = |row: usize| us(&rows[row].1, 0.5);
+    println!("shared memory / (bare + step): {:.2}", p50(2) / (p50(1) + p50(0)));
+    println!("gRPC / (bare + step):          {:.2}", p50(4) / (p50(3) + p50(0)));
+    link.finish()
+}
+
+fn times() -> Result<Times> {
+    Ok(Histogram::new_with_max(LONGEST_NS, 3)?)
+}
+
+fn note(times: &mut Times, is_counted: bool, act: impl FnOnce() -> Result<()>) -> Result<()> {
+    let started = Instant::now();
+    act()?;
+    count(times, is_counted, started)
+}
+
+fn count(times: &mut Times, is_counted: bool, started: Instant) -> Result<()> {
+    if is_counted {
+        times.record(started.elapsed().as_nanos() as u64)?;
+    }
+    Ok(())
+}
+
+/// A process that ends with its value.
+struct Other(Child);
+
+impl Other {
+    fn start(echo: &str, at: &Path) -> Result<Self> {
+        let mut command = Command::new(std::env::current_exe()?);
+        Ok(Self(command.args(["--echo", echo, "--at"]).arg(at).spawn()?))
+    }
+}
+
+impl Drop for Other {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The plant's link, polling on both sides.
+struct SharedMemory {
+    driver: LinkDriver,
+    host: ChildProcess,
+}
+
+impl SharedMemory {
+    fn start(root: &Path, model: &str) -> Result<Self> {
+        let program = std::env::current_exe()?.with_file_name("link_host");
+        let mut host = ChildProcess::start(&program, root, &["--model", model, "--poll"])?;
+        host.wait_for_line("open")?;
+        let options =
+            LinkOptions { root: root.to_owned(), wait: Wait::Poll, ..LinkOptions::default() };
+        Ok(Self { driver: LinkDriver::connect(PLANT, options)?, host })
+    }
+
+    fn finish(mut self) -> Result<()> {
+        drop(self.driver);
+        anyhow::ensure!(self.host.finish()?, "the host failed");
+        Ok(())
+    }
+}
+
+/// Publish and subscribe of slices with a header of the link's size, polled, without anything else.
+struct BareIceoryx {
+    ends: Ends,
+    answer_len: usize,
+    _other: Other,
+}
+
+/// The ports of one end.
+struct Ends {
+    publisher: Publisher<ipc::Service, [f64], Header>,
+    subscriber: Subscriber<ipc::Service, [f64], Header>,
+    _node: Node<ipc::Service>,
+}
+
+impl Ends {
+    /// Of the two services of a name, sends to `out` and receives from `back`.
+    fn new(name: &str, out: &str, back: &str) -> Result<Self> {
+        let node = NodeBuilder::new().create::<ipc::Service>()?;
+        let service = |direction: &str| -> Result<_> {
+            let name = ServiceName::new(&format!("{name}/{direction}"))?;
+            Ok(node
+                .service_builder(&name)
+                .publish_subscribe::<[f64]>()
+                .user_header::<Header>()
+                .enable_safe_overflow(true)
+                .subscriber_max_buffer_size(2)
+                .open_or_create()?)
+        };
+        let (out, back) = (service(out)?, service(back)?);
+        let subscriber = back.subscriber_builder().create()?;
+        let publisher = out.publisher_builder().initial_max_slice_len(512).create()?;
+        Ok(Self { publisher, subscriber, _node: node })
+    }
+
+    fn send(&self, payload: &[f64]) -> Result<()> {
+        let mut sample = self.publisher.loan_slice(payload.len())?;
+        sample.payload_mut().copy_from_slice(payload);
+        sample.send()?;
+        Ok(())
+    }
+}
+
+impl BareIceoryx {
+    fn start(model: &str) -> Result<Self> {
+        let name = format!("plantd-overhead-{}", std::process::id());
+        let ends = Ends::new(&name, "ping", "pong")?;
+        let other = Other::start("iceoryx", Path::new(&name))?;
+        let d = new_plant(model)?.model().dimensions();
+        let mut bare = Self { ends, answer_len: d.state() + d.constraints, _other: other };
+        // Until the other end is there.
+        let deadline = Instant::now() + PATIENCE;
+        while bare.ends.subscriber.receive()?.is_none() {
+            anyhow::ensure!(Instant::now() < deadline, "the other end does not answer");
+            bare.ends.send(&[bare.answer_len as f64])?;
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        std::thread::sleep(Duration::from_millis(10));
+        while bare.ends.subscriber.receive()?.is_some() {}
+        bare.round_trip(&[0.0])?;
+        Ok(bare)
+    }
+
+    /// As many numbers one way as an input has, as many back as a state has.
+    fn round_trip(&mut self, u: &[f64]) -> Result<()> {
+        let mut message = [0.0; 64];
+        message[0] = self.answer_len as f64;
+        self.ends.send(&message[..u.len().clamp(1, 64)])?;
+        while self.ends.subscriber.receive()?.is_none() {
+            std::hint::spin_loop();
+        }
+        Ok(())
+    }
+}
+
+/// The other end: answers with as many numbers as the first one says. Is killed.
+fn echo_iceoryx(name: &Path) -> Result<()> {
+    let name = name.to_str().context("a name in UTF-8")?;
+    let ends = Ends::new(name, "pong", "ping")?;
+    let answer = [0.0; 512];
+    loop {
+        if let Some(message) = ends.subscriber.receive()? {
+            let len = message.payload().first().copied().unwrap_or(0.0) as usize;
+            ends.send(&answer[..len.min(512)])?;
+        } else {
+            std::hint::spin_loop();
+        }
+    }
+}
+
+/// A driver of a plant of a real server.
+struct PlantOverGrpc {
+    driver: Driver,
+    _server: ServerProcess,
+}
+
+impl PlantOverGrpc {
+    async fn start(model: &str) -> Result<Self> {
+        let server = ServerProcess::start()?;
+        let client = Client::connect(server.unix_address()).await?;
+        let request = v1::CreatePlantRequest { model: model.to_owned(), ..Default::default() };
+        let id = client.create_plant(request).await?.id;
+        Ok(Self { driver: client.drive(id).await?, _server: server })
+    }
+}
+
+/// A bidirectional stream of the same messages to a server that only sends back.
+struct BareGrpc {
+    requests: mpsc::Sender<v1::DriveRequest>,
+    answers: Streaming<v1::DriveResponse>,
+    _other: Other,
+}
+
+impl BareGrpc {
+    async fn start(socket: &Path) -> Result<Self> {
+        let other = Other::start("grpc", socket)?;
+        let deadline = Instant::now() + PATIENCE;
+        while !socket.exists() {
+            anyhow::ensure!(Instant::now() < deadline, "the other end does not listen");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        let path = socket.to_owned();
+        let address = format!("unix:{}", socket.display());
+        let channel = Client::connect(address).await?.channel();
+        let (requests, queue) = mpsc::channel(1);
+        let mut client = tonic::client::Grpc::new(channel);
+        client.ready().await?;
+        let path = http::uri::PathAndQuery::from_static("/echo.EchoService/Echo");
+        let codec = ProstCodec::<v1::DriveRequest, v1::DriveResponse>::default();
+        let request = Request::new(ReceiverStream::new(queue));
+        let answers = client.streaming(request, path, codec).await?.into_inner();
+        Ok(Self { requests, answers, _other: other })
+    }
+
+    async fn round_trip(&mut self, u: &[f64]) -> Result<()> {
+        let input = v1::DriveInput { sequence: 1, u: u.to_vec(), answers_ns: 1 };
+        let request = v1::drive_request::Request::Input(input);
+        self.requests.send(v1::DriveRequest { request: Some(request) }).await?;
+        self.answers.message().await?.context("the echo has ended")?;
+        Ok(())
+    }
+}
+
+/// The other end: answers each input with a step of a pendulum that is not taken. Is killed.
+async fn serve_echo(socket: PathBuf) -> Result<()> {
+    let listener = tokio::net::UnixListener::bind(socket)?;
+    let incoming = tokio_stream::wrappers::UnixListenerStream::new(listener);
+    tonic::transport::Server::builder()
+        .add_service(EchoService)
+        .serve_with_incoming(incoming)
+        .await?;
+    Ok(())
+}
+
+#[derive(Clone)]
+struct EchoService;
+
+impl NamedService for EchoService {
+    const NAME: &'static str = "echo.EchoService";
+}
+
+impl Service<http::Request<Body>> for EchoService {
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = BoxFuture<'static, Result<Self::Response, Infallible>>;
+
+    fn poll_ready(&mut self, _: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn call(&mut self, request: http::Request<Body>) -> Self::Future {
+        async move {
+            let codec = ProstCodec::<v1::DriveResponse, v1::DriveRequest>::default();
+            Ok(Grpc::new(codec).streaming(Echo, request).await)
+        }
+        .boxed()
+    }
+}
+
+struct Echo;
+
+impl StreamingService<v1::DriveRequest> for Echo {
+    type Response = v1::DriveResponse;
+    type ResponseStream = BoxStream<'static, Result<v1::DriveResponse, Status>>;
+    type Future = BoxFuture<'static, Result<Response<Self::ResponseStream>, Status>>;
+
+    fn call(&mut self, request: Request<Streaming<v1::DriveRequest>>) -> Self::Future {
+        let state =
+            v1::State { step: 1, time_s: 0.1, q: vec![0.1], p: vec![0.1], ..Default::default() };
+        let report = v1::StepReport { iterations: 2, residual: 0.5, ..Default::default() };
+        let clocks = v1::Clocks { plant_s: 0.1, monotonic_ns: 1 << 50, utc_ns: 1 << 60 };
+        let step = v1::DriveStep {
+            sequence: 1,
+            state: Some(state),
+            report: Some(report),
+            clocks: Some(clocks),
+            ..Default::default()
+        };
+        let response = v1::drive_response::Response::Step(step);
+        let answer = v1::DriveResponse { response: Some(response) };
+        let answers = request.into_inner().map(move |input| input.map(|_| answer.clone()));
+        async move { Ok(Response::new(answers.boxed())) }.boxed()
+    }
+}
