@@ -410,7 +410,8 @@ impl Session {
         let frames = vec![like; queue];
         // In the core's hands no step falls between the registration and the first frame.
         let subscribed = self.with_core(move |core| {
-            let subscription = Subscription::new(session, every, frames, watchers_max)?;
+            let from = core.ring.as_ref().map_or(0, |ring| ring.written());
+            let subscription = Subscription::new(session, every, from, frames, watchers_max)?;
             subscription.offer(&core.published());
             Ok(subscription)
         });
@@ -655,7 +656,7 @@ impl Session {
             }
         });
         if let Some((key, handle)) = place {
-            self.ring();
+            self.live().first_record.store(self.ring().written(), Ordering::Release);
             self.enter_loop(key, handle, &settings, steps)?;
         }
         self.tell_run_status();
@@ -772,6 +773,12 @@ impl Session {
         let words = record_words(self.model.dimensions());
         let ring = Arc::new(Ring::new(RING_RECORDS, words));
         self.with_core(move |core| Arc::clone(core.ring.get_or_insert(ring)))
+    }
+
+    /// A reader of what the plant's loop wrote into the ring and a watcher has not seen.
+    pub(crate) fn read_for_watchers(&self) -> Reader {
+        let from = self.live().first_record.load(Ordering::Acquire);
+        Reader::from(self.ring(), from.max(self.watchers.first_record()))
     }
 
     /// A reader of the ring, from its last record on.

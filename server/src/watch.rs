@@ -31,12 +31,22 @@ impl Watchers {
 
     /// Offers a state to all watchers whose turn it is.
     pub(crate) fn publish(&self, published: &Published<'_>) {
+        self.publish_record(published, u64::MAX);
+    }
+
+    /// The same for a record of the plant's ring: not to those who came after it.
+    pub(crate) fn publish_record(&self, published: &Published<'_>, record: u64) {
         if self.count() == 0 {
             return;
         }
-        for slot in lock(&self.slots).iter() {
+        for slot in lock(&self.slots).iter().filter(|slot| slot.from <= record) {
             slot.offer(published);
         }
+    }
+
+    /// The first record of the plant's ring that somebody wants.
+    pub(crate) fn first_record(&self) -> u64 {
+        lock(&self.slots).iter().map(|slot| slot.from).min().unwrap_or(u64::MAX)
     }
 
     fn add(&self, slot: Arc<Slot>, watchers_max: u64) -> Result<(), LimitExceeded> {
@@ -57,6 +67,8 @@ impl Watchers {
 
 struct Slot {
     every: u64,
+    /// The first record of the plant's ring that came after the watcher.
+    from: u64,
     cell: Mutex<Cell>,
     filled: AtomicWaker,
 }
@@ -122,12 +134,14 @@ impl Subscription {
     pub(crate) fn new(
         session: Arc<Session>,
         every: u64,
+        from: u64,
         frames: Vec<Frame>,
         watchers_max: u64,
     ) -> Result<Self, LimitExceeded> {
         let frame = frames.first().cloned().unwrap_or_default();
         let cell = Mutex::new(Cell { frames, first: 0, count: 0, dropped: 0 });
-        let slot = Arc::new(Slot { every: every.max(1), cell, filled: AtomicWaker::new() });
+        let every = every.max(1);
+        let slot = Arc::new(Slot { every, from, cell, filled: AtomicWaker::new() });
         session.watchers().add(Arc::clone(&slot), watchers_max)?;
         session.metrics().watcher_started();
         Ok(Self { session, slot, frame, dropped: 0 })

@@ -65,7 +65,7 @@ impl Drive {
         let (inputs, requests) = mpsc::channel(4);
         let answers = plants.drive(ReceiverStream::new(requests)).await.unwrap().into_inner();
         let mut drive = Self { inputs, answers };
-        let open = v1::DriveOpen { id: id.to_owned(), linearization: false };
+        let open = v1::DriveOpen { id: id.to_owned(), ..Default::default() };
         drive.send(DriveMessage::Open(open)).await;
         drive
     }

@@ -147,6 +147,8 @@ pub struct Live {
     pub due_ns: AtomicU64,
     /// Steps after which it pauses; 0 means never.
     pub steps_left: AtomicU64,
+    /// The first record of the ring that the loop wrote.
+    pub first_record: AtomicU64,
 }
 
 impl Live {
@@ -157,6 +159,7 @@ impl Live {
             counts: TimingCounts::default(),
             due_ns: AtomicU64::new(0),
             steps_left: AtomicU64::new(0),
+            first_record: AtomicU64::new(0),
         }
     }
 }

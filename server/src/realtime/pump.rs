@@ -94,11 +94,12 @@ impl Worker {
     /// Hands on what is there; when to look again.
     fn hand_on(&mut self, session: &Session, now_ns: u64) -> u64 {
         let place = self.places.entry(session.id().to_owned());
-        let (reader, frame) = place.or_insert_with(|| (session.read_ring(), Frame::default()));
+        let (reader, frame) =
+            place.or_insert_with(|| (session.read_for_watchers(), Frame::default()));
         let mut has_news = false;
-        while let Some((_, record)) = reader.read_next() {
+        while let Some((number, record)) = reader.read_next() {
             frame.read(record);
-            session.watchers().publish(&frame.published());
+            session.watchers().publish_record(&frame.published(), number);
             has_news = true;
         }
         let due_ns = session.live().due_ns.load(Ordering::Relaxed);

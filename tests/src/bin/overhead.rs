@@ -302,7 +302,6 @@ impl BareGrpc {
             anyhow::ensure!(Instant::now() < deadline, "the other end does not listen");
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
-        let path = socket.to_owned();
         let address = format!("unix:{}", socket.display());
         let channel = Client::connect(address).await?.channel();
         let (requests, queue) = mpsc::channel(1);

@@ -94,7 +94,7 @@ async fn messages_out_of_order_end_the_stream() {
     use v1::drive_request::Request;
     let (_server, client) = server().await;
     let id = plant(&client, "pendulum").await.id;
-    let open = || Request::Open(v1::DriveOpen { id: id.clone(), linearization: false });
+    let open = || Request::Open(v1::DriveOpen { id: id.clone(), ..Default::default() });
     let input = Request::Input(v1::DriveInput { sequence: 1, u: vec![0.0], answers_ns: 0 });
     for (requests, answers) in [
         (vec![Some(input)], 0),
