@@ -245,11 +245,11 @@ impl Collector for LoopCounters {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
         let counts = &self.0;
         for (name, help, count) in [
-            ("plantd_loop_steps", "Steps of plants that run by themselves", &counts.steps),
-            ("plantd_loop_overruns", "Steps that ended after the next was due", &counts.overruns),
-            ("plantd_loop_slips", "Times that a schedule was given up", &counts.slips),
-            ("plantd_loop_late_inputs", "Steps without a new input", &counts.late_inputs),
-            ("plantd_loop_safe_inputs", "Steps without a valid input", &counts.safe_inputs),
+            ("loop_steps", "Steps of plants that run by themselves", &counts.steps),
+            ("loop_overruns", "Steps that ended after the next was due", &counts.overruns),
+            ("loop_slips", "Times that a schedule was given up", &counts.slips),
+            ("loop_late_inputs", "Steps without a new input", &counts.late_inputs),
+            ("loop_safe_inputs", "Steps without a valid input", &counts.safe_inputs),
         ] {
             let counter = ConstCounter::new(count.load(Ordering::Relaxed));
             let metric = encoder.encode_descriptor(name, help, None, counter.metric_type())?;

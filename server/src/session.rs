@@ -115,8 +115,8 @@ pub enum DriveError {
     /// A watchdog holds the plant.
     #[error("a watchdog holds the plant")]
     Frozen(Trip),
-    /// A watchdog took the lease away.
-    #[error("a watchdog took the lease away")]
+    /// The lease was taken away.
+    #[error("the lease was taken away")]
     Revoked,
 }
 
@@ -193,8 +193,10 @@ pub struct Session {
     input_lease: AtomicU64,
     /// Number of the last lease that was taken away.
     revoked: AtomicU64,
-    /// The lease of a driver whose connection broke, with its name.
-    parked: Mutex<Option<(String, Lease)>>,
+    /// Number of the lease in force.
+    holder: AtomicU64,
+    /// The name under which a lease can be taken over, and its number.
+    named: Mutex<Option<(String, u64)>>,
     /// Held by whoever replaces the plant; taken before the core's lock.
     replacing: Mutex<()>,
     /// The feedback's law for watchers of gains.
@@ -239,7 +241,8 @@ impl Session {
             leases: AtomicU64::new(0),
             input_lease: AtomicU64::new(0),
             revoked: AtomicU64::new(0),
-            parked: Mutex::default(),
+            holder: AtomicU64::new(0),
+            named: Mutex::default(),
             replacing: Mutex::default(),
             in_force: watch::Sender::new(None),
             is_recomputing: AtomicBool::new(false),
@@ -383,15 +386,39 @@ impl Session {
             .compare_exchange(0, kind.code(), Ordering::AcqRel, Ordering::Acquire)
             .map_err(|code| LeaseHeld { by: DriverKind::from_code(code).unwrap_or(kind) })?;
         self.metrics.driver_started(kind);
+        let lease = self.new_lease(kind);
+        self.holder.store(lease.number, Ordering::Release);
+        if kind != DriverKind::Step {
+            self.input_lease.store(lease.number, Ordering::Release);
+        }
+        Ok(lease)
+    }
+
+    fn new_lease(self: &Arc<Self>, kind: DriverKind) -> Lease {
         let number = self.leases.fetch_add(1, Ordering::Relaxed) + 1;
-        let lease = Lease { session: Arc::clone(self), kind, number, untimed_steps: 0 };
         if kind != DriverKind::Step {
             self.with_core(move |core| {
                 core.note(EventKind::DriverAttached, kind.code().into(), 0.0)
             });
-            self.input_lease.store(number, Ordering::Release);
         }
-        Ok(lease)
+        Lease { session: Arc::clone(self), kind, number, untimed_steps: 0 }
+    }
+
+    /// Takes the lease of that name over from whoever holds it: a stream whose connection broke, noticed
+    /// or not.
+    pub fn take_over(self: &Arc<Self>, token: &str) -> Option<Lease> {
+        let named = lock(&self.named).take_if(|(name, _)| name == token);
+        let (_, former) = named?;
+        let lease = self.new_lease(DriverKind::Drive);
+        let taken =
+            self.holder.compare_exchange(former, lease.number, Ordering::AcqRel, Ordering::Acquire);
+        self.metrics.driver_started(DriverKind::Drive);
+        // Dropped, it gives up nothing that is not its own.
+        taken.ok()?;
+        self.input_lease.store(lease.number, Ordering::Release);
+        self.revoked.store(former, Ordering::Release);
+        self.tell_run_status();
+        Some(lease)
     }
 
     /// Subscribes to every `every`-th state. Starts with the state as it is, if its step counts.
@@ -726,17 +753,6 @@ impl Session {
         }
     }
 
-    /// Keeps the lease of a driver whose connection broke, under a name.
-    pub fn park(&self, token: String, lease: Lease) {
-        *lock(&self.parked) = Some((token, lease));
-    }
-
-    /// The lease that is kept under that name.
-    pub fn take_parked(&self, token: &str) -> Option<Lease> {
-        let parked = lock(&self.parked).take_if(|(name, _)| name == token);
-        parked.map(|(_, lease)| lease)
-    }
-
     /// The events of the plant.
     pub fn events(&self) -> &Arc<Events> {
         &self.events
@@ -1011,7 +1027,12 @@ impl Lease {
         Ok(())
     }
 
-    /// A watchdog has taken it away.
+    /// Gives it a name, under which it can be taken over.
+    pub fn set_name(&self, token: String) {
+        *lock(&self.session.named) = Some((token, self.number));
+    }
+
+    /// It was taken away.
     pub fn is_revoked(&self) -> bool {
         self.session.revoked.load(Ordering::Acquire) >= self.number
     }
@@ -1051,13 +1072,20 @@ impl Lease {
 impl Drop for Lease {
     fn drop(&mut self) {
         let (session, kind) = (&self.session, self.kind);
-        if kind != DriverKind::Step {
-            session.input_lease.store(0, Ordering::Release);
-            session
-                .with_core(move |core| core.note(EventKind::DriverLeft, kind.code().into(), 0.0));
-        }
         session.metrics.driver_ended(kind);
+        let holds =
+            session.holder.compare_exchange(self.number, 0, Ordering::AcqRel, Ordering::Acquire);
+        if holds.is_err() {
+            // Somebody has taken it over.
+            return;
+        }
+        if kind == DriverKind::Step {
+            session.driver.store(0, Ordering::Release);
+            return;
+        }
+        session.input_lease.store(0, Ordering::Release);
         session.driver.store(0, Ordering::Release);
+        session.with_core(move |core| core.note(EventKind::DriverLeft, kind.code().into(), 0.0));
     }
 }
 

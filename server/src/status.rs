@@ -21,7 +21,7 @@
 //! | FAILED_PRECONDITION | `LEASE_LOST` | PreconditionFailure | the lease that a driver wants to go on with has ended |
 //! | FAILED_PRECONDITION | `RUNNING`, `PAUSED` | PreconditionFailure | the plant runs by itself, or is paused |
 //! | FAILED_PRECONDITION | `WATCHDOG`, `INPUT_LOST` | PreconditionFailure | the plant stands still because it left bounds, or had no valid input |
-//! | ABORTED | `LEASE_REVOKED` | | a watchdog has taken the lease away |
+//! | ABORTED | `LEASE_REVOKED` | | a watchdog has taken the lease away, or its driver goes on with it in another stream |
 //! | UNAVAILABLE | `LOOP_FAILED` | | the system gave no thread for plants that run |
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
 //! | FAILED_PRECONDITION | `NOT_CONVERGED`, `MOTION_NOT_FINITE`, `TOO_FAST`, `SINGULAR`, `SINGULAR_CONSTRAINTS`, `INCONSISTENT_CONSTRAINTS` | PreconditionFailure; metadata `steps_taken`, `constraints` | the step has no solution; the plant stays at the last good state |
@@ -450,7 +450,9 @@ impl Fault {
                 Self::precondition("WATCHDOG", id, why)
             }
             DriveError::Revoked => {
-                let why = format!("a watchdog has taken the lease of plant `{id}` away");
+                let why = format!(
+                    "the lease of plant `{id}` was taken away, by a watchdog or by its own driver"
+                );
                 Self::new(Code::Aborted, "LEASE_REVOKED", why)
             }
         }

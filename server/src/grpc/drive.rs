@@ -130,19 +130,17 @@ impl DriveStream {
         let Phase::Driving(driving) = std::mem::replace(&mut self.phase, Phase::Ended) else {
             return;
         };
-        let Driving { lease, keep: Some((token, grace)), .. } = *driving else { return };
+        let Driving { lease, keep: Some((_, grace)), .. } = *driving else { return };
         // Without a runtime the server ends.
         let Ok(runtime) = Handle::try_current() else { return };
-        let (session, ending) = (Arc::clone(lease.session()), self.hub.ending.clone());
-        session.park(token.clone(), lease);
+        let ending = self.hub.ending.clone();
         runtime.spawn(async move {
             tokio::select! {
                 () = tokio::time::sleep(grace) => {}
-                () = session.closed() => {}
+                () = lease.session().closed() => {}
                 () = ending.cancelled() => {}
             }
-            // If it is still there.
-            drop(session.take_parked(&token));
+            drop(lease);
         });
     }
 
@@ -202,13 +200,16 @@ impl Driving {
         let lease = if open.resume.is_empty() {
             session.acquire(DriverKind::Drive)?
         } else {
-            session.take_parked(&open.resume).ok_or_else(|| {
+            session.take_over(&open.resume).ok_or_else(|| {
                 let why = format!("the lease of plant `{}` has ended", session.id());
                 Fault::precondition("LEASE_LOST", session.id(), why)
             })?
         };
         let grace = Duration::from_secs_f64(open.grace_s);
         let keep = (!grace.is_zero()).then(|| (format!("{:016x}", random_instance()), grace));
+        if let Some((token, _)) = &keep {
+            lease.set_name(token.clone());
+        }
         let linearization = open.linearization.then(|| Linearization::new(session.model()));
         let work = convert::period_work(&session.mechanics().settings, dimensions);
         let is_short = work <= INLINE_WORK_MAX;

@@ -112,8 +112,10 @@ impl LoopInput {
         if self.lost_steps.is_some() {
             timing.flags |= Timing::SAFE;
         }
-        timing.input_sequence = self.last.sequence;
-        timing.input_age_ns = match self.last.arrived_ns {
+        // The number of another driver's input says nothing to this one.
+        let last = if self.last.lease == lease { self.last } else { Arrival::default() };
+        timing.input_sequence = last.sequence;
+        timing.input_age_ns = match last.arrived_ns {
             0 => 0,
             arrived_ns => now_ns.saturating_sub(arrived_ns),
         };

@@ -66,7 +66,7 @@ mod tests {
         let files = FileDescriptorSet::decode(&descriptors("StepRecord")[..]).unwrap().file;
         let names: Vec<_> =
             files.iter().flat_map(|f| &f.message_type).map(|m| m.name().to_owned()).collect();
-        let expected = ["State", "StepReport", "Outputs", "StepRecord", "RecordTiming"];
+        let expected = ["State", "StepReport", "Outputs", "StepTiming", "StepRecord"];
         assert_eq!(names, expected);
         // `InitialState` nests messages, `PlantSettings` has enumerations.
         let files = FileDescriptorSet::decode(&descriptors("CreatePlantRequest")[..]).unwrap().file;

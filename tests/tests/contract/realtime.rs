@@ -434,7 +434,7 @@ async fn broken_driver(server: &ServerProcess, open: v1::DriveOpen) -> String {
     let Some(Response::Opened(opened)) = opened else { panic!("{opened:?}") };
     let step = answers.message().await.unwrap().unwrap().response;
     assert!(matches!(step, Some(Response::Step(_))), "{step:?}");
-    // The sender stays: the stream is not ended, it is cut off.
+    // The sender stays: the stream is cut off, not ended.
     drop((answers, client));
     std::mem::forget(requests);
     opened.lease_token
