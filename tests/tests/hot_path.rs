@@ -66,7 +66,7 @@ fn a_paced_step_over_shared_memory_makes_no_system_call_but_its_sleep() {
     let is_note = |line: &&str| line.starts_with("---") || line.starts_with("strace:");
     let (allowed, other): (Vec<&str>, Vec<&str>) =
         text.lines().filter(|line| !is_note(line)).partition(|l| is_sleep(l) || is_time(l));
-    assert!(inputs >= 20, "{inputs} inputs");
+    assert!(inputs >= 5, "{inputs} inputs");
     assert!(allowed.len() as u64 >= STEPS / 2, "{text}");
     // The last line is cut off where strace let go; that it was attached shows as a sleep that is begun
     // again.

@@ -24,6 +24,9 @@ pub type Message = Sample<ipc::Service, [f64], Header>;
 /// time in each round trip; a pair on two loses nothing.
 const POLL_UNDISTURBED_NS: u64 = 1_000;
 
+/// Shortest sleep, ns: the transport counts in microseconds, and takes zero for ever.
+const SLEEP_MIN_NS: u64 = 1_000;
+
 /// How a side waits for what comes next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wait {
@@ -172,8 +175,8 @@ impl Endpoint {
             }
             if now_ns >= self.poll_end_ns {
                 // A signal may end the sleep early: then the loop looks again and goes on.
-                let _ =
-                    self.listener.timed_wait(|_| {}, Duration::from_nanos(deadline_ns - now_ns));
+                let time_ns = (deadline_ns - now_ns).max(SLEEP_MIN_NS);
+                let _ = self.listener.timed_wait(|_| {}, Duration::from_nanos(time_ns));
             } else if now_ns - start_ns < POLL_UNDISTURBED_NS {
                 std::hint::spin_loop();
             } else {

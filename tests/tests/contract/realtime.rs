@@ -421,23 +421,22 @@ async fn what_cannot_be_run_is_refused_by_name() {
 
 /// A driver that takes a step, and whose connection then breaks; the name of its lease.
 async fn broken_driver(server: &ServerProcess, open: v1::DriveOpen) -> String {
-    use v1::drive_request::Request;
-    use v1::drive_response::Response;
-    let client = Client::connect(server.address()).await.unwrap();
-    let (requests, queue) = tokio::sync::mpsc::channel(2);
-    let send = |request| requests.try_send(v1::DriveRequest { request: Some(request) }).unwrap();
-    send(Request::Open(open));
-    send(Request::Input(v1::DriveInput { sequence: 1, u: vec![0.1], answers_ns: 0 }));
-    let call = client.plants().drive(tokio_stream::wrappers::ReceiverStream::new(queue)).await;
-    let mut answers = call.unwrap().into_inner();
-    let opened = answers.message().await.unwrap().unwrap().response;
-    let Some(Response::Opened(opened)) = opened else { panic!("{opened:?}") };
-    let step = answers.message().await.unwrap().unwrap().response;
-    assert!(matches!(step, Some(Response::Step(_))), "{step:?}");
-    // The sender stays: the stream is cut off, not ended.
-    drop((answers, client));
-    std::mem::forget(requests);
-    opened.lease_token
+    let address = server.address().to_owned();
+    let drive = move || {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let token = runtime.block_on(async {
+            let client = Client::connect(address).await.unwrap();
+            let mut driver = client.drive_as(open).await.unwrap();
+            driver.step(&[0.1]).await.unwrap();
+            let token = driver.lease_token().to_owned();
+            // It does not end its stream: its connection goes with the runtime.
+            std::mem::forget(driver);
+            token
+        });
+        runtime.shutdown_background();
+        token
+    };
+    tokio::task::spawn_blocking(drive).await.unwrap()
 }
 
 /// A driver whose connection breaks keeps its lease for a while, and goes on with it; one that ends its
