@@ -1,6 +1,7 @@
 //! What the two links cost beside what they are made of, in one run: a closed-loop round trip of a plant
 //! over shared memory beside a bare iceoryx2 ping-pong, and over gRPC beside a bare tonic stream echo of
-//! the same messages, both between two processes, taking turns. Prints the ratio; asserts nothing.
+//! the same messages, each between two processes on a processor each. They take turns; whose turn it is
+//! not is stopped, so that nobody polls beside the others. Prints the ratio; asserts nothing.
 
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};
@@ -20,8 +21,11 @@ use iceoryx2::prelude::*;
 use plantd_client::link::{LinkDriver, LinkOptions, Wait};
 use plantd_client::{Client, Driver, v1};
 use plantd_proto::link::Header;
+use plantd_server::convert::{clocks, plant_state};
+use plantd_server::priority::allow_cpus;
 use plantd_tests::links::{ChildProcess, PLANT, new_plant};
 use plantd_tests::server::ServerProcess;
+use rustix::process::{Pid, Signal, kill_process};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::body::Body;
@@ -56,13 +60,18 @@ type Times = Histogram<u64>;
 const LONGEST_NS: u64 = 10_000_000_000;
 /// Longest wait for the other end.
 const PATIENCE: Duration = Duration::from_secs(30);
+/// First round trips of a turn, which are not counted.
+const WARM_UP: u64 = 500;
 
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     match arguments.echo.as_deref() {
         Some("iceoryx") => echo_iceoryx(arguments.at.as_deref().context("no path")?),
-        Some("grpc") => runtime.block_on(serve_echo(arguments.at.context("no path")?)),
+        Some("grpc") => {
+            let at = arguments.at.as_deref().context("no path")?;
+            runtime.block_on(serve_echo(at, &arguments.model))
+        }
         Some(other) => anyhow::bail!("no echo `{other}`"),
         None => runtime.block_on(measure(&arguments)),
     }
@@ -77,35 +86,58 @@ async fn measure(arguments: &Arguments) -> Result<()> {
         ("plant over gRPC", times()?),
     ];
     let directory = tempfile::Builder::new().prefix("plantd-").tempdir()?;
+    // The others inherit the last processor; this process takes the first.
+    let processors = std::thread::available_parallelism()?.get();
+    allow_cpus(&[processors - 1]);
     let mut bare = BareIceoryx::start(&arguments.model)?;
+    suspend(bare.other.pid())?;
     let mut link = SharedMemory::start(&directory.path().join("link"), &arguments.model)?;
-    let mut echo = BareGrpc::start(&directory.path().join("echo.sock")).await?;
+    suspend(link.host.pid())?;
+    let mut echo = BareGrpc::start(&directory.path().join("echo.sock"), &arguments.model).await?;
+    suspend(echo.other.pid())?;
     let mut grpc = PlantOverGrpc::start(&arguments.model).await?;
+    suspend(grpc.server.pid())?;
+    allow_cpus(&[0]);
     let mut plant = new_plant(&arguments.model)?;
     let mut u = vec![0.0; plant.model().dimensions().input()];
     plant.hold_input(&mut u);
-    for turn in 0..=arguments.turns {
-        // The first turn warms up.
-        let is_counted = turn > 0;
-        for _ in 0..arguments.steps {
-            note(&mut rows[0].1, is_counted, || Ok(plant.step(&u).map(drop)?))?;
+    for _ in 0..arguments.turns {
+        for k in 0..WARM_UP + arguments.steps {
+            let started = Instant::now();
+            plant.step(&u)?;
+            count(&mut rows[0].1, k, started)?;
         }
-        for _ in 0..arguments.steps {
-            note(&mut rows[1].1, is_counted, || bare.round_trip(&u))?;
+        resume(bare.other.pid())?;
+        for k in 0..WARM_UP + arguments.steps {
+            let started = Instant::now();
+            bare.round_trip(&u)?;
+            count(&mut rows[1].1, k, started)?;
         }
-        for _ in 0..arguments.steps {
-            note(&mut rows[2].1, is_counted, || Ok(link.driver.step(&u).map(drop)?))?;
+        suspend(bare.other.pid())?;
+        resume(link.host.pid())?;
+        for k in 0..WARM_UP + arguments.steps {
+            let started = Instant::now();
+            link.driver.step(&u)?;
+            count(&mut rows[2].1, k, started)?;
         }
-        for _ in 0..arguments.steps {
+        suspend(link.host.pid())?;
+        resume(echo.other.pid())?;
+        for k in 0..WARM_UP + arguments.steps {
             let started = Instant::now();
             echo.round_trip(&u).await?;
-            count(&mut rows[3].1, is_counted, started)?;
+            count(&mut rows[3].1, k, started)?;
         }
-        for _ in 0..arguments.steps {
+        suspend(echo.other.pid())?;
+        resume(grpc.server.pid())?;
+        for k in 0..WARM_UP + arguments.steps {
             let started = Instant::now();
             grpc.driver.step(&u).await?;
-            count(&mut rows[4].1, is_counted, started)?;
+            count(&mut rows[4].1, k, started)?;
         }
+        suspend(grpc.server.pid())?;
+    }
+    for pid in [link.host.pid(), grpc.server.pid()] {
+        resume(pid)?;
     }
     println!("{}, {} round trips each, us", arguments.model, rows[0].1.len());
     println!("{:28} {:>8} {:>8} {:>8}", "", "p50", "p99", "p99.9");
@@ -128,26 +160,38 @@ fn times() -> Result<Times> {
     Ok(Histogram::new_with_max(LONGEST_NS, 3)?)
 }
 
-fn note(times: &mut Times, is_counted: bool, act: impl FnOnce() -> Result<()>) -> Result<()> {
-    let started = Instant::now();
-    act()?;
-    count(times, is_counted, started)
-}
-
-fn count(times: &mut Times, is_counted: bool, started: Instant) -> Result<()> {
-    if is_counted {
+/// Counts a round trip that began then, unless it is one of the first of a turn.
+fn count(times: &mut Times, k: u64, started: Instant) -> Result<()> {
+    if k >= WARM_UP {
         times.record(started.elapsed().as_nanos() as u64)?;
     }
     Ok(())
+}
+
+fn suspend(pid: u32) -> Result<()> {
+    signal(pid, Signal::STOP)
+}
+
+fn resume(pid: u32) -> Result<()> {
+    signal(pid, Signal::CONT)
+}
+
+fn signal(pid: u32, signal: Signal) -> Result<()> {
+    let pid = Pid::from_raw(pid.cast_signed()).context("a process has a number")?;
+    Ok(kill_process(pid, signal)?)
 }
 
 /// A process that ends with its value.
 struct Other(Child);
 
 impl Other {
-    fn start(echo: &str, at: &Path) -> Result<Self> {
+    fn start(echo: &str, at: &Path, model: &str) -> Result<Self> {
         let mut command = Command::new(std::env::current_exe()?);
-        Ok(Self(command.args(["--echo", echo, "--at"]).arg(at).spawn()?))
+        Ok(Self(command.args(["--model", model, "--echo", echo, "--at"]).arg(at).spawn()?))
+    }
+
+    fn pid(&self) -> u32 {
+        self.0.id()
     }
 }
 
@@ -186,7 +230,7 @@ impl SharedMemory {
 struct BareIceoryx {
     ends: Ends,
     answer_len: usize,
-    _other: Other,
+    other: Other,
 }
 
 /// The ports of one end.
@@ -228,9 +272,9 @@ impl BareIceoryx {
     fn start(model: &str) -> Result<Self> {
         let name = format!("plantd-overhead-{}", std::process::id());
         let ends = Ends::new(&name, "ping", "pong")?;
-        let other = Other::start("iceoryx", Path::new(&name))?;
+        let other = Other::start("iceoryx", Path::new(&name), model)?;
         let d = new_plant(model)?.model().dimensions();
-        let mut bare = Self { ends, answer_len: d.state() + d.constraints, _other: other };
+        let mut bare = Self { ends, answer_len: d.state() + d.constraints, other };
         // Until the other end is there.
         let deadline = Instant::now() + PATIENCE;
         while bare.ends.subscriber.receive()?.is_none() {
@@ -274,7 +318,7 @@ fn echo_iceoryx(name: &Path) -> Result<()> {
 /// A driver of a plant of a real server.
 struct PlantOverGrpc {
     driver: Driver,
-    _server: ServerProcess,
+    server: ServerProcess,
 }
 
 impl PlantOverGrpc {
@@ -283,7 +327,7 @@ impl PlantOverGrpc {
         let client = Client::connect(server.unix_address()).await?;
         let request = v1::CreatePlantRequest { model: model.to_owned(), ..Default::default() };
         let id = client.create_plant(request).await?.id;
-        Ok(Self { driver: client.drive(id).await?, _server: server })
+        Ok(Self { driver: client.drive(id).await?, server })
     }
 }
 
@@ -291,12 +335,12 @@ impl PlantOverGrpc {
 struct BareGrpc {
     requests: mpsc::Sender<v1::DriveRequest>,
     answers: Streaming<v1::DriveResponse>,
-    _other: Other,
+    other: Other,
 }
 
 impl BareGrpc {
-    async fn start(socket: &Path) -> Result<Self> {
-        let other = Other::start("grpc", socket)?;
+    async fn start(socket: &Path, model: &str) -> Result<Self> {
+        let other = Other::start("grpc", socket, model)?;
         let deadline = Instant::now() + PATIENCE;
         while !socket.exists() {
             anyhow::ensure!(Instant::now() < deadline, "the other end does not listen");
@@ -311,7 +355,7 @@ impl BareGrpc {
         let codec = ProstCodec::<v1::DriveRequest, v1::DriveResponse>::default();
         let request = Request::new(ReceiverStream::new(queue));
         let answers = client.streaming(request, path, codec).await?.into_inner();
-        Ok(Self { requests, answers, _other: other })
+        Ok(Self { requests, answers, other })
     }
 
     async fn round_trip(&mut self, u: &[f64]) -> Result<()> {
@@ -323,19 +367,31 @@ impl BareGrpc {
     }
 }
 
-/// The other end: answers each input with a step of a pendulum that is not taken. Is killed.
-async fn serve_echo(socket: PathBuf) -> Result<()> {
+/// The other end: answers each input with a step that is not taken. Is killed.
+async fn serve_echo(socket: &Path, model: &str) -> Result<()> {
+    let plant = new_plant(model)?;
+    let report = v1::StepReport { iterations: 2, residual: 0.5, ..Default::default() };
+    let step = v1::DriveStep {
+        sequence: 1,
+        state: Some(plant_state(&plant)),
+        report: Some(report),
+        clocks: Some(clocks(0.1, 1 << 50)),
+        ..Default::default()
+    };
+    let response = v1::drive_response::Response::Step(step);
+    let answer = v1::DriveResponse { response: Some(response) };
     let listener = tokio::net::UnixListener::bind(socket)?;
     let incoming = tokio_stream::wrappers::UnixListenerStream::new(listener);
     tonic::transport::Server::builder()
-        .add_service(EchoService)
+        .add_service(EchoService(answer))
         .serve_with_incoming(incoming)
         .await?;
     Ok(())
 }
 
+/// Echoes this answer.
 #[derive(Clone)]
-struct EchoService;
+struct EchoService(v1::DriveResponse);
 
 impl NamedService for EchoService {
     const NAME: &'static str = "echo.EchoService";
@@ -351,15 +407,16 @@ impl Service<http::Request<Body>> for EchoService {
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
+        let answer = self.0.clone();
         async move {
             let codec = ProstCodec::<v1::DriveResponse, v1::DriveRequest>::default();
-            Ok(Grpc::new(codec).streaming(Echo, request).await)
+            Ok(Grpc::new(codec).streaming(Echo(answer), request).await)
         }
         .boxed()
     }
 }
 
-struct Echo;
+struct Echo(v1::DriveResponse);
 
 impl StreamingService<v1::DriveRequest> for Echo {
     type Response = v1::DriveResponse;
@@ -367,19 +424,7 @@ impl StreamingService<v1::DriveRequest> for Echo {
     type Future = BoxFuture<'static, Result<Response<Self::ResponseStream>, Status>>;
 
     fn call(&mut self, request: Request<Streaming<v1::DriveRequest>>) -> Self::Future {
-        let state =
-            v1::State { step: 1, time_s: 0.1, q: vec![0.1], p: vec![0.1], ..Default::default() };
-        let report = v1::StepReport { iterations: 2, residual: 0.5, ..Default::default() };
-        let clocks = v1::Clocks { plant_s: 0.1, monotonic_ns: 1 << 50, utc_ns: 1 << 60 };
-        let step = v1::DriveStep {
-            sequence: 1,
-            state: Some(state),
-            report: Some(report),
-            clocks: Some(clocks),
-            ..Default::default()
-        };
-        let response = v1::drive_response::Response::Step(step);
-        let answer = v1::DriveResponse { response: Some(response) };
+        let answer = self.0.clone();
         let answers = request.into_inner().map(move |input| input.map(|_| answer.clone()));
         async move { Ok(Response::new(answers.boxed())) }.boxed()
     }
