@@ -27,7 +27,7 @@ impl Profile {
 
 /// The stages that a plan leaves out, by the functions that do their work.
 const CONSTRAINTS: &[&str] =
-    &["plant::closure::", "plant::pivoted_lu::", "newton::fill_schur", "Workspace::find_responses"];
+    &["plant::closure::", "plant::pivoted_lu::", "matrix::fill_schur", "Workspace::find_responses"];
 const SPRINGS: &[&str] = &["plant::potentials::"];
 const DAMPING: &[&str] = &["plant::forces::add_damping"];
 const INPUTS: &[&str] = &["plant::forces::input_forces"];

@@ -181,9 +181,8 @@ impl Collocation {
         let Self { tableau, stages, base, input, .. } = &mut *self;
         base.q_low.copy_from_slice(&state.q_low);
         base.p_low.copy_from_slice(&state.p_low);
-        let coupling = &tableau.coupling[i * stages.len()..][..stages.len()];
-        let others = stages.iter().zip(coupling).enumerate().filter(|(j, _)| *j != i);
-        for (_, (stage, weight)) in others {
+        for j in (0..stages.len()).filter(|j| *j != i) {
+            let (stage, weight) = (&stages[j], tableau.coupling[i * stages.len() + j]);
             for k in 0..d.dynamic {
                 base.q_low[k] += weight * stage.increment[k];
                 base.p_low[k] += weight * stage.impulse[k];

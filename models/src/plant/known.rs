@@ -44,7 +44,8 @@ impl Plant {
         out.assert_model(&self.model);
         self.place_known(step)?;
         let Self { model, settings, state, workspace, period } = self;
-        workspace.linearize(At { model, settings, state, u: period.known_input() }, out)
+        let u = period.input.of_step(model, state, settings.time_step_s, step.u, [0.0, 1.0])?;
+        workspace.linearize(At { model, settings, state, u }, out)
     }
 
     /// Whether the period is one step of the midpoint rule.
@@ -126,10 +127,9 @@ impl Plant {
     fn place_known(&mut self, step: &KnownStep<'_>) -> Result<(), StepError> {
         self.model.check_input(step.u)?;
         self.place_start(step);
-        self.hold(step.u)?;
         let Self { model, settings, state, workspace, period } = self;
-        period.set_whole_input(model, state, settings.time_step_s)?;
-        workspace.prepare(At { model, settings, state, u: period.known_input() });
+        let u = period.input.of_step(model, state, settings.time_step_s, step.u, [0.0, 1.0])?;
+        workspace.prepare(At { model, settings, state, u });
         let nd = self.model.dimensions.dynamic;
         let increment = &mut self.workspace.increment;
         for (x, (q1, q0)) in increment.iter_mut().zip(step.q1.iter().zip(step.q0)) {

@@ -50,7 +50,6 @@ use crate::plant::period::Period;
 use crate::plant::predictor::Past;
 use crate::plant::scheme::Scheme;
 use crate::rotation::Quaternion;
-use crate::signal::Target;
 use balls::three;
 use newton::Workspace;
 
@@ -405,11 +404,7 @@ impl Plant {
         let (inputs, prescribed) = u.split_at_mut(d.inputs);
         inputs.fill(0.0);
         prescribed.copy_from_slice(&self.state.q[d.dynamic..]);
-        for signal in &self.model.signals {
-            if let Target::Prescribed(k) = signal.target {
-                prescribed[k] = signal.at(self.end_of_step_s());
-            }
-        }
+        self.model.replace_prescribed(self.time_after_s(1.0), prescribed);
     }
 
     /// The input with which a step from here runs if it is given `u`: signals add to inputs and replace
@@ -421,23 +416,10 @@ impl Plant {
     pub fn effective_input(&self, u: &[f64]) -> Vec<f64> {
         assert_eq!(u.len(), self.model.dimensions.input(), "entries of the input");
         let mut effective = u.to_vec();
-        self.apply_signals(&mut effective);
-        effective
-    }
-
-    /// Inputs at the middle of the period from here, prescribed positions at its end.
-    fn apply_signals(&self, u: &mut [f64]) {
-        let (inputs, prescribed) = u.split_at_mut(self.model.dimensions.inputs);
+        let (inputs, prescribed) = effective.split_at_mut(self.model.dimensions.inputs);
         self.model.add_input_signals(self.time_after_s(0.5), inputs);
-        for signal in &self.model.signals {
-            if let Target::Prescribed(k) = signal.target {
-                prescribed[k] = signal.at(self.end_of_step_s());
-            }
-        }
-    }
-
-    fn end_of_step_s(&self) -> f64 {
-        self.time_after_s(1.0)
+        self.model.replace_prescribed(self.time_after_s(1.0), prescribed);
+        effective
     }
 
     fn time_after_s(&self, steps: f64) -> f64 {

@@ -34,9 +34,7 @@ pub(crate) struct Period {
     /// How often the last solution was halved, and whether it was tried with fewer steps.
     halvings: u8,
     failed: bool,
-    /// The input of the period, and that of a step.
-    held: Vec<f64>,
-    input: Vec<f64>,
+    pub(crate) input: StepInput,
     /// Multipliers of the steps, summed.
     multipliers: Vec<f64>,
     /// Momentum before an impulse, and what it had lost to rounding.
@@ -46,20 +44,21 @@ pub(crate) struct Period {
 
 impl Period {
     pub(crate) fn new(model: &Model, scheme: Scheme, state: &PreciseState) -> Self {
-        let input = vec![0.0; model.dimensions.input()];
         let collocation = match scheme {
             Scheme::Gauss(stages) => Some(Box::new(Collocation::new(model, stages))),
             Scheme::Midpoint | Scheme::Composition(_) => None,
         };
         Self {
             scheme,
-            collocation,
             reached: state.clone(),
             is_reached: false,
             halvings: 0,
             failed: false,
-            held: input.clone(),
-            input,
+            input: StepInput {
+                numbers: vec![0.0; model.dimensions.input()],
+                at_middle: collocation.is_none(),
+            },
+            collocation,
             multipliers: vec![0.0; model.dimensions.constraints],
             before_impulse: vec![[0.0; 2]; model.dimensions.dynamic],
             chain: Chain::default(),
@@ -96,13 +95,12 @@ impl Plant {
         if let Some(out) = &out {
             out.assert_model(&self.model);
         }
-        self.hold(u)?;
         let PreciseState { halvings, calm, .. } = self.state;
-        let first = halvings - u8::from(halvings > 0 && calm >= CALM);
         let most = self.most_halvings();
+        let first = (halvings - u8::from(halvings > 0 && calm >= CALM)).min(most);
         let mut failed = false;
         for halvings in first.. {
-            let result = self.attempt(halvings, out.as_deref_mut());
+            let result = self.attempt(u, halvings, out.as_deref_mut());
             if self.period.is_reached {
                 // It holds what belongs to a step within the period.
                 self.workspace.forget();
@@ -131,25 +129,10 @@ impl Plant {
         (0..=self.settings.halvings).rev().find(fits).unwrap_or_default() as u8
     }
 
-    /// The input of the period: signals replace prescribed positions, at its end.
-    pub(crate) fn hold(&mut self, u: &[f64]) -> Result<(), StepError> {
-        self.period.held.copy_from_slice(u);
-        if self.model.signals.is_empty() {
-            return Ok(());
-        }
-        let (_, next) = self.period.held.split_at_mut(self.model.dimensions.inputs);
-        let end = self.state.time_after_s(1.0, self.settings.time_step_s);
-        for signal in &self.model.signals {
-            if let Target::Prescribed(k) = signal.target {
-                next[k] = signal.at(end);
-            }
-        }
-        self.model.check_input(&self.period.held)
-    }
-
     /// Solves the period in so many times two steps.
     fn attempt(
         &mut self,
+        u: &[f64],
         halvings: u8,
         mut out: Option<&mut Linearization>,
     ) -> Result<StepReport, StepError> {
@@ -160,8 +143,8 @@ impl Plant {
         let scheme = period.scheme;
         period.is_reached = count * scheme.steps() > 1 || halvings != state.halvings;
         if !period.is_reached {
-            period.set_input(model, state, h, 0.0, 1.0)?;
-            let at = At { model, settings, state, u: &period.input };
+            let u = period.input.of_step(model, state, h, u, [0.0, 1.0])?;
+            let at = At { model, settings, state, u };
             return take(workspace, &mut period.collocation, at, state.time_after_s(0.0, h), out);
         }
         workspace.forget();
@@ -186,10 +169,10 @@ impl Plant {
                 let is_last = part + 1 == scheme.steps();
                 let end =
                     if is_last { (substep + 1) as f64 / count as f64 } else { fraction + length };
-                period.set_input(model, state, h, fraction, end)?;
                 let settings = Settings { time_step_s: length * h, ..*settings };
-                let Period { reached, collocation, input, chain, .. } = period;
-                let at = At { model, settings: &settings, state: reached, u: input };
+                let Period { reached, collocation, input, chain, .. } = &mut *period;
+                let u = input.of_step(model, state, h, u, [fraction, end])?;
+                let at = At { model, settings: &settings, state: reached, u };
                 let start_s = state.time_after_s(fraction, h);
                 let part_report = match out.as_deref_mut() {
                     None => take(workspace, collocation, at, start_s, None)?,
@@ -252,43 +235,50 @@ fn take(
     Ok(report)
 }
 
+/// Room for the input of a step, where it is not that of the period.
+#[derive(Clone, Debug)]
+pub(crate) struct StepInput {
+    numbers: Vec<f64>,
+    /// Whether signals on inputs are taken at the middle of the step; else the stages take them.
+    at_middle: bool,
+}
+
+impl StepInput {
+    /// The input of the step between two fractions of the period that starts from a state with the
+    /// input `u`: signals replace prescribed positions at the end of the period.
+    pub(crate) fn of_step<'a>(
+        &'a mut self,
+        model: &Model,
+        start: &PreciseState,
+        h: f64,
+        u: &'a [f64],
+        [from, to]: [f64; 2],
+    ) -> Result<&'a [f64], StepError> {
+        let has_signals = !model.signals.is_empty();
+        if to == 1.0 && !has_signals {
+            return Ok(u);
+        }
+        self.numbers.copy_from_slice(u);
+        let (inputs, next) = self.numbers.split_at_mut(model.dimensions.inputs);
+        if has_signals {
+            model.replace_prescribed(start.time_after_s(1.0, h), next);
+            if self.at_middle {
+                model.add_input_signals(start.time_after_s(0.5 * (from + to), h), inputs);
+            }
+        }
+        if to != 1.0 {
+            for (next, begin) in next.iter_mut().zip(&start.q[model.dimensions.dynamic..]) {
+                *next = begin + to * (*next - begin);
+            }
+        }
+        if has_signals {
+            model.check_input(&self.numbers)?;
+        }
+        Ok(&self.numbers)
+    }
+}
+
 impl Period {
-    /// The input of the period as that of one step.
-    pub(crate) fn set_whole_input(
-        &mut self,
-        model: &Model,
-        start: &PreciseState,
-        h: f64,
-    ) -> Result<(), StepError> {
-        self.set_input(model, start, h, 0.0, 1.0)
-    }
-
-    pub(crate) fn known_input(&self) -> &[f64] {
-        &self.input
-    }
-
-    /// The input of the step between two fractions of the period, from a state at its start.
-    fn set_input(
-        &mut self,
-        model: &Model,
-        start: &PreciseState,
-        h: f64,
-        from: f64,
-        to: f64,
-    ) -> Result<(), StepError> {
-        let (inputs, next) = self.input.split_at_mut(model.dimensions.inputs);
-        let (held, end) = self.held.split_at(inputs.len());
-        inputs.copy_from_slice(held);
-        if self.collocation.is_none() {
-            model.add_input_signals(start.time_after_s(0.5 * (from + to), h), inputs);
-        }
-        let begin = &start.q[model.dimensions.dynamic..];
-        for ((next, begin), end) in next.iter_mut().zip(begin).zip(end) {
-            *next = if to == 1.0 { *end } else { begin + to * (end - begin) };
-        }
-        if model.signals.is_empty() { Ok(()) } else { model.check_input(&self.input) }
-    }
-
     /// Moves on to the solution of a step of length `h`.
     fn advance(&mut self, model: &Model, workspace: &mut Workspace, h: f64) {
         self.reached.move_on(model, workspace, self.collocation.as_deref(), h);
@@ -354,6 +344,15 @@ impl Model {
         for signal in &self.signals {
             if let Target::Input(i) = signal.target {
                 inputs[i] += signal.at(time_s);
+            }
+        }
+    }
+
+    /// Replaces prescribed positions that signals drive by where they are at a time.
+    pub(crate) fn replace_prescribed(&self, time_s: f64, prescribed: &mut [f64]) {
+        for signal in &self.signals {
+            if let Target::Prescribed(k) = signal.target {
+                prescribed[k] = signal.at(time_s);
             }
         }
     }

@@ -126,21 +126,20 @@ impl Collocation {
         tangent.iter_mut().for_each(|entry| *entry = -*entry);
 
         out.begin_collocation(h);
-        let mut row = vec![0.0; stride];
+        let [mut increment, mut moved] = [0; 2].map(|_| vec![0.0; stride]);
         for a in 0..nd {
-            row.fill(0.0);
+            increment.fill(0.0);
             terms.clear();
             terms.extend((0..count).map(|i| (1.0, i * nd + a)));
-            add_rows(&mut row, tangent, stride, terms);
-            out.set_increment_row(a, &row);
-            row.fill(0.0);
-            row[momentum + a] = 1.0;
-            add_rows(&mut row, impulses, stride, terms);
+            add_rows(&mut increment, tangent, stride, terms);
+            moved.fill(0.0);
+            moved[momentum + a] = 1.0;
+            add_rows(&mut moved, impulses, stride, terms);
             terms.clear();
             let slopes = slopes[a * count * nd..][..count * nd].iter().copied();
             terms.extend(slopes.zip(0..).filter(|(slope, _)| *slope != 0.0));
-            add_rows(&mut row, tangent, stride, terms);
-            out.set_momentum_row(a, &row);
+            add_rows(&mut moved, tangent, stride, terms);
+            out.set_rows(a, [&increment, &moved]);
         }
 
         tangents.time_step_s = h;
