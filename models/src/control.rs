@@ -17,7 +17,7 @@
 //! Everything here allocates and may take milliseconds to seconds: it belongs on a worker, never
 //! on a control path. Costs are given in flops of `n` states and `m` inputs.
 
-mod blocked;
+pub(crate) mod blocked;
 mod controllability;
 mod doubling;
 mod error;

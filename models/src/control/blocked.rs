@@ -42,11 +42,39 @@ impl Scratch {
     }
 }
 
+/// Copies the lower triangle of the first `count` rows and columns to the upper one.
+#[inline(always)]
+pub(crate) fn mirror_head(value: &mut [f64], n: usize, count: usize) {
+    let whole = count / LANES * LANES;
+    for col in (0..whole).step_by(LANES) {
+        for row in (col..whole).step_by(LANES) {
+            let mut block = [[0.0; LANES]; LANES];
+            for (j, lower) in block.iter_mut().enumerate() {
+                lower.copy_from_slice(&value[n * (col + j) + row..][..LANES]);
+            }
+            for i in 0..LANES {
+                let known = if row == col { i } else { LANES };
+                let upper = &mut value[n * (row + i) + col..][..LANES];
+                for (j, upper) in upper.iter_mut().enumerate() {
+                    *upper = if j < known { block[j][i] } else { *upper };
+                }
+            }
+        }
+    }
+    for row in whole..count {
+        for col in 0..row {
+            value[n * row + col] = value[n * col + row];
+        }
+    }
+}
+
 /// What becomes of a product.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Into {
+pub(crate) enum Into {
     /// `C = A Bᵀ`.
     Set,
+    /// `C += A Bᵀ`, in blocks that reach the lower triangle.
+    AddLower,
     /// `C −= A Bᵀ`, in blocks that reach the lower triangle.
     SubtractLower,
     /// `C = A Bᵀ`, in blocks that reach the lower triangle.
@@ -55,13 +83,13 @@ pub(super) enum Into {
 
 /// A factor of a product, term by term.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Operand<'a> {
+pub(crate) struct Operand<'a> {
     /// The numbers of all terms.
-    pub(super) numbers: &'a [f64],
+    pub(crate) numbers: &'a [f64],
     /// Where each term begins.
-    pub(super) terms: &'a [usize],
+    pub(crate) terms: &'a [usize],
     /// From an entry of a term to the next.
-    pub(super) stride: usize,
+    pub(crate) stride: usize,
 }
 
 impl Operand<'_> {
@@ -78,7 +106,7 @@ impl Operand<'_> {
 ///
 /// # Panics
 /// If a slice is too short, or the operands differ in their number of terms.
-pub(super) fn product(
+pub(crate) fn product(
     c: &mut [f64],
     stride: usize,
     a: Operand<'_>,
@@ -146,7 +174,11 @@ fn portable(c: &mut [f64], shape: &Shape<'_>) {
             for (j, sum) in sums.iter().enumerate() {
                 let target = &mut c[stride * (col + j) + row..][..LANES];
                 for (target, sum) in target.iter_mut().zip(sum) {
-                    *target = if into == Into::SubtractLower { *target - sum } else { *sum };
+                    *target = match into {
+                        Into::Set | Into::SetLower => *sum,
+                        Into::AddLower => *target + sum,
+                        Into::SubtractLower => *target - sum,
+                    };
                 }
             }
         }
@@ -215,10 +247,10 @@ mod wide {
             for (j, sum) in sums.iter().enumerate() {
                 for (v, sum) in sum.iter().enumerate() {
                     let place = target.add(shape.stride * j + 8 * v);
-                    let result = if shape.into == Into::SubtractLower {
-                        _mm512_sub_pd(_mm512_loadu_pd(place), *sum)
-                    } else {
-                        *sum
+                    let result = match shape.into {
+                        Into::Set | Into::SetLower => *sum,
+                        Into::AddLower => _mm512_add_pd(_mm512_loadu_pd(place), *sum),
+                        Into::SubtractLower => _mm512_sub_pd(_mm512_loadu_pd(place), *sum),
                     };
                     _mm512_storeu_pd(place, result);
                 }
@@ -233,41 +265,36 @@ mod wide {
         for col in (shape.start()..shape.cols).step_by(4) {
             let mut row = shape.first_row(col / LANES * LANES);
             while row < shape.rows {
-                let vectors = ((shape.rows - row) / 4).min(3);
+                // Three vectors need all sixteen registers, and compilers run out of them. Rows come
+                // in pairs of vectors.
                 // SAFETY: all rows and columns of the block are within the shape.
-                unsafe {
-                    match vectors {
-                        1 => block_avx2::<1>(c, shape, row, col),
-                        2 => block_avx2::<2>(c, shape, row, col),
-                        _ => block_avx2::<3>(c, shape, row, col),
-                    }
-                }
-                row += 4 * vectors;
+                unsafe { block_avx2(c, shape, row, col) };
+                row += LANES;
             }
         }
     }
 
-    /// `4 V` rows and 4 columns.
+    /// 8 rows and 4 columns.
     ///
     /// # Safety
     /// The block is within the shape, and the slices are as long as the shape says.
     #[target_feature(enable = "avx2,fma")]
-    unsafe fn block_avx2<const V: usize>(c: &mut [f64], shape: &Shape<'_>, row: usize, col: usize) {
+    unsafe fn block_avx2(c: &mut [f64], shape: &Shape<'_>, row: usize, col: usize) {
         let across = shape.b.stride;
-        let mut sums = [[_mm256_setzero_pd(); V]; 4];
-        // SAFETY: each term of A has `row + 4 V` entries, each of B `col + 4`; the last column of C
+        let mut sums = [[_mm256_setzero_pd(); 2]; 4];
+        // SAFETY: each term of A has `row + 8` entries, each of B `col + 4`; the last column of C
         // that is written is `col + 3 < cols`.
         unsafe {
             for (&left, &right) in shape.a.terms.iter().zip(shape.b.terms) {
                 let left = shape.a.numbers.as_ptr().add(left + row);
                 let right = shape.b.numbers.as_ptr().add(right + across * col);
-                let mut l = [_mm256_setzero_pd(); V];
+                let mut l = [_mm256_setzero_pd(); 2];
                 for (v, l) in l.iter_mut().enumerate() {
                     *l = _mm256_loadu_pd(left.add(4 * v));
                 }
                 for (j, sum) in sums.iter_mut().enumerate() {
                     let r = _mm256_set1_pd(*right.add(across * j));
-                    for v in 0..V {
+                    for v in 0..2 {
                         sum[v] = _mm256_fmadd_pd(l[v], r, sum[v]);
                     }
                 }
@@ -276,10 +303,10 @@ mod wide {
             for (j, sum) in sums.iter().enumerate() {
                 for (v, sum) in sum.iter().enumerate() {
                     let place = target.add(shape.stride * j + 4 * v);
-                    let result = if shape.into == Into::SubtractLower {
-                        _mm256_sub_pd(_mm256_loadu_pd(place), *sum)
-                    } else {
-                        *sum
+                    let result = match shape.into {
+                        Into::Set | Into::SetLower => *sum,
+                        Into::AddLower => _mm256_add_pd(_mm256_loadu_pd(place), *sum),
+                        Into::SubtractLower => _mm256_sub_pd(_mm256_loadu_pd(place), *sum),
                     };
                     _mm256_storeu_pd(place, result);
                 }
@@ -314,6 +341,7 @@ mod tests {
                 (Into::Set, 0, b),
                 (Into::Set, 0, b_across),
                 (Into::SetLower, 0, b),
+                (Into::AddLower, 0, b),
                 (Into::SubtractLower, 0, b),
                 (Into::SetLower, 8, b_across),
             ] {
@@ -343,7 +371,11 @@ mod tests {
                 let sum: f64 =
                     terms.map(|(l, r)| a.numbers[l + row] * b.numbers[r + b.stride * col]).sum();
                 let at = stride * col + row;
-                let expected = if into == Into::SubtractLower { before[at] - sum } else { sum };
+                let expected = match into {
+                    Into::Set | Into::SetLower => sum,
+                    Into::AddLower => before[at] + sum,
+                    Into::SubtractLower => before[at] - sum,
+                };
                 assert!((c[at] - expected).abs() < 1e-13, "{kernel} {row} {col}");
             }
         };

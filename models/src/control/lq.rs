@@ -13,7 +13,8 @@ mod map;
 use nalgebra::{DMatrix, DVector};
 
 pub(crate) use self::map::Map;
-use super::blocked::{Into, LANES, Operand, Scratch, product};
+use super::blocked::{Into, LANES, Operand, Scratch, mirror_head, product};
+use crate::plant::rows::{Term, add_rows_portable};
 use crate::wide::wide;
 
 /// One stage of the cost,
@@ -72,6 +73,8 @@ struct Work {
     whole: Vec<f64>,
     /// `Mᵀb`, then what the offset takes from it.
     linear: Vec<f64>,
+    /// Rows of a triangular system that are solved.
+    terms: Vec<Term>,
     /// For the sum that cancels less: rows of `A − BK`, where they begin, and a row of `½RK − Sᵀ`.
     closed_loop: Scratch,
     closed_loop_rows: Vec<usize>,
@@ -358,6 +361,7 @@ impl LqRecursion {
             gain: law,
             whole,
             linear,
+            terms,
             ..
         } = &mut self.work;
         let value_stride = next.next_multiple_of(LANES);
@@ -421,6 +425,8 @@ impl LqRecursion {
             let source = &bracket[stride * j..][j..m];
             self.factor.as_mut_slice()[m * j..][j..m].copy_from_slice(source);
         }
+        // From here on there are columns of states.
+        let first = m / LANES * LANES;
         for j in 0..m {
             let (done, rest) = cross.split_at_mut(stride * j);
             let target = &mut rest[..stride];
@@ -433,19 +439,20 @@ impl LqRecursion {
                     *target += s[state];
                 }
             }
-            for k in 0..j {
-                subtract(target, bracket[stride * k + j], &done[stride * k..][..stride]);
-            }
+            terms.clear();
+            terms.extend((0..j).map(|k| (-bracket[stride * k + j], k)));
+            let (target, done) = (&mut target[first..], &done[first.min(done.len())..]);
+            add_rows_portable(target, done, stride, terms);
             scale(target, bracket[stride * j + j].recip());
         }
         for j in (0..m).rev() {
             let (before, done) = law.split_at_mut(stride * (j + 1));
             let target = &mut before[stride * j..];
             target.copy_from_slice(&cross[stride * j..][..stride]);
-            for k in j + 1..m {
-                let source = &done[stride * (k - j - 1)..][..stride];
-                subtract(target, bracket[stride * j + k], source);
-            }
+            terms.clear();
+            terms.extend((j + 1..m).map(|k| (-bracket[stride * j + k], k - j - 1)));
+            let (target, done) = (&mut target[first..stride], &done[first.min(done.len())..]);
+            add_rows_portable(target, done, stride, terms);
             scale(target, bracket[stride * j + j].recip());
         }
         if active.len() < n {
@@ -493,7 +500,6 @@ impl LqRecursion {
         whole.clear();
         whole.extend((0..active.len()).map(|i| diagonal(bracket, i)));
         let operand = Operand { numbers: cross, terms: cross_columns, stride: 1 };
-        let first = m / LANES * LANES;
         product(bracket, stride, operand, operand, (width, width), Into::SubtractLower, first);
         let has_cancelled = active.iter().zip(&*whole).enumerate().any(|(i, (&state, whole))| {
             let q = stage.q[(state, state)];
@@ -507,22 +513,27 @@ impl LqRecursion {
             self.value = DMatrix::zeros(n, n);
         }
         let value = self.value.as_mut_slice();
-        value.copy_from_slice(stage.q.as_slice());
-        let is_head = active.last().is_none_or(|&last| last + 1 == active.len());
-        for (j, &col) in active.iter().enumerate() {
-            let source = &bracket[stride * (m + j)..][m + j..width];
-            let column = &mut value[n * col..][..n];
-            if is_head {
-                subtract(&mut column[j..], -1.0, source);
-            } else {
-                for (&row, source) in active[j..].iter().zip(source) {
-                    column[row] += source;
+        let count = active.len();
+        if active.last().is_none_or(|&last| last + 1 == count) {
+            let columns = value.chunks_exact_mut(n).zip(stage.q.as_slice().chunks_exact(n));
+            for (j, (column, q)) in columns.enumerate() {
+                let copied = if j < count { count } else { 0 };
+                column[copied..].copy_from_slice(&q[copied..]);
+                if j < count {
+                    let source = &bracket[stride * (m + j)..][m + j..width];
+                    let sums = column[j..count].iter_mut().zip(&q[j..count]);
+                    sums.zip(source).for_each(|((sum, q), source)| *sum = q + source);
                 }
             }
-        }
-        if is_head {
-            mirror_head(value, n, active.len());
+            mirror_head(value, n, count);
         } else {
+            value.copy_from_slice(stage.q.as_slice());
+            for (j, &col) in active.iter().enumerate() {
+                let source = &bracket[stride * (m + j)..][m + j..width];
+                for (&row, source) in active[j..].iter().zip(source) {
+                    value[n * col + row] += source;
+                }
+            }
             mirror(value, n, active);
         }
         if self.linear.len() != n {
@@ -656,32 +667,6 @@ fn factorize(c: &mut [f64], stride: usize, m: usize) -> Result<(), NotConvex> {
 fn mirror(value: &mut [f64], n: usize, indices: &[usize]) {
     for (i, &row) in indices.iter().enumerate() {
         for &col in &indices[..i] {
-            value[n * row + col] = value[n * col + row];
-        }
-    }
-}
-
-/// The same of the first rows and columns, block by block.
-#[inline(always)]
-fn mirror_head(value: &mut [f64], n: usize, count: usize) {
-    let whole = count / LANES * LANES;
-    for col in (0..whole).step_by(LANES) {
-        for row in (col..whole).step_by(LANES) {
-            let mut block = [[0.0; LANES]; LANES];
-            for (j, lower) in block.iter_mut().enumerate() {
-                lower.copy_from_slice(&value[n * (col + j) + row..][..LANES]);
-            }
-            for i in 0..LANES {
-                let known = if row == col { i } else { LANES };
-                let upper = &mut value[n * (row + i) + col..][..LANES];
-                for (j, upper) in upper.iter_mut().enumerate() {
-                    *upper = if j < known { block[j][i] } else { *upper };
-                }
-            }
-        }
-    }
-    for row in whole..count {
-        for col in 0..row {
             value[n * row + col] = value[n * col + row];
         }
     }

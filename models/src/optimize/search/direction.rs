@@ -71,18 +71,10 @@ impl Optimizer {
             let keeps = !linearizations.is_empty();
             let split = if keeps { used.start } else { 0 };
             let (linearized_head, linearized) = linearizations.split_at_mut(split);
-            let kept = if keeps { made.clone() } else { 0..0 };
-            let mut rest = &mut linearized_head[kept];
-            let share = made.len().div_ceil(workers.len()).max(1);
-            let mut jobs: Vec<LinearizeJob<'_>> = Vec::with_capacity(workers.len());
-            for (part, maps) in head[made.clone()].chunks_mut(share).enumerate() {
-                let (kept, others) = rest.split_at_mut(maps.len().min(rest.len()));
-                rest = others;
-                jobs.push((made.start + part * share, maps, kept));
-            }
-            let job = |worker: &mut Worker, (first, maps, kept): LinearizeJob<'_>| {
-                let steps = (first..).map(|k| known(current, k, first_step));
-                worker.linearize(steps, maps, kept).map_err(|(k, error)| (first + k, error))
+            let mut kept = linearized_head[if keeps { made.clone() } else { 0..0 }].iter_mut();
+            let jobs = made.clone().zip(&mut head[made]).map(|(k, map)| (k, (map, kept.next())));
+            let job = |worker: &mut Worker, k, (map, kept): LinearizeJob<'_>| {
+                worker.linearize(&known(current, k, first_step), map, kept)
             };
             let consume = || {
                 for k in used.clone().rev() {
@@ -126,7 +118,7 @@ impl Optimizer {
                 }
                 Ok(())
             };
-            share_work(workers, jobs, job, consume)?;
+            share_work(workers, jobs.collect(), job, consume)?;
             self.linearized[block] = true;
             if not_convex.is_some() {
                 break;
@@ -273,18 +265,11 @@ impl Optimizer {
             if !go_on() {
                 return Err(OptimizeError::Cancelled);
             }
-            let share = made.len().div_ceil(workers.len()).max(1);
-            let parts = made_now[..made.len()].chunks_mut(share).enumerate();
-            let jobs = parts.map(|(part, slots)| (made.start + part * share, slots)).collect();
-            let job = |worker: &mut Worker, (first, slots): (usize, &mut [Second])| {
-                for (k, slot) in (first..).zip(slots) {
-                    let z = adjoint[k + 1].as_slice();
-                    let contraction = &mut worker.contraction;
-                    contraction
-                        .contract(model, &linearizations[k], z, zero_multipliers)
-                        .map_err(|error| (k, error))?;
-                    slot.take(contraction);
-                }
+            let jobs = made.zip(&mut *made_now).collect();
+            let job = |worker: &mut Worker, k: usize, slot: &mut Second| {
+                let (contraction, z) = (&mut worker.contraction, adjoint[k + 1].as_slice());
+                contraction.contract(model, &linearizations[k], z, zero_multipliers)?;
+                slot.take(contraction);
                 Ok(())
             };
             let consume = || {
@@ -398,19 +383,16 @@ impl Worker {
         }
     }
 
-    /// Linearizes steps; where room is given, into that. On failure the place of the step.
-    fn linearize<'a>(
+    /// Linearizes a step; where room is given, into that.
+    fn linearize(
         &mut self,
-        steps: impl Iterator<Item = KnownStep<'a>>,
-        maps: &mut [Map],
-        kept: &mut [Linearization],
-    ) -> Result<(), (usize, StepError)> {
-        let mut kept = kept.iter_mut();
-        for (place, (map, step)) in maps.iter_mut().zip(steps).enumerate() {
-            let out = kept.next().unwrap_or(&mut self.linearization);
-            self.plant.linearize_known(&step, out).map_err(|error| (place, error))?;
-            out.write_map(map);
-        }
+        step: &KnownStep<'_>,
+        map: &mut Map,
+        kept: Option<&mut Linearization>,
+    ) -> Result<(), StepError> {
+        let out = kept.unwrap_or(&mut self.linearization);
+        self.plant.linearize_known(step, out)?;
+        out.write_map(map);
         Ok(())
     }
 }
@@ -461,11 +443,14 @@ pub(super) fn linearize_behind(
                     let Some(Block { number, first, motion, maps, kept }) = waiting.pop() else {
                         break;
                     };
-                    let known = |k| KnownStep {
-                        index: first_step.saturating_add((first + k) as u64),
-                        ..known(&motion, k, 0)
-                    };
-                    if worker.linearize((0..maps.len()).map(known), maps, kept).is_ok() {
+                    let mut kept = kept.iter_mut();
+                    let first_step = first_step.saturating_add(first as u64);
+                    let mut steps = maps.iter_mut().enumerate();
+                    let linearized = steps.all(|(k, map)| {
+                        let step = known(&motion, k, first_step);
+                        worker.linearize(&step, map, kept.next()).is_ok()
+                    });
+                    if linearized {
                         done.push(number);
                     }
                 }
@@ -510,8 +495,8 @@ struct Block<'a> {
     kept: &'a mut [Linearization],
 }
 
-/// First step, maps to write, and linearizations to keep.
-type LinearizeJob<'a> = (usize, &'a mut [Map], &'a mut [Linearization]);
+/// The map to write, and the linearization to keep.
+type LinearizeJob<'a> = (&'a mut Map, Option<&'a mut Linearization>);
 
 /// Steps of a block: enough for threads to share, few enough for caches and for questions.
 pub(super) fn block_length(states: usize) -> usize {
@@ -527,34 +512,43 @@ fn blocks(steps: usize, states: usize) -> impl Iterator<Item = (Range<usize>, Ra
     (0..=count).rev().map(move |i| (if i == 0 { 0..0 } else { block(i - 1) }, block(i)))
 }
 
-/// Does the jobs, one worker each, and `consume` meanwhile. With one worker, one after the other.
+/// Does the jobs of steps: helpers do while this thread does `consume`, or this one before if there are none.
 fn share_work<J: Send>(
     workers: &mut [Worker],
-    jobs: Vec<J>,
-    job: impl Fn(&mut Worker, J) -> Result<(), (usize, StepError)> + Sync,
+    jobs: Vec<(usize, J)>,
+    job: impl Fn(&mut Worker, usize, J) -> Result<(), StepError> + Sync,
     consume: impl FnOnce() -> Result<(), OptimizeError>,
 ) -> Result<(), OptimizeError> {
-    let failed = |(step, error)| OptimizeError::Linearization { step, error };
-    if workers.len() == 1 {
-        for (worker, work) in workers.iter_mut().zip(jobs) {
-            job(worker, work).map_err(failed)?;
-        }
+    let do_all = |worker: &mut Worker, jobs: Vec<(usize, J)>| {
+        jobs.into_iter().try_for_each(|(step, what)| {
+            job(worker, step, what).map_err(|error| OptimizeError::Linearization { step, error })
+        })
+    };
+    let Some((own, helpers)) = workers.split_first_mut() else { return consume() };
+    if helpers.is_empty() {
+        do_all(own, jobs)?;
         return consume();
     }
-    let job = &job;
+    let share = jobs.len().div_ceil(helpers.len()).max(1);
+    let mut jobs = jobs.into_iter();
     std::thread::scope(|scope| {
-        let spawn = |(worker, work)| scope.spawn(move || job(worker, work));
-        let handles: Vec<_> = workers.iter_mut().zip(jobs).map(spawn).collect();
+        let mut threads = Vec::with_capacity(helpers.len());
+        for worker in helpers {
+            let part: Vec<_> = jobs.by_ref().take(share).collect();
+            if !part.is_empty() {
+                threads.push(scope.spawn(|| do_all(worker, part)));
+            }
+        }
         let consumed = consume();
         // All are joined, and the first failure counts, whichever thread was faster.
         let mut made = Ok(());
-        for handle in handles {
-            match handle.join() {
+        for thread in threads {
+            match thread.join() {
                 Ok(result) => made = made.and(result),
                 Err(panic) => std::panic::resume_unwind(panic),
             }
         }
-        made.map_err(failed)?;
+        made?;
         consumed
     })
 }

@@ -58,7 +58,7 @@ impl Contraction {
             }
             z = part.step.a().tr_mul(&z) + part.step.multipliers_x().tr_mul(&w);
         }
-        self.quadratic.sum.copy_from_slice(&total);
+        self.quadratic.sum[..rows].copy_from_slice(&total);
         Ok(())
     }
 
@@ -113,7 +113,7 @@ impl Contraction {
                 terms.extend(non_zero((0..2 * n).map(hessian)));
                 add_rows(target, &tangent, stride, terms);
             }
-            for (a, row) in self.quadratic.sum.chunks_exact_mut(stride).enumerate() {
+            for (a, row) in self.quadratic.sum.chunks_exact_mut(stride).enumerate().take(size) {
                 terms.clear();
                 terms.extend(non_zero(tangent.iter().skip(a).step_by(stride).copied()));
                 add_rows(row, &product, stride, terms);
@@ -195,6 +195,6 @@ impl Contraction {
 
     /// The sum of second derivatives by two parameters, of which the first is not the smaller.
     pub(super) fn entry(&self, a: usize, b: usize) -> f64 {
-        self.quadratic.sum[a * self.scratch.layout.stride + b]
+        self.quadratic.sum[b * self.scratch.layout.stride + a]
     }
 }

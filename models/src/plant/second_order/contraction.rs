@@ -17,12 +17,13 @@
 use nalgebra::DMatrix;
 
 use crate::Model;
+use crate::control::blocked::{Into, Operand, mirror_head, product};
 use crate::plant::balls::three;
 use crate::plant::blocks::{StepBlocks, non_zero};
 use crate::plant::closure::Closure;
 use crate::plant::linearize::{Linearization, SolvedStep};
 use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::rows::{LANES, Term, add_rows, padded};
+use crate::plant::rows::{Term, add_rows, padded};
 use crate::plant::{Plant, StepError, StepReport};
 use crate::rotation;
 use crate::scalar::Dual;
@@ -61,11 +62,11 @@ pub struct Contraction {
 /// sum + Wᵀ (C + Y W) + Cᵀ W
 /// ```
 ///
-/// which is symmetric: the lower triangle is computed. `C` and `Y` have few entries.
+/// which is symmetric: in the order of rows the upper triangle is computed. `Y` has few entries.
 #[derive(Clone, Debug)]
 pub(super) struct Quadratic {
     layout: Layout,
-    /// Row-major over all parameters; the lower triangle counts.
+    /// Row-major over all parameters, square with the padding; the upper triangle counts.
     pub(super) sum: Vec<f64>,
     /// `C`, row-major, nd + nc rows.
     mixed: Vec<f64>,
@@ -73,17 +74,20 @@ pub(super) struct Quadratic {
     cofactor: Vec<f64>,
     /// `Y`, nd by nd.
     increments: Vec<f64>,
+    /// Where the rows of `C` and `W` begin.
+    rows: Vec<usize>,
 }
 
 impl Quadratic {
     fn new(layout: Layout) -> Self {
-        let (size, rows) = (layout.parameters(), layout.nd + layout.nc);
+        let rows = layout.nd + layout.nc;
         Self {
             layout,
-            sum: vec![0.0; size * layout.stride],
+            sum: vec![0.0; layout.stride * layout.stride],
             mixed: vec![0.0; rows * layout.stride],
             cofactor: vec![0.0; rows * layout.stride],
             increments: vec![0.0; layout.nd * layout.nd],
+            rows: (0..rows).map(|row| row * layout.stride).collect(),
         }
     }
 
@@ -109,8 +113,8 @@ impl Quadratic {
         if j < nd {
             self.add_mixed(j, i, value);
         } else {
-            // The lower triangle alone: next positions come after all starts.
-            self.add(self.layout.next() + j - nd, i, value);
+            // The upper triangle alone: next positions come after all starts.
+            self.add(i, self.layout.next() + j - nd, value);
         }
     }
 
@@ -125,10 +129,11 @@ impl Quadratic {
         }
     }
 
-    /// Puts the Hessian into the lower triangle of `sum`; `tangent` is `W`, row-major.
+    /// Puts the Hessian into the upper triangle of `sum`; `tangent` is `W`, row-major.
     fn substitute(&mut self, tangent: &[f64], terms: &mut Vec<Term>) {
         let Layout { nd, stride, .. } = self.layout;
-        let Self { sum, mixed, cofactor, increments, .. } = self;
+        let size = self.layout.parameters();
+        let Self { sum, mixed, cofactor, increments, rows, .. } = self;
         cofactor.copy_from_slice(mixed);
         let by_increment = increments.chunks_exact(nd.max(1));
         for (row, by) in cofactor.chunks_exact_mut(stride).zip(by_increment) {
@@ -136,28 +141,16 @@ impl Quadratic {
             terms.extend(non_zero(by.iter().copied()));
             add_rows(row, tangent, stride, terms);
         }
-        for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
-            let row = &mut row[..padded(a + 1)];
-            for (factor, source) in [(tangent, &cofactor[..]), (&mixed[..], tangent)] {
-                terms.clear();
-                terms.extend(non_zero(factor.iter().skip(a).step_by(stride).copied()));
-                add_rows(row, source, stride, terms);
-            }
+        let operand = |numbers| Operand { numbers, terms: rows, stride: 1 };
+        for (left, right) in [(tangent, &cofactor[..]), (&mixed[..], tangent)] {
+            let (left, right) = (operand(left), operand(right));
+            product(sum, stride, left, right, (size, size), Into::AddLower, 0);
         }
     }
 
-    /// Fills the upper triangle of `sum` with the lower one, block by block.
+    /// Fills the lower triangle of `sum` with the upper one.
     pub(super) fn mirror(&mut self) {
-        let (stride, size) = (self.layout.stride, self.layout.parameters());
-        for first_row in (0..size).step_by(LANES) {
-            for first_column in (0..=first_row).step_by(LANES) {
-                for a in first_row..(first_row + LANES).min(size) {
-                    for b in first_column..(first_column + LANES).min(a) {
-                        self.sum[b * stride + a] = self.sum[a * stride + b];
-                    }
-                }
-            }
-        }
+        mirror_head(&mut self.sum, self.layout.stride, self.layout.parameters());
     }
 }
 
@@ -280,9 +273,10 @@ impl Contraction {
     /// The sum with ball joints, whose tangent spaces do not commute, or with forces: one evaluation of
     /// all blocks for each parameter.
     fn contract_directions(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
-        let Layout { nd, nc, ni, stride, .. } = self.scratch.layout;
-        let (n, inputs, next) =
-            (self.scratch.layout.n(), self.scratch.layout.inputs(), self.scratch.layout.next());
+        let layout = self.scratch.layout;
+        let Layout { nd, nc, ni, stride, .. } = layout;
+        let (n, size) = (layout.n(), layout.parameters());
+        let (inputs, next) = (layout.inputs(), layout.next());
         if nc > 0 {
             self.scratch.seed(0, model, step);
             self.scratch.blocks.evaluate(model, &step.settings);
@@ -294,7 +288,7 @@ impl Contraction {
         let Quadratic { sum, cofactor, .. } = quadratic;
         // What `x'` and `λ'` are multiplied with.
         let by_unknown = &mut cofactor[..nd + nc];
-        for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
+        for (a, row) in sum.chunks_exact_mut(stride).enumerate().take(size) {
             scratch.seed(a, model, step);
             scratch.blocks.evaluate(model, &step.settings);
             let Scratch { blocks, tangent, terms, .. } = &mut *scratch;
@@ -359,9 +353,9 @@ impl Contraction {
             add_rows(row, tangent, stride, terms);
         }
         // Both orders of derivatives count the same.
-        for a in 1..sum.len() / stride {
+        for a in 1..size {
             for b in 0..a {
-                sum[a * stride + b] = 0.5 * (sum[a * stride + b] + sum[b * stride + a]);
+                sum[b * stride + a] = 0.5 * (sum[a * stride + b] + sum[b * stride + a]);
             }
         }
     }
