@@ -29,6 +29,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "build", quick: true, run: build },
     Stage { name: "tests", quick: true, run: tests },
     Stage { name: "doctests", quick: false, run: doctests },
+    Stage { name: "stress", quick: false, run: stress },
     Stage { name: "python", quick: false, run: python::test_client },
     Stage { name: "demo", quick: false, run: demo },
 ];
@@ -145,6 +146,12 @@ fn tests(context: &mut Context) -> Outcome {
 fn doctests(context: &mut Context) -> Outcome {
     context.must_build()?;
     run(&mut context.cargo(&["test", "--workspace", "--locked", "--doc"]))
+}
+
+/// The short form of the stress suite, about a minute.
+fn stress(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    run(Command::new(context.binaries().join("stress")).current_dir(&context.root))
 }
 
 /// Shows the demo, which compares its numbers with the paper's.
