@@ -292,6 +292,7 @@ mod tests {
             (EventKind::Slipped, v1::EventKind::Slipped),
             (EventKind::Watchdog, v1::EventKind::Watchdog),
             (EventKind::FaultEnded, v1::EventKind::FaultEnded),
+            (EventKind::Overran, v1::EventKind::Overran),
         ] {
             assert_eq!(kind as i32 + 1, expected as i32);
         }

@@ -55,6 +55,9 @@ kinds! {
     FaultBegan,
     /// A fault ended; `index` is its number.
     FaultEnded,
+    /// Steps ended after the next one was due; `value` is how many since the last such event. At most one
+    /// such event comes in a second.
+    Overran,
 }
 
 /// Something that happened.

@@ -21,6 +21,8 @@ use crate::status::Fault;
 /// A paced plant that is late by up to this long takes its steps one after the other until it has caught
 /// up; beyond it goes on from where it is, and the schedule has slipped.
 const CATCH_UP_NS: u64 = 100_000_000;
+/// Overruns are told at most once in this time, ns.
+const OVERRUN_PERIOD_NS: u64 = 1_000_000_000;
 
 /// What is done with the core of a running plant between two steps. Without a core the plant does not
 /// run here.
@@ -220,6 +222,9 @@ pub(crate) struct Runner {
     ticks: u64,
     time_step_s: f64,
     period_ns: f64,
+    /// Overruns that no event has told, and when the last one did, ns.
+    untold_overruns: u64,
+    overruns_told_ns: u64,
 }
 
 impl Runner {
@@ -247,6 +252,8 @@ impl Runner {
             ticks: 0,
             time_step_s: 0.0,
             period_ns: 0.0,
+            untold_overruns: 0,
+            overruns_told_ns: 0,
             core,
         });
         runner.set_period();
@@ -376,6 +383,9 @@ impl Runner {
                 counts.slips.fetch_add(1, Ordering::Relaxed);
             }
         }
+        if is_overrun {
+            self.tell_overrun(timing.ended_ns);
+        }
         if !self.is_paced {
             // The others of this loop take their turns first.
             self.origin_ns = timing.ended_ns;
@@ -384,6 +394,15 @@ impl Runner {
             self.core.note(EventKind::Slipped, 0, behind_ns as f64 * 1e-9);
             self.origin_ns = timing.ended_ns;
             self.ticks = 1;
+        }
+    }
+
+    fn tell_overrun(&mut self, now_ns: u64) {
+        self.untold_overruns += 1;
+        if now_ns - self.overruns_told_ns >= OVERRUN_PERIOD_NS {
+            self.overruns_told_ns = now_ns;
+            let count = std::mem::take(&mut self.untold_overruns);
+            self.core.note(EventKind::Overran, 0, count as f64);
         }
     }
 }

@@ -24,7 +24,7 @@ use plantd_proto::link::Header;
 use plantd_server::convert::{clocks, plant_state};
 use plantd_server::priority::allow_cpus;
 use plantd_tests::links::{ChildProcess, PLANT, new_plant};
-use plantd_tests::server::ServerProcess;
+use plantd_tests::server::{ServerProcess, binary};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
@@ -86,7 +86,8 @@ async fn measure(arguments: &Arguments) -> Result<()> {
         ("plant over gRPC", times()?),
     ];
     let directory = tempfile::Builder::new().prefix("plantd-").tempdir()?;
-    // The others inherit the last processor; this process takes the first.
+    // Built, if need be, with all processors. The others inherit the last one; this process takes the first.
+    binary("plantd")?;
     let processors = std::thread::available_parallelism()?.get();
     allow_cpus(&[processors - 1]);
     let mut bare = BareIceoryx::start(&arguments.model)?;

@@ -1,6 +1,6 @@
-//! Many paced plants on one thread: 100 pendulums and 4 marionettes at 1 kHz, beside an empty loop at the
-//! same rate in this process. Prints what the server counted, what the empty loop saw in the same time,
-//! and the server's memory; asserts nothing.
+//! Many paced plants on one thread: 100 pendulums and 4 marionettes at 1 kHz, after an empty loop at the
+//! same rate on the same processor and beside one on another. Prints what the server counted, what the
+//! empty loops saw, and the server's memory; asserts nothing.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,10 +15,10 @@ use plantd_server::realtime::alarm::Alarm;
 use plantd_server::realtime::histogram::{Histogram, Summary};
 use plantd_tests::server::ServerProcess;
 
-/// Runs many paced plants on one thread, beside an empty loop.
+/// Runs many paced plants on one thread, after an empty loop and beside one.
 #[derive(Parser)]
 struct Arguments {
-    /// Time to measure, s.
+    /// Time to measure, twice, s.
     #[arg(long, default_value_t = 60)]
     seconds: u64,
     /// Pendulums.
@@ -69,6 +69,10 @@ async fn main() -> Result<()> {
             ids.push((model, client.create_plant(request).await?.id));
         }
     }
+    let time = Duration::from_secs(arguments.seconds);
+    let before = EmptyLoop::start(&arguments, 0);
+    tokio::time::sleep(time).await;
+    let before = before.stop();
     for (_, id) in &ids {
         let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), ..Default::default() };
         let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0 };
@@ -79,11 +83,12 @@ async fn main() -> Result<()> {
         client.timing(id, true).await?;
     }
     let before_kib = resident_kib(server.pid())?;
-    let empty = EmptyLoop::start(&arguments);
+    let processors = std::thread::available_parallelism().map_or(1, usize::from);
+    let beside = EmptyLoop::start(&arguments, processors - 1);
     let started = Instant::now();
-    tokio::time::sleep(Duration::from_secs(arguments.seconds)).await;
+    tokio::time::sleep(time).await;
     let elapsed_s = started.elapsed().as_secs_f64();
-    let empty = empty.stop();
+    let beside = beside.stop();
     let after_kib = resident_kib(server.pid())?;
 
     println!(
@@ -94,7 +99,8 @@ async fn main() -> Result<()> {
         1.0 / arguments.time_step
     );
     println!("{:28} {:>8} {:>8} {:>8} {:>8} {:>8}", "us", "mean", "p50", "p99", "p99.9", "max");
-    print_row("empty loop, wake-up", &empty);
+    print_row("empty loop, before", &before.lateness);
+    print_row("empty loop, beside", &beside.lateness);
     for (model, count) in plants {
         let (mut steps, mut overruns, mut slips) = (0, 0, 0);
         let mut worst = v1::GetTimingResponse::default();
@@ -112,8 +118,13 @@ async fn main() -> Result<()> {
         print_row(&format!("{model}, lateness of worst"), &summary(worst.lateness));
         print_row(&format!("{model}, its steps"), &summary(worst.step));
         let expected = count as f64 * elapsed_s / arguments.time_step;
-        println!("{model}: {steps} steps of {expected:.0} due, {overruns} overruns, {slips} slips");
+        println!(
+            "{model}: {steps} steps of {expected:.0} due, {:.1} overruns and {:.1} slips each",
+            overruns as f64 / count as f64,
+            slips as f64 / count as f64
+        );
     }
+    println!("empty loops: {} periods missed before, {} beside", before.missed, beside.missed);
     println!("memory of the server: {before_kib} KiB, after {elapsed_s:.0} s {after_kib} KiB");
     Ok(())
 }
@@ -136,15 +147,21 @@ fn print_row(name: &str, times: &Summary) {
     );
 }
 
-/// A loop at the same rate and with the same scheduling that does nothing, on the other processor if
-/// there is one.
+/// A loop at the same rate and with the same scheduling that does nothing.
 struct EmptyLoop {
     is_over: Arc<AtomicBool>,
-    thread: std::thread::JoinHandle<Histogram>,
+    thread: std::thread::JoinHandle<Seen>,
+}
+
+/// What an empty loop saw.
+struct Seen {
+    lateness: Summary,
+    /// Periods that were over when it woke for their beginning.
+    missed: u64,
 }
 
 impl EmptyLoop {
-    fn start(arguments: &Arguments) -> Self {
+    fn start(arguments: &Arguments, processor: usize) -> Self {
         let is_over = Arc::new(AtomicBool::new(false));
         let period_ns = (arguments.time_step * 1e9) as u64;
         let scheduling = match arguments.fifo {
@@ -153,26 +170,26 @@ impl EmptyLoop {
         };
         let stop = Arc::clone(&is_over);
         let thread = std::thread::spawn(move || {
-            let processors = std::thread::available_parallelism().map_or(1, usize::from);
-            allow_cpus(&[processors - 1]);
+            allow_cpus(&[processor]);
             scheduling.apply();
             sharpen_timers();
-            let (alarm, lateness) = (Alarm::default(), Histogram::default());
+            let (alarm, lateness, mut missed) = (Alarm::default(), Histogram::default(), 0);
             let mut due_ns = monotonic_ns() + period_ns;
             while !stop.load(Ordering::Relaxed) {
                 alarm.sleep_until(due_ns);
-                let now_ns = monotonic_ns();
-                lateness.record(now_ns.saturating_sub(due_ns));
+                let late_ns = monotonic_ns().saturating_sub(due_ns);
+                lateness.record(late_ns);
+                missed += u64::from(late_ns > period_ns);
                 due_ns += period_ns;
             }
-            lateness
+            Seen { lateness: lateness.summary(), missed }
         });
         Self { is_over, thread }
     }
 
-    fn stop(self) -> Summary {
+    fn stop(self) -> Seen {
         self.is_over.store(true, Ordering::Relaxed);
-        self.thread.join().expect("an empty loop does not panic").summary()
+        self.thread.join().expect("an empty loop does not panic")
     }
 }
 

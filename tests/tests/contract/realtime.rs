@@ -237,8 +237,10 @@ async fn without_a_valid_input_the_policy_acts_and_the_next_input_ends_it() {
         assert_eq!(event.number, kinds.len() as u64);
         kinds.push(event.kind());
     }
-    use v1::EventKind::{DriverAttached, DriverLeft, InputBack, InputLost, Started};
-    let among = [InputBack, InputLost, Started, DriverAttached, DriverLeft];
+    use v1::EventKind::{
+        DriverAttached, DriverLeft, InputBack, InputLost, Overran, Slipped, Started,
+    };
+    let among = [InputBack, InputLost, Started, DriverAttached, DriverLeft, Overran, Slipped];
     assert!(kinds.iter().all(|kind| among.contains(kind)), "{kinds:?}");
     let back = kinds.iter().filter(|kind| **kind == InputBack).count();
     assert!(back >= 2, "{kinds:?}");
@@ -249,6 +251,34 @@ async fn without_a_valid_input_the_policy_acts_and_the_next_input_ends_it() {
             break;
         }
     }
+}
+
+/// No machine takes a step in 100 ns: the plant is late all the time, and two events tell of it in two
+/// seconds.
+#[tokio::test]
+async fn overruns_are_counted_and_told_once_a_second() {
+    let (_server, client) = server().await;
+    let created = v1::CreatePlantRequest {
+        model: "pendulum".to_owned(),
+        settings: Some(v1::PlantSettings { time_step_s: 0.001, ..Default::default() }),
+        ..Default::default()
+    };
+    let id = client.create_plant(created).await.unwrap().id;
+    client.run(run_request(&id, v1::Pace::Paced, 1e4, 0)).await.unwrap();
+    let mut events = client.watch_events(&id, Some(0)).await.unwrap();
+    let mut told = Vec::new();
+    while told.len() < 2 {
+        let event = events.next().await.unwrap().unwrap().event.unwrap();
+        if event.kind() == v1::EventKind::Overran {
+            told.push((event.value, event.monotonic_ns));
+        }
+    }
+    client.pause(&id).await.unwrap();
+    let (first, second) = (told[0], told[1]);
+    assert_eq!(first.0, 1.0);
+    assert!(second.1 - first.1 >= 1_000_000_000);
+    let counted = client.timing(&id, false).await.unwrap().overruns as f64;
+    assert!(second.0 > 1.0 && first.0 + second.0 <= counted, "{told:?}, {counted}");
 }
 
 #[tokio::test]
