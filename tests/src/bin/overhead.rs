@@ -41,10 +41,10 @@ struct Arguments {
     #[arg(long, default_value = "pendulum")]
     model: String,
     /// Round trips in a turn.
-    #[arg(long, default_value_t = 5_000)]
+    #[arg(long, default_value_t = 1_000)]
     steps: u64,
     /// Turns.
-    #[arg(long, default_value_t = 8)]
+    #[arg(long, default_value_t = 40, value_parser = clap::value_parser!(u32).range(1..))]
     turns: u32,
     /// Serves as the other end of a bare link: `iceoryx` or `grpc`.
     #[arg(long, hide = true)]
@@ -78,12 +78,12 @@ fn main() -> Result<()> {
 }
 
 async fn measure(arguments: &Arguments) -> Result<()> {
-    let mut rows: [(&str, Times); 5] = [
-        ("step in process", times()?),
-        ("bare iceoryx2 ping-pong", times()?),
-        ("plant over shared memory", times()?),
-        ("bare tonic stream echo", times()?),
-        ("plant over gRPC", times()?),
+    let [mut alone, mut ping_pong, mut over_link, mut bare_stream, mut over_grpc] = [
+        Row::new("step in process")?,
+        Row::new("bare iceoryx2 ping-pong")?,
+        Row::new("plant over shared memory")?,
+        Row::new("bare tonic stream echo")?,
+        Row::new("plant over gRPC")?,
     ];
     let directory = tempfile::Builder::new().prefix("plantd-").tempdir()?;
     // Built, if need be, with all processors. The others inherit the last one; this process takes the first.
@@ -102,71 +102,106 @@ async fn measure(arguments: &Arguments) -> Result<()> {
     let mut plant = new_plant(&arguments.model)?;
     let mut u = vec![0.0; plant.model().dimensions().input()];
     plant.hold_input(&mut u);
+    let round_trips = 0..WARM_UP + arguments.steps;
     for _ in 0..arguments.turns {
-        for k in 0..WARM_UP + arguments.steps {
+        for k in round_trips.clone() {
             let started = Instant::now();
             plant.step(&u)?;
-            count(&mut rows[0].1, k, started)?;
+            alone.count(k, started)?;
         }
         resume(bare.other.pid())?;
-        for k in 0..WARM_UP + arguments.steps {
+        for k in round_trips.clone() {
             let started = Instant::now();
             bare.round_trip(&u)?;
-            count(&mut rows[1].1, k, started)?;
+            ping_pong.count(k, started)?;
         }
         suspend(bare.other.pid())?;
         resume(link.host.pid())?;
-        for k in 0..WARM_UP + arguments.steps {
+        for k in round_trips.clone() {
             let started = Instant::now();
             link.driver.step(&u)?;
-            count(&mut rows[2].1, k, started)?;
+            over_link.count(k, started)?;
         }
         suspend(link.host.pid())?;
         resume(echo.other.pid())?;
-        for k in 0..WARM_UP + arguments.steps {
+        for k in round_trips.clone() {
             let started = Instant::now();
             echo.round_trip(&u).await?;
-            count(&mut rows[3].1, k, started)?;
+            bare_stream.count(k, started)?;
         }
         suspend(echo.other.pid())?;
         resume(grpc.server.pid())?;
-        for k in 0..WARM_UP + arguments.steps {
+        for k in round_trips.clone() {
             let started = Instant::now();
             grpc.driver.step(&u).await?;
-            count(&mut rows[4].1, k, started)?;
+            over_grpc.count(k, started)?;
         }
         suspend(grpc.server.pid())?;
+        for row in [&mut alone, &mut ping_pong, &mut over_link, &mut bare_stream, &mut over_grpc] {
+            row.end_turn()?;
+        }
     }
     for pid in [link.host.pid(), grpc.server.pid()] {
         resume(pid)?;
     }
-    println!("{}, {} round trips each, us", arguments.model, rows[0].1.len());
+    println!(
+        "{}, {} turns of {} round trips, us",
+        arguments.model, arguments.turns, arguments.steps
+    );
     println!("{:28} {:>8} {:>8} {:>8}", "", "p50", "p99", "p99.9");
-    let us = |times: &Times, quantile| times.value_at_quantile(quantile) as f64 * 1e-3;
-    for (name, times) in &rows {
-        println!(
-            "{name:28} {:8.2} {:8.2} {:8.2}",
-            us(times, 0.5),
-            us(times, 0.99),
-            us(times, 0.999)
-        );
+    for row in [&alone, &ping_pong, &over_link, &bare_stream, &over_grpc] {
+        row.print();
     }
-    let p50 = |row: usize| us(&rows[row].1, 0.5);
-    println!("shared memory / (bare + step): {:.2}", p50(2) / (p50(1) + p50(0)));
-    println!("gRPC / (bare + step):          {:.2}", p50(4) / (p50(3) + p50(0)));
+    println!("a turn's median over those of the bare link and the step: median, and quartiles");
+    print_ratio("shared memory", &over_link, &ping_pong, &alone);
+    print_ratio("gRPC", &over_grpc, &bare_stream, &alone);
     link.finish()
 }
 
-fn times() -> Result<Times> {
-    Ok(Histogram::new_with_max(LONGEST_NS, 3)?)
+/// What is measured, turn by turn.
+struct Row {
+    name: &'static str,
+    all: Times,
+    turn: Times,
+    /// Of each turn, ns.
+    medians: Vec<f64>,
 }
 
-/// Counts a round trip that began then, unless it is one of the first of a turn.
-fn count(times: &mut Times, k: u64, started: Instant) -> Result<()> {
-    if k >= WARM_UP {
-        times.record(started.elapsed().as_nanos() as u64)?;
+impl Row {
+    fn new(name: &'static str) -> Result<Self> {
+        let times = Times::new_with_max(LONGEST_NS, 3)?;
+        Ok(Self { name, all: times.clone(), turn: times, medians: Vec::new() })
     }
-    Ok(())
+
+    /// Counts a round trip that began then, unless it is one of the first of a turn.
+    fn count(&mut self, k: u64, started: Instant) -> Result<()> {
+        if k >= WARM_UP {
+            self.turn.record(started.elapsed().as_nanos() as u64)?;
+        }
+        Ok(())
+    }
+
+    fn end_turn(&mut self) -> Result<()> {
+        self.medians.push(self.turn.value_at_quantile(0.5) as f64);
+        self.all.add(&self.turn)?;
+        self.turn.reset();
+        Ok(())
+    }
+
+    fn print(&self) {
+        let us = |quantile| self.all.value_at_quantile(quantile) as f64 * 1e-3;
+        println!("{:28} {:8.2} {:8.2} {:8.2}", self.name, us(0.5), us(0.99), us(0.999));
+    }
+}
+
+/// The machine is faster in some turns than in others: ratios are those within a turn.
+fn print_ratio(name: &str, plant: &Row, bare: &Row, step: &Row) {
+    let bare_and_step = bare.medians.iter().zip(&step.medians).map(|(bare, step)| bare + step);
+    let mut ratios: Vec<f64> =
+        plant.medians.iter().zip(bare_and_step).map(|(a, b)| a / b).collect();
+    ratios.sort_by(f64::total_cmp);
+    let at = |quarter: usize| ratios[(ratios.len() - 1) * quarter / 4];
+    println!("{name:28} {:8.2} {:8.2} {:8.2}", at(2), at(1), at(3));
 }
 
 fn suspend(pid: u32) -> Result<()> {
@@ -231,6 +266,8 @@ impl SharedMemory {
 struct BareIceoryx {
     ends: Ends,
     answer_len: usize,
+    /// The last answer.
+    state: Vec<f64>,
     other: Other,
 }
 
@@ -275,7 +312,8 @@ impl BareIceoryx {
         let ends = Ends::new(&name, "ping", "pong")?;
         let other = Other::start("iceoryx", Path::new(&name), model)?;
         let d = new_plant(model)?.model().dimensions();
-        let mut bare = Self { ends, answer_len: d.state() + d.constraints, other };
+        let mut bare =
+            Self { ends, answer_len: d.state() + d.constraints, state: Vec::new(), other };
         // Until the other end is there.
         let deadline = Instant::now() + PATIENCE;
         while bare.ends.subscriber.receive()?.is_none() {
@@ -289,14 +327,19 @@ impl BareIceoryx {
         Ok(bare)
     }
 
-    /// As many numbers one way as an input has, as many back as a state has.
+    /// As many numbers one way as an input has, as many back as a state has, which are read.
     fn round_trip(&mut self, u: &[f64]) -> Result<()> {
         let mut message = [0.0; 64];
         message[0] = self.answer_len as f64;
         self.ends.send(&message[..u.len().clamp(1, 64)])?;
-        while self.ends.subscriber.receive()?.is_none() {
-            std::hint::spin_loop();
-        }
+        let answer = loop {
+            match self.ends.subscriber.receive()? {
+                Some(answer) => break answer,
+                None => std::hint::spin_loop(),
+            }
+        };
+        self.state.clear();
+        self.state.extend_from_slice(answer.payload());
         Ok(())
     }
 }
