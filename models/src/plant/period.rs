@@ -362,3 +362,22 @@ impl Model {
         self.orientations.iter().any(|i| *i >= self.dimensions.dynamic)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::builtin;
+
+    /// A snapshot may say that the last period was halved more often than its settings allow.
+    #[test]
+    fn periods_are_halved_no_more_often_than_settings_allow() {
+        let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
+        let settings = Settings { halvings: 1, ..Settings::new(&model) };
+        let mut plant = Plant::new(model, settings).unwrap();
+        plant.state.halvings = 3;
+        let report = plant.step(&[0.0]).unwrap();
+        assert_eq!((report.halvings, report.steps), (1, 2));
+    }
+}

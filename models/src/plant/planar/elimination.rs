@@ -208,28 +208,29 @@ impl Elimination {
 
     #[inline(always)]
     fn solve_portable(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
-        self.flow.fill([0.0; 3]);
-        for (i, joint) in joints.iter().enumerate().rev() {
-            let (generator, flow) = (&self.generators[i + 1], self.flow[i + 1]);
-            let x = &mut x[i];
+        let (generators, flows) = (&self.generators[1..], &mut self.flow[..]);
+        flows.fill([0.0; 3]);
+        for (i, ((joint, generator), x)) in
+            joints.iter().zip(generators).zip(&mut *x).enumerate().rev()
+        {
+            let flow = flows[i + 1];
             *x = (*x - dot3(generator.minus, flow)) * generator.inverse_pivot;
             if joint.parent > 0 {
                 let flow = add_scaled(flow, *x, generator.above);
-                let parent = &mut self.flow[joint.parent];
+                let parent = &mut flows[joint.parent];
                 parent[0] += flow[0] + cross(generator.edge, linear(flow));
                 parent[1] += flow[1];
                 parent[2] += flow[2];
             }
         }
-        for (i, joint) in joints.iter().enumerate() {
-            let (generator, mut flow) = (&self.generators[i + 1], self.flow[joint.parent]);
+        for (i, ((joint, generator), x)) in joints.iter().zip(generators).zip(x).enumerate() {
+            let mut flow = flows[joint.parent];
             if joint.parent > 0 {
                 let moved = spun(flow[0], generator.edge);
                 flow = [flow[0], flow[1] + moved[0], flow[2] + moved[1]];
             }
-            let x = &mut x[i];
             *x -= dot3(generator.across, flow);
-            self.flow[i + 1] = add_scaled(flow, *x, generator.plus);
+            flows[i + 1] = add_scaled(flow, *x, generator.plus);
         }
     }
 
