@@ -15,6 +15,7 @@ async fn main() -> plantd_client::Result<()> {
         u: Some(v1::Matrix::from_rows(&[[5.0], [-5.0]])),
         hold: 8,
         all_states: true,
+        ..Default::default()
     };
     for state in client.step(request).await?.states {
         println!("{:.2} s  q = {:?}", state.time_s, state.q);

@@ -94,6 +94,9 @@ pub struct Settings {
         value_delimiter = ','
     )]
     pub limits: Vec<(String, u64)>,
+    /// End when standard input does: with the process at its other end, however that ends.
+    #[arg(long)]
+    pub until_stdin_ends: bool,
     /// Print the configuration in force, as TOML, and end.
     #[arg(long)]
     pub print_config: bool,

@@ -8,7 +8,7 @@ use plantd_models::control::{StageWeights, TrajectoryWeights, Weights, WeightsEr
 use plantd_models::scene::Signal;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
-    Plant, Precision, Scene, SceneError, Settings, Snapshot, State, StepReport,
+    Plant, Precision, Scene, SceneError, Settings, State, StepReport,
 };
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
@@ -20,6 +20,7 @@ use crate::frame::Timing;
 use crate::limits::{LimitExceeded, Limits};
 use crate::parameters::Parameters;
 use crate::realtime::utc_ns;
+use crate::session::PlantSnapshot;
 use crate::status::Fault;
 use crate::workers::Abandoned;
 
@@ -29,7 +30,7 @@ pub enum Start {
     /// From a description of the state.
     Initial(Initial),
     /// From a snapshot.
-    Snapshot(Box<Snapshot>),
+    Snapshot(Box<PlantSnapshot>),
 }
 
 /// Checks a name or an id: lower-case letters, digits and hyphens, 1 to 63 of them.
@@ -233,7 +234,7 @@ pub fn start(
             Initial::Equilibrium { q, hold: form.hold, inputs }
         }
         Some(InitialForm::Snapshot(bytes)) => {
-            return Ok(Start::Snapshot(Box::new(Snapshot::from_bytes(&bytes)?)));
+            return Ok(Start::Snapshot(Box::new(PlantSnapshot::from_bytes(&bytes)?)));
         }
     };
     Ok(Start::Initial(initial))
@@ -275,7 +276,7 @@ pub fn plant(
         Start::Initial(initial) => {
             plant.initialize(initial).map_err(|error| Fault::from_initial(error, field))?;
         }
-        Start::Snapshot(snapshot) => plant.restore(snapshot)?,
+        Start::Snapshot(snapshot) => plant.restore(&snapshot.plant)?,
     }
     Ok(plant)
 }

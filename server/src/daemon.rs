@@ -6,6 +6,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::oneshot;
 use tracing_subscriber::EnvFilter;
 
 use crate::config::{Config, LogConfig, LogFormat};
@@ -26,14 +27,15 @@ pub fn start_log(config: &LogConfig) -> Result<()> {
     Ok(())
 }
 
-/// Serves until SIGTERM or SIGINT.
-pub async fn serve(config: Config) -> Result<()> {
+/// Serves until SIGTERM or SIGINT, or until standard input ends where that is asked for.
+pub async fn serve(config: Config, until_stdin_ends: bool) -> Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let shutdown = async {
         tokio::select! {
             _ = terminate.recv() => {}
             _ = interrupt.recv() => {}
+            () = stdin_ended(), if until_stdin_ends => {}
         }
         tracing::info!("shutting down");
         notify(&[NotifyState::Stopping]);
@@ -61,6 +63,17 @@ pub async fn serve(config: Config) -> Result<()> {
         let _ = std::fs::remove_file(path);
     }
     outcome
+}
+
+/// Completes when nobody can write to standard input any more.
+async fn stdin_ended() {
+    let (ends, ended) = oneshot::channel::<()>();
+    // A thread of its own: the runtime would wait at its end for one that reads.
+    std::thread::spawn(move || {
+        let _ends = ends;
+        let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+    });
+    let _ = ended.await;
 }
 
 /// Writes the addresses beside the file and renames them into place, so that readers see all or

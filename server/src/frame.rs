@@ -29,8 +29,6 @@ impl Timing {
     pub const LATE: u64 = 1;
     /// The safe input was in force: none had come, or none for longer than the policy allows.
     pub const SAFE: u64 = 2;
-    /// Something besides the input pushed the plant.
-    pub const PUSHED: u64 = 4;
 }
 
 /// A state with the step that led to it.
@@ -48,6 +46,8 @@ pub struct Frame {
     pub input: Vec<f64>,
     /// What the driver asked for.
     pub driver_input: Vec<f64>,
+    /// Impulse that was added to the momentum before the step; empty for none.
+    pub impulse: Vec<f64>,
     /// What the output channels deliver.
     pub outputs: Vec<f64>,
     /// A flag for each of these channels: 1 where it delivers once more what it did before, else 0.
@@ -71,6 +71,7 @@ pub(crate) struct Published<'a> {
     pub(crate) multipliers: &'a [f64],
     pub(crate) input: &'a [f64],
     pub(crate) driver_input: &'a [f64],
+    pub(crate) impulse: &'a [f64],
     pub(crate) outputs: &'a [f64],
     pub(crate) lost: &'a [f64],
     pub(crate) report: StepReport,
@@ -82,7 +83,7 @@ pub(crate) struct Published<'a> {
 
 /// Words of a record of a plant of these sizes.
 pub fn record_words(d: Dimensions) -> usize {
-    FIXED_WORDS + d.state() + d.constraints + 2 * d.input() + OUTPUTS_MAX
+    FIXED_WORDS + d.state() + d.constraints + 2 * d.input() + d.dynamic + OUTPUTS_MAX
 }
 
 impl Published<'_> {
@@ -112,8 +113,8 @@ impl Published<'_> {
             report.reciprocal_condition.to_bits(),
             report.constraint_reciprocal_condition.to_bits(),
         ];
-        let Self { q, p, v, multipliers, input, driver_input, outputs, lost, .. } = *self;
-        let vectors = [q, p, v, multipliers, input, driver_input, outputs, lost];
+        let Self { q, p, v, multipliers, input, driver_input, impulse, outputs, lost, .. } = *self;
+        let vectors = [q, p, v, multipliers, input, driver_input, impulse, outputs, lost];
         let sizes = vectors.map(|vector| vector.len() as u64);
         let numbers = vectors.into_iter().flatten().map(|number| number.to_bits());
         fixed.into_iter().chain(sizes).chain(numbers)
@@ -137,6 +138,7 @@ impl Frame {
             (&mut self.state.multipliers, published.multipliers),
             (&mut self.input, published.input),
             (&mut self.driver_input, published.driver_input),
+            (&mut self.impulse, published.impulse),
             (&mut self.outputs, published.outputs),
             (&mut self.lost, published.lost),
         ] {
@@ -174,7 +176,7 @@ impl Frame {
             reciprocal_condition: number(next()),
             constraint_reciprocal_condition: number(next()),
         };
-        let sizes: [usize; 8] = std::array::from_fn(|_| next() as usize);
+        let sizes: [usize; 9] = std::array::from_fn(|_| next() as usize);
         let vectors = [
             &mut self.state.q,
             &mut self.state.p,
@@ -182,6 +184,7 @@ impl Frame {
             &mut self.state.multipliers,
             &mut self.input,
             &mut self.driver_input,
+            &mut self.impulse,
             &mut self.outputs,
             &mut self.lost,
         ];
@@ -202,6 +205,7 @@ impl Frame {
             multipliers: &self.state.multipliers,
             input: &self.input,
             driver_input: &self.driver_input,
+            impulse: &self.impulse,
             outputs: &self.outputs,
             lost: &self.lost,
             report: self.report,
@@ -242,6 +246,7 @@ mod tests {
             },
             input: vec![6.0, 7.0],
             driver_input: vec![8.0],
+            impulse: vec![9.0, 10.0],
             outputs: vec![f64::INFINITY],
             lost: vec![1.0],
             time_step_s: 0.01,

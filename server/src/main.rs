@@ -22,7 +22,7 @@ fn main() -> Result<()> {
 }
 
 fn serve(settings: Settings) -> Result<()> {
-    let print_config = settings.print_config;
+    let (print_config, until_stdin_ends) = (settings.print_config, settings.until_stdin_ends);
     let config = settings.resolve()?;
     if print_config {
         print!("{}", config.to_toml()?);
@@ -34,7 +34,7 @@ fn serve(settings: Settings) -> Result<()> {
         .enable_all()
         .build()
         .context("threads")?;
-    let outcome = runtime.block_on(daemon::serve(config));
+    let outcome = runtime.block_on(daemon::serve(config, until_stdin_ends));
     runtime.shutdown_timeout(LEFTOVERS_MAX);
     outcome
 }

@@ -19,6 +19,8 @@ pub struct Changed {
     pub model: Model,
     /// All changes since the plant was made.
     pub parameters: Parameters,
+    /// What the numbers were that these changes concern.
+    pub former: Parameters,
 }
 
 /// Why a change was refused.
@@ -57,21 +59,22 @@ pub fn change(
 ) -> Result<Changed, ChangeError> {
     let mut scene = serde_json::to_value(model.scene())
         .map_err(|error| ChangeError::Structure(error.to_string()))?;
-    let mut parameters = before.clone();
+    let (mut parameters, mut former) = (before.clone(), Parameters::new());
     let mut seen = BTreeMap::new();
     for (index, (path, value)) in changes.iter().enumerate() {
         let refuse = |problem: String| ChangeError::Path { index, problem };
-        let canonical = set(&mut scene, path, *value).map_err(refuse)?;
+        let (canonical, was) = set(&mut scene, path, *value).map_err(refuse)?;
         if let Some(first) = seen.insert(canonical.clone(), index) {
             return Err(refuse(format!("is that of entry {first}: `{canonical}`")));
         }
+        former.insert(canonical.clone(), was);
         parameters.insert(canonical, *value);
     }
     let text = scene.to_string();
     let scene = Scene::from_json(&text).map_err(ChangeError::Scene)?;
     let changed = Model::compile(&scene).map_err(ChangeError::Scene)?;
     check_structure(model, &changed).map_err(ChangeError::Structure)?;
-    Ok(Changed { model: changed, parameters })
+    Ok(Changed { model: changed, parameters, former })
 }
 
 /// A change of numbers leaves everything that has a name as it was.
@@ -125,9 +128,9 @@ fn segments(path: &str) -> Result<Vec<Segment<'_>>, String> {
     }
 }
 
-/// Sets one number; returns its path in the one notation. A key that is not there stands for a default
+/// Sets one number; returns its path in the one notation, and what it was. A key that is not there stands for a default
 /// of the format; whether there is such a key shows when the scene is read.
-fn set(scene: &mut Value, path: &str, value: f64) -> Result<String, String> {
+fn set(scene: &mut Value, path: &str, value: f64) -> Result<(String, f64), String> {
     if !value.is_finite() {
         return Err(format!("`{path}` is to become {value}"));
     }
@@ -179,11 +182,9 @@ fn set(scene: &mut Value, path: &str, value: f64) -> Result<String, String> {
             }
         }
     }
-    if !place.is_number() {
-        return Err(format!("`{canonical}` is not a number"));
-    }
+    let former = place.as_f64().ok_or_else(|| format!("`{canonical}` is not a number"))?;
     *place = number;
-    Ok(canonical)
+    Ok((canonical, former))
 }
 
 fn name(item: &Value) -> Option<&str> {

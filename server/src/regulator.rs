@@ -213,6 +213,8 @@ pub struct Spec {
     pub constraints: Constraints,
     /// Time step for which a trajectory was given, s.
     pub time_step_s: f64,
+    /// Along a trajectory: the request, from which all this comes.
+    pub given: Option<v1::SetFeedbackRequest>,
 }
 
 impl Spec {
@@ -254,7 +256,8 @@ impl Spec {
                 let weights = self.trajectory_weights.as_ref().ok_or_else(missing)?;
                 let (steps, stages) = (inputs.count(), weights.steps().unwrap_or(1));
                 Memory { steps, stages, values: Values::Drop }.check(limits, model)?;
-                let room = room.reserve(numbers(model, steps, stages))?;
+                // The request has the weights once more.
+                let room = room.reserve(numbers(model, steps, stages.saturating_mul(2)))?;
                 let start = Start::Initial(start.clone());
                 let plant = convert::plant(model, settings, &start, "trajectory.initial")?;
                 let path = Path::follow(plant, inputs, self.constraints, abandoned)?;
@@ -293,5 +296,5 @@ fn numbers(model: &Model, steps: usize, stages: usize) -> usize {
     let d = model.dimensions();
     let (nx, nu) = (d.state(), d.input());
     let weights = stages.saturating_mul(stage_numbers(model)).saturating_add(nx * nx);
-    steps.saturating_mul(nx * nu + nx + 3 * nu).saturating_add(weights + nx)
+    steps.saturating_mul(nx * nu + nx + 4 * nu).saturating_add(weights + nx)
 }

@@ -41,6 +41,9 @@ use crate::metrics_http;
 use crate::record::Recordings;
 use crate::state::StateDirectory;
 
+/// Longest wait at the end for plants to be saved on a disk that does not answer.
+const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
+
 /// Where a server can be reached.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Addresses {
@@ -258,7 +261,9 @@ impl RunningServer {
             tracing::error!(%error, "shared-memory links were not closed");
         }
         self.saver.abort();
-        save_once(&self.hub).await;
+        if tokio::time::timeout(SAVE_WAIT_MAX, save_once(&self.hub)).await.is_err() {
+            tracing::error!("the disk does not answer: not all plants were saved");
+        }
         if let Some(metrics) = &self.metrics {
             metrics.abort();
         }

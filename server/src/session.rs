@@ -37,6 +37,7 @@ use crate::watch::{Subscription, Watchers};
 
 pub use self::core::{Core, Mechanics};
 use self::gate::Gate;
+pub use self::saved::PlantSnapshot;
 
 /// Records that the ring of a plant keeps: a quarter of a second at 1 kHz.
 const RING_RECORDS: usize = 256;
@@ -320,8 +321,8 @@ impl Session {
     }
 
     /// A snapshot of the plant as it is.
-    pub fn snapshot(&self) -> Snapshot {
-        self.with_core(|core| core.plant.snapshot())
+    pub fn snapshot(&self) -> PlantSnapshot {
+        self.with_core(|core| core.snapshot())
     }
 
     /// A copy of the plant as it is, to compute on.
@@ -487,16 +488,34 @@ impl Session {
 
     /// Replaces the plant by a copy of it that was put into another state, which comes back with its
     /// time. The caller holds `replacing`.
-    fn replace_plant(self: &Arc<Self>, plant: Plant) -> (State, f64) {
+    fn replace_plant(
+        self: &Arc<Self>,
+        plant: Plant,
+        memory: Option<v1::ChannelMemory>,
+    ) -> (State, f64) {
         let session = Arc::clone(self);
         // The former plant is dropped here, not in the core's hands.
         let (put, _former) = self.with_core(move |core| {
-            let former = core.replace_plant(plant);
+            let former = core.replace_plant(plant, memory.as_ref());
             core.mark(MarkReason::Reset);
             session.watchers.publish(&core.published());
-            (core.state(), former)
+            (core.state(), (former, memory))
         });
         put
+    }
+
+    /// Puts the plant into the state of a snapshot: one of the same parameters and time step. The caller
+    /// holds the lease.
+    pub(crate) fn restore(
+        self: &Arc<Self>,
+        snapshot: PlantSnapshot,
+    ) -> Result<(State, f64), SnapshotError> {
+        let _replacing = lock(&self.replacing);
+        let mut plants = self.copy_plants();
+        let fits = plants.iter_mut().position(|plant| plant.restore(&snapshot.plant).is_ok());
+        let mut plant = plants.swap_remove(fits.unwrap_or(0));
+        plant.restore(&snapshot.plant)?;
+        Ok(self.replace_plant(plant, snapshot.channels))
     }
 
     /// Changes numbers of the scene, and the time step if one is given, between two steps: the state
@@ -962,6 +981,17 @@ impl Lease {
         linearization: Option<&mut Linearization>,
         look: impl FnOnce(&Core) -> R,
     ) -> Result<R, DriveError> {
+        self.step_pushed_and(u, &[], linearization, look)
+    }
+
+    /// The same with an impulse that is added to the momentum before; none if it is empty.
+    pub fn step_pushed_and<R>(
+        &mut self,
+        u: &[f64],
+        impulse: &[f64],
+        linearization: Option<&mut Linearization>,
+        look: impl FnOnce(&Core) -> R,
+    ) -> Result<R, DriveError> {
         if self.session.is_closed() {
             return Err(DriveError::Closed);
         }
@@ -974,7 +1004,7 @@ impl Lease {
         }
         let mut place = lock(&self.session.place);
         let Place::Rest(core) = &mut *place else { return Err(DriveError::Running) };
-        let outcome = core.step(u, linearization);
+        let outcome = core.step_pushed(u, impulse, linearization);
         let metrics = &self.session.metrics;
         if let Some(started) = started {
             metrics.step_timed(started.elapsed());
@@ -1000,6 +1030,7 @@ impl Lease {
             Err(error) => {
                 if let DriveError::Step(error) = &error {
                     metrics.step_failed(step_error_reason(error));
+                    core.note_failure(error);
                 }
                 Err(error)
             }
@@ -1041,7 +1072,7 @@ impl Lease {
     pub fn reset(&mut self) -> Result<(State, f64), InitialError> {
         let _replacing = lock(&self.session.replacing);
         let plant = self.session.plant_at_start()?;
-        Ok(self.session.replace_plant(plant))
+        Ok(self.session.replace_plant(plant, None))
     }
 
     /// Puts the plant into a state, step 0, and tells it.
@@ -1049,17 +1080,12 @@ impl Lease {
         let _replacing = lock(&self.session.replacing);
         let mut plant = self.session.copy_plants().swap_remove(0);
         plant.initialize(initial)?;
-        Ok(self.session.replace_plant(plant))
+        Ok(self.session.replace_plant(plant, None))
     }
 
     /// Puts the plant into the state of a snapshot: one of the same parameters and time step.
-    pub fn restore(&mut self, snapshot: &Snapshot) -> Result<(State, f64), SnapshotError> {
-        let _replacing = lock(&self.session.replacing);
-        let mut plants = self.session.copy_plants();
-        let fits = plants.iter_mut().position(|plant| plant.restore(snapshot).is_ok());
-        let mut plant = plants.swap_remove(fits.unwrap_or(0));
-        plant.restore(snapshot)?;
-        Ok(self.session.replace_plant(plant))
+    pub fn restore(&mut self, snapshot: PlantSnapshot) -> Result<(State, f64), SnapshotError> {
+        self.session.restore(snapshot)
     }
 
     fn is_step_timed(&mut self) -> bool {

@@ -10,16 +10,17 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use anyhow::{Context as _, Result, bail};
-use plantd_models::{Model, Plant, Snapshot};
+use plantd_models::{Initial, Model, Plant, Snapshot};
 use plantd_proto::v1;
 use prost::Message as _;
 
+use crate::channels::noise::hash;
 use crate::convert::{self, Start};
 use crate::grpc::feedback::set_feedback;
 use crate::grpc::model::compile;
-use crate::grpc::run::{run, run_info};
+use crate::grpc::run::{run, run_info, set_safety};
 use crate::hub::Hub;
-use crate::session::Session;
+use crate::session::{PlantSnapshot, Session};
 use crate::status::Fault;
 
 const EXTENSION: &str = "plant";
@@ -178,6 +179,7 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     let record = decode(&fs::read(path)?)?;
     let v1::PlantRecord { plant, model, start_model, start_settings, feedback, channels, .. } =
         record;
+    let snapshot = PlantSnapshot::from_bytes(&record.snapshot)?;
     let (info, model) = (plant.context("no plant in it")?, model.context("no model in it")?);
     if info.id != id {
         bail!("the plant in it is `{}`", info.id);
@@ -195,24 +197,44 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
         }
         _ => start_model,
     };
-    let plant = |model: &Arc<Model>, settings, snapshot: &[u8]| -> Result<Plant> {
+    let plant = |model: &Arc<Model>, settings| -> Result<Plant> {
         let settings = convert::settings(settings, model, &hub.limits).map_err(sentence)?;
-        let start = Start::Snapshot(Box::new(Snapshot::from_bytes(snapshot)?));
-        convert::plant(model, settings, &start, "snapshot").map_err(sentence)
+        convert::plant(model, settings, &Start::Initial(Initial::Scene), "model").map_err(sentence)
     };
-    let start = plant(&start_model, start_settings, &record.start_snapshot)?;
+    let mut start = plant(&start_model, start_settings)?;
+    start.restore(&Snapshot::from_bytes(&record.start_snapshot)?)?;
     let is_changed = in_force.digest() != start_model.digest();
     let in_force = if is_changed { in_force } else { start_model };
-    let present = plant(&in_force, info.settings, &record.snapshot)?;
+    let mut present = plant(&in_force, info.settings)?;
+    let has_changes = record.faults.iter().any(is_change);
+    if !has_changes {
+        present.restore(&snapshot.plant)?;
+    }
     let session = hub.insert(id.to_owned(), info.model, start, info.accuracy).map_err(sentence)?;
     let changed = info.parameters.into_iter().map(|p| (p.path, p.value)).collect();
     session.resume(present, changed);
+    let warn = |what: &str, fault: Fault| {
+        tracing::warn!(plant = id, error = %sentence(fault), "{what}");
+    };
     if let Some(channels) = channels
         && let Err(fault) = session.set_channels(channels, &hub.limits)
     {
-        tracing::warn!(plant = id, error = %sentence(fault), "its channels are not restored");
+        warn("its channels are not restored", fault);
     }
     resume_feedback(hub, &session, feedback, info.feedback).await;
+    if let Some(safety) = record.safety {
+        let request = v1::SetSafetyRequest { id: id.to_owned(), ..safety };
+        if let Err(fault) = set_safety(hub, request) {
+            warn("its watchdogs are not restored", fault);
+        }
+    }
+    if let Err(fault) = session.resume_faults(record.faults, record.fault_count, &hub.limits) {
+        warn("its faults are not restored", fault);
+    }
+    if let Err(error) = session.restore(snapshot) {
+        hub.delete(id).await.map_err(sentence)?;
+        return Err(error.into());
+    }
     if info.link_open
         && let Err(fault) = hub.open_link(Arc::clone(&session)).await
     {
@@ -247,7 +269,7 @@ async fn resume_feedback(
     let Some(info) = info else { return };
     let id = session.id();
     let Some(request) = request else {
-        tracing::warn!(plant = id, "its feedback along a trajectory is not restored");
+        tracing::warn!(plant = id, "its feedback is not restored: the time step has changed");
         return;
     };
     let request = v1::SetFeedbackRequest { id: id.to_owned(), ..request };
@@ -261,6 +283,11 @@ async fn resume_feedback(
             tracing::warn!(plant = id, error = %sentence(fault), "its feedback is not restored");
         }
     }
+}
+
+fn is_change(saved: &v1::SavedFault) -> bool {
+    let kind = saved.fault.as_ref().and_then(|fault| fault.kind.as_ref());
+    matches!(kind, Some(v1::fault_spec::Kind::Parameters(_)))
 }
 
 fn scene(hub: &Hub, model: &v1::Model) -> Result<Model> {
@@ -280,9 +307,3 @@ fn sentence(fault: Fault) -> anyhow::Error {
     anyhow::anyhow!("{}", tonic::Status::from(fault).message())
 }
 
-/// The 64-bit FNV-1a hash.
-fn hash(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
-    })
-}

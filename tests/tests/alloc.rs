@@ -262,6 +262,22 @@ fn steps_with_channels_allocate_nothing() {
     });
     assert_eq!(count, 0);
     assert!(session.faults().iter().all(|fault| fault.beginnings > 0));
+
+    // Nor does a watchdog that puts the plant back after each step.
+    let never = Watchdog {
+        quantity: Quantity::Energy,
+        min: f64::MAX,
+        max: f64::INFINITY,
+        action: WatchdogAction::Reset,
+    };
+    let safety = Safety { watchdogs: vec![never], on_step_failure: None };
+    session.set_safety(safety).expect("it can be protected");
+    let count = allocations(|| {
+        for _ in 0..STEPS {
+            lease.step(&u).expect("a step succeeds");
+        }
+    });
+    assert_eq!((count, session.step_index()), (0, 0));
 }
 
 #[test]

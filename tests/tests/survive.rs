@@ -1,5 +1,6 @@
 //! Plants survive their server, ended or killed, and go on bit for bit.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -31,7 +32,7 @@ fn serve(state: &Path) -> ServerProcess {
 async fn step(client: &Client, id: &str, from: u64, count: u64) -> Vec<v1::State> {
     let rows: Vec<_> = (from..from + count).map(|k| vec![(k as f64 * 0.1).sin()]).collect();
     let u = Some(v1::Matrix::from_rows(&rows));
-    let request = v1::StepRequest { id: id.to_owned(), u, all_states: true, hold: 0 };
+    let request = v1::StepRequest { id: id.to_owned(), u, all_states: true, hold: 0, ..Default::default() };
     client.step(request).await.unwrap().states
 }
 
@@ -166,6 +167,138 @@ async fn the_trajectory_over_a_restart_is_the_uninterrupted_one() {
             false => assert_eq!(states.to_vec(), whole, "killed: {is_killed:?}"),
         }
         drop(server);
+    }
+}
+
+/// A cart-pole along a trajectory with channels in which much is under way, faults of all kinds, of which
+/// some change its parameters, and a watchdog that puts it back.
+async fn create_disturbed(client: &Client, id: &str) {
+    use v1::fault_spec::{Kind, Pattern, Start, Target};
+    let plant = create(client, id, "cart-pole").await;
+    let h = plant.settings.unwrap().time_step_s;
+    let name = |name: &str| name.to_owned();
+    let theta = v1::output_channel::Source::Coordinate(name("theta"));
+    let sensor = v1::OutputChannel {
+        name: name("angle"),
+        source: Some(theta),
+        latency_s: 30.0 * h,
+        sample_period_s: 4.0 * h,
+        noise: 0.1,
+        ..Default::default()
+    };
+    let actuator =
+        v1::InputChannel { input: name("force"), delay_s: 40.0 * h, ..Default::default() };
+    let channels = v1::Channels { outputs: vec![sensor], inputs: vec![actuator], seed: 9 };
+    client.set_channels(id, channels).await.unwrap();
+    let blink = |period: f64, kind, target| v1::FaultSpec {
+        target,
+        kind: Some(kind),
+        start: Some(Start::StartS(5.0 * h)),
+        pattern: Some(Pattern::Intermittent(v1::Intermittent { period_s: period * h, duty: 0.5 })),
+        ..Default::default()
+    };
+    let point = v1::FramePoint { frame: name("pole"), at: vec![0.0, -1.0, 0.0] };
+    let push = v1::Push { point: Some(point), force: vec![1.0, 0.0, 0.0], torque: vec![] };
+    let number = |path: &str, value| v1::Parameter { path: path.to_owned(), value };
+    let change = |path, value| {
+        Kind::Parameters(v1::ParameterChange { parameters: vec![number(path, value)] })
+    };
+    let delay = Kind::Delay(v1::ExtraDelay { delay_s: 25.0 * h });
+    // The first one is gone by the time, and its number is not used again.
+    let first = blink(9.0, Kind::Off(true), Some(Target::Input(name("force"))));
+    let first = client.inject_fault(id, first).await.unwrap().id;
+    for fault in [
+        v1::FaultSpec { start: None, ..blink(8.0, delay, Some(Target::Output(name("angle")))) },
+        blink(60.0, Kind::Stuck(true), Some(Target::Input(name("force")))),
+        blink(14.0, Kind::Push(push), None),
+        blink(80.0, change("gravity[1]", -3.0), None),
+        blink(56.0, change("frames[pole].translation[1]", 0.2), None),
+    ] {
+        client.inject_fault(id, fault).await.unwrap();
+    }
+    client.clear_fault(id, first).await.unwrap();
+    let rows: Vec<_> = (0..400).map(|k| vec![2.0 * (0.05 * f64::from(k)).sin()]).collect();
+    let trajectory = v1::Trajectory { initial: None, u: Some(v1::Matrix::from_rows(&rows)) };
+    let feedback = v1::SetFeedbackRequest {
+        id: id.to_owned(),
+        reference: Some(v1::set_feedback_request::Reference::Trajectory(trajectory)),
+        weights: Some(weights(diagonal([1.0; 4]), diagonal([1.0]))),
+        mode: v1::FeedbackMode::Add.into(),
+        first_step: Some(3),
+        ..Default::default()
+    };
+    client.set_feedback(feedback).await.unwrap();
+    let watchdog = v1::Watchdog {
+        quantity: name("v(x)"),
+        min: Some(-1.0),
+        max: None,
+        action: v1::WatchdogAction::Reset.into(),
+    };
+    let watchdogs = vec![watchdog];
+    let request = v1::SetSafetyRequest { id: id.to_owned(), watchdogs, ..Default::default() };
+    client.set_safety(request).await.unwrap();
+}
+
+#[tokio::test]
+async fn channels_faults_feedback_and_watchdogs_survive() {
+    let state = tempfile::tempdir().unwrap();
+    let mut server = serve(state.path());
+    let client = server.client().await;
+    for id in ["whole", "cut"] {
+        create_disturbed(&client, id).await;
+    }
+    let whole = step(&client, "whole", 0, 460).await;
+    let resets = whole.iter().filter(|state| state.step == 0).count();
+    assert!((1..20).contains(&resets), "{resets} resets");
+    let mut cut = Vec::new();
+    let mut sets = BTreeSet::new();
+    // Within changes of parameters, and between them.
+    for (from, count) in [(0, 50), (50, 60), (110, 51), (161, 39), (200, 260)] {
+        let client = server.client().await;
+        cut.extend(step(&client, "cut", from, count).await);
+        let before = everything(&client, "cut").await;
+        sets.insert(before.parameters.len());
+        assert!(server.stop().unwrap().success());
+        server = serve(state.path());
+        let client = server.client().await;
+        assert_eq!(everything(&client, "cut").await, before, "{}", server.log());
+    }
+    assert_eq!(cut, whole);
+    assert!(sets.len() > 1, "{sets:?}");
+    // It is as free as ever.
+    let client = server.client().await;
+    let plant = async || client.get_plant("cut").await.unwrap().plant.unwrap();
+    client.clear_fault("cut", 0).await.unwrap();
+    assert!(plant().await.parameters.is_empty());
+    let stuck = v1::FaultSpec {
+        target: Some(v1::fault_spec::Target::Input("force".to_owned())),
+        kind: Some(v1::fault_spec::Kind::Stuck(true)),
+        ..Default::default()
+    };
+    assert_eq!(client.inject_fault("cut", stuck).await.unwrap().id, 7);
+    assert_eq!(plant().await.feedback.unwrap().horizon, 400);
+}
+
+/// What can be seen of a plant.
+#[derive(Debug, PartialEq)]
+struct Everything {
+    snapshot: Vec<u8>,
+    state: Option<v1::State>,
+    parameters: Vec<v1::Parameter>,
+    faults: Vec<v1::FaultInfo>,
+    channels: v1::GetChannelsResponse,
+    first_step: u64,
+}
+
+async fn everything(client: &Client, id: &str) -> Everything {
+    let plant = client.get_plant(id).await.unwrap().plant.unwrap();
+    Everything {
+        snapshot: client.snapshot(id).await.unwrap(),
+        state: plant.state,
+        parameters: plant.parameters,
+        faults: client.list_faults(id).await.unwrap(),
+        channels: client.get_channels(id).await.unwrap(),
+        first_step: plant.feedback.unwrap().first_step,
     }
 }
 

@@ -356,8 +356,17 @@ impl Plant {
     ///
     /// `M q̇ = p − Dhᵀ μ` on the dynamic rows, with `μ` such that `Dh q̇ = 0`.
     pub fn velocity(&mut self) -> Vec<f64> {
+        let mut velocity = vec![0.0; self.model.dimensions.coordinates()];
+        self.write_velocity(&mut velocity);
+        velocity
+    }
+
+    /// The same into `out`, nd + nk entries; allocates nothing.
+    pub fn write_velocity(&mut self, out: &mut [f64]) {
         self.workspace.find_velocity(&self.model, &self.state);
-        [&self.workspace.residual[..], &self.state.v].concat()
+        let (dynamic, prescribed) = out.split_at_mut(self.workspace.residual.len());
+        dynamic.copy_from_slice(&self.workspace.residual);
+        prescribed.copy_from_slice(&self.state.v);
     }
 
     /// Energy of the state, with the projected momentum. Costs the factorization of a mass matrix;

@@ -100,6 +100,12 @@ impl Actuator {
     pub(crate) fn commit(&mut self) {
         self.memory = self.next;
     }
+
+    /// What it keeps from step to step.
+    pub(super) fn memory(&mut self) -> impl Iterator<Item = &mut f64> {
+        let Memory { before, sample, given } = &mut self.memory;
+        [before, sample, given].into_iter().chain(&mut self.line)
+    }
 }
 
 #[cfg(test)]

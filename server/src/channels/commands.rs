@@ -12,7 +12,7 @@ use v1::output_channel::Source;
 
 use super::Channels;
 use super::declare::{self, check_numbers};
-use super::fault::{Effect, Injected, Schedule, Start};
+use super::fault::{Effect, Injected, Pattern, Schedule, Start};
 use super::timeline::{Base, Change, Timeline};
 use crate::limits::{LimitExceeded, Limits};
 use crate::realtime::event::EventKind;
@@ -40,19 +40,12 @@ struct PresentFault {
 
 impl Present {
     fn of(core: &Core) -> Self {
-        let mechanics = core.mechanics();
-        let base = Base {
-            model: mechanics.model,
-            parameters: Arc::clone(&core.parameters),
-            settings: mechanics.settings,
-        };
+        let base = core.base();
         let Some(channels) = &core.channels else {
-            let (declared, info) = (Arc::default(), Arc::default());
-            let faults = Vec::new();
             return Self {
-                declared,
-                info,
-                faults,
+                declared: Arc::default(),
+                info: Arc::default(),
+                faults: Vec::new(),
                 numbers: 0,
                 is_there: false,
                 base,
@@ -70,14 +63,13 @@ impl Present {
             faults: channels.faults.iter().map(fault).collect(),
             numbers: channels.numbers(),
             is_there: true,
-            base: channels.timeline.as_ref().map_or(base, |timeline| timeline.base().clone()),
+            base,
             is_scheduled: channels.timeline.is_some(),
         }
     }
 }
 
 impl PresentFault {
-    /// As it will be, once it is injected.
     fn of(fault: &Injected) -> Self {
         Self {
             id: fault.id,
@@ -86,6 +78,17 @@ impl PresentFault {
             schedule: fault.schedule,
             is_over: false,
         }
+    }
+
+    /// As it will be, once it is injected. A plant that runs goes on meanwhile: what begins with the next
+    /// step may do so at any.
+    fn next(fault: &Injected) -> Self {
+        let mut next = Self::of(fault);
+        if next.start == Start::Next {
+            let pattern = Pattern::Random { window: 1, probability: 0.5 };
+            next.schedule = Schedule { end: None, pattern, ..next.schedule };
+        }
+        next
     }
 }
 
@@ -138,6 +141,10 @@ impl Session {
                 channels.faults.push(fault);
             }
             number_changes(&mut channels.faults);
+            if let Some(mut timeline) = channels.timeline.take() {
+                timeline.adopt(&mut core.plant, channels.sites_mut());
+                channels.timeline = Some(timeline);
+            }
             channels.begin(&mut core.plant, &core.input);
             let output = channels.output().to_vec();
             core.channels = (!channels.is_empty()).then(|| Box::new(channels));
@@ -176,18 +183,12 @@ impl Session {
         let (model, info) = (&present.base.model, &present.info);
         let mut fault = declare::fault(id, given, model, time_step_s, info, limits)?;
         fault.schedule(step, time_s, time_step_s);
-        let next = PresentFault::of(&fault);
+        let next = PresentFault::next(&fault);
         let stay = present.faults.iter().filter(|fault| !gone.contains(&fault.id));
         let all = stay.chain(std::iter::once(&next));
         let timeline = timeline(&present.base, &present.declared, all, limits)?;
         check_numbers(present.numbers.saturating_add(fault.numbers()), limits)?;
-        let spare = if present.is_there {
-            None
-        } else {
-            let none = v1::Channels::default();
-            let mut plant = self.copy_plants().swap_remove(0);
-            Some(Box::new(declare::channels(none, &mut plant, limits)?))
-        };
+        let spare = self.spare_channels(&present, limits)?;
         let room = Vec::with_capacity(count);
         let (info, former, spent) = self
             .with_core(move |core| {
@@ -211,6 +212,59 @@ impl Session {
             .ok_or_else(|| Fault::internal("channels are gone"))?;
         drop((former, spent));
         Ok(info)
+    }
+
+    /// Channels without any, to hold faults, where there are none.
+    fn spare_channels(
+        &self,
+        present: &Present,
+        limits: &Limits,
+    ) -> Result<Option<Box<Channels>>, Fault> {
+        if present.is_there {
+            return Ok(None);
+        }
+        let mut plant = self.copy_plants().swap_remove(0);
+        let channels = declare::channels(v1::Channels::default(), &mut plant, limits)?;
+        Ok(Some(Box::new(channels)))
+    }
+
+    /// Gives a plant without faults those that it was saved with, `count` of them so far. The plant is to be
+    /// restored after it.
+    pub(crate) fn resume_faults(
+        &self,
+        saved: Vec<v1::SavedFault>,
+        count: u64,
+        limits: &Limits,
+    ) -> Result<(), Fault> {
+        let _replacing = self.replacing();
+        let present = self.with_core(|core| Present::of(core));
+        LimitExceeded::check("faults", limits.faults, "faults", saved.len())?;
+        let (model, h) = (&present.base.model, present.base.settings.time_step_s);
+        let mut faults = Vec::new();
+        for v1::SavedFault { id, fault, start_step } in saved {
+            let given = fault.unwrap_or_default();
+            let mut fault = declare::fault(id, given, model, h, &present.info, limits)?;
+            fault.begin_at(start_step);
+            fault.keep_start();
+            faults.push(fault);
+        }
+        let numbers = faults.iter().map(Injected::numbers).fold(present.numbers, usize::saturating_add);
+        check_numbers(numbers, limits)?;
+        number_changes(&mut faults);
+        let all: Vec<_> = faults.iter().map(PresentFault::of).collect();
+        let timeline = timeline(&present.base, &present.declared, all.iter(), limits)?;
+        let spare = if faults.is_empty() { None } else { self.spare_channels(&present, limits)? };
+        self.with_core(move |core| {
+            core.faults = count;
+            if core.channels.is_none() {
+                core.channels = spare;
+            }
+            if let Some(channels) = &mut core.channels {
+                channels.faults = faults;
+                channels.timeline = timeline;
+            }
+        });
+        Ok(())
     }
 
     /// Clears a fault, or with 0 all of them; returns how many.

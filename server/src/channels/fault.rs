@@ -8,9 +8,10 @@ use std::sync::Arc;
 
 use plantd_models::{Plant, Site};
 use plantd_proto::v1;
+use prost::Message as _;
 use v1::fault_spec::{Pattern as GivenPattern, Start as GivenStart};
 
-use super::noise::Stream;
+use super::noise::{self, Stream};
 
 /// When a fault is active, in steps of the plant. On inputs, and of pushes, `k` is the step from `k` to
 /// `k + 1`; on outputs the measurement at `k`.
@@ -201,6 +202,11 @@ impl Line {
     fn commit(&mut self) {
         std::mem::swap(&mut self.held, &mut self.next);
     }
+
+    /// What it keeps from step to step.
+    fn memory(&mut self) -> impl Iterator<Item = &mut f64> {
+        self.held.iter_mut().chain(&mut self.late)
+    }
 }
 
 /// Whether and with which numbers a fault acts in a step.
@@ -220,6 +226,8 @@ pub(crate) struct Injected {
     duration: Option<u64>,
     /// As it was asked for.
     pub(crate) given: Arc<v1::FaultSpec>,
+    /// Hash of that.
+    hash: u64,
     stream: Stream,
     /// It was active in the last step.
     pub(crate) is_active: bool,
@@ -244,6 +252,7 @@ impl Injected {
             effect,
             start,
             duration,
+            hash: noise::hash(&given.encode_to_vec()),
             given: Arc::new(given),
             stream: Stream::of("fault").part(id as usize),
             is_active: false,
@@ -255,19 +264,28 @@ impl Injected {
     /// Binds it to steps of a plant that is at a step and time.
     pub(crate) fn schedule(&mut self, step: u64, time_s: f64, time_step_s: f64) {
         let is_output = matches!(self.effect, Effect::Output { .. });
-        self.schedule.start = self.start.step(step, time_s, time_step_s, is_output);
-        self.schedule.end = self.duration.map(|steps| self.schedule.start.saturating_add(steps));
+        self.begin_at(self.start.step(step, time_s, time_step_s, is_output));
+    }
+
+    /// Binds it to the step with which it begins.
+    pub(crate) fn begin_at(&mut self, step: u64) {
+        self.schedule.start = step;
+        self.schedule.end = self.duration.map(|steps| step.saturating_add(steps));
     }
 
     /// Binds it to steps of a plant for good, and begins at its state.
     pub(crate) fn place(&mut self, plant: &Plant, input: &[f64], output: &[f64]) {
         let h = plant.settings().time_step_s;
         self.schedule(plant.step_index(), plant.time_s(), h);
-        self.start = match self.start {
-            Start::Next => Start::Step(self.schedule.start),
-            start => start,
-        };
+        self.keep_start();
         self.begin(input, output);
+    }
+
+    /// The next step is this one from now on.
+    pub(crate) fn keep_start(&mut self) {
+        if self.start == Start::Next {
+            self.start = Start::Step(self.schedule.start);
+        }
     }
 
     pub(crate) fn is_active_at(&self, step: u64, seed: u64) -> bool {
@@ -348,6 +366,35 @@ impl Injected {
             beginnings: self.beginnings,
             refused: false,
         }
+    }
+
+    /// What it keeps from one step to the next.
+    pub(super) fn memory(&mut self) -> v1::FaultMemory {
+        let fault = self.hash ^ self.schedule.start;
+        let (active, beginnings) = (self.is_active, self.beginnings);
+        let numbers = self.numbers_mut().map(|number| *number).collect();
+        v1::FaultMemory { id: self.id, fault, numbers, active, beginnings }
+    }
+
+    /// Goes on with what it kept, if it was this one.
+    pub(super) fn recall(&mut self, memory: &v1::FaultMemory) {
+        if (self.id, self.hash ^ self.schedule.start) != (memory.id, memory.fault)
+            || self.numbers_mut().count() != memory.numbers.len()
+        {
+            return;
+        }
+        (self.is_active, self.beginnings) = (memory.active, memory.beginnings);
+        for (number, kept) in self.numbers_mut().zip(&memory.numbers) {
+            *number = *kept;
+        }
+    }
+
+    fn numbers_mut(&mut self) -> impl Iterator<Item = &mut f64> {
+        let line = match &mut self.effect {
+            Effect::Input(line) | Effect::Output { line, .. } => Some(line),
+            Effect::Push { .. } | Effect::Parameters { .. } => None,
+        };
+        line.into_iter().flat_map(Line::memory)
     }
 
     /// Disturbs the input of the step from `step`.

@@ -16,8 +16,9 @@ pub(crate) mod timeline;
 
 use std::sync::Arc;
 
-use plantd_models::{Plant, Site, StepError};
+use plantd_models::{Plant, Site};
 use plantd_proto::v1;
+use prost::Message as _;
 
 use self::actuator::Actuator;
 use self::fault::{Effect, Injected};
@@ -38,12 +39,12 @@ pub struct Channels {
     pub(crate) declared: Arc<v1::Channels>,
     /// The same with times in whole steps.
     pub(crate) info: Arc<v1::ChannelsInfo>,
+    /// Hash of what was declared.
+    hash: u64,
     output: Vec<f64>,
     /// Of each sensor: 1 where its numbers stand for lost ones, else 0.
     lost: Vec<f64>,
     rates: Option<Box<Rates>>,
-    impulse: Vec<f64>,
-    has_impulse: bool,
 }
 
 /// Velocities and accelerations by differences.
@@ -53,8 +54,8 @@ struct Rates {
     velocity: Vec<f64>,
     acceleration: Vec<f64>,
     change: Vec<f64>,
-    /// No step was taken since the beginning.
-    is_new: bool,
+    /// Part of a step from the time of `velocity` to that of `q`.
+    age: f64,
 }
 
 impl Channels {
@@ -67,14 +68,14 @@ impl Channels {
         info: v1::ChannelsInfo,
         plant: &mut Plant,
     ) -> Self {
-        let (n, nd) = (plant.q().len(), plant.p().len());
+        let n = plant.q().len();
         let needs_rates = |sensor: &Sensor| {
             matches!(sensor.source, sensor::Source::Velocity(_) | sensor::Source::Acceleration(_))
         };
         let rates = sensors.iter().any(needs_rates).then(|| {
             let zeros = || vec![0.0; n];
             let (q, velocity, acceleration, change) = (zeros(), zeros(), zeros(), zeros());
-            Box::new(Rates { q, velocity, acceleration, change, is_new: true })
+            Box::new(Rates { q, velocity, acceleration, change, age: 0.0 })
         });
         let mut channels = Self {
             seed,
@@ -84,11 +85,10 @@ impl Channels {
             actuators,
             faults: Vec::new(),
             timeline: None,
+            hash: noise::hash(&declared.encode_to_vec()),
             declared: Arc::new(declared),
             info: Arc::new(info),
             rates,
-            impulse: vec![0.0; nd],
-            has_impulse: false,
         };
         let mut input = vec![0.0; plant.model().dimensions().input()];
         plant.hold_input(&mut input);
@@ -114,13 +114,16 @@ impl Channels {
         &self.lost
     }
 
-    /// Begins at the present state: everything on its way has the value it has here. Allocates.
+    /// Begins at the present state: everything on its way has the value it has here.
     pub(crate) fn begin(&mut self, plant: &mut Plant, input: &[f64]) {
+        if let Some(timeline) = &mut self.timeline {
+            timeline.begin();
+        }
         if let Some(rates) = &mut self.rates {
             rates.q.copy_from_slice(plant.q());
-            rates.velocity.copy_from_slice(&plant.velocity());
+            plant.write_velocity(&mut rates.velocity);
             rates.acceleration.fill(0.0);
-            rates.is_new = true;
+            rates.age = 0.0;
         }
         let mut at = instant(plant, self.rates.as_deref(), input, self.seed);
         for sensor in &mut self.sensors {
@@ -153,10 +156,48 @@ impl Channels {
         })
     }
 
-    /// Turns what is given as input into what acts on the plant in its next step. Until
-    /// [`Channels::measure`] a step can be tried any number of times. False when nothing acts on inputs.
-    pub(crate) fn actuate(&mut self, plant: &Plant, input: &mut [f64]) -> bool {
-        self.has_impulse = false;
+    /// Everything that is under way.
+    pub(crate) fn memory(&mut self) -> v1::ChannelMemory {
+        v1::ChannelMemory {
+            declared: self.hash,
+            numbers: self.numbers_mut().map(|number| *number).collect(),
+            faults: self.faults.iter_mut().map(Injected::memory).collect(),
+        }
+    }
+
+    /// Goes on with what was under way, in the channels and faults that are those of then.
+    pub(crate) fn recall(&mut self, memory: &v1::ChannelMemory) {
+        if self.hash == memory.declared && self.numbers_mut().count() == memory.numbers.len() {
+            for (number, kept) in self.numbers_mut().zip(&memory.numbers) {
+                *number = *kept;
+            }
+        }
+        for fault in &mut self.faults {
+            memory.faults.iter().for_each(|memory| fault.recall(memory));
+        }
+    }
+
+    /// What the channels keep from one step to the next, and what they deliver.
+    fn numbers_mut(&mut self) -> impl Iterator<Item = &mut f64> {
+        let Self { sensors, actuators, output, lost, rates, .. } = self;
+        let rates = rates.iter_mut().flat_map(|rates| {
+            let Rates { q, velocity, age, .. } = &mut **rates;
+            q.iter_mut().chain(velocity).chain(Some(age))
+        });
+        let sensors = sensors.iter_mut().flat_map(Sensor::memory);
+        let actuators = actuators.iter_mut().flat_map(Actuator::memory);
+        rates.chain(sensors).chain(actuators).chain(output).chain(lost)
+    }
+
+    /// Turns what is given as input into what acts on the plant in its next step, and adds the impulses of
+    /// pushes; an empty `impulse` is none. Until [`Channels::measure`] a step can be tried any number of
+    /// times. False when nothing acts on inputs.
+    pub(crate) fn actuate(
+        &mut self,
+        plant: &Plant,
+        input: &mut [f64],
+        impulse: &mut Vec<f64>,
+    ) -> bool {
         // The plant will refuse it by name.
         if input.iter().any(|value| !value.is_finite()) {
             return false;
@@ -173,29 +214,13 @@ impl Channels {
             if let Effect::Push { site, force, torque } = &fault.effect
                 && fault.is_active_at(step, self.seed)
             {
-                if !std::mem::replace(&mut self.has_impulse, true) {
-                    self.impulse.fill(0.0);
-                }
                 let h = plant.settings().time_step_s;
                 let over_step = |wrench: &[f64; 3]| wrench.map(|component| h * component);
-                plant.add_wrench(site, over_step(force), over_step(torque), &mut self.impulse);
+                impulse.resize(plant.p().len(), 0.0);
+                plant.add_wrench(site, over_step(force), over_step(torque), impulse);
             }
         }
         acts
-    }
-
-    /// Pushes fell into the last step.
-    pub(crate) fn pushes(&self) -> bool {
-        self.has_impulse
-    }
-
-    /// Takes the step, with the pushes that fall into it.
-    pub(crate) fn advance<T>(
-        &self,
-        plant: &mut Plant,
-        step: impl FnOnce(&mut Plant) -> Result<T, StepError>,
-    ) -> Result<T, StepError> {
-        if self.has_impulse { plant.with_impulse(&self.impulse, step) } else { step(plant) }
     }
 
     /// Measures after a step with an input, and notes that it was taken.
@@ -233,10 +258,10 @@ impl Channels {
     fn write_output(&mut self, step: u64) {
         let mut rest = &mut self.output[..];
         for (sensor, lost) in self.sensors.iter().zip(&mut self.lost) {
-            let (values, is_lost) = sensor.present(step);
+            let values = sensor.present(step);
             let (part, after) = rest.split_at_mut(sensor.source.width());
             part.copy_from_slice(&values[..part.len()]);
-            (rest, *lost) = (after, f64::from(u8::from(is_lost)));
+            (rest, *lost) = (after, values[3]);
         }
     }
 
@@ -276,8 +301,8 @@ impl Rates {
         plant.model().write_difference(&self.q, plant.q(), &mut self.change);
         self.q.copy_from_slice(plant.q());
         // The velocity at a beginning belongs to its time, all others to the middle of a step.
-        let apart = if self.is_new { 0.5 * h } else { h };
-        self.is_new = false;
+        let apart = (self.age + 0.5) * h;
+        self.age = 0.5;
         for (i, change) in self.change.iter().enumerate() {
             let velocity = change / h;
             self.acceleration[i] = (velocity - self.velocity[i]) / apart;

@@ -12,8 +12,7 @@ pub(crate) struct Stream(u64);
 impl Stream {
     /// The stream of a name: of a channel or a fault.
     pub(crate) fn of(name: &str) -> Self {
-        let byte = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
-        Self(name.bytes().fold(0xcbf2_9ce4_8422_2325, byte))
+        Self(hash(name.as_bytes()))
     }
 
     /// One of many streams beside this one.
@@ -37,6 +36,12 @@ impl Stream {
         let radius = (-2.0 * libm::log(unit(bits))).sqrt();
         radius * libm::cos(TAU * unit(mix(bits ^ GOLDEN)))
     }
+}
+
+/// The 64-bit FNV-1a hash.
+pub(crate) fn hash(bytes: &[u8]) -> u64 {
+    let byte = |hash: u64, byte: &u8| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3);
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, byte)
 }
 
 const GOLDEN: u64 = 0x9E37_79B9_7F4A_7C15;

@@ -98,11 +98,10 @@ pub(crate) struct Sensor {
     pub(crate) source: Source,
     pub(crate) settings: SensorSettings,
     stream: Stream,
-    /// The last sample, and whether it stands for one that was lost.
-    reading: [f64; 3],
-    lost: bool,
+    /// The last sample, and 1 where it stands for one that was lost, else 0.
+    reading: [f64; 4],
     /// Samples on their way, by steps.
-    line: Vec<([f64; 3], bool)>,
+    line: Vec<[f64; 4]>,
 }
 
 impl Sensor {
@@ -111,17 +110,15 @@ impl Sensor {
             source,
             settings,
             stream: Stream::of(name),
-            reading: [0.0; 3],
-            lost: false,
-            line: vec![([0.0; 3], false); settings.latency + 1],
+            reading: [0.0; 4],
+            line: vec![[0.0; 4]; settings.latency + 1],
         }
     }
 
     /// Begins at a state: all that was under way has its value.
     pub(crate) fn begin(&mut self, at: &mut Instant<'_>) {
         self.sample(at);
-        self.lost = false;
-        self.line.fill((self.reading, false));
+        self.line.fill(self.reading);
     }
 
     /// Measures after a step.
@@ -129,18 +126,24 @@ impl Sensor {
         let step = at.plant.step_index();
         if step.is_multiple_of(self.settings.period) {
             let chance = self.settings.drop_out;
-            self.lost = chance > 0.0 && self.stream.part(3).uniform(at.seed, step) <= chance;
-            if !self.lost {
+            if chance > 0.0 && self.stream.part(3).uniform(at.seed, step) <= chance {
+                self.reading[3] = 1.0;
+            } else {
                 self.sample(at);
             }
         }
         let length = self.line.len() as u64;
-        self.line[(step % length) as usize] = (self.reading, self.lost);
+        self.line[(step % length) as usize] = self.reading;
     }
 
-    /// What it delivers at a step, and whether that stands for a lost sample.
-    pub(crate) fn present(&self, step: u64) -> ([f64; 3], bool) {
+    /// What it delivers at a step, and 1 if that stands for a lost sample, else 0.
+    pub(crate) fn present(&self, step: u64) -> [f64; 4] {
         self.line[((step + 1) % self.line.len() as u64) as usize]
+    }
+
+    /// What it keeps from step to step.
+    pub(super) fn memory(&mut self) -> impl Iterator<Item = &mut f64> {
+        self.reading.iter_mut().chain(self.line.as_flattened_mut())
     }
 
     fn sample(&mut self, at: &mut Instant<'_>) {
@@ -154,6 +157,7 @@ impl Sensor {
             }
             self.reading[part] = quantised(reading, quantum).max(min).min(max);
         }
+        self.reading[3] = 0.0;
     }
 }
 

@@ -23,6 +23,8 @@ const BLINKING_MAX: usize = 6;
 #[derive(Clone, Debug)]
 pub(crate) struct Timeline {
     base: Base,
+    /// What the changed numbers are without changes.
+    unchanged: Arc<Parameters>,
     /// By set; the first has no changes. That of the set in force holds what the core had before.
     entries: Vec<Entry>,
     /// Which entry's plant the core has.
@@ -36,6 +38,8 @@ pub(crate) struct Timeline {
 #[derive(Clone, Debug)]
 struct Entry {
     set: Set,
+    /// Of the set's model, wherever its plant is.
+    digest: u64,
     plant: Plant,
     parameters: Arc<Parameters>,
     /// Those of outputs and pushes, in the order of [`super::Channels::sites_mut`].
@@ -56,6 +60,15 @@ pub(crate) struct Base {
     pub(crate) settings: Settings,
 }
 
+/// What a recorder needs to know of changes to come.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Announced {
+    /// What the numbers are without changes.
+    pub(crate) unchanged: Arc<Parameters>,
+    /// Digests of the models that can be in force, with what is changed in them.
+    pub(crate) models: Vec<(u64, Arc<Parameters>)>,
+}
+
 impl Timeline {
     /// Compiles a model for each set: call it on a worker.
     pub(crate) fn new(
@@ -64,7 +77,7 @@ impl Timeline {
         sites: impl Fn(&Model) -> Vec<Site>,
         limits: &Limits,
     ) -> Result<Self, Fault> {
-        let mut entries = Vec::new();
+        let (mut entries, mut unchanged) = (Vec::new(), Parameters::new());
         for set in sets(changes, limits)? {
             let (mut model, mut parameters) =
                 (Arc::clone(&base.model), Arc::clone(&base.parameters));
@@ -72,21 +85,35 @@ impl Timeline {
             for (_, change) in chosen {
                 let changed = parameters::change(&model, &parameters, &change.numbers);
                 let changed = changed.map_err(refused)?;
+                // The first change of a number in a set is one of the base.
+                for (path, former) in changed.former {
+                    unchanged.entry(path).or_insert(former);
+                }
                 (model, parameters) = (Arc::new(changed.model), Arc::new(changed.parameters));
             }
             let (what, count) = ("numbers of the scene changed", parameters.len());
             LimitExceeded::check("parameters", limits.parameters, what, count)?;
-            let sites = sites(&model);
+            let (digest, sites) = (model.digest(), sites(&model));
             let plant = Plant::new(model, base.settings);
             let plant = plant.map_err(|error| Fault::from_initial(error, "fault.parameters"))?;
-            entries.push(Entry { set, plant, parameters, sites });
+            entries.push(Entry { set, digest, plant, parameters, sites });
         }
-        Ok(Self { base: base.clone(), entries, current: None, asked: None, is_refused: false })
+        let (base, unchanged) = (base.clone(), Arc::new(unchanged));
+        Ok(Self { base, unchanged, entries, current: None, asked: None, is_refused: false })
     }
 
     /// The mechanics without changes.
     pub(crate) fn base(&self) -> &Base {
         &self.base
+    }
+
+    /// What a recorder needs to know.
+    pub(crate) fn announced(&self) -> Announced {
+        let model = |entry: &Entry| (entry.digest, Arc::clone(&entry.parameters));
+        Announced {
+            unchanged: Arc::clone(&self.unchanged),
+            models: self.entries.iter().map(model).collect(),
+        }
     }
 
     /// Puts the plant of a set in force, if it is not; true when it has changed. Allocates nothing unless
@@ -102,31 +129,70 @@ impl Timeline {
         }
         self.asked = Some(set);
         let wanted = self.entries.iter().position(|entry| entry.set == set);
-        if wanted.is_some() && wanted == self.current {
-            self.is_refused = false;
+        let taken = wanted.filter(|wanted| self.can_enter(*wanted, plant));
+        self.is_refused = taken.is_none();
+        taken.is_some_and(|wanted| self.enter(wanted, plant, sites))
+    }
+
+    /// Finds the plant that the core has among its own, or one that is equal.
+    pub(crate) fn adopt<'a>(
+        &mut self,
+        plant: &mut Plant,
+        sites: impl Iterator<Item = &'a mut Site>,
+    ) {
+        let same = self.entries.iter().position(|entry| entry.digest == plant.model().digest());
+        if let Some(same) = same.filter(|same| self.can_enter(*same, plant)) {
+            self.enter(same, plant, sites);
+        }
+    }
+
+    /// A copy of one of the plants is to take the place of the one in force: prepares everything else for
+    /// it. True when it is another one.
+    pub(crate) fn prepare_for<'a>(
+        &mut self,
+        copy: &Plant,
+        plant: &mut Plant,
+        sites: impl Iterator<Item = &'a mut Site>,
+    ) -> bool {
+        let digest = copy.model().digest();
+        let same = self.entries.iter().position(|entry| entry.digest == digest);
+        same.is_some_and(|same| self.enter(same, plant, sites))
+    }
+
+    /// The plant is in another state: what could not be done may be possible.
+    pub(crate) fn begin(&mut self) {
+        self.asked = None;
+        self.is_refused = false;
+    }
+
+    fn can_enter(&mut self, wanted: usize, plant: &Plant) -> bool {
+        Some(wanted) == self.current || self.entries[wanted].plant.go_on_from(plant).is_ok()
+    }
+
+    /// Changes places with an entry, if it is not in force.
+    fn enter<'a>(
+        &mut self,
+        wanted: usize,
+        plant: &mut Plant,
+        sites: impl Iterator<Item = &'a mut Site>,
+    ) -> bool {
+        if Some(wanted) == self.current {
             return false;
         }
-        let taken = wanted.filter(|&wanted| self.entries[wanted].plant.go_on_from(plant).is_ok());
-        self.is_refused = taken.is_none();
-        let Some(wanted) = taken else { return false };
         let entry = &mut self.entries[wanted];
         std::mem::swap(plant, &mut entry.plant);
         for (present, site) in sites.zip(&mut entry.sites) {
             std::mem::swap(present, site);
         }
-        if let Some(current) = self.current {
-            self.put_back(wanted, current);
-        }
-        self.current = Some(wanted);
-        true
-    }
-
-    /// What was in force goes from the place of its successor to its own.
-    fn put_back(&mut self, from: usize, to: usize) {
-        if let Ok([from, to]) = self.entries.get_disjoint_mut([from, to]) {
+        // What was in force goes from the place of its successor to its own.
+        if let Some(current) = self.current
+            && let Ok([from, to]) = self.entries.get_disjoint_mut([wanted, current])
+        {
             std::mem::swap(&mut from.plant, &mut to.plant);
             std::mem::swap(&mut from.sites, &mut to.sites);
         }
+        self.current = Some(wanted);
+        true
     }
 
     /// Numbers that are changed in the set in force.
@@ -140,23 +206,6 @@ impl Timeline {
             if self.current == Some(index) { present.clone() } else { entry.plant.clone() }
         };
         self.entries.iter().enumerate().map(plant).collect()
-    }
-
-    /// A copy of one of the plants has taken the place of the one in force, which is `former`. Returns what is
-    /// left, and the numbers that are changed now.
-    pub(crate) fn replaced(
-        &mut self,
-        former: Plant,
-        present: &Plant,
-    ) -> (Plant, Option<Arc<Parameters>>) {
-        self.asked = None;
-        let rest = match self.current.take() {
-            Some(current) => std::mem::replace(&mut self.entries[current].plant, former),
-            None => former,
-        };
-        let is_it = |entry: &&Entry| Arc::ptr_eq(entry.plant.model(), present.model());
-        let parameters = self.entries.iter().find(is_it).map(|entry| Arc::clone(&entry.parameters));
-        (rest, parameters)
     }
 }
 

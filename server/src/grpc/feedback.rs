@@ -115,7 +115,7 @@ pub(crate) async fn set_feedback(
         move |abandoned: &Abandoned| {
             let _permit = permit;
             let mode = mode(request.mode)?;
-            let guard = guard(request.guard, mode, session.model())?;
+            let guard = guard(&request.guard, mode, session.model())?;
             let first_step = request.first_step;
             let mechanics = session.mechanics();
             let is_trajectory = matches!(request.reference, Some(Form::Trajectory(_)));
@@ -125,6 +125,7 @@ pub(crate) async fn set_feedback(
             if !request.stages.is_empty() && !is_trajectory {
                 return Err(Fault::field("stages", "are for trajectories only"));
             }
+            let given = is_trajectory.then(|| request.clone());
             let constraints = Constraints::new(request.constraints)?;
             let reference = reference(&hub, request.reference, &mechanics)?;
             let model = &mechanics.model;
@@ -141,8 +142,14 @@ pub(crate) async fn set_feedback(
                 _ => (Some(convert::weights(request.weights, model)?), None),
             };
             let time_step_s = mechanics.settings.time_step_s;
-            let spec = Spec { reference, weights, trajectory_weights, constraints, time_step_s };
-            let spec = Arc::new(spec);
+            let spec = Arc::new(Spec {
+                reference,
+                weights,
+                trajectory_weights,
+                constraints,
+                time_step_s,
+                given,
+            });
             let law = solve(&hub, &spec, &mechanics, abandoned)?;
             if session.is_closed() {
                 return Err(Fault::plant_deleted(session.id()));
@@ -168,7 +175,7 @@ fn mode(mode: i32) -> Result<Mode, Fault> {
     }
 }
 
-fn guard(bounds: Vec<v1::Bound>, mode: Mode, model: &Model) -> Result<Vec<GuardBound>, Fault> {
+fn guard(bounds: &[v1::Bound], mode: Mode, model: &Model) -> Result<Vec<GuardBound>, Fault> {
     match (mode, bounds.is_empty()) {
         (Mode::Guard, true) => return Err(Fault::field("guard", "is missing: the mode needs it")),
         (Mode::Guard, false) | (_, true) => {}
@@ -179,11 +186,11 @@ fn guard(bounds: Vec<v1::Bound>, mode: Mode, model: &Model) -> Result<Vec<GuardB
         let problem = format!("has {} entries; the state has {}", bounds.len(), names.len());
         return Err(Fault::field("guard", problem));
     }
-    let bound = |(i, bound): (usize, v1::Bound)| {
-        let (index, min, max) = convert::bound(&format!("guard[{i}]"), &bound, &names)?;
-        Ok(GuardBound { index, name: bound.entry, min, max })
+    let bound = |(i, bound): (usize, &v1::Bound)| {
+        let (index, min, max) = convert::bound(&format!("guard[{i}]"), bound, &names)?;
+        Ok(GuardBound { index, name: bound.entry.clone(), min, max })
     };
-    bounds.into_iter().enumerate().map(bound).collect()
+    bounds.iter().enumerate().map(bound).collect()
 }
 
 fn reference(hub: &Hub, form: Option<Form>, mechanics: &Mechanics) -> Result<Reference, Fault> {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use plantd_models::{Initial, Snapshot, State};
+use plantd_models::{Dimensions, Initial, State};
 use plantd_proto::v1;
 use tonic::{Request, Response, Status, Streaming};
 
@@ -11,7 +11,7 @@ use super::{Answers, cut_page, feedback, run, watch};
 use crate::convert::{self, Inputs, Start};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
-use crate::session::{Core, DriverKind, Lease, Session};
+use crate::session::{Core, DriverKind, Lease, PlantSnapshot, Session};
 use crate::status::Fault;
 use crate::workers::Abandoned;
 
@@ -76,10 +76,14 @@ impl PlantService {
         let plan = StepPlan {
             steps: inputs.count().saturating_add(request.hold as usize),
             inputs,
+            impulses: impulses(request.impulses, dimensions)?,
             all_states: request.all_states,
         };
         if plan.steps == 0 {
             return Err(Fault::field("u", "and `hold` are both empty: no step is asked for"));
+        }
+        if plan.impulses.count() > plan.steps {
+            return Err(Fault::field("impulses", "has more rows than there are steps"));
         }
         let limits = &self.hub.limits;
         LimitExceeded::check("steps_per_call", limits.steps_per_call, "steps", plan.steps)?;
@@ -112,9 +116,17 @@ impl PlantService {
     }
 }
 
+fn impulses(given: Option<v1::Matrix>, dimensions: Dimensions) -> Result<Inputs, Fault> {
+    if given.iter().flat_map(|given| &given.data).any(|impulse| !impulse.is_finite()) {
+        return Err(Fault::field("impulses.data", "must be finite"));
+    }
+    Inputs::new("impulses", given, dimensions.dynamic)
+}
+
 /// The steps of one Step call.
 struct StepPlan {
     inputs: Inputs,
+    impulses: Inputs,
     steps: usize,
     all_states: bool,
 }
@@ -148,7 +160,9 @@ impl StepPlan {
                     response.outputs = core.outputs();
                 }
             };
-            let taken = lease.step_and(u, None, look);
+            let pushed = k < self.impulses.count();
+            let impulse = if pushed { self.impulses.get(k) } else { &[] };
+            let taken = lease.step_pushed_and(u, impulse, None, look);
             taken.map_err(|error| {
                 Fault::from_drive(error, lease.session().id()).with("steps_taken", k)
             })?;
@@ -303,7 +317,7 @@ impl v1::plant_service_server::PlantService for PlantService {
         let change = move |lease: &mut Lease| match initial {
             None => lease.reset().map_err(|error| Fault::from_initial(error, "initial")),
             Some(initial) => match convert::start(Some(initial), &model, &hub.limits)? {
-                Start::Snapshot(snapshot) => Ok(lease.restore(&snapshot)?),
+                Start::Snapshot(snapshot) => Ok(lease.restore(*snapshot)?),
                 Start::Initial(initial) => initialize(lease, &initial),
             },
         };
@@ -327,8 +341,8 @@ impl v1::plant_service_server::PlantService for PlantService {
     ) -> Result<Response<v1::RestoreResponse>, Status> {
         let v1::RestoreRequest { id, snapshot } = request.into_inner();
         let change = move |lease: &mut Lease| {
-            let snapshot = Snapshot::from_bytes(&snapshot)?;
-            Ok(lease.restore(&snapshot)?)
+            let snapshot = PlantSnapshot::from_bytes(&snapshot)?;
+            Ok(lease.restore(snapshot)?)
         };
         let state = Some(self.put(&id, change).await?);
         Ok(Response::new(v1::RestoreResponse { state }))

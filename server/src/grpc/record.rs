@@ -34,7 +34,7 @@ impl RecordingService {
         job: impl FnOnce(&Hub, &Recordings) -> Result<R, Fault> + Send + 'static,
     ) -> Result<R, Fault> {
         let hub = Arc::clone(&self.hub);
-        wait(move || job(&hub, recordings(&hub)?)).await
+        recordings(&self.hub)?.wait(move || job(&hub, recordings(&hub)?)).await
     }
 }
 
@@ -45,28 +45,21 @@ fn recordings(hub: &Hub) -> Result<&Recordings, Fault> {
     })
 }
 
-async fn wait<R: Send + 'static>(
-    job: impl FnOnce() -> Result<R, Fault> + Send + 'static,
-) -> Result<R, Fault> {
-    let outcome = tokio::task::spawn_blocking(job).await;
-    outcome.unwrap_or_else(|error| Err(Fault::internal(error.to_string())))
-}
-
 /// A file, piece by piece, up to the length that it had.
-fn pieces(file: File, length: u64) -> Answers<v1::GetRecordingResponse> {
-    Box::pin(stream::try_unfold((file, length), |(file, left)| async move {
+fn pieces(hub: Arc<Hub>, file: File, length: u64) -> Answers<v1::GetRecordingResponse> {
+    Box::pin(stream::try_unfold((hub, file, length), |(hub, file, left)| async move {
         let read = move || {
             let mut data = Vec::new();
             let outcome = (&file).take(left.min(PIECE_BYTES)).read_to_end(&mut data);
             outcome.map_err(|error| Fault::internal(error.to_string()))?;
             Ok((file, data))
         };
-        let (file, data) = wait(read).await?;
+        let (file, data) = recordings(&hub)?.wait(read).await?;
         if data.is_empty() {
             return Ok(None);
         }
         let left = left - data.len() as u64;
-        Ok(Some((v1::GetRecordingResponse { data }, (file, left))))
+        Ok(Some((v1::GetRecordingResponse { data }, (hub, file, left))))
     }))
 }
 
@@ -115,7 +108,7 @@ impl v1::recording_service_server::RecordingService for RecordingService {
     ) -> Result<Response<Self::GetRecordingStream>, Status> {
         let name = request.into_inner().name;
         let (file, left) = self.run(move |_, recordings| recordings.file(&name)).await?;
-        Ok(Response::new(self.hub.until_ending(pieces(file, left))))
+        Ok(Response::new(self.hub.until_ending(pieces(Arc::clone(&self.hub), file, left))))
     }
 
     async fn delete_recording(

@@ -45,7 +45,7 @@ kinds! {
     DriverLeft,
     /// A watchdog acted; `index` is that of the watchdog, `value` the quantity's.
     Watchdog,
-    /// A step failed and the plant stands still; `value` is the residual, if there is one.
+    /// A step was refused or failed; `value` is the residual, if there is one.
     StepFailed,
     /// The plant was put into another state.
     StateSet,

@@ -342,11 +342,9 @@ impl Runner {
     }
 
     fn step_failed(&mut self, error: DriveError) -> Result<u64, Stop> {
-        let residual = match &error {
-            DriveError::Step(plantd_models::StepError::NotConverged { residual, .. }) => *residual,
-            _ => 0.0,
-        };
-        self.core.note(EventKind::StepFailed, 0, residual);
+        if let DriveError::Step(error) = &error {
+            self.core.note_failure(error);
+        }
         match self.core.on_step_failure() {
             Some(WatchdogAction::Reset) if self.core.go_home() => {
                 self.ticks += 1;

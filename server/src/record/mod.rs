@@ -22,6 +22,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use plantd_proto::v1::{self, RecordingStatus};
+use tokio::sync::Semaphore;
 use tonic::Code;
 
 use self::recorder::{Options, Recorder, StartError, sentence};
@@ -36,19 +37,39 @@ const CHECKPOINT_INTERVAL_S: f64 = 5.0;
 /// Longest and shortest time that can be asked for, s.
 const CHECKPOINT_INTERVAL_RANGE_S: (f64, f64) = (0.1, 86_400.0);
 
+/// Calls that may wait for the disk at a time.
+const WAITING_MAX: usize = 8;
+
 /// The recordings in a directory.
 pub struct Recordings {
     directory: PathBuf,
     limits: Limits,
-    /// Those that this server has begun.
-    own: Mutex<BTreeMap<String, Arc<Recorder>>>,
+    /// Those that this server has begun; none while it begins. Nobody waits for the disk with this in hand.
+    own: Mutex<BTreeMap<String, Option<Arc<Recorder>>>>,
+    /// Permits to wait for the disk: one that does not answer holds no more threads than these.
+    permits: Arc<Semaphore>,
 }
 
 impl Recordings {
     /// The recordings in a directory, made if there is none.
     pub fn open(directory: &Path, limits: Limits) -> io::Result<Self> {
         fs::create_dir_all(directory)?;
-        Ok(Self { directory: directory.to_owned(), limits, own: Mutex::default() })
+        let permits = Arc::new(Semaphore::new(WAITING_MAX));
+        Ok(Self { directory: directory.to_owned(), limits, own: Mutex::default(), permits })
+    }
+
+    /// Does something for which the disk is waited for, on a thread that may wait.
+    pub async fn wait<R: Send + 'static>(
+        &self,
+        job: impl FnOnce() -> Result<R, Fault> + Send + 'static,
+    ) -> Result<R, Fault> {
+        let permit = Arc::clone(&self.permits).acquire_owned().await;
+        let work = move || {
+            let _permit = permit;
+            job()
+        };
+        let outcome = tokio::task::spawn_blocking(work).await;
+        outcome.unwrap_or_else(|error| Err(Fault::internal(error.to_string())))
     }
 
     /// Starts to record a plant. Writes a file: call it on a worker.
@@ -69,41 +90,61 @@ impl Recordings {
             let problem = format!("is {interval_s}; it must lie between {low} and {high}");
             return Err(Fault::field("checkpoint_interval_s", problem));
         }
+        let former = {
+            let mut own = self.own();
+            let active = own.values().filter(|recorder| is_active(recorder)).count() + 1;
+            let (limit, what) = (self.limits.active_recordings, "recordings in progress");
+            LimitExceeded::check("active_recordings", limit, what, active)?;
+            if own.get(&name).is_some_and(is_active) {
+                return Err(Fault::recording_exists(&name));
+            }
+            own.insert(name.clone(), None)
+        };
+        let started = self.begin(session, &name, Duration::from_secs_f64(interval_s));
         let mut own = self.own();
-        let active = own.values().filter(|recorder| recorder.is_active()).count() + 1;
-        let (limit, what) = (self.limits.active_recordings, "recordings in progress");
-        LimitExceeded::check("active_recordings", limit, what, active)?;
+        match started {
+            Ok(recorder) => {
+                let info = recorder.info();
+                own.insert(name, Some(Arc::new(recorder)));
+                Ok(info)
+            }
+            Err(fault) => {
+                own.remove(&name);
+                own.extend(former.map(|former| (name, former)));
+                Err(fault)
+            }
+        }
+    }
+
+    fn begin(
+        &self,
+        session: &Arc<Session>,
+        name: &str,
+        checkpoint_interval: Duration,
+    ) -> Result<Recorder, Fault> {
         let count = self.files().map_err(|error| failed(&error))?.len() + 1;
         LimitExceeded::check("recordings", self.limits.recordings, "recordings", count)?;
-        let path = self.path(&name);
+        let path = self.path(name);
         let file = File::create_new(&path).map_err(|error| match error.kind() {
-            io::ErrorKind::AlreadyExists => Fault::recording_exists(&name),
+            io::ErrorKind::AlreadyExists => Fault::recording_exists(name),
             _ => failed(&error),
         })?;
-        let options = Options {
-            name: name.clone(),
-            checkpoint_interval: Duration::from_secs_f64(interval_s),
-            bytes_max: self.limits.recording_bytes,
-        };
-        let started = Recorder::start(session, file, options).map_err(|error| {
+        let (name, bytes_max) = (name.to_owned(), self.limits.recording_bytes);
+        let options = Options { name, checkpoint_interval, bytes_max };
+        Recorder::start(session, file, options).map_err(|error| {
             // Nothing is in it yet.
             let _ = fs::remove_file(&path);
             match error {
                 StartError::Active => Fault::recording_active(format!("plant:{}", session.id())),
                 StartError::File(error) => failed(&sentence(&error)),
             }
-        });
-        let recorder = started?;
-        let info = recorder.info();
-        own.insert(name, Arc::new(recorder));
-        Ok(info)
+        })
     }
 
     /// Ends a recording and waits for it: call it on a worker.
     pub fn stop(&self, name: &str) -> Result<v1::Recording, Fault> {
         check_name("name", name)?;
-        let recorder = self.own().get(name).map(Arc::clone);
-        match recorder {
+        match self.recorder(name) {
             Some(recorder) => {
                 recorder.stop();
                 Ok(recorder.info())
@@ -114,10 +155,8 @@ impl Recordings {
 
     /// Ends all of them.
     pub fn stop_all(&self) {
-        let all: Vec<_> = self.own().values().map(Arc::clone).collect();
-        for recorder in all {
-            recorder.stop();
-        }
+        let all: Vec<_> = self.own().values().flatten().map(Arc::clone).collect();
+        Recorder::stop_all(&all);
     }
 
     /// Up to `size` recordings after the one named `after`, and whether there are more.
@@ -127,8 +166,7 @@ impl Recordings {
         names.sort();
         let has_more = names.len() > size;
         names.truncate(size);
-        let own = self.own();
-        let info = |name: &String| match own.get(name) {
+        let info = |name: &String| match self.recorder(name) {
             Some(recorder) => Ok(recorder.info()),
             None => self.left(name),
         };
@@ -150,13 +188,18 @@ impl Recordings {
     /// Deletes a recording that is not in progress.
     pub fn delete(&self, name: &str) -> Result<(), Fault> {
         check_name("name", name)?;
-        let mut own = self.own();
-        if own.get(name).is_some_and(|recorder| recorder.is_active()) {
+        if self.own().get(name).is_some_and(is_active) {
             return Err(Fault::recording_active(format!("recording:{name}")));
         }
         fs::remove_file(self.path(name)).map_err(|error| not_found_or_failed(name, &error))?;
-        own.remove(name);
+        // One of that name may have begun since.
+        self.own().retain(|other, recorder| other != name || is_active(recorder));
         Ok(())
+    }
+
+    /// One that this server has begun.
+    fn recorder(&self, name: &str) -> Option<Arc<Recorder>> {
+        self.own().get(name)?.as_ref().map(Arc::clone)
     }
 
     /// What can be said of a file that another server has left.
@@ -186,9 +229,14 @@ impl Recordings {
         self.directory.join(name).with_extension(EXTENSION)
     }
 
-    fn own(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Recorder>>> {
+    fn own(&self) -> MutexGuard<'_, BTreeMap<String, Option<Arc<Recorder>>>> {
         self.own.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// It begins or is in progress.
+fn is_active(recorder: &Option<Arc<Recorder>>) -> bool {
+    recorder.as_ref().is_none_or(|recorder| recorder.is_active())
 }
 
 /// A name from a plant's id, cut where it would be too long, and the time.

@@ -3,8 +3,9 @@
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::thread::{self, JoinHandle};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
 use mcap::McapError;
@@ -12,9 +13,11 @@ use plantd_models::Plant;
 use plantd_proto::v1::{self, MarkReason, RecordingStatus};
 
 use super::file::{Times, Writer};
+use crate::channels::timeline::Announced;
 use crate::convert;
 use crate::frame::{Frame, Timing};
 use crate::grpc::run::{event_message, run_info};
+use crate::parameters::Parameters;
 use crate::realtime::event::EventReader;
 use crate::ring::Reader;
 use crate::session::Session;
@@ -24,6 +27,8 @@ use crate::session::tap::{Mark, Tap};
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 /// How often what was written is handed to the system.
 const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
+/// Longest wait for a recording to end whose disk does not answer.
+const END_WAIT_MAX: Duration = Duration::from_millis(if cfg!(test) { 300 } else { 10_000 });
 /// Least time between two snapshots, where disturbances ask for many.
 const SNAPSHOT_INTERVAL_MIN: Duration = Duration::from_millis(50);
 
@@ -39,9 +44,13 @@ pub(super) struct Options {
 
 /// A recording in progress, or one that has ended.
 pub(super) struct Recorder {
+    session: Weak<Session>,
     shared: Arc<Shared>,
     tap: Arc<Tap>,
-    thread: Mutex<Option<JoinHandle<()>>>,
+    /// Number of the ring's record with which it begins.
+    first: u64,
+    /// Breaks off when the thread ends.
+    ended: Mutex<Receiver<()>>,
 }
 
 struct Shared {
@@ -86,19 +95,24 @@ impl Recorder {
             bytes: Arc::default(),
             info: Mutex::new(info),
         });
+        let (ends, ended) = mpsc::channel();
         let outcome =
             Loop::new(session, &tap, &mark, &first, file, options, &shared).and_then(|run| {
+                let work = move || {
+                    let _ends: Sender<()> = ends;
+                    run.run();
+                };
                 let name = format!("record {}", session.id());
-                let thread = thread::Builder::new().name(name).spawn(move || run.run());
-                thread.map_err(McapError::Io)
+                thread::Builder::new().name(name).spawn(work).map_err(McapError::Io)
             });
         match outcome {
             Ok(thread) => {
                 tap.set_recorder(thread.thread().clone());
-                Ok(Self { shared, tap, thread: Mutex::new(Some(thread)) })
+                let session = Arc::downgrade(session);
+                Ok(Self { session, shared, tap, first: mark.at, ended: Mutex::new(ended) })
             }
             Err(error) => {
-                session.close_tap();
+                session.close_tap(&tap, 2);
                 Err(StartError::File(error))
             }
         }
@@ -115,15 +129,45 @@ impl Recorder {
         self.shared.info().status() == RecordingStatus::Active
     }
 
-    /// Ends it, and waits until the file is complete.
-    pub(super) fn stop(&self) {
+    /// Lets it end.
+    pub(super) fn begin_to_end(&self) {
         self.shared.is_ending.store(true, Ordering::Release);
         self.tap.wake();
-        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(thread) = thread.take()
-            && thread.join().is_err()
-        {
-            tracing::error!("a recorder panicked");
+    }
+
+    /// Ends it, and waits until the file is complete, or for a disk that does not answer.
+    pub(super) fn stop(&self) {
+        self.begin_to_end();
+        self.wait_until(Instant::now() + END_WAIT_MAX);
+    }
+
+    /// Ends all, as [`Recorder::stop`] does.
+    pub(super) fn stop_all(recorders: &[Arc<Self>]) {
+        recorders.iter().for_each(|recorder| recorder.begin_to_end());
+        let deadline = Instant::now() + END_WAIT_MAX;
+        recorders.iter().for_each(|recorder| recorder.wait_until(deadline));
+    }
+
+    fn wait_until(&self, deadline: Instant) {
+        let ended = self.ended.lock().unwrap_or_else(PoisonError::into_inner);
+        let left = deadline.saturating_duration_since(Instant::now());
+        let why = match ended.recv_timeout(left) {
+            Ok(()) | Err(RecvTimeoutError::Disconnected) => "the recorder has panicked",
+            Err(RecvTimeoutError::Timeout) => "the disk does not answer",
+        };
+        let mut info = self.shared.info();
+        if info.status() != RecordingStatus::Active {
+            return;
+        }
+        // If the disk answers after all, the thread says how it ended.
+        info.status = RecordingStatus::Failed.into();
+        why.clone_into(&mut info.failure);
+        info.lost = self.tap.ring.written() - self.first - info.steps;
+        let (recording, lost) = (info.name.clone(), info.lost);
+        drop(info);
+        tracing::error!(recording, lost, why, "recording given up");
+        if let Some(session) = self.session.upgrade() {
+            session.close_tap(&self.tap, 3);
         }
     }
 }
@@ -158,8 +202,14 @@ struct Loop {
     clock: Clock,
     frame: Frame,
     record: v1::StepRecord,
-    /// Step and generation from which the next frame follows; none where it follows from nothing.
-    at: Option<(u64, u64)>,
+    /// Step from which the next frame follows; none where it follows from nothing.
+    at: Option<u64>,
+    /// The model's digest and the time step there.
+    mechanics: (u64, f64),
+    /// What faults may make of the parameters.
+    announced: Announced,
+    /// Numbers that faults have changed, as they are without these changes.
+    unchanged: Parameters,
     lost: u64,
     steps: u64,
     last_snapshot: Instant,
@@ -192,7 +242,10 @@ impl Loop {
             clock,
             frame: Frame::default(),
             record: v1::StepRecord::default(),
-            at: Some((mark.step, mark.generation)),
+            at: Some(mark.step),
+            mechanics: (mark.model_digest, mark.time_step_s),
+            announced: mark.announced.clone(),
+            unchanged: (*mark.announced.unchanged).clone(),
             lost: 0,
             steps: 0,
             last_snapshot: Instant::now(),
@@ -206,8 +259,7 @@ impl Loop {
         let Self { session, tap, reader, writer, shared, options, .. } = self;
         // The ring goes with its last reader.
         drop(reader);
-        session.close_tap();
-        tap.close();
+        session.close_tap(&tap, 2);
         let finished = outcome.and_then(|why| {
             let file = writer.finish()?.into_inner().map_err(|error| error.into_error())?;
             file.file.sync_all()?;
@@ -317,33 +369,34 @@ impl Loop {
 
     fn mark(&mut self, mark: &Mark) -> Result<(), McapError> {
         let lost = self.take_lost();
+        let changed = mark.announced.unchanged.iter().map(|(path, number)| (path.clone(), *number));
+        self.unchanged.extend(changed);
+        self.announced = mark.announced.clone();
         let message = v1::MarkRecord {
             reason: mark.reason.into(),
             step: mark.step,
             snapshot: mark.snapshot.to_bytes(),
-            parameters: convert::parameters(&mark.parameters),
+            parameters: all_parameters(&self.unchanged, &mark.parameters),
             time_step_s: mark.time_step_s,
             lost,
         };
         let times = Times { log_ns: self.clock.now_ns(0), plant_s: mark.time_s };
         self.writer.mark(&message, times)?;
-        self.at = Some((mark.step, mark.generation));
+        self.at = Some(mark.step);
+        self.mechanics = (mark.model_digest, mark.time_step_s);
         Ok(())
     }
 
     /// Writes the step in `frame`.
     fn step(&mut self) -> Result<(), McapError> {
-        let frame = &self.frame;
-        let now = (frame.state.step, frame.generation);
-        if self.at == Some(now) {
+        let step = self.frame.state.step;
+        if self.at == Some(step) {
             // A watchdog has put the plant into another state after the step: the mark tells it.
             return Ok(());
         }
-        let is_pushed = frame.timing.flags & Timing::PUSHED != 0;
-        let follows = |(step, generation)| now == (step + 1, generation) && !is_pushed;
         if let Some(at) = self.at {
-            if follows(at) {
-                self.at = Some(now);
+            if step == at + 1 && self.knows_mechanics()? {
+                self.at = Some(step);
             } else {
                 self.break_off(MarkReason::Disturbance)?;
             }
@@ -357,6 +410,31 @@ impl Loop {
         self.steps += 1;
         self.has_moved = true;
         Ok(())
+    }
+
+    /// Whether the mechanics of the step in `frame` are those that stand in the file; writes a mark before
+    /// it when a fault has changed the parameters.
+    fn knows_mechanics(&mut self) -> Result<bool, McapError> {
+        let (digest, time_step_s) = (self.frame.model_digest, self.frame.time_step_s);
+        if self.mechanics == (digest, time_step_s) {
+            return Ok(true);
+        }
+        let model = self.announced.models.iter().find(|model| model.0 == digest);
+        let Some((_, parameters)) = model.filter(|_| time_step_s == self.mechanics.1) else {
+            return Ok(false);
+        };
+        self.mechanics.0 = digest;
+        let message = v1::MarkRecord {
+            reason: MarkReason::Parameters.into(),
+            step: self.frame.state.step - 1,
+            parameters: all_parameters(&self.unchanged, parameters),
+            time_step_s,
+            ..Default::default()
+        };
+        let plant_s = self.frame.time_s - time_step_s;
+        let times = Times { log_ns: self.clock.now_ns(self.frame.timing.began_ns), plant_s };
+        self.writer.mark(&message, times)?;
+        Ok(true)
     }
 
     /// Notes that the step in `frame` does not follow from what was written.
@@ -417,7 +495,7 @@ fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecor
         settings: Some(convert::settings_message(plant.settings())),
         state: Some(convert::plant_state(plant)),
         accuracy: session.accuracy(),
-        parameters: convert::parameters(&mark.parameters),
+        parameters: all_parameters(&mark.announced.unchanged, &mark.parameters),
         run: Some(run_info(session)),
         ..Default::default()
     };
@@ -432,6 +510,13 @@ fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecor
     }
 }
 
+/// All numbers that are or were changed.
+fn all_parameters(unchanged: &Parameters, changed: &Parameters) -> Vec<v1::Parameter> {
+    let mut all = unchanged.clone();
+    all.extend(changed.iter().map(|(path, number)| (path.clone(), *number)));
+    convert::parameters(&all)
+}
+
 /// Puts a frame into a message, whose memory is kept.
 fn fill(record: &mut v1::StepRecord, frame: &Frame) {
     let state = record.state.get_or_insert_default();
@@ -444,6 +529,7 @@ fn fill(record: &mut v1::StepRecord, frame: &Frame) {
         (&mut state.multipliers, &frame.state.multipliers),
         (&mut record.u, &frame.input),
         (&mut record.driver, &frame.driver_input),
+        (&mut record.impulse, &frame.impulse),
     ] {
         target.clone_from(source);
     }
@@ -606,6 +692,36 @@ mod tests {
         assert!(session.with_core(|core| core.full_tap().is_none()));
         run(&session, capacity);
         assert!(session.with_core(|core| core.full_tap().is_some()));
+    }
+
+    #[test]
+    fn a_disk_that_does_not_answer_holds_up_neither_the_plant_nor_the_end() {
+        let session = session();
+        // A pipe that nobody empties.
+        let (reader, writer) = std::io::pipe().unwrap();
+        let file = File::from(std::os::fd::OwnedFd::from(writer));
+        let Ok(hung) = Recorder::start(&session, file, options()) else { panic!("no recording") };
+        let steps = 4 * hung.tap.ring.capacity() as u64;
+        let mut lease = session.acquire(DriverKind::Step).unwrap();
+        for _ in 0..steps {
+            lease.step(&[0.1]).unwrap();
+        }
+        hung.stop();
+        let info = hung.info();
+        assert_eq!(info.status(), RecordingStatus::Failed);
+        assert!(info.failure.contains("does not answer"), "{}", info.failure);
+        assert_eq!(info.steps + info.lost, steps);
+        assert!(session.with_core(|core| core.ring.is_none()));
+        // The next one is not its business when it goes on after all.
+        let directory = tempfile::tempdir().unwrap();
+        let file = File::create(directory.path().join("r.mcap")).unwrap();
+        let Ok(next) = Recorder::start(&session, file, options()) else { panic!("no recording") };
+        drop(reader);
+        hung.ended.lock().unwrap().recv().unwrap_err();
+        lease.step(&[0.1]).unwrap();
+        next.stop();
+        let info = next.info();
+        assert_eq!((info.status(), info.steps), (RecordingStatus::Done, 1));
     }
 
     #[test]

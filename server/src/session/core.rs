@@ -7,9 +7,10 @@ use plantd_models::{
 };
 use plantd_proto::v1::{self, MarkReason};
 
+use super::saved::PlantSnapshot;
 use super::tap::Tap;
 use crate::channels::Channels;
-use crate::channels::timeline::Timeline;
+use crate::channels::timeline::{Base, Timeline};
 use crate::convert;
 use crate::feedback::Feedback;
 use crate::frame::{Published, Timing};
@@ -37,6 +38,8 @@ pub struct Core {
     applied: Vec<f64>,
     /// It was in force in the last step.
     has_applied: bool,
+    /// What was added to the momentum before the last step; empty for nothing.
+    impulse: Vec<f64>,
     /// When the last step was taken.
     pub(crate) timing: Timing,
     /// Where each step is written, as long as somebody reads it.
@@ -76,6 +79,7 @@ impl Core {
         let mut input = vec![0.0; plant.model().dimensions().input()];
         plant.hold_input(&mut input);
         Self {
+            impulse: Vec::with_capacity(plant.p().len()),
             plant,
             driver_input: input.clone(),
             applied: input.clone(),
@@ -106,6 +110,16 @@ impl Core {
         driver: &[f64],
         linearization: Option<&mut Linearization>,
     ) -> Result<StepReport, DriveError> {
+        self.step_pushed(driver, &[], linearization)
+    }
+
+    /// The same with an impulse, one entry for each of the momentum or none, that is added to it before.
+    pub(crate) fn step_pushed(
+        &mut self,
+        driver: &[f64],
+        impulse: &[f64],
+        linearization: Option<&mut Linearization>,
+    ) -> Result<StepReport, DriveError> {
         if let Some(trip) = self.frozen {
             return Err(DriveError::Frozen(trip));
         }
@@ -121,6 +135,8 @@ impl Core {
             None => false,
             Some(feedback) => feedback.input(&self.plant, driver, &mut self.applied)?,
         };
+        self.impulse.clear();
+        self.impulse.extend_from_slice(impulse);
         let has_say = match &mut self.channels {
             None => has_say,
             Some(channels) => {
@@ -131,7 +147,7 @@ impl Core {
                     }
                     self.applied.copy_from_slice(driver);
                 }
-                channels.actuate(&self.plant, &mut self.applied) || has_say
+                channels.actuate(&self.plant, &mut self.applied, &mut self.impulse) || has_say
             }
         };
         let u = if has_say { &self.applied[..] } else { driver };
@@ -139,9 +155,13 @@ impl Core {
             None => plant.step(u),
             Some(out) => plant.step_and_linearize(u, out),
         };
-        let report = match &self.channels {
-            None => advance(&mut self.plant)?,
-            Some(channels) => channels.advance(&mut self.plant, advance)?,
+        // What is zero does not even touch the sign of a zero.
+        if self.impulse.iter().all(|impulse| *impulse == 0.0) {
+            self.impulse.clear();
+        }
+        let report = match &self.impulse[..] {
+            [] => advance(&mut self.plant)?,
+            impulse => self.plant.with_impulse(impulse, advance)?,
         };
         self.has_applied = has_say;
         self.input.copy_from_slice(u);
@@ -231,6 +251,30 @@ impl Core {
         self.events.note(kind, self.plant.step_index(), index, value);
     }
 
+    /// Notes that a step was refused or has failed.
+    pub(crate) fn note_failure(&self, error: &StepError) {
+        let residual = match error {
+            StepError::NotConverged { residual, .. } => *residual,
+            _ => 0.0,
+        };
+        self.note(EventKind::StepFailed, 0, residual);
+    }
+
+    /// The mechanics without what faults change.
+    pub(crate) fn base(&self) -> Base {
+        let timeline = self.channels.as_ref().and_then(|channels| channels.timeline.as_ref());
+        timeline.map(|timeline| timeline.base().clone()).unwrap_or_else(|| Base {
+            model: Arc::clone(self.plant.model()),
+            parameters: Arc::clone(&self.parameters),
+            settings: *self.plant.settings(),
+        })
+    }
+
+    /// What protects the plant.
+    pub(crate) fn safety(&self) -> Option<&Safety> {
+        self.guard.as_ref().map(|guard| &guard.safety)
+    }
+
     /// The input with which the plant's own loop begins, and whether it is a driver's.
     pub(crate) fn first_input(&self) -> (Vec<f64>, bool) {
         if self.has_loop_input && self.driver_input.len() == self.input.len() {
@@ -264,20 +308,34 @@ impl Core {
 
     /// Gives the plants of changed parameters their places: `timeline` knows the changes of the faults that
     /// are there. Without one the changes end at once.
-    pub(crate) fn install(&mut self, timeline: Option<Box<Timeline>>) -> Option<Box<Timeline>> {
+    pub(crate) fn install(&mut self, mut timeline: Option<Box<Timeline>>) -> Option<Box<Timeline>> {
         let channels = self.channels.as_mut()?;
         let mut former = channels.timeline.take();
-        if timeline.is_none()
-            && let Some(former) = &mut former
-            && former.ask(0, &mut self.plant, channels.sites_mut())
-            && let Some(parameters) = former.parameters()
-        {
-            self.note_changed(parameters);
-            self.mark(v1::MarkReason::Parameters);
+        let is_none = former.is_none() && timeline.is_none();
+        let mut reason = MarkReason::Checkpoint;
+        match (&mut timeline, &mut former) {
+            (Some(timeline), _) => timeline.adopt(&mut self.plant, channels.sites_mut()),
+            (None, Some(former)) => {
+                if former.ask(0, &mut self.plant, channels.sites_mut())
+                    && let Some(parameters) = former.parameters()
+                {
+                    self.note_changed(parameters);
+                    reason = MarkReason::Parameters;
+                }
+            }
+            (None, None) => {}
         }
-        let channels = self.channels.as_mut()?;
-        channels.timeline = timeline;
+        self.channels.as_mut()?.timeline = timeline;
+        if !is_none {
+            self.mark(reason);
+        }
         former
+    }
+
+    /// Everything that the plant needs to go on bit for bit.
+    pub(crate) fn snapshot(&mut self) -> PlantSnapshot {
+        let channels = self.channels.as_mut().map(|channels| channels.memory());
+        PlantSnapshot { plant: self.plant.snapshot(), channels }
     }
 
     /// Writes the last step into the ring, if somebody reads it.
@@ -327,39 +385,45 @@ impl Core {
             multipliers: self.plant.multipliers(),
             input: &self.input,
             driver_input: &self.driver_input,
+            impulse: &self.impulse,
             outputs: self.channels.as_ref().map_or(&[], |channels| channels.output()),
             lost: self.channels.as_ref().map_or(&[], |channels| channels.lost()),
             report: self.report,
             generation: self.generation,
             time_step_s: self.plant.settings().time_step_s,
             model_digest: self.plant.model().digest(),
-            timing: Timing { flags: self.timing.flags | self.pushed(), ..self.timing },
+            timing: self.timing,
         }
     }
 
-    /// The flag of a last step that was pushed.
-    fn pushed(&self) -> u64 {
-        let is_pushed = self.channels.as_ref().is_some_and(|channels| channels.pushes());
-        if is_pushed { Timing::PUSHED } else { 0 }
-    }
-
-    /// Puts a copy of the plant in its place that is in another state.
-    pub(crate) fn replace_plant(&mut self, plant: Plant) -> Plant {
+    /// Puts a copy of the plant in its place that is in another state, and what was under way there in its
+    /// channels, as far as it is known.
+    pub(crate) fn replace_plant(
+        &mut self,
+        plant: Plant,
+        memory: Option<&v1::ChannelMemory>,
+    ) -> Plant {
         plant.hold_input(&mut self.input);
         self.release();
         self.has_applied = false;
+        self.impulse.clear();
         self.report = StepReport::default();
-        let mut former = std::mem::replace(&mut self.plant, plant);
-        if let Some(channels) = &mut self.channels {
-            if let Some(timeline) = &mut channels.timeline {
-                let (rest, parameters) = timeline.replaced(former, &self.plant);
-                former = rest;
-                if let Some(parameters) = parameters {
-                    self.parameters = parameters;
-                }
-                self.generation += 1;
+        if let Some(channels) = &mut self.channels
+            && let Some(mut timeline) = channels.timeline.take()
+        {
+            let is_new = timeline.prepare_for(&plant, &mut self.plant, channels.sites_mut());
+            let parameters = timeline.parameters().filter(|_| is_new);
+            channels.timeline = Some(timeline);
+            if let Some(parameters) = parameters {
+                self.note_changed(parameters);
             }
+        }
+        let former = std::mem::replace(&mut self.plant, plant);
+        if let Some(channels) = &mut self.channels {
             channels.begin(&mut self.plant, &self.input);
+            if let Some(memory) = memory {
+                channels.recall(memory);
+            }
         }
         self.note(EventKind::StateSet, 0, 0.0);
         former
@@ -372,10 +436,14 @@ impl Core {
         mut plant: Plant,
         parameters: Arc<Parameters>,
     ) -> Result<Plant, InitialError> {
-        let (State { step, q, p, v, .. }, time_s) = self.state();
-        plant.initialize(&Initial::Momentum { q, p, v })?;
-        plant.set_step_index(step);
-        plant.set_time_s(time_s);
+        if plant.settings() == self.plant.settings() {
+            plant.go_on_from(&self.plant)?;
+        } else {
+            let (State { step, q, p, v, .. }, time_s) = self.state();
+            plant.initialize(&Initial::Momentum { q, p, v })?;
+            plant.set_step_index(step);
+            plant.set_time_s(time_s);
+        }
         self.parameters = parameters;
         self.generation += 1;
         let former = std::mem::replace(&mut self.plant, plant);

@@ -2,56 +2,106 @@
 
 use std::sync::Arc;
 
-use plantd_models::{Model, Plant};
+use plantd_models::{Model, Plant, Snapshot, SnapshotError};
 use plantd_proto::v1;
+use prost::Message as _;
 use v1::set_feedback_request::Reference;
 
 use super::Session;
+use crate::channels::fault::Injected;
 use crate::convert;
 use crate::feedback::{GuardBound, InForce, Trip};
 use crate::parameters::Parameters;
+use crate::realtime::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
+use crate::regulator::Spec;
+
+/// Everything that a session's plant needs to go on bit for bit.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlantSnapshot {
+    /// The plant.
+    pub plant: Snapshot,
+    /// What is under way in its channels and faults, if it has any.
+    pub channels: Option<v1::ChannelMemory>,
+}
+
+impl PlantSnapshot {
+    /// Encodes: a plant without channels as itself, else a `ChannelSnapshot`.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let plant = self.plant.to_bytes();
+        match self.channels.clone() {
+            None => plant,
+            channels => v1::ChannelSnapshot { plant, channels }.encode_to_vec(),
+        }
+    }
+
+    /// Decodes.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
+        match v1::ChannelSnapshot::decode(bytes) {
+            Ok(v1::ChannelSnapshot { plant, channels }) if !plant.is_empty() => {
+                Ok(Self { plant: Snapshot::from_bytes(&plant)?, channels })
+            }
+            _ => Ok(Self { plant: Snapshot::from_bytes(bytes)?, channels: None }),
+        }
+    }
+}
 
 impl Session {
-    /// Everything from which the plant can be made again but its models, and the model in force.
+    /// Everything from which the plant can be made again but its models, and the model in force without
+    /// what faults change.
     pub fn saved(&self) -> (v1::PlantRecord, Arc<Model>) {
         // No more than copies in the core's hands: a plant may be running.
-        let (mechanics, snapshot, state, parameters, feedback, channels) =
+        let (base, state, snapshot, feedback, channels, fault_count, safety) =
             self.with_core(move |core| {
                 let feedback = core.feedback.as_ref();
-                let feedback = feedback.map(|f| (f.in_force(), f.guard.clone(), f.info()));
-                let channels =
-                    core.channels.as_ref().map(|channels| Arc::clone(&channels.declared));
-                let (mechanics, snapshot) = (core.mechanics(), core.plant.snapshot());
-                let parameters = Arc::clone(&core.parameters);
-                (mechanics, snapshot, core.state(), parameters, feedback, channels)
+                let feedback = feedback
+                    .map(|f| (Arc::clone(&f.spec), f.in_force(), f.guard.clone(), f.info()));
+                let channels = core.channels.as_ref().map(|channels| {
+                    let faults = channels.faults.iter().map(saved_fault).collect::<Vec<_>>();
+                    (Arc::clone(&channels.declared), faults)
+                });
+                let (base, safety) = (core.base(), core.safety().cloned());
+                let (state, snapshot, count) = (core.state(), core.snapshot(), core.faults);
+                (base, state, snapshot, feedback, channels, count, safety)
             });
         let rotations = convert::rotations(&self.model);
+        let time_step_s = base.settings.time_step_s;
         let (feedback, feedback_info) = feedback
-            .map(|(law, guard, info)| (feedback_request(&law, &guard, &info, &rotations), info))
+            .map(|(spec, law, guard, info)| {
+                (feedback_request(&spec, time_step_s, &law, &guard, &info, &rotations), info)
+            })
             .unzip();
         let info = v1::PlantInfo {
             id: self.id.clone(),
             model: self.model_name.clone(),
-            settings: Some(convert::settings_message(&mechanics.settings)),
+            settings: Some(convert::settings_message(&base.settings)),
             state: Some(convert::state(&state.0, state.1)),
             link_open: self.link_open(),
             feedback: feedback_info,
             accuracy: self.accuracy,
-            parameters: convert::parameters(&parameters),
+            parameters: convert::parameters(&base.parameters),
             ..Default::default()
+        };
+        let (declared, faults) = channels.unzip();
+        let fault = |(id, fault, start_step): (u64, Arc<v1::FaultSpec>, u64)| v1::SavedFault {
+            id,
+            fault: Some(Arc::unwrap_or_clone(fault)),
+            start_step,
         };
         let record = v1::PlantRecord {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             plant: Some(info),
-            model_digest: mechanics.model.digest(),
+            model_digest: base.model.digest(),
             snapshot: snapshot.to_bytes(),
             start_snapshot: self.start.to_bytes(),
             start_settings: Some(convert::settings_message(&self.start_settings)),
             feedback: feedback.flatten(),
-            channels: channels.map(Arc::unwrap_or_clone),
+            channels: declared.map(Arc::unwrap_or_clone),
+            faults: faults.into_iter().flatten().map(fault).collect(),
+            fault_count,
+            safety: safety.map(|safety| safety_request(&safety, &self.model)),
             ..Default::default()
         };
-        (record, mechanics.model)
+        (record, base.model)
     }
 
     /// Puts a plant of the session's model in its place, with the numbers that were changed in it.
@@ -74,18 +124,24 @@ impl Session {
     }
 }
 
-/// The request that puts a feedback's present law in force as it stands; none for a law along a
-/// trajectory.
+fn saved_fault(fault: &Injected) -> (u64, Arc<v1::FaultSpec>, u64) {
+    (fault.id, Arc::clone(&fault.given), fault.schedule.start)
+}
+
+/// The request that puts a feedback's present law in force: about a point as it stands; along a trajectory
+/// by computing it again, if it still can be.
 fn feedback_request(
+    spec: &Spec,
+    time_step_s: f64,
     in_force: &InForce,
     guard: &[GuardBound],
     info: &v1::FeedbackInfo,
     rotations: &[u32],
 ) -> Option<v1::SetFeedbackRequest> {
-    if in_force.law.end.is_some() {
-        return None;
+    if let Some(given) = &spec.given {
+        let request = v1::SetFeedbackRequest { first_step: Some(info.first_step), ..given.clone() };
+        return (spec.time_step_s == time_step_s).then_some(request);
     }
-    let finite = |value: f64| value.is_finite().then_some(value);
     let bound = |bound: &GuardBound| v1::Bound {
         entry: bound.name.clone(),
         min: finite(bound.min),
@@ -97,4 +153,28 @@ fn feedback_request(
         guard: guard.iter().map(bound).collect(),
         ..Default::default()
     })
+}
+
+/// The request that sets these watchdogs.
+fn safety_request(safety: &Safety, model: &Model) -> v1::SetSafetyRequest {
+    let action = |action: WatchdogAction| match action {
+        WatchdogAction::Freeze => v1::WatchdogAction::Freeze,
+        WatchdogAction::Reset => v1::WatchdogAction::Reset,
+        WatchdogAction::Disconnect => v1::WatchdogAction::Disconnect,
+    };
+    let watchdog = |dog: &Watchdog| v1::Watchdog {
+        quantity: Quantity::name(dog.quantity.code(), model),
+        min: finite(dog.min),
+        max: finite(dog.max),
+        action: action(dog.action).into(),
+    };
+    v1::SetSafetyRequest {
+        watchdogs: safety.watchdogs.iter().map(watchdog).collect(),
+        on_step_failure: safety.on_step_failure.map_or(0, |failure| action(failure).into()),
+        ..Default::default()
+    }
+}
+
+fn finite(value: f64) -> Option<f64> {
+    value.is_finite().then_some(value)
 }

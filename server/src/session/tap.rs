@@ -10,6 +10,7 @@ use plantd_models::{Plant, Snapshot};
 use plantd_proto::v1::MarkReason;
 
 use super::{Core, Session};
+use crate::channels::timeline::Announced;
 use crate::frame::record_words;
 use crate::parameters::Parameters;
 use crate::ring::Ring;
@@ -33,8 +34,10 @@ pub(crate) struct Mark {
     pub(crate) step: u64,
     pub(crate) time_s: f64,
     pub(crate) time_step_s: f64,
-    pub(crate) generation: u64,
+    pub(crate) model_digest: u64,
     pub(crate) parameters: Arc<Parameters>,
+    /// Changes of parameters by faults that may come.
+    pub(crate) announced: Announced,
 }
 
 /// What a plant and its recorder share.
@@ -53,11 +56,6 @@ impl Tap {
     pub(crate) fn set_read(&self, next: u64) {
         self.read.store(next, Ordering::Release);
         self.is_stalled.store(false, Ordering::Release);
-    }
-
-    /// Nobody reads any more, and nobody shall wait.
-    pub(crate) fn close(&self) {
-        self.set_read(u64::MAX);
     }
 
     /// Names the thread that reads.
@@ -122,6 +120,7 @@ impl Core {
     }
 
     fn marked(&self, at: u64, reason: MarkReason) -> Mark {
+        let timeline = self.channels.as_ref().and_then(|channels| channels.timeline.as_ref());
         Mark {
             at,
             reason,
@@ -129,8 +128,9 @@ impl Core {
             step: self.plant.step_index(),
             time_s: self.plant.time_s(),
             time_step_s: self.plant.settings().time_step_s,
-            generation: self.generation,
+            model_digest: self.plant.model().digest(),
             parameters: Arc::clone(&self.parameters),
+            announced: timeline.map(|timeline| timeline.announced()).unwrap_or_default(),
         }
     }
 }
@@ -166,12 +166,20 @@ impl Session {
         self.with_core(|core| core.mark(MarkReason::Checkpoint));
     }
 
-    /// Ends the recording. The ring goes when nobody else reads it.
-    pub(crate) fn close_tap(&self) {
-        let former = self.with_core(|core| {
-            let tap = core.tap.take();
-            // One in the core, one in the tap.
-            let is_last = core.ring.as_ref().is_some_and(|ring| Arc::strong_count(ring) <= 2);
+    /// Ends a recording. The ring goes when nobody else reads it:
+    /// `holders` are the core, the tap, and readers that are to be left alone.
+    pub(crate) fn close_tap(&self, tap: &Arc<Tap>, holders: usize) {
+        // Nobody reads any more, and nobody shall wait.
+        tap.set_read(u64::MAX);
+        let tap = Arc::clone(tap);
+        let former = self.with_core(move |core| {
+            // Another recording may have begun.
+            let tap = core.tap.take_if(|present| Arc::ptr_eq(present, &tap));
+            if tap.is_none() {
+                return (None, None);
+            }
+            let is_last =
+                core.ring.as_ref().is_some_and(|ring| Arc::strong_count(ring) <= holders);
             (tap, if is_last { core.ring.take() } else { None })
         });
         // Dropped here, not in the core's hands.

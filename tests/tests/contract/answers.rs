@@ -94,6 +94,7 @@ async fn same_bits_whichever_way(client: &Client, model: &str, inputs: &[[f64; 1
         u: Some(v1::Matrix::from_rows(inputs)),
         hold: 0,
         all_states: true,
+        ..Default::default()
     };
     let answer = client.step(request).await.unwrap();
     assert_eq!(answer.states.iter().map(bits).collect::<Vec<_>>(), states);

@@ -321,6 +321,7 @@ async fn step(
         u: Some(v1::Matrix::from_rows(rows)),
         hold: count - given,
         all_states: all,
+        ..Default::default()
     };
     let answer = client.step(request).await?;
     let as_text = || {

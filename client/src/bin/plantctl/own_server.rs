@@ -44,14 +44,15 @@ impl OwnServer {
         }
         command
             .args(["serve", "--grpc", "off", "--metrics", "off", "--worker-priority", "normal"])
-            .args(["--shutdown-grace-s", "0.2"])
+            .args(["--shutdown-grace-s", "0.2", "--until-stdin-ends"])
             .arg("--unix")
             .arg(path("plantd.sock"))
             .arg("--link-root")
             .arg(path("link"))
             .arg("--ready-file")
             .arg(path("ready.json"))
-            .stdin(Stdio::null())
+            // It ends with this process, however that ends.
+            .stdin(Stdio::piped())
             .stdout(log.try_clone()?)
             .stderr(log)
             // Ctrl-C is for this process, which then ends the server.

@@ -226,8 +226,7 @@ impl Outcome {
         if self.skipped > 0 {
             let _ = writeln!(
                 text,
-                "{} recorded steps were not compared: steps were lost before them, or something \
-                 besides the inputs acted on the plant",
+                "{} recorded steps were not compared: steps were lost before them",
                 self.skipped
             );
         }
@@ -373,7 +372,8 @@ impl<'a> Twin<'a> {
             0 => (None, rows.len() as u32),
             _ => (Some(v1::Matrix::from_rows(&rows)), 0),
         };
-        let request = v1::StepRequest { id: self.id.clone(), u, hold, all_states: true };
+        let impulses = impulses(steps)?;
+        let request = v1::StepRequest { id: self.id.clone(), u, hold, all_states: true, impulses };
         let replayed = match self.client.step(request).await {
             Ok(answer) => answer.states,
             Err(Error::Rpc(refusal)) => return Ok(Err(refusal.to_string())),
@@ -414,7 +414,8 @@ impl<'a> Twin<'a> {
     /// Goes on from a mark. True when the steps after it cannot be taken again.
     async fn take_mark(&mut self, mark: v1::MarkRecord, is_lost: bool) -> Result<bool> {
         self.outcome.lost += mark.lost;
-        if mark.snapshot.is_empty() {
+        let has_snapshot = !mark.snapshot.is_empty();
+        if !has_snapshot && (is_lost || mark.reason() != v1::MarkReason::Parameters) {
             return Ok(true);
         }
         let changes: Vec<_> = mark
@@ -436,6 +437,9 @@ impl<'a> Twin<'a> {
             };
             self.client.set_parameters(request).await?;
         }
+        if !has_snapshot {
+            return Ok(false);
+        }
         let goes_on = !is_lost && mark.lost == 0 && mark.reason() != v1::MarkReason::Reset;
         if goes_on && self.client.snapshot(&self.id).await? != mark.snapshot {
             let what = What::Snapshot;
@@ -444,6 +448,21 @@ impl<'a> Twin<'a> {
         self.client.restore(&self.id, mark.snapshot).await?;
         Ok(false)
     }
+}
+
+/// What pushed the plant before steps; none if nothing did.
+fn impulses(steps: &[v1::StepRecord]) -> Result<Option<v1::Matrix>> {
+    let width = steps.iter().map(|step| step.impulse.len()).max().unwrap_or(0);
+    if width == 0 {
+        return Ok(None);
+    }
+    let row = |step: &v1::StepRecord| match step.impulse.len() {
+        0 => Ok(vec![0.0; width]),
+        n if n == width => Ok(step.impulse.clone()),
+        n => anyhow::bail!("an impulse of {n} entries beside one of {width}"),
+    };
+    let rows = steps.iter().map(row).collect::<Result<Vec<_>>>()?;
+    Ok(Some(v1::Matrix::from_rows(&rows)))
 }
 
 /// All numbers of a state.

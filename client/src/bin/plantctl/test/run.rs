@@ -6,7 +6,9 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail, ensure};
-use plantd_client::{Client, Error, MatrixExt as _, StateExt as _, diagonal, operating_point, v1};
+use plantd_client::{
+    Answers, Client, Error, MatrixExt as _, StateExt as _, diagonal, operating_point, v1,
+};
 use tokio::time::{Instant, sleep_until, timeout_at};
 
 use super::controller::{Assignment, Controller as Process};
@@ -22,6 +24,8 @@ const STEP_ROUNDING: f64 = 1e-6;
 const WATCH_QUEUE: u32 = 2048;
 /// Steps that a driver in lockstep is let take before they have all been seen.
 const STEPS_AHEAD: u64 = WATCH_QUEUE as u64 / 2;
+/// Refused steps that are kept.
+const FAILURES_MAX: usize = 1000;
 /// How often a plant that nobody steps is looked at.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// How often it is looked whether a driver has come.
@@ -271,7 +275,9 @@ impl Run<'_> {
             return self.step(plant, state).await;
         }
         let messages = self.watch(plant).await?;
+        let mut events = None;
         if scenario.pace == Pace::Lockstep {
+            events = Some(self.place.client.watch_events(plant, None).await?);
             self.let_run(plant, 0).await?;
         }
         let mut process = match &scenario.controller {
@@ -288,11 +294,14 @@ impl Run<'_> {
             }
             _ => None,
         };
-        let seen = self.follow(plant, messages, process.as_mut()).await;
+        let seen = self.follow(plant, messages, events.as_mut(), process.as_mut()).await;
         if let Some(process) = process {
             self.output = process.stop().await;
         }
         seen?;
+        if let Some(events) = events {
+            self.hear_out(plant, events).await?;
+        }
         if scenario.pace == Pace::Paced {
             let timing = self.place.client.timing(plant, false).await?;
             self.facts.deadline_misses = Some(timing.overruns);
@@ -424,7 +433,7 @@ impl Run<'_> {
         }
     }
 
-    async fn watch(&self, id: &str) -> Result<plantd_client::Answers<v1::WatchResponse>> {
+    async fn watch(&self, id: &str) -> Result<Answers<v1::WatchResponse>> {
         let mut fields = vec![v1::WatchField::State.into(), v1::WatchField::Input.into()];
         if self.prepared.channels.is_some() {
             fields.push(v1::WatchField::Outputs.into());
@@ -475,7 +484,8 @@ impl Run<'_> {
     async fn follow(
         &mut self,
         id: &str,
-        mut messages: plantd_client::Answers<v1::WatchResponse>,
+        mut messages: Answers<v1::WatchResponse>,
+        mut events: Option<&mut Answers<v1::WatchEventsResponse>>,
         mut process: Option<&mut Process>,
     ) -> Result<()> {
         let Prepared { scenario, steps, .. } = self.prepared;
@@ -499,10 +509,19 @@ impl Run<'_> {
                     _ => std::future::pending().await,
                 }
             };
+            let event = async {
+                match events.as_mut() {
+                    Some(events) => events.next().await,
+                    None => std::future::pending().await,
+                }
+            };
             tokio::select! {
                 message = messages.next() => {
                     let message = message?.context("the server closed the stream of states")?;
                     self.see(&message)?;
+                }
+                event = event => {
+                    self.hear(event?)?;
                 }
                 status = ends => {
                     goal = goal.min(self.plant_step(id).await?.1);
@@ -542,6 +561,30 @@ impl Run<'_> {
         if let Some(reason) = stopped.filter(|_| self.last_step < *steps) {
             self.ended = Some(format!("step {} of {steps}: {reason}", self.last_step));
         }
+        Ok(())
+    }
+
+    /// Takes an event of a plant in lockstep; true when it was paused.
+    fn hear(&mut self, message: Option<v1::WatchEventsResponse>) -> Result<bool> {
+        let event = message.and_then(|message| message.event);
+        let event = event.context("the server closed the stream of events")?;
+        if event.kind() == v1::EventKind::StepFailed && self.facts.failures.len() < FAILURES_MAX {
+            let time_s = event.step as f64 * self.time_step_s;
+            let what = format!("the driver's input for step {} was refused", event.step + 1);
+            self.facts.failures.push((time_s, what));
+        }
+        Ok(event.kind() == v1::EventKind::Paused)
+    }
+
+    /// Takes the events that are still on their way.
+    async fn hear_out(
+        &mut self,
+        id: &str,
+        mut events: Answers<v1::WatchEventsResponse>,
+    ) -> Result<()> {
+        // The last one.
+        self.place.client.pause(id).await?;
+        while !self.hear(events.next().await?)? {}
         Ok(())
     }
 
