@@ -306,4 +306,3 @@ fn decode(bytes: &[u8]) -> Result<v1::PlantRecord> {
 fn sentence(fault: Fault) -> anyhow::Error {
     anyhow::anyhow!("{}", tonic::Status::from(fault).message())
 }
-

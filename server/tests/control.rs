@@ -60,7 +60,13 @@ async fn rollouts_take_the_very_steps_of_a_plant() {
     let request = v1::CreatePlantRequest { model: "pendulum".to_owned(), ..Default::default() };
     let mut plants = PlantServiceClient::new(channel.clone());
     let id = plants.create_plant(request).await.unwrap().into_inner().plant.unwrap().id;
-    let request = v1::StepRequest { id, u: Some(torques(STEPS)), hold: 10, all_states: true, ..Default::default() };
+    let request = v1::StepRequest {
+        id,
+        u: Some(torques(STEPS)),
+        hold: 10,
+        all_states: true,
+        ..Default::default()
+    };
     let stepped = plants.step(request).await.unwrap().into_inner().states;
 
     let case = v1::RolloutCase { initial: None, u: Some(torques(STEPS)), hold: 10 };

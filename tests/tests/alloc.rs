@@ -166,6 +166,7 @@ fn steps_with_feedback_allocate_nothing() {
             trajectory_weights: None,
             constraints: Constraints::Full,
             time_step_s: 0.01,
+            given: None,
         };
         let law = Law {
             stages: (0..STEPS / 2).map(stage).collect(),

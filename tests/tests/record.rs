@@ -60,7 +60,8 @@ impl Setup {
             0 => (None, count),
             _ => (Some(v1::Matrix::from_rows(&rows)), 0),
         };
-        let request = v1::StepRequest { id: id.to_owned(), u, hold, all_states: true, ..Default::default() };
+        let request =
+            v1::StepRequest { id: id.to_owned(), u, hold, all_states: true, ..Default::default() };
         self.client.step(request).await.unwrap().states
     }
 
@@ -365,7 +366,8 @@ async fn a_plant_that_its_watchdog_resets_is_replayed() {
     setup.record(&id, "reset").await;
     // One push after the other to the same side.
     let u = Some(v1::Matrix::from_rows(&vec![vec![5.0]; 400]));
-    let request = v1::StepRequest { id: id.clone(), u, hold: 0, all_states: true, ..Default::default() };
+    let request =
+        v1::StepRequest { id: id.clone(), u, hold: 0, all_states: true, ..Default::default() };
     let states = setup.client.step(request).await.unwrap().states;
     let resets = states.iter().filter(|state| state.step == 0).count() as u64;
     assert!(resets > 1, "{resets}");

@@ -32,7 +32,8 @@ fn serve(state: &Path) -> ServerProcess {
 async fn step(client: &Client, id: &str, from: u64, count: u64) -> Vec<v1::State> {
     let rows: Vec<_> = (from..from + count).map(|k| vec![(k as f64 * 0.1).sin()]).collect();
     let u = Some(v1::Matrix::from_rows(&rows));
-    let request = v1::StepRequest { id: id.to_owned(), u, all_states: true, hold: 0, ..Default::default() };
+    let request =
+        v1::StepRequest { id: id.to_owned(), u, all_states: true, hold: 0, ..Default::default() };
     client.step(request).await.unwrap().states
 }
 

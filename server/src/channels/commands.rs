@@ -248,7 +248,8 @@ impl Session {
             fault.keep_start();
             faults.push(fault);
         }
-        let numbers = faults.iter().map(Injected::numbers).fold(present.numbers, usize::saturating_add);
+        let numbers =
+            faults.iter().map(Injected::numbers).fold(present.numbers, usize::saturating_add);
         check_numbers(numbers, limits)?;
         number_changes(&mut faults);
         let all: Vec<_> = faults.iter().map(PresentFault::of).collect();

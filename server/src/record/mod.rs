@@ -11,8 +11,10 @@
 //! has one.
 
 mod file;
+mod message;
 mod recorder;
 mod schema;
+mod work;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};

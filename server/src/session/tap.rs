@@ -178,8 +178,7 @@ impl Session {
             if tap.is_none() {
                 return (None, None);
             }
-            let is_last =
-                core.ring.as_ref().is_some_and(|ring| Arc::strong_count(ring) <= holders);
+            let is_last = core.ring.as_ref().is_some_and(|ring| Arc::strong_count(ring) <= holders);
             (tap, if is_last { core.ring.take() } else { None })
         });
         // Dropped here, not in the core's hands.

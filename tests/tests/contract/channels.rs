@@ -263,7 +263,8 @@ async fn delay(client: &Client, id: &str) {
     let name = |name: &str| name.to_owned();
     let tip = v1::FramePoint { frame: name("pole"), at: vec![0.0, -1.0, 0.0] };
     let (latency_s, sample_period_s) = (7.0 * H, 3.0 * H);
-    let late = |name, source| v1::OutputChannel { latency_s, sample_period_s, ..output(name, source) };
+    let late =
+        |name, source| v1::OutputChannel { latency_s, sample_period_s, ..output(name, source) };
     let delayed = v1::InputChannel {
         input: name("force"),
         delay_s: 5.0 * H,
@@ -274,7 +275,11 @@ async fn delay(client: &Client, id: &str) {
     };
     let declared = v1::Channels {
         outputs: vec![
-            v1::OutputChannel { drop_out: 0.4, noise: 0.1, ..late("rate", Source::Velocity(name("theta"))) },
+            v1::OutputChannel {
+                drop_out: 0.4,
+                noise: 0.1,
+                ..late("rate", Source::Velocity(name("theta")))
+            },
             output("acceleration", Source::Acceleration(name("x"))),
             late("tip", Source::Position(tip)),
             late("motor", Source::Input(name("force"))),
@@ -288,10 +293,8 @@ async fn delay(client: &Client, id: &str) {
         pattern: Some(Pattern::Intermittent(v1::Intermittent { period_s: period * H, duty: 0.5 })),
         ..fault
     };
-    let pushed = v1::FaultSpec {
-        kind: Some(push("pole", [3.0, 0.0, 0.0], [0.0; 3])),
-        ..Default::default()
-    };
+    let pushed =
+        v1::FaultSpec { kind: Some(push("pole", [3.0, 0.0, 0.0], [0.0; 3])), ..Default::default() };
     for fault in [
         from_step(4, 0.0, on_output("tip.y", delay(6.0))),
         half(6.0, from_step(3, 0.0, on_input(Kind::Stuck(true)))),
@@ -384,8 +387,7 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
                 v1::Pace::Lockstep => {
                     let settings = v1::RunSettings { pace: (*pace).into(), ..Default::default() };
                     let (id, hold) = (id.clone(), steps as u32);
-                    let run =
-                        v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0 };
+                    let run = v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0 };
                     client.run(run).await.unwrap();
                     let request = v1::StepRequest { id, hold, ..Default::default() };
                     client.step(request).await.unwrap();
@@ -396,7 +398,16 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
                     let run = v1::RunRequest { id: id.clone(), settings: Some(settings), steps };
                     client.run(run).await.unwrap();
                     let stands = async {
-                        while client.get_plant(&id).await.unwrap().plant.unwrap().run.unwrap().running {
+                        while client
+                            .get_plant(&id)
+                            .await
+                            .unwrap()
+                            .plant
+                            .unwrap()
+                            .run
+                            .unwrap()
+                            .running
+                        {
                             tokio::time::sleep(Duration::from_millis(5)).await;
                         }
                     };

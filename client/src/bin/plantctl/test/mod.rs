@@ -6,6 +6,7 @@ mod expect;
 mod expression;
 mod html;
 mod junit;
+mod prepare;
 mod run;
 mod samples;
 mod scenario;
@@ -25,7 +26,8 @@ use serde_json::json;
 use tokio::signal::unix::{SignalKind, signal};
 
 use self::expect::short;
-use self::run::{Outcome, Place, Prepared, Status, lock, summary};
+use self::prepare::Prepared;
+use self::run::{Outcome, Place, Status, lock, summary};
 use self::scenario::{Case, Controller, Pace, Scenario};
 use crate::FAILED;
 use crate::commands::Output;
