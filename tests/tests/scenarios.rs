@@ -3,9 +3,13 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 use plantd_tests::server::{ServerProcess, binary};
 use serde_json::Value;
+
+/// Longest wait for a process to come or go.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 fn scenarios(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("scenarios").join(path)
@@ -99,6 +103,46 @@ fn a_step_that_is_refused_ends_the_run() {
 }
 
 #[test]
+fn a_refused_input_of_any_driver_is_a_failure() {
+    let (cases, code) = cases("broken/refused.toml", &[]);
+    let [case] = &cases[..] else { panic!("{cases:?}") };
+    assert_eq!((code, &case["steps"], &case["ended"]), (1, &50.into(), &Value::Null), "{case}");
+    let failure = &case["expectations"][0];
+    assert!((failure["time_s"].as_f64().unwrap() - 0.2).abs() < 1e-9, "{failure}");
+    assert_eq!(case["expectations"][1]["passed"], true, "{case}");
+}
+
+/// The server that plantctl has started ends with it, however that ends.
+#[test]
+fn no_server_is_left_behind() {
+    let mut command = Command::new(binary("plantctl").unwrap());
+    let path = scenarios("broken/silent.toml");
+    let mut plantctl = with_path(command.arg("test").arg(path)).spawn().unwrap();
+    let servers = || -> Vec<u32> {
+        let of = format!("/proc/{0}/task/{0}/children", plantctl.id());
+        let children = std::fs::read_to_string(of).unwrap_or_default();
+        children.split_whitespace().map(|id| id.parse().unwrap()).collect()
+    };
+    let is_server = |id: &u32| {
+        std::fs::read_to_string(format!("/proc/{id}/comm")).is_ok_and(|name| name == "plantd\n")
+    };
+    let started = Instant::now();
+    let server = loop {
+        if let Some(server) = servers().into_iter().find(is_server) {
+            break server;
+        }
+        assert!(started.elapsed() < PATIENCE, "no server");
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    plantctl.kill().unwrap();
+    plantctl.wait().unwrap();
+    while is_server(&server) {
+        assert!(started.elapsed() < PATIENCE, "the server is left behind");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
 fn a_controller_that_dies_or_falls_silent_is_told_of() {
     let (dead, _) = cases("broken/dies.toml", &[]);
     assert_eq!((&dead[0]["status"], &dead[0]["steps"]), (&"failed".into(), &20.into()));
@@ -178,7 +222,8 @@ fn reports_say_what_the_console_says() {
         assert!(place.contains("--seed 0"), "{what}");
     }
     assert!(xml.contains("tests=\"1\" failures=\"1\" errors=\"0\""), "{xml}");
-    assert_eq!(html.matches("<svg").count(), 7, "a plot for each expectation with a signal");
+    let plots = html.matches("role=\"img\"").count();
+    assert_eq!(plots, 7, "a plot for each expectation with a signal");
     assert!(!html.contains("http://") && !html.contains("https://"), "it needs nothing else");
 }
 

@@ -231,7 +231,7 @@ async fn create_disturbed(client: &Client, id: &str) {
     client.set_feedback(feedback).await.unwrap();
     let watchdog = v1::Watchdog {
         quantity: name("v(x)"),
-        min: Some(-1.0),
+        min: Some(-0.3),
         max: None,
         action: v1::WatchdogAction::Reset.into(),
     };

@@ -1,7 +1,6 @@
 //! Sensors, actuators and faults.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use plantd_client::{Client, Code, Error, v1};
 use plantd_models::{Initial, Model, Plant, Scene, Settings, builtin};
@@ -348,7 +347,7 @@ async fn a_restored_plant_goes_on_with_what_was_under_way() {
         assert_eq!(seen(&drive(&client, &a, 60).await), ahead);
     }
     // Channels that the snapshot does not know begin where the plant is; faults that it does not know, too.
-    drive(&client, &a, 1).await;
+    drive(&client, &a, 8).await;
     let snapshot = client.snapshot(&a).await.unwrap();
     let late = v1::OutputChannel { latency_s: 7.0 * H, ..theta("late") };
     client.clear_fault(&a, 0).await.unwrap();
@@ -381,48 +380,30 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
             ..Default::default()
         };
         let mut stream = client.watch(request).await.unwrap();
-        for pace in paces {
-            let steps = u64::from(STEPS) / paces.len() as u64;
-            match pace {
-                v1::Pace::Lockstep => {
-                    let settings = v1::RunSettings { pace: (*pace).into(), ..Default::default() };
-                    let (id, hold) = (id.clone(), steps as u32);
-                    let run = v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0 };
-                    client.run(run).await.unwrap();
-                    let request = v1::StepRequest { id, hold, ..Default::default() };
-                    client.step(request).await.unwrap();
-                }
-                pace => {
-                    let speed = if *pace == v1::Pace::Paced { 20.0 } else { 0.0 };
-                    let settings = v1::RunSettings { pace: (*pace).into(), speed, input: None };
-                    let run = v1::RunRequest { id: id.clone(), settings: Some(settings), steps };
-                    client.run(run).await.unwrap();
-                    let stands = async {
-                        while client
-                            .get_plant(&id)
-                            .await
-                            .unwrap()
-                            .plant
-                            .unwrap()
-                            .run
-                            .unwrap()
-                            .running
-                        {
-                            tokio::time::sleep(Duration::from_millis(5)).await;
-                        }
-                    };
-                    soon(stands).await;
-                }
-            }
-        }
         let mut all = Vec::new();
-        while all.len() <= STEPS as usize {
-            let message = soon(stream.next()).await.unwrap().expect("a state");
-            assert_eq!(message.dropped, 0);
-            let outputs = message.outputs.unwrap();
-            let y: Vec<u64> = outputs.y.iter().map(|y| y.to_bits()).collect();
-            let u: Vec<u64> = message.u.iter().map(|u| u.to_bits()).collect();
-            all.push((bits(&message.state.unwrap()), y, outputs.lost, u));
+        for (phase, pace) in (1..).zip(paces) {
+            let steps = STEPS / paces.len() as u32;
+            let speed = if *pace == v1::Pace::Paced { 20.0 } else { 0.0 };
+            let settings = v1::RunSettings { pace: (*pace).into(), speed, input: None };
+            let is_lockstep = *pace == v1::Pace::Lockstep;
+            let request = v1::RunRequest {
+                id: id.clone(),
+                settings: Some(settings),
+                steps: if is_lockstep { 0 } else { steps.into() },
+            };
+            client.run(request).await.unwrap();
+            if is_lockstep {
+                let request = v1::StepRequest { id: id.clone(), hold: steps, ..Default::default() };
+                client.step(request).await.unwrap();
+            }
+            while all.len() <= (phase * steps) as usize {
+                let message = soon(stream.next()).await.unwrap().expect("a state");
+                assert_eq!(message.dropped, 0);
+                let outputs = message.outputs.unwrap();
+                let y: Vec<u64> = outputs.y.iter().map(|y| y.to_bits()).collect();
+                let u: Vec<u64> = message.u.iter().map(|u| u.to_bits()).collect();
+                all.push((bits(&message.state.unwrap()), y, outputs.lost, u));
+            }
         }
         all
     };

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use super::expect::{Curve, Verdict};
 use super::junit::escaped;
 use super::run::{Outcome, Status};
-use super::{Replay, Report, Tested, faults, short, title};
+use super::{Replay, Report, Tested, short};
 
 /// Cases that passed and are plotted all the same, of each scenario.
 const PASSED_PLOTTED: usize = 10;
@@ -20,43 +20,39 @@ const BOTTOM: f64 = 24.0;
 const TOP: f64 = 8.0;
 const RIGHT: f64 = 16.0;
 
-const STYLE: &str = "\
-:root{color-scheme:light dark;--line:#0b62c4;--band:#2e8b57;--bad:#c62828;--grid:#8886}\
-body{font:15px/1.5 system-ui,sans-serif;max-width:1000px;margin:2rem auto;padding:0 1rem}\
-h1{font-size:1.5rem}h2{font-size:1.15rem;margin:2rem 0 .3rem}\
-table{border-collapse:collapse}td,th{padding:.15rem .8rem .15rem 0;text-align:left;vertical-align:top}\
-code,pre{font:13px/1.4 ui-monospace,monospace}pre{overflow-x:auto;padding:.6rem;background:#8881;white-space:pre-wrap}\
-details{border-left:4px solid #888;padding:.2rem .8rem;margin:.5rem 0}summary{cursor:pointer}\
-.passed{border-color:var(--band)}.failed,.error{border-color:var(--bad)}\
-b.passed{color:var(--band)}b.failed,b.error{color:var(--bad)}\
-svg{max-width:100%;height:auto;display:block;font:11px system-ui,sans-serif}\
-svg text{fill:currentColor}figure{margin:.6rem 0}figcaption{font-size:.9rem}\
-.grid{stroke:var(--grid);stroke-width:1}.curve{fill:none;stroke:var(--line);stroke-width:1.5;stroke-linejoin:round}\
-.band{fill:var(--band);opacity:.16}.bound{fill:none;stroke:var(--band);stroke-width:1;stroke-dasharray:4 3}\
-.break{fill:none;stroke:var(--bad);stroke-width:2}";
+const STYLE: &str = include_str!("report.css");
 
 /// The page.
 pub(super) fn page(report: &Report, replay: &Replay<'_>) -> String {
-    let [passed, failed, errors] =
-        [Status::Passed, Status::Failed, Status::Error].map(|status| report.count(status));
+    let counts = [Status::Passed, Status::Failed, Status::Error].map(|status| report.count(status));
+    let [passed, failed, errors] = counts;
     let verdict = class(report.status());
+    let elapsed_s: f64 = report.outcomes().map(|outcome| outcome.elapsed.as_secs_f64()).sum();
     let mut html = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
          <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\
          <title>{passed} passed, {failed} failed, {errors} not run</title>\
-         <style>{STYLE}</style></head>\n<body><h1>plantctl test</h1>\n\
-         <p><b class=\"{verdict}\">{passed} passed, {failed} failed, {errors} not run</b></p>\n"
+         <style>{STYLE}</style></head>\n<body><header class=\"{verdict}\"><h1>{}</h1>\n\
+         <p>{passed} passed, {failed} failed, {errors} not run, in {elapsed_s:.1} s of running \
+         cases; plantctl {}</p></header>\n",
+        match report.status() {
+            Status::Passed => "Every expectation came true",
+            Status::Failed => "Expectations broke",
+            Status::Error => "Not everything could be run",
+        },
+        env!("CARGO_PKG_VERSION"),
     );
+    overview(&mut html, report);
     for unusable in &report.unusable {
         let _ = writeln!(
             html,
-            "<h2>{}</h2>\n<pre>{}</pre>",
+            "<section><h2>{}</h2>\n<pre>{}</pre></section>",
             escaped(&unusable.file.to_string_lossy()),
             escaped(&unusable.error)
         );
     }
-    for tested in &report.tested {
-        scenario(&mut html, tested, replay);
+    for (index, tested) in report.tested.iter().enumerate() {
+        scenario(&mut html, index, tested, replay);
     }
     html.push_str("</body></html>\n");
     html
@@ -70,37 +66,77 @@ fn class(status: Status) -> &'static str {
     }
 }
 
-fn scenario(html: &mut String, tested: &Tested, replay: &Replay<'_>) {
+/// A line for each scenario.
+fn overview(html: &mut String, report: &Report) {
+    html.push_str(
+        "<table><thead><tr><th>scenario</th><th>passed</th><th>failed</th><th>not run</th>\
+         <th>s</th></tr></thead><tbody>\n",
+    );
+    for (index, Tested { prepared, outcomes }) in report.tested.iter().enumerate() {
+        let count = |status| outcomes.iter().filter(|o| o.status() == status).count();
+        let cell = |status| match count(status) {
+            0 => "<td class=\"none\">0</td>".to_owned(),
+            count => format!("<td class=\"{}\">{count}</td>", class(status)),
+        };
+        let elapsed_s: f64 = outcomes.iter().map(|outcome| outcome.elapsed.as_secs_f64()).sum();
+        let _ = writeln!(
+            html,
+            "<tr><td><a href=\"#s{index}\">{}</a></td>{}{}{}<td>{elapsed_s:.1}</td></tr>",
+            escaped(&prepared.name),
+            cell(Status::Passed),
+            cell(Status::Failed),
+            cell(Status::Error),
+        );
+    }
+    html.push_str(
+        "</tbody></table>\n<p class=\"key\"><svg viewBox=\"0 0 36 12\" width=\"36\" height=\"12\">\
+         <path class=\"curve\" d=\"M2 6H34\"/></svg> the signal \
+         <svg viewBox=\"0 0 36 12\" width=\"36\" height=\"12\"><path class=\"band\" \
+         d=\"M2 1H34V11H2Z\"/><path class=\"bound\" d=\"M2 1H34M2 11H34\"/></svg> where it is \
+         expected, and when <svg viewBox=\"0 0 12 12\" width=\"12\" height=\"12\">\
+         <circle class=\"break\" cx=\"6\" cy=\"6\" r=\"4.5\"/></svg> where it breaks the \
+         expectation</p>\n",
+    );
+}
+
+fn scenario(html: &mut String, index: usize, tested: &Tested, replay: &Replay<'_>) {
     let Tested { prepared, outcomes } = tested;
-    let file = escaped(&prepared.file.to_string_lossy());
-    let _ = writeln!(html, "<h2>{}</h2>\n<p><code>{file}</code>", escaped(&prepared.name));
-    let _ = writeln!(html, "{}</p>", escaped(&prepared.scenario.description));
+    let _ = writeln!(
+        html,
+        "<section id=\"s{index}\"><h2>{}</h2>\n<p>{} <code>{}</code></p>",
+        escaped(&prepared.name),
+        escaped(&prepared.scenario.description),
+        escaped(&prepared.file.to_string_lossy())
+    );
     let mut plotted = 0;
-    for outcome in outcomes {
+    // What broke comes first.
+    let mut sorted: Vec<&Outcome> = outcomes.iter().collect();
+    sorted.sort_by_key(|outcome| std::cmp::Reverse(outcome.status()));
+    for outcome in sorted {
         let status = outcome.status();
         let is_passed = status == Status::Passed;
         plotted += usize::from(is_passed);
         let (class, open) = (class(status), if is_passed { "" } else { " open" });
-        let name = escaped(&title(&prepared.name, &outcome.case));
+        let name = match outcome.case.is_empty() {
+            true => escaped(&prepared.name),
+            false => escaped(&outcome.case),
+        };
         let _ = writeln!(
             html,
-            "<details class=\"{class}\"{open}><summary><b class=\"{class}\">{class}</b> {name}, \
-             {} steps in {:.2} s</summary>",
+            "<details class=\"{class}\"{open}><summary><b class=\"{class}\">{class}</b> {name} \
+             <small>{} steps in {:.2} s</small></summary>",
             outcome.steps,
             outcome.elapsed.as_secs_f64()
         );
-        for line in faults(outcome) {
-            let _ = writeln!(html, "<p>{}</p>", escaped(&line));
+        for line in outcome.error.iter().chain(&outcome.ended) {
+            let _ = writeln!(html, "<p class=\"why\">{}</p>", escaped(line));
         }
         if !is_passed {
             let command = escaped(&replay.command(prepared, outcome));
             let _ = writeln!(html, "<pre>{command}</pre>");
         }
-        if is_passed && plotted > PASSED_PLOTTED {
-            html.push_str(&table(outcome));
-        } else {
-            plots(html, outcome);
-        }
+        let has_plots = !is_passed || plotted <= PASSED_PLOTTED;
+        figures(html, outcome, has_plots);
         if !outcome.output.is_empty() {
             let _ = writeln!(
                 html,
@@ -110,42 +146,30 @@ fn scenario(html: &mut String, tested: &Tested, replay: &Replay<'_>) {
         }
         html.push_str("</details>\n");
     }
+    html.push_str("</section>\n");
 }
 
-fn words(verdict: &Verdict) -> String {
-    let class = class(if verdict.broken.is_some() { Status::Failed } else { Status::Passed });
-    format!(
-        "<b class=\"{class}\">{class}</b> {}: {}",
-        escaped(&verdict.expectation),
-        escaped(&verdict.message)
-    )
-}
-
-fn table(outcome: &Outcome) -> String {
-    outcome.verdicts.iter().map(|verdict| format!("<p>{}</p>\n", words(verdict))).collect()
-}
-
-fn plots(html: &mut String, outcome: &Outcome) {
-    for verdict in &outcome.verdicts {
-        let svg = verdict.curve.as_ref().map(|curve| {
-            let at = verdict.broken.and_then(|b| b.time_s.zip(b.value));
-            svg(&outcome.time_s, curve, at)
-        });
-        let _ = writeln!(
-            html,
-            "<figure><figcaption>{}</figcaption>{}</figure>",
-            words(verdict),
-            svg.unwrap_or_default()
-        );
+/// What came of each expectation, those that broke first, and the other signals.
+fn figures(html: &mut String, outcome: &Outcome, has_plots: bool) {
+    let mut verdicts: Vec<&Verdict> = outcome.verdicts.iter().collect();
+    verdicts.sort_by_key(|verdict| verdict.broken.is_none());
+    html.push_str("<div class=\"figures\">\n");
+    let mut figure = |caption: String, curve: Option<&Curve>, at: Option<(f64, f64)>| {
+        let svg = curve.filter(|_| has_plots).map(|curve| svg(&outcome.time_s, curve, at));
+        let svg = svg.unwrap_or_default();
+        let _ = writeln!(html, "<figure><figcaption>{caption}</figcaption>{svg}</figure>");
+    };
+    for verdict in verdicts {
+        let class = class(if verdict.broken.is_some() { Status::Failed } else { Status::Passed });
+        let (expectation, message) = (escaped(&verdict.expectation), escaped(&verdict.message));
+        let caption = format!("<b class=\"{class}\">{class}</b> {expectation}: {message}");
+        let at = verdict.broken.and_then(|broken| broken.time_s.zip(broken.value));
+        figure(caption, verdict.curve.as_ref(), at);
     }
-    for curve in &outcome.plots {
-        let _ = writeln!(
-            html,
-            "<figure><figcaption>{}</figcaption>{}</figure>",
-            escaped(&curve.name),
-            svg(&outcome.time_s, curve, None)
-        );
+    for curve in outcome.plots.iter().filter(|_| has_plots) {
+        figure(escaped(&curve.name), Some(curve), None);
     }
+    html.push_str("</div>\n");
 }
 
 /// A range with round marks in it.
@@ -203,7 +227,10 @@ fn svg(time_s: &[f64], curve: &Curve, broken: Option<(f64, f64)>) -> String {
     let values = Axis::over(shown.iter().map(|&k| curve.values[k]).chain(of_bounds)).padded();
     let x = |t: f64| LEFT + times.fraction(t) * (WIDTH - LEFT - RIGHT);
     let y = |v: f64| TOP + (1.0 - values.fraction(v)) * (HEIGHT - BOTTOM - TOP);
-    let mut svg = format!("<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" width=\"{WIDTH}\" role=\"img\">");
+    let mut svg = format!(
+        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{0}\"><title>{0}</title>",
+        escaped(&curve.name)
+    );
     for mark in values.marks() {
         let y = y(mark);
         let _ = write!(
@@ -216,12 +243,12 @@ fn svg(time_s: &[f64], curve: &Curve, broken: Option<(f64, f64)>) -> String {
             short(mark)
         );
     }
-    for mark in times.marks() {
-        let x = x(mark);
+    for (i, mark) in times.marks().into_iter().enumerate() {
+        let (x, unit) = (x(mark), if i == 0 { " s" } else { "" });
         let _ = write!(
             svg,
             "<path class=\"grid\" d=\"M{x:.1} {TOP}V{:.1}\"/><text x=\"{x:.1}\" y=\"{:.1}\" \
-             text-anchor=\"middle\">{} s</text>",
+             text-anchor=\"middle\">{}{unit}</text>",
             HEIGHT - BOTTOM,
             HEIGHT - 8.0,
             short(mark)

@@ -455,7 +455,7 @@ impl Run<'_> {
         let event = event.context("the server closed the stream of events")?;
         if event.kind() == v1::EventKind::StepFailed && self.facts.failures.len() < FAILURES_MAX {
             let time_s = event.step as f64 * self.time_step_s;
-            let what = format!("the driver's input for step {} was refused", event.step + 1);
+            let what = format!("step {} was refused or failed", event.step + 1);
             self.facts.failures.push((time_s, what));
         }
         Ok(event.kind() == v1::EventKind::Paused)
