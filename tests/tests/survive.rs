@@ -230,9 +230,9 @@ async fn create_disturbed(client: &Client, id: &str) {
     };
     client.set_feedback(feedback).await.unwrap();
     let watchdog = v1::Watchdog {
-        quantity: name("v(x)"),
-        min: Some(-0.3),
-        max: None,
+        quantity: name("v(theta)"),
+        min: None,
+        max: Some(2.0),
         action: v1::WatchdogAction::Reset.into(),
     };
     let watchdogs = vec![watchdog];

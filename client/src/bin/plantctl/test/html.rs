@@ -7,8 +7,11 @@ use super::junit::escaped;
 use super::run::{Outcome, Status};
 use super::{Replay, Report, Tested, short};
 
-/// Cases that passed and are plotted all the same, of each scenario.
+/// Cases that passed, and that did not, of each scenario that are plotted.
 const PASSED_PLOTTED: usize = 10;
+const BROKEN_PLOTTED: usize = 50;
+/// Cases of each scenario that are open at first.
+const OPEN_MAX: usize = 5;
 /// Points of a curve; a plot is no wider.
 const POINTS_MAX: usize = 600;
 
@@ -108,15 +111,17 @@ fn scenario(html: &mut String, index: usize, tested: &Tested, replay: &Replay<'_
         escaped(&prepared.scenario.description),
         escaped(&prepared.file.to_string_lossy())
     );
-    let mut plotted = 0;
+    let (mut passed, mut broken) = (0, 0);
     // What broke comes first.
     let mut sorted: Vec<&Outcome> = outcomes.iter().collect();
     sorted.sort_by_key(|outcome| std::cmp::Reverse(outcome.status()));
     for outcome in sorted {
         let status = outcome.status();
         let is_passed = status == Status::Passed;
-        plotted += usize::from(is_passed);
-        let (class, open) = (class(status), if is_passed { "" } else { " open" });
+        passed += usize::from(is_passed);
+        broken += usize::from(!is_passed);
+        let is_open = !is_passed && broken <= OPEN_MAX;
+        let (class, open) = (class(status), if is_open { " open" } else { "" });
         let name = match outcome.case.is_empty() {
             true => escaped(&prepared.name),
             false => escaped(&outcome.case),
@@ -135,7 +140,7 @@ fn scenario(html: &mut String, index: usize, tested: &Tested, replay: &Replay<'_
             let command = escaped(&replay.command(prepared, outcome));
             let _ = writeln!(html, "<pre>{command}</pre>");
         }
-        let has_plots = !is_passed || plotted <= PASSED_PLOTTED;
+        let has_plots = if is_passed { passed <= PASSED_PLOTTED } else { broken <= BROKEN_PLOTTED };
         figures(html, outcome, has_plots);
         if !outcome.output.is_empty() {
             let _ = writeln!(
