@@ -6,13 +6,12 @@ use std::process::Command;
 use std::time::Duration;
 
 use plantd_client::link::{LeaseHolder, LinkDriver, LinkError, LinkOptions, StepFailure, Wait};
-use plantd_models::Snapshot;
 use plantd_proto::link::{
     Code, Domain, DomainError, Endpoint, HEADER_FIELDS, Header, Holder, Kind, LAYOUT_VERSION,
     MAGIC, SCHEMA_HASH, monotonic_ns, random_instance,
 };
 use plantd_server::link::{LinkConfig, LinkError as HostError, LinkHost};
-use plantd_server::session::DriverKind;
+use plantd_server::session::{DriverKind, PlantSnapshot};
 use plantd_tests::links::{
     ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_domain, new_plant, new_session,
     wait_until, wiggle,
@@ -91,7 +90,7 @@ fn a_restored_plant_goes_on_bit_for_bit_over_the_link() {
     for k in 0..40 {
         if k == 20 {
             let bytes = fixture.session.snapshot().to_bytes();
-            snapshot = Some(Snapshot::from_bytes(&bytes).unwrap());
+            snapshot = Some(PlantSnapshot::from_bytes(&bytes).unwrap());
         }
         let view = driver.step(&[0.1 * f64::from(k)]).unwrap();
         first.push(bits(view.x, view.multipliers));
@@ -99,7 +98,7 @@ fn a_restored_plant_goes_on_bit_for_bit_over_the_link() {
     drop(driver);
     wait_until("the lease", || fixture.session.driver().is_none()).unwrap();
     let mut lease = fixture.session.acquire(DriverKind::Step).unwrap();
-    lease.restore(&snapshot.unwrap()).unwrap();
+    lease.restore(snapshot.unwrap()).unwrap();
     drop(lease);
     let mut driver = fixture.connect(SLEEP).unwrap();
     assert_eq!(driver.state().step, 20);
