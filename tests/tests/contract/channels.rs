@@ -383,9 +383,9 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
         let mut all = Vec::new();
         for (phase, pace) in (1..).zip(paces) {
             let steps = STEPS / paces.len() as u32;
-            let speed = if *pace == v1::Pace::Paced { 20.0 } else { 0.0 };
-            let settings = v1::RunSettings { pace: (*pace).into(), speed, input: None };
             let is_lockstep = *pace == v1::Pace::Lockstep;
+            let speed = if is_lockstep { 0.0 } else { 20.0 };
+            let settings = v1::RunSettings { pace: (*pace).into(), speed, input: None };
             let request = v1::RunRequest {
                 id: id.clone(),
                 settings: Some(settings),
@@ -407,9 +407,9 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
         }
         all
     };
-    use v1::Pace::{Free, Lockstep, Paced};
+    use v1::Pace::{Lockstep, Paced};
     let lockstep = watched(&[Lockstep]).await;
-    for paces in [&[Paced][..], &[Free], &[Paced, Lockstep, Free, Lockstep, Paced]] {
+    for paces in [&[Paced][..], &[Paced, Lockstep, Paced, Lockstep, Paced]] {
         let other = watched(paces).await;
         for (k, (expected, found)) in lockstep.iter().zip(&other).enumerate() {
             assert_eq!(expected, found, "step {k}, {paces:?}");
