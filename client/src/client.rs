@@ -249,8 +249,11 @@ impl Client {
     }
 
     /// Runs a plant: by the wall clock, as fast as possible, or in lockstep; with `steps` of 0 for good.
+    /// With `wait` it returns when the plant stands still again, however long that takes.
     pub async fn run(&self, request: v1::RunRequest) -> Result<v1::RunInfo> {
-        let answer = self.plants().run(self.limited(request)).await?.into_inner();
+        let request =
+            if request.wait { tonic::Request::new(request) } else { self.limited(request) };
+        let answer = self.plants().run(request).await?.into_inner();
         answer.run.ok_or(Error::Protocol("an answer without what was asked"))
     }
 

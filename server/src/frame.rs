@@ -1,6 +1,10 @@
 //! What a plant publishes after a step.
 
+use std::sync::Arc;
+
 use plantd_models::{Dimensions, State, StepReport};
+
+use crate::ring::{Reader, Ring};
 
 /// Room for the numbers of a frame that are neither state nor input.
 const FIXED_WORDS: usize = 32;
@@ -214,6 +218,39 @@ impl Frame {
             model_digest: self.model_digest,
             timing: self.timing,
         }
+    }
+}
+
+/// Frames, read from a plant's ring.
+#[derive(Debug)]
+pub struct Frames {
+    reader: Reader,
+    frame: Frame,
+}
+
+impl Frames {
+    /// Record `next` and what comes after it.
+    pub fn from(ring: Arc<Ring>, next: u64) -> Self {
+        Self { reader: Reader::from(ring, next), frame: Frame::default() }
+    }
+
+    /// The next one and the number of its record, if there is one before record `end`. Skips what has been
+    /// overwritten.
+    pub fn read_before(&mut self, end: u64) -> Option<(u64, &Frame)> {
+        let (number, record) = self.reader.read_before(end)?;
+        self.frame.read(record);
+        Some((number, &self.frame))
+    }
+
+    /// Number of those that were overwritten before they were read.
+    pub fn lost(&self) -> u64 {
+        self.reader.lost()
+    }
+
+    /// The last one, if it was not read.
+    pub fn read_last(&mut self) -> Option<&Frame> {
+        self.reader.skip_to_last();
+        self.read_before(u64::MAX).map(|(_, frame)| frame)
     }
 }
 

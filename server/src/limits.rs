@@ -64,7 +64,7 @@ limits! {
     plants = 1024 in 0..=1_000_000;
     /// Plants that run by themselves at a time.
     running_plants = 256 in 0..=1_000_000;
-    /// Watch streams of one plant, and WatchGains streams.
+    /// Watch streams of one plant, WatchGains streams, and WatchEvents streams, each.
     watchers_per_plant = 64 in 0..=1_000_000;
     /// Numbers held in the queues of all watchers together (8 bytes each).
     watch_numbers = 16_000_000 in 0..=10_000_000_000;

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering, fence};
 #[derive(Debug)]
 pub struct Ring {
     slots: Box<[Slot]>,
-    /// Number of records written so far.
+    /// Number of the next record.
     written: AtomicU64,
 }
 
@@ -32,12 +32,17 @@ impl Ring {
         Self { slots: (0..records.max(1)).map(slot).collect(), written: AtomicU64::new(0) }
     }
 
+    /// Gives the first record this number. Before anybody reads or writes.
+    pub(crate) fn begin_at(&self, first: u64) {
+        self.written.store(first, Ordering::Release);
+    }
+
     /// Number of records that it keeps.
     pub fn capacity(&self) -> usize {
         self.slots.len()
     }
 
-    /// Number of records written so far; the last of them has this number less one.
+    /// Number of the next record.
     pub fn written(&self) -> u64 {
         self.written.load(Ordering::Acquire)
     }
@@ -98,9 +103,13 @@ impl Reader {
 
     /// The next record and its number, if there is one. Skips what has been overwritten.
     pub fn read_next(&mut self) -> Option<(u64, &[u64])> {
+        self.read_before(u64::MAX)
+    }
+
+    /// The same for records before `end`.
+    pub fn read_before(&mut self, end: u64) -> Option<(u64, &[u64])> {
         loop {
-            let written = self.ring.written();
-            if self.next >= written {
+            if self.next >= self.ring.written().min(end) {
                 return None;
             }
             let n = self.next;
@@ -125,11 +134,6 @@ impl Reader {
     /// Number of records that were overwritten before they were read.
     pub fn lost(&self) -> u64 {
         self.lost
-    }
-
-    /// Records that wait to be read.
-    pub fn waiting(&self) -> u64 {
-        self.ring.written().saturating_sub(self.next)
     }
 }
 
@@ -167,7 +171,6 @@ mod tests {
         let ring = Arc::new(Ring::new(8, 1));
         (0..5).for_each(|k| ring.write([k]));
         let mut reader = Reader::from(Arc::clone(&ring), 3);
-        assert_eq!(reader.waiting(), 2);
         assert_eq!(reader.read_next(), Some((3, &[3][..])));
         let mut reader = Reader::from(ring, 0);
         reader.skip_to_last();

@@ -18,8 +18,9 @@ use crate::channels::noise::hash;
 use crate::convert::{self, Start};
 use crate::grpc::feedback::set_feedback;
 use crate::grpc::model::compile;
-use crate::grpc::run::{run, run_info, set_safety};
+use crate::grpc::run::{protect, run, run_info};
 use crate::hub::Hub;
+use crate::realtime::watchdog::{Trip, WatchdogAction};
 use crate::session::{PlantSnapshot, Session};
 use crate::status::Fault;
 
@@ -222,11 +223,9 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
         warn("its channels are not restored", fault);
     }
     resume_feedback(hub, &session, feedback, info.feedback).await;
-    if let Some(safety) = record.safety {
-        let request = v1::SetSafetyRequest { id: id.to_owned(), ..safety };
-        if let Err(fault) = set_safety(hub, request) {
-            warn("its watchdogs are not restored", fault);
-        }
+    let v1::SafetyInfo { watchdogs, on_step_failure, frozen } = info.safety.unwrap_or_default();
+    if let Err(fault) = protect(&session, watchdogs, on_step_failure) {
+        warn("its watchdogs are not restored", fault);
     }
     if let Err(fault) = session.resume_faults(record.faults, record.fault_count, &hub.limits) {
         warn("its faults are not restored", fault);
@@ -245,6 +244,10 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     {
         tracing::warn!(plant = id, error = %sentence(fault), "the plant does not run by itself");
     }
+    if let Some(v1::WatchdogTrip { watchdog, value, step }) = frozen {
+        let (watchdog, action) = (watchdog as usize, WatchdogAction::Freeze);
+        session.resume_frozen(Trip { watchdog, value, action, step });
+    }
     Ok(session)
 }
 
@@ -255,7 +258,7 @@ fn resume_run(hub: &Hub, session: &Arc<Session>, info: v1::RunInfo) -> Result<()
         return Ok(());
     }
     let id = session.id().to_owned();
-    run(hub, v1::RunRequest { id, settings: info.settings, steps: info.steps_left })?;
+    run(hub, v1::RunRequest { id, settings: info.settings, steps: info.steps_left, wait: false })?;
     Ok(())
 }
 

@@ -6,14 +6,15 @@
 //! takes its frame by swapping buffers, so the driver never waits for more than that.
 
 use std::future::poll_fn;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 
 use futures::task::AtomicWaker;
 
-use crate::frame::{Frame, Published};
+use crate::frame::{Frame, Frames, Published};
 use crate::limits::LimitExceeded;
+use crate::ring::Ring;
 use crate::session::Session;
 
 /// The watchers of one plant.
@@ -31,11 +32,11 @@ impl Watchers {
 
     /// Offers a state to all watchers whose turn it is.
     pub(crate) fn publish(&self, published: &Published<'_>) {
-        self.publish_record(published, u64::MAX);
+        self.publish_record(u64::MAX, published);
     }
 
     /// The same for a record of the plant's ring: not to those who came after it.
-    pub(crate) fn publish_record(&self, published: &Published<'_>, record: u64) {
+    fn publish_record(&self, record: u64, published: &Published<'_>) {
         if self.count() == 0 {
             return;
         }
@@ -44,8 +45,17 @@ impl Watchers {
         }
     }
 
+    /// So many records of the ring were overwritten before anybody saw them.
+    fn lose(&self, records: u64) {
+        if records > 0 {
+            for slot in lock(&self.slots).iter() {
+                lock(&slot.cell).dropped += records / slot.every;
+            }
+        }
+    }
+
     /// The first record of the plant's ring that somebody wants.
-    pub(crate) fn first_record(&self) -> u64 {
+    fn first_record(&self) -> u64 {
         lock(&self.slots).iter().map(|slot| slot.from).min().unwrap_or(u64::MAX)
     }
 
@@ -62,6 +72,76 @@ impl Watchers {
         let mut slots = lock(&self.slots);
         slots.retain(|other| !Arc::ptr_eq(other, slot));
         self.count.store(slots.len(), Ordering::Release);
+    }
+}
+
+/// Brings what a plant's own loop writes into the ring to its watchers: all of it, in order, and before
+/// what comes after it.
+#[derive(Default)]
+pub(crate) struct Relay {
+    /// Something may be on its way.
+    is_busy: AtomicBool,
+    /// The first record that is not the loop's; `u64::MAX` while it runs.
+    end: AtomicU64,
+    /// What the loop has written since it began.
+    written: Mutex<Option<Written>>,
+}
+
+struct Written {
+    ring: Arc<Ring>,
+    /// The first record.
+    first: u64,
+    /// Where they are read, while there are watchers.
+    frames: Option<Frames>,
+}
+
+impl Relay {
+    /// A loop begins to write into this ring.
+    pub(crate) fn begin(&self, ring: Arc<Ring>, watchers: &Watchers) {
+        self.hand_on(watchers);
+        let mut written = lock(&self.written);
+        let first = ring.written();
+        *written = Some(Written { ring, first, frames: None });
+        self.end.store(u64::MAX, Ordering::Release);
+        self.is_busy.store(true, Ordering::Release);
+    }
+
+    /// The loop has ended; the next record is not its.
+    pub(crate) fn end(&self, next: u64) {
+        self.end.store(next, Ordering::Release);
+    }
+
+    /// Something may be on its way.
+    pub(crate) fn is_busy(&self) -> bool {
+        self.is_busy.load(Ordering::Acquire)
+    }
+
+    /// Hands on what is there.
+    pub(crate) fn hand_on(&self, watchers: &Watchers) {
+        if !self.is_busy() {
+            return;
+        }
+        let mut place = lock(&self.written);
+        let Some(Written { ring, first, frames }) = &mut *place else { return };
+        // Looked at first: what is there by then is handed on below.
+        let end = self.end.load(Ordering::Acquire);
+        let until = end.min(ring.written());
+        if watchers.count() == 0 {
+            *frames = None;
+        } else {
+            let frames = frames.get_or_insert_with(|| {
+                Frames::from(Arc::clone(ring), watchers.first_record().max(*first))
+            });
+            let before = frames.lost();
+            while let Some((number, frame)) = frames.read_before(until) {
+                watchers.publish_record(number, &frame.published());
+            }
+            watchers.lose(frames.lost() - before);
+        }
+        if end != u64::MAX {
+            *place = None;
+            self.is_busy.store(false, Ordering::Release);
+        }
     }
 }
 

@@ -23,6 +23,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 
@@ -35,6 +36,15 @@ const TURN: Duration = Duration::from_millis(20);
 
 /// Threads for each turn, at most: those that wait for their next turn included.
 const THREADS_PER_TURN: usize = 8;
+
+/// Runs a long computation, or a wait, on this thread, while the runtime that it may belong to moves its
+/// other tasks to another one.
+pub(crate) fn beside_other_tasks<R>(compute: impl FnOnce() -> R) -> R {
+    match Handle::try_current().map(|runtime| runtime.runtime_flavor()) {
+        Ok(RuntimeFlavor::MultiThread) => tokio::task::block_in_place(compute),
+        _ => compute(),
+    }
+}
 
 /// Told to jobs that nobody waits for; also where a job lets others have their turn.
 pub struct Abandoned {

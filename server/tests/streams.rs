@@ -6,7 +6,7 @@ use futures::StreamExt as _;
 use plantd_proto::v1;
 use plantd_server::config::{Config, Listen};
 use plantd_server::serve::RunningServer;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::{sleep, timeout};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::Channel;
@@ -88,6 +88,47 @@ impl Drive {
 
 fn reason(status: &Status) -> String {
     status.get_error_details().error_info().map(|info| info.reason.clone()).unwrap_or_default()
+}
+
+/// A step that takes long holds up those who wait for it; the threads on which all calls run do not. Here
+/// there is one.
+#[tokio::test]
+async fn a_plant_that_takes_long_does_not_hold_the_server_up() {
+    let (server, channel) = start(|_| {}).await;
+    let mut plants = PlantServiceClient::new(channel);
+    let id = create_pendulum(&mut plants).await;
+    let mut former = Drive::open(&mut plants, &id).await;
+    assert!(matches!(former.answer().await, Ok(DriveAnswer::Opened(_))));
+    let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), ..Default::default() };
+    let run = v1::RunRequest { id: id.clone(), settings: Some(settings), ..Default::default() };
+    plants.run(run).await.unwrap();
+    let (begin, has_begun) = oneshot::channel();
+    let (end, ending) = std::sync::mpsc::channel();
+    let session = server.hub().session(&id).unwrap();
+    let long = move || {
+        session.with_core(move |_| {
+            begin.send(()).unwrap();
+            ending.recv_timeout(PATIENCE).is_ok()
+        })
+    };
+    let long = std::thread::spawn(long);
+    has_begun.await.unwrap();
+
+    // One driver goes, another one comes.
+    drop(former.inputs);
+    while timeout(PATIENCE, former.answers.message()).await.unwrap().unwrap().is_some() {}
+    let mut drive = Drive::open(&mut plants, &id).await;
+    let mut others = plants.clone();
+    let clear = v1::ClearFeedbackRequest { id: id.clone() };
+    let cleared = tokio::spawn(async move { others.clear_feedback(clear).await });
+    for _ in 0..10 {
+        plants.get_timing(v1::GetTimingRequest { id: id.clone(), clear: false }).await.unwrap();
+    }
+    end.send(()).unwrap();
+    assert!(long.join().unwrap(), "the server stood still");
+    assert!(matches!(drive.answer().await, Ok(DriveAnswer::Opened(_))));
+    cleared.await.unwrap().unwrap();
+    server.stop().await;
 }
 
 #[tokio::test]

@@ -4,8 +4,12 @@
 
 use std::io::{BufRead as _, BufReader};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use plantd_client::link::{LinkDriver, LinkOptions};
 use plantd_client::{Client, v1};
 use plantd_tests::server::{ServerProcess, binary};
 use rustix::process::{Pid, Signal, kill_process};
@@ -58,7 +62,8 @@ async fn running(client: &Client, id: &str) {
     };
     let settings =
         v1::RunSettings { pace: v1::Pace::Paced.into(), speed: 10.0, input: Some(policy) };
-    let request = v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps: 0 };
+    let request =
+        v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps: 0, wait: false };
     client.run(request).await.unwrap();
 }
 
@@ -236,4 +241,145 @@ async fn long_lockstep_does_not_grow() {
     }
     let grown_kib = resident_kib(&server).saturating_sub(before_kib);
     assert!(grown_kib < GROWTH_MAX_KIB / 4, "the server has grown by {grown_kib} KiB");
+}
+
+/// Stops a process for a while, now and then, as a debugger does; until it is dropped.
+struct Debugger {
+    is_over: Arc<AtomicBool>,
+    thread: Option<JoinHandle<u32>>,
+}
+
+impl Debugger {
+    fn of(pid: u32) -> Self {
+        let pid = Pid::from_raw(pid.cast_signed()).unwrap();
+        let is_over = Arc::new(AtomicBool::new(false));
+        let thread = {
+            let is_over = Arc::clone(&is_over);
+            std::thread::spawn(move || {
+                let mut stops = 0;
+                while !is_over.load(Ordering::Acquire) {
+                    // Some stops are longer than a plant catches up with.
+                    let pause = Duration::from_millis(if stops % 4 == 0 { 120 } else { 20 });
+                    kill_process(pid, Signal::STOP).unwrap();
+                    std::thread::sleep(pause);
+                    kill_process(pid, Signal::CONT).unwrap();
+                    stops += 1;
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                stops
+            })
+        };
+        Self { is_over, thread: Some(thread) }
+    }
+
+    /// Lets the process go; how often it was stopped.
+    fn detach(mut self) -> u32 {
+        self.is_over.store(true, Ordering::Release);
+        self.thread.take().unwrap().join().unwrap()
+    }
+}
+
+impl Drop for Debugger {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+async fn create(client: &Client, model: &str, open_link: bool) -> String {
+    let model = model.to_owned();
+    let request = v1::CreatePlantRequest { model, open_link, ..Default::default() };
+    client.create_plant(request).await.unwrap().id
+}
+
+/// The `k`-th force on the cart of the tests with debuggers; that of the controller `sway`.
+fn sway(k: u32) -> f64 {
+    f64::from(k % 17) - 8.0
+}
+
+/// Where a plant is, bit for bit.
+async fn bits_of(client: &Client, id: &str) -> (u64, Vec<u64>) {
+    let state = client.get_plant(id).await.unwrap().plant.unwrap().state.unwrap();
+    (state.step, state.q.iter().chain(&state.p).map(|number| number.to_bits()).collect())
+}
+
+/// A server or a controller that stands in a debugger now and then does not change the motion: in
+/// lockstep over gRPC and over shared memory, and paced.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_debugger_on_either_side_does_not_change_a_bit_of_the_motion() {
+    const STEPS: u32 = 1000;
+    let server = ServerProcess::start().unwrap();
+    let client = server.client().await;
+    let expected = create(&client, "cart-pole", false).await;
+    let mut driver = client.drive(&expected).await.unwrap();
+    for k in 0..STEPS {
+        driver.step(&[sway(k)]).await.unwrap();
+    }
+    let expected = bits_of(&client, &expected).await;
+    let free = create(&client, "double-pendulum", false).await;
+    let hold = v1::StepRequest { id: free.clone(), hold: STEPS, ..Default::default() };
+    client.step(hold).await.unwrap();
+    let expected_free = bits_of(&client, &free).await;
+
+    // The server, in lockstep over gRPC.
+    let id = create(&client, "cart-pole", false).await;
+    let mut driver = client.drive(&id).await.unwrap();
+    let debugger = Debugger::of(server.pid());
+    for k in 0..STEPS {
+        driver.step(&[sway(k)]).await.unwrap();
+        if k % 100 == 0 {
+            // Long enough to be stopped in between.
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    }
+    assert!(debugger.detach() > 0);
+    assert_eq!(bits_of(&client, &id).await, expected);
+
+    // The server, in lockstep over shared memory.
+    let id = create(&client, "cart-pole", true).await;
+    let root = client.open_link(&id).await.unwrap().root_path.into();
+    let options =
+        LinkOptions { root, timeout: PATIENCE, connect_timeout: PATIENCE, ..Default::default() };
+    let mut driver = LinkDriver::connect(&id, options).unwrap();
+    let debugger = Debugger::of(server.pid());
+    for k in 0..STEPS {
+        driver.step(&[sway(k)]).unwrap();
+        if k % 100 == 0 {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+    assert!(debugger.detach() > 0);
+    assert_eq!(bits_of(&client, &id).await, expected);
+
+    // The server, of a plant that follows the clock.
+    let id = create(&client, "double-pendulum", false).await;
+    let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), speed: 10.0, input: None };
+    let steps = u64::from(STEPS);
+    let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps, wait: true };
+    let debugger = Debugger::of(server.pid());
+    let run = client.run(request).await.unwrap();
+    assert!(debugger.detach() > 0);
+    assert_eq!((run.running, run.steps_left), (false, 0));
+    assert_eq!(bits_of(&client, &id).await, expected_free);
+    let timing = client.timing(&id, false).await.unwrap();
+    assert!(timing.overruns > 0, "it was stopped: {timing:?}");
+
+    // The controller, in lockstep.
+    let id = create(&client, "cart-pole", false).await;
+    let run = v1::RunRequest { id: id.clone(), settings: None, steps, wait: true };
+    let waiting = client.run(run);
+    let controller = async {
+        while client.get_plant(&id).await.unwrap().plant.unwrap().run.unwrap().steps_left == 0 {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        let controller = Controller::start(&server, &id, "sway");
+        (Debugger::of(controller.0.id()), controller)
+    };
+    let (run, (debugger, controller)) = tokio::join!(waiting, controller);
+    assert!(!run.unwrap().running);
+    assert!(debugger.detach() > 0);
+    assert_eq!(bits_of(&client, &id).await, expected);
+    drop(controller);
 }

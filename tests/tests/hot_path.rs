@@ -2,11 +2,13 @@
 //! over shared memory gives it inputs. Looked at by strace, from outside.
 
 use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use plantd_client::link::Wait;
 use plantd_server::realtime::{Pace, RunSettings};
-use plantd_tests::links::LinkFixture;
+use plantd_tests::links::{LinkFixture, new_session};
 
 /// Steps of the plant while somebody looks.
 const STEPS: u64 = 200;
@@ -73,4 +75,40 @@ fn a_paced_step_over_shared_memory_makes_no_system_call_but_its_sleep() {
     let other: Vec<&str> =
         other.into_iter().filter(|line| !line.contains("restart_syscall")).collect();
     assert!(other.is_empty(), "{other:#?}");
+}
+
+/// However many want something of a plant that runs, and however long it takes, it goes on; and so do they.
+#[test]
+fn a_plant_that_is_flooded_takes_its_steps() {
+    for pace in [Pace::Paced, Pace::Free] {
+        let session = new_session("pendulum").unwrap();
+        let settings = RunSettings { pace, speed: 10.0, ..RunSettings::default() };
+        session.run(Some(settings), 0, 1).unwrap();
+        let (is_over, served) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
+        let flood = || {
+            let (session, is_over) = (Arc::clone(&session), Arc::clone(&is_over));
+            let served = Arc::clone(&served);
+            std::thread::spawn(move || {
+                while !is_over.load(Ordering::Acquire) {
+                    // Longer than a step may take.
+                    session.with_core(|_| std::thread::sleep(Duration::from_millis(2)));
+                    served.fetch_add(1, Ordering::Relaxed);
+                }
+            })
+        };
+        let flood: Vec<_> = (0..8).map(|_| flood()).collect();
+        let counts = &session.live().counts;
+        let (steps, deadline) = (counts.steps.load(Ordering::Relaxed), Instant::now() + PATIENCE);
+        while counts.steps.load(Ordering::Relaxed) < steps + STEPS
+            || served.load(Ordering::Relaxed) < 20
+        {
+            assert!(Instant::now() < deadline, "{counts:?}, {served:?} were served");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        is_over.store(true, Ordering::Release);
+        for thread in flood {
+            thread.join().unwrap();
+        }
+        session.pause();
+    }
 }

@@ -279,7 +279,7 @@ async fn run(client: &Client, id: &str, pace: v1::Pace, speed: f64, steps: u64) 
     let settings = v1::RunSettings { pace: pace.into(), speed, input: None };
     let id = id.to_owned();
     let before = client.get_plant(&id).await.unwrap().plant.unwrap().state.unwrap().step;
-    let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps };
+    let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps, wait: false };
     client.run(request).await.unwrap();
     let end = async {
         while client.get_plant(&id).await.unwrap().plant.unwrap().state.unwrap().step
@@ -299,7 +299,8 @@ async fn plants_that_run_by_themselves_are_recorded_with_times_and_events() {
     run(&setup.client, &id, v1::Pace::Paced, 10.0, 500).await;
     // A reset while it runs.
     let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), speed: 10.0, input: None };
-    let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0 };
+    let request =
+        v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0, wait: false };
     setup.client.run(request).await.unwrap();
     tokio::time::sleep(Duration::from_millis(200)).await;
     setup.client.pause(&id).await.unwrap();

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use plantd_client::{Client, MatrixExt as _, diagonal, operating_point, v1, weights};
 use plantd_tests::server::ServerProcess;
+use prost::Message as _;
 
 const SCENE: &str = r#"
 format = 1
@@ -303,11 +304,64 @@ async fn everything(client: &Client, id: &str) -> Everything {
     }
 }
 
-/// Waits until there is a file of a plant.
+/// Watchdogs protect the plant with the next server too, and one that held it still does.
+#[tokio::test]
+async fn watchdogs_survive() {
+    let state = tempfile::tempdir().unwrap();
+    let mut server = serve(state.path());
+    let client = server.client().await;
+    let dog = |max, action: v1::WatchdogAction| v1::Watchdog {
+        quantity: "x".to_owned(),
+        min: None,
+        max: Some(max),
+        action: action.into(),
+    };
+    let (freeze, reset) = (v1::WatchdogAction::Freeze, v1::WatchdogAction::Reset);
+    for (id, action) in [("frozen", freeze), ("fresh", reset)] {
+        create(&client, id, "cart-pole").await;
+        let request = v1::SetSafetyRequest {
+            id: id.to_owned(),
+            watchdogs: vec![dog(0.2, action)],
+            on_step_failure: reset.into(),
+        };
+        client.set_safety(request).await.unwrap();
+    }
+    let mut driver = client.drive("frozen").await.unwrap();
+    while driver.step(&[20.0]).await.is_ok() {}
+    driver.close().await.unwrap();
+    let mut before = Vec::new();
+    for id in ["frozen", "fresh"] {
+        before.push(client.get_plant(id).await.unwrap().plant.unwrap());
+    }
+    assert!(before[0].safety.as_ref().unwrap().frozen.is_some());
+    assert!(server.stop().unwrap().success());
+
+    let server = serve(state.path());
+    let client = server.client().await;
+    for plant in before {
+        let now = client.get_plant(&plant.id).await.unwrap().plant.unwrap();
+        assert_eq!((now.safety, now.state), (plant.safety, plant.state), "{}", server.log());
+    }
+    let mut driver = client.drive("frozen").await.unwrap();
+    assert_eq!(driver.step(&[0.0]).await.unwrap_err().reason(), "WATCHDOG");
+    let mut driver = client.drive("fresh").await.unwrap();
+    let mut step = driver.step(&[20.0]).await.unwrap().state.unwrap().step;
+    while step != 0 {
+        step = driver.step(&[20.0]).await.unwrap().state.unwrap().step;
+        assert!(step < 1000, "nothing puts it back");
+    }
+}
+
+/// Waits until there is a file of a plant that has taken steps: everything before them is in it.
 async fn wait_until_saved(state: &Path, id: &str) {
     let path = state.join(id).with_extension("plant");
     let started = Instant::now();
-    while !path.exists() {
+    let has_steps = || {
+        let bytes = std::fs::read(&path).ok()?;
+        let record = v1::PlantRecord::decode(&bytes[..bytes.len() - 8]).ok()?;
+        Some(record.plant?.state?.step > 0)
+    };
+    while has_steps() != Some(true) {
         assert!(started.elapsed() < Duration::from_secs(30), "{} is not there", path.display());
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
@@ -361,8 +415,12 @@ async fn a_plant_that_ran_runs_again_and_one_that_was_paused_does_not() {
         create(&client, id, "pendulum").await;
     }
     let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), speed: 2.0, input: None };
-    let request =
-        v1::RunRequest { id: "runs".to_owned(), settings: Some(settings.clone()), steps: 0 };
+    let request = v1::RunRequest {
+        id: "runs".to_owned(),
+        settings: Some(settings.clone()),
+        steps: 0,
+        wait: false,
+    };
     client.run(request).await.unwrap();
     step(&client, "stands", 0, 5).await;
     client.pause("stands").await.unwrap();

@@ -14,7 +14,7 @@ use futures::{Stream, StreamExt as _};
 use plantd_models::Linearization;
 use plantd_proto::link::{monotonic_ns, random_instance};
 use plantd_proto::v1;
-use tokio::runtime::{Handle, RuntimeFlavor};
+use tokio::runtime::Handle;
 use tokio::time::Sleep;
 use tokio_stream::wrappers::WatchStream;
 use tokio_util::sync::WaitForCancellationFutureOwned;
@@ -30,6 +30,7 @@ use crate::limits::LimitExceeded;
 use crate::session::{DriveError, DriverKind, Lease, RunStatus};
 use crate::status::Fault;
 use crate::watch::Subscription;
+use crate::workers::beside_other_tasks;
 
 /// Answers in a row after which the stream lets others on its thread run.
 const BURST_MAX: u32 = 32;
@@ -48,9 +49,14 @@ pub struct DriveStream {
     burst: u32,
 }
 
+/// What a worker does for a stream, because it may have to wait for a step.
+type Job<T> = Pin<Box<dyn Future<Output = Result<T, Fault>> + Send>>;
+
 enum Phase {
     /// Waits for `open`.
-    Opening,
+    Waiting,
+    /// Takes the lease.
+    Opening(Job<(Box<Driving>, v1::PlantInfo)>),
     /// Holds the lease.
     Driving(Box<Driving>),
     /// Has ended; the lease is given up.
@@ -69,8 +75,14 @@ struct Driving {
     status: WatchStream<RunStatus>,
     /// An input that waits for its step in lockstep: the plant is paused, or slowed.
     held: Option<Held>,
-    /// The states of the plant while it runs by itself.
-    states: Option<Subscription>,
+    states: States,
+}
+
+/// The states of the plant while it runs by itself.
+enum States {
+    None,
+    Opening(Job<Subscription>),
+    Open(Box<Subscription>),
 }
 
 struct Held {
@@ -85,23 +97,29 @@ impl DriveStream {
     /// A stream that waits for its first message.
     pub fn new(hub: Arc<Hub>, requests: Streaming<v1::DriveRequest>) -> Self {
         let ending = Box::pin(hub.ending.clone().cancelled_owned());
-        Self { hub, requests, ending, phase: Phase::Opening, burst: 0 }
+        Self { hub, requests, ending, phase: Phase::Waiting, burst: 0 }
     }
 
     fn answer(&mut self, request: v1::DriveRequest) -> Result<Option<v1::DriveResponse>, Fault> {
         let response = match (&mut self.phase, request.request) {
-            (Phase::Opening, Some(Message::Open(open))) => {
-                let driving = Driving::open(&self.hub, &open)?;
-                let plant = Some(plant_info(driving.lease.session()));
-                let token = driving.keep.as_ref().map(|(token, _)| token.clone());
-                self.phase = Phase::Driving(Box::new(driving));
-                Answer::Opened(v1::DriveOpened { plant, lease_token: token.unwrap_or_default() })
+            (Phase::Waiting, Some(Message::Open(open))) => {
+                let hub = Arc::clone(&self.hub);
+                self.phase = Phase::Opening(Box::pin(async move {
+                    let opener = Arc::clone(&hub);
+                    let job = move |_: &_| {
+                        let driving = Driving::open(&opener, &open)?;
+                        let plant = plant_info(driving.lease.session());
+                        Ok((Box::new(driving), plant))
+                    };
+                    hub.attendants.resume(job).await
+                }));
+                return Ok(None);
             }
             (Phase::Driving(driving), Some(Message::Input(input))) => match driving.input(input)? {
                 Some(answer) => answer,
                 None => return Ok(None),
             },
-            (Phase::Opening, _) => return Err(protocol("the first message must be `open`")),
+            (Phase::Waiting, _) => return Err(protocol("the first message must be `open`")),
             (_, Some(Message::Open(_))) => return Err(protocol("the stream is open already")),
             (_, _) => return Err(protocol("the message is empty")),
         };
@@ -135,12 +153,14 @@ impl DriveStream {
         let Ok(runtime) = Handle::try_current() else { return };
         let ending = self.hub.ending.clone();
         runtime.spawn(async move {
+            let mut status = lease.session().run_status();
             tokio::select! {
                 () = tokio::time::sleep(grace) => {}
                 () = lease.session().closed() => {}
                 () = ending.cancelled() => {}
+                // Somebody goes on with it.
+                _ = status.wait_for(|_| lease.is_revoked()) => {}
             }
-            drop(lease);
         });
     }
 
@@ -149,6 +169,9 @@ impl DriveStream {
         &mut self,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<v1::DriveRequest, Status>>> {
+        if let Phase::Opening(_) = self.phase {
+            return Poll::Pending;
+        }
         if let Phase::Driving(driving) = &mut self.phase
             && let Some(held) = &mut driving.held
         {
@@ -169,14 +192,6 @@ impl DriveStream {
 impl Drop for DriveStream {
     fn drop(&mut self) {
         self.keep_lease();
-    }
-}
-
-/// Runs a long computation on this thread, while the runtime moves its other tasks to another one.
-fn beside_other_tasks<R>(compute: impl FnOnce() -> R) -> R {
-    match Handle::current().runtime_flavor() {
-        RuntimeFlavor::MultiThread => tokio::task::block_in_place(compute),
-        _ => compute(),
     }
 }
 
@@ -221,7 +236,7 @@ impl Driving {
             keep,
             is_short,
             held: None,
-            states: None,
+            states: States::None,
         })
     }
 
@@ -254,14 +269,23 @@ impl Driving {
     }
 
     /// A state of the plant's own loop.
-    fn poll_state(&mut self, hub: &Hub, context: &mut Context<'_>) -> Poll<Result<Answer, Fault>> {
-        let states = match &mut self.states {
-            Some(states) => states,
-            none => {
-                let watchers_max = hub.limits.watchers_per_plant;
-                none.insert(self.lease.session().subscribe(1, 1, watchers_max)?)
-            }
-        };
+    fn poll_state(
+        &mut self,
+        hub: &Arc<Hub>,
+        context: &mut Context<'_>,
+    ) -> Poll<Result<Answer, Fault>> {
+        if let States::None = self.states {
+            let (hub, session) = (Arc::clone(hub), Arc::clone(self.lease.session()));
+            let watchers_max = hub.limits.watchers_per_plant;
+            self.states = States::Opening(Box::pin(async move {
+                let job = move |_: &_| Ok(session.subscribe(1, 1, watchers_max)?);
+                hub.attendants.resume(job).await
+            }));
+        }
+        if let States::Opening(job) = &mut self.states {
+            self.states = States::Open(Box::new(std::task::ready!(job.as_mut().poll(context))?));
+        }
+        let States::Open(states) = &mut self.states else { return Poll::Pending };
         let (frame, dropped) = std::task::ready!(states.poll_next(context));
         Poll::Ready(Ok(Answer::Step(v1::DriveStep {
             sequence: frame.timing.input_sequence,
@@ -322,6 +346,21 @@ impl Stream for DriveStream {
                 context.waker().wake_by_ref();
                 return Poll::Pending;
             }
+            if let Phase::Opening(job) = &mut this.phase
+                && let Poll::Ready(opened) = job.as_mut().poll(context)
+            {
+                match opened {
+                    Ok((driving, plant)) => {
+                        let token = driving.keep.as_ref().map(|(token, _)| token.clone());
+                        let lease_token = token.unwrap_or_default();
+                        this.phase = Phase::Driving(driving);
+                        let opened = v1::DriveOpened { plant: Some(plant), lease_token };
+                        let response = Some(Answer::Opened(opened));
+                        break Some(Ok(v1::DriveResponse { response }));
+                    }
+                    Err(fault) => break Some(Err(fault.into())),
+                }
+            }
             match this.poll_request(context) {
                 Poll::Ready(None) => break None,
                 Poll::Ready(Some(Err(status))) => {
@@ -346,7 +385,7 @@ impl Stream for DriveStream {
                         break Some(answer.map_err(Status::from));
                     }
                 } else {
-                    driving.states = None;
+                    driving.states = States::None;
                 }
             }
             this.burst = 0;

@@ -60,11 +60,16 @@ pub(super) async fn set_parameters(
 fn recompute(hub: Arc<Hub>, session: Arc<Session>) {
     tokio::spawn(async move {
         // A change that comes while the task ends finds it ended, or is found by it.
-        while session.outdated_feedback().is_some() && session.begin_recomputing() {
+        while outdated(&hub, &session).await.is_some() && session.begin_recomputing() {
             let work = async {
-                while let Some((spec, mechanics)) = session.outdated_feedback() {
+                while let Some((spec, mechanics)) = outdated(&hub, &session).await {
                     let outcome = solve_again(&hub, &spec, mechanics.clone()).await;
-                    session.renew_feedback(&spec, mechanics.generation, outcome);
+                    let session = Arc::clone(&session);
+                    let renew = move |_: &_| {
+                        session.renew_feedback(&spec, mechanics.generation, outcome);
+                        Ok(())
+                    };
+                    let _ = hub.attendants.resume(renew).await;
                 }
             };
             tokio::select! {
@@ -75,6 +80,11 @@ fn recompute(hub: Arc<Hub>, session: Arc<Session>) {
             session.end_recomputing();
         }
     });
+}
+
+async fn outdated(hub: &Hub, session: &Arc<Session>) -> Option<(Arc<Spec>, Mechanics)> {
+    let session = Arc::clone(session);
+    hub.attendants.resume(move |_| Ok(session.outdated_feedback())).await.ok().flatten()
 }
 
 async fn solve_again(hub: &Arc<Hub>, spec: &Arc<Spec>, mechanics: Mechanics) -> Result<Law, Fault> {
@@ -310,7 +320,7 @@ impl Messages for Watcher {
             if self.session.is_closed() {
                 return Err(Fault::plant_deleted(self.session.id()));
             }
-            if let Some(response) = self.ready()? {
+            if let Some(response) = self.ready().await? {
                 return Ok(response);
             }
             tokio::select! {
@@ -327,7 +337,7 @@ impl Messages for Watcher {
 
 impl Watcher {
     /// A message that is to be sent now.
-    fn ready(&mut self) -> Result<Option<v1::WatchGainsResponse>, Fault> {
+    async fn ready(&mut self) -> Result<Option<v1::WatchGainsResponse>, Fault> {
         let present = self.in_force.borrow_and_update().clone();
         let present = present.ok_or_else(|| Fault::no_feedback(self.session.id()))?;
         if present.revision != self.revision {
@@ -335,7 +345,9 @@ impl Watcher {
                 self.dropped += present.revision - self.revision - 1;
             }
             self.revision = present.revision;
-            self.next = present.first(self.session.step_index());
+            let session = Arc::clone(&self.session);
+            let step = self.hub.attendants.resume(move |_| Ok(session.step_index())).await?;
+            self.next = present.first(step);
             self.failure_of = None;
         }
         let failure_of = present.failure.as_ref().map(|(generation, _)| *generation);

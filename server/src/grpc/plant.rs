@@ -11,7 +11,7 @@ use super::{Answers, cut_page, feedback, run, watch};
 use crate::convert::{self, Inputs, Start};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
-use crate::session::{Core, DriverKind, Lease, PlantSnapshot, Session};
+use crate::session::{Core, DriverKind, Lease, PlantSnapshot, Session, View};
 use crate::status::Fault;
 use crate::workers::Abandoned;
 
@@ -93,7 +93,9 @@ impl PlantService {
             LimitExceeded::check(name, limit, "numbers in all states", numbers)?;
         }
         let mut lease = session.acquire(DriverKind::Step)?;
-        let work = convert::period_work(&session.mechanics().settings, dimensions);
+        let settings = lease.look(|core| *core.plant().settings());
+        let settings = settings.map_err(|error| Fault::from_drive(error, session.id()))?;
+        let work = convert::period_work(&settings, dimensions);
         if plan.steps.saturating_mul(work) <= INLINE_WORK_MAX {
             return plan.run(&mut lease, None);
         }
@@ -139,7 +141,9 @@ impl StepPlan {
     ) -> Result<v1::StepResponse, Fault> {
         let held = match self.inputs.last() {
             Some(last) => last.to_vec(),
-            None => lease.session().with_core(|core| convert::hold_input(core.plant())),
+            None => lease
+                .look(|core| convert::hold_input(core.plant()))
+                .map_err(|error| Fault::from_drive(error, lease.session().id()))?,
         };
         let mut response = v1::StepResponse::default();
         response.states.reserve(if self.all_states { self.steps } else { 1 });
@@ -174,7 +178,10 @@ impl StepPlan {
 /// A plant as a message. Waits for a step in progress, which is long on a large model: call it on a
 /// worker unless you hold the lease.
 pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
-    let view = session.view();
+    info(session, session.view())
+}
+
+fn info(session: &Session, view: View) -> v1::PlantInfo {
     v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
@@ -186,6 +193,7 @@ pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
         accuracy: session.accuracy(),
         run: Some(run::run_info(session)),
         parameters: convert::parameters(&view.parameters),
+        safety: run::safety_info(&view.safety, view.frozen, session.model()),
     }
 }
 
@@ -200,9 +208,7 @@ impl v1::plant_service_server::PlantService for PlantService {
         &self,
         request: Request<v1::RunRequest>,
     ) -> Result<Response<v1::RunResponse>, Status> {
-        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
-        let job = move |_: &_| run::run(&hub, request);
-        Ok(Response::new(self.hub.attendants.run(job).await?))
+        Ok(Response::new(run::run_and_wait(&self.hub, request.into_inner()).await?))
     }
 
     async fn pause(
@@ -242,7 +248,9 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<v1::CreatePlantRequest>,
     ) -> Result<Response<v1::CreatePlantResponse>, Status> {
         let session = self.create(request.into_inner()).await?;
-        Ok(Response::new(v1::CreatePlantResponse { plant: Some(plant_info(&session)) }))
+        let job = move |_: &_| Ok(plant_info(&session));
+        let plant = Some(self.hub.attendants.resume(job).await?);
+        Ok(Response::new(v1::CreatePlantResponse { plant }))
     }
 
     async fn get_plant(
@@ -251,9 +259,9 @@ impl v1::plant_service_server::PlantService for PlantService {
     ) -> Result<Response<v1::GetPlantResponse>, Status> {
         let session = self.hub.session(&request.into_inner().id)?;
         let job = move |_: &_| {
-            let plant = Some(plant_info(&session));
-            let energy = Some(convert::energy(session.copy_plant().energy()));
-            Ok(v1::GetPlantResponse { plant, energy })
+            let (view, mut copy) = session.view_and_copy();
+            let energy = Some(convert::energy(copy.energy()));
+            Ok(v1::GetPlantResponse { plant: Some(info(&session, view)), energy })
         };
         Ok(Response::new(self.hub.attendants.run(job).await?))
     }
@@ -366,14 +374,18 @@ impl v1::plant_service_server::PlantService for PlantService {
         &self,
         request: Request<v1::ClearFeedbackRequest>,
     ) -> Result<Response<v1::ClearFeedbackResponse>, Status> {
-        Ok(Response::new(feedback::clear_feedback(&self.hub, &request.into_inner().id)?))
+        let (hub, id) = (Arc::clone(&self.hub), request.into_inner().id);
+        let job = move |_: &_| feedback::clear_feedback(&hub, &id);
+        Ok(Response::new(self.hub.attendants.run(job).await?))
     }
 
     async fn watch_gains(
         &self,
         request: Request<v1::WatchGainsRequest>,
     ) -> Result<Response<Self::WatchGainsStream>, Status> {
-        Ok(Response::new(feedback::watch_gains(&self.hub, &request.into_inner().id)?))
+        let (hub, id) = (Arc::clone(&self.hub), request.into_inner().id);
+        let job = move |_: &_| feedback::watch_gains(&hub, &id);
+        Ok(Response::new(self.hub.attendants.run(job).await?))
     }
 
     async fn diagnose(

@@ -14,7 +14,7 @@ use crate::hub::Hub;
 use crate::realtime::event::{Event, EventKind, EventReader};
 use crate::realtime::histogram::{Histogram, Summary};
 use crate::realtime::input::{InputAction, InputPolicy};
-use crate::realtime::watchdog::{self, Quantity, Safety, Watchdog, WatchdogAction};
+use crate::realtime::watchdog::{self, Quantity, Safety, Trip, Watchdog, WatchdogAction};
 use crate::realtime::{Pace, RunSettings, TimingCounts, utc_ns};
 use crate::session::{DriverKind, Session};
 use crate::status::Fault;
@@ -29,11 +29,33 @@ const WATCHDOGS_MAX: usize = 256;
 /// How often a watcher of events looks for new ones.
 const EVENTS_PERIOD: Duration = Duration::from_millis(10);
 
-/// Answers a Run call. Blocks for as long as a step takes: call it on a worker.
-pub(crate) fn run(hub: &Hub, request: v1::RunRequest) -> Result<v1::RunResponse, Fault> {
+/// Answers a Run call, with the call's number among those of its plant. Blocks for as long as a step
+/// takes: call it on a worker.
+pub(crate) fn run(hub: &Hub, request: v1::RunRequest) -> Result<(u64, v1::RunResponse), Fault> {
     let session = hub.session(&request.id)?;
     let settings = request.settings.map(|settings| run_settings(settings, session.model()));
-    session.run(settings.transpose()?, request.steps, hub.limits.running_plants)?;
+    let number = session.run(settings.transpose()?, request.steps, hub.limits.running_plants)?;
+    Ok((number, v1::RunResponse { run: Some(run_info(&session)) }))
+}
+
+/// The same, after the steps that were asked for if that is wanted.
+pub(super) async fn run_and_wait(
+    hub: &Arc<Hub>,
+    request: v1::RunRequest,
+) -> Result<v1::RunResponse, Fault> {
+    let (session, wait) = (hub.session(&request.id)?, request.wait);
+    let starter = Arc::clone(hub);
+    let (number, response) = hub.attendants.run(move |_| run(&starter, request)).await?;
+    if !wait {
+        return Ok(response);
+    }
+    let mut status = session.run_status();
+    tokio::select! {
+        biased;
+        () = hub.ending.cancelled() => return Err(Fault::shutting_down()),
+        () = session.closed() => return Err(Fault::plant_deleted(session.id())),
+        _ = status.wait_for(|now| now.run != number || !now.is_running) => {}
+    }
     Ok(v1::RunResponse { run: Some(run_info(&session)) })
 }
 
@@ -137,20 +159,61 @@ pub(crate) fn set_safety(
     hub: &Hub,
     request: v1::SetSafetyRequest,
 ) -> Result<v1::SetSafetyResponse, Fault> {
-    let session = hub.session(&request.id)?;
-    if request.watchdogs.len() > WATCHDOGS_MAX {
-        let problem = format!("are {}; at most {WATCHDOGS_MAX}", request.watchdogs.len());
+    let v1::SetSafetyRequest { id, watchdogs, on_step_failure } = request;
+    protect(hub.session(&id)?.as_ref(), watchdogs, on_step_failure)?;
+    Ok(v1::SetSafetyResponse {})
+}
+
+/// Sets what protects a plant.
+pub(crate) fn protect(
+    session: &Session,
+    watchdogs: Vec<v1::Watchdog>,
+    on_step_failure: i32,
+) -> Result<(), Fault> {
+    if watchdogs.len() > WATCHDOGS_MAX {
+        let problem = format!("are {}; at most {WATCHDOGS_MAX}", watchdogs.len());
         return Err(Fault::field("watchdogs", problem));
     }
-    let watchdogs = request.watchdogs.into_iter().enumerate();
+    let watchdogs = watchdogs.into_iter().enumerate();
     let watchdogs = watchdogs.map(|(index, dog)| watchdog(index, dog, session.model()));
-    let on_step_failure = match request.on_step_failure {
+    let on_step_failure = match on_step_failure {
         0 => None,
         action => Some(watchdog_action("on_step_failure", action)?),
     };
     let safety = Safety { watchdogs: watchdogs.collect::<Result<_, _>>()?, on_step_failure };
-    session.set_safety(safety).map_err(|error| Fault::from_initial(error, "watchdogs"))?;
-    Ok(v1::SetSafetyResponse {})
+    session.set_safety(safety).map_err(|error| Fault::from_initial(error, "watchdogs"))
+}
+
+/// What protects a plant; none if nothing does.
+pub(crate) fn safety_info(
+    safety: &Safety,
+    frozen: Option<Trip>,
+    model: &Model,
+) -> Option<v1::SafetyInfo> {
+    if safety.watchdogs.is_empty() && safety.on_step_failure.is_none() {
+        return None;
+    }
+    let action = |action: WatchdogAction| match action {
+        WatchdogAction::Freeze => v1::WatchdogAction::Freeze.into(),
+        WatchdogAction::Reset => v1::WatchdogAction::Reset.into(),
+        WatchdogAction::Disconnect => v1::WatchdogAction::Disconnect.into(),
+    };
+    let watchdog = |dog: &Watchdog| v1::Watchdog {
+        quantity: Quantity::name(dog.quantity.code(), model),
+        min: dog.min.is_finite().then_some(dog.min),
+        max: dog.max.is_finite().then_some(dog.max),
+        action: action(dog.action),
+    };
+    let trip = |trip: Trip| v1::WatchdogTrip {
+        watchdog: trip.watchdog as u32,
+        value: trip.value,
+        step: trip.step,
+    };
+    Some(v1::SafetyInfo {
+        watchdogs: safety.watchdogs.iter().map(watchdog).collect(),
+        on_step_failure: safety.on_step_failure.map_or(0, action),
+        frozen: frozen.map(trip),
+    })
 }
 
 fn watchdog(index: usize, dog: v1::Watchdog, model: &Model) -> Result<Watchdog, Fault> {
@@ -223,10 +286,11 @@ pub(super) fn watch_events(
     request: &v1::WatchEventsRequest,
 ) -> Result<Answers<v1::WatchEventsResponse>, Fault> {
     let session = hub.session(&request.id)?;
+    let place = session.events().watch(hub.limits.watchers_per_plant)?;
     let from = request.since.unwrap_or_else(|| session.events().next_number());
     let reader = session.events().reader(from);
-    let watcher = EventWatcher { hub: Arc::clone(hub), session, reader, waiting: VecDeque::new() };
-    Ok(watcher.into_answers())
+    let (hub, waiting) = (Arc::clone(hub), VecDeque::new());
+    Ok(EventWatcher { hub, session, reader, waiting, _place: place }.into_answers())
 }
 
 struct EventWatcher {
@@ -235,6 +299,7 @@ struct EventWatcher {
     reader: EventReader,
     /// Events that were read together.
     waiting: VecDeque<(u64, Event)>,
+    _place: Arc<()>,
 }
 
 impl Messages for EventWatcher {

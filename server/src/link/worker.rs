@@ -12,8 +12,7 @@ use plantd_proto::link::{
 };
 
 use super::LinkConfig;
-use crate::frame::{Frame, OUTPUTS_MAX, Published};
-use crate::ring::Reader;
+use crate::frame::{Frames, OUTPUTS_MAX, Published, Timing};
 use crate::session::{DriveError, DriverKind, Lease, Session};
 
 /// How often the thread looks whether it shall end and whether its driver lives, ns.
@@ -59,7 +58,7 @@ struct Driver {
     /// An input that waits for its step in lockstep, and when it is tried again, ns.
     held: Option<(Header, u64)>,
     /// The states of the plant while it runs by itself.
-    states: Option<(Reader, Frame)>,
+    states: Option<Frames>,
 }
 
 /// A failure of one input or attachment: goes to the driver, the link goes on.
@@ -142,12 +141,8 @@ impl Worker {
         if driver.states.is_none() {
             return check_ns;
         }
-        let due_ns = self.session.live().due_ns.load(Ordering::Relaxed);
-        match due_ns + AFTER_DUE_NS {
-            // Free-running, late, or paused a moment ago.
-            look_ns if look_ns <= now_ns => now_ns + LOOK_AGAIN_NS,
-            look_ns => look_ns.min(check_ns),
-        }
+        let live = self.session.live();
+        live.look_ns(now_ns, AFTER_DUE_NS, LOOK_AGAIN_NS).min(check_ns)
     }
 
     /// Brings the driver what it has not asked for: the answer to an input that had to wait, or the
@@ -170,17 +165,15 @@ impl Worker {
             driver.states = None;
             return Ok(());
         }
-        let (reader, frame) =
-            driver.states.get_or_insert_with(|| (self.session.read_ring(), Frame::default()));
-        reader.skip_to_last();
-        let Some((_, record)) = reader.read_next() else { return Ok(()) };
-        frame.read(record);
+        let states = driver.states.get_or_insert_with(|| Frames::from(self.session.ring(), 0));
+        let Some(frame) = states.read_last() else { return Ok(()) };
         let request = Header {
             driver: driver.instance,
             sequence: frame.timing.input_sequence,
             ..self.header
         };
-        let common = Header { code: LIVE | frame.timing.flags as u32, ..self.header };
+        let flags = frame.timing.flags & (Timing::LATE | Timing::SAFE);
+        let common = Header { code: LIVE | flags as u32, ..self.header };
         let published = frame.published();
         send_state(
             &mut self.endpoint,

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use plantd_proto::link::monotonic_ns;
 
+use crate::limits::LimitExceeded;
 use crate::ring::{Reader, Ring};
 
 /// Events that a plant keeps.
@@ -79,11 +80,13 @@ pub struct Event {
 #[derive(Debug)]
 pub struct Events {
     ring: Arc<Ring>,
+    /// Each watcher has one more.
+    watcher: Arc<()>,
 }
 
 impl Default for Events {
     fn default() -> Self {
-        Self { ring: Arc::new(Ring::new(EVENTS, WORDS)) }
+        Self { ring: Arc::new(Ring::new(EVENTS, WORDS)), watcher: Arc::default() }
     }
 }
 
@@ -96,6 +99,14 @@ impl Events {
     /// A reader from event number `from` on.
     pub fn reader(&self, from: u64) -> EventReader {
         EventReader { reader: Reader::from(Arc::clone(&self.ring), from) }
+    }
+
+    /// A place among the watchers, while it is held.
+    pub(crate) fn watch(&self, watchers_max: u64) -> Result<Arc<()>, LimitExceeded> {
+        let place = Arc::clone(&self.watcher);
+        let (name, what) = ("watchers_per_plant", "watchers of events");
+        LimitExceeded::check(name, watchers_max, what, Arc::strong_count(&place) - 1)?;
+        Ok(place)
     }
 
     /// Number of the next event.

@@ -31,11 +31,15 @@ use serde::{Deserialize, Serialize};
 use self::histogram::Histogram;
 use self::input::InputPolicy;
 use self::pump::Pump;
-pub(crate) use self::scheduler::{Act, Handle, Runner, Stop};
+pub(crate) use self::scheduler::{Handle, Runner, Stop};
 use self::slot::InputSlot;
 use crate::limits::LimitExceeded;
 use crate::metrics::Metrics;
 use crate::priority::{Scheduling, lock_memory};
+
+/// A plant that is late by up to this long takes its steps one after the other until it has caught up;
+/// beyond it goes on from where it is, and the schedule has slipped.
+pub(crate) const CATCH_UP_NS: u64 = 100_000_000;
 
 /// Who decides when a plant takes a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -147,8 +151,6 @@ pub struct Live {
     pub due_ns: AtomicU64,
     /// Steps after which it pauses; 0 means never.
     pub steps_left: AtomicU64,
-    /// The first record of the ring that the loop wrote.
-    pub first_record: AtomicU64,
 }
 
 impl Live {
@@ -159,8 +161,23 @@ impl Live {
             counts: TimingCounts::default(),
             due_ns: AtomicU64::new(0),
             steps_left: AtomicU64::new(0),
-            first_record: AtomicU64::new(0),
         }
+    }
+
+    /// When to look for the step that is due: so long after it is, or, if that was before, so long after
+    /// now; all in ns.
+    pub(crate) fn look_ns(&self, now_ns: u64, after_ns: u64, again_ns: u64) -> u64 {
+        let look_ns = self.due_ns.load(Ordering::Relaxed) + after_ns;
+        if look_ns > now_ns { look_ns } else { now_ns + again_ns }
+    }
+}
+
+/// Room for a plant that runs by itself, until it is dropped.
+pub(crate) struct Permit(Gauge);
+
+impl Drop for Permit {
+    fn drop(&mut self) {
+        self.0.dec();
     }
 }
 
@@ -197,17 +214,13 @@ impl RealTime {
         })
     }
 
-    /// Counts one more plant that runs by itself.
-    pub(crate) fn admit(&self, running_max: u64) -> Result<(), LimitExceeded> {
+    /// Room for one more plant that runs by itself.
+    pub(crate) fn admit(&self, running_max: u64) -> Result<Permit, LimitExceeded> {
         let running = self.running.inc() + 1;
+        let permit = Permit(self.running.clone());
         let (name, what) = ("running_plants", "plants that run by themselves");
-        let checked = LimitExceeded::check(name, running_max, what, running.max(0) as usize);
-        checked.inspect_err(|_| self.leave())
-    }
-
-    /// One less.
-    pub(crate) fn leave(&self) {
-        self.running.dec();
+        LimitExceeded::check(name, running_max, what, running.max(0) as usize)?;
+        Ok(permit)
     }
 
     /// A number for a plant that begins to run, and the loop that it is to run in.

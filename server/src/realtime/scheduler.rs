@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
 
 use plantd_proto::link::monotonic_ns;
 
@@ -12,28 +12,29 @@ use super::alarm::Alarm;
 use super::event::EventKind;
 use super::input::{Change, LoopInput};
 use super::watchdog::WatchdogAction;
-use super::{Live, Pace, RealTimeSettings, RunSettings, TimingCounts};
+use super::{CATCH_UP_NS, Live, Pace, Permit, RealTimeSettings, RunSettings, TimingCounts};
 use crate::frame::Timing;
 use crate::priority::{Priority, allow_cpus, sharpen_timers};
 use crate::session::{Core, DriveError, Session};
 use crate::status::Fault;
 
-/// A paced plant that is late by up to this long takes its steps one after the other until it has caught
-/// up; beyond it goes on from where it is, and the schedule has slipped.
-const CATCH_UP_NS: u64 = 100_000_000;
 /// Overruns are told at most once in this time, ns.
 const OVERRUN_PERIOD_NS: u64 = 1_000_000_000;
+/// Least time after which a command is obeyed although there is no time for it before the next step, ns;
+/// it is also this many times as long as commands take.
+const PATIENCE_NS: u64 = 1_000_000;
+const PATIENCE: u64 = 8;
 
 /// What is done with the core of a running plant between two steps. Without a core the plant does not
 /// run here.
-pub(crate) type Act = Box<dyn FnOnce(Option<&mut Core>) + Send>;
+type Act = Box<dyn FnOnce(Option<&mut Core>) + Send>;
 
 /// What a loop is told.
 enum Command {
     Start(Box<Runner>),
     Act(u64, Act),
-    /// Gives the core back.
-    Stop(u64, Sender<Option<Box<Core>>>),
+    /// Gives the core back to its session, and says what room the plant had.
+    Stop(u64, Sender<Option<Permit>>),
 }
 
 /// A loop, for those who tell it something.
@@ -69,7 +70,7 @@ impl Handle {
         let scheduler = Scheduler {
             inbox,
             alarm: alarm.clone(),
-            // No plant that is taken in makes it grow beyond what `Scheduler::obey` has reserved.
+            attention: Attention::default(),
             due: BinaryHeap::new(),
             runners: Vec::new(),
         };
@@ -87,8 +88,8 @@ impl Handle {
         self.tell(Command::Act(key, act));
     }
 
-    /// Takes a plant's core back, if the plant still runs here.
-    pub(crate) fn stop(&self, key: u64) -> Option<Box<Core>> {
+    /// Takes a plant out of the loop, if it still runs here: its session has it then. The room that it had.
+    pub(crate) fn stop(&self, key: u64) -> Option<Permit> {
         let (give, taken) = channel();
         self.tell(Command::Stop(key, give));
         taken.recv().ok().flatten()
@@ -105,6 +106,7 @@ impl Handle {
 struct Scheduler {
     inbox: Receiver<Command>,
     alarm: Alarm,
+    attention: Attention,
     /// When which plant is due, the earliest first.
     due: BinaryHeap<Reverse<(u64, usize)>>,
     runners: Vec<Option<Box<Runner>>>,
@@ -114,14 +116,19 @@ impl Scheduler {
     /// Runs until nobody can tell it anything any more.
     fn run(mut self, spin_ns: u64) {
         loop {
-            if self.alarm.take() || self.due.is_empty() {
-                if !self.obey_all() {
-                    return;
-                }
+            let Some(&Reverse((due_ns, _))) = self.due.peek() else {
+                let Ok(command) = self.inbox.recv() else { return };
+                self.obey(command);
+                continue;
+            };
+            let mut now_ns = monotonic_ns();
+            if self.alarm.take() {
+                self.attention.call(now_ns);
+            }
+            if self.attention.is_due(now_ns, due_ns) {
+                self.obey_next(now_ns);
                 continue;
             }
-            let Some(&Reverse((due_ns, _))) = self.due.peek() else { continue };
-            let mut now_ns = monotonic_ns();
             if now_ns + spin_ns < due_ns {
                 self.alarm.sleep_until(due_ns - spin_ns);
                 continue;
@@ -131,6 +138,17 @@ impl Scheduler {
                 now_ns = monotonic_ns();
             }
             self.step_first(now_ns);
+        }
+    }
+
+    /// Obeys a command, if there is one.
+    fn obey_next(&mut self, now_ns: u64) {
+        match self.inbox.try_recv() {
+            Ok(command) => {
+                self.obey(command);
+                self.attention.obeyed(now_ns, monotonic_ns());
+            }
+            Err(_) => self.attention.is_called = false,
         }
     }
 
@@ -144,23 +162,6 @@ impl Scheduler {
                 if let Some(runner) = self.runners[slot].take() {
                     runner.session.loop_ended(runner.core, stop);
                 }
-            }
-        }
-    }
-
-    /// Does what it was told; waits for a command when there is no plant. False at the end.
-    fn obey_all(&mut self) -> bool {
-        if self.due.is_empty() {
-            match self.inbox.recv() {
-                Ok(command) => self.obey(command),
-                Err(_) => return false,
-            }
-        }
-        loop {
-            match self.inbox.try_recv() {
-                Ok(command) => self.obey(command),
-                Err(TryRecvError::Empty) => return true,
-                Err(TryRecvError::Disconnected) => return !self.due.is_empty(),
             }
         }
     }
@@ -188,10 +189,47 @@ impl Scheduler {
                     self.due.retain(|Reverse((_, other))| *other != slot);
                     self.runners[slot].take()
                 });
+                let permit = runner.and_then(|runner| runner.session.put_back(runner.core));
                 // The receiver waits for it.
-                let _ = give.send(runner.map(|runner| runner.core));
+                let _ = give.send(permit);
             }
         }
+    }
+}
+
+/// When a loop attends to commands: while there is time for one before the next step; beyond that now and
+/// then, so that however many there are they take a small part of its time.
+#[derive(Debug, Default)]
+struct Attention {
+    /// There may be commands.
+    is_called: bool,
+    /// Since when one waits, ns.
+    since_ns: u64,
+    /// What the longest one of late has taken, ns.
+    cost_ns: u64,
+}
+
+impl Attention {
+    /// Somebody has a command.
+    fn call(&mut self, now_ns: u64) {
+        if !self.is_called {
+            self.is_called = true;
+            self.since_ns = now_ns;
+        }
+    }
+
+    /// It is time for a command, while the next step is due at `due_ns`.
+    fn is_due(&self, now_ns: u64, due_ns: u64) -> bool {
+        let has_waited_ns = now_ns.saturating_sub(self.since_ns);
+        self.is_called
+            && (now_ns + self.cost_ns < due_ns
+                || has_waited_ns >= PATIENCE_NS.max(PATIENCE * self.cost_ns))
+    }
+
+    /// A command was obeyed; the next one may wait already.
+    fn obeyed(&mut self, began_ns: u64, ended_ns: u64) {
+        self.cost_ns = (ended_ns - began_ns).max(self.cost_ns / 2);
+        self.since_ns = ended_ns;
     }
 }
 
@@ -283,20 +321,21 @@ impl Runner {
         if self.session.is_closed() {
             return Err(Stop::Closed);
         }
-        let due_ns = self.due_ns();
-        let mut timing = Timing { due_ns, began_ns, ..Timing::default() };
+        let mut timing = Timing { due_ns: self.due_ns(), began_ns, ..Timing::default() };
         self.find_input(began_ns, &mut timing)?;
-        if let Err(error) = self.core.step(self.input.u(), None) {
-            return self.step_failed(error);
-        }
+        let outcome = self.core.step(self.input.u(), None);
         timing.ended_ns = monotonic_ns();
-        self.core.timing = timing;
+        match outcome {
+            Ok(_) => self.core.timing = timing,
+            Err(error) => {
+                self.recover(error)?;
+                self.core.write_ring();
+                return Ok(self.schedule(timing.ended_ns));
+            }
+        }
         self.core.write_ring();
-        self.set_period();
-        self.ticks += 1;
-        let next_ns = self.due_ns();
-        self.count(&timing, next_ns);
-        self.live.due_ns.store(next_ns, Ordering::Relaxed);
+        let next_ns = self.schedule(timing.ended_ns);
+        self.count(&timing);
         if let Some(trip) = self.core.take_trip() {
             match trip.action {
                 WatchdogAction::Freeze => {
@@ -312,6 +351,33 @@ impl Runner {
         self.steps_left -= 1;
         self.live.steps_left.store(self.steps_left, Ordering::Relaxed);
         if self.steps_left == 0 { Err(Stop::StepsTaken) } else { Ok(next_ns) }
+    }
+
+    /// When the next step is due, after one that ended at `ended_ns`. Gives the schedule up when it cannot
+    /// be caught up with.
+    fn schedule(&mut self, ended_ns: u64) -> u64 {
+        self.set_period();
+        if self.is_paced {
+            self.ticks += 1;
+            let behind_ns = ended_ns.saturating_sub(self.due_ns());
+            for counts in [&self.live.counts, &*self.all] {
+                counts.overruns.fetch_add(u64::from(behind_ns > 0), Ordering::Relaxed);
+                counts.slips.fetch_add(u64::from(behind_ns > CATCH_UP_NS), Ordering::Relaxed);
+            }
+            if behind_ns > 0 {
+                self.tell_overrun(ended_ns);
+            }
+            if behind_ns > CATCH_UP_NS {
+                self.core.note(EventKind::Slipped, 0, behind_ns as f64 * 1e-9);
+                (self.origin_ns, self.ticks) = (ended_ns, 1);
+            }
+        } else {
+            // The others of this loop take their turns first.
+            (self.origin_ns, self.ticks) = (ended_ns, 0);
+        }
+        let next_ns = self.due_ns();
+        self.live.due_ns.store(next_ns, Ordering::Relaxed);
+        next_ns
     }
 
     fn find_input(&mut self, now_ns: u64, timing: &mut Timing) -> Result<(), Stop> {
@@ -341,66 +407,84 @@ impl Runner {
         Ok(())
     }
 
-    fn step_failed(&mut self, error: DriveError) -> Result<u64, Stop> {
+    /// Puts the plant back after a step that failed, or says why it stops.
+    fn recover(&mut self, error: DriveError) -> Result<(), Stop> {
         if let DriveError::Step(error) = &error {
             self.core.note_failure(error);
         }
-        match self.core.on_step_failure() {
-            Some(WatchdogAction::Reset) if self.core.go_home() => {
-                self.ticks += 1;
-                Ok(self.due_ns())
-            }
-            action => {
-                if action == Some(WatchdogAction::Disconnect) {
-                    self.session.revoke_lease();
-                }
-                Err(Stop::Fault(Fault::from_drive(error, self.session.id())))
-            }
+        let action = self.core.on_step_failure();
+        if action == Some(WatchdogAction::Reset) && self.core.go_home() {
+            return Ok(());
         }
+        if action == Some(WatchdogAction::Disconnect) {
+            self.session.revoke_lease();
+        }
+        Err(Stop::Fault(Fault::from_drive(error, self.session.id())))
     }
 
-    /// Counts the times of a step, and gives the schedule up when it cannot be caught up with.
-    fn count(&mut self, timing: &Timing, next_ns: u64) {
-        let lateness_ns = timing.began_ns.saturating_sub(timing.due_ns);
-        let behind_ns = timing.ended_ns.saturating_sub(next_ns);
-        let is_overrun = self.is_paced && behind_ns > 0;
-        let has_slipped = self.is_paced && behind_ns > CATCH_UP_NS;
+    /// Counts the times of a step.
+    fn count(&self, timing: &Timing) {
         for counts in [&self.live.counts, &*self.all] {
             counts.steps.fetch_add(1, Ordering::Relaxed);
             counts.step.record(timing.ended_ns.saturating_sub(timing.began_ns));
             if self.is_paced {
-                counts.lateness.record(lateness_ns);
+                counts.lateness.record(timing.began_ns.saturating_sub(timing.due_ns));
             }
             if timing.input_sequence != 0 {
                 counts.input_age.record(timing.input_age_ns);
             }
-            if is_overrun {
-                counts.overruns.fetch_add(1, Ordering::Relaxed);
-            }
-            if has_slipped {
-                counts.slips.fetch_add(1, Ordering::Relaxed);
-            }
-        }
-        if is_overrun {
-            self.tell_overrun(timing.ended_ns);
-        }
-        if !self.is_paced {
-            // The others of this loop take their turns first.
-            self.origin_ns = timing.ended_ns;
-            self.ticks = 0;
-        } else if has_slipped {
-            self.core.note(EventKind::Slipped, 0, behind_ns as f64 * 1e-9);
-            self.origin_ns = timing.ended_ns;
-            self.ticks = 1;
         }
     }
 
     fn tell_overrun(&mut self, now_ns: u64) {
         self.untold_overruns += 1;
-        if now_ns - self.overruns_told_ns >= OVERRUN_PERIOD_NS {
-            self.overruns_told_ns = now_ns;
+        if now_ns.saturating_sub(self.overruns_told_ns) >= OVERRUN_PERIOD_NS {
             let count = std::mem::take(&mut self.untold_overruns);
             self.core.note(EventKind::Overran, 0, count as f64);
+            self.overruns_told_ns = monotonic_ns();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Steps that leave no time, and commands without end: time goes on as either is taken.
+    #[test]
+    fn commands_take_a_small_part_of_a_busy_loop() {
+        const STEP_NS: u64 = 100_000;
+        const COMMAND_NS: u64 = 400_000;
+        let (mut attention, mut now_ns, mut steps, mut commands) = (Attention::default(), 0, 0, 0);
+        while now_ns < 10_000_000_000 {
+            attention.call(now_ns);
+            if attention.is_due(now_ns, now_ns) {
+                attention.obeyed(now_ns, now_ns + COMMAND_NS);
+                now_ns += COMMAND_NS;
+                commands += 1;
+            } else {
+                now_ns += STEP_NS;
+                steps += 1;
+            }
+        }
+        let part = (commands * COMMAND_NS) as f64 / now_ns as f64;
+        assert!(part > 0.1 && part < 0.112, "{part}");
+        assert!(steps > 80_000);
+    }
+
+    #[test]
+    fn a_command_waits_when_it_would_make_a_step_late() {
+        let mut attention = Attention::default();
+        assert!(!attention.is_due(0, 1_000_000), "there is none");
+        attention.call(1000);
+        assert!(attention.is_due(1000, 1_000_000));
+        attention.obeyed(1000, 51_000);
+        assert!(attention.is_due(900_000, 1_000_000));
+        assert!(!attention.is_due(960_000, 1_000_000));
+        // One that took long once is forgotten.
+        for _ in 0..20 {
+            attention.obeyed(900_000, 901_000);
+        }
+        assert!(attention.is_due(960_000, 1_000_000));
     }
 }

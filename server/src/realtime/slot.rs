@@ -2,8 +2,10 @@
 //!
 //! A triple buffer: the driver fills one, the loop reads one, the third changes hands by an atomic
 //! exchange. Neither side waits for the other, and the loop always gets a whole input, the newest.
+//! Drivers wait for each other, which happens when one takes over from another.
 
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 const INDEX: u8 = 0b011;
 /// The buffer in the middle is newer than the one that the loop has.
@@ -15,8 +17,8 @@ pub struct InputSlot {
     buffers: [Buffer; 3],
     /// Index of the buffer that nobody has, and whether it is fresh.
     middle: AtomicU8,
-    /// Index of the driver's buffer; used by the holder of the lease alone.
-    back: AtomicU8,
+    /// Index of the driver's buffer. One driver may come while another one goes.
+    back: Mutex<u8>,
     /// Index of the loop's buffer; used by the loop alone.
     front: AtomicU8,
 }
@@ -51,24 +53,23 @@ impl InputSlot {
         };
         Self {
             buffers: [buffer(), buffer(), buffer()],
-            back: AtomicU8::new(0),
+            back: Mutex::new(0),
             middle: AtomicU8::new(1),
             front: AtomicU8::new(2),
         }
     }
 
-    /// Puts an input there in place of the one before. One driver at a time.
+    /// Puts an input there in place of the one before.
     pub fn put(&self, arrival: Arrival, u: &[f64]) {
-        let back = self.back.load(Ordering::Relaxed);
-        let buffer = &self.buffers[usize::from(back)];
+        let mut back = self.back.lock().unwrap_or_else(PoisonError::into_inner);
+        let buffer = &self.buffers[usize::from(*back)];
         buffer.lease.store(arrival.lease, Ordering::Relaxed);
         buffer.sequence.store(arrival.sequence, Ordering::Relaxed);
         buffer.arrived_ns.store(arrival.arrived_ns, Ordering::Relaxed);
         for (word, value) in buffer.u.iter().zip(u) {
             word.store(value.to_bits(), Ordering::Relaxed);
         }
-        let former = self.middle.swap(back | FRESH, Ordering::AcqRel);
-        self.back.store(former & INDEX, Ordering::Relaxed);
+        *back = self.middle.swap(*back | FRESH, Ordering::AcqRel) & INDEX;
     }
 
     /// Copies the newest input into `u`, if one has come since the last call. One loop at a time.

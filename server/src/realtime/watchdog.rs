@@ -73,6 +73,14 @@ pub struct Safety {
     pub on_step_failure: Option<WatchdogAction>,
 }
 
+impl Safety {
+    /// Something may put the plant back to where it began.
+    pub(crate) fn resets(&self) -> bool {
+        let mut actions = self.watchdogs.iter().map(|dog| dog.action).chain(self.on_step_failure);
+        actions.any(|action| action == WatchdogAction::Reset)
+    }
+}
+
 /// A bound that was left.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trip {
@@ -94,7 +102,7 @@ pub(crate) struct Guard {
     before: Vec<f64>,
     increment: Vec<f64>,
     needs_velocity: bool,
-    /// Coordinates of the plant in its state of creation.
+    /// The plant in the state to which a reset returns.
     pub(crate) home: Option<Box<Plant>>,
 }
 

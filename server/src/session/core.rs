@@ -9,6 +9,7 @@ use plantd_proto::v1::{self, MarkReason};
 
 use super::saved::PlantSnapshot;
 use super::tap::Tap;
+use super::{DriveError, View};
 use crate::channels::Channels;
 use crate::channels::timeline::{Base, Timeline};
 use crate::convert;
@@ -18,7 +19,6 @@ use crate::parameters::Parameters;
 use crate::realtime::event::{EventKind, Events};
 use crate::realtime::watchdog::{Guard, Safety, Trip, WatchdogAction};
 use crate::ring::Ring;
-use crate::session::DriveError;
 
 /// A plant with what its steps need. One owner at a time: whoever holds the session's lock, or the loop
 /// that runs the plant.
@@ -42,8 +42,12 @@ pub struct Core {
     impulse: Vec<f64>,
     /// When the last step was taken.
     pub(crate) timing: Timing,
+    /// It is in the plant's own loop.
+    pub(super) is_running: bool,
     /// Where each step is written, as long as somebody reads it.
     pub(crate) ring: Option<Arc<Ring>>,
+    /// Records written into rings that nobody reads any more.
+    past_records: u64,
     /// Where the recorder learns what happens between steps.
     pub(super) tap: Option<Arc<Tap>>,
     /// What happens besides.
@@ -85,7 +89,9 @@ impl Core {
             applied: input.clone(),
             input,
             timing: Timing::default(),
+            is_running: false,
             ring: None,
+            past_records: 0,
             tap: None,
             events,
             guard: None,
@@ -131,25 +137,22 @@ impl Core {
         if let Some(guard) = &mut self.guard {
             guard.begin(&self.plant);
         }
-        let has_say = match &mut self.feedback {
+        let mut has_say = match &mut self.feedback {
             None => false,
             Some(feedback) => feedback.input(&self.plant, driver, &mut self.applied)?,
         };
         self.impulse.clear();
         self.impulse.extend_from_slice(impulse);
-        let has_say = match &mut self.channels {
-            None => has_say,
-            Some(channels) => {
+        if let Some(channels) = &mut self.channels {
+            if !has_say {
                 let (expected, actual) = (self.applied.len(), driver.len());
-                if !has_say {
-                    if actual != expected {
-                        return Err(StepError::Dimension { expected, actual }.into());
-                    }
-                    self.applied.copy_from_slice(driver);
+                if actual != expected {
+                    return Err(StepError::Dimension { expected, actual }.into());
                 }
-                channels.actuate(&self.plant, &mut self.applied, &mut self.impulse) || has_say
+                self.applied.copy_from_slice(driver);
             }
-        };
+            has_say |= channels.actuate(&self.plant, &mut self.applied, &mut self.impulse);
+        }
         let u = if has_say { &self.applied[..] } else { driver };
         let advance = |plant: &mut Plant| match linearization {
             None => plant.step(u),
@@ -209,6 +212,7 @@ impl Core {
         let is_home = self.plant.go_on_from(home).is_ok();
         if is_home {
             self.plant.hold_input(&mut self.input);
+            self.timing = Timing::default();
             if let Some(channels) = &mut self.channels {
                 channels.begin(&mut self.plant, &self.input);
             }
@@ -233,6 +237,11 @@ impl Core {
         let is_needed = !safety.watchdogs.is_empty() || safety.on_step_failure.is_some();
         let guard = is_needed.then(|| Box::new(Guard::new(safety, &self.plant, home)));
         std::mem::replace(&mut self.guard, guard)
+    }
+
+    /// Lets a plant stand still because of a watchdog.
+    pub(super) fn freeze(&mut self, trip: Trip) {
+        self.frozen = Some(trip);
     }
 
     /// Lets a plant go on that stands still because of a watchdog.
@@ -268,11 +277,6 @@ impl Core {
             parameters: Arc::clone(&self.parameters),
             settings: *self.plant.settings(),
         })
-    }
-
-    /// What protects the plant.
-    pub(crate) fn safety(&self) -> Option<&Safety> {
-        self.guard.as_ref().map(|guard| &guard.safety)
     }
 
     /// The input with which the plant's own loop begins, and whether it is a driver's.
@@ -338,6 +342,26 @@ impl Core {
         PlantSnapshot { plant: self.plant.snapshot(), channels }
     }
 
+    /// The ring into which each step is written; this one if there is none.
+    pub(super) fn ring_or(&mut self, ring: Arc<Ring>) -> Arc<Ring> {
+        let ring = self.ring.get_or_insert_with(|| {
+            ring.begin_at(self.past_records);
+            ring
+        });
+        Arc::clone(ring)
+    }
+
+    /// Takes the ring away; records are counted on.
+    pub(super) fn take_ring(&mut self) -> Option<Arc<Ring>> {
+        self.past_records = self.records();
+        self.ring.take()
+    }
+
+    /// Records written into rings.
+    pub(super) fn records(&self) -> u64 {
+        self.ring.as_ref().map_or(self.past_records, |ring| ring.written())
+    }
+
     /// Writes the last step into the ring, if somebody reads it.
     pub(crate) fn write_ring(&self) {
         if let Some(ring) = &self.ring {
@@ -364,6 +388,20 @@ impl Core {
     /// Input of the last step, when somebody besides the driver had a say in it.
     pub fn applied_input(&self) -> Option<&[f64]> {
         self.has_applied.then_some(&self.input)
+    }
+
+    /// The plant as it is, to be shown.
+    pub(super) fn view(&self) -> View {
+        let (state, time_s) = self.state();
+        View {
+            state,
+            time_s,
+            settings: *self.plant.settings(),
+            feedback: self.feedback.as_ref().map(|feedback| feedback.info()),
+            parameters: Arc::clone(&self.parameters),
+            safety: self.guard.as_ref().map(|guard| guard.safety.clone()).unwrap_or_default(),
+            frozen: self.frozen,
+        }
     }
 
     pub(crate) fn state(&self) -> (State, f64) {
@@ -408,6 +446,7 @@ impl Core {
         self.has_applied = false;
         self.impulse.clear();
         self.report = StepReport::default();
+        self.timing = Timing::default();
         if let Some(channels) = &mut self.channels
             && let Some(mut timeline) = channels.timeline.take()
         {

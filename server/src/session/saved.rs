@@ -11,8 +11,9 @@ use super::Session;
 use crate::channels::fault::Injected;
 use crate::convert;
 use crate::feedback::{GuardBound, InForce, Trip};
+use crate::grpc::run::safety_info;
 use crate::parameters::Parameters;
-use crate::realtime::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
+use crate::realtime::watchdog;
 use crate::regulator::Spec;
 
 /// Everything that a session's plant needs to go on bit for bit.
@@ -50,19 +51,16 @@ impl Session {
     /// what faults change.
     pub fn saved(&self) -> (v1::PlantRecord, Arc<Model>) {
         // No more than copies in the core's hands: a plant may be running.
-        let (base, state, snapshot, feedback, channels, fault_count, safety) =
-            self.with_core(move |core| {
-                let feedback = core.feedback.as_ref();
-                let feedback = feedback
-                    .map(|f| (Arc::clone(&f.spec), f.in_force(), f.guard.clone(), f.info()));
-                let channels = core.channels.as_ref().map(|channels| {
-                    let faults = channels.faults.iter().map(saved_fault).collect::<Vec<_>>();
-                    (Arc::clone(&channels.declared), faults)
-                });
-                let (base, safety) = (core.base(), core.safety().cloned());
-                let (state, snapshot, count) = (core.state(), core.snapshot(), core.faults);
-                (base, state, snapshot, feedback, channels, count, safety)
+        let (base, view, snapshot, feedback, channels, fault_count) = self.with_core(move |core| {
+            let feedback = core.feedback.as_ref();
+            let feedback =
+                feedback.map(|f| (Arc::clone(&f.spec), f.in_force(), f.guard.clone(), f.info()));
+            let channels = core.channels.as_ref().map(|channels| {
+                let faults = channels.faults.iter().map(saved_fault).collect::<Vec<_>>();
+                (Arc::clone(&channels.declared), faults)
             });
+            (core.base(), core.view(), core.snapshot(), feedback, channels, core.faults)
+        });
         let rotations = convert::rotations(&self.model);
         let time_step_s = base.settings.time_step_s;
         let (feedback, feedback_info) = feedback
@@ -74,11 +72,12 @@ impl Session {
             id: self.id.clone(),
             model: self.model_name.clone(),
             settings: Some(convert::settings_message(&base.settings)),
-            state: Some(convert::state(&state.0, state.1)),
+            state: Some(convert::state(&view.state, view.time_s)),
             link_open: self.link_open(),
             feedback: feedback_info,
             accuracy: self.accuracy,
             parameters: convert::parameters(&base.parameters),
+            safety: safety_info(&view.safety, view.frozen, &self.model),
             ..Default::default()
         };
         let (declared, faults) = channels.unzip();
@@ -98,7 +97,6 @@ impl Session {
             channels: declared.map(Arc::unwrap_or_clone),
             faults: faults.into_iter().flatten().map(fault).collect(),
             fault_count,
-            safety: safety.map(|safety| safety_request(&safety, &self.model)),
             ..Default::default()
         };
         (record, base.model)
@@ -111,6 +109,11 @@ impl Session {
             core.parameters = Arc::new(parameters);
             core.plant = plant;
         });
+    }
+
+    /// Lets the plant stand still where a watchdog had stopped it.
+    pub fn resume_frozen(&self, trip: watchdog::Trip) {
+        self.with_core(move |core| core.freeze(trip));
     }
 
     /// Notes that the feedback's watchdog had taken over.
@@ -153,26 +156,6 @@ fn feedback_request(
         guard: guard.iter().map(bound).collect(),
         ..Default::default()
     })
-}
-
-/// The request that sets these watchdogs.
-fn safety_request(safety: &Safety, model: &Model) -> v1::SetSafetyRequest {
-    let action = |action: WatchdogAction| match action {
-        WatchdogAction::Freeze => v1::WatchdogAction::Freeze,
-        WatchdogAction::Reset => v1::WatchdogAction::Reset,
-        WatchdogAction::Disconnect => v1::WatchdogAction::Disconnect,
-    };
-    let watchdog = |dog: &Watchdog| v1::Watchdog {
-        quantity: Quantity::name(dog.quantity.code(), model),
-        min: finite(dog.min),
-        max: finite(dog.max),
-        action: action(dog.action).into(),
-    };
-    v1::SetSafetyRequest {
-        watchdogs: safety.watchdogs.iter().map(watchdog).collect(),
-        on_step_failure: safety.on_step_failure.map_or(0, |failure| action(failure).into()),
-        ..Default::default()
-    }
 }
 
 fn finite(value: f64) -> Option<f64> {

@@ -14,6 +14,7 @@ use crate::channels::timeline::Announced;
 use crate::frame::record_words;
 use crate::parameters::Parameters;
 use crate::ring::Ring;
+use crate::workers::beside_other_tasks;
 
 /// Bytes of a plant's ring.
 const RING_BYTES: usize = 4 << 20;
@@ -89,13 +90,15 @@ impl Tap {
     /// does not answer holds nobody for ever; steps are lost then, and counted.
     pub(crate) fn wait(&self) {
         let started = Instant::now();
-        while self.is_half_full() {
-            if started.elapsed() > WAIT_MAX {
-                self.is_stalled.store(true, Ordering::Release);
+        beside_other_tasks(|| {
+            while self.is_half_full() {
+                if started.elapsed() > WAIT_MAX {
+                    self.is_stalled.store(true, Ordering::Release);
+                }
+                self.wake();
+                std::thread::sleep(WAIT_STEP);
             }
-            self.wake();
-            std::thread::sleep(WAIT_STEP);
-        }
+        });
     }
 
     /// Wakes the recorder.
@@ -146,7 +149,7 @@ impl Session {
             if core.tap.is_some() {
                 return None;
             }
-            let ring = Arc::clone(core.ring.get_or_insert(ring));
+            let ring = core.ring_or(ring);
             let at = ring.written();
             let tap = Arc::new(Tap {
                 ring,
@@ -179,7 +182,7 @@ impl Session {
                 return (None, None);
             }
             let is_last = core.ring.as_ref().is_some_and(|ring| Arc::strong_count(ring) <= holders);
-            (tap, if is_last { core.ring.take() } else { None })
+            (tap, if is_last { core.take_ring() } else { None })
         });
         // Dropped here, not in the core's hands.
         drop(former);

@@ -30,6 +30,8 @@ enum Manner {
     Nan,
     /// Answers, but takes ten seconds for it.
     Slow,
+    /// Drives with forces that depend on their number alone.
+    Sway,
     /// Watches the states.
     Watch,
 }
@@ -47,6 +49,12 @@ async fn main() -> Result<()> {
         return Ok(());
     }
     let mut driver = client.drive(plant).await?;
+    if let Manner::Sway = manner {
+        say_ready()?;
+        for k in 0_u32.. {
+            driver.step(&[f64::from(k % 17) - 8.0]).await?;
+        }
+    }
     driver.step(&[0.0]).await?;
     say_ready()?;
     loop {

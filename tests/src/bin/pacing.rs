@@ -75,7 +75,8 @@ async fn main() -> Result<()> {
     let before = before.stop();
     for (_, id) in &ids {
         let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), ..Default::default() };
-        let request = v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0 };
+        let request =
+            v1::RunRequest { id: id.clone(), settings: Some(settings), steps: 0, wait: false };
         client.run(request).await?;
     }
     tokio::time::sleep(Duration::from_secs(1)).await;

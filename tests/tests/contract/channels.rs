@@ -390,6 +390,7 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
                 id: id.clone(),
                 settings: Some(settings),
                 steps: if is_lockstep { 0 } else { steps.into() },
+                wait: false,
             };
             client.run(request).await.unwrap();
             if is_lockstep {

@@ -45,7 +45,12 @@ async fn no_more_plants_models_and_watchers_than_allowed() {
     let watch =
         v1::WatchRequest { id, fields: vec![v1::WatchField::State.into()], ..Default::default() };
     let _first = client.watch(watch.clone()).await.unwrap();
+    let id = watch.id.clone();
     assert_limited(client.watch(watch).await, "watchers_per_plant");
+    let first = client.watch_events(&id, None).await.unwrap();
+    assert_limited(client.watch_events(&id, None).await, "watchers_per_plant");
+    drop(first);
+    soon(async { while client.watch_events(&id, None).await.is_err() {} }).await;
 }
 
 #[tokio::test]

@@ -16,6 +16,7 @@ mod parameters;
 mod realtime;
 mod refusals;
 mod rest;
+mod running;
 mod support;
 mod transport;
 mod watch;

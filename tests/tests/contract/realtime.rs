@@ -9,9 +9,9 @@ use plantd_tests::server::ServerProcess;
 
 use crate::support::*;
 
-fn run_request(id: &str, pace: v1::Pace, speed: f64, steps: u64) -> v1::RunRequest {
+pub(crate) fn run_request(id: &str, pace: v1::Pace, speed: f64, steps: u64) -> v1::RunRequest {
     let settings = v1::RunSettings { pace: pace.into(), speed, input: None };
-    v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps }
+    v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps, wait: false }
 }
 
 fn with_policy(mut request: v1::RunRequest, policy: v1::InputPolicy) -> v1::RunRequest {
@@ -21,7 +21,7 @@ fn with_policy(mut request: v1::RunRequest, policy: v1::InputPolicy) -> v1::RunR
     request
 }
 
-async fn state(client: &Client, id: &str) -> v1::State {
+pub(crate) async fn state(client: &Client, id: &str) -> v1::State {
     client.get_plant(id).await.unwrap().plant.unwrap().state.unwrap()
 }
 
@@ -84,11 +84,11 @@ async fn in_lockstep_speed_and_pauses_do_not_change_a_bit_of_the_motion() {
                 // An input that waits: each step has to be let through.
                 let force = [f64::from(k).sin()];
                 let step = driver.step(&force);
-                let one = v1::RunRequest { id: id.clone(), settings: None, steps: 1 };
+                let one = v1::RunRequest { id: id.clone(), settings: None, steps: 1, wait: false };
                 let (step, run) = tokio::join!(step, client.run(one));
                 run.unwrap();
                 assert_eq!(step.unwrap().state.unwrap().step, before + 1);
-                let all = v1::RunRequest { id: id.clone(), settings: None, steps: 0 };
+                let all = v1::RunRequest { id: id.clone(), settings: None, steps: 0, wait: false };
                 client.run(all).await.unwrap();
                 continue;
             }
@@ -164,7 +164,10 @@ async fn steps_of_others_are_refused_while_a_plant_runs() {
     let stands_at = paused.state.unwrap().step;
     assert_eq!(client.step(step).await.unwrap().states[0].step, stands_at + 1);
     // One step at a time, at its pace.
-    client.run(v1::RunRequest { id: id.clone(), settings: None, steps: 1 }).await.unwrap();
+    client
+        .run(v1::RunRequest { id: id.clone(), settings: None, steps: 1, wait: false })
+        .await
+        .unwrap();
     standing(&client, &id).await;
     assert_eq!(state(&client, &id).await.step, stands_at + 2);
 }
@@ -200,7 +203,10 @@ async fn everything_else_can_be_done_to_a_running_plant_between_its_steps() {
     let step = v1::StepRequest { id: other.id, hold: 10, ..Default::default() };
     assert_eq!(bits(&client.step(step).await.unwrap().states[0]), bits(&all));
     // A plant that runs can be deleted.
-    client.run(v1::RunRequest { id: id.clone(), settings: None, steps: 0 }).await.unwrap();
+    client
+        .run(v1::RunRequest { id: id.clone(), settings: None, steps: 0, wait: false })
+        .await
+        .unwrap();
     client.delete_plant(&id).await.unwrap();
     assert_refused(client.get_plant(&id).await, Code::NotFound, "PLANT_NOT_FOUND", "");
 }
@@ -298,12 +304,12 @@ async fn a_policy_may_stop_the_plant_and_run_goes_on() {
     assert_eq!(state(&client, &id).await.step, 5);
 }
 
-fn watchdog(quantity: &str, max: f64, action: v1::WatchdogAction) -> v1::Watchdog {
+pub(crate) fn watchdog(quantity: &str, max: f64, action: v1::WatchdogAction) -> v1::Watchdog {
     let (quantity, max) = (quantity.to_owned(), Some(max));
     v1::Watchdog { quantity, min: None, max, action: action.into() }
 }
 
-async fn protect(client: &Client, id: &str, dog: v1::Watchdog) {
+pub(crate) async fn protect(client: &Client, id: &str, dog: v1::Watchdog) {
     let (id, watchdogs) = (id.to_owned(), vec![dog]);
     let request = v1::SetSafetyRequest { id, watchdogs, on_step_failure: 0 };
     client.set_safety(request).await.unwrap();
@@ -336,7 +342,10 @@ async fn a_watchdog_freezes_the_plant_and_says_why() {
         let stands_at = state(&client, &id).await.step;
         assert_eq!(event.step, stands_at);
         // Run releases it, and the next step is beyond the bound again.
-        client.run(v1::RunRequest { id: id.clone(), settings: None, steps: 0 }).await.unwrap();
+        client
+            .run(v1::RunRequest { id: id.clone(), settings: None, steps: 0, wait: false })
+            .await
+            .unwrap();
         assert_eq!(driver.step(&[0.0]).await.unwrap().state.unwrap().step, stands_at + 1);
         assert_eq!(driver.step(&[0.0]).await.unwrap_err().reason(), "WATCHDOG");
     }
@@ -450,7 +459,7 @@ async fn what_cannot_be_run_is_refused_by_name() {
 }
 
 /// A driver that takes a step, and whose connection then breaks; the name of its lease.
-async fn broken_driver(server: &ServerProcess, open: v1::DriveOpen) -> String {
+pub(crate) async fn broken_driver(server: &ServerProcess, open: v1::DriveOpen) -> String {
     let address = server.address().to_owned();
     let drive = move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

@@ -135,8 +135,8 @@ class Client:
         self.close()
 
     @translate
-    def _call(self, method: Any, request: Any) -> Any:
-        return method(request, timeout=self._timeout)
+    def _call(self, method: Any, request: Any, limited: bool = True) -> Any:
+        return method(request, timeout=self._timeout if limited else None)
 
     # ---- models ----
 
@@ -471,6 +471,7 @@ class Client:
         *,
         speed: float = 0.0,
         steps: int = 0,
+        wait: bool = False,
         timeout: float = 0.0,
         action: str = "hold",
         ramp: float = 0.0,
@@ -478,7 +479,8 @@ class Client:
         latch: bool = False,
     ) -> realtime_pb2.RunInfo:
         """Runs a plant: ``"paced"`` by the wall clock, ``"free"`` as fast as possible, or in
-        ``"lockstep"``; without a pace as before. ``steps`` of 0 means until it is paused.
+        ``"lockstep"``; without a pace as before. ``steps`` of 0 means until it is paused. With
+        ``wait`` it returns when the plant stands still again, however long that takes.
 
         A plant that runs by itself waits for nobody: its driver's latest input acts. ``timeout``
         (seconds on the plant's clock, 0 for never), ``action`` (``"hold"``, ``"safe"``, ``"ramp"``
@@ -498,8 +500,8 @@ class Client:
                 speed=speed,
                 input=None if pace == "lockstep" else policy,
             )
-        request = realtime_pb2.RunRequest(id=id, settings=settings, steps=steps)
-        return self._call(self.plants.Run, request).run
+        request = realtime_pb2.RunRequest(id=id, settings=settings, steps=steps, wait=wait)
+        return self._call(self.plants.Run, request, limited=not wait).run
 
     def pause(self, id: str) -> State:
         """Pauses a plant between two steps, and returns the state in which it stands."""

@@ -573,6 +573,8 @@ class Plant:
     precision: str = "exact"
     #: What was promised, if order and substeps were chosen by a tolerance.
     accuracy: Accuracy | None = None
+    #: The bounds that protect it and which of them holds it, if there are any.
+    safety: realtime_pb2.SafetyInfo | None = None
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
@@ -591,6 +593,7 @@ class Plant:
             m.settings.halvings,
             plant_service_pb2.Precision.Name(m.settings.precision)[10:].lower(),
             Accuracy._from(m.accuracy) if m.HasField("accuracy") else None,
+            m.safety if m.HasField("safety") else None,
         )
 
 

@@ -295,6 +295,7 @@ async fn show_plant(client: &Client, output: Output, id: String) -> Result<()> {
             answer.energy.as_ref().map(text::energy),
             plant.map(text::parameters),
             plant.and_then(|p| p.feedback.as_ref()).map(text::feedback),
+            plant.and_then(|p| p.safety.as_ref()).map(text::safety),
         ]
         .into_iter()
         .flatten()

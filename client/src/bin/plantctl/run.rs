@@ -3,16 +3,79 @@
 use std::fmt::Write as _;
 
 use anyhow::Result;
+use clap::ValueEnum;
 use plantd_client::{Client, v1};
 use serde_json::json;
 
-use crate::args::{InputAction, Pace, RunArgs, WatchdogArg};
+use crate::args::{Numbers, numbers};
 use crate::commands::Output;
 use crate::{json, text};
 
+/// Arguments of `run`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct RunArgs {
+    /// Plant.
+    pub(crate) id: String,
+    /// Who decides when it takes a step; as before if not given.
+    #[arg(long, value_enum)]
+    pub(crate) pace: Option<Pace>,
+    /// Seconds of the plant's clock in a second of the wall clock.
+    #[arg(long, requires = "pace")]
+    pub(crate) speed: Option<f64>,
+    /// Pause again after this many steps.
+    #[arg(long, short = 'n')]
+    pub(crate) steps: Option<u64>,
+    /// Wait until the plant stands still again: the steps are taken, or something has stopped it.
+    #[arg(long)]
+    pub(crate) wait: bool,
+    /// How long an input is valid, seconds on the plant's clock; for ever if not given.
+    #[arg(long, value_name = "SECONDS", requires = "pace")]
+    pub(crate) timeout: Option<f64>,
+    /// What to do without a valid input.
+    #[arg(long, value_enum, requires = "pace")]
+    pub(crate) action: Option<InputAction>,
+    /// Duration of a ramp, seconds on the plant's clock.
+    #[arg(long, value_name = "SECONDS", requires = "action")]
+    pub(crate) ramp: Option<f64>,
+    /// The safe input, comma-separated.
+    #[arg(long, value_parser = numbers, allow_hyphen_values = true, requires = "pace")]
+    pub(crate) safe: Option<Numbers>,
+    /// Once the safe input acts, it acts until `run` is called again.
+    #[arg(long, requires = "pace")]
+    pub(crate) latch: bool,
+}
+
+/// Who decides when a plant takes a step.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub(crate) enum Pace {
+    /// The driver, one step for each input.
+    Lockstep,
+    /// The wall clock.
+    Paced,
+    /// Nobody: as fast as possible.
+    Free,
+}
+
+/// What to do without a valid input.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub(crate) enum InputAction {
+    /// The last input acts on.
+    Hold,
+    /// The safe input acts at once.
+    Safe,
+    /// The safe input acts after a ramp.
+    Ramp,
+    /// The plant stands still.
+    Stop,
+}
+
+/// A watchdog.
+#[derive(Clone, Debug)]
+pub(crate) struct WatchdogArg(pub(crate) v1::Watchdog);
+
 /// `run`.
 pub(crate) async fn run(client: &Client, output: Output, args: RunArgs) -> Result<()> {
-    let RunArgs { id, pace, speed, steps, timeout, action, ramp, safe, latch } = args;
+    let RunArgs { id, pace, speed, steps, wait, timeout, action, ramp, safe, latch } = args;
     let pace = pace.map(|pace| match pace {
         Pace::Lockstep => v1::Pace::Lockstep,
         Pace::Paced => v1::Pace::Paced,
@@ -38,7 +101,8 @@ pub(crate) async fn run(client: &Client, output: Output, args: RunArgs) -> Resul
         speed: speed.unwrap_or(0.0),
         input: policy,
     });
-    let run = client.run(v1::RunRequest { id, settings, steps: steps.unwrap_or(0) }).await?;
+    let request = v1::RunRequest { id, settings, steps: steps.unwrap_or(0), wait };
+    let run = client.run(request).await?;
     Ok(output.print(|| json::message("RunInfo", &run), String::new)?)
 }
 

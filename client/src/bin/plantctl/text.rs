@@ -536,6 +536,30 @@ pub(crate) fn parameters(plant: &v1::PlantInfo) -> String {
     plant.parameters.iter().map(line).collect()
 }
 
+/// The bounds that protect a plant, and which of them holds it.
+pub(crate) fn safety(safety: &v1::SafetyInfo) -> String {
+    let name = |action: v1::WatchdogAction| {
+        action.as_str_name().trim_start_matches("WATCHDOG_ACTION_").to_lowercase()
+    };
+    let mut text = String::new();
+    for dog in &safety.watchdogs {
+        let end = |end: Option<f64>| end.map_or_else(String::new, number);
+        let (min, max) = (end(dog.min), end(dog.max));
+        let _ =
+            writeln!(text, "  guard {} in [{min}, {max}]: {}", dog.quantity, name(dog.action()));
+    }
+    if safety.on_step_failure != 0 {
+        let _ = writeln!(text, "  guard failed steps: {}", name(safety.on_step_failure()));
+    }
+    if let Some(trip) = &safety.frozen {
+        let (quantity, step) = (trip.watchdog as usize, trip.step);
+        let quantity = safety.watchdogs.get(quantity).map_or("", |dog| dog.quantity.as_str());
+        let value = number(trip.value);
+        let _ = writeln!(text, "  stopped by a watchdog at step {step}: {quantity} = {value}");
+    }
+    text
+}
+
 /// What a feedback is and does.
 pub(crate) fn feedback(feedback: &v1::FeedbackInfo) -> String {
     let about = match feedback.horizon {

@@ -358,7 +358,8 @@ impl Run<'_> {
             input: policy.clone(),
         };
         let steps = until - step;
-        let request = v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps };
+        let request =
+            v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps, wait: false };
         self.place.client.run(request).await?;
         self.until = until;
         Ok(())

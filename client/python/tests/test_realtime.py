@@ -1,0 +1,51 @@
+"""Plants that run by themselves."""
+
+import pytest
+
+import plantd
+
+
+def test_a_run_of_some_steps_is_waited_for(client):
+    id = client.create_plant("cart-pole").id
+    run = client.run(id, "paced", speed=10, steps=20, wait=True)
+    assert (run.running, run.steps_left) == (False, 0)
+    assert client.get_plant(id).state.step == 20
+    assert client.timing(id, clear=True).steps == 20
+    assert client.timing(id).steps == 0
+
+
+def test_the_same_loop_drives_a_plant_that_runs_by_itself(client):
+    id = client.create_plant("cart-pole").id
+    client.run(id, "paced", speed=10, timeout=0.5, action="ramp", ramp=0.1, safe=[0.0])
+    with client.drive(id) as driver:
+        before = driver.plant.state
+        for force in (1.0, -2.0):
+            state = driver.step([force])
+            assert state.step > before.step and driver.u == [force]
+            assert driver.timing.due_ns <= driver.timing.began_ns < driver.timing.ended_ns
+            before = state
+        assert driver.timing.input_sequence == 2 and not driver.timing.input_safe
+        driver.offer([3.0])
+        assert driver.next().step > before.step
+    with pytest.raises(plantd.PlantdError) as refused:
+        client.step(id, [0.0])
+    assert refused.value.reason == "RUNNING"
+    stands_at = client.pause(id).step
+    client.run(id, steps=1, wait=True)
+    assert client.get_plant(id).state.step == stands_at + 1
+
+
+def test_watchdogs_hold_a_plant_and_say_why(client):
+    id = client.create_plant("cart-pole").id
+    assert client.get_plant(id).safety is None
+    client.set_safety(id, [dict(quantity="x", max=0.2)])
+    with client.drive(id) as driver, pytest.raises(plantd.PlantdError) as stopped:
+        while True:
+            driver.step([20.0])
+    assert stopped.value.reason == "WATCHDOG"
+    frozen = client.get_plant(id).safety.frozen
+    assert frozen.value > 0.2 and frozen.step == client.get_plant(id).state.step
+    for event in client.watch_events(id, since=0):
+        if event.kind == "watchdog":
+            break
+    assert (event.subject, event.value) == ("x", frozen.value)
