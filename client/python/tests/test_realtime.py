@@ -28,7 +28,7 @@ def test_the_same_loop_drives_a_plant_that_runs_by_itself(client):
         driver.offer([3.0])
         assert driver.next().step > before.step
     with pytest.raises(plantd.PlantdError) as refused:
-        client.step(id, [0.0])
+        client.step(id, [[0.0]])
     assert refused.value.reason == "RUNNING"
     stands_at = client.pause(id).step
     client.run(id, steps=1, wait=True)

@@ -362,9 +362,9 @@ async fn a_restored_plant_goes_on_with_what_was_under_way() {
     assert_eq!(y(&drive(&client, &a, 1).await[0]), [steps[0].state.as_ref().unwrap().q[1]]);
 }
 
-/// A plant that the clock moves meets the same noise, delays and faults as one in lockstep.
+/// A plant that moves by itself meets the same noise, delays and faults as one in lockstep.
 #[tokio::test]
-async fn channels_do_the_same_paced_and_in_lockstep() {
+async fn channels_do_the_same_at_every_pace() {
     const STEPS: u32 = 250;
     let (_server, client) = server().await;
     let watched = async |paces: &[v1::Pace]| {
@@ -384,13 +384,13 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
         for (phase, pace) in (1..).zip(paces) {
             let steps = STEPS / paces.len() as u32;
             let is_lockstep = *pace == v1::Pace::Lockstep;
-            let speed = if is_lockstep { 0.0 } else { 20.0 };
+            let speed = if *pace == v1::Pace::Paced { 20.0 } else { 0.0 };
             let settings = v1::RunSettings { pace: (*pace).into(), speed, input: None };
             let request = v1::RunRequest {
                 id: id.clone(),
                 settings: Some(settings),
                 steps: if is_lockstep { 0 } else { steps.into() },
-                wait: false,
+                wait: !is_lockstep,
             };
             client.run(request).await.unwrap();
             if is_lockstep {
@@ -408,9 +408,9 @@ async fn channels_do_the_same_paced_and_in_lockstep() {
         }
         all
     };
-    use v1::Pace::{Lockstep, Paced};
+    use v1::Pace::{Free, Lockstep, Paced};
     let lockstep = watched(&[Lockstep]).await;
-    for paces in [&[Paced][..], &[Paced, Lockstep, Paced, Lockstep, Paced]] {
+    for paces in [&[Paced][..], &[Free], &[Paced, Lockstep, Free, Lockstep, Paced]] {
         let other = watched(paces).await;
         for (k, (expected, found)) in lockstep.iter().zip(&other).enumerate() {
             assert_eq!(expected, found, "step {k}, {paces:?}");
