@@ -4,7 +4,7 @@ use plantd_models::Plant;
 use plantd_proto::v1;
 
 use crate::convert;
-use crate::frame::{Frame, Timing};
+use crate::frame::Frame;
 use crate::grpc::run::run_info;
 use crate::parameters::Parameters;
 use crate::session::Session;
@@ -59,14 +59,5 @@ pub(super) fn fill(record: &mut v1::StepRecord, frame: &Frame) {
     }
     record.outputs = convert::outputs(&frame.outputs, &frame.lost);
     record.report = Some(convert::report(&frame.report));
-    let timing = &frame.timing;
-    record.timing = (timing.began_ns != 0).then_some(v1::StepTiming {
-        due_ns: timing.due_ns,
-        began_ns: timing.began_ns,
-        ended_ns: timing.ended_ns,
-        input_sequence: timing.input_sequence,
-        input_age_ns: timing.input_age_ns,
-        input_late: timing.flags & Timing::LATE != 0,
-        input_safe: timing.flags & Timing::SAFE != 0,
-    });
+    record.timing = convert::step_timing(&frame.timing);
 }
