@@ -155,7 +155,7 @@ fn input_policy(policy: v1::InputPolicy, model: &Model) -> Result<InputPolicy, F
 }
 
 /// Answers a SetSafety call. Copies a plant: call it on a worker.
-pub(crate) fn set_safety(
+pub(super) fn set_safety(
     hub: &Hub,
     request: v1::SetSafetyRequest,
 ) -> Result<v1::SetSafetyResponse, Fault> {

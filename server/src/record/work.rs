@@ -8,6 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
 use mcap::McapError;
+use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1::{self, MarkReason, RecordingStatus};
 
 use super::file::{Times, Writer};
@@ -331,11 +332,6 @@ impl Clock {
         self.last_ns = self.last_ns.max(self.offset_ns.saturating_add(monotonic));
         self.last_ns
     }
-}
-
-fn monotonic_ns() -> u64 {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
 pub(super) fn unix_ns(time: SystemTime) -> u64 {
