@@ -12,7 +12,7 @@ use std::f64::consts::PI;
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
-use plantd_models::control::{Sample, Values, Weights, finite_horizon};
+use plantd_models::control::{Momentum, Sample, Values, Weights, finite_horizon};
 use plantd_models::optimize::{Bounds, Method, Optimizer, Options, Status, TrajectoryCost};
 use plantd_models::{
     Contraction, ForceSplit, Initial, Linearization, Model, Plant, Settings, builtin,
@@ -89,6 +89,7 @@ fn pendulum(method: Method, near_last_step: bool) -> Outcome<Optimizer> {
         x: DMatrix::from_fn(101, 2, |k, i| if i == 0 && k >= 50 { PI } else { 0.0 }),
         u: DMatrix::zeros(100, 1),
         weights: Weights::diagonal(&[1000.0, 1.0], &[50.0])?.into(),
+        momentum: Momentum::State,
     };
     let options = Options {
         method,
@@ -146,8 +147,12 @@ impl Marionette {
         let mut weights = vec![100.0; d.dynamic];
         weights.resize(d.state(), 1.0);
         let weights = Weights::diagonal(&weights, &vec![0.1; d.input()])?;
-        let cost =
-            TrajectoryCost { x, u: DMatrix::zeros(STEPS, d.input()), weights: weights.into() };
+        let cost = TrajectoryCost {
+            x,
+            u: DMatrix::zeros(STEPS, d.input()),
+            weights: weights.into(),
+            momentum: Momentum::State,
+        };
         let mut marionette = Self { plant, cost, inputs: rows(0.0) };
         let mut search = marionette.search(Method::QuasiNewton, false)?;
         for _ in 0..3 {

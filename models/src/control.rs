@@ -45,7 +45,8 @@ pub use kalman::{
 pub use manifold::{Tangent, tangent_basis};
 pub use modes::{Mode, modes};
 pub use spectrum::spectral_radius;
-pub use weights::{StageWeights, TrajectoryWeights, Weights, WeightsError};
+pub(crate) use weights::congruent;
+pub use weights::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
 
 use nalgebra::DMatrix;
 

@@ -355,6 +355,10 @@ impl Dimensions {
     pub fn state(&self) -> usize {
         2 * self.coordinates()
     }
+    /// Where the momentum stands in `x`.
+    pub fn momentum(&self) -> std::ops::Range<usize> {
+        self.coordinates()..self.coordinates() + self.dynamic
+    }
     /// Entries of `u = (inputs, next prescribed positions)`: `ni + nk`.
     pub fn input(&self) -> usize {
         self.inputs + self.prescribed

@@ -44,6 +44,22 @@
 //! tangent space: the first derivatives go through the derivative of the logarithm. Quasi-Newton leaves
 //! out its second derivative (Gauss-Newton), Newton has it.
 //!
+//! **Projected momentum.** With constraints the momentum of the state holds a part that depends on the
+//! step. With [`Momentum::Projected`] the cost weighs `p̃` in its place
+//! ([`Plant::projected_momentum`](crate::Plant::projected_momentum)):
+//!
+//! ```text
+//! dx = (q ⊖ q_d, p̃(x) − p̃(x_d), v − v_d)        l_x = Tᵀ (Q dx + S du + x_linear)        T = ∂(q, p̃, v)/∂x
+//! ```
+//!
+//! The desired state is projected, too, so that a motion of the plant does not deviate from itself; a
+//! desired momentum that is projected already stays as it is. Derivatives are exact, second ones `TᵀQT`
+//! and `TᵀS`: all methods leave out the curvature of `p̃` (Gauss-Newton), so that Newton's method
+//! converges quadratically only where the desired momentum is reached, and descends everywhere as before.
+//! Each evaluation of the cost takes a factorization of the mass matrix, each second derivative O(n³).
+//! Bounds, the weight of a free initial state and [`Options::projection`] stay with the state's own
+//! momentum. Without constraints nothing changes.
+//!
 //! **Bounds** are held by an augmented Lagrangian: each end of each bound at each step has a multiplier
 //! `λ` and adds `(max(0, λ + ρ c)² − λ²) / 2ρ` for its excess `c`, whose kink is passed over (semi-smooth
 //! Newton). `ρ` is the penalty times the weight of the entry in the cost, or the mean weight where that
@@ -62,7 +78,7 @@
 //! ```
 //! use std::sync::Arc;
 //! use nalgebra::DMatrix;
-//! use plantd_models::control::Weights;
+//! use plantd_models::control::{Momentum, Weights};
 //! use plantd_models::optimize::{Bounds, Options, Optimizer, Status, TrajectoryCost};
 //! use plantd_models::{Initial, Model, Plant, Settings, builtin};
 //!
@@ -72,7 +88,12 @@
 //! plant.initialize(&Initial::Momentum { q: vec![0.0], p: vec![0.0], v: vec![] })?;
 //! let desired = DMatrix::from_fn(101, 2, |k, i| if i == 0 && k >= 50 { 3.14 } else { 0.0 });
 //! let weights = Weights::diagonal(&[100.0, 1.0], &[10.0])?;
-//! let cost = TrajectoryCost { x: desired, u: DMatrix::zeros(100, 1), weights: weights.into() };
+//! let cost = TrajectoryCost {
+//!     x: desired,
+//!     u: DMatrix::zeros(100, 1),
+//!     weights: weights.into(),
+//!     momentum: Momentum::State,
+//! };
 //! let guess = DMatrix::zeros(100, 1);
 //! let mut search =
 //!     Optimizer::new(plant, guess, cost, &Bounds::default(), None, Options::default())?;
@@ -94,7 +115,7 @@ mod trajectory;
 use nalgebra::DMatrix;
 
 use crate::State;
-use crate::control::{TrajectoryWeights, Weights};
+use crate::control::{Momentum, TrajectoryWeights, Weights};
 
 pub use error::{BoundFault, OptimizeError, Stuck};
 pub use search::Optimizer;
@@ -108,6 +129,8 @@ pub struct TrajectoryCost {
     pub u: DMatrix<f64>,
     /// Weights, constant or one set per step. They need only be convex together with the map.
     pub weights: TrajectoryWeights,
+    /// Which momentum they weigh.
+    pub momentum: Momentum,
 }
 
 /// Bounds of single entries.

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
-use plantd_models::control::{Sample, Values, Weights, finite_horizon};
+use plantd_models::control::{Momentum, Sample, Values, Weights, finite_horizon};
 use plantd_models::optimize::{
     Bounds, Method, Optimizer, Options, Progress, Status, TrajectoryCost,
 };
@@ -59,6 +59,7 @@ fn pendulum_cost() -> TrajectoryCost {
         x: DMatrix::from_fn(101, 2, angle),
         u: DMatrix::zeros(100, 1),
         weights: Weights::diagonal(&[1000.0, 1.0], &[50.0]).unwrap().into(),
+        momentum: Momentum::State,
     }
 }
 
@@ -233,6 +234,7 @@ fn the_marionette_is_optimised_as_in_the_paper() {
         x: desired,
         u: DMatrix::zeros(n, d.input()),
         weights: Weights::diagonal(&q, &vec![0.1; d.input()]).unwrap().into(),
+        momentum: Momentum::State,
     };
     let options = Options {
         first_method: Some(Method::QuasiNewton),

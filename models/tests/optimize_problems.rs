@@ -8,7 +8,8 @@ use std::sync::Arc;
 use common::{builtin, plant, waving_input};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::{
-    Sample, StageWeights, TrajectoryWeights, Values, Weights, WeightsError, finite_horizon,
+    Momentum, Sample, StageWeights, TrajectoryWeights, Values, Weights, WeightsError,
+    finite_horizon,
 };
 use plantd_models::optimize::{
     Bound, BoundFault, Bounds, FreeInitialState, Method, OptimizeError, Optimizer, Options,
@@ -39,6 +40,7 @@ fn goal(steps: usize, x: &[f64], q: &[f64], q_final: &[f64], r: &[f64]) -> Traje
         x: DMatrix::from_fn(steps + 1, x.len(), |_, i| x[i]),
         u: DMatrix::zeros(steps, r.len()),
         weights: weights.into(),
+        momentum: Momentum::State,
     }
 }
 
@@ -275,7 +277,8 @@ fn follow(name: &str, steps: usize) -> (Plant, TrajectoryCost, DMatrix<f64>) {
     }
     let weights = Weights::diagonal(&vec![100.0; d.state()], &vec![0.1; d.input()]).unwrap();
     let u = DMatrix::from_fn(steps, d.input(), |_, j| held[j]);
-    let cost = TrajectoryCost { x, u: u.clone(), weights: weights.into() };
+    let cost =
+        TrajectoryCost { x, u: u.clone(), weights: weights.into(), momentum: Momentum::State };
     (start, cost, u)
 }
 

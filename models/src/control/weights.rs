@@ -53,6 +53,17 @@ enum Stages {
     PerStep(Vec<StageWeights>),
 }
 
+/// Which momentum weights weigh.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Momentum {
+    /// The state's own.
+    #[default]
+    State,
+    /// The projected one, [`Plant::projected_momentum`](crate::Plant::projected_momentum). Without
+    /// constraints it is the state's own.
+    Projected,
+}
+
 /// Why weights were refused.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WeightsError {
@@ -116,6 +127,14 @@ pub enum WeightsError {
     /// Weights per step without a step.
     #[error("weights per step need at least one step")]
     NoSteps,
+    /// Weights of another number of steps than they are pulled back along.
+    #[error("there are weights for {weights} steps; they are pulled back along {steps}")]
+    Steps {
+        /// Steps that have weights.
+        weights: usize,
+        /// Steps that have a `T`.
+        steps: usize,
+    },
 }
 
 impl WeightsError {
@@ -130,7 +149,7 @@ impl WeightsError {
             Self::NotPositiveDefinite => "r",
             Self::CrossTooLarge => "s",
             Self::Step { error, .. } => error.weight(),
-            Self::NoSteps => "",
+            Self::NoSteps | Self::Steps { .. } => "",
         }
     }
 
@@ -294,6 +313,15 @@ impl Weights {
         Ok(self)
     }
 
+    /// Weights of `x` in place of those of `y`, where `dy = T dx`: `TᵀQT`, `TᵀS` and `Tᵀ Q_f T`, with `T`
+    /// square. For [`Momentum::Projected`], `T` is
+    /// [`Plant::projection_by_state`](crate::Plant::projection_by_state). Refuses another size, and numbers
+    /// that are not finite. Costs `4 n³`.
+    pub fn pull_back(&self, t: &DMatrix<f64>) -> Result<Self, WeightsError> {
+        let stage = self.stage.pull_back(t)?;
+        Ok(Self { stage, q_final: congruent(t, &self.q_final) })
+    }
+
     /// Number of states.
     pub fn states(&self) -> usize {
         self.stage.states()
@@ -325,6 +353,20 @@ impl Weights {
 }
 
 impl StageWeights {
+    /// Stays convex if it is.
+    fn pull_back(&self, t: &DMatrix<f64>) -> Result<Self, WeightsError> {
+        let n = self.states();
+        check_entries("q", t.shape(), (n, n), t.as_slice())?;
+        Ok(Self {
+            q: congruent(t, &self.q),
+            r: self.r.clone(),
+            s: self.s.as_ref().map(|s| t.tr_mul(s)),
+            x_linear: self.x_linear.as_ref().map(|linear| t.tr_mul(linear)),
+            u_linear: self.u_linear.clone(),
+            is_convex: self.is_convex,
+        })
+    }
+
     fn check_system(&self, states: usize, inputs: usize) -> Result<(), WeightsError> {
         for (weight, size, expected) in [("q", self.states(), states), ("r", self.inputs(), inputs)]
         {
@@ -375,6 +417,20 @@ impl TrajectoryWeights {
         Ok(Self { stages: Stages::PerStep(stages), q_final })
     }
 
+    /// Weights of `x` in place of those of `y`, where `dy = T[k] dx` at step `k`: [`Weights::pull_back`]
+    /// with a `T` of each step and of the end. Refuses another number of steps, too.
+    pub fn pull_back(&self, t: &[DMatrix<f64>]) -> Result<Self, WeightsError> {
+        let (last, t) = t.split_last().ok_or(WeightsError::NoSteps)?;
+        if let Some(weights) = self.steps().filter(|weights| *weights != t.len()) {
+            return Err(WeightsError::Steps { weights, steps: t.len() });
+        }
+        let n = self.states();
+        check_entries("q_final", last.shape(), (n, n), last.as_slice())?;
+        let stages = t.iter().enumerate().map(|(k, t)| self.stage(k).pull_back(t));
+        let stages = Stages::PerStep(stages.collect::<Result<_, _>>()?);
+        Ok(Self { stages, q_final: congruent(last, &self.q_final) })
+    }
+
     /// Number of states.
     pub fn states(&self) -> usize {
         self.q_final.nrows()
@@ -419,6 +475,13 @@ impl From<&Weights> for TrajectoryWeights {
     fn from(weights: &Weights) -> Self {
         weights.clone().into()
     }
+}
+
+/// `tᵀ q t` of a symmetric `q`.
+pub(crate) fn congruent(t: &DMatrix<f64>, q: &DMatrix<f64>) -> DMatrix<f64> {
+    let mut congruent = t.tr_mul(&(q * t));
+    symmetrize(&mut congruent);
+    congruent
 }
 
 fn check_final(mut q_final: DMatrix<f64>, states: usize) -> Result<DMatrix<f64>, WeightsError> {

@@ -7,12 +7,12 @@ use nalgebra::{DMatrix, DVector};
 use super::bounds::{Ends, Of};
 use super::trajectory::rows;
 use super::{Bounds, FreeInitialState, OptimizeError, TrajectoryCost};
-use crate::Model;
-use crate::control::{StageWeights, TrajectoryWeights, Weights, WeightsError};
+use crate::control::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError, congruent};
 use crate::plant::balls::three;
 use crate::rotation::{self, Quaternion};
 use crate::scalar::Dual;
 use crate::spatial::{Mat3, Vec3};
+use crate::{Model, Plant};
 
 /// A symmetric weight, which is diagonal more often than not.
 #[derive(Clone, Debug)]
@@ -51,7 +51,7 @@ impl Shape {
 /// Deviations from what is desired, and what the weights make of them, of one step.
 #[derive(Clone, Debug)]
 pub(super) struct Deviation {
-    /// `x ⊖ x_desired`.
+    /// `x ⊖ x_desired`, of projected momenta where these are weighed.
     pub(super) x: Vec<f64>,
     /// `u − u_desired`.
     pub(super) u: Vec<f64>,
@@ -59,6 +59,15 @@ pub(super) struct Deviation {
     by_x: Vec<f64>,
     /// `R du + Sᵀ dx + u_linear`.
     by_u: Vec<f64>,
+    /// At `x`; none where the state's own momentum is weighed.
+    projector: Option<Box<Plant>>,
+}
+
+impl Deviation {
+    /// The derivative by the state of what is weighed in its place.
+    fn projection(&mut self) -> Option<DMatrix<f64>> {
+        self.projector.as_mut().map(|plant| plant.projection_by_state())
+    }
 }
 
 #[derive(Debug)]
@@ -70,6 +79,9 @@ pub(super) struct Problem {
     weights: TrajectoryWeights,
     shapes: Vec<[Shape; 2]>,
     final_shape: Shape,
+    /// Projects momenta; none where the state's own are weighed.
+    projector: Option<Box<Plant>>,
+    /// With projected momenta where these are weighed.
     x_desired: Vec<f64>,
     u_desired: Vec<f64>,
     pub(super) ends: Ends,
@@ -87,12 +99,13 @@ pub(super) struct Free {
 
 impl Problem {
     pub(super) fn new(
-        model: Arc<Model>,
+        plant: &Plant,
         steps: usize,
         cost: TrajectoryCost,
         bounds: &Bounds,
         free: Option<FreeInitialState>,
     ) -> Result<Self, OptimizeError> {
+        let model = Arc::clone(plant.model());
         let d = model.dimensions();
         let (states, inputs) = (d.state(), d.input());
         check("the desired x", &cost.x, steps + 1, states)?;
@@ -135,6 +148,9 @@ impl Problem {
                 _ => 1.0,
             }
         };
+        let projects = cost.momentum == Momentum::Projected && d.constraints > 0;
+        let mut projector = projects.then(|| Box::new(plant.clone()));
+        let x_desired = desired_states(&cost.x, projector.as_deref_mut())?;
         let ends = Ends::new(bounds, (states, inputs), steps, scale)?;
         Ok(Self {
             steps,
@@ -142,7 +158,8 @@ impl Problem {
             inputs,
             shapes: shapes.collect(),
             final_shape: Shape::of(weights.q_final()),
-            x_desired: rows(&cost.x),
+            x_desired,
+            projector,
             u_desired: rows(&cost.u),
             weights,
             ends,
@@ -154,7 +171,8 @@ impl Problem {
 
     pub(super) fn deviation(&self) -> Deviation {
         let (x, u) = (vec![0.0; self.states], vec![0.0; self.inputs]);
-        Deviation { by_x: x.clone(), by_u: u.clone(), x, u }
+        let projector = self.projector.clone();
+        Deviation { by_x: x.clone(), by_u: u.clone(), x, u, projector }
     }
 
     pub(super) fn stage(&self, k: usize) -> &StageWeights {
@@ -198,7 +216,16 @@ impl Problem {
 
     /// Evaluates the deviation at step `k`; of the final step without `u`. Returns the cost.
     pub(super) fn evaluate(&self, k: usize, x: &[f64], u: &[f64], at: &mut Deviation) -> f64 {
-        self.difference(&self.x_desired[k * self.states..][..self.states], x, &mut at.x);
+        let desired = &self.x_desired[k * self.states..][..self.states];
+        self.difference(desired, x, &mut at.x);
+        if let Some(plant) = &mut at.projector {
+            let momentum = self.model.dimensions().momentum();
+            plant.place(x);
+            let momenta = plant.projected_momentum().into_iter().zip(&desired[momentum.clone()]);
+            for (dx, (p, desired)) in at.x[momentum].iter_mut().zip(momenta) {
+                *dx = p - desired;
+            }
+        }
         if k == self.steps {
             self.final_shape.multiply(self.weights.q_final(), &at.x, &mut at.by_x);
             return 0.5 * dot(&at.x, &at.by_x);
@@ -253,12 +280,12 @@ impl Problem {
         of_x.chain(of_u).map(value).sum()
     }
 
-    /// Writes the gradient of the cost at the deviation.
+    /// Writes the gradient of the cost at the deviation, which was evaluated at `x`.
     pub(super) fn gradient(
         &self,
         k: usize,
         (x, u): (&[f64], &[f64]),
-        at: &Deviation,
+        at: &mut Deviation,
         (multipliers, penalty): (&[f64], f64),
         by_x: &mut DVector<f64>,
         by_u: Option<&mut DVector<f64>>,
@@ -267,6 +294,9 @@ impl Problem {
         for &i in &self.model.orientations {
             let turned = chart(&at.x, i).apply_transposed(three(&at.by_x, i));
             by_x.rows_mut(i, 3).copy_from_slice(&turned.0);
+        }
+        if let Some(projection) = at.projection() {
+            *by_x = projection.tr_mul(by_x);
         }
         for (end, place) in self.ends.at(false, k) {
             let slope = end.penalty(x[end.index], multipliers[place], penalty).slope;
@@ -300,6 +330,21 @@ impl Problem {
             let mut transposed = q.transpose();
             turn_rows(&map, i, &mut transposed);
             q.copy_from(&transposed);
+        }
+    }
+
+    /// Whether what is weighed is anything but the difference of states.
+    pub(super) fn is_curved(&self) -> bool {
+        !self.model.orientations.is_empty() || self.projector.is_some()
+    }
+
+    /// Turns weights into second derivatives by the tangent space at `x`, where the deviation was
+    /// evaluated; without the curvature of what is weighed.
+    pub(super) fn pull_back(&self, at: &mut Deviation, q: &mut DMatrix<f64>, s: &mut DMatrix<f64>) {
+        self.turn_weights(at, q, s);
+        if let Some(projection) = at.projection() {
+            *q = congruent(&projection, q);
+            *s = projection.tr_mul(s);
         }
     }
 
@@ -358,6 +403,23 @@ impl Problem {
     pub(super) fn has_bounds(&self) -> bool {
         !self.ends.is_empty()
     }
+}
+
+/// The desired states, one after the other, with their momenta projected if they are to be.
+fn desired_states(x: &DMatrix<f64>, plant: Option<&mut Plant>) -> Result<Vec<f64>, OptimizeError> {
+    let mut desired = rows(x);
+    let Some(plant) = plant else { return Ok(desired) };
+    let d = plant.model().dimensions();
+    for (row, x) in desired.chunks_exact_mut(d.state().max(1)).enumerate() {
+        plant.place(x);
+        let p = plant.projected_momentum();
+        if let Some(i) = p.iter().position(|entry| !entry.is_finite()) {
+            let what = "the projected momentum of the desired x";
+            return Err(OptimizeError::NotFinite { what, row, col: d.coordinates() + i });
+        }
+        x[d.momentum()].copy_from_slice(&p);
+    }
+    Ok(desired)
 }
 
 impl Free {

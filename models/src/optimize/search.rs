@@ -252,7 +252,7 @@ impl Optimizer {
         check_options(&options)?;
         let weights = options.projection.clone();
         let projection = weights.map(|weights| weights.for_system(states, width)).transpose()?;
-        let problem = Arc::new(Problem::new(Arc::clone(&model), steps, cost, bounds, free)?);
+        let problem = Arc::new(Problem::new(&plant, steps, cost, bounds, free)?);
         let State { q, p, v, .. } = initial.clone();
         plant.keep_periods_whole();
         plant.initialize(&Initial::Momentum { q, p, v })?;
@@ -670,7 +670,7 @@ impl Optimizer {
     fn is_projection(&self, method: Method) -> bool {
         let Some(projection) = &self.projection else { return true };
         let problem = &self.problem;
-        let is_plain = !problem.has_bounds() && problem.model.orientations().is_empty();
+        let is_plain = !problem.has_bounds() && !problem.is_curved();
         match method {
             Method::Steepest => {
                 let Second { xx, uu, .. } = &self.scratch.identity;

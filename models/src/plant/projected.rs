@@ -23,6 +23,30 @@ use crate::plant::blocks::Blocks;
 const REDUNDANT: f64 = 1e-11;
 
 impl Plant {
+    /// Takes `x = (q, p, v)` as it is, whether it satisfies the constraints or not.
+    pub(crate) fn place(&mut self, x: &[f64]) {
+        let state = &mut self.state;
+        let (q, rest) = x.split_at(state.q.len());
+        let (p, v) = rest.split_at(state.p.len());
+        state.q.copy_from_slice(q);
+        state.p.copy_from_slice(p);
+        state.v.copy_from_slice(v);
+        state.q_low.fill(0.0);
+        state.p_low.fill(0.0);
+        state.orient(&self.model);
+        self.workspace.forget();
+    }
+
+    /// The derivative of `(q, p̃, v)` by `x = (q, p, v)`, square of `2 nd + 2 nk`: what weights on the
+    /// projected momentum are pulled back with (allocates). Costs O(n³).
+    pub fn projection_by_state(&mut self) -> DMatrix<f64> {
+        let d = self.model.dimensions;
+        let mut by_state = DMatrix::identity(d.state(), d.state());
+        let momentum = self.projected_momentum_by_state();
+        by_state.rows_range_mut(d.momentum()).copy_from(&momentum);
+        by_state
+    }
+
     /// The projected momentum `p̃`, nd (allocates). Without constraints it is the momentum.
     pub fn projected_momentum(&mut self) -> Vec<f64> {
         let velocity = self.velocity();
@@ -55,7 +79,12 @@ impl Plant {
         let Some(mass) = mass.cholesky() else { return by_state };
         let dh_d = dh.columns(0, nd).into_owned();
         let response = mass.solve(&dh_d.transpose());
-        let schur = (&dh_d * &response).symmetric_eigen();
+        let schur = &dh_d * &response;
+        // Eigenvalues of what is not finite are never found.
+        if !schur.iter().all(|entry| entry.is_finite()) {
+            return by_state;
+        }
+        let schur = schur.symmetric_eigen();
         let smallest = REDUNDANT * schur.eigenvalues.amax();
         let inverse = schur.eigenvalues.map(|x| if x > smallest { 1.0 / x } else { 0.0 });
         let solve = |right: DMatrix<f64>| {

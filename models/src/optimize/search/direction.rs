@@ -137,7 +137,7 @@ impl Optimizer {
             let x = current.x(k);
             let u = if k < steps { current.u(k) } else { &[] };
             problem.evaluate(k, x, u, &mut scratch.deviation);
-            problem.gradient(k, (x, u), &scratch.deviation, bounds, by_x, by_u.get_mut(k));
+            problem.gradient(k, (x, u), &mut scratch.deviation, bounds, by_x, by_u.get_mut(k));
         }
         if let Some(weight) = problem.free.as_ref().and_then(|free| free.weight.as_ref()) {
             let reference = self.reference.x();
@@ -306,10 +306,10 @@ impl Optimizer {
             q.copy_from(&identity.xx);
         } else {
             q.copy_from(problem.q_final());
-            if !problem.model.orientations().is_empty() {
+            if problem.is_curved() {
                 problem.evaluate(steps, x, &[], deviation);
                 s.fill(0.0);
-                problem.turn_weights(deviation, q, s);
+                problem.pull_back(deviation, q, s);
                 if method == Method::Newton {
                     problem.add_chart_curvature(deviation, q);
                 }
@@ -564,8 +564,8 @@ fn stage_weights<'a>(
     own: &'a mut Second,
     identity: &'a Second,
 ) -> Stage<'a> {
-    let has_balls = !problem.model.orientations().is_empty();
-    let is_plain = !problem.has_bounds() && (!has_balls || method == Method::Steepest);
+    let is_curved = problem.is_curved();
+    let is_plain = !problem.has_bounds() && (!is_curved || method == Method::Steepest);
     let stage = problem.stage(k);
     if is_plain && method == Method::Steepest {
         return Stage { q: &identity.xx, r: &identity.uu, s: None, x_linear: None, u_linear: None };
@@ -580,9 +580,9 @@ fn stage_weights<'a>(
         r.copy_from(&identity.uu);
     } else {
         has_cross = copy_weights(problem, k, (&mut *q, &mut *s, &mut *r));
-        if has_balls {
+        if is_curved {
             problem.evaluate(k, x, u, deviation);
-            problem.turn_weights(deviation, q, s);
+            problem.pull_back(deviation, q, s);
         }
     }
     problem.add_penalty_curvature(k, (x, u), bounds, q, Some(&mut *r));
@@ -599,7 +599,7 @@ pub(super) fn add_stage_weights(
     second: &mut Second,
 ) {
     let stage = problem.stage(k);
-    if problem.model.orientations().is_empty() {
+    if !problem.is_curved() {
         second.xx += stage.q();
         if let Some(s) = stage.s() {
             second.xu += s;
@@ -607,7 +607,7 @@ pub(super) fn add_stage_weights(
     } else {
         copy_weights(problem, k, (&mut own.xx, &mut own.xu, &mut own.uu));
         problem.evaluate(k, x, u, deviation);
-        problem.turn_weights(deviation, &mut own.xx, &mut own.xu);
+        problem.pull_back(deviation, &mut own.xx, &mut own.xu);
         problem.add_chart_curvature(deviation, &mut own.xx);
         second.xx += &own.xx;
         second.xu += &own.xu;
