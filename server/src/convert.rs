@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use nalgebra::{Complex, DMatrix, DVector};
-use plantd_models::control::{StageWeights, TrajectoryWeights, Weights, WeightsError};
+use plantd_models::control::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
 use plantd_models::scene::Signal;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
@@ -472,6 +472,34 @@ pub fn weights_in(
     match s.transpose()? {
         Some(s) => weights.with_cross(s).map_err(refuse),
         None => Ok(weights),
+    }
+}
+
+/// Weights of a regulator that knows the momentum of the state alone.
+pub fn state_weights_in(
+    field: &str,
+    weights: Option<v1::LqrWeights>,
+    model: &Model,
+) -> Result<Weights, Fault> {
+    match momentum_in(field, weights.as_ref())? {
+        Momentum::State => weights_in(field, weights, model),
+        Momentum::Projected => {
+            let problem = "is projected; these weights are on the momentum of the state";
+            Err(Fault::field(format!("{field}.momentum"), problem))
+        }
+    }
+}
+
+/// Which momentum weights in a field of the request weigh.
+pub fn momentum_in(field: &str, weights: Option<&v1::LqrWeights>) -> Result<Momentum, Fault> {
+    let momentum = weights.map_or(0, |weights| weights.momentum);
+    match v1::Momentum::try_from(momentum) {
+        Ok(v1::Momentum::Unspecified | v1::Momentum::State) => Ok(Momentum::State),
+        Ok(v1::Momentum::Projected) => Ok(Momentum::Projected),
+        Err(_) => Err(Fault::field(
+            format!("{field}.momentum"),
+            format!("{momentum} is no such momentum"),
+        )),
     }
 }
 

@@ -3,8 +3,9 @@
 
 use std::sync::Arc;
 
+use nalgebra::DMatrix;
 use plantd_models::control::{
-    self, FiniteHorizon, Regulator, Sample, Tangent, TrajectoryWeights, Values, Weights,
+    self, FiniteHorizon, Momentum, Regulator, Sample, Tangent, TrajectoryWeights, Values, Weights,
 };
 use plantd_models::{Initial, Linearization, Model, Plant, Settings, State};
 use plantd_proto::v1;
@@ -73,21 +74,42 @@ pub fn check_equilibrium(mut plant: Plant, u: &[f64]) -> Result<(), Fault> {
     Ok(())
 }
 
+/// What pulls weights on a momentum back to the plant's state; none where they are on it.
+fn projection(momentum: Momentum, plant: &mut Plant) -> Option<DMatrix<f64>> {
+    let is_needed = momentum == Momentum::Projected && plant.model().dimensions().constraints > 0;
+    is_needed.then(|| plant.projection_by_state())
+}
+
+/// The regulator of a linearization at the plant's state.
+pub fn at_state(
+    plant: &mut Plant,
+    linearization: &Linearization,
+    weights: &Weights,
+    momentum: Momentum,
+    constraints: Constraints,
+) -> Result<Regulator, Fault> {
+    let (a, b) = (linearization.a(), linearization.b());
+    let pulled = projection(momentum, plant).map(|by_state| weights.pull_back(&by_state));
+    let pulled = pulled.transpose()?;
+    let weights = pulled.as_ref().unwrap_or(weights);
+    Ok(match constraints.tangent(plant) {
+        Some(tangent) => control::infinite_horizon_on_manifold(&a, &b, &tangent, weights)?,
+        None => control::infinite_horizon(&a, &b, weights)?,
+    })
+}
+
 /// The regulator about an equilibrium.
 pub fn about_point(
     plant: &mut Plant,
     u: &[f64],
     weights: &Weights,
+    momentum: Momentum,
     constraints: Constraints,
 ) -> Result<Regulator, Fault> {
     check_equilibrium(plant.clone(), u)?;
     let mut linearization = Linearization::new(plant.model());
     plant.linearize(u, &mut linearization)?;
-    let (a, b) = (linearization.a(), linearization.b());
-    Ok(match constraints.tangent(plant) {
-        Some(tangent) => control::infinite_horizon_on_manifold(&a, &b, &tangent, weights)?,
-        None => control::infinite_horizon(&a, &b, weights)?,
-    })
+    at_state(plant, &linearization, weights, momentum, constraints)
 }
 
 /// What a regulator along a trajectory needs memory for.
@@ -97,13 +119,15 @@ pub struct Memory {
     pub steps: usize,
     /// Steps with weights of their own.
     pub stages: usize,
+    /// Which momentum weights weigh.
+    pub momentum: Momentum,
     /// Whether value functions are kept.
     pub values: Values,
 }
 
 impl Memory {
     /// Refuses a trajectory whose matrices would need too much memory: A, B, the gain, the tangent
-    /// space twice, weights, and value functions.
+    /// space twice, weights, what pulls them back and what it makes of them, and value functions.
     pub fn check(self, limits: &Limits, model: &Model) -> Result<(), Fault> {
         let d = model.dimensions();
         let (nx, nu) = (d.state(), d.input());
@@ -111,6 +135,9 @@ impl Memory {
         let values = if self.values == Values::Keep { nx * nx + nx } else { 0 };
         let numbers = (self.steps + 1).saturating_mul(nx * nx + 2 * nx * nu + tangents + values);
         let weights = self.stages.saturating_mul(stage_numbers(model));
+        let is_projected = self.momentum == Momentum::Projected && d.constraints > 0;
+        let pulled = if is_projected { nx * nx + stage_numbers(model) } else { 0 };
+        let weights = weights.saturating_add((self.steps + 1).saturating_mul(pulled));
         let (name, limit) = ("trajectory_numbers", limits.trajectory_numbers);
         let (what, numbers) =
             ("numbers in the trajectory's matrices", numbers.saturating_add(weights));
@@ -133,6 +160,8 @@ pub struct Path {
     pub samples: Vec<Sample>,
     /// Tangent spaces of the constraints, one per state, or none.
     pub tangents: Vec<Tangent>,
+    /// What pulls weights on the projected momentum back, one per state, or none.
+    projections: Vec<DMatrix<f64>>,
 }
 
 impl Path {
@@ -140,34 +169,44 @@ impl Path {
     pub fn follow(
         mut plant: Plant,
         inputs: &Inputs,
+        momentum: Momentum,
         constraints: Constraints,
         abandoned: &Abandoned,
     ) -> Result<Self, Fault> {
         let mut linearization = Linearization::new(plant.model());
-        let mut path = Self { states: Vec::new(), samples: Vec::new(), tangents: Vec::new() };
+        let mut path = Self {
+            states: Vec::new(),
+            samples: Vec::new(),
+            tangents: Vec::new(),
+            projections: Vec::new(),
+        };
         for k in 0..inputs.count() {
             abandoned.check()?;
-            path.note_state(&mut plant, constraints);
+            path.note_state(&mut plant, momentum, constraints);
             plant
                 .step_and_linearize(inputs.get(k), &mut linearization)
                 .map_err(|error| Fault::from(error).with("steps_taken", k))?;
             path.samples.push(Sample { a: linearization.a(), b: linearization.b() });
         }
-        path.note_state(&mut plant, constraints);
+        path.note_state(&mut plant, momentum, constraints);
         Ok(path)
     }
 
-    fn note_state(&mut self, plant: &mut Plant, constraints: Constraints) {
+    fn note_state(&mut self, plant: &mut Plant, momentum: Momentum, constraints: Constraints) {
         self.states.push(plant.state());
         self.tangents.extend(constraints.tangent(plant));
+        self.projections.extend(projection(momentum, plant));
     }
 
-    /// The regulator along the path.
+    /// The regulator along the path, with weights on the momentum that the path was followed for.
     pub fn solve(
         &self,
         weights: &TrajectoryWeights,
         values: Values,
     ) -> Result<FiniteHorizon, Fault> {
+        let is_projected = !self.projections.is_empty();
+        let pulled = is_projected.then(|| weights.pull_back(&self.projections)).transpose()?;
+        let weights = pulled.as_ref().unwrap_or(weights);
         Ok(if self.tangents.is_empty() {
             control::finite_horizon(&self.samples, weights, values)?
         } else {
@@ -209,6 +248,8 @@ pub struct Spec {
     pub weights: Option<Weights>,
     /// Weights of one along a trajectory.
     pub trajectory_weights: Option<TrajectoryWeights>,
+    /// Which momentum they weigh.
+    pub momentum: Momentum,
     /// On which space it is solved.
     pub constraints: Constraints,
     /// Time step for which a trajectory was given, s.
@@ -255,12 +296,13 @@ impl Spec {
                 let missing = || Fault::field("weights", "are missing");
                 let weights = self.trajectory_weights.as_ref().ok_or_else(missing)?;
                 let (steps, stages) = (inputs.count(), weights.steps().unwrap_or(1));
-                Memory { steps, stages, values: Values::Drop }.check(limits, model)?;
+                let momentum = self.momentum;
+                Memory { steps, stages, momentum, values: Values::Drop }.check(limits, model)?;
                 // The request has the weights once more.
                 let room = room.reserve(numbers(model, steps, stages.saturating_mul(2)))?;
                 let start = Start::Initial(start.clone());
                 let plant = convert::plant(model, settings, &start, "trajectory.initial")?;
-                let path = Path::follow(plant, inputs, self.constraints, abandoned)?;
+                let path = Path::follow(plant, inputs, momentum, self.constraints, abandoned)?;
                 let solution = path.solve(weights, Values::Drop)?;
                 let mut feedforward = solution.feedforward.into_iter();
                 let mut states = path.states.into_iter().map(|state| state.x());
@@ -280,7 +322,7 @@ impl Spec {
         let missing = || Fault::field("weights", "are missing");
         let weights = self.weights.as_ref().ok_or_else(missing)?;
         let room = room.reserve(numbers(plant.model(), 1, 1))?;
-        let regulator = about_point(&mut plant, u, weights, self.constraints)?;
+        let regulator = about_point(&mut plant, u, weights, self.momentum, self.constraints)?;
         let stage = Stage {
             k: convert::matrix(&regulator.gain).data,
             x: convert::x(&plant),

@@ -88,8 +88,9 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
     let constraints = Constraints::new(request.constraints)?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
+    let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
     let weights = convert::weights(request.weights, plant.model())?;
-    let regulator = regulator::about_point(&mut plant, &u, &weights, constraints)?;
+    let regulator = regulator::about_point(&mut plant, &u, &weights, momentum, constraints)?;
     Ok(v1::SolveLqrResponse {
         gain: Some(v1::Gain {
             step: 0,
@@ -222,12 +223,13 @@ impl TrajectoryRegulator {
         let (plant, inputs) =
             convert::trajectory(request.trajectory, &model, settings, &hub.limits)?;
         let values = if request.values { Values::Keep } else { Values::Drop };
-        let memory = Memory { steps: inputs.count(), stages: request.stages.len(), values };
-        memory.check(&hub.limits, &model)?;
+        let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
+        let (steps, stages) = (inputs.count(), request.stages.len());
+        Memory { steps, stages, momentum, values }.check(&hub.limits, &model)?;
         let fields = WeightFields::default();
         let (weights, stages) = (request.weights, request.stages);
-        let weights = convert::trajectory_weights(fields, weights, stages, inputs.count(), &model)?;
-        let path = Path::follow(plant, &inputs, constraints, abandoned)?;
+        let weights = convert::trajectory_weights(fields, weights, stages, steps, &model)?;
+        let path = Path::follow(plant, &inputs, momentum, constraints, abandoned)?;
         let solution = path.solve(&weights, values)?;
         Ok(Self {
             gains: solution.gains.into_iter(),

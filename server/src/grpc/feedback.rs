@@ -139,11 +139,13 @@ pub(crate) async fn set_feedback(
             let constraints = Constraints::new(request.constraints)?;
             let reference = reference(&hub, request.reference, &mechanics)?;
             let model = &mechanics.model;
+            let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
             let (weights, trajectory_weights) = match &reference {
                 Reference::Gain(_) => (None, None),
                 Reference::Trajectory { inputs, .. } => {
                     let (steps, stages) = (inputs.count(), request.stages);
-                    let memory = Memory { steps, stages: stages.len(), values: Values::Drop };
+                    let (count, values) = (stages.len(), Values::Drop);
+                    let memory = Memory { steps, stages: count, momentum, values };
                     memory.check(&hub.limits, model)?;
                     let (fields, weights) = (WeightFields::default(), request.weights);
                     let all = convert::trajectory_weights(fields, weights, stages, steps, model)?;
@@ -156,6 +158,7 @@ pub(crate) async fn set_feedback(
                 reference,
                 weights,
                 trajectory_weights,
+                momentum,
                 constraints,
                 time_step_s,
                 given,

@@ -1,7 +1,7 @@
 //! `ControlService.SolveKalman` and `SolveTrajectoryKalman`.
 
 use nalgebra::{DMatrix, DVector};
-use plantd_models::control::{self, Kalman, NoiseCovariances, Sample, Values};
+use plantd_models::control::{self, Kalman, Momentum, NoiseCovariances, Sample, Values};
 use plantd_models::{Linearization, Model, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
@@ -121,7 +121,7 @@ impl TrajectoryFilter {
         let initial = convert::weight("initial_covariance", request.initial_covariance, size)?;
         let values = if request.covariances { Values::Keep } else { Values::Drop };
         check_memory(hub, &model, inputs.count(), outputs.x.nrows(), request.covariances)?;
-        let path = Path::follow(plant, &inputs, constraints, abandoned)?;
+        let path = Path::follow(plant, &inputs, Momentum::State, constraints, abandoned)?;
         let (samples, c) = (&path.samples, [outputs.x.clone()]);
         let solution = if path.tangents.is_empty() {
             control::time_varying_kalman(samples, &c, &noise, &initial, values)?

@@ -281,8 +281,9 @@ fn trajectory_cost(
         None => DMatrix::zeros(steps, d.input()),
     };
     let fields = WeightFields { weights: "cost.weights", stages: "cost.stages", are_convex: false };
+    let momentum = convert::momentum_in(fields.weights, cost.weights.as_ref())?;
     let weights = convert::trajectory_weights(fields, cost.weights, cost.stages, steps, model)?;
-    Ok(TrajectoryCost { x, u, weights })
+    Ok(TrajectoryCost { x, u, weights, momentum })
 }
 
 fn bounds(given: v1::TrajectoryBounds, model: &Model) -> Result<Bounds, Fault> {
@@ -344,7 +345,7 @@ fn given_options(
         near_last_step: given.near_last_step,
         projection: match given.projection {
             None => None,
-            weights => Some(convert::weights_in("options.projection", weights, model)?),
+            weights => Some(convert::state_weights_in("options.projection", weights, model)?),
         },
         bound_tolerance: or(given.bound_tolerance, defaults.bound_tolerance),
     };

@@ -52,15 +52,18 @@ impl Projection {
         let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
         let numbers = steps.saturating_mul(2 * d.input());
         LimitExceeded::check(name, limit, "numbers in the report's inputs", numbers)?;
-        Memory { steps, stages: 0, values: Values::Drop }.check(&hub.limits, &model)?;
+        let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
+        Memory { steps, stages: 0, momentum, values: Values::Drop }.check(&hub.limits, &model)?;
         let u =
             request.u.map(|u| convert::matrix_of("u", &u, Some(steps), d.input())).transpose()?;
-        let weights_of = |field: &str, weights: Option<v1::LqrWeights>| match weights {
-            None => Ok(None),
-            given => convert::weights_in(field, given, &model).map(Some),
+        let pull = match request.projection {
+            None => None,
+            given => Some(convert::state_weights_in("projection", given, &model)?),
         };
-        let pull = weights_of("projection", request.projection)?;
-        let weights = weights_of("weights", request.weights)?;
+        let weights = match request.weights {
+            None => None,
+            given => Some(convert::weights(given, &model)?),
+        };
 
         let plant = Plant::new(model.clone(), settings)
             .map_err(|error| Fault::from_initial(error, "model"))?;
@@ -78,7 +81,7 @@ impl Projection {
                 let inputs = Inputs::from_rows(&projected.inputs);
                 let start = Start::Initial(convert::momentum_of(&projected.initial));
                 let plant = convert::plant(&model, settings, &start, "q")?;
-                let path = Path::follow(plant, &inputs, constraints, abandoned)?;
+                let path = Path::follow(plant, &inputs, momentum, constraints, abandoned)?;
                 path.solve(&weights.into(), Values::Drop)?.gains
             }
         };

@@ -7,7 +7,7 @@
 use std::collections::HashSet;
 use std::sync::Arc;
 
-use plantd_models::control::{self, Tangent, Weights};
+use plantd_models::control::{Momentum, Weights};
 use plantd_models::{Initial, Linearization, Plant, StepError};
 use plantd_proto::v1;
 use v1::WatchField;
@@ -18,6 +18,7 @@ use crate::feedback::Reservation;
 use crate::frame::{Frame, record_words};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
+use crate::regulator::{self, Constraints};
 use crate::session::Session;
 use crate::status::Fault;
 use crate::watch::Subscription;
@@ -79,7 +80,10 @@ pub(super) fn stream(
         LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?;
     }
     let weights = match wanted.gain {
-        true => Some(Arc::new(convert::weights(request.weights, session.model())?)),
+        true => {
+            let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
+            Some(Arc::new((convert::weights(request.weights, session.model())?, momentum)))
+        }
         false => None,
     };
     let every = u64::from(request.every.max(1));
@@ -105,7 +109,7 @@ struct Watcher {
     _room: Reservation,
     wanted: Wanted,
     mask: Option<Mask>,
-    weights: Option<Arc<Weights>>,
+    weights: Option<Arc<(Weights, Momentum)>>,
     analysis: Option<Box<Analysis>>,
 }
 
@@ -181,7 +185,7 @@ impl Analysis {
         response: &mut v1::WatchResponse,
         frame: &Frame,
         wanted: Wanted,
-        weights: Option<&Weights>,
+        weights: Option<&(Weights, Momentum)>,
     ) {
         if let Err(fault) = self.try_fill(response, frame, wanted, weights) {
             response.failure = Some(fault.into());
@@ -193,7 +197,7 @@ impl Analysis {
         response: &mut v1::WatchResponse,
         frame: &Frame,
         wanted: Wanted,
-        weights: Option<&Weights>,
+        weights: Option<&(Weights, Momentum)>,
     ) -> Result<(), Fault> {
         let state = &frame.state;
         let momentum =
@@ -210,11 +214,13 @@ impl Analysis {
         if wanted.linearization {
             response.linearization = Some(convert::linearization(state.step, &self.linearization));
         }
-        if let Some(weights) = weights {
-            let k = self.gain(weights)?;
+        if let Some((weights, momentum)) = weights {
+            let space = Constraints::Manifold;
+            let (plant, linearization) = (&mut self.plant, &self.linearization);
+            let regulator = regulator::at_state(plant, linearization, weights, *momentum, space)?;
             response.gain = Some(v1::Gain {
                 step: state.step,
-                k: Some(k),
+                k: Some(convert::matrix(&regulator.gain)),
                 x_reference: state.x(),
                 u_reference: frame.input.clone(),
                 rotations: convert::rotations(self.plant.model()),
@@ -227,18 +233,6 @@ impl Analysis {
     fn linearize(&mut self, input: &[f64]) -> Result<(), StepError> {
         self.plant.linearize(input, &mut self.linearization)?;
         Ok(())
-    }
-
-    fn gain(&mut self, weights: &Weights) -> Result<v1::Matrix, Fault> {
-        let (a, b) = (self.linearization.a(), self.linearization.b());
-        let d = self.plant.model().dimensions();
-        let regulator = if d.constraints == 0 {
-            control::infinite_horizon(&a, &b, weights)?
-        } else {
-            let tangent = Tangent::new(&self.plant.constraint_jacobian(), d.dynamic);
-            control::infinite_horizon_on_manifold(&a, &b, &tangent, weights)?
-        };
-        Ok(convert::matrix(&regulator.gain))
     }
 }
 
