@@ -128,6 +128,8 @@ pub trait WeightsExt: Sized {
     fn with_cross(self, s: v1::Matrix) -> Self;
     /// With `½ xᵀ q_final x` at the end of a finite horizon.
     fn with_final(self, q_final: v1::Weight) -> Self;
+    /// On the projected momentum in place of the state's own.
+    fn on_projected_momentum(self) -> Self;
 }
 
 impl WeightsExt for v1::LqrWeights {
@@ -137,6 +139,10 @@ impl WeightsExt for v1::LqrWeights {
 
     fn with_final(self, q_final: v1::Weight) -> Self {
         Self { q_final: Some(q_final), ..self }
+    }
+
+    fn on_projected_momentum(self) -> Self {
+        Self { momentum: v1::Momentum::Projected.into(), ..self }
     }
 }
 
@@ -169,7 +175,9 @@ mod tests {
         let cross = v1::Matrix::from_rows(&[[0.5], [0.0]]);
         let weights = weights(diagonal([1.0, 2.0]), full(v1::Matrix::from_rows(&[[3.0]])))
             .with_cross(cross.clone())
-            .with_final(diagonal([4.0, 5.0]));
+            .with_final(diagonal([4.0, 5.0]))
+            .on_projected_momentum();
+        assert_eq!(weights.momentum(), v1::Momentum::Projected);
         assert_eq!((weights.s, weights.q_final), (Some(cross), Some(diagonal([4.0, 5.0]))));
         assert_eq!(weights.q, Some(diagonal([1.0, 2.0])));
     }

@@ -4,6 +4,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::Arc;
 
+use plantd_models::control::Momentum;
 use plantd_models::{
     Contraction, ForceSplit, Linearization, Model, Plant, Scene, SecondOrder, Settings, builtin,
 };
@@ -164,6 +165,7 @@ fn steps_with_feedback_allocate_nothing() {
             reference: Reference::Gain(stage(0)),
             weights: None,
             trajectory_weights: None,
+            momentum: Momentum::State,
             constraints: Constraints::Full,
             time_step_s: 0.01,
             given: None,

@@ -88,6 +88,24 @@ def test_gains_along_a_trajectory(client):
     assert np.array_equal(gains[0](initial), [0.0])
 
 
+def test_weights_are_on_either_momentum(client):
+    # The linkage has one freedom: so many are the independent projected momenta.
+    weights = {"q": np.ones(6), "r": [1.0], "full": True}
+    u = np.zeros((5, 1))
+
+    def rank(value):
+        return np.linalg.matrix_rank(value[3:, 3:] / np.abs(value).max(), tol=1e-8)
+
+    for projected, expected in [(False, 3), (True, 1)]:
+        regulator = client.solve_lqr("four-bar", at="rest", projected_momentum=projected, **weights)
+        assert rank(regulator.value) == expected
+        initial = client.create_plant("four-bar").state
+        along = client.solve_trajectory_lqr(
+            "four-bar", initial, u, projected_momentum=projected, values=True, **weights
+        )
+        assert [rank(gain.value) for gain in along] == [expected] * 6
+
+
 def test_snapshot_restore_and_reset(client):
     plant = client.create_plant("double-pendulum", q=[0.5, -0.5])
     client.step(plant.id, hold=10)

@@ -11,6 +11,7 @@ mod feedback;
 mod kalman;
 mod limits;
 mod methods;
+mod momentum;
 mod optimise;
 mod parameters;
 mod realtime;

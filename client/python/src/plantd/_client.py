@@ -37,6 +37,7 @@ from ._requests import (
     constraints,
     initial_state,
     measurement,
+    momentum,
     noise,
     point,
     settings,
@@ -299,6 +300,7 @@ class Client:
         coordinates: Sequence[str] = (),
         q: npt.ArrayLike | None = None,
         r: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
         queue: int = 1,
     ) -> Iterator[Watched]:
         """What a plant does while somebody drives it. A slow reader loses messages: ``queue`` of them
@@ -314,7 +316,7 @@ class Client:
             ],
             every=every,
             coordinates=coordinates,
-            weights=None if q is None or r is None else weights(q, r),
+            weights=_trajectory_weights(q, r, None, None, projected_momentum),
             queue=queue,
         )
         # Asked for now rather than at the first message, so that nothing in between is missed.
@@ -422,6 +424,7 @@ class Client:
         r: npt.ArrayLike | None = None,
         q_final: npt.ArrayLike | None = None,
         s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
         stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
         full: bool = False,
         mode: Literal["watch", "replace", "add", "guard"] = "watch",
@@ -455,7 +458,7 @@ class Client:
             request.trajectory.CopyFrom(trajectory._message())
         else:
             request.point.CopyFrom(point(at or "", state, u, plant))
-        given = _trajectory_weights(q, r, q_final, s)
+        given = _trajectory_weights(q, r, q_final, s, projected_momentum)
         if given is not None:
             request.weights.CopyFrom(given)
         return Feedback._from(self._call(self.plants.SetFeedback, request).feedback)
@@ -744,6 +747,7 @@ class Client:
         q: npt.ArrayLike,
         r: npt.ArrayLike,
         s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
         at: str = "initial",
         state: State | None = None,
         u: Vector = (),
@@ -751,7 +755,8 @@ class Client:
         **stepping: Unpack[Stepping],
     ) -> Regulator:
         """Infinite-horizon LQR about an equilibrium. Weights are diagonals or matrices, ``s`` is that
-        of the cross term x' s u.
+        of the cross term x' s u. With ``projected_momentum`` they are on (q, projected p, v): on a
+        momentum that does not depend on the time step, where constraints would make it.
 
         ``full`` solves on the full state of a constrained model instead of on its manifold.
         """
@@ -759,7 +764,7 @@ class Client:
             model=model,
             settings=settings(**stepping),
             point=point(at, state, u),
-            weights=weights(q, r, s=s),
+            weights=weights(q, r, s=s, projected_momentum=projected_momentum),
             constraints=constraints(full),
         )
         return Regulator._from_answer(self._call(self.control.SolveLqr, request))
@@ -792,6 +797,7 @@ class Client:
         r: npt.ArrayLike | None = None,
         q_final: npt.ArrayLike | None = None,
         s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
         stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
         values: bool = False,
         full: bool = False,
@@ -801,13 +807,14 @@ class Client:
         reference state. `GainSchedule` makes a law of them.
 
         ``stages`` are weights of each step in place of ``q``, ``r`` and ``s``: mappings of these names
-        and of ``x_linear`` and ``u_linear``. ``values`` also returns the cost to go.
+        and of ``x_linear`` and ``u_linear``. ``projected_momentum`` is as in `solve_lqr`. ``values``
+        also returns the cost to go.
         """
         request = control_service_pb2.SolveTrajectoryLqrRequest(
             model=model,
             settings=settings(**stepping),
             trajectory=trajectory(initial, u),
-            weights=_trajectory_weights(q, r, q_final, s),
+            weights=_trajectory_weights(q, r, q_final, s, projected_momentum),
             stages=stage_weights(stages),
             values=values,
             constraints=constraints(full),
@@ -825,6 +832,7 @@ class Client:
         r: npt.ArrayLike | None = None,
         q_final: npt.ArrayLike | None = None,
         s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
         stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
         resume: Checkpoint | None = None,
         state_bounds: Bounds | None = None,
@@ -873,7 +881,7 @@ class Client:
             cost=control_service_pb2.TrajectoryCost(
                 x=matrix_message(x),
                 u=None if u is None else matrix_message(u),
-                weights=_trajectory_weights(q, r, q_final, s),
+                weights=_trajectory_weights(q, r, q_final, s, projected_momentum),
                 stages=stage_weights(stages),
             ),
             guess=None if start is None else start._message(),
@@ -911,6 +919,7 @@ class Client:
         r: npt.ArrayLike | None = None,
         q_final: npt.ArrayLike | None = None,
         s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
         projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         tolerance: float = 0.0,
         strict: bool = False,
@@ -931,7 +940,7 @@ class Client:
             q=matrix_message(reference),
             u=None if u is None else matrix_message(u),
             projection=None if projection is None else weights(*projection),
-            weights=_trajectory_weights(q, r, q_final, s) if has_weights else None,
+            weights=_trajectory_weights(q, r, q_final, s, projected_momentum) if has_weights else None,
             constraints=constraints(full),
             tolerance=tolerance,
             strict=strict,
@@ -1034,10 +1043,13 @@ def _trajectory_weights(
     r: npt.ArrayLike | None,
     q_final: npt.ArrayLike | None,
     s: npt.ArrayLike | None,
+    projected_momentum: bool,
 ) -> plant_service_pb2.LqrWeights | None:
     """The weights that go beside those of each step, or stand for them."""
     if q is not None and r is not None:
-        return weights(q, r, q_final, s)
+        return weights(q, r, q_final, s, projected_momentum)
     if q_final is not None:
-        return plant_service_pb2.LqrWeights(q_final=weight(q_final))
+        return plant_service_pb2.LqrWeights(
+            q_final=weight(q_final), momentum=momentum(projected_momentum)
+        )
     return None

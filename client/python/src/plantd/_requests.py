@@ -103,13 +103,20 @@ def weights(
     r: npt.ArrayLike,
     q_final: npt.ArrayLike | None = None,
     s: npt.ArrayLike | None = None,
+    projected_momentum: bool = False,
 ) -> plant_service_pb2.LqrWeights:
     return plant_service_pb2.LqrWeights(
         q=weight(q),
         r=weight(r),
         q_final=None if q_final is None else weight(q_final),
         s=None if s is None else matrix_message(s),
+        momentum=momentum(projected_momentum),
     )
+
+
+def momentum(projected: bool) -> plant_service_pb2.Momentum.ValueType:
+    projected_momentum = plant_service_pb2.MOMENTUM_PROJECTED
+    return projected_momentum if projected else plant_service_pb2.MOMENTUM_UNSPECIFIED
 
 
 def stage_weights(stages: Iterable[Mapping[str, npt.ArrayLike]]) -> list[Any]:

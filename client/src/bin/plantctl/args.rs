@@ -105,7 +105,7 @@ pub(crate) enum Command {
         #[arg(long, value_name = "N", default_value_t = 1)]
         queue: u32,
         #[command(flatten)]
-        weights: Weights,
+        weights: RegulatorWeights,
     },
     /// Linearizes the discrete map of a model: `dx[k+1] = A dx[k] + B du[k]`.
     Linearize {
@@ -121,7 +121,7 @@ pub(crate) enum Command {
         #[command(flatten)]
         settings: Settings,
         #[command(flatten)]
-        weights: Weights,
+        weights: RegulatorWeights,
         /// Solve on the full state of a constrained model instead of on its manifold.
         #[arg(long)]
         full: bool,
@@ -414,7 +414,7 @@ pub(crate) enum Feedback {
         #[command(flatten)]
         reference: Reference,
         #[command(flatten)]
-        weights: Weights,
+        weights: RegulatorWeights,
         /// Solve on the full state of a constrained model instead of on its manifold.
         #[arg(long)]
         full: bool,

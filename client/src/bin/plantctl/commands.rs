@@ -9,7 +9,7 @@ use plantd_client::{Answers, Client, DEFAULT_ADDRESS, MatrixExt as _, v1};
 use serde_json::{Value, json};
 
 use crate::args::{
-    Args, Assignment, Command, Field, Numbers, Plural, Point, Settings, Singular, Weights,
+    Args, Assignment, Command, Field, Numbers, Plural, Point, RegulatorWeights, Settings, Singular,
 };
 use crate::{FAILED, channels, feedback, json, optimize, replay, run, test, text};
 
@@ -337,7 +337,7 @@ async fn watch(
     output: Output,
     mut request: v1::WatchRequest,
     fields: &[Field],
-    weights: &Weights,
+    weights: &RegulatorWeights,
     count: Option<u64>,
 ) -> Result<()> {
     let named = fields.iter().any(|f| matches!(f, Field::Linearization | Field::Gain));
@@ -433,7 +433,7 @@ async fn lqr(
     output: Output,
     point: Point,
     settings: Settings,
-    weights: &Weights,
+    weights: &RegulatorWeights,
     full: bool,
 ) -> Result<()> {
     let (model, settings, point) = resolve(client, point, settings).await?;

@@ -66,6 +66,8 @@ struct Cost {
     r: Weight,
     q_final: Option<Weight>,
     s: Option<Vec<Vec<f64>>>,
+    #[serde(default)]
+    projected_momentum: bool,
     x: Vec<Vec<f64>>,
     #[serde(default)]
     u: Vec<Vec<f64>>,
@@ -189,6 +191,9 @@ impl Problem {
         }
         if let Some(s) = &cost.s {
             weights = weights.with_cross(matrix("cost.s", s)?);
+        }
+        if cost.projected_momentum {
+            weights = weights.on_projected_momentum();
         }
         let u = match cost.u.as_slice() {
             [] => None,

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args as Group, ValueEnum};
-use plantd_client::v1;
+use plantd_client::{WeightsExt as _, v1};
 
 /// What a feedback keeps a plant at.
 #[derive(Debug, Group)]
@@ -218,6 +218,24 @@ impl Weights {
         let states = 2 * model.coordinates.len();
         let inputs = model.inputs.len() + prescribed;
         plantd_client::weights(self.q.diagonal(states), self.r.diagonal(inputs))
+    }
+}
+
+/// Weights of a regulator that may be on either momentum.
+#[derive(Debug, Group)]
+pub(crate) struct RegulatorWeights {
+    #[command(flatten)]
+    weights: Weights,
+    /// Weigh the projected momentum in place of the state's own.
+    #[arg(long)]
+    projected_momentum: bool,
+}
+
+impl RegulatorWeights {
+    /// The weights for a model; lengths are for the server to judge.
+    pub(crate) fn for_model(&self, model: &v1::Model) -> v1::LqrWeights {
+        let weights = self.weights.for_model(model);
+        if self.projected_momentum { weights.on_projected_momentum() } else { weights }
     }
 }
 

@@ -51,6 +51,7 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
   q = [1000.0, 1.0]                 # a diagonal, or a matrix as a list of rows
   r = [50.0]
   q_final = [1000.0, 1.0]           # q if not given
+  projected_momentum = false        # weigh it in place of the state's own
   x = [[0.0, 0.0]]                  # desired states, one row per step; the last one holds on
   u = [[0.0]]                       # desired inputs, the same way; zero if not given
   changes = [{ step = 50, x = [3.141592653589793, 0.0] }]   # other desired states from there on

@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use plantd_client::{Client, MatrixExt as _, StateExt as _, diagonal, operating_point, v1};
+use plantd_client::{
+    Client, MatrixExt as _, StateExt as _, WeightsExt as _, diagonal, operating_point, v1,
+};
 
 use super::expression::Expression;
 use super::run::Place;
@@ -266,10 +268,13 @@ pub(super) async fn feedback(
         [value] => diagonal(vec![*value; count]),
         values => diagonal(values),
     };
-    let weights = plantd_client::weights(
+    let mut weights = plantd_client::weights(
         weight(&lqr.q, states),
         weight(&lqr.r, model.inputs.len() + prescribed),
     );
+    if lqr.projected_momentum {
+        weights = weights.on_projected_momentum();
+    }
     let form = match (&reference.trajectory, &scenario.reference) {
         (Some(trajectory), _) => Form::Trajectory(trajectory.clone()),
         (None, Some(Reference::At(point))) if lqr.adapts => Form::Point(operating_point(point)),

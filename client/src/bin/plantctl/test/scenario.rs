@@ -182,6 +182,9 @@ pub(crate) struct Lqr {
     /// Compute the gain anew when parameters change. Along a trajectory it always is.
     #[serde(default)]
     pub(crate) adapts: bool,
+    /// Weigh the projected momentum in place of the state's own.
+    #[serde(default)]
+    pub(crate) projected_momentum: bool,
 }
 
 /// A process that drives the plant.
