@@ -3,15 +3,9 @@
 /// Rows are padded to a multiple of this, so that no loop has a rest.
 pub(super) const LANES: usize = 8;
 
-/// Scratch numbers that begin on a cache line. A clone begins anew: what was in it is lost.
+/// Numbers that begin on a cache line.
 #[derive(Debug, Default)]
 pub(super) struct Scratch(Vec<f64>);
-
-impl Clone for Scratch {
-    fn clone(&self) -> Self {
-        Self(vec![0.0; self.0.len()])
-    }
-}
 
 impl Scratch {
     /// Sees to room for `len` numbers; whether they keep their values is left open.
@@ -45,26 +39,64 @@ impl Scratch {
 /// Copies the lower triangle of the first `count` rows and columns to the upper one.
 #[inline(always)]
 pub(crate) fn mirror_head(value: &mut [f64], n: usize, count: usize) {
-    let whole = count / LANES * LANES;
-    for col in (0..whole).step_by(LANES) {
-        for row in (col..whole).step_by(LANES) {
-            let mut block = [[0.0; LANES]; LANES];
-            for (j, lower) in block.iter_mut().enumerate() {
-                lower.copy_from_slice(&value[n * (col + j) + row..][..LANES]);
+    for first in (0..count).step_by(LANES) {
+        let end = (first + LANES).min(count);
+        if end - first == LANES {
+            let (lower, upper) = value.split_at_mut(n * first);
+            for col in (0..first).step_by(LANES) {
+                transpose_block(&mut upper[col..], n, &lower[n * col + first..], n);
             }
-            for i in 0..LANES {
-                let known = if row == col { i } else { LANES };
-                let upper = &mut value[n * (row + i) + col..][..LANES];
-                for (j, upper) in upper.iter_mut().enumerate() {
-                    *upper = if j < known { block[j][i] } else { *upper };
-                }
+        }
+        for row in first..end {
+            for col in if end - first == LANES { first } else { 0 }..row {
+                value[n * row + col] = value[n * col + row];
             }
         }
     }
-    for row in whole..count {
-        for col in 0..row {
-            value[n * row + col] = value[n * col + row];
+}
+
+/// The transpose of a matrix, of which rows and columns are written. Strides are those of columns.
+#[inline(always)]
+pub(super) fn transpose(
+    (target, target_stride): (&mut [f64], usize),
+    (source, source_stride): (&[f64], usize),
+    (rows, cols): (usize, usize),
+) {
+    if rows.min(cols) < LANES {
+        for (row, col) in (0..rows).flat_map(|row| (0..cols).map(move |col| (row, col))) {
+            target[target_stride * col + row] = source[source_stride * row + col];
         }
+        return;
+    }
+    // The last blocks overlap those before.
+    let starts = |count: usize| (0..count).step_by(LANES).map(move |i| i.min(count - LANES));
+    for row in starts(rows) {
+        for col in starts(cols) {
+            let target = &mut target[target_stride * col + row..];
+            transpose_block(
+                target,
+                target_stride,
+                &source[source_stride * row + col..],
+                source_stride,
+            );
+        }
+    }
+}
+
+/// The transpose of a block of [`LANES`] rows and columns.
+#[inline(always)]
+fn transpose_block(target: &mut [f64], target_stride: usize, source: &[f64], source_stride: usize) {
+    const LAST: usize = LANES - 1;
+    assert!(target.len() >= LAST * target_stride + LANES);
+    assert!(source.len() >= LAST * source_stride + LANES);
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx") {
+        // SAFETY: the processor has AVX; the block is within the slices.
+        unsafe { wide::transpose_avx(target, target_stride, source, source_stride) };
+        return;
+    }
+    for (i, j) in (0..LANES).flat_map(|i| (0..LANES).map(move |j| (i, j))) {
+        target[target_stride * i + j] = source[source_stride * j + i];
     }
 }
 
@@ -193,23 +225,60 @@ mod wide {
     use super::{Into, LANES, Shape};
 
     /// # Safety
+    /// Eight columns of eight entries are within each slice.
+    #[inline]
+    #[target_feature(enable = "avx")]
+    pub(super) unsafe fn transpose_avx(
+        target: &mut [f64],
+        target_stride: usize,
+        source: &[f64],
+        source_stride: usize,
+    ) {
+        for (i, j) in [(0, 0), (0, 4), (4, 0), (4, 4)] {
+            // SAFETY: rows up to i + 3 and columns up to j + 3 of the source are within the block.
+            unsafe {
+                let from = source.as_ptr().add(source_stride * j + i);
+                let a = _mm256_loadu_pd(from);
+                let b = _mm256_loadu_pd(from.add(source_stride));
+                let c = _mm256_loadu_pd(from.add(2 * source_stride));
+                let d = _mm256_loadu_pd(from.add(3 * source_stride));
+                let (ab, cd) = (_mm256_unpacklo_pd(a, b), _mm256_unpacklo_pd(c, d));
+                let (ab_next, cd_next) = (_mm256_unpackhi_pd(a, b), _mm256_unpackhi_pd(c, d));
+                let to = target.as_mut_ptr().add(target_stride * i + j);
+                let next = to.add(target_stride);
+                _mm256_storeu_pd(to, _mm256_permute2f128_pd::<0x20>(ab, cd));
+                _mm256_storeu_pd(next, _mm256_permute2f128_pd::<0x20>(ab_next, cd_next));
+                let (to, next) = (to.add(2 * target_stride), next.add(2 * target_stride));
+                _mm256_storeu_pd(to, _mm256_permute2f128_pd::<0x31>(ab, cd));
+                _mm256_storeu_pd(next, _mm256_permute2f128_pd::<0x31>(ab_next, cd_next));
+            }
+        }
+    }
+
+    /// # Safety
     /// The slices are as long as the shape says.
     #[target_feature(enable = "avx512f")]
     pub(super) unsafe fn product_avx512(c: &mut [f64], shape: &Shape<'_>) {
-        for col in (shape.start()..shape.cols).step_by(8) {
-            let mut row = shape.first_row(col);
-            while row < shape.rows {
-                let vectors = ((shape.rows - row) / LANES).min(3);
+        // Rows of A stay in the nearest cache while B passes by.
+        let mut first = shape.start();
+        while first < shape.rows {
+            // Four vectors are two and two, not three and one.
+            let left = (shape.rows - first) / LANES;
+            let vectors = if left == 4 { 2 } else { left.min(3) };
+            let end = first + LANES * vectors;
+            for col in (shape.start()..shape.cols).step_by(8) {
+                let row = shape.first_row(col).max(first);
                 // SAFETY: all rows and columns of the block are within the shape.
                 unsafe {
-                    match vectors {
+                    match end.saturating_sub(row) / LANES {
+                        0 => break,
                         1 => block_avx512::<1>(c, shape, row, col),
                         2 => block_avx512::<2>(c, shape, row, col),
                         _ => block_avx512::<3>(c, shape, row, col),
                     }
                 }
-                row += LANES * vectors;
             }
+            first = end;
         }
     }
 
@@ -346,6 +415,30 @@ mod tests {
                 (Into::SetLower, 8, b_across),
             ] {
                 check(a, b, stride, (rows, cols), into, first);
+            }
+        }
+    }
+
+    #[test]
+    fn transposes_and_mirrors_move_every_entry() {
+        for (rows, cols) in [(18, 62), (8, 8), (3, 20), (9, 31)] {
+            let source = numbers(rows * cols, 0.4);
+            let mut target = vec![0.0; rows * cols];
+            transpose((&mut target, rows), (&source, cols), (rows, cols));
+            for (row, col) in (0..rows).flat_map(|row| (0..cols).map(move |col| (row, col))) {
+                assert_eq!(target[rows * col + row], source[cols * row + col], "{row} {col}");
+            }
+        }
+        for count in [0, 5, 8, 30, 62] {
+            let n = count + 3;
+            let before = numbers(n * n, 0.5);
+            let mut value = before.clone();
+            mirror_head(&mut value, n, count);
+            for (row, col) in (0..n).flat_map(|row| (0..n).map(move |col| (row, col))) {
+                let is_mirrored = row < col && col < count;
+                let expected =
+                    if is_mirrored { before[n * row + col] } else { before[n * col + row] };
+                assert_eq!(value[n * col + row], expected, "{count}: {row} {col}");
             }
         }
     }

@@ -68,7 +68,7 @@ pub fn finite_horizon(
         backwards.gains.push(backwards.gain.clone());
         backwards.keep(&recursion, |value| value.clone(), |linear| linear.clone());
     }
-    Ok(backwards.finish(recursion.value().clone()))
+    Ok(backwards.finish(recursion.value()))
 }
 
 /// The same on the constraint manifold: sample `k` maps from `tangents[k]` to `tangents[k + 1]`,
@@ -110,7 +110,7 @@ pub fn finite_horizon_on_manifold(
         backwards.keep(&recursion, |p| start.extend_value(p), |b| start.extend_vector(b));
         end = start;
     }
-    Ok(backwards.finish(end.extend_value(recursion.value())))
+    Ok(backwards.finish(end.extend_value(&recursion.value())))
 }
 
 /// What a solution gathers, in the order in which it is found: the end of the horizon first.
@@ -151,13 +151,13 @@ impl Backwards {
         let Self { map, gain, offset, .. } = self;
         recursion.step(map, stage, gain, offset).map_err(|NotConvex| {
             // Convex stages lose definiteness to overflow or round-off alone.
-            if weights.is_convex() || !all_finite(recursion.value()) {
+            if weights.is_convex() || !recursion.is_finite() {
                 RiccatiError::Overflow { sample }
             } else {
                 RiccatiError::NotConvex { sample }
             }
         })?;
-        if !all_finite(recursion.value()) || !all_finite(&self.gain) {
+        if !recursion.is_finite() || !all_finite(&self.gain) {
             return Err(RiccatiError::Overflow { sample });
         }
         self.feedforward.push(-&self.offset);
@@ -172,7 +172,7 @@ impl Backwards {
         linear: impl FnOnce(&DVector<f64>) -> DVector<f64>,
     ) {
         if let Some(values) = &mut self.values {
-            values.push((value(recursion.value()), linear(recursion.linear())));
+            values.push((value(&recursion.value()), linear(recursion.linear())));
         }
     }
 

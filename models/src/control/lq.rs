@@ -13,9 +13,8 @@ mod map;
 use nalgebra::{DMatrix, DVector};
 
 pub(crate) use self::map::Map;
-use super::blocked::{Into, LANES, Operand, Scratch, mirror_head, product};
+use super::blocked::{Into, LANES, Operand, Scratch, mirror_head, product, transpose};
 use crate::plant::rows::{Term, add_rows_portable};
-use crate::wide::wide;
 
 /// One stage of the cost,
 /// `½ xᵀQx + xᵀSu + ½ uᵀRu + x_linearᵀx + u_linearᵀu`. Nothing here need be definite.
@@ -44,9 +43,12 @@ const SMALL: usize = 8;
 const CANCELLED: f64 = 1e-3;
 
 /// The recursion with the cost to go `½ xᵀPx + bᵀx` that it has reached.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(crate) struct LqRecursion {
-    value: DMatrix<f64>,
+    /// n.
+    states: usize,
+    /// `P` by columns, which begin on cache lines; zeros between them.
+    value: Scratch,
     linear: DVector<f64>,
     /// Lower triangular factor of the last `Γ`.
     factor: DMatrix<f64>,
@@ -54,10 +56,8 @@ pub(crate) struct LqRecursion {
 }
 
 /// Room for the large kernel; nothing here outlives a step.
-#[derive(Clone, Debug, Default)]
+#[derive(Debug, Default)]
 struct Work {
-    /// `P`, where its columns have to be padded.
-    value: Scratch,
     /// Where the columns of `P` begin that belong to full rows of `M`, and those of the cross term.
     value_columns: Vec<usize>,
     cross_columns: Vec<usize>,
@@ -85,17 +85,25 @@ struct Work {
 impl LqRecursion {
     /// Room for `n` states and `m` inputs; begins with zero cost.
     pub(crate) fn new(n: usize, m: usize) -> Self {
-        Self {
-            value: DMatrix::zeros(n, n),
+        let mut recursion = Self {
+            states: n,
+            value: Scratch::default(),
             linear: DVector::zeros(n),
             factor: DMatrix::identity(m, m),
             work: Work::default(),
-        }
+        };
+        recursion.begin(&DMatrix::zeros(n, n), None);
+        recursion
     }
 
     /// Begins at the end of the horizon, with `P = value` and `b = linear` (none means zero).
     pub(crate) fn begin(&mut self, value: &DMatrix<f64>, linear: Option<&DVector<f64>>) {
-        self.value.copy_from(value);
+        let stride = self.set_states(value.nrows());
+        for (target, source) in
+            self.value.numbers().chunks_exact_mut(stride.max(1)).zip(value.column_iter())
+        {
+            target[..value.nrows()].copy_from_slice(source.as_slice());
+        }
         match linear {
             Some(linear) => self.linear.copy_from(linear),
             None => self.linear.fill(0.0),
@@ -103,8 +111,26 @@ impl LqRecursion {
     }
 
     /// `P`, n × n, symmetric.
-    pub(crate) fn value(&self) -> &DMatrix<f64> {
-        &self.value
+    pub(crate) fn value(&self) -> DMatrix<f64> {
+        let (n, numbers) = (self.states, self.value.read());
+        DMatrix::from_fn(n, n, |i, j| numbers[n.next_multiple_of(LANES) * j + i])
+    }
+
+    /// Whether all of `P` is finite.
+    pub(crate) fn is_finite(&self) -> bool {
+        self.value.read().iter().all(|entry| entry.is_finite())
+    }
+
+    /// Makes `P` one of `n` states, zeros at first if that changes anything; from a column to the next.
+    fn set_states(&mut self, n: usize) -> usize {
+        let stride = n.next_multiple_of(LANES);
+        self.value.reserve(stride * n);
+        if self.states != n {
+            self.states = n;
+            self.linear = DVector::zeros(n);
+            self.value.numbers().fill(0.0);
+        }
+        stride
     }
 
     /// `b`, n entries.
@@ -132,7 +158,7 @@ impl LqRecursion {
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
         let Map { next, states: n, inputs: m, .. } = *map;
-        assert!(self.value.nrows() == next, "A and B fit P");
+        assert!(self.states == next, "A and B fit P");
         assert!(stage.q.shape() == (n, n) && stage.r.shape() == (m, m), "Q and R fit A and B");
         assert!(stage.s.is_none_or(|s| s.shape() == (n, m)), "S fits Q and R");
         assert!(gain.shape() == (m, n) && offset.len() == m, "room for the law");
@@ -171,20 +197,20 @@ impl LqRecursion {
                 a[state][row] = *entry;
             }
         }
-        for &(row, col, entry) in &map.entries {
+        for (row, col, entry) in map.entries() {
             if col < m {
                 b[col][row] = entry;
             } else {
                 a[map.active[col - m]][row] = entry;
             }
         }
-        let value = &self.value.as_slice()[..next * next];
+        let value = &self.value.read()[..LANES * next];
         let (q, r) = (&stage.q.as_slice()[..n * n], &stage.r.as_slice()[..m * m]);
         let times_value = |x: &[f64]| {
             let mut y = [0.0; N];
             for k in 0..next {
                 for i in 0..next {
-                    y[i] += value[next * k + i] * x[k];
+                    y[i] += value[LANES * k + i] * x[k];
                 }
             }
             y
@@ -302,16 +328,13 @@ impl LqRecursion {
                 }
             }
         }
-        if self.value.nrows() != n {
-            self.value = DMatrix::zeros(n, n);
-            self.linear = DVector::zeros(n);
-        }
+        self.set_states(n);
         self.linear.as_mut_slice()[..n].copy_from_slice(&new_linear[..n]);
-        let value = &mut self.value.as_mut_slice()[..n * n];
+        let value = &mut self.value.numbers()[..LANES * n];
         for j in 0..n {
             for i in 0..=j {
-                value[n * j + i] = new_value[j][i];
-                value[n * i + j] = new_value[j][i];
+                value[LANES * j + i] = new_value[j][i];
+                value[LANES * i + j] = new_value[j][i];
             }
         }
         Ok(())
@@ -330,14 +353,50 @@ impl LqRecursion {
         self.step_wide(map, stage, gain, offset)
     }
 
-    wide! {
-        fn step_wide(
-            mut self,
-            map: &Map,
-            stage: Stage<'_>,
-            gain: &mut DMatrix<f64>,
-            offset: &mut DVector<f64>,
-        ) -> Result<(), NotConvex> = step_portable, step_avx2;
+    /// The same code for wider registers, with the same bits but for those of products.
+    fn step_wide(
+        &mut self,
+        map: &Map,
+        stage: Stage<'_>,
+        gain: &mut DMatrix<f64>,
+        offset: &mut DVector<f64>,
+    ) -> Result<(), NotConvex> {
+        #[cfg(target_arch = "x86_64")]
+        {
+            if std::arch::is_x86_feature_detected!("avx512f") {
+                // SAFETY: the processor has AVX-512.
+                return unsafe { self.step_avx512(map, stage, gain, offset) };
+            }
+            if std::arch::is_x86_feature_detected!("avx2") {
+                // SAFETY: the processor has AVX2.
+                return unsafe { self.step_avx2(map, stage, gain, offset) };
+            }
+        }
+        self.step_portable(map, stage, gain, offset)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f")]
+    fn step_avx512(
+        &mut self,
+        map: &Map,
+        stage: Stage<'_>,
+        gain: &mut DMatrix<f64>,
+        offset: &mut DVector<f64>,
+    ) -> Result<(), NotConvex> {
+        self.step_portable(map, stage, gain, offset)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn step_avx2(
+        &mut self,
+        map: &Map,
+        stage: Stage<'_>,
+        gain: &mut DMatrix<f64>,
+        offset: &mut DVector<f64>,
+    ) -> Result<(), NotConvex> {
+        self.step_portable(map, stage, gain, offset)
     }
 
     #[inline(always)]
@@ -348,11 +407,11 @@ impl LqRecursion {
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
-        let Map { next, states: n, inputs: m, active, full, starts, entries, .. } = whole_map;
+        let Map { next, states: n, inputs: m, active, full, starts, .. } = whole_map;
         let (next, n, m) = (*next, *n, *m);
         let (width, stride) = (whole_map.width(), whole_map.stride());
+        let panel = (width + 1).next_multiple_of(LANES);
         let Work {
-            value,
             value_columns,
             cross_columns,
             reached,
@@ -368,41 +427,36 @@ impl LqRecursion {
         value_columns.clear();
         value_columns.extend(full.iter().map(|row| value_stride * row));
         cross_columns.clear();
-        cross_columns.extend((0..m).map(|j| stride * j));
-        let reach = reach(&self.value, full);
+        cross_columns.extend((0..m).map(|j| panel * j));
+        let value = self.value.read();
+        let last_full = full.last().map_or(0, |row| row + 1);
+        let apart = first_apart(value, next, last_full);
         reached.reserve(value_stride * stride);
-        for scratch in [&mut *bracket, &mut *cross, &mut *law] {
-            scratch.reserve(stride * stride);
-        }
+        bracket.reserve(stride * stride);
+        cross.reserve(panel * m);
+        law.reserve(panel * m);
         let reached = reached.numbers();
         let (bracket, cross, law) = (bracket.numbers(), cross.numbers(), law.numbers());
-        let value: &[f64] = if next == value_stride {
-            self.value.as_slice()
-        } else {
-            value.reserve(value_stride * next);
-            let padded = value.numbers();
-            for (target, source) in
-                padded.chunks_exact_mut(value_stride).zip(self.value.as_slice().chunks_exact(next))
-            {
-                target[..next].copy_from_slice(source);
-                target[next..].fill(0.0);
-            }
-            padded
-        };
 
         // PM.
         let map = Operand { numbers: whole_map.numbers(), terms: starts, stride: 1 };
         let operand = Operand { numbers: value, terms: value_columns, stride: 1 };
-        product(reached, value_stride, operand, map, (reach, width), Into::Set, 0);
-        let known = reach.next_multiple_of(LANES);
+        product(reached, value_stride, operand, map, (apart, width), Into::Set, 0);
+        let known = apart.next_multiple_of(LANES);
         if known < value_stride {
             for column in reached.chunks_exact_mut(value_stride).take(width) {
-                column[known..].fill(0.0);
+                column[known..].as_chunks_mut().0.fill([0.0; LANES]);
             }
         }
-        for &(row, col, entry) in entries {
-            let target = &mut reached[value_stride * col..][..value_stride];
-            subtract(target, -entry, &value[value_stride * row..][..value_stride]);
+        for (row, col, entry) in whole_map.entries() {
+            // What is apart in P has zeros towards the others.
+            let rows = match row {
+                _ if apart > last_full => 0..value_stride,
+                _ if row < last_full => 0..known,
+                _ => last_full / LANES * LANES..value_stride,
+            };
+            let target = &mut reached[value_stride * col..][rows.clone()];
+            add_rows_portable(target, &value[value_stride * row..][rows], 0, &[(entry, 0)]);
         }
         // G = MᵀPM, lower triangle.
         let operand = Operand { numbers: reached, terms: full, stride: value_stride };
@@ -410,90 +464,73 @@ impl LqRecursion {
         let columns =
             bracket.chunks_exact_mut(stride.max(1)).zip(reached.chunks_exact(value_stride.max(1)));
         for (first, (target, source)) in columns.take(width).enumerate() {
-            let lower = &entries[entries.partition_point(|&(_, col, _)| col < first)..];
-            lower.iter().for_each(|&(row, col, entry)| target[col] += entry * source[row]);
-        }
-
-        // Γ and its factor, in place; what it leaves of the cross term, and the gain.
-        for (column, r) in bracket.chunks_exact_mut(stride).zip(stage.r.column_iter()) {
-            for (target, r) in column.iter_mut().zip(r.iter()) {
-                *target += r;
+            let reach_down =
+                |(_, col, entries): &(usize, usize, &[f64])| col + entries.len() > first;
+            for (row, col, entries) in whole_map.runs().filter(reach_down) {
+                add_products(&mut target[col..], entries, &source[row..]);
             }
         }
-        factorize(bracket, stride, m)?;
-        for j in 0..m {
-            let source = &bracket[stride * j..][j..m];
-            self.factor.as_mut_slice()[m * j..][j..m].copy_from_slice(source);
-        }
+
+        // [R + BᵀPB; AᵀPB + S], and what the factor of Γ leaves of it.
         // From here on there are columns of states.
         let first = m / LANES * LANES;
-        for j in 0..m {
-            let (done, rest) = cross.split_at_mut(stride * j);
-            let target = &mut rest[..stride];
-            target[..m].fill(0.0);
-            target[m..width].copy_from_slice(&bracket[stride * j..][m..width]);
-            target[width..].fill(0.0);
+        for (j, (target, source)) in
+            cross.chunks_exact_mut(panel).zip(bracket.chunks_exact(stride)).take(m).enumerate()
+        {
+            target[..stride].copy_from_slice(source);
+            target[stride..].fill(0.0);
+            let r = &stage.r.as_slice()[m * j..][..m];
+            target.iter_mut().zip(r).for_each(|(target, r)| *target += r);
             if let Some(s) = stage.s {
                 let s = s.column(j);
                 for (target, &state) in target[m..].iter_mut().zip(active) {
                     *target += s[state];
                 }
             }
-            terms.clear();
-            terms.extend((0..j).map(|k| (-bracket[stride * k + j], k)));
-            let (target, done) = (&mut target[first..], &done[first.min(done.len())..]);
-            add_rows_portable(target, done, stride, terms);
-            scale(target, bracket[stride * j + j].recip());
+        }
+        // Below them [Bᵀb + u_linear]ᵀ, of which the same is left.
+        whole_map.pull_back(self.linear.as_slice(), terms, linear);
+        let (input, state) = linear.split_at_mut(m);
+        if let Some(u_linear) = stage.u_linear {
+            input.iter_mut().zip(u_linear.iter()).for_each(|(input, given)| *input += given);
+        }
+        for (j, input) in input.iter().enumerate() {
+            cross[panel * j + width] = *input;
+        }
+        factorize(cross, panel, m, terms)?;
+        for j in 0..m {
+            let source = &cross[panel * j..][j..m];
+            self.factor.as_mut_slice()[m * j..][j..m].copy_from_slice(source);
         }
         for j in (0..m).rev() {
-            let (before, done) = law.split_at_mut(stride * (j + 1));
-            let target = &mut before[stride * j..];
-            target.copy_from_slice(&cross[stride * j..][..stride]);
+            let (before, done) = law.split_at_mut(panel * (j + 1));
+            let target = &mut before[panel * j..];
+            target.copy_from_slice(&cross[panel * j..][..panel]);
+            let column = &cross[panel * j..][..m];
             terms.clear();
-            terms.extend((j + 1..m).map(|k| (-bracket[stride * j + k], k - j - 1)));
-            let (target, done) = (&mut target[first..stride], &done[first.min(done.len())..]);
-            add_rows_portable(target, done, stride, terms);
-            scale(target, bracket[stride * j + j].recip());
+            terms.extend(column[j + 1..].iter().enumerate().map(|(k, factor)| (-factor, k)));
+            let (target, done) = (&mut target[first..], &done[first.min(done.len())..]);
+            add_rows_portable(target, done, panel, terms);
+            scale(target, column[j].recip());
         }
-        if active.len() < n {
+        if is_head(active) {
+            gain.as_mut_slice()[m * active.len()..].fill(0.0);
+            let target = (gain.as_mut_slice(), m);
+            transpose(target, (&law[m.min(law.len())..], panel), (m, active.len()));
+        } else {
             gain.as_mut_slice().fill(0.0);
-        }
-        for (i, &state) in active.iter().enumerate() {
-            let column = &mut gain.as_mut_slice()[m * state..][..m];
-            for (target, source) in column.iter_mut().zip(law[m + i..].iter().step_by(stride)) {
-                *target = *source;
+            for (i, &state) in active.iter().enumerate() {
+                let column = &mut gain.as_mut_slice()[m * state..][..m];
+                for (target, source) in column.iter_mut().zip(law[m + i..].iter().step_by(panel)) {
+                    *target = *source;
+                }
             }
         }
 
-        // The linear part.
-        if self.linear.iter().any(|&entry| entry != 0.0) {
-            whole_map.pull_back(self.linear.as_slice(), linear);
-        } else {
-            linear.clear();
-            linear.resize(width, 0.0);
+        for (j, offset) in offset.iter_mut().enumerate() {
+            *offset = law[panel * j + width];
+            subtract(state, cross[panel * j + width], &cross[panel * j..][m..width]);
         }
-        let (input, state) = linear.split_at_mut(m);
-        if let Some(u_linear) = stage.u_linear {
-            for (input, given) in input.iter_mut().zip(u_linear.iter()) {
-                *input += given;
-            }
-        }
-        if input.iter().any(|&entry| entry != 0.0) {
-            for j in 0..m {
-                input[j] /= bracket[stride * j + j];
-                for k in j + 1..m {
-                    input[k] -= bracket[stride * j + k] * input[j];
-                }
-                subtract(state, input[j], &cross[stride * j..][m..width]);
-            }
-            for j in (0..m).rev() {
-                for k in j + 1..m {
-                    input[j] -= bracket[stride * j + k] * input[k];
-                }
-                input[j] /= bracket[stride * j + j];
-            }
-        }
-        offset.as_mut_slice().copy_from_slice(input);
 
         // The value: Q + AᵀPA less what the inputs gain.
         let diagonal = |bracket: &[f64], i: usize| bracket[(stride + 1) * (m + i)];
@@ -508,36 +545,35 @@ impl LqRecursion {
         if has_cancelled {
             self.value_again(whole_map, stage);
         }
-        let bracket = self.work.bracket.numbers();
-        if self.value.nrows() != n {
-            self.value = DMatrix::zeros(n, n);
-        }
-        let value = self.value.as_mut_slice();
+        let value_stride = self.set_states(n);
+        let bracket = self.work.bracket.read();
+        let value = self.value.numbers();
         let count = active.len();
-        if active.last().is_none_or(|&last| last + 1 == count) {
-            let columns = value.chunks_exact_mut(n).zip(stage.q.as_slice().chunks_exact(n));
+        if is_head(active) {
+            let columns =
+                value.chunks_exact_mut(value_stride).zip(stage.q.as_slice().chunks_exact(n));
             for (j, (column, q)) in columns.enumerate() {
                 let copied = if j < count { count } else { 0 };
-                column[copied..].copy_from_slice(&q[copied..]);
+                column[copied..n].copy_from_slice(&q[copied..]);
                 if j < count {
-                    let source = &bracket[stride * (m + j)..][m + j..width];
-                    let sums = column[j..count].iter_mut().zip(&q[j..count]);
-                    sums.zip(source).for_each(|((sum, q), source)| *sum = q + source);
+                    // What stands above the diagonal is replaced.
+                    let first = j / LANES * LANES;
+                    let source = &bracket[stride * (m + j)..][m + first..width];
+                    set_sums(&mut column[first..count], &q[first..count], source);
                 }
             }
-            mirror_head(value, n, count);
+            mirror_head(value, value_stride, count);
         } else {
-            value.copy_from_slice(stage.q.as_slice());
+            for (column, q) in value.chunks_exact_mut(value_stride).zip(stage.q.column_iter()) {
+                column[..n].copy_from_slice(q.as_slice());
+            }
             for (j, &col) in active.iter().enumerate() {
                 let source = &bracket[stride * (m + j)..][m + j..width];
                 for (&row, source) in active[j..].iter().zip(source) {
-                    value[n * col + row] += source;
+                    value[value_stride * col + row] += source;
                 }
             }
-            mirror(value, n, active);
-        }
-        if self.linear.len() != n {
-            self.linear = DVector::zeros(n);
+            mirror(value, value_stride, active);
         }
         match stage.x_linear {
             Some(x_linear) => self.linear.copy_from(x_linear),
@@ -556,7 +592,6 @@ impl LqRecursion {
         let (width, stride) = (map.width(), map.stride());
         let value_stride = next.next_multiple_of(LANES);
         let Work {
-            value,
             value_columns,
             reached,
             bracket,
@@ -568,7 +603,8 @@ impl LqRecursion {
             ..
         } = &mut self.work;
         let (bracket, law) = (bracket.numbers(), law.numbers());
-        let law = |j: usize| &law[stride * j..][..stride];
+        let panel = (width + 1).next_multiple_of(LANES);
+        let law = |j: usize| &law[panel * j..][..stride];
         closed_loop.reserve(stride * next);
         let closed_loop = closed_loop.numbers();
         closed_loop[..stride * next].fill(0.0);
@@ -580,7 +616,7 @@ impl LqRecursion {
             target[m..width].copy_from_slice(states);
             inputs.iter().enumerate().for_each(|(j, b)| subtract(target, *b, law(j)));
         }
-        for &(row, col, entry) in &map.entries {
+        for (row, col, entry) in map.entries() {
             let target = &mut closed_loop[stride * row..][..stride];
             if col < m {
                 subtract(target, entry, law(col));
@@ -588,8 +624,8 @@ impl LqRecursion {
                 target[col] += entry;
             }
         }
-        // Columns of inputs stay zero: what they have of the law is nothing.
-        let value = if next == value_stride { self.value.as_slice() } else { value.read() };
+        // What stands in columns of inputs is of no use.
+        let value = self.value.read();
         value_columns.clear();
         value_columns.extend((0..next).map(|row| value_stride * row));
         let right = Operand { numbers: closed_loop, terms: rows, stride: 1 };
@@ -630,35 +666,43 @@ fn reaches_beyond(s: &DMatrix<f64>, active: &[usize]) -> bool {
     })
 }
 
-/// Rows of `P` up to here have entries in the columns of full rows of `M`.
-fn reach(value: &DMatrix<f64>, full: &[usize]) -> usize {
-    let n = value.nrows();
-    let last_full = full.last().map_or(0, |row| row + 1);
-    let reaches = |row: usize| {
-        let column = &value.as_slice()[n * row..][..last_full];
-        column.iter().fold(false, |any, entry| any | (*entry != 0.0))
-            && full.iter().any(|&full| column[full] != 0.0)
+/// The first of the rows at the end of `P` that have no entry in the first `columns` columns.
+fn first_apart(value: &[f64], n: usize, columns: usize) -> usize {
+    let stride = n.next_multiple_of(LANES);
+    let is_apart = |row: usize| {
+        let entries = &value[stride * row..][..columns];
+        !entries.iter().fold(false, |any, entry| any | (*entry != 0.0))
     };
-    (last_full..n).rev().find(|&row| reaches(row)).map_or(last_full, |row| row + 1)
+    (columns..n).rev().find(|&row| !is_apart(row)).map_or(columns, |row| row + 1)
 }
 
-/// The lower triangular factor of the first `m` rows and columns, in place of their lower triangle.
+/// Whether these are the first indices.
+fn is_head(indices: &[usize]) -> bool {
+    indices.last().is_none_or(|&last| last + 1 == indices.len())
+}
+
+/// Of `m` columns `[Γ; X]` makes `[L; X L⁻ᵀ]` with `Γ = L Lᵀ`; above the diagonal anything.
 #[inline(always)]
-fn factorize(c: &mut [f64], stride: usize, m: usize) -> Result<(), NotConvex> {
+fn factorize(
+    c: &mut [f64],
+    stride: usize,
+    m: usize,
+    terms: &mut Vec<Term>,
+) -> Result<(), NotConvex> {
     for j in 0..m {
         let (done, rest) = c.split_at_mut(stride * j);
-        let column = &mut rest[j..m];
-        for k in 0..j {
-            let source = &done[stride * k..][j..m];
-            subtract(column, source[0], source);
-        }
-        let pivot = column[0];
+        let first = j / LANES * LANES;
+        terms.clear();
+        terms.extend((0..j).map(|k| (-done[stride * k + j], k)));
+        let column = &mut rest[first..stride];
+        add_rows_portable(column, &done[first.min(done.len())..], stride, terms);
+        let pivot = column[j - first];
         if !(pivot > 0.0) {
             return Err(NotConvex);
         }
         let root = pivot.sqrt();
-        column[0] = root;
-        scale(&mut column[1..], root.recip());
+        scale(column, root.recip());
+        column[j - first] = root;
     }
     Ok(())
 }
@@ -669,6 +713,32 @@ fn mirror(value: &mut [f64], n: usize, indices: &[usize]) {
         for &col in &indices[..i] {
             value[n * row + col] = value[n * col + row];
         }
+    }
+}
+
+/// `target += a ∘ b`, as far as `a` goes.
+#[inline(always)]
+fn add_products(target: &mut [f64], a: &[f64], b: &[f64]) {
+    in_blocks(target, a, b, |target, a, b| *target += a * b);
+}
+
+/// `target = a + b`, as far as `a` goes.
+#[inline(always)]
+fn set_sums(target: &mut [f64], a: &[f64], b: &[f64]) {
+    in_blocks(target, a, b, |target, a, b| *target = a + b);
+}
+
+/// Whole blocks first: such loops are short here, and what compilers unroll is longer.
+#[inline(always)]
+fn in_blocks(target: &mut [f64], a: &[f64], b: &[f64], act: impl Fn(&mut f64, f64, f64)) {
+    let (target, target_rest) = target[..a.len()].as_chunks_mut::<LANES>();
+    let (b, b_rest) = b[..a.len()].as_chunks::<LANES>();
+    let (a, a_rest) = a.as_chunks::<LANES>();
+    for ((target, a), b) in target.iter_mut().zip(a).zip(b) {
+        (0..LANES).for_each(|i| act(&mut target[i], a[i], b[i]));
+    }
+    for ((target, a), b) in target_rest.iter_mut().zip(a_rest).zip(b_rest) {
+        act(target, *a, *b);
     }
 }
 

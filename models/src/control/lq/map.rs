@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use crate::control::blocked::{LANES, Scratch};
+use crate::plant::rows::{Term, add_rows_portable};
 
 /// Entries up to which a row of the map is added entry by entry.
 const FEW: usize = 4;
@@ -23,9 +24,19 @@ pub(crate) struct Map {
     pub(super) full: Vec<usize>,
     /// Where they begin in the numbers.
     pub(super) starts: Vec<usize>,
-    /// Of the other rows: row, column among inputs and active states, entry; by columns.
-    pub(super) entries: Vec<(usize, usize, f64)>,
+    /// Of the other rows: the entries, run after run.
+    entries: Vec<f64>,
+    runs: Vec<Run>,
     numbers: Scratch,
+}
+
+/// Entries along a diagonal.
+#[derive(Debug)]
+struct Run {
+    /// Where the first entry is: its row, its column among inputs and active states.
+    row: usize,
+    col: usize,
+    length: usize,
 }
 
 impl Map {
@@ -46,7 +57,7 @@ impl Map {
         }
         let is_full = |row: usize| is_small || counts[row] > FEW;
         self.begin((next, n, m), (0..n).filter(is_active), (0..next).filter(|row| is_full(*row)));
-        let Self { active, full, starts, entries, numbers, .. } = self;
+        let Self { active, full, starts, numbers, .. } = self;
         let (numbers, width) = (numbers.numbers(), m + active.len());
         for (row, start) in full.iter().zip(starts) {
             let (inputs, states) = numbers[*start..][..width].split_at_mut(m);
@@ -57,16 +68,19 @@ impl Map {
                 *to = a.as_slice()[next * state + row];
             }
         }
+        let mut entries = Vec::new();
         for row in (0..next).filter(|row| !is_full(*row)) {
             let by_input = (0..m).map(|j| b[(row, j)]);
             let by_state = active.iter().map(|state| a[(row, *state)]);
             let all = by_input.chain(by_state).enumerate().map(|(col, x)| (row, col, x));
             entries.extend(all.filter(|(.., x)| *x != 0.0));
         }
-        entries.sort_unstable_by_key(|&(row, col, _)| (col, row));
+        // Diagonal by diagonal.
+        entries.sort_unstable_by_key(|&(row, col, _)| (next + col - row, row));
+        entries.into_iter().for_each(|(row, col, entry)| self.push(row, col, entry));
     }
 
-    /// Begins with zeros: rows, states and inputs; active states; full rows.
+    /// Begins: rows, states and inputs; active states; full rows, of which all numbers are to be written.
     pub(crate) fn begin(
         &mut self,
         (next, states, inputs): (usize, usize, usize),
@@ -75,6 +89,7 @@ impl Map {
     ) {
         (self.next, self.states, self.inputs) = (next, states, inputs);
         self.entries.clear();
+        self.runs.clear();
         self.active.clear();
         self.active.extend(active);
         self.full.clear();
@@ -83,7 +98,10 @@ impl Map {
         self.starts.clear();
         self.starts.extend((0..self.full.len()).map(|i| stride * i));
         self.numbers.reserve(stride * self.full.len());
-        self.numbers.numbers()[..stride * self.full.len()].fill(0.0);
+        let width = self.width();
+        for row in self.numbers.numbers().chunks_exact_mut(stride.max(1)).take(self.full.len()) {
+            row[width..].fill(0.0);
+        }
     }
 
     /// The full row at a place among the full ones: inputs, active states, padding.
@@ -92,9 +110,33 @@ impl Map {
         &mut self.numbers.numbers()[stride * place..][..stride]
     }
 
-    /// Adds an entry of a row of few, columns ascending: row, column among inputs and active states.
-    pub(crate) fn push(&mut self, row: usize, column: usize, entry: f64) {
-        self.entries.push((row, column, entry));
+    /// Adds an entry of a row of few: row, column among inputs and active states. What lies along a
+    /// diagonal is best added in its order.
+    pub(crate) fn push(&mut self, row: usize, col: usize, entry: f64) {
+        self.entries.push(entry);
+        match self.runs.last_mut() {
+            Some(run) if (run.row + run.length, run.col + run.length) == (row, col) => {
+                run.length += 1;
+            }
+            _ => self.runs.push(Run { row, col, length: 1 }),
+        }
+    }
+
+    /// The entries of rows of few, along diagonals: first row, first column, entries.
+    pub(super) fn runs(&self) -> impl Iterator<Item = (usize, usize, &[f64])> {
+        let mut rest = &self.entries[..];
+        self.runs.iter().map(move |run| {
+            let (entries, others) = rest.split_at(run.length);
+            rest = others;
+            (run.row, run.col, entries)
+        })
+    }
+
+    /// The same one by one: row, column, entry.
+    pub(super) fn entries(&self) -> impl Iterator<Item = (usize, usize, f64)> {
+        self.runs().flat_map(|(row, col, entries)| {
+            entries.iter().enumerate().map(move |(i, entry)| (row + i, col + i, *entry))
+        })
     }
 
     /// The same map where every state is active.
@@ -106,10 +148,11 @@ impl Map {
         for (place, start) in self.starts.iter().enumerate() {
             let row = &self.numbers()[*start..][..self.width()];
             let target = all.row_mut(place);
+            target.fill(0.0);
             target[..m].copy_from_slice(&row[..m]);
             self.active.iter().zip(&row[m..]).for_each(|(state, x)| target[m + state] = *x);
         }
-        for &(row, col, entry) in &self.entries {
+        for (row, col, entry) in self.entries() {
             all.push(row, if col < m { col } else { m + self.active[col - m] }, entry);
         }
         all
@@ -130,6 +173,16 @@ impl Map {
         self.numbers.read()
     }
 
+    /// Begins to bring the map into caches, for soon.
+    pub(crate) fn prefetch(&self) {
+        #[cfg(target_arch = "x86_64")]
+        for line in self.numbers()[..self.stride() * self.full.len()].chunks(LANES) {
+            use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+            // SAFETY: a hint, whatever the address.
+            unsafe { _mm_prefetch::<_MM_HINT_T1>(line.as_ptr().cast()) };
+        }
+    }
+
     /// `next = A x + B u`. `packed` is room.
     pub(crate) fn apply(&self, x: &[f64], u: &[f64], packed: &mut Vec<f64>, next: &mut [f64]) {
         packed.clear();
@@ -146,20 +199,20 @@ impl Map {
             }
             next[*row] = sums.iter().sum();
         }
-        for &(row, col, entry) in &self.entries {
+        for (row, col, entry) in self.entries() {
             next[row] += entry * packed[col];
         }
     }
 
     /// `Mᵀ z` into room for the inputs and the active states.
-    pub(super) fn pull_back(&self, z: &[f64], out: &mut Vec<f64>) {
+    #[inline(always)]
+    pub(super) fn pull_back(&self, z: &[f64], terms: &mut Vec<Term>, out: &mut Vec<f64>) {
         out.clear();
         out.resize(self.stride(), 0.0);
-        for (row, start) in self.full.iter().zip(&self.starts) {
-            let numbers = &self.numbers()[*start..][..out.len()];
-            out.iter_mut().zip(numbers).for_each(|(out, x)| *out += z[*row] * x);
-        }
-        for &(row, col, entry) in &self.entries {
+        terms.clear();
+        terms.extend(self.full.iter().enumerate().map(|(place, row)| (z[*row], place)));
+        add_rows_portable(out, self.numbers(), self.stride(), terms);
+        for (row, col, entry) in self.entries() {
             out[col] += z[row] * entry;
         }
         out.truncate(self.width());
@@ -173,7 +226,7 @@ impl Map {
         by_x: &mut [f64],
         by_u: &mut [f64],
     ) {
-        self.pull_back(z, packed);
+        self.pull_back(z, &mut Vec::new(), packed);
         let (inputs, states) = packed.split_at(self.inputs);
         by_u.iter_mut().zip(inputs).for_each(|(to, x)| *to += x);
         self.active.iter().zip(states).for_each(|(state, x)| by_x[*state] += x);

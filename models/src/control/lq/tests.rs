@@ -97,8 +97,8 @@ fn fast_steps_follow_the_formulas() {
             let name = format!("{n} states, {m} inputs, step {k}");
             let off = error(&gain, &expected_gain);
             assert!(off < 1e-11, "{name}: {off:e}");
-            assert!(error(recursion.value(), &p) < 1e-11, "{name}");
-            assert_eq!(recursion.value(), &recursion.value().transpose(), "{name}");
+            assert!(error(&recursion.value(), &p) < 1e-11, "{name}");
+            assert_eq!(recursion.value(), recursion.value().transpose(), "{name}");
             let vector = |v: &DVector<f64>| DMatrix::from_column_slice(v.len(), 1, v.as_slice());
             assert!(error(&vector(&offset), &vector(&expected_offset)) < 1e-10, "{name}");
             assert!(error(&vector(recursion.linear()), &vector(&linear)) < 1e-10, "{name}");
@@ -120,7 +120,7 @@ fn a_stage_without_a_minimum_leaves_the_cost_to_go() {
         recursion.begin(&q, Some(&linear));
         let (mut gain, mut offset) = (DMatrix::zeros(1, n), DVector::zeros(1));
         assert_eq!(recursion.step(&map(&a, &b), stage, &mut gain, &mut offset), Err(NotConvex));
-        assert_eq!((recursion.value(), recursion.linear()), (&q, &linear));
+        assert_eq!((&recursion.value(), recursion.linear()), (&q, &linear));
         let nan = Stage { r: &(&r * f64::NAN), ..stage };
         assert_eq!(recursion.step(&map(&a, &b), nan, &mut gain, &mut offset), Err(NotConvex));
     }
@@ -140,7 +140,7 @@ fn a_map_may_lead_from_one_number_of_states_to_another() {
         let expected = bracket.try_inverse().unwrap() * b.transpose() * &a;
         assert!(error(&gain, &expected) < 1e-12);
         let value = &q + a.transpose() * &a - a.transpose() * &b * expected;
-        assert!(error(recursion.value(), &value) < 1e-12);
+        assert!(error(&recursion.value(), &value) < 1e-12);
         assert_eq!(recursion.linear().len(), n);
     }
 }
@@ -159,7 +159,7 @@ fn what_cancels_keeps_its_digits() {
         recursion.step(&map(&a, &b), stage, &mut gain, &mut offset).unwrap();
         // P = Q + Aᵀ (I − (1 + r)⁻¹) A = Q + Aᵀ A r / (1 + r).
         let expected = &q + a.transpose() * &a * (1e-12 / (1.0 + 1e-12));
-        let off = error(recursion.value(), &expected);
+        let off = error(&recursion.value(), &expected);
         assert!(off < 1e-9, "{n} states: off by {off:e}");
     }
 }

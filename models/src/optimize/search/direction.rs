@@ -80,6 +80,9 @@ impl Optimizer {
                 for k in used.clone().rev() {
                     ask(k, go_on)?;
                     let map = &tail[k - used.start];
+                    if k > used.start {
+                        tail[k - used.start - 1].prefetch();
+                    }
                     let at = (k, current.x(k), current.u(k));
                     let linear = (Some(&by_x[k]), Some(&by_u[k]));
                     let (stage, gain, offset) = match (law, &*projection) {
@@ -334,7 +337,7 @@ impl Optimizer {
         if basis.ncols() == 0 {
             return true;
         }
-        let mut value = self.scratch.recursion.value().clone();
+        let mut value = self.scratch.recursion.value();
         if let Some(weight) = &free.weight {
             let mut deviation = self.problem.deviation();
             let reference = self.reference.x();

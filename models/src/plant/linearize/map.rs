@@ -23,6 +23,7 @@ impl Linearization {
             for (i, source) in numbers.chunks_exact(self.stride.max(1)).enumerate() {
                 let target = map.row_mut(part * nd + i);
                 let driven = self.driven(part * (nd + self.constraints()) + i);
+                target[..ni].fill(0.0);
                 target.iter_mut().zip(driven).for_each(|(target, entry)| *target = *entry);
                 for impulse in self.impulses() {
                     let InputImpulse { input, coordinate, residual, momentum } = *impulse;
@@ -39,9 +40,9 @@ impl Linearization {
                 self.replaced.iter().for_each(|column| target[*column] = 0.0);
             }
         }
-        for (k, input) in (0..nk).zip(ni..).filter(|(_, input)| !self.replaced.contains(input)) {
-            map.push(nd + k, input, 1.0);
-            map.push(n + nd + k, input, 1.0 / self.time_step_s);
+        for (first, entry) in [(nd, 1.0), (n + nd, 1.0 / self.time_step_s)] {
+            let driven = (0..nk).filter(|k| !self.replaced.contains(&(ni + k)));
+            driven.for_each(|k| map.push(first + k, ni + k, entry));
         }
         for k in 0..nk {
             map.push(n + nd + k, inputs + nd + k, -1.0 / self.time_step_s);
