@@ -45,13 +45,12 @@ pub use kalman::{
 pub use manifold::{Tangent, tangent_basis};
 pub use modes::{Mode, modes};
 pub use spectrum::spectral_radius;
-pub(crate) use weights::congruent;
 pub use weights::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
 
 use nalgebra::DMatrix;
 
 /// Replaces a matrix that is symmetric but for round-off by its symmetric part.
-fn symmetrize(m: &mut DMatrix<f64>) {
+pub(crate) fn symmetrize(m: &mut DMatrix<f64>) {
     for column in 0..m.ncols() {
         for row in 0..column {
             let mean = 0.5 * (m[(row, column)] + m[(column, row)]);

@@ -56,9 +56,11 @@
 //! desired momentum that is projected already stays as it is. Derivatives are exact, second ones `TᵀQT`
 //! and `TᵀS`: all methods leave out the curvature of `p̃` (Gauss-Newton), so that Newton's method
 //! converges quadratically only where the desired momentum is reached, and descends everywhere as before.
-//! Each evaluation of the cost takes a factorization of the mass matrix, each second derivative O(n³).
+//! Each evaluation of the cost takes a factorization of the mass matrix, each iteration O(n³) per step, and
+//! `∂p̃/∂x` of all steps is kept.
 //! Bounds, the weight of a free initial state and [`Options::projection`] stay with the state's own
-//! momentum. Without constraints nothing changes.
+//! momentum; what a free initial momentum has along `Dh_dᵀ` then costs nothing, and stays but for
+//! round-off. Without constraints nothing changes.
 //!
 //! **Bounds** are held by an augmented Lagrangian: each end of each bound at each step has a multiplier
 //! `λ` and adds `(max(0, λ + ρ c)² − λ²) / 2ρ` for its excess `c`, whose kink is passed over (semi-smooth

@@ -478,8 +478,9 @@ impl From<&Weights> for TrajectoryWeights {
 }
 
 /// `tᵀ q t` of a symmetric `q`.
-pub(crate) fn congruent(t: &DMatrix<f64>, q: &DMatrix<f64>) -> DMatrix<f64> {
-    let mut congruent = t.tr_mul(&(q * t));
+fn congruent(t: &DMatrix<f64>, q: &DMatrix<f64>) -> DMatrix<f64> {
+    // Not `tr_mul`, which takes no blocks.
+    let mut congruent = t.transpose() * (q * t);
     symmetrize(&mut congruent);
     congruent
 }

@@ -7,7 +7,9 @@ use nalgebra::{DMatrix, DVector};
 use super::bounds::{Ends, Of};
 use super::trajectory::rows;
 use super::{Bounds, FreeInitialState, OptimizeError, TrajectoryCost};
-use crate::control::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError, congruent};
+use crate::control::{
+    Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError, symmetrize,
+};
 use crate::plant::balls::three;
 use crate::rotation::{self, Quaternion};
 use crate::scalar::Dual;
@@ -61,13 +63,8 @@ pub(super) struct Deviation {
     by_u: Vec<f64>,
     /// At `x`; none where the state's own momentum is weighed.
     projector: Option<Box<Plant>>,
-}
-
-impl Deviation {
-    /// The derivative by the state of what is weighed in its place.
-    fn projection(&mut self) -> Option<DMatrix<f64>> {
-        self.projector.as_mut().map(|plant| plant.projection_by_state())
-    }
+    /// `∂(p̃ − p)/∂x` of each step, as the last gradient there has found it; none without a projector.
+    projections: Vec<DMatrix<f64>>,
 }
 
 #[derive(Debug)]
@@ -172,7 +169,9 @@ impl Problem {
     pub(super) fn deviation(&self) -> Deviation {
         let (x, u) = (vec![0.0; self.states], vec![0.0; self.inputs]);
         let projector = self.projector.clone();
-        Deviation { by_x: x.clone(), by_u: u.clone(), x, u, projector }
+        let count = if projector.is_some() { self.steps + 1 } else { 0 };
+        let projections = vec![DMatrix::zeros(0, 0); count];
+        Deviation { by_x: x.clone(), by_u: u.clone(), x, u, projector, projections }
     }
 
     pub(super) fn stage(&self, k: usize) -> &StageWeights {
@@ -295,8 +294,15 @@ impl Problem {
             let turned = chart(&at.x, i).apply_transposed(three(&at.by_x, i));
             by_x.rows_mut(i, 3).copy_from_slice(&turned.0);
         }
-        if let Some(projection) = at.projection() {
-            *by_x = projection.tr_mul(by_x);
+        if let Some(plant) = &mut at.projector {
+            let momentum = self.model.dimensions().momentum();
+            let mut change = plant.projected_momentum_by_state();
+            for (i, j) in momentum.clone().enumerate() {
+                change[(i, j)] -= 1.0;
+            }
+            let by_p = by_x.rows_range(momentum).into_owned();
+            by_x.gemv_tr(1.0, &change, &by_p, 1.0);
+            at.projections[k] = change;
         }
         for (end, place) in self.ends.at(false, k) {
             let slope = end.penalty(x[end.index], multipliers[place], penalty).slope;
@@ -333,19 +339,36 @@ impl Problem {
         }
     }
 
-    /// Whether what is weighed is anything but the difference of states.
-    pub(super) fn is_curved(&self) -> bool {
-        !self.model.orientations.is_empty() || self.projector.is_some()
+    /// Whether projected momenta are weighed in place of others.
+    pub(super) fn projects(&self) -> bool {
+        self.projector.is_some()
     }
 
-    /// Turns weights into second derivatives by the tangent space at `x`, where the deviation was
-    /// evaluated; without the curvature of what is weighed.
-    pub(super) fn pull_back(&self, at: &mut Deviation, q: &mut DMatrix<f64>, s: &mut DMatrix<f64>) {
+    /// Whether what is weighed is anything but the difference of states.
+    pub(super) fn is_curved(&self) -> bool {
+        !self.model.orientations.is_empty() || self.projects()
+    }
+
+    /// Turns weights of step `k` into second derivatives by the tangent space at `x`, where deviation and
+    /// gradient were evaluated; without the curvature of what is weighed.
+    pub(super) fn pull_back(
+        &self,
+        k: usize,
+        at: &Deviation,
+        q: &mut DMatrix<f64>,
+        s: &mut DMatrix<f64>,
+    ) {
         self.turn_weights(at, q, s);
-        if let Some(projection) = at.projection() {
-            *q = congruent(&projection, q);
-            *s = projection.tr_mul(s);
+        let Some(change) = at.projections.get(k) else { return };
+        let momentum = self.model.dimensions().momentum();
+        let columns = q.columns_range(momentum.clone()).into_owned();
+        q.gemm(1.0, &columns, change, 1.0);
+        let change = change.transpose();
+        for matrix in [&mut *q, s] {
+            let rows = matrix.rows_range(momentum.clone()).into_owned();
+            matrix.gemm(1.0, &change, &rows, 1.0);
         }
+        symmetrize(q);
     }
 
     /// Adds the curvature of the rotation vectors themselves, which the gradient weighs.

@@ -168,17 +168,30 @@ fn derivatives_of_the_projected_cost_along_the_directions() {
 /// the desired motion is reached.
 #[test]
 fn derivatives_with_the_projected_momentum() {
-    let mut newton = 0;
+    let (mut newton, mut free) = (0, 0);
     let mut models = models();
     models.retain(|model| model.dimensions().constraints > 0);
     for model in &models {
-        for is_reached in [false, true] {
-            let momentum = Momentum::Projected;
+        let d = model.dimensions();
+        let start = Plant::new(Arc::clone(model), Settings::new(model)).unwrap().state().x();
+        // Violated throughout, of the state's own momentum.
+        let momentum = d.momentum().start;
+        let bound = Bound { index: momentum, min: None, max: Some(start[momentum] - 20.0) };
+        let bounded = Bounds { states: vec![bound], ..Bounds::default() };
+        for (is_reached, bounds) in
+            [(false, Bounds::default()), (true, Bounds::default()), (true, bounded)]
+        {
             let case = Case::new(Arc::clone(model), ForceSplit::Symmetric);
-            newton += usize::from(Case { momentum, is_reached, ..case }.check());
+            let momentum = Momentum::Projected;
+            newton += usize::from(Case { momentum, is_reached, bounds, ..case }.check());
         }
+        let mut case = Case::new(Arc::clone(model), ForceSplit::Symmetric);
+        case.momentum = Momentum::Projected;
+        case.free = Some(FreeInitialState { entries: vec![], weight: None });
+        free += usize::from(case.check());
     }
-    assert!(2 * newton > models.len() && models.len() > 8, "{newton} of {}", models.len());
+    let count = models.len();
+    assert!(count > 8 && newton > count && 2 * free > count, "{newton} {free} of {count}");
 }
 
 #[test]

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use futures::stream;
 use nalgebra::DMatrix;
+use plantd_models::control::Momentum;
 use plantd_models::optimize::{
     Bound, Bounds, Checkpoint, FreeInitialState, Method, Optimizer, Options, Progress, Status,
     TrajectoryCost,
@@ -45,7 +46,7 @@ impl Search {
         let steps = start.steps();
         let cost = request.cost.ok_or_else(|| Fault::field("cost", "is missing"))?;
         let uses_newton = [Some(given.method), given.first_method].contains(&Some(Method::Newton));
-        check_memory(hub, &model, steps, cost.stages.len(), uses_newton)?;
+        check_memory(hub, &model, steps, &cost, uses_newton)?;
         let cost = trajectory_cost(cost, steps, &model)?;
         let bounds = bounds(request.bounds.unwrap_or_default(), &model)?;
         let free = request.free_initial.map(|free| free_initial(free, &model)).transpose()?;
@@ -247,12 +248,13 @@ fn state(field: &str, state: v1::State, model: &Model) -> Result<State, Fault> {
 }
 
 /// Refuses a search that would need too much memory, or whose result no client would take: A, B, two
-/// gains, the motion and what is as long seven times, and for Newton's method whole linearizations.
+/// gains, the motion and what is as long seven times, for Newton's method whole linearizations, and the
+/// derivatives of projected momenta.
 fn check_memory(
     hub: &Hub,
     model: &Model,
     steps: usize,
-    stages: usize,
+    cost: &v1::TrajectoryCost,
     uses_newton: bool,
 ) -> Result<(), Fault> {
     let d = model.dimensions();
@@ -261,9 +263,12 @@ fn check_memory(
     let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
     LimitExceeded::check(name, limit, "numbers in the trajectory found", result)?;
     let linearizations = if uses_newton { 2 * convert::linearization_numbers(d) } else { 0 };
-    let of_step = nx * nx + 3 * nx * nu + linearizations + 8 * (nx + nu);
+    let momentum = convert::momentum_in("cost.weights", cost.weights.as_ref())?;
+    let is_projected = momentum == Momentum::Projected && d.constraints > 0;
+    let projections = if is_projected { d.dynamic * nx } else { 0 };
+    let of_step = nx * nx + 3 * nx * nu + linearizations + projections + 8 * (nx + nu);
     let of_stage = nx * nx + nu * nu + nx * nu + nx + nu;
-    let numbers = (steps + 1).saturating_mul(of_step).saturating_add(stages * of_stage);
+    let numbers = (steps + 1).saturating_mul(of_step).saturating_add(cost.stages.len() * of_stage);
     let (name, limit) = ("trajectory_numbers", hub.limits.trajectory_numbers);
     Ok(LimitExceeded::check(name, limit, "numbers in the search's matrices", numbers)?)
 }

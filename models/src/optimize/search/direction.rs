@@ -16,6 +16,10 @@ use crate::optimize::{Fallback, Method, OptimizeError};
 use crate::plant::known::KnownStep;
 use crate::{Contraction, Linearization, Plant, StepError};
 
+/// Curvature, relative to the largest, that a free initial state is given where projected momenta leave it
+/// none.
+const LEAST_CURVATURE: f64 = 1e-10;
+
 /// What a recursion finds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Law {
@@ -312,7 +316,7 @@ impl Optimizer {
             if problem.is_curved() {
                 problem.evaluate(steps, x, &[], deviation);
                 s.fill(0.0);
-                problem.pull_back(deviation, q, s);
+                problem.pull_back(steps, deviation, q, s);
                 if method == Method::Newton {
                     problem.add_chart_curvature(deviation, q);
                 }
@@ -347,7 +351,12 @@ impl Optimizer {
             self.problem.turn_weights(&deviation, &mut weight, cross);
             value += weight;
         }
-        let reduced = basis.transpose() * (value * &basis);
+        let mut reduced = basis.transpose() * (value * &basis);
+        if self.problem.projects() {
+            // What a momentum has along `Dh_dᵀ` costs nothing.
+            let least = LEAST_CURVATURE * reduced.diagonal().amax();
+            (0..reduced.nrows()).for_each(|i| reduced[(i, i)] += least);
+        }
         let slope = basis.tr_mul(self.scratch.recursion.linear());
         let Some(factor) = reduced.cholesky() else { return false };
         let step = -(&basis * factor.solve(&slope));
@@ -585,7 +594,7 @@ fn stage_weights<'a>(
         has_cross = copy_weights(problem, k, (&mut *q, &mut *s, &mut *r));
         if is_curved {
             problem.evaluate(k, x, u, deviation);
-            problem.pull_back(deviation, q, s);
+            problem.pull_back(k, deviation, q, s);
         }
     }
     problem.add_penalty_curvature(k, (x, u), bounds, q, Some(&mut *r));
@@ -610,7 +619,7 @@ pub(super) fn add_stage_weights(
     } else {
         copy_weights(problem, k, (&mut own.xx, &mut own.xu, &mut own.uu));
         problem.evaluate(k, x, u, deviation);
-        problem.pull_back(deviation, &mut own.xx, &mut own.xu);
+        problem.pull_back(k, deviation, &mut own.xx, &mut own.xu);
         problem.add_chart_curvature(deviation, &mut own.xx);
         second.xx += &own.xx;
         second.xu += &own.xu;
