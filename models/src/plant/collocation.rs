@@ -24,7 +24,7 @@ mod stage;
 use crate::Model;
 use crate::plant::closure::larger;
 use crate::plant::dense_lu::DenseLu;
-use crate::plant::newton::{At, CHORD_FLOOR, FLOOR, Factors, Workspace};
+use crate::plant::newton::{At, CHORD_FLOOR, FLOOR, Factors, STALE, Workspace};
 use crate::plant::predictor::Past;
 use crate::plant::scheme::{Scheme, Tableau};
 use crate::plant::{PreciseState, Settings, StepError, StepReport};
@@ -247,6 +247,12 @@ impl Collocation {
             report.residual = size;
             let stagnates = size > SLOW * previous;
             if report.iterations > 1 && (size <= enough || (stagnates && size <= CHORD_FLOOR)) {
+                if size > STALE {
+                    for i in 0..self.stages.len() {
+                        self.evaluate(workspace, at, i);
+                        self.take_impulse(workspace, settings, i);
+                    }
+                }
                 return Ok(Some(report));
             }
             slow = if stagnates { slow + 1 } else { 0 };
@@ -281,7 +287,8 @@ impl Collocation {
         let mut report = StepReport::default();
         let mut previous = f64::INFINITY;
         let nd = model.dimensions.dynamic;
-        let mut fresh = true;
+        // Whether the next correction renews the Jacobian, and whether the last one did.
+        let (mut fresh, mut was_fresh) = (true, false);
         for iteration in 1..=settings.max_iterations.min(ROUNDS) {
             report.iterations = iteration;
             let mut round_off = f64::MIN_POSITIVE;
@@ -300,7 +307,7 @@ impl Collocation {
                 return Err(StepError::NotFinite { iterations: iteration });
             }
             let stagnates = size > SLOW * previous;
-            let floor = if report.factorizations == iteration { FLOOR } else { CHORD_FLOOR };
+            let floor = if was_fresh { FLOOR } else { CHORD_FLOOR };
             let converged = size <= enough || (stagnates && size <= floor);
             if fresh && !(converged && iteration > 1) {
                 self.fill_system(model, settings, system);
@@ -316,12 +323,41 @@ impl Collocation {
             }
             report.residual = size;
             if converged {
+                self.correct_impulses(settings, system);
                 return Ok(report);
             }
+            was_fresh = fresh;
             fresh = size > SLOW * previous;
             previous = size;
         }
         Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
+    }
+
+    /// Takes the last correction, which `residual` holds, into the impulses, which were evaluated before it.
+    fn correct_impulses(&mut self, settings: &Settings, system: &mut System) {
+        let Self { stages, tableau, .. } = self;
+        let System { hessians, residual, products, .. } = system;
+        let (count, nd) = (stages.len(), stages.first().map_or(0, |stage| stage.impulse.len()));
+        if nd == 0 {
+            return;
+        }
+        let n = hessians[0].qq.len() / nd;
+        for (i, (stage, hessian)) in stages.iter_mut().zip(hessians).enumerate() {
+            let (length, own) = (settings.time_step_s * tableau.weights[i], &residual[i * nd..]);
+            let moved = &mut products[..nd];
+            moved.fill(0.0);
+            for (weight, correction) in
+                tableau.coupling[i * count..].iter().zip(residual.chunks_exact(nd))
+            {
+                moved.iter_mut().zip(correction).for_each(|(moved, c)| *moved += weight * c);
+            }
+            for (k, impulse) in stage.impulse.iter_mut().enumerate() {
+                let by_position = hessian.qq[k * n..].iter().zip(&*moved);
+                let by_velocity = hessian.qv[k * n..][..nd].iter().zip(own);
+                *impulse -= length * by_position.map(|(l, q)| l * q).sum::<f64>()
+                    + by_velocity.map(|(l, y)| l * y).sum::<f64>();
+            }
+        }
     }
 
     /// Writes the residuals of all stages from their impulses and momenta; returns the largest entry.

@@ -36,6 +36,8 @@ const NEARLY: f64 = 1e5;
 pub(crate) const FLOOR: f64 = 1e4;
 /// The same for a Jacobian that was kept.
 pub(crate) const CHORD_FLOOR: f64 = 1e2;
+/// What a correction of a larger residual moves, the impulse must see, or energy drifts.
+pub(crate) const STALE: f64 = 2.0;
 
 /// What a step is taken of.
 #[derive(Clone, Copy, Debug)]
@@ -344,6 +346,9 @@ impl Workspace {
             }
             self.correct(model);
             if converged {
+                if size > STALE {
+                    self.evaluate(model, settings, state);
+                }
                 return self.accept(model, settings, report);
             }
             idle = self.is_round_off_of_coordinates();
