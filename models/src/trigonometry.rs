@@ -34,6 +34,23 @@ const COSINE: [f64; 6] = [
     -1.135_964_755_778_819_5e-11,
 ];
 
+/// Whole turns up to this are taken off exactly.
+const MOST_TURNS: f64 = 1_048_576.0;
+
+/// `angle + more` without its whole turns, rounded once: what the sum of a large angle and a small one
+/// loses to rounding is kept. `per_radian` is `1/2π`; with zero, or within half a turn, it is the sum.
+#[inline(always)]
+pub(crate) fn unwound(angle: f64, more: f64, per_radian: f64) -> f64 {
+    let turns = (angle * per_radian + TO_INTEGER) - TO_INTEGER;
+    let turns = if turns.abs() <= MOST_TURNS { turns } else { 0.0 };
+    // Up to the last line nothing is lost, as in the reduction below.
+    let first = angle - turns * (4.0 * PARTS[0]);
+    let second = turns * (4.0 * PARTS[1]);
+    let difference = first - second;
+    let lost = (first - difference) - second;
+    difference + (more + (lost - turns * (4.0 * PARTS[2])))
+}
+
 /// Writes the sine and the cosine of each angle; about 25 flops each.
 #[inline(always)]
 pub(crate) fn sin_cos(angles: &[f64], out: &mut [[f64; 2]]) {
@@ -132,6 +149,25 @@ mod tests {
             unsafe { in_wide_registers(&angles, &mut out) };
             assert_eq!(out, narrow, "the same bits in any register");
         }
+    }
+
+    /// Sines of `angle + more` as a whole, by the sum formula.
+    #[test]
+    fn whole_turns_are_taken_off_without_loss() {
+        for i in 0..20_000 {
+            let x = f64::from(i);
+            let angle = 6e6_f64.powf((0.618 * x).fract()) * (1.7 * x).sin();
+            let more = 0.3 * (0.9 * x).sin() * 1e-15_f64.powf((0.37 * x).fract());
+            let angle_left = unwound(angle, more, std::f64::consts::FRAC_1_PI / 2.0);
+            assert!(angle_left.abs() <= 3.5, "{angle} + {more}: {angle_left}");
+            let ((s, c), (sine, cosine)) = (angle.sin_cos(), more.sin_cos());
+            let expected = s * cosine + c * sine;
+            assert!((angle_left.sin() - expected).abs() <= 6e-16, "{angle} + {more}");
+            assert_eq!(unwound(angle, more, 0.0), angle + more);
+            let near = (1.7 * x).sin() * 3.1;
+            assert_eq!(unwound(near, more, std::f64::consts::FRAC_1_PI / 2.0), near + more);
+        }
+        assert!(unwound(f64::NAN, 0.0, 0.1).is_nan());
     }
 
     #[test]

@@ -282,6 +282,7 @@ impl Model {
         // Configurations where something is singular by chance are rare.
         for k in (0..=SAMPLES).rev() {
             workspace.q_mid = sample(self, k, 1.0);
+            workspace.angles.copy_from_slice(&workspace.q_mid);
             workspace.orientations_mid = orientations(self, &workspace.q_mid);
             workspace.evaluate_lagrangian(self);
             match workspace.factor_newton_matrix(self, &settings) {

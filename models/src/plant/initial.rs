@@ -235,6 +235,7 @@ impl Plant {
         let change = self.model.difference(q0, q1);
         for i in 0..q0.len() {
             workspace.q_mid[i] = q0[i] + 0.5 * change[i];
+            workspace.angles[i] = workspace.q_mid[i];
             workspace.velocity[i] = change[i] / h;
         }
         let turns = self.model.orientations.iter().map(|&i| three(&change, i));

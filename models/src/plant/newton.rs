@@ -12,10 +12,12 @@
 
 mod matrix;
 
+use std::f64::consts::TAU;
+
 use crate::Model;
 use crate::model::Solver;
 use crate::plant::blocks::StepBlocks;
-use crate::plant::closure::{Closure, larger};
+use crate::plant::closure::{Closure, larger, largest};
 use crate::plant::curvature::Curvature;
 use crate::plant::forces::Instant;
 use crate::plant::kinematics::Poses;
@@ -25,6 +27,8 @@ use crate::plant::planar::{Of, PlanarTree};
 use crate::plant::rows::{Term, padded, spread};
 use crate::plant::{PreciseState, Precision, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
+use crate::tree::JointKind;
+use crate::trigonometry::unwound;
 
 pub(crate) use matrix::{Factors, fill_schur};
 
@@ -36,7 +40,7 @@ const NEARLY: f64 = 1e5;
 pub(crate) const FLOOR: f64 = 1e4;
 /// The same for a Jacobian that was kept.
 pub(crate) const CHORD_FLOOR: f64 = 1e2;
-/// What a correction of a larger residual moves, the impulse must see, or energy drifts.
+/// Corrections of larger residuals must be seen by the impulse, or energy drifts by a part of them.
 pub(crate) const STALE: f64 = 2.0;
 
 /// What a step is taken of.
@@ -59,6 +63,10 @@ pub(crate) struct Workspace {
     pub(crate) impulse: Vec<f64>,
     /// Configuration at the midpoint.
     pub(crate) q_mid: Vec<f64>,
+    /// The same with angles of hinges less their whole turns, in which they keep all digits.
+    pub(crate) angles: Vec<f64>,
+    /// `1/2π` for the coordinates of hinges, else zero.
+    turns_per_radian: Vec<f64>,
     /// Configuration at the end.
     pub(crate) q_end: Vec<f64>,
     /// Orientations of ball joints at the start, the midpoint and the end.
@@ -79,7 +87,8 @@ pub(crate) struct Workspace {
     /// Inputs, damping and forces at the midpoint.
     pub(crate) force: Vec<f64>,
     pub(crate) residual: Vec<f64>,
-    /// Magnitude of what the residual is the sum of.
+    /// Magnitudes of what the residuals are the sums of, and the largest.
+    magnitudes: Vec<f64>,
     pub(crate) round_off: f64,
     pub(crate) constraint_residual: Vec<f64>,
     /// What follows from configuration and velocity at the midpoint: in the plane where the scene allows
@@ -148,11 +157,19 @@ impl Workspace {
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
         let no = model.orientations.len();
         let zeros = |len: usize| vec![0.0; len];
+        let mut turns_per_radian = zeros(nd);
+        for joint in model.dynamics.joints.iter().filter(|j| j.kind == JointKind::Revolute) {
+            if let Some(turns) = turns_per_radian.get_mut(joint.coordinate) {
+                *turns = 1.0 / TAU;
+            }
+        }
         Self {
             increment: zeros(nd),
             multipliers: zeros(nc),
             impulse: zeros(nd),
             q_mid: zeros(n),
+            angles: zeros(n),
+            turns_per_radian,
             q_end: zeros(n),
             orientations_start: vec![Mat3::IDENTITY; no],
             orientations_mid: vec![Mat3::IDENTITY; no],
@@ -166,6 +183,7 @@ impl Workspace {
             input_force: zeros(nd),
             force: zeros(nd),
             residual: zeros(nd),
+            magnitudes: zeros(nd),
             round_off: 0.0,
             constraint_residual: zeros(nc),
             planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
@@ -214,6 +232,7 @@ impl Workspace {
         for (k, next) in next.iter().enumerate() {
             let i = d.dynamic + k;
             self.q_mid[i] = 0.5 * (state.q[i] + next);
+            self.angles[i] = self.q_mid[i];
             self.velocity[i] = (next - state.q[i]) / settings.time_step_s;
             self.q_end[i] = *next;
         }
@@ -368,43 +387,42 @@ impl Workspace {
         let inverse = 1.0 / h;
         let (x, q, q_low) = (&self.increment[..nd], &state.q[..nd], &state.q_low[..nd]);
         let (q_mid, velocity) = (&mut self.q_mid[..nd], &mut self.velocity[..nd]);
+        let (angles, per_radian) = (&mut self.angles[..nd], &self.turns_per_radian[..nd]);
         for i in 0..nd {
             q_mid[i] = q[i] + (q_low[i] + 0.5 * x[i]);
             velocity[i] = x[i] * inverse;
+            angles[i] = unwound(q[i], q_low[i] + 0.5 * x[i], per_radian[i]);
         }
         if !model.orientations.is_empty() {
             self.turn_to_midpoint(model);
         }
         self.evaluate_lagrangian(model);
         let (half, weight) = (0.5 * h, settings.force_split.at_start() * h);
-        let (p, p_low, q_mid) = (&state.p[..nd], &state.p_low[..nd], &self.q_mid[..nd]);
+        let (p, p_low, angles) = (&state.p[..nd], &state.p_low[..nd], &self.angles[..nd]);
         let (l_q, l_v, force) = (&self.l_q[..nd], &self.l_v[..nd], &self.force[..nd]);
-        let residual = &mut self.residual[..nd];
-        let mut round_off = f64::MIN_POSITIVE;
+        let (residual, magnitudes) = (&mut self.residual[..nd], &mut self.magnitudes[..nd]);
         for i in 0..nd {
             let (half_q, force) = (half * l_q[i], weight * force[i]);
             residual[i] = ((p[i] - l_v[i]) + (half_q + force)) + p_low[i];
-            let magnitude =
-                p[i].abs() + l_v[i].abs() + half_q.abs() * (1.0 + q_mid[i].abs()) + force.abs();
-            round_off = larger(round_off, magnitude);
+            magnitudes[i] =
+                p[i].abs() + l_v[i].abs() + half_q.abs() * (1.0 + angles[i].abs()) + force.abs();
         }
+        self.round_off = largest(&self.magnitudes).max(f64::MIN_POSITIVE);
         if !model.orientations.is_empty() {
             self.turn_residual(model, settings, state);
         }
         if model.dimensions.constraints > 0 {
             self.start.subtract_impulses(model, &self.multipliers, &mut self.residual);
         }
-        let largest = self.residual.iter().fold(0.0, |m, r| larger(m, r.abs()));
-        self.round_off = round_off;
-        largest / (f64::EPSILON * round_off)
+        largest(&self.residual) / (f64::EPSILON * self.round_off)
     }
 
     /// Gradient of the Lagrangian and forces at the midpoint.
     pub(crate) fn evaluate_lagrangian(&mut self, model: &Model) {
         if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
-            planar.gradient(joints, &self.q_mid, &self.velocity, &mut self.l_q, &mut self.l_v);
+            planar.gradient(joints, &self.angles, &self.velocity, &mut self.l_q, &mut self.l_v);
         } else {
-            self.poses.evaluate(&model.dynamics, &self.q_mid, &self.orientations_mid);
+            self.poses.evaluate(&model.dynamics, &self.angles, &self.orientations_mid);
             self.momenta.gradient(
                 &model.dynamics,
                 &self.poses,
@@ -501,7 +519,7 @@ impl Workspace {
     /// Whether the last correction is no more than the round-off of the coordinates.
     fn is_round_off_of_coordinates(&self) -> bool {
         // The midpoint may be next to zero where start and end are not.
-        let size = |i: usize| self.q_mid[i].abs() + self.increment[i].abs();
+        let size = |i: usize| self.angles[i].abs() + self.increment[i].abs();
         let mut corrections = self.residual.iter().enumerate();
         corrections.all(|(i, x)| x.abs() <= 2.0 * f64::EPSILON * size(i))
     }
@@ -514,8 +532,9 @@ impl Workspace {
         mut report: StepReport,
     ) -> Result<StepReport, StepError> {
         model.check_turns(&self.increment)?;
-        for (i, impulse) in self.impulse.iter_mut().enumerate() {
-            *impulse = settings.time_step_s * (self.l_q[i] + self.force[i]);
+        let pairs = self.l_q.iter().zip(&self.force);
+        for (impulse, (l_q, force)) in self.impulse.iter_mut().zip(pairs) {
+            *impulse = settings.time_step_s * (l_q + force);
         }
         if !model.orientations.is_empty() {
             self.turn_impulse(model, settings);
@@ -546,6 +565,9 @@ impl Workspace {
 impl Model {
     /// Refuses increments of more than half a turn.
     pub(crate) fn check_turns(&self, increments: &[f64]) -> Result<(), StepError> {
+        if largest(increments) <= std::f64::consts::PI {
+            return Ok(());
+        }
         for (coordinate, x) in self.coordinates.iter().zip(increments) {
             if coordinate.is_angle && x.abs() > std::f64::consts::PI {
                 let coordinate = coordinate.name.clone();

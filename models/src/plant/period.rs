@@ -304,12 +304,8 @@ impl PreciseState {
         h: f64,
     ) {
         let nd = model.dimensions.dynamic;
-        for i in 0..nd {
-            let (q, low) = two_sum(self.q[i], workspace.increment[i] + self.q_low[i]);
-            (self.q[i], self.q_low[i]) = (q, low);
-            let (p, low) = two_sum(self.p[i], workspace.impulse[i] + self.p_low[i]);
-            (self.p[i], self.p_low[i]) = (p, low);
-        }
+        add(&mut self.q[..nd], &mut self.q_low, &workspace.increment);
+        add(&mut self.p, &mut self.p_low, &workspace.impulse);
         self.q[nd..].copy_from_slice(&workspace.q_end[nd..]);
         if !model.orientations.is_empty() {
             workspace.turn(model, self);
@@ -320,6 +316,13 @@ impl PreciseState {
             (Past::Stages(past), Some(collocation)) => past.record(collocation.motion()),
             (past, _) => past.record(h, &workspace.increment, &model.conditioning.inertia),
         }
+    }
+}
+
+/// Adds changes to sums, with what rounding took from them.
+fn add(sums: &mut [f64], low: &mut [f64], changes: &[f64]) {
+    for ((sum, low), change) in sums.iter_mut().zip(low).zip(changes) {
+        (*sum, *low) = two_sum(*sum, change + *low);
     }
 }
 
