@@ -115,6 +115,26 @@ fn a_scene_runs_no_code_of_what_it_does_not_have() {
     }
 }
 
+/// What keeps the last digits of a state, the update as a whole, and what refuses solutions that turn too
+/// far.
+const SAFEGUARDS: &[&str] = &["PreciseState>::move_on", "check_turns"];
+/// The part of a step that they may take.
+const SAFEGUARDS_SHARE: f64 = 0.02;
+
+#[test]
+fn safeguards_take_a_small_part_of_a_step() {
+    let Some(valgrind) = valgrind() else { return };
+    for (scene, calls) in [("chain-32", 20), ("marionette", 50)] {
+        let profile = valgrind.profile(scene, "step", calls);
+        for name in SAFEGUARDS {
+            assert!(profile.of(&[name]) > 0, "{name} is a function of its own");
+        }
+        let share = profile.of(SAFEGUARDS) as f64 / profile.total() as f64;
+        println!("{scene}: {:.2} %", 100.0 * share);
+        assert!(share <= SAFEGUARDS_SHARE, "{scene}: {:.2} %", 100.0 * share);
+    }
+}
+
 /// Instructions per call by operation.
 type Counts = BTreeMap<String, u64>;
 

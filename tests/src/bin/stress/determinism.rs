@@ -14,7 +14,8 @@ pub(crate) fn cases() -> Vec<Case> {
     let method = |order, substeps| Method::new(2e-3, order, substeps);
     [
         ("double-pendulum", method(2, 1)),
-        ("chain-32", method(2, 1)),
+        // Released from horizontal, it whips too violently for longer steps.
+        ("chain-32", Method::new(2e-4, 2, 1)),
         ("tree-30", method(2, 1)),
         ("four-bar", method(2, 1)),
         ("scissor-4", method(2, 1)),
