@@ -10,13 +10,14 @@ use crate::case::{Line, Outcome};
 
 const SIZE: (u32, u32) = (860, 480);
 /// Told apart also without colours, by their order in the legend.
-const COLORS: [RGBColor; 6] = [
+const COLORS: [RGBColor; 7] = [
     RGBColor(0, 90, 160),
     RGBColor(204, 85, 0),
     RGBColor(0, 130, 80),
     RGBColor(150, 60, 150),
     RGBColor(110, 110, 110),
     RGBColor(180, 150, 0),
+    RGBColor(0, 150, 170),
 ];
 /// Below every relative error.
 const LEAST: f64 = 1e-18;
@@ -46,11 +47,21 @@ pub(crate) fn write(out: &Path, outcomes: &[Outcome]) -> Result<()> {
     let plots = [
         Plot {
             file: "energy.svg",
-            title: "Distance of the modified energy from its start",
+            title: "Distance of the modified energy from its start, midpoint rule",
             x: "steps",
             y: "of the largest kinetic energy",
             lines: lines("energy"),
             dots: true,
+            legend: SeriesLabelPosition::UpperLeft,
+        },
+        Plot {
+            file: "energy-orders.svg",
+            title: "Distance of the energy from its start, higher orders",
+            x: "steps",
+            y: "of the largest kinetic energy",
+            lines: lines("energy-orders"),
+            dots: true,
+            legend: SeriesLabelPosition::UpperLeft,
         },
         Plot {
             file: "refused.svg",
@@ -59,6 +70,7 @@ pub(crate) fn write(out: &Path, outcomes: &[Outcome]) -> Result<()> {
             y: "fraction",
             lines: lines("refused"),
             dots: false,
+            legend: SeriesLabelPosition::LowerRight,
         },
         Plot {
             file: "derivatives.svg",
@@ -67,6 +79,7 @@ pub(crate) fn write(out: &Path, outcomes: &[Outcome]) -> Result<()> {
             y: "found, and resolved",
             lines: derivatives.iter().filter(|line| !line.points.is_empty()).collect(),
             dots: true,
+            legend: SeriesLabelPosition::LowerRight,
         },
     ];
     plots.iter().filter(|plot| !plot.lines.is_empty()).try_for_each(|plot| {
@@ -113,6 +126,7 @@ struct Plot<'a> {
     lines: Vec<&'a Line>,
     /// Single points, on a logarithmic ordinate.
     dots: bool,
+    legend: SeriesLabelPosition,
 }
 
 impl Plot<'_> {
@@ -158,7 +172,7 @@ impl Plot<'_> {
         }
         chart
             .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
+            .position(self.legend.clone())
             .background_style(WHITE.mix(0.85))
             .label_font(("sans-serif", 14))
             .draw()?;
