@@ -61,7 +61,7 @@ pub(crate) fn write(out: &Path, outcomes: &[Outcome]) -> Result<()> {
             y: "of the largest kinetic energy",
             lines: lines("energy-orders"),
             dots: true,
-            legend: SeriesLabelPosition::UpperLeft,
+            legend: SeriesLabelPosition::LowerLeft,
         },
         Plot {
             file: "refused.svg",
