@@ -15,6 +15,7 @@ use nalgebra::{DMatrix, DVector};
 pub(crate) use self::map::Map;
 use super::blocked::{Into, LANES, Operand, Scratch, mirror_head, product, transpose};
 use crate::plant::rows::{Term, add_rows_portable};
+use crate::wide::wide;
 
 /// One stage of the cost,
 /// `½ xᵀQx + xᵀSu + ½ uᵀRu + x_linearᵀx + u_linearᵀu`. Nothing here need be definite.
@@ -362,17 +363,11 @@ impl LqRecursion {
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
         #[cfg(target_arch = "x86_64")]
-        {
-            if std::arch::is_x86_feature_detected!("avx512f") {
-                // SAFETY: the processor has AVX-512.
-                return unsafe { self.step_avx512(map, stage, gain, offset) };
-            }
-            if std::arch::is_x86_feature_detected!("avx2") {
-                // SAFETY: the processor has AVX2.
-                return unsafe { self.step_avx2(map, stage, gain, offset) };
-            }
+        if std::arch::is_x86_feature_detected!("avx512f") {
+            // SAFETY: the processor has AVX-512.
+            return unsafe { self.step_avx512(map, stage, gain, offset) };
         }
-        self.step_portable(map, stage, gain, offset)
+        self.step_narrow(map, stage, gain, offset)
     }
 
     #[cfg(target_arch = "x86_64")]
@@ -387,16 +382,14 @@ impl LqRecursion {
         self.step_portable(map, stage, gain, offset)
     }
 
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn step_avx2(
-        &mut self,
-        map: &Map,
-        stage: Stage<'_>,
-        gain: &mut DMatrix<f64>,
-        offset: &mut DVector<f64>,
-    ) -> Result<(), NotConvex> {
-        self.step_portable(map, stage, gain, offset)
+    wide! {
+        fn step_narrow(
+            mut self,
+            map: &Map,
+            stage: Stage<'_>,
+            gain: &mut DMatrix<f64>,
+            offset: &mut DVector<f64>,
+        ) -> Result<(), NotConvex> = step_portable, step_avx2;
     }
 
     #[inline(always)]
