@@ -1,16 +1,21 @@
 """The mechanisms that are compared, and how each peer is told of them.
 
-Bodies hang from hinges: `parent` (-1 is the world), `pos` of the hinge in the parent's frame, `axis`,
-`mass`, centre of mass `com` and diagonal `inertia` about it, in the body's axes. Units are SI.
+Bodies hang from joints: `parent` (-1 is the world), `pos` of the joint in the parent's frame, `axis`, `mass`,
+centre of mass `com` and diagonal `inertia` about it, in the body's axes. A joint is a hinge unless its `type` says
+`slide`, `ball` or `free`; hinges and slides may have `stiffness` about `rest`, and `damping`. In q0 an orientation
+is a rotation vector, after the place of a free body; in v0 its velocity is in the body's axes. Units are SI.
 """
 
 import math
 
 GRAVITY = 9.8
+# What MuJoCo needs at least, kg m².
+LEAST_INERTIA = 2e-15
+SIZES = {"hinge": 1, "slide": 1, "ball": 3, "free": 6}
 
 
-def body(parent, pos, axis, mass, com, inertia):
-    return dict(parent=parent, pos=pos, axis=axis, mass=mass, com=com, inertia=inertia)
+def body(parent, pos, axis, mass, com, inertia, **joint):
+    return dict(parent=parent, pos=pos, axis=axis, mass=mass, com=com, inertia=inertia) | joint
 
 
 def mechanism(name, bodies, q0, v0=None, loops=()):
@@ -18,8 +23,31 @@ def mechanism(name, bodies, q0, v0=None, loops=()):
     return dict(name=name, gravity=GRAVITY, bodies=bodies, q0=q0, v0=v0, loops=list(loops))
 
 
-def point_mass(parent, z):
-    return body(parent, [0, 0, z], [0, 1, 0], 1.0, [0, 0, -1.0], [0, 0, 0])
+def joint_type(b):
+    return b.get("type", "hinge")
+
+
+def parts(m):
+    """Bodies, each with its part of q0 and of v0."""
+    at = 0
+    for b in m["bodies"]:
+        size = SIZES[joint_type(b)]
+        yield b, m["q0"][at : at + size], m["v0"][at : at + size]
+        at += size
+
+
+def quaternion(turn):
+    """Of a rotation vector; w first."""
+    angle = math.hypot(*turn)
+    return [math.cos(angle / 2), *(x * math.sin(angle / 2) / angle if angle else 0.0 for x in turn)]
+
+
+def point_mass(parent, z, mass=1.0, length=1.0):
+    return body(parent, [0, 0, z], [0, 1, 0], mass, [0, 0, -length], [0, 0, 0])
+
+
+def slider(mass, **joint):
+    return body(-1, [0, 0, 0], [1, 0, 0], mass, [0, 0, 0], [0, 0, 0], type="slide", **joint)
 
 
 def rod(parent, pos, length, mass):
@@ -31,8 +59,9 @@ def pendulum():
     return mechanism("P", [point_mass(-1, 0)], [math.pi / 2])
 
 
-def double_pendulum():
-    return mechanism("D", [point_mass(-1, 0), point_mass(0, -1.0)], [math.pi / 2, 0.0])
+def double_pendulum(masses=(1.0, 1.0), lengths=(1.0, 1.0)):
+    bodies = [point_mass(-1, 0, masses[0], lengths[0]), point_mass(0, -lengths[0], masses[1], lengths[1])]
+    return mechanism("D", bodies, [math.pi / 2, 0.0])
 
 
 def spherical_pendulum():
@@ -73,8 +102,83 @@ def four_bar():
     return mechanism("L", bodies, [-1.2, 0.27841001304404134, -0.4355357264293478], loops=[loop])
 
 
+def ball_pendulum():
+    rod = body(-1, [0, 0, 0], [0, 0, 0], 1.0, [0, 0, -1.0], [0.01, 0.01, 0.01], type="ball")
+    return mechanism("ball", [rod], [0.8, 0.0, 0.0])
+
+
+def cart_pole():
+    return mechanism("cart", [slider(10.0), point_mass(0, 0)], [0.0, 0.7])
+
+
+def elastic_pendulum(stiffness):
+    """A point mass that slides along a massless rod, held 1 m from its hinge by a spring."""
+    hinge = body(-1, [0, 0, 0], [0, 1, 0], 0.0, [0, 0, 0], [0, 0, 0])
+    spring = dict(type="slide", stiffness=stiffness, rest=1.0)
+    bob = body(0, [0, 0, 0], [0, 0, -1], 1.0, [0, 0, 0], [0, 0, 0], **spring)
+    return mechanism("elastic", [hinge, bob], [1.0, 1.0])
+
+
+def gimbal():
+    """A body on three hinges, without gravity."""
+    axes = [[0, 0, 1], [0, 1, 0], [1, 0, 0]]
+    bodies = [body(i - 1, [0, 0, 0], axis, 0.0, [0, 0, 0], [0, 0, 0]) for i, axis in enumerate(axes)]
+    bodies[2] |= dict(mass=1.0, inertia=[0.3, 0.4, 0.5])
+    return mechanism("gimbal", bodies, [0.0] * 3) | dict(gravity=0.0)
+
+
+def rigid_body(joint, v0):
+    """An asymmetric body, without gravity."""
+    free = body(-1, [0, 0, 0], [0, 0, 0], 1.0, [0, 0, 0], [0.02, 0.03, 0.045], type=joint)
+    return mechanism(joint, [free], [0.0] * len(v0), v0) | dict(gravity=0.0)
+
+
+def parallelogram(rocker=1.0, third=None):
+    """Four-bar linkage that can be flat, without gravity; `third` is the length of another crank in its middle."""
+    crank = lambda pos: body(-1, pos, [0, 1, 0], 1.0, [0, 0, -0.5], [0.1, 0.1, 0.0])
+    coupler = body(0, [0, 0, -1.0], [0, 1, 0], 1.0, [1.0, 0, 0], [0.3, 0.3, 0.3])
+    bodies = [crank([0, 0, 0]), coupler, crank([2.0, 0, rocker - 1.0])]
+    loops = [dict(body_a=1, at_a=[2.0, 0, 0], body_b=2, at_b=[0, 0, -rocker])]
+    if third:
+        bodies.append(crank([1.0, 0, 0]))
+        loops.append(dict(body_a=1, at_a=[1.0, 0, 0], body_b=3, at_b=[0, 0, -third]))
+    q0 = [0.3, -0.3, 0.3, 0.3][: len(bodies)]
+    return mechanism("parallelogram", bodies, q0, [1.0, -1.0, 1.0, 1.0][: len(bodies)], loops) | dict(gravity=0.0)
+
+
+def scissor(n):
+    """n pairs of crossed links of 5 m below a rail, nearly flat, in two strands that change sides at every pair."""
+    length, opening = 5.0, math.pi / 20
+    bodies, q0, at = [slider(1.0)], [length * math.cos(opening)], {}
+    for start, first_is_right in [(0, True), (-1, False)]:
+        parent = start
+        for i in range(n):
+            right = first_is_right == (i % 2 == 0)
+            fold = opening * (2 if i else 1)
+            q0.append(math.pi - fold if right else fold + (math.pi if i else 0.0))
+            pos = [length if i else 0.0, 0, 0]
+            bodies.append(body(parent, pos, [0, 1, 0], 1.0, [length / 2, 0, 0], [1.0] * 3))
+            parent = at[i, right] = len(bodies) - 1
+    middle = [length / 2, 0, 0]
+    loops = [dict(body_a=at[i, False], at_a=middle, body_b=at[i, True], at_b=middle) for i in range(n)]
+    return mechanism(f"X{n}", bodies, q0, loops=loops)
+
+
+def scaled(m, length, mass):
+    """The same mechanism of other size and weight."""
+    times = lambda factor, numbers: [factor * x for x in numbers]
+    bodies = [
+        b
+        | dict(pos=times(length, b["pos"]), com=times(length, b["com"]), mass=mass * b["mass"])
+        | dict(inertia=times(mass * length**2, b["inertia"]))
+        for b in m["bodies"]
+    ]
+    loops = [l | dict(at_a=times(length, l["at_a"]), at_b=times(length, l["at_b"])) for l in m["loops"]]
+    return m | dict(bodies=bodies, loops=loops)
+
+
 SINGLE = {"P": pendulum, "D": double_pendulum, "S": spherical_pendulum, "L": four_bar}
-FAMILIES = {"C": chain, "H": hanging_chain, "T": tree}
+FAMILIES = {"C": chain, "H": hanging_chain, "T": tree, "X": scissor}
 
 
 def named(name):
@@ -92,24 +196,31 @@ def text(m):
 
 
 def mjcf(m):
-    """For MuJoCo: a motor on every hinge; bodies without mass are merged into their children."""
+    """For MuJoCo: a motor on every hinge and slide; bodies without mass are merged into their children."""
     children = {i: [] for i in range(-1, len(m["bodies"]))}
     for i, b in enumerate(m["bodies"]):
         children[b["parent"]].append(i)
     spread = lambda numbers: " ".join(map(repr, numbers))
     lines = []
 
+    def joint(i, b):
+        if joint_type(b) in ("ball", "free"):
+            return f'<joint name="j{i}" type="{joint_type(b)}"/>'
+        spring = f'stiffness="{b.get("stiffness", 0.0)!r}" springref="{b.get("rest", 0.0)!r}"'
+        place = f'type="{joint_type(b)}" axis="{spread(b["axis"])}"'
+        return f'<joint name="j{i}" {place} {spring} damping="{b.get("damping", 0.0)!r}"/>'
+
     def open_bodies(parent):
         for i in children[parent]:
             lines.append(f'<body pos="{spread(m["bodies"][i]["pos"])}">')
             b = m["bodies"][i]
             while True:
-                lines.append(f'<joint name="j{i}" axis="{spread(b["axis"])}"/>')
+                lines.append(joint(i, b))
                 if b["mass"]:
                     break
                 [i] = children[i]
                 b = m["bodies"][i]
-            inertia = [max(entry, 1e-13) for entry in b["inertia"]]
+            inertia = [max(entry, LEAST_INERTIA) for entry in b["inertia"]]
             lines.append(
                 f'<inertial pos="{spread(b["com"])}" mass="{b["mass"]!r}" diaginertia="{spread(inertia)}"/>'
             )
@@ -121,8 +232,9 @@ def mjcf(m):
             lines.append("</body>")
 
     open_bodies(-1)
-    n = len(m["q0"])
-    motors = "".join(f'<motor joint="j{i}"/>' for i in range(n))
+    turns = [joint_type(b) in ("ball", "free") for b in m["bodies"]]
+    motors = "".join(f'<motor joint="j{i}"/>' for i, turn in enumerate(turns) if not turn)
+    q0 = [x for (_, q, _), turn in zip(parts(m), turns) for x in (q[:-3] + quaternion(q[-3:]) if turn else q)]
     connects = "".join(f'<connect site1="a{k}" site2="b{k}"/>' for k in range(len(m["loops"])))
     return f"""<mujoco model="{m["name"]}">
 <compiler angle="radian" autolimits="false" boundmass="0" boundinertia="0"/>
@@ -130,6 +242,6 @@ def mjcf(m):
 <worldbody>{"".join(lines)}</worldbody>
 <equality>{connects}</equality>
 <actuator>{motors}</actuator>
-<keyframe><key qpos="{spread(m["q0"])}" qvel="{spread(m["v0"])}"/></keyframe>
+<keyframe><key qpos="{spread(q0)}" qvel="{spread(m["v0"])}"/></keyframe>
 </mujoco>
 """

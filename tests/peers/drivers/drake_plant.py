@@ -11,9 +11,21 @@ import time
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.multibody.tree import (
+    BallRpyJoint,
+    FixedOffsetFrame,
+    PrismaticJoint,
+    PrismaticSpring,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+    RevoluteSpring,
+    SpatialInertia,
+    UnitInertia,
+)
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
+AXIAL = {"hinge": (RevoluteJoint, RevoluteSpring), "slide": (PrismaticJoint, PrismaticSpring)}
+TURNING = {"ball": BallRpyJoint, "free": QuaternionFloatingJoint}
 INTEGRATORS = {"rk3": "runge_kutta3", "rk5": "runge_kutta5"}
 
 
@@ -31,9 +43,15 @@ def build(path, time_step):
         parent = plant.world_body() if b["parent"] < 0 else bodies[b["parent"]]
         hinge = FixedOffsetFrame(f"f{i}", parent.body_frame(), RigidTransform(b["pos"]))
         frame = plant.AddFrame(hinge)
-        joint = RevoluteJoint(f"j{i}", frame, bodies[i].body_frame(), b["axis"])
-        joint = plant.AddJoint(joint)
+        ends = f"j{i}", frame, bodies[i].body_frame()
+        if b.get("type") in TURNING:
+            plant.AddJoint(TURNING[b["type"]](*ends))
+            continue
+        kind, spring = AXIAL[b.get("type", "hinge")]
+        joint = plant.AddJoint(kind(*ends, b["axis"], damping=b.get("damping", 0.0)))
         plant.AddJointActuator(f"m{i}", joint)
+        if b.get("stiffness"):
+            plant.AddForceElement(spring(joint, b["rest"], b["stiffness"]))
     for loop in m["loops"]:
         a, b = bodies[loop["body_a"]], bodies[loop["body_b"]]
         plant.AddBallConstraint(a, loop["at_a"], b, loop["at_b"])
