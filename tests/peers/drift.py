@@ -74,7 +74,8 @@ def plot(curves, path):
             points = [(at[k], abs(means[k] - means[0])) for k in every if k < PARTS and means[k] != means[0]]
             axis.loglog(*zip(*points), marker=".", linewidth=1, color=f"C{index + 1}", label=engine)
         axis.loglog(*own, marker="*", markersize=10, linestyle="", color="C0", label="plantd")
-        axis.set(title=name, xlabel="steps", ylabel="energy from its start", ylim=(1e-16, 10))
+        axis.set_title(name, fontsize=10)
+        axis.set(xlabel="steps", ylabel="energy from its start", ylim=(1e-16, 10))
         axis.minorticks_off()
         axis.grid(alpha=0.3)
     axes.flat[-1].axis("off")

@@ -258,6 +258,7 @@ ENGINES = [
 def stress(*arguments):
     """Rows of the stress suite by name: what it found."""
     out = compare.TARGET / "stress"
+    (out / "stress.md").unlink(missing_ok=True)
     suite = ["cargo", "run", "--quiet", "--release", "--locked", "-p", "plantd-tests", "--bin", "stress", "--"]
     subprocess.run([*suite, *arguments, "--out", str(out)], cwd=compare.ROOT, stdout=subprocess.DEVNULL)
     rows = [line.split(" | ") for line in (out / "stress.md").read_text().splitlines() if line.startswith("| ")]
