@@ -92,7 +92,7 @@ const RUNS: [Long; 13] = [
         speed: 0.0,
         method: (2e-3, 2, 1),
         short: 500_000,
-        long: 10_000_000,
+        long: 100_000_000,
     },
     Long {
         name: "marionette with still hands",
