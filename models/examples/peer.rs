@@ -13,7 +13,7 @@ use std::io::BufRead;
 use std::sync::Arc;
 
 use plantd_models::scene::{Axis, Body, Constraint, Coordinate, Frame, Input, Joint, Point};
-use plantd_models::{Initial, Linearization, Model, Plant, Scene, Settings};
+use plantd_models::{Initial, Linearization, Model, Plant, Precision, Scene, Settings};
 use serde::Deserialize;
 
 /// A mechanism of `tests/peers/mechanisms.py`.
@@ -89,11 +89,15 @@ fn run(
     steps: u64,
     passes: u64,
 ) -> Result<(f64, Vec<f64>), Box<dyn Error>> {
+    let (method, precision) = match method.strip_suffix("-fast") {
+        Some(method) => (method, Precision::Fast),
+        None => (method, Precision::Exact),
+    };
     let (method, order) = match method.strip_prefix("order-") {
         Some(order) => ("midpoint", order.parse()?),
         None => (method, 2),
     };
-    let settings = Settings { time_step_s, order, ..Settings::new(model) };
+    let settings = Settings { time_step_s, order, precision, ..Settings::new(model) };
     let mut plant = Plant::new(Arc::clone(model), settings)?;
     let (q, v) = (mechanism.q0.clone(), mechanism.v0.clone());
     plant.initialize(&Initial::Velocity { q, v })?;

@@ -34,6 +34,13 @@ pub(crate) trait Scalar:
     fn value(self) -> f64;
     /// `(sin x, cos x)`.
     fn sin_cos(self) -> (Self, Self);
+    /// Writes `sin x` and `cos x` of each.
+    #[inline(always)]
+    fn sin_cos_of_all(x: &[Self], out: &mut [[Self; 2]]) {
+        for (x, out) in x.iter().zip(out) {
+            *out = x.sin_cos().into();
+        }
+    }
     /// `√x`; not differentiable at zero.
     fn sqrt(self) -> Self;
     /// `1 / x`.
@@ -56,6 +63,10 @@ impl Scalar for f64 {
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
         trigonometry::sin_cos_of(self)
+    }
+    #[inline(always)]
+    fn sin_cos_of_all(x: &[Self], out: &mut [[Self; 2]]) {
+        trigonometry::sin_cos(x, out);
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
@@ -192,6 +203,176 @@ impl<S: Scalar> SubAssign for Dual<S> {
 }
 
 impl<S: Scalar> MulAssign for Dual<S> {
+    #[inline(always)]
+    fn mul_assign(&mut self, o: Self) {
+        *self = *self * o;
+    }
+}
+
+/// Four numbers side by side, for the same computation on each: a register's worth.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(align(32))]
+pub(crate) struct Lanes(pub(crate) [f64; 4]);
+
+impl Lanes {
+    pub(crate) const COUNT: usize = 4;
+
+    #[inline(always)]
+    fn each(mut self, f: impl Fn(f64) -> f64) -> Self {
+        for x in &mut self.0 {
+            *x = f(*x);
+        }
+        self
+    }
+
+    #[inline(always)]
+    fn with(mut self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
+        for (x, y) in self.0.iter_mut().zip(other.0) {
+            *x = f(*x, y);
+        }
+        self
+    }
+}
+
+impl Scalar for Lanes {
+    const ZERO: Self = Self([0.0; 4]);
+    const ONE: Self = Self([1.0; 4]);
+    #[inline(always)]
+    fn constant(value: f64) -> Self {
+        Self([value; 4])
+    }
+    /// Of the first: nothing that branches on it may run on several numbers.
+    #[inline(always)]
+    fn value(self) -> f64 {
+        self.0[0]
+    }
+    #[inline(always)]
+    fn sin_cos(self) -> (Self, Self) {
+        let mut both = [[0.0; 2]; 4];
+        trigonometry::sin_cos(&self.0, &mut both);
+        let (mut s, mut c) = (self, self);
+        for (i, [sine, cosine]) in both.into_iter().enumerate() {
+            (s.0[i], c.0[i]) = (sine, cosine);
+        }
+        (s, c)
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.each(f64::sqrt)
+    }
+    #[inline(always)]
+    fn recip(self) -> Self {
+        self.each(f64::recip)
+    }
+    #[inline(always)]
+    fn tanh(self) -> Self {
+        self.each(libm::tanh)
+    }
+}
+
+/// One number, or several side by side, of a list.
+pub(crate) trait Side: Scalar {
+    /// The first of the list.
+    fn load(list: &[f64]) -> Self;
+    /// Replaces the first of the list.
+    fn store(self, list: &mut [f64]);
+}
+
+impl Side for f64 {
+    #[inline(always)]
+    fn load(list: &[f64]) -> Self {
+        list[0]
+    }
+    #[inline(always)]
+    fn store(self, list: &mut [f64]) {
+        list[0] = self;
+    }
+}
+
+impl Side for Lanes {
+    #[inline(always)]
+    fn load(list: &[f64]) -> Self {
+        let mut lanes = [0.0; 4];
+        lanes.copy_from_slice(&list[..4]);
+        Self(lanes)
+    }
+    #[inline(always)]
+    fn store(self, list: &mut [f64]) {
+        list[..4].copy_from_slice(&self.0);
+    }
+}
+
+impl Neg for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn neg(self) -> Self {
+        self.each(|x| -x)
+    }
+}
+
+impl Add for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn add(self, o: Self) -> Self {
+        self.with(o, |x, y| x + y)
+    }
+}
+
+impl Add<f64> for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn add(self, o: f64) -> Self {
+        self.each(|x| x + o)
+    }
+}
+
+impl AddAssign for Lanes {
+    #[inline(always)]
+    fn add_assign(&mut self, o: Self) {
+        *self = *self + o;
+    }
+}
+
+impl Sub for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn sub(self, o: Self) -> Self {
+        self.with(o, |x, y| x - y)
+    }
+}
+
+impl Sub<f64> for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn sub(self, o: f64) -> Self {
+        self.each(|x| x - o)
+    }
+}
+
+impl SubAssign for Lanes {
+    #[inline(always)]
+    fn sub_assign(&mut self, o: Self) {
+        *self = *self - o;
+    }
+}
+
+impl Mul for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn mul(self, o: Self) -> Self {
+        self.with(o, |x, y| x * y)
+    }
+}
+
+impl Mul<f64> for Lanes {
+    type Output = Self;
+    #[inline(always)]
+    fn mul(self, o: f64) -> Self {
+        self.each(|x| x * o)
+    }
+}
+
+impl MulAssign for Lanes {
     #[inline(always)]
     fn mul_assign(&mut self, o: Self) {
         *self = *self * o;

@@ -41,6 +41,13 @@ const MOST_TURNS: f64 = 1_048_576.0;
 /// loses to rounding is kept. `per_radian` is `1/2π`; with zero, or within half a turn, it is the sum.
 #[inline(always)]
 pub(crate) fn unwound(angle: f64, more: f64, per_radian: f64) -> f64 {
+    let [angle, rest] = without_turns(angle, per_radian);
+    angle + (more + rest)
+}
+
+/// The same without `more`, as a sum of two numbers.
+#[inline(always)]
+pub(crate) fn without_turns(angle: f64, per_radian: f64) -> [f64; 2] {
     let turns = (angle * per_radian + TO_INTEGER) - TO_INTEGER;
     let turns = if turns.abs() <= MOST_TURNS { turns } else { 0.0 };
     // Up to the last line nothing is lost, as in the reduction below.
@@ -48,7 +55,7 @@ pub(crate) fn unwound(angle: f64, more: f64, per_radian: f64) -> f64 {
     let second = turns * (4.0 * PARTS[1]);
     let difference = first - second;
     let lost = (first - difference) - second;
-    difference + (more + (lost - turns * (4.0 * PARTS[2])))
+    [difference, lost - turns * (4.0 * PARTS[2])]
 }
 
 /// Writes the sine and the cosine of each angle; about 25 flops each.

@@ -437,7 +437,7 @@ fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f6
 impl Workspace {
     fn energy_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Energy {
         self.gradient_at(model, state, velocity);
-        let (poses, momenta) = (&self.poses, &self.momenta);
+        let (poses, momenta) = (&self.mechanics.poses, &self.mechanics.momenta);
         Energy {
             kinetic_j: 0.5 * momenta.twice_kinetic_energy(&model.dynamics, velocity),
             potential_j: potential_energy(model, poses, momenta, &state.q),
@@ -455,10 +455,10 @@ impl Workspace {
         for (matrix, orientation) in self.orientations_start.iter_mut().zip(&state.orientations) {
             *matrix = orientation.matrix();
         }
-        self.poses.evaluate(&model.dynamics, &state.q, &self.orientations_start);
-        self.momenta.gradient(
+        self.mechanics.poses.evaluate(&model.dynamics, &state.q, &self.orientations_start);
+        self.mechanics.momenta.gradient(
             &model.dynamics,
-            &self.poses,
+            &self.mechanics.poses,
             velocity,
             model.gravity,
             &mut self.l_q,
@@ -482,9 +482,17 @@ impl Workspace {
         let velocity = std::mem::take(&mut self.velocity);
         self.gradient_at(model, state, &velocity);
         self.velocity = velocity;
-        self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
+        self.mechanics.curvature.evaluate(
+            &model.dynamics,
+            &self.mechanics.poses,
+            &self.mechanics.momenta,
+        );
         self.factors.matrix.clear();
-        self.curvature.fill_mass_matrix(&model.pairs, &self.momenta, &mut self.factors.matrix);
+        self.mechanics.curvature.fill_mass_matrix(
+            &model.pairs,
+            &self.mechanics.momenta,
+            &mut self.factors.matrix,
+        );
         let pivot =
             self.factors.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.iter_mut().enumerate() {

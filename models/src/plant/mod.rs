@@ -1,7 +1,7 @@
 //! Plants: a model with a state and a workspace.
 //!
 //! The files in the order in which a step runs: [`initial`], [`predictor`], [`kinematics`], [`momenta`],
-//! [`vectors`], [`potentials`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`],
+//! [`mechanics`], [`vectors`], [`potentials`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`],
 //! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
 //! [`linearize`]; [`scheme`], [`collocation`] and [`period`] (higher order, substeps); [`blocks`] and
 //! [`second_order`]; then
@@ -21,6 +21,7 @@ mod initial;
 mod kinematics;
 pub(crate) mod known;
 mod linearize;
+mod mechanics;
 mod momenta;
 mod newton;
 mod period;
@@ -494,6 +495,12 @@ impl Model {
         if u.len() != d.input() {
             return Err(StepError::Dimension { expected: d.input(), actual: u.len() });
         }
+        self.check_finite(u)
+    }
+
+    /// Refuses an input, or its first entries, with a number that is not finite.
+    pub(crate) fn check_finite(&self, u: &[f64]) -> Result<(), StepError> {
+        let d = self.dimensions;
         match u.iter().position(|value| !value.is_finite()) {
             None => Ok(()),
             Some(index) => {

@@ -18,12 +18,10 @@ use crate::Model;
 use crate::model::Solver;
 use crate::plant::blocks::StepBlocks;
 use crate::plant::closure::{Closure, larger, largest};
-use crate::plant::curvature::Curvature;
 use crate::plant::forces::Instant;
-use crate::plant::kinematics::Poses;
-use crate::plant::momenta::Momenta;
+use crate::plant::mechanics::Mechanics;
 use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::planar::{Of, PlanarTree};
+use crate::plant::planar::Of;
 use crate::plant::rows::{Term, padded, spread};
 use crate::plant::{PreciseState, Precision, Settings, StepError, StepReport, forces, potentials};
 use crate::spatial::{Mat3, Vec3};
@@ -66,7 +64,7 @@ pub(crate) struct Workspace {
     /// The same with angles of hinges less their whole turns, in which they keep all digits.
     pub(crate) angles: Vec<f64>,
     /// `1/2π` for the coordinates of hinges, else zero.
-    turns_per_radian: Vec<f64>,
+    pub(crate) turns_per_radian: Vec<f64>,
     /// Configuration at the end.
     pub(crate) q_end: Vec<f64>,
     /// Orientations of ball joints at the start, the midpoint and the end.
@@ -91,17 +89,13 @@ pub(crate) struct Workspace {
     magnitudes: Vec<f64>,
     pub(crate) round_off: f64,
     pub(crate) constraint_residual: Vec<f64>,
-    /// What follows from configuration and velocity at the midpoint: in the plane where the scene allows
-    /// it, else in space.
-    pub(crate) planar: Option<Box<PlanarTree>>,
+    /// At the midpoint.
+    pub(crate) mechanics: Mechanics,
     pub(crate) factors: Factors,
     /// What springs and dampers of coordinates add to its diagonal.
     diagonal: Vec<f64>,
     /// The same for the linearization: of the residual by the start, of the momentum by the increment.
     pub(crate) diagonals: [Vec<f64>; 2],
-    pub(crate) poses: Poses,
-    pub(crate) momenta: Momenta,
-    pub(crate) curvature: Curvature,
     /// Constraints at `q[k]`.
     pub(crate) start: Closure,
     /// `start` holds the constraints at the state's configuration.
@@ -186,13 +180,10 @@ impl Workspace {
             magnitudes: zeros(nd),
             round_off: 0.0,
             constraint_residual: zeros(nc),
-            planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
+            mechanics: Mechanics::new(model),
             factors: Factors::new(model),
             diagonal: zeros(nd),
             diagonals: [zeros(nd), zeros(nd)],
-            poses: Poses::new(&model.dynamics),
-            momenta: Momenta::new(&model.dynamics),
-            curvature: Curvature::new(&model.dynamics),
             start: Closure::new(model),
             start_is_valid: false,
             end: Closure::new(model),
@@ -284,7 +275,7 @@ impl Workspace {
     /// Guess: the velocity that belongs to the momentum goes on.
     pub(crate) fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
         if let (Some(planar), Some(joints), Some(generators)) =
-            (&mut self.planar, &model.planar, &mut self.factors.generators)
+            (&mut self.mechanics.planar, &model.planar, &mut self.factors.generators)
         {
             let h = settings.time_step_s;
             self.velocity.fill(0.0);
@@ -419,24 +410,14 @@ impl Workspace {
 
     /// Gradient of the Lagrangian and forces at the midpoint.
     pub(crate) fn evaluate_lagrangian(&mut self, model: &Model) {
-        if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
-            planar.gradient(joints, &self.angles, &self.velocity, &mut self.l_q, &mut self.l_v);
-        } else {
-            self.poses.evaluate(&model.dynamics, &self.angles, &self.orientations_mid);
-            self.momenta.gradient(
-                &model.dynamics,
-                &self.poses,
-                &self.velocity,
-                model.gravity,
-                &mut self.l_q,
-                &mut self.l_v,
-            );
-        }
+        let (orientations, derivatives) =
+            (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
+        self.mechanics.gradient(model, &self.angles, orientations, &self.velocity, derivatives);
         if model.potentials.any {
             potentials::add_gradient(
                 &model.potentials,
                 &model.dynamics,
-                &self.poses,
+                &self.mechanics.poses,
                 &self.q_mid,
                 &mut self.l_q,
             );
@@ -458,8 +439,8 @@ impl Workspace {
     pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a> {
         Instant {
             tree: &model.dynamics,
-            poses: &self.poses,
-            momenta: &self.momenta,
+            poses: &self.mechanics.poses,
+            momenta: &self.mechanics.momenta,
             velocity: &self.velocity,
             inputs: &self.inputs,
         }

@@ -26,95 +26,95 @@ use crate::model::Pair;
 use crate::planar::PlanarJoint;
 use crate::plant::curvature::SecondDerivatives;
 use crate::plant::tree_lu::TreeLu;
-use crate::trigonometry::sin_cos;
+use crate::scalar::Scalar;
 use crate::wide::wide;
 
 /// A vector in the plane.
-type Vec2 = [f64; 2];
+type Vec2<S = f64> = [S; 2];
 /// A twist or a wrench: the angular part first.
-type Vec3 = [f64; 3];
+type Vec3<S = f64> = [S; 3];
 
 /// A joint at a configuration and velocity.
 #[derive(Clone, Copy, Debug, Default)]
-struct Link {
+struct Link<S = f64> {
     /// From the parent joint to this one.
-    edge: Vec2,
+    edge: Vec2<S>,
     /// Where the joint is, from the origin of the tree; set by [`PlanarTree::differentiate`].
-    position: Vec2,
+    position: Vec2<S>,
     /// `d` of a slider; zero for a hinge.
-    slide: Vec2,
+    slide: Vec2<S>,
     /// Linear part of `J̇`.
-    rate: Vec2,
+    rate: Vec2<S>,
     /// Twist of the body.
-    twist: Vec3,
+    twist: Vec3<S>,
     /// Momentum of the subtree, and its first moment of mass.
-    momentum: Vec3,
-    moment: Vec2,
+    momentum: Vec3<S>,
+    moment: Vec2<S>,
     /// Inertia of the body, and a sum over what hangs from it.
-    inertia: f64,
-    inertia_below: f64,
+    inertia: S,
+    inertia_below: S,
     /// `F`.
-    force: Vec3,
+    force: Vec3<S>,
     /// `P`.
-    slope: Vec3,
+    slope: Vec3<S>,
     /// `f × g` for the linear part `f` of `F`.
-    weight: f64,
+    weight: S,
 }
 
 /// A planar tree at a configuration and velocity. The first entry of each list is the world.
 #[derive(Clone, Debug)]
-pub(crate) struct PlanarTree {
-    links: Vec<Link>,
-    angles: Vec<f64>,
+pub(crate) struct PlanarTree<S = f64> {
+    links: Vec<Link<S>>,
+    angles: Vec<S>,
     /// Sine and cosine of the angle of each body.
-    directions: Vec<Vec2>,
+    directions: Vec<Vec2<S>>,
 }
 
 #[inline(always)]
-fn cross(a: Vec2, b: Vec2) -> f64 {
+fn cross<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> S {
     a[0] * b[1] - a[1] * b[0]
 }
 
 #[inline(always)]
-fn dot(a: Vec2, b: Vec2) -> f64 {
+fn dot<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> S {
     a[0] * b[0] + a[1] * b[1]
 }
 
 #[inline(always)]
-fn add(a: Vec2, b: Vec2) -> Vec2 {
+fn add<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> Vec2<S> {
     [a[0] + b[0], a[1] + b[1]]
 }
 
 /// `ẑ × v`, times `w`.
 #[inline(always)]
-fn spun(w: f64, v: Vec2) -> Vec2 {
+fn spun<S: Scalar>(w: S, v: Vec2<S>) -> Vec2<S> {
     [-w * v[1], w * v[0]]
 }
 
 /// `v` turned by the angle of which sine and cosine are given.
 #[inline(always)]
-fn turned([s, c]: Vec2, v: Vec2) -> Vec2 {
+fn turned<S: Scalar>([s, c]: Vec2<S>, v: Vec2) -> Vec2<S> {
     [c * v[0] - s * v[1], s * v[0] + c * v[1]]
 }
 
 /// One turn after the other.
 #[inline(always)]
-fn combined([s, c]: Vec2, [s1, c1]: Vec2) -> Vec2 {
+fn combined<S: Scalar>([s, c]: Vec2<S>, [s1, c1]: Vec2<S>) -> Vec2<S> {
     [s * c1 + c * s1, c * c1 - s * s1]
 }
 
 #[inline(always)]
-fn linear(v: Vec3) -> Vec2 {
+fn linear<S: Scalar>(v: Vec3<S>) -> Vec2<S> {
     [v[1], v[2]]
 }
 
-impl PlanarTree {
+impl<S: Scalar> PlanarTree<S> {
     pub(crate) fn new(joints: &[PlanarJoint]) -> Self {
         let n = joints.len() + 1;
         Self {
             links: vec![Link::default(); n],
-            angles: vec![0.0; joints.len()],
-            directions: vec![[0.0, 1.0]; n],
+            angles: vec![S::ZERO; joints.len()],
+            directions: vec![[S::ZERO, S::ONE]; n],
         }
     }
 
@@ -125,10 +125,10 @@ impl PlanarTree {
         pub(crate) fn gradient(
             mut self,
             joints: &[PlanarJoint],
-            q: &[f64],
-            velocity: &[f64],
-            l_q: &mut [f64],
-            l_v: &mut [f64],
+            q: &[S],
+            velocity: &[S],
+            l_q: &mut [S],
+            l_v: &mut [S],
         ) = gradient_portable, gradient_avx2;
     }
 
@@ -136,15 +136,15 @@ impl PlanarTree {
     fn gradient_portable(
         &mut self,
         joints: &[PlanarJoint],
-        q: &[f64],
-        velocity: &[f64],
-        l_q: &mut [f64],
-        l_v: &mut [f64],
+        q: &[S],
+        velocity: &[S],
+        l_q: &mut [S],
+        l_v: &mut [S],
     ) {
         for (i, joint) in joints.iter().enumerate() {
-            self.angles[i] = joint.turn * q[joint.coordinate];
+            self.angles[i] = q[joint.coordinate] * joint.turn;
         }
-        sin_cos(&self.angles, &mut self.directions[1..]);
+        S::sin_cos_of_all(&self.angles, &mut self.directions[1..]);
         let (links, directions) = (&mut self.links[..], &mut self.directions[..]);
         for (i, joint) in joints.iter().enumerate() {
             let (parent, above) = (links[joint.parent].twist, directions[joint.parent]);
@@ -163,15 +163,15 @@ impl PlanarTree {
             } else {
                 link.edge = turned(above, joint.offset);
                 let v = add(linear(parent), spun(w, link.edge));
-                link.rate = spun(-joint.turn, v);
-                twist = [w + joint.turn * rate, v[0], v[1]];
+                link.rate = spun(S::constant(-joint.turn), v);
+                twist = [w + rate * joint.turn, v[0], v[1]];
             }
             let arm = turned(direction, joint.center);
             let f = add(linear(twist), spun(twist[0], arm)).map(|v| v * joint.mass);
             link.twist = twist;
-            link.momentum = [joint.inertia * twist[0] + cross(arm, f), f[0], f[1]];
+            link.momentum = [twist[0] * joint.inertia + cross(arm, f), f[0], f[1]];
             link.moment = arm.map(|x| x * joint.mass);
-            link.inertia = joint.inertia + joint.mass * dot(arm, arm);
+            link.inertia = dot(arm, arm) * joint.mass + joint.inertia;
         }
         for (i, joint) in joints.iter().enumerate().rev() {
             let Link { edge, momentum, moment, slide, rate, .. } = links[i + 1];
@@ -181,15 +181,15 @@ impl PlanarTree {
                 parent.momentum[0] += momentum[0] + cross(edge, f);
                 parent.momentum[1] += f[0];
                 parent.momentum[2] += f[1];
-                parent.moment[0] += moment[0] + mass * edge[0];
-                parent.moment[1] += moment[1] + mass * edge[1];
+                parent.moment[0] += moment[0] + edge[0] * mass;
+                parent.moment[1] += moment[1] + edge[1] * mass;
             }
             if let (Some(l_q), Some(l_v)) =
                 (l_q.get_mut(joint.coordinate), l_v.get_mut(joint.coordinate))
             {
-                let (s, g) = (joint.turn, joint.gravity);
-                *l_v = s * momentum[0] + dot(slide, f);
-                *l_q = dot(rate, f) + s * cross(moment, g) + mass * dot(slide, g);
+                let (s, g) = (joint.turn, joint.gravity.map(S::constant));
+                *l_v = momentum[0] * s + dot(slide, f);
+                *l_q = dot(rate, f) + cross(moment, g) * s + dot(slide, g) * mass;
             }
         }
     }
@@ -203,14 +203,15 @@ impl PlanarTree {
             let inertia = link.inertia + std::mem::take(&mut link.inertia_below);
             let (edge, moment, slide, rate) = (link.edge, link.moment, link.slide, link.rate);
             let (s, mass, f) = (joint.turn, joint.subtree_mass, linear(link.momentum));
-            let push = add(spun(s, moment), slide.map(|d| d * mass));
-            link.force = [s * inertia + cross(moment, slide), push[0], push[1]];
-            let pull = add(spun(s, f), rate.map(|a| a * mass));
+            let turn = S::constant(s);
+            let push = add(spun(turn, moment), slide.map(|d| d * mass));
+            link.force = [inertia * s + cross(moment, slide), push[0], push[1]];
+            let pull = add(spun(turn, f), rate.map(|a| a * mass));
             link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
-            link.weight = cross(push, joint.gravity);
+            link.weight = cross(push, joint.gravity.map(S::constant));
             if joint.parent > 0 {
                 links[joint.parent].inertia_below +=
-                    inertia + 2.0 * dot(edge, moment) + mass * dot(edge, edge);
+                    inertia + dot(edge, moment) * 2.0 + dot(edge, edge) * mass;
             }
         }
     }
@@ -222,12 +223,12 @@ impl PlanarTree {
         for (i, joint) in joints.iter().enumerate() {
             // The root of a tree is its origin, unless that moves on.
             links[i + 1].position = match joint.parent {
-                0 => [0.0; 2],
+                0 => [S::ZERO; 2],
                 parent => add(links[parent].position, links[i + 1].edge),
             };
             if joint.anchor {
                 // All joints placed so far in its tree are its ancestors.
-                links[i + 1].position = [0.0; 2];
+                links[i + 1].position = [S::ZERO; 2];
                 let mut below = i + 1;
                 while joints[below - 1].parent > 0 {
                     let parent = joints[below - 1].parent;
@@ -246,22 +247,24 @@ impl PlanarTree {
         joints: &[PlanarJoint],
         ancestor: usize,
         descendant: usize,
-    ) -> SecondDerivatives {
+    ) -> SecondDerivatives<S> {
         let (above, below) = (&self.links[ancestor + 1], &self.links[descendant + 1]);
         let s = joints[ancestor].turn;
         let arm = [below.position[0] - above.position[0], below.position[1] - above.position[1]];
-        let along = |wrench: Vec3| {
+        let along = |wrench: Vec3<S>| {
             let f = linear(wrench);
-            s * (wrench[0] + cross(arm, f)) + dot(above.slide, f)
+            (wrench[0] + cross(arm, f)) * s + dot(above.slide, f)
         };
         SecondDerivatives {
-            qq: dot(above.rate, linear(below.slope)) + s * below.weight,
+            qq: dot(above.rate, linear(below.slope)) + below.weight * s,
             v_above_q_below: along(below.slope),
             q_above_v_below: dot(above.rate, linear(below.force)),
             vv: along(below.force),
         }
     }
+}
 
+impl PlanarTree {
     /// Writes the Jacobian of the residual by the increment, without springs and forces, entry by entry.
     #[inline(never)]
     pub(crate) fn fill_newton_matrix(

@@ -298,14 +298,22 @@ impl Stages {
     pub(crate) fn predict(&self, tableau: &Tableau, motion: &mut [f64]) -> bool {
         let stages = tableau.nodes.len();
         let count = motion.len() / (2 * stages);
-        for (row, next) in motion.chunks_exact_mut(count.max(1)).enumerate() {
-            let (half, i) = (row / stages, row % stages);
-            next.fill(0.0);
-            for j in 0..stages {
-                let last = if j + 1 == stages { 1.0 } else { 0.0 };
-                let weight = if self.is_even { tableau.onward[i * stages + j] } else { last };
-                let past = &self.motion[(half * stages + j) * count..][..count];
-                next.iter_mut().zip(past).for_each(|(next, past)| *next += weight * past);
+        for half in 0..2 {
+            for a in 0..count {
+                let entry = |j: usize| (half * stages + j) * count + a;
+                let last = if self.is_even { 0.0 } else { self.motion[entry(stages - 1)] };
+                let mut next = [last; STAGES_MAX];
+                if self.is_even {
+                    for (j, column) in tableau.onward.chunks_exact(stages).enumerate() {
+                        let past = self.motion[entry(j)];
+                        for (next, weight) in next.iter_mut().zip(column) {
+                            *next += weight * past;
+                        }
+                    }
+                }
+                for (i, next) in next[..stages].iter().enumerate() {
+                    motion[entry(i)] = *next;
+                }
             }
         }
         self.is_known

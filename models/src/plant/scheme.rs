@@ -105,7 +105,7 @@ pub(crate) struct Tableau {
     /// `μ_ij`, row-major.
     pub(crate) coupling: Vec<f64>,
     /// The velocities of the next step from those of the last: the collocation polynomial one step on,
-    /// row-major.
+    /// column after column.
     pub(crate) onward: Vec<f64>,
 }
 
@@ -151,8 +151,8 @@ impl Tableau {
                 // Two that add up to 1 exactly: the larger is rounded, the smaller what is left.
                 let larger = 0.5 + 0.5 * skew.abs();
                 coupling.push(if skew < 0.0 { 1.0 - larger } else { larger });
-                let others = nodes.iter().enumerate().filter(|(k, _)| *k != j);
-                let factors = others.map(|(_, c)| (1.0 + nodes[i] - c) / (nodes[j] - c));
+                let others = nodes.iter().enumerate().filter(|(k, _)| *k != i);
+                let factors = others.map(|(_, c)| (1.0 + nodes[j] - c) / (nodes[i] - c));
                 onward.push(factors.product());
             }
         }
@@ -192,8 +192,9 @@ mod tests {
     fn the_polynomial_goes_on() {
         let tableau = Tableau::new(4);
         let motion = |t: f64| 1.0 - t + 0.5 * t * t - 2.0 * t * t * t;
-        for (row, c) in tableau.onward.chunks(4).zip(&tableau.nodes) {
-            let next: f64 = row.iter().zip(&tableau.nodes).map(|(e, c)| e * motion(*c)).sum();
+        for (i, c) in tableau.nodes.iter().enumerate() {
+            let row = tableau.onward.iter().skip(i).step_by(4);
+            let next: f64 = row.zip(&tableau.nodes).map(|(e, c)| e * motion(*c)).sum();
             assert!((next - motion(1.0 + c)).abs() < 1e-12, "{next}");
         }
     }

@@ -9,6 +9,7 @@
 //! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
 
 use super::Collocation;
+use super::system::System;
 use crate::plant::StepError;
 use crate::plant::dense_lu::DenseLu;
 use crate::plant::linearize::Linearization;
@@ -26,11 +27,12 @@ pub(crate) struct StageTangents {
     pub(crate) q: Vec<f64>,
     pub(crate) velocity: Vec<f64>,
     pub(crate) inputs: Vec<f64>,
-    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `s n` padded rows.
+    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `n s` padded rows: those of the stages of a
+    /// coordinate side by side.
     pub(crate) tangent: Vec<f64>,
-    /// `∂P_i/∂θ`, row-major, `s n` rows.
+    /// `∂P_i/∂θ`, the same way.
     impulses: Vec<f64>,
-    /// `Σ ∂P_i/∂Y`, row-major, n by `s n`.
+    /// `Σ ∂P_i/∂Y`, row-major, n by `n s`.
     pub(crate) slopes: Vec<f64>,
     /// The factors of `∂R/∂Y`.
     pub(crate) matrix: DenseLu,
@@ -47,11 +49,14 @@ impl Collocation {
     ) -> Result<(), StepError> {
         let model = at.model;
         let d = model.dimensions;
-        let (count, n, nd) = (self.stages.len(), d.coordinates(), d.dynamic);
+        let (count, n, nd) = (self.tableau.nodes.len(), d.coordinates(), d.dynamic);
         let h = at.settings.time_step_s;
         let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
         let stride = padded((next + d.prescribed).max(1));
-        let mut system = self.take_system(model);
+        let system = match &mut self.system {
+            Some(system) => system,
+            system => system.insert(Box::new(System::new(model, &self.tableau))),
+        };
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {
                 time_step_s: h,
@@ -64,42 +69,45 @@ impl Collocation {
                 tangent: vec![0.0; count * nd * stride],
                 impulses: vec![0.0; count * nd * stride],
                 slopes: vec![0.0; nd * count * nd],
-                matrix: DenseLu::new(count * nd),
+                matrix: system.matrix.clone(),
                 terms: Vec::new(),
             })
         });
+        system.begin(at, &self.motion, &self.inputs, &mut workspace.input_force);
+        system.evaluate(workspace, at, &self.inputs);
+        system.differentiate(workspace, at, &self.inputs);
         for i in 0..count {
-            self.evaluate(workspace, at, i);
-            system.hessians[i].take(model, workspace);
+            system.place(workspace, at.state, i);
             tangents.q[i * n..][..n].copy_from_slice(&workspace.q_mid);
             tangents.velocity[i * n..][..n].copy_from_slice(&workspace.velocity);
-            tangents.inputs[i * d.inputs..][..d.inputs].copy_from_slice(&self.stages[i].inputs);
         }
-        self.sum_up(workspace, at);
-        self.fill_system(model, at.settings, &mut system);
+        tangents.inputs.copy_from_slice(&self.inputs);
+        workspace.prepare(at);
+        system.fill_matrix(n);
         if !system.matrix.factor() {
-            self.system = Some(system);
             return Err(StepError::NotFinite { iterations: 0 });
         }
+        let (hessian, width) = system.hessian();
         let StageTangents { coupling, tangent, impulses, slopes, terms, .. } = &mut *tangents;
         tangent.fill(0.0);
         impulses.fill(0.0);
         slopes.fill(0.0);
-        for (j, hessian) in system.hessians.iter().enumerate() {
+        for j in 0..count {
             let (weight, node) = (self.tableau.weights[j], self.tableau.nodes[j]);
             let length = h * weight;
             for a in 0..nd {
-                let row = &mut impulses[(j * nd + a) * stride..][..stride];
-                let own = &mut tangent[(j * nd + a) * stride..][..stride];
+                let row = &mut impulses[(a * count + j) * stride..][..stride];
+                let own = &mut tangent[(a * count + j) * stride..][..stride];
                 for b in 0..n {
-                    let (q, v) = (length * hessian.qq[a * n + b], hessian.qv[a * n + b]);
-                    let (p_q, p_v) = (hessian.vq[a * n + b], hessian.vv[a * n + b]);
+                    let entry = (a * n + b) * width + j;
+                    let (q, v) = (length * hessian.qq[entry], hessian.qv[entry]);
+                    let (p_q, p_v) = (hessian.vq[entry], hessian.vv[entry]);
                     if b < nd {
                         row[b] = q;
                         own[b] = -p_q;
-                        slopes[a * count * nd + j * nd + b] += v;
+                        slopes[a * count * nd + b * count + j] += v;
                         for k in 0..count {
-                            slopes[a * count * nd + k * nd + b] += q * coupling[j * count + k];
+                            slopes[a * count * nd + b * count + k] += q * coupling[j * count + k];
                         }
                     } else {
                         row[b] = (1.0 - node) * q - weight * v;
@@ -109,7 +117,7 @@ impl Collocation {
                     }
                 }
                 for input in 0..d.inputs {
-                    row[inputs + input] = length * hessian.qu[a * d.inputs + input];
+                    row[inputs + input] = length * hessian.qu[(a * d.inputs + input) * width + j];
                 }
                 own[momentum + a] = 1.0;
             }
@@ -117,8 +125,8 @@ impl Collocation {
         for i in 0..count {
             for a in 0..nd {
                 terms.clear();
-                terms.extend((0..count).map(|j| (coupling[i * count + j], j * nd + a)));
-                let target = &mut tangent[(i * nd + a) * stride..][..stride];
+                terms.extend((0..count).map(|j| (coupling[i * count + j], a * count + j)));
+                let target = &mut tangent[(a * count + i) * stride..][..stride];
                 add_rows(target, impulses, stride, terms);
             }
         }
@@ -130,7 +138,7 @@ impl Collocation {
         for a in 0..nd {
             increment.fill(0.0);
             terms.clear();
-            terms.extend((0..count).map(|i| (1.0, i * nd + a)));
+            terms.extend((0..count).map(|i| (1.0, a * count + i)));
             add_rows(&mut increment, tangent, stride, terms);
             moved.fill(0.0);
             moved[momentum + a] = 1.0;
@@ -145,7 +153,6 @@ impl Collocation {
         tangents.time_step_s = h;
         tangents.matrix.take_factors_of(&system.matrix);
         out.keep_stages(tangents);
-        self.system = Some(system);
         Ok(())
     }
 }

@@ -1,8 +1,6 @@
 //! Linearizes the step that is solved in a workspace.
 
 use super::{Kind, Linearization};
-use crate::Model;
-use crate::plant::curvature::SecondDerivatives;
 use crate::plant::newton::{At, Workspace};
 use crate::plant::rows::{add_rows, add_rows_portable, padded};
 use crate::plant::{StepError, planar, potentials};
@@ -35,20 +33,6 @@ impl Workspace {
             self.stiffness[i * nd..][..nd]
                 .copy_from_slice(&blocks.momentum_start[row.clone()][..nd]);
             self.end_slopes[i * nd..][..nd].copy_from_slice(&blocks.momentum_next[row][..nd]);
-        }
-    }
-
-    /// Second derivatives of the Lagrangian for a pair of joints on one path to the root.
-    #[inline(always)]
-    pub(crate) fn pair(
-        &self,
-        model: &Model,
-        ancestor: usize,
-        descendant: usize,
-    ) -> SecondDerivatives {
-        match (&self.planar, &model.planar) {
-            (Some(planar), Some(joints)) => planar.pair(joints, ancestor, descendant),
-            _ => self.curvature.pair(&self.momenta, model.gravity, ancestor, descendant),
         }
     }
 
@@ -104,7 +88,7 @@ impl Workspace {
             place.residual = out.at_start * place.momentum;
         }
         let (Some(planar), Some(joints), Some(generators)) =
-            (&self.planar, &model.planar, &mut self.factors.generators)
+            (&self.mechanics.planar, &model.planar, &mut self.factors.generators)
         else {
             return Ok(());
         };
@@ -116,7 +100,7 @@ impl Workspace {
             potentials::for_each_second_derivative(
                 &model.potentials,
                 &model.dynamics,
-                &self.poses,
+                &self.mechanics.poses,
                 &self.q_mid,
                 |i, _, value| residual[i] -= 0.5 * h * value,
             );
@@ -161,7 +145,8 @@ impl Workspace {
         self.end_slopes.fill(0.0);
         for pair in &model.pairs {
             let (i, j) = (pair.row as usize, pair.column as usize);
-            let second = self.pair(model, pair.ancestor as usize, pair.descendant as usize);
+            let second =
+                self.mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
             let half = 0.5 * h * second.qq;
             out.increment[i * stride + j] = half - second.v_above_q_below;
             out.increment[j * stride + i] = half - second.q_above_v_below;
@@ -171,7 +156,7 @@ impl Workspace {
             self.stiffness[j * nd + i] = h * second.qq;
         }
         for pair in &model.mixed_pairs {
-            let second = self.pair(model, pair.ancestor, pair.descendant);
+            let second = self.mechanics.pair(model, pair.ancestor, pair.descendant);
             let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
             let descendant = model.dynamics.joints[pair.descendant].coordinate;
             // Row of the dynamic coordinate, column of the prescribed one.
@@ -222,7 +207,7 @@ impl Workspace {
         potentials::for_each_second_derivative(
             &model.potentials,
             &model.dynamics,
-            &self.poses,
+            &self.mechanics.poses,
             &self.q_mid,
             |i, j, value| {
                 if i < nd {

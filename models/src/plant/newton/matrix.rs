@@ -52,17 +52,6 @@ impl Workspace {
         Ok(())
     }
 
-    /// Prepares second derivatives of the Lagrangian at the last evaluation, for [`Workspace::pair`].
-    pub(crate) fn differentiate(&mut self, model: &Model) {
-        match (&mut self.planar, &model.planar) {
-            (Some(planar), Some(joints)) => {
-                planar.differentiate(joints);
-                planar.place(joints);
-            }
-            _ => self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta),
-        }
-    }
-
     /// Fills `K` at the last evaluation.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
         if !model.orientations.is_empty() {
@@ -73,13 +62,13 @@ impl Workspace {
         if model.potentials.couple_branches || model.forces.is_some() {
             self.factors.matrix.clear();
         }
-        self.differentiate(model);
-        if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
+        self.mechanics.differentiate(model);
+        if let (Some(planar), Some(joints)) = (&mut self.mechanics.planar, &model.planar) {
             planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.factors.matrix);
         } else {
-            self.curvature.fill_newton_matrix(
+            self.mechanics.curvature.fill_newton_matrix(
                 &model.pairs,
-                &self.momenta,
+                &self.mechanics.momenta,
                 model.gravity,
                 h,
                 &mut self.factors.matrix,
@@ -89,7 +78,7 @@ impl Workspace {
             potentials::add_to_newton_matrix(
                 &model.potentials,
                 &model.dynamics,
-                &self.poses,
+                &self.mechanics.poses,
                 &self.q_mid,
                 h,
                 &model.elimination,
@@ -128,7 +117,7 @@ impl Workspace {
         settings: &Settings,
     ) -> Result<(), StepError> {
         let (Some(planar), Some(joints), Some(generators)) =
-            (&mut self.planar, &model.planar, &mut self.factors.generators)
+            (&mut self.mechanics.planar, &model.planar, &mut self.factors.generators)
         else {
             return self.factor_newton_matrix(model, settings);
         };
@@ -140,7 +129,7 @@ impl Workspace {
             potentials::for_each_second_derivative(
                 &model.potentials,
                 &model.dynamics,
-                &self.poses,
+                &self.mechanics.poses,
                 &self.q_mid,
                 |i, _, value| diagonal[i] -= 0.25 * h * value,
             );

@@ -73,17 +73,21 @@ fn gradients_and_second_derivatives_are_those_in_space() {
         }
         planar.place(joints);
         let workspace = &mut spatial.workspace;
-        workspace.poses.evaluate(&model.dynamics, &q, &[]);
+        workspace.mechanics.poses.evaluate(&model.dynamics, &q, &[]);
         let (mut in_space_q, mut in_space_v) = (vec![0.0; nd], vec![0.0; nd]);
-        workspace.momenta.gradient(
+        workspace.mechanics.momenta.gradient(
             &model.dynamics,
-            &workspace.poses,
+            &workspace.mechanics.poses,
             &v,
             model.gravity,
             &mut in_space_q,
             &mut in_space_v,
         );
-        workspace.curvature.evaluate(&model.dynamics, &workspace.poses, &workspace.momenta);
+        workspace.mechanics.curvature.evaluate(
+            &model.dynamics,
+            &workspace.mechanics.poses,
+            &workspace.mechanics.momenta,
+        );
         let size = |x: &[f64]| 1.0 + x.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
         for i in 0..nd {
             assert_close(l_q[i], in_space_q[i], size(&in_space_q), "∂L/∂q");
@@ -92,8 +96,8 @@ fn gradients_and_second_derivatives_are_those_in_space() {
         for descendant in 0..joints.len() {
             for ancestor in model.dynamics.path(descendant) {
                 let a = planar.pair(joints, ancestor, descendant);
-                let b = workspace.curvature.pair(
-                    &workspace.momenta,
+                let b = workspace.mechanics.curvature.pair(
+                    &workspace.mechanics.momenta,
                     model.gravity,
                     ancestor,
                     descendant,

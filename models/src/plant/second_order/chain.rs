@@ -73,7 +73,7 @@ impl Contraction {
         let mut adjoint = vec![0.0; count * nd];
         for (k, mu) in adjoint.iter_mut().enumerate() {
             let slopes = z_p.iter().enumerate().map(|(a, z)| z * stages.slopes[a * count * nd + k]);
-            *mu = -(z[k % nd] + slopes.sum::<f64>());
+            *mu = -(z[k / count] + slopes.sum::<f64>());
         }
         stages.matrix.solve_transposed(&mut adjoint);
 
@@ -83,7 +83,7 @@ impl Contraction {
             let length = stages.weights[j] * stages.time_step_s;
             self.place_tangent(stages, j, &mut tangent);
             let weight = |a: usize| {
-                let coupled = |i: usize| stages.coupling[i * count + j] * adjoint[i * nd + a];
+                let coupled = |i: usize| stages.coupling[i * count + j] * adjoint[a * count + i];
                 length * (z_p[a] + (0..count).map(coupled).sum::<f64>())
             };
             let weights: Vec<f64> = (0..nd).map(weight).collect();
@@ -91,7 +91,7 @@ impl Contraction {
             let blocks = &mut self.scratch.blocks;
             for i in 0..n {
                 let (alpha, beta) =
-                    if i < nd { (weights[i], -adjoint[j * nd + i]) } else { (0.0, 0.0) };
+                    if i < nd { (weights[i], -adjoint[i * count + j]) } else { (0.0, 0.0) };
                 blocks.q_mid[i] = Dual::new(stages.q[j * n + i], alpha);
                 blocks.velocity[i] = Dual::new(stages.velocity[j * n + i], beta);
             }
@@ -167,10 +167,10 @@ impl Contraction {
             let (q, v) = (&mut by_q[a * stride..][..stride], &mut by_v[a * stride..][..stride]);
             if a < nd {
                 q[a] = 1.0;
-                let coupled = (0..count).map(|k| (stages.coupling[j * count + k], k * nd + a));
+                let coupled = (0..count).map(|k| (stages.coupling[j * count + k], a * count + k));
                 add_rows(q, &stages.tangent, stride, &coupled.collect::<Vec<_>>());
                 let rate = 1.0 / (stages.weights[j] * h);
-                add_rows(v, &stages.tangent, stride, &[(rate, j * nd + a)]);
+                add_rows(v, &stages.tangent, stride, &[(rate, a * count + j)]);
             } else {
                 let next = layout.next() + a - nd;
                 (q[a], q[next]) = (1.0 - node, node);
