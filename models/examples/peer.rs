@@ -4,8 +4,9 @@
 //! start of the mechanism in the JSON file PATH, and answers each with the CPU seconds of its thread and
 //! the last configuration, or with `error:` and a reason. Methods: `midpoint`, `midpoint-ab` (a step
 //! with A and B of all joint torques), the same with `-moving` (without the first step of a pass, which
-//! finds the velocity that a momentum means), `order-4` to `order-12` (Gauss collocation), and `scalar`: the midpoint rule written by hand for a
-//! pendulum.
+//! finds the velocity that a momentum means), `order-4` to `order-12` (Gauss collocation), `order-4-fast`
+//! and so on (solved to what precision `fast` asks for), and `scalar`: the midpoint rule written by hand
+//! for a pendulum.
 
 use std::collections::BTreeMap;
 use std::error::Error;

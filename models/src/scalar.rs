@@ -218,6 +218,11 @@ impl Lanes {
     pub(crate) const COUNT: usize = 4;
 
     #[inline(always)]
+    pub(crate) fn abs(self) -> Self {
+        self.each(f64::abs)
+    }
+
+    #[inline(always)]
     fn each(mut self, f: impl Fn(f64) -> f64) -> Self {
         for x in &mut self.0 {
             *x = f(*x);
@@ -276,7 +281,32 @@ pub(crate) trait Side: Scalar {
     fn load(list: &[f64]) -> Self;
     /// Replaces the first of the list.
     fn store(self, list: &mut [f64]);
+    /// [`trigonometry::unwound`].
+    fn unwound(angle: Self, more: Self, per_radian: Self) -> Self;
 }
+
+/// Computes the entries of lists from those of other lists of the same length, four at a time, then those
+/// that are left. Reading comes before writing, so that compilers need not know that lists do not overlap.
+macro_rules! side_by_side {
+    (for ($($x:ident in $from:expr),+ $(,)?) let $local:pat = $value:expr; {
+        $($out:ident($to:expr) = $result:expr;)+
+    }) => {{
+        $(let $x = <[f64]>::as_chunks::<{ $crate::scalar::Lanes::COUNT }>($from);)+
+        $(let $out = <[f64]>::as_chunks_mut::<{ $crate::scalar::Lanes::COUNT }>($to);)+
+        let (lanes, rest) = [$(($x.0.len(), $x.1.len())),+][0];
+        for i in 0..lanes {
+            $(let $x = $crate::scalar::Lanes($x.0[i]);)+
+            let $local = $value;
+            $($out.0[i] = ($result).0;)+
+        }
+        for i in 0..rest {
+            $(let $x = $x.1[i];)+
+            let $local = $value;
+            $($out.1[i] = $result;)+
+        }
+    }};
+}
+pub(crate) use side_by_side;
 
 impl Side for f64 {
     #[inline(always)]
@@ -286,6 +316,10 @@ impl Side for f64 {
     #[inline(always)]
     fn store(self, list: &mut [f64]) {
         list[0] = self;
+    }
+    #[inline(always)]
+    fn unwound(angle: Self, more: Self, per_radian: Self) -> Self {
+        trigonometry::unwound(angle, more, per_radian)
     }
 }
 
@@ -299,6 +333,14 @@ impl Side for Lanes {
     #[inline(always)]
     fn store(self, list: &mut [f64]) {
         list[..4].copy_from_slice(&self.0);
+    }
+    #[inline(always)]
+    fn unwound(angle: Self, more: Self, per_radian: Self) -> Self {
+        let mut unwound = angle;
+        for (i, angle) in unwound.0.iter_mut().enumerate() {
+            *angle = trigonometry::unwound(*angle, more.0[i], per_radian.0[i]);
+        }
+        unwound
     }
 }
 

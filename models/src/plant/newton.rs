@@ -24,9 +24,10 @@ use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::planar::Of;
 use crate::plant::rows::{Term, padded, spread};
 use crate::plant::{PreciseState, Precision, Settings, StepError, StepReport, forces, potentials};
+use crate::scalar::{Side, side_by_side};
 use crate::spatial::{Mat3, Vec3};
 use crate::tree::JointKind;
-use crate::trigonometry::unwound;
+use crate::wide::wide;
 
 pub(crate) use matrix::{Factors, fill_schur};
 
@@ -374,30 +375,13 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) -> f64 {
-        let (h, nd) = (settings.time_step_s, self.residual.len());
-        let inverse = 1.0 / h;
-        let (x, q, q_low) = (&self.increment[..nd], &state.q[..nd], &state.q_low[..nd]);
-        let (q_mid, velocity) = (&mut self.q_mid[..nd], &mut self.velocity[..nd]);
-        let (angles, per_radian) = (&mut self.angles[..nd], &self.turns_per_radian[..nd]);
-        for i in 0..nd {
-            q_mid[i] = q[i] + (q_low[i] + 0.5 * x[i]);
-            velocity[i] = x[i] * inverse;
-            angles[i] = unwound(q[i], q_low[i] + 0.5 * x[i], per_radian[i]);
-        }
+        let h = settings.time_step_s;
+        self.go_to_middle(state, 1.0 / h);
         if !model.orientations.is_empty() {
             self.turn_to_midpoint(model);
         }
         self.evaluate_lagrangian(model);
-        let (half, weight) = (0.5 * h, settings.force_split.at_start() * h);
-        let (p, p_low, angles) = (&state.p[..nd], &state.p_low[..nd], &self.angles[..nd]);
-        let (l_q, l_v, force) = (&self.l_q[..nd], &self.l_v[..nd], &self.force[..nd]);
-        let (residual, magnitudes) = (&mut self.residual[..nd], &mut self.magnitudes[..nd]);
-        for i in 0..nd {
-            let (half_q, force) = (half * l_q[i], weight * force[i]);
-            residual[i] = ((p[i] - l_v[i]) + (half_q + force)) + p_low[i];
-            magnitudes[i] =
-                p[i].abs() + l_v[i].abs() + half_q.abs() * (1.0 + angles[i].abs()) + force.abs();
-        }
+        self.sum_up(state, 0.5 * h, settings.force_split.at_start() * h);
         self.round_off = largest(&self.magnitudes).max(f64::MIN_POSITIVE);
         if !model.orientations.is_empty() {
             self.turn_residual(model, settings, state);
@@ -406,6 +390,48 @@ impl Workspace {
             self.start.subtract_impulses(model, &self.multipliers, &mut self.residual);
         }
         largest(&self.residual) / (f64::EPSILON * self.round_off)
+    }
+
+    wide! {
+        /// Configuration and velocity at the midpoint.
+        fn go_to_middle(mut self, state: &PreciseState, inverse: f64)
+            = go_to_middle_portable, go_to_middle_avx2;
+
+        /// The residual, and what it is the sum of.
+        fn sum_up(mut self, state: &PreciseState, half: f64, weight: f64)
+            = sum_up_portable, sum_up_avx2;
+    }
+
+    #[inline(always)]
+    fn go_to_middle_portable(&mut self, state: &PreciseState, inverse: f64) {
+        let nd = self.increment.len();
+        side_by_side!(for (
+            x in &self.increment[..nd],
+            q in &state.q[..nd],
+            q_low in &state.q_low[..nd],
+            per_radian in &self.turns_per_radian[..nd],
+        ) let more = x * 0.5 + q_low; {
+            middle(&mut self.q_mid[..nd]) = q + more;
+            velocity(&mut self.velocity[..nd]) = x * inverse;
+            angle(&mut self.angles[..nd]) = Side::unwound(q, more, per_radian);
+        });
+    }
+
+    #[inline(always)]
+    fn sum_up_portable(&mut self, state: &PreciseState, half: f64, weight: f64) {
+        let nd = self.increment.len();
+        side_by_side!(for (
+            p in &state.p[..nd],
+            p_low in &state.p_low[..nd],
+            l_q in &self.l_q[..nd],
+            l_v in &self.l_v[..nd],
+            force in &self.force[..nd],
+            angle in &self.angles[..nd],
+        ) let (half_q, force) = (l_q * half, force * weight); {
+            residual(&mut self.residual[..nd]) = ((p - l_v) + (half_q + force)) + p_low;
+            magnitude(&mut self.magnitudes[..nd]) =
+                p.abs() + l_v.abs() + half_q.abs() * (angle.abs() + 1.0) + force.abs();
+        });
     }
 
     /// Gradient of the Lagrangian and forces at the midpoint.
