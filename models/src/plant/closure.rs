@@ -18,7 +18,7 @@ use crate::plant::kinematics::Poses;
 use crate::plant::vectors::{Distance, ProductAt};
 use crate::scalar::Scalar;
 use crate::spatial::{Mat3, Vec3};
-use crate::tree::Tree;
+use crate::tree::{JointKind, Tree};
 
 /// The constraints at a configuration.
 #[derive(Clone, Debug)]
@@ -32,6 +32,30 @@ pub(crate) struct Closure<S = f64> {
     pub(crate) jacobian: Vec<S>,
     /// Change of `h` by round-off of the coordinates, from the last Jacobian.
     coordinate_round_off: Vec<f64>,
+    /// What pulls at each joint, for second derivatives.
+    pulls: Vec<Pull<S>>,
+}
+
+/// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
+#[derive(Clone, Copy, Debug)]
+struct Pull<S> {
+    is_there: bool,
+    /// `Σ f`.
+    force: Vec3<S>,
+    /// `Σ p fᵀ`.
+    product: Mat3<S>,
+}
+
+impl<S: Scalar> Pull<S> {
+    const NONE: Self = Self { is_there: false, force: Vec3::ZERO, product: Mat3::ZERO };
+
+    fn add(&mut self, other: &Self) {
+        self.is_there |= other.is_there;
+        self.force += other.force;
+        for (column, other) in self.product.0.iter_mut().zip(other.product.0) {
+            *column += other;
+        }
+    }
 }
 
 impl<S: Scalar> Closure<S> {
@@ -43,6 +67,7 @@ impl<S: Scalar> Closure<S> {
             round_off: vec![0.0; nc],
             jacobian: vec![S::ZERO; nc * model.dimensions.coordinates()],
             coordinate_round_off: vec![0.0; nc],
+            pulls: vec![Pull::NONE; model.closure.joints.len()],
         }
     }
 
@@ -103,13 +128,78 @@ impl<S: Scalar> Closure<S> {
 
     /// Writes `Σ_c λ_c D²h_c` at `q`, rows and columns over all coordinates, row-major.
     #[inline(never)]
-    pub(crate) fn hessian(&self, model: &Model, q: &[S], multipliers: &[S], out: &mut [S]) {
+    pub(crate) fn hessian(&mut self, model: &Model, q: &[S], multipliers: &[S], out: &mut [S]) {
         let n = model.dimensions.coordinates();
         out.fill(S::ZERO);
+        self.pulls.fill(Pull::NONE);
+        let mut are_pulled = false;
         for (constraint, &lambda) in model.constraints.iter().zip(multipliers) {
-            constraint.for_each_second_derivative(&model.closure, &self.poses, q, |i, j, value| {
-                out[i * n + j] += lambda * value;
-            });
+            match &constraint.kind {
+                ConstraintKind::Axis(points, axis) if !model.closure.has_other_joints => {
+                    self.pull(model, points, *axis, lambda);
+                    are_pulled = true;
+                }
+                _ => {
+                    let (tree, poses) = (&model.closure, &self.poses);
+                    constraint.for_each_second_derivative(tree, poses, q, |i, j, value| {
+                        out[i * n + j] += lambda * value;
+                    });
+                }
+            }
+        }
+        if are_pulled {
+            self.add_pulls(&model.closure, n, out);
+        }
+    }
+
+    /// Takes the multiplier of `d · e = 0`, for a world axis `e`, as forces at both points.
+    fn pull(&mut self, model: &Model, points: &PointPair, axis: usize, lambda: S) {
+        for (end, force) in [(&points.a, lambda), (&points.b, -lambda)] {
+            if let Some(pull) = self.pulls.get_mut(end.joint) {
+                pull.is_there = true;
+                pull.force.0[axis] += force;
+                let (point, _) = self.poses.point(&model.closure, end);
+                pull.product.0[axis] += point * force;
+            }
+        }
+    }
+
+    /// Adds the second derivatives of `Σ f·p` by the coordinates of hinges and sliders, O(n·depth) for
+    /// however many forces: with joint `i`, axis `w_i`, at or above joint `j`, and the sums over what
+    /// `j` carries,
+    ///
+    /// ```text
+    /// w_i · Σ ∂p/∂q_j × f      hinge: Σ (w × (p − o)) × f = Σ p fᵀ w − o (F·w) − w (Σ p·f − o·F)
+    ///                          slider: w × F
+    /// ```
+    fn add_pulls(&mut self, tree: &Tree, n: usize, out: &mut [S]) {
+        for (j, joint) in tree.joints.iter().enumerate().rev() {
+            let pull = self.pulls[j];
+            if !pull.is_there {
+                continue;
+            }
+            if let Some(parent) = self.pulls.get_mut(joint.parent) {
+                parent.add(&pull);
+            }
+            let (axis, place) = (self.poses.axis(j), self.poses.position[j]);
+            let torque = if joint.kind == JointKind::Revolute {
+                let [x, y, z] = pull.product.0;
+                let along = x[0] + y[1] + z[2] - place.dot(pull.force);
+                pull.product.apply(axis) - place * pull.force.dot(axis) - axis * along
+            } else {
+                axis.cross(pull.force)
+            };
+            let mut i = j;
+            while let Some(above) = tree.joints.get(i) {
+                if above.kind == JointKind::Revolute {
+                    let value = self.poses.axis(i).dot(torque);
+                    out[above.coordinate * n + joint.coordinate] += value;
+                    if i != j {
+                        out[joint.coordinate * n + above.coordinate] += value;
+                    }
+                }
+                i = above.parent;
+            }
         }
     }
 }
