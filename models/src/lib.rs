@@ -20,6 +20,7 @@ pub mod builtin;
 mod compile;
 mod continuous;
 pub mod control;
+mod cost;
 mod elimination;
 mod model;
 pub mod optimize;
@@ -40,6 +41,7 @@ mod wide;
 pub use continuous::{
     Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,
 };
+pub use cost::StageCost;
 pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
 pub use plant::{
     Choice, ChoiceError, Contraction, Diagnostics, Energy, Equilibrium, ErrorEstimate, ForceSplit,

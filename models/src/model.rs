@@ -545,6 +545,23 @@ impl Model {
             equations(|kind| matches!(kind, ConstraintKind::Coupling(..))),
             skipped(d.constraints > 0)
         ));
+        let stages = self.stage_costs();
+        let step: f64 = stages.iter().map(|stage| stage.times * stage.instructions).sum();
+        line(format!("cost          about {:.1} thousand instructions a step:", step / 1e3));
+        for stage in stages {
+            let (share, thousands) =
+                (stage.times * stage.instructions / step, stage.instructions / 1e3);
+            line(match stage.times {
+                0.0 => format!("  {:<20}and {thousands:.1} more", stage.name),
+                times => {
+                    format!(
+                        "  {:<20}{times:.1} × {thousands:.1}, {:.0} %",
+                        stage.name,
+                        100.0 * share
+                    )
+                }
+            });
+        }
         plan
     }
 }

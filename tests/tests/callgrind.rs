@@ -220,6 +220,30 @@ fn instructions_per_step_are_those_of_the_table() {
     );
 }
 
+/// What `plantctl explain` says a step costs, against what it did cost when the table was made.
+#[test]
+fn estimates_of_cost_are_right_to_a_factor_of_two() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("instructions.toml");
+    let text = std::fs::read_to_string(path).expect("the table is there");
+    let table: Table = toml::from_str(&text).expect("the table is TOML");
+    for (name, counts) in &table.scenes {
+        let scene = plantd_models::builtin::scene(name).expect("a built-in scene");
+        let costs = plantd_models::Model::compile(&scene).expect("it compiles").stage_costs();
+        let step: f64 = costs.iter().map(|stage| stage.times * stage.instructions).sum();
+        let linearization: f64 =
+            costs.iter().filter(|s| s.times == 0.0).map(|s| s.instructions).sum();
+        let count = |operation: &str| counts[operation] as f64;
+        for (what, estimate, actual) in [
+            ("step", step, count("step")),
+            ("with A and B", step + linearization, count("step-and-linearize")),
+        ] {
+            let ratio = estimate / actual;
+            println!("{name}, {what}: {estimate:.0}, {actual}, {ratio:.2}");
+            assert!((0.5..2.0).contains(&ratio), "{name}, {what}: {estimate:.0} for {actual}");
+        }
+    }
+}
+
 /// Describes the counts that differ by more than the tolerance, are new or are gone.
 fn changes(then: &BTreeMap<String, Counts>, now: &BTreeMap<String, Counts>) -> Vec<String> {
     let flat = |table: &BTreeMap<String, Counts>| -> BTreeMap<(String, String), u64> {
