@@ -25,7 +25,7 @@ pub(crate) struct DenseLu {
 impl DenseLu {
     /// A matrix whose rows have room for some more columns, which do not count.
     pub(crate) fn new(order: usize, room: usize) -> Self {
-        let stride = (order + room).next_multiple_of(LANES);
+        let stride = (order + room).max(1).next_multiple_of(LANES);
         Self {
             matrix: vec![0.0; order * stride],
             stride,

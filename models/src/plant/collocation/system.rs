@@ -102,7 +102,7 @@ impl System {
         }
     }
 
-    /// Of four stages.
+    /// How many times four stages there are.
     fn groups(&self) -> usize {
         self.width / Lanes::COUNT
     }
@@ -158,7 +158,7 @@ impl System {
         for k in 0..d.prescribed {
             let start = state.q[nd + k];
             let way = u[d.inputs + k] - start;
-            for g in 0..width / Lanes::COUNT {
+            for g in 0..self.groups() {
                 let node = Lanes::load(&self.nodes[g * Lanes::COUNT..]);
                 self.q[g * n + nd + k] = node * way + start;
                 self.velocity[g * n + nd + k] = Lanes::constant(way / h);
@@ -176,7 +176,7 @@ impl System {
         let At { model, state, .. } = at;
         let n = model.dimensions.coordinates();
         let mut magnitude = f64::MIN_POSITIVE;
-        for g in 0..self.width / Lanes::COUNT {
+        for g in 0..self.groups() {
             self.move_to(state, &workspace.turns_per_radian, n, g);
             if self.mechanics.is_empty() {
                 for lane in 0..Lanes::COUNT.min(self.count - g * Lanes::COUNT) {
@@ -228,7 +228,7 @@ impl System {
         let rates = Lanes::load(&self.rates[first..]);
         for (a, per_radian) in per_radian.iter().enumerate() {
             let own = &self.increment[a * self.width..][..self.width];
-            let groups = self.width / Lanes::COUNT;
+            let groups = self.groups();
             let more = Self::coupled(&self.columns, groups, g, &own[..self.count]) + state.q_low[a];
             let [angle, rest] = without_turns(state.q[a], *per_radian);
             self.q[g * n + a] = more + rest + angle;
@@ -295,12 +295,11 @@ impl System {
 
     #[inline(always)]
     fn find_residuals_portable(&mut self, state: &PreciseState) -> f64 {
-        let mut sizes = Lanes::ZERO;
+        let (groups, mut sizes) = (self.groups(), Lanes::ZERO);
         for (a, residual) in self.residual.chunks_exact_mut(self.count).enumerate() {
             let own = &self.impulse[a * self.width..][..self.width];
             for (g, residual) in residual.chunks_mut(Lanes::COUNT).enumerate() {
                 let first = g * Lanes::COUNT;
-                let groups = self.width / Lanes::COUNT;
                 let sum = Self::coupled(&self.columns, groups, g, &own[..self.count]);
                 let momentum = Lanes::load(&self.momentum[a * self.width + first..]);
                 let value = (-momentum + state.p[a] + sum) + state.p_low[a];
@@ -383,14 +382,14 @@ impl System {
 
     #[inline(always)]
     fn correct_impulses_portable(&mut self, n: usize) {
-        let (count, width) = (self.count, self.width);
+        let (count, width, groups) = (self.count, self.width, self.groups());
         let nd = self.increment.len() / width;
-        for g in 0..width / Lanes::COUNT {
+        for g in 0..groups {
             let first = g * Lanes::COUNT;
             let lengths = Lanes::load(&self.lengths[first..]);
             for b in 0..nd {
                 let corrections = &self.residual[b * count..][..count];
-                let moved = Self::coupled(&self.columns, width / Lanes::COUNT, g, corrections);
+                let moved = Self::coupled(&self.columns, groups, g, corrections);
                 let mut own = Lanes::ZERO;
                 let rest = &corrections[first..];
                 let length = rest.len().min(Lanes::COUNT);
