@@ -83,7 +83,7 @@ fn compile(scene: &Scene) -> Model {
         dimensions,
         operating_points: layout.operating_points(scene),
         digest: digest(scene),
-        solver: Solver::of(planar.as_deref(), dimensions),
+        solver: Solver::of(&dynamics, &elimination, planar.as_deref(), needs_poses, dimensions),
         planar,
         gravity,
         damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },

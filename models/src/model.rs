@@ -56,21 +56,44 @@ pub struct Model {
 pub(crate) enum Solver {
     /// Entry by entry along the elimination tree: O(n·depth²) once, O(n·depth) for each correction.
     Tree,
-    /// By the vectors that generate the entries: O(n).
-    Generators,
+    /// By the vectors that generate the entries: O(n). In planes, or in space.
+    Planar,
+    Spatial,
 }
 
 impl Solver {
-    /// Coordinates from which on generators are faster.
+    /// Coordinates from which on generators are faster in planes.
     const MANY: usize = 4;
+    /// Stored entries a row, on average, above which they are in space. A step took so many thousand
+    /// instructions with the elimination tree and with generators:
+    ///
+    /// ```text
+    /// chains of hinges about x and y by turns      8: 36, 33   16: 100, 66   32: 355, 173   128: 8099, 920
+    /// tree-N, of 4, 5 and 6 entries a row          30: 120, 114   63: 270, 236   127: 618, 502
+    /// ```
+    ///
+    /// Generators of joints on one path wait for each other: in time they are even at 5 entries.
+    const DEEP: usize = 6;
 
-    /// The faster one for a scene.
-    pub(crate) fn of(planar: Option<&[PlanarJoint]>, d: Dimensions) -> Self {
-        let are_all = |joints: &[PlanarJoint]| {
-            joints.iter().map(|joint| joint.coordinate).eq(0..d.coordinates())
-        };
-        if d.dynamic >= Self::MANY && d.constraints == 0 && planar.is_some_and(are_all) {
-            Self::Generators
+    /// The fastest one for a scene; `needs_poses` where springs between points or forces act.
+    pub(crate) fn of(
+        tree: &Tree,
+        elimination: &Elimination,
+        planar: Option<&[PlanarJoint]>,
+        needs_poses: bool,
+        d: Dimensions,
+    ) -> Self {
+        let joints = tree.joints.iter().map(|joint| joint.coordinate);
+        if d.constraints > 0 || d.prescribed > 0 || !joints.eq(0..d.dynamic) {
+            return Self::Tree;
+        }
+        if planar.is_some() {
+            return if d.dynamic >= Self::MANY { Self::Planar } else { Self::Tree };
+        }
+        let is_generated = !needs_poses
+            && tree.joints.iter().all(|joint| !matches!(joint.kind, JointKind::Ball(_)));
+        if is_generated && elimination.entries() > Self::DEEP * d.dynamic {
+            Self::Spatial
         } else {
             Self::Tree
         }
@@ -495,7 +518,7 @@ impl Model {
                 self.elimination.entries(),
                 d.dynamic * (d.dynamic + 1) / 2,
             ),
-            Solver::Generators => {
+            Solver::Planar | Solver::Spatial => {
                 format!("factorization by generators, {} joints, {islands}", joints.len())
             }
         });

@@ -39,6 +39,7 @@ mod settings;
 mod settle;
 mod site;
 mod snapshot;
+mod space;
 pub(crate) mod tree_lu;
 mod vectors;
 

@@ -29,6 +29,8 @@ use crate::spatial::{Mat3, Vec3};
 use crate::tree::JointKind;
 use crate::wide::wide;
 
+#[cfg(test)]
+pub(crate) use matrix::Generators;
 pub(crate) use matrix::{Factors, fill_schur};
 
 /// A residual this small, in units of round-off, is as good as zero.
@@ -275,20 +277,23 @@ impl Workspace {
 
     /// Guess: the velocity that belongs to the momentum goes on.
     pub(crate) fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
-        if let (Some(planar), Some(joints), Some(generators)) =
-            (&mut self.mechanics.planar, &model.planar, &mut self.factors.generators)
-        {
-            let h = settings.time_step_s;
+        if self.factors.generators.is_some() {
             self.velocity.fill(0.0);
-            planar.gradient(joints, &state.q, &self.velocity, &mut self.l_q, &mut self.l_v);
-            planar.differentiate(joints);
+            let (orientations, derivatives) =
+                (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
+            self.mechanics.gradient(model, &state.q, orientations, &self.velocity, derivatives);
             self.diagonal.fill(0.0);
-            let inertia = &model.conditioning.inertia;
-            generators.factor(planar, joints, &self.diagonal, inertia, h, Of::Masses);
+            self.factors.generate(
+                model,
+                &mut self.mechanics,
+                &self.diagonal,
+                settings.time_step_s,
+                Of::Masses,
+            );
             for (x, p) in self.increment.iter_mut().zip(&state.p) {
                 *x = -p;
             }
-            generators.solve(joints, &mut self.increment);
+            self.factors.solve(model, &mut self.increment);
             // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
             for x in self.increment.iter_mut().filter(|x| !x.is_finite()) {
                 *x = 0.0;
@@ -322,7 +327,7 @@ impl Workspace {
         // What a factorization costs, in corrections.
         let patience = match model.solver {
             Solver::Tree => 3,
-            Solver::Generators => 2,
+            Solver::Planar | Solver::Spatial => 2,
         };
         let enough = settings.precision.residual();
         let mut previous = f64::INFINITY;

@@ -3,6 +3,33 @@
 /// Rows are padded to a multiple of this, and worked on in blocks of it.
 pub(crate) const LANES: usize = 8;
 
+/// A block of numbers side by side, so that compilers use whole registers.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(align(64))]
+pub(crate) struct Lanes(pub(crate) [f64; LANES]);
+
+impl Lanes {
+    pub(crate) const ZERO: Self = Self([0.0; LANES]);
+
+    #[inline(always)]
+    pub(crate) fn plus(self, o: Self) -> Self {
+        let mut sum = self.0;
+        for (sum, part) in sum.iter_mut().zip(o.0) {
+            *sum += part;
+        }
+        Self(sum)
+    }
+
+    #[inline(always)]
+    pub(crate) fn times(self, factor: f64) -> Self {
+        let mut product = self.0;
+        for entry in &mut product {
+            *entry *= factor;
+        }
+        Self(product)
+    }
+}
+
 /// The length of a padded row.
 pub(crate) fn padded(width: usize) -> usize {
     width.next_multiple_of(LANES)

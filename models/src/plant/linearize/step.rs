@@ -46,7 +46,7 @@ impl Workspace {
         out.kind = Kind::Step;
         out.time_step_s = at.settings.time_step_s;
         out.at_start = at.settings.force_split.at_start();
-        if self.factors.generators.is_some() {
+        if self.factors.planar().is_some() {
             self.linearize_by_generators(at, out)?;
             out.solved.remember(self, at);
             return Ok(());
@@ -88,7 +88,7 @@ impl Workspace {
             place.residual = out.at_start * place.momentum;
         }
         let (Some(planar), Some(joints), Some(generators)) =
-            (&self.mechanics.planar, &model.planar, &mut self.factors.generators)
+            (&self.mechanics.planar, &model.planar, self.factors.planar())
         else {
             return Ok(());
         };

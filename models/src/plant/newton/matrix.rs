@@ -4,11 +4,12 @@ use super::Workspace;
 use crate::Model;
 use crate::model::{Forces, Solver};
 use crate::plant::closure::Closure;
+use crate::plant::mechanics::Mechanics;
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::planar::{self, Of};
 use crate::plant::rows::padded;
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
-use crate::plant::{Settings, StepError, potentials};
+use crate::plant::{Settings, StepError, potentials, space};
 
 /// The Newton matrix `K`, factored.
 #[derive(Clone, Debug)]
@@ -16,23 +17,65 @@ pub(crate) struct Factors {
     /// Entry by entry.
     pub(crate) matrix: TreeLu,
     /// By its generators, where that is faster.
-    pub(crate) generators: Option<Box<planar::Elimination>>,
+    pub(crate) generators: Option<Box<Generators>>,
+}
+
+/// The Newton matrix of a tree in planes or in space.
+#[derive(Clone, Debug)]
+pub(crate) enum Generators {
+    Planar(planar::Elimination),
+    Spatial(space::Elimination),
 }
 
 impl Factors {
     pub(crate) fn new(model: &Model) -> Self {
-        let is_generated = model.solver == Solver::Generators;
         let joints = model.dimensions.dynamic;
-        Self {
-            matrix: TreeLu::new(&model.elimination),
-            generators: is_generated.then(|| Box::new(planar::Elimination::new(joints))),
+        let generators = match model.solver {
+            Solver::Tree => None,
+            Solver::Planar => Some(Generators::Planar(planar::Elimination::new(joints))),
+            Solver::Spatial => {
+                Some(Generators::Spatial(space::Elimination::new(&model.dynamics, model.gravity)))
+            }
+        };
+        Self { matrix: TreeLu::new(&model.elimination), generators: generators.map(Box::new) }
+    }
+
+    /// The generators of a planar tree.
+    pub(crate) fn planar(&mut self) -> Option<&mut planar::Elimination> {
+        match self.generators.as_deref_mut() {
+            Some(Generators::Planar(generators)) => Some(generators),
+            _ => None,
+        }
+    }
+
+    /// Factors the generators, where there are some, at the last gradient of `mechanics`.
+    pub(crate) fn generate(
+        &mut self,
+        model: &Model,
+        mechanics: &mut Mechanics,
+        diagonal: &[f64],
+        step: f64,
+        of: Of,
+    ) -> Option<SmallestPivot> {
+        let inertia = &model.conditioning.inertia;
+        match (self.generators.as_deref_mut()?, &mut mechanics.planar, &model.planar) {
+            (Generators::Planar(generators), Some(planar), Some(joints)) => {
+                planar.differentiate(joints);
+                Some(generators.factor(planar, joints, diagonal, inertia, step, of))
+            }
+            (Generators::Spatial(generators), ..) => {
+                mechanics.differentiate(model);
+                Some(generators.factor(&model.dynamics, mechanics, diagonal, inertia, step, of))
+            }
+            _ => None,
         }
     }
 
     /// Solves `K x = b` in place.
     pub(crate) fn solve(&mut self, model: &Model, x: &mut [f64]) {
-        match (&mut self.generators, &model.planar) {
-            (Some(generators), Some(joints)) => generators.solve(joints, x),
+        match (self.generators.as_deref_mut(), &model.planar) {
+            (Some(Generators::Planar(generators)), Some(joints)) => generators.solve(joints, x),
+            (Some(Generators::Spatial(generators)), _) => generators.solve(&model.dynamics, x),
             _ => self.matrix.solve(&model.elimination, x),
         }
     }
@@ -116,13 +159,10 @@ impl Workspace {
         model: &Model,
         settings: &Settings,
     ) -> Result<(), StepError> {
-        let (Some(planar), Some(joints), Some(generators)) =
-            (&mut self.mechanics.planar, &model.planar, &mut self.factors.generators)
-        else {
+        if self.factors.generators.is_none() {
             return self.factor_newton_matrix(model, settings);
-        };
+        }
         let h = settings.time_step_s;
-        planar.differentiate(joints);
         let diagonal = &mut self.diagonal;
         diagonal.fill(0.0);
         if model.potentials.any {
@@ -138,9 +178,10 @@ impl Workspace {
         for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
             *entry -= a * c;
         }
-        let inertia = &model.conditioning.inertia;
-        let pivot = generators.factor(planar, joints, diagonal, inertia, h, Of::Motion);
-        self.accept_pivot(model, settings, pivot)
+        match self.factors.generate(model, &mut self.mechanics, diagonal, h, Of::Motion) {
+            Some(pivot) => self.accept_pivot(model, settings, pivot),
+            None => self.factor_newton_matrix(model, settings),
+        }
     }
 
     /// Takes note of the smallest pivot; refuses one that is too small.

@@ -21,7 +21,7 @@
 
 use super::{PlanarTree, Vec2, Vec3, cross, dot, linear, spun};
 use crate::planar::PlanarJoint;
-use crate::plant::rows::LANES;
+use crate::plant::rows::{LANES, Lanes};
 use crate::plant::tree_lu::SmallestPivot;
 use crate::wide::wide;
 
@@ -359,33 +359,6 @@ impl Elimination {
                 add_to(&mut self.flows[joint.parent], [n, fx, fy]);
             }
         }
-    }
-}
-
-/// A block of columns in one row: side by side, so that compilers use whole registers.
-#[derive(Clone, Copy, Debug)]
-#[repr(align(64))]
-struct Lanes([f64; LANES]);
-
-impl Lanes {
-    const ZERO: Self = Self([0.0; LANES]);
-
-    #[inline(always)]
-    fn plus(self, o: Self) -> Self {
-        let mut sum = self.0;
-        for (sum, part) in sum.iter_mut().zip(o.0) {
-            *sum += part;
-        }
-        Self(sum)
-    }
-
-    #[inline(always)]
-    fn times(self, factor: f64) -> Self {
-        let mut product = self.0;
-        for entry in &mut product {
-            *entry *= factor;
-        }
-        Self(product)
     }
 }
 

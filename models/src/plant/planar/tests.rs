@@ -4,8 +4,10 @@ use std::sync::Arc;
 
 use nalgebra::DMatrix;
 
+use crate::model::Solver;
 use crate::plant::planar::PlanarTree;
 use crate::plant::{Initial, Linearization, Plant, Settings};
+use crate::scene::{Coordinate, CoordinateKind};
 use crate::{Model, Scene, builtin};
 
 /// A number between −1 and 1 that looks random.
@@ -180,4 +182,23 @@ fn generators_stand_for_the_newton_matrix() {
             }
         }
     }
+}
+
+#[test]
+fn a_prescribed_leaf_is_left_to_the_elimination_tree() {
+    let mut scene = builtin::scene("chain-6").unwrap();
+    scene.coordinates.push(Coordinate {
+        name: "link5".to_owned(),
+        kind: CoordinateKind::Prescribed,
+        initial: 0.0,
+        damping: None,
+    });
+    let model = Arc::new(Model::compile(&scene).unwrap());
+    assert_eq!(model.solver, Solver::Tree);
+    let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+    let mut out = Linearization::new(&model);
+    plant.step_and_linearize(&[0.0, 0.001], &mut out).unwrap();
+    // Without the prescribed position and velocity.
+    let (a, place) = (out.a(), |i: usize| if i < 5 { i } else { i + 1 });
+    assert!(defect(&DMatrix::from_fn(10, 10, |i, j| a[(place(i), place(j))])) < 1e-10);
 }

@@ -249,7 +249,7 @@ impl Plant {
             second.gather(&self.model, first)?;
             return Ok(report);
         }
-        if self.workspace.factors.generators.is_some() {
+        if self.workspace.factors.planar().is_some() {
             self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
         }
         self.differentiate_linearization(first, second);
