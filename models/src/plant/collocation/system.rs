@@ -150,8 +150,8 @@ impl System {
             if d.inputs > 0 {
                 let inputs = &inputs[i * d.inputs..][..d.inputs];
                 forces::input_forces(&model.coordinate_inputs, inputs, force);
-                for a in 0..nd {
-                    self.held[a * width + i] = force[a];
+                for (a, force) in force.iter().enumerate() {
+                    self.held[a * width + i] = *force;
                 }
             }
         }
@@ -281,13 +281,10 @@ impl System {
             let (by_position, by_force) = (*l_q * lengths, force * lengths);
             (by_position + by_force).store(&mut self.impulse[at..]);
             l_v.store(&mut self.momentum[at..]);
-            let angle = self.q[g * n + a];
-            for i in 0..Lanes::COUNT {
-                let size = state.p[a].abs()
-                    + l_v.0[i].abs()
-                    + 0.5 * by_position.0[i].abs() * (1.0 + angle.0[i].abs())
-                    + 0.5 * by_force.0[i].abs();
-                largest[i] = if size > largest[i] { size } else { largest[i] };
+            let by_angle = by_position.abs() * (self.q[g * n + a].abs() + 1.0);
+            let size = l_v.abs() + (by_angle + by_force.abs()) * 0.5 + state.p[a].abs();
+            for (largest, size) in largest.iter_mut().zip(size.0) {
+                *largest = if size > *largest { size } else { *largest };
             }
         }
         largest.into_iter().fold(0.0, f64::max)
