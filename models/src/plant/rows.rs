@@ -6,9 +6,9 @@ pub(crate) const LANES: usize = 8;
 /// A block of numbers side by side, so that compilers use whole registers.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(align(64))]
-pub(crate) struct Lanes(pub(crate) [f64; LANES]);
+pub(crate) struct Block(pub(crate) [f64; LANES]);
 
-impl Lanes {
+impl Block {
     pub(crate) const ZERO: Self = Self([0.0; LANES]);
 
     #[inline(always)]

@@ -28,7 +28,7 @@ mod tests;
 
 use crate::plant::mechanics::Mechanics;
 use crate::plant::planar::Of;
-use crate::plant::rows::Lanes;
+use crate::plant::rows::Block;
 use crate::plant::tree_lu::SmallestPivot;
 use crate::spatial::{Mat3, Vec3};
 use crate::tree::Tree;
@@ -37,11 +37,11 @@ use crate::wide::wide;
 /// What is left of a joint when it has been eliminated.
 #[derive(Clone, Copy, Debug, Default)]
 struct Generator {
-    minus: Lanes,
-    plus: Lanes,
-    above: Lanes,
+    minus: Block,
+    plus: Block,
+    above: Block,
     /// Divided by the pivot.
-    across: Lanes,
+    across: Block,
 }
 
 /// The matrix.
@@ -52,9 +52,9 @@ pub(crate) struct Elimination {
     /// Where the sums of each joint are.
     places: Vec<usize>,
     /// `A` by rows; zero but for joints whose elimination has begun.
-    sums: Vec<[Lanes; 8]>,
+    sums: Vec<[Block; 8]>,
     /// The same for right-hand sides, and twists that belong to solutions.
-    flows: Vec<Lanes>,
+    flows: Vec<Block>,
     /// `e1` and `e2`.
     horizontal: [Vec3; 2],
     /// `|g|`.
@@ -82,15 +82,15 @@ fn places(tree: &Tree) -> Vec<usize> {
 }
 
 #[inline(always)]
-fn dot(a: &Lanes, b: &Lanes) -> f64 {
+fn dot(a: &Block, b: &Block) -> f64 {
     let (a, b) = (&a.0, &b.0);
     let pair = |k: usize| a[k] * b[k] + a[k + 4] * b[k + 4];
     (pair(0) + pair(1)) + (pair(2) + pair(3))
 }
 
 #[inline(always)]
-fn lanes(a: Vec3, b: Vec3, [c, d]: [f64; 2]) -> Lanes {
-    Lanes([a[0], a[1], a[2], b[0], b[1], b[2], c, d])
+fn lanes(a: Vec3, b: Vec3, [c, d]: [f64; 2]) -> Block {
+    Block([a[0], a[1], a[2], b[0], b[1], b[2], c, d])
 }
 
 impl Elimination {
@@ -107,8 +107,8 @@ impl Elimination {
             generators: vec![Generator::default(); joints],
             inverse_pivot: vec![0.0; joints],
             places,
-            sums: vec![[Lanes::ZERO; 8]; most],
-            flows: vec![Lanes::ZERO; most],
+            sums: vec![[Block::ZERO; 8]; most],
+            flows: vec![Block::ZERO; most],
             horizontal: [e1, e2],
             gravity: size,
         }
@@ -165,7 +165,7 @@ impl Elimination {
             let place = self.places[row];
             let (sums, own) = self.sums.split_at_mut(place);
             let own = &mut own[0];
-            let mut pushed = Lanes::ZERO;
+            let mut pushed = Block::ZERO;
             for (pushed, line) in pushed.0.iter_mut().zip(&*own) {
                 *pushed = dot(line, &plus);
             }
@@ -194,7 +194,7 @@ impl Elimination {
                             *target = target.plus(*line);
                         }
                     }
-                    *own = [Lanes::ZERO; 8];
+                    *own = [Block::ZERO; 8];
                 }
             }
             self.generators[row] = Generator { minus, plus, above, across };
@@ -206,7 +206,7 @@ impl Elimination {
     #[inline(always)]
     fn solve_portable(&mut self, tree: &Tree, x: &mut [f64]) {
         let Self { generators, inverse_pivot, places, flows, .. } = self;
-        flows.fill(Lanes::ZERO);
+        flows.fill(Block::ZERO);
         for (i, joint) in tree.joints.iter().enumerate().rev() {
             let (generator, place) = (&generators[i], places[i]);
             let flow = flows[place];
@@ -215,7 +215,7 @@ impl Elimination {
             match places.get(joint.parent) {
                 Some(&to) if to == place => flows[to] = flow,
                 to => {
-                    flows[place] = Lanes::ZERO;
+                    flows[place] = Block::ZERO;
                     if let Some(&to) = to {
                         flows[to] = flows[to].plus(flow);
                     }
@@ -223,7 +223,7 @@ impl Elimination {
             }
         }
         for (i, joint) in tree.joints.iter().enumerate() {
-            let flow = places.get(joint.parent).map_or(Lanes::ZERO, |&place| flows[place]);
+            let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
             x[i] -= dot(&generators[i].across, &flow);
             flows[places[i]] = flow.plus(generators[i].plus.times(x[i]));
         }

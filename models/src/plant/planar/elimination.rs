@@ -21,7 +21,7 @@
 
 use super::{PlanarTree, Vec2, Vec3, cross, dot, linear, spun};
 use crate::planar::PlanarJoint;
-use crate::plant::rows::{LANES, Lanes};
+use crate::plant::rows::{Block, LANES};
 use crate::plant::tree_lu::SmallestPivot;
 use crate::wide::wide;
 
@@ -67,10 +67,10 @@ pub(crate) struct Elimination {
     sums: Vec<[Vec3; 3]>,
     /// The same for right-hand sides, and twists that belong to solutions: one, and a block of them.
     flow: Vec<Vec3>,
-    flows: Vec<[Lanes; 3]>,
+    flows: Vec<[Block; 3]>,
     /// A block of columns of the derivatives.
-    increment: Vec<Lanes>,
-    momentum: Vec<Lanes>,
+    increment: Vec<Block>,
+    momentum: Vec<Block>,
 }
 
 #[inline(always)]
@@ -95,9 +95,9 @@ impl Elimination {
             step: 0.0,
             sums: vec![[[0.0; 3]; 3]; joints + 1],
             flow: vec![[0.0; 3]; joints + 1],
-            flows: vec![[Lanes::ZERO; 3]; joints + 1],
-            increment: vec![Lanes::ZERO; joints],
-            momentum: vec![Lanes::ZERO; joints],
+            flows: vec![[Block::ZERO; 3]; joints + 1],
+            increment: vec![Block::ZERO; joints],
+            momentum: vec![Block::ZERO; joints],
         }
     }
 
@@ -246,8 +246,8 @@ impl Elimination {
     ) {
         let n = joints.len();
         for first in (0..stride).step_by(LANES) {
-            self.increment.fill(Lanes::ZERO);
-            self.momentum.fill(Lanes::ZERO);
+            self.increment.fill(Block::ZERO);
+            self.momentum.fill(Block::ZERO);
             for lane in 0..LANES {
                 match first + lane {
                     column if column < n => {
@@ -308,7 +308,7 @@ impl Elimination {
     /// From the leaves to the root, with the right-hand side taken away.
     #[inline(always)]
     fn eliminate(&mut self, joints: &[PlanarJoint]) {
-        self.flows.fill([Lanes::ZERO; 3]);
+        self.flows.fill([Block::ZERO; 3]);
         for (i, (joint, row)) in joints.iter().zip(&mut self.increment).enumerate().rev() {
             let Generator { edge, minus, above, inverse_pivot, .. } = self.generators[i + 1];
             let [n, fx, fy] = self.flows[i + 1];
@@ -346,7 +346,7 @@ impl Elimination {
     /// From the leaves to the root: what joints below add to the momentum.
     #[inline(always)]
     fn gather(&mut self, joints: &[PlanarJoint]) {
-        self.flows.fill([Lanes::ZERO; 3]);
+        self.flows.fill([Block::ZERO; 3]);
         let rows = self.increment.iter().zip(&mut self.momentum);
         for (i, (joint, (x, momentum))) in joints.iter().zip(rows).enumerate().rev() {
             let Generator { plus, push, rate, .. } = self.generators[i + 1];
@@ -363,7 +363,7 @@ impl Elimination {
 }
 
 #[inline(always)]
-fn add_to(sum: &mut [Lanes; 3], part: [Lanes; 3]) {
+fn add_to(sum: &mut [Block; 3], part: [Block; 3]) {
     let [n, fx, fy] = *sum;
     *sum = [n.plus(part[0]), fx.plus(part[1]), fy.plus(part[2])];
 }
