@@ -149,7 +149,7 @@ impl Elimination {
         let (half, inverse) = (step * motion, 1.0 / step);
         let [e1, e2] = self.horizontal;
         let weight = 0.5 * half * self.gravity;
-        let mut smallest = SmallestPivot { row: 0, relative: 1.0 };
+        let mut smallest = SmallestPivot::NONE;
         for (row, joint) in tree.joints.iter().enumerate().rev() {
             let (axis, rate) = (momenta.axis[row], momenta.axis_rate[row]);
             let (force, slope) = (curvature.force[row], curvature.rate[row]);
@@ -177,10 +177,7 @@ impl Elimination {
             }
             let entry = dot(&minus, &upper) + diagonal[row];
             let pivot = entry + dot(&minus, &pushed);
-            let relative = (pivot.abs() / entry.abs().max(inertia[row] * inverse.abs())).max(0.0);
-            if relative < smallest.relative {
-                smallest = SmallestPivot { row, relative };
-            }
+            smallest.see(row, pivot, entry.abs().max(inertia[row] * inverse.abs()));
             let inverse_pivot = 1.0 / pivot;
             let across = across.times(inverse_pivot);
             for (line, above) in own.iter_mut().zip(above.0) {

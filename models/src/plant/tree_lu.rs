@@ -26,6 +26,20 @@ pub(crate) struct SmallestPivot {
     pub(crate) relative: f64,
 }
 
+impl SmallestPivot {
+    /// Before any.
+    pub(crate) const NONE: Self = Self { row: 0, relative: 1.0 };
+
+    /// Compares a pivot with its reference. A NaN counts as zero.
+    #[inline(always)]
+    pub(crate) fn see(&mut self, row: usize, pivot: f64, reference: f64) {
+        let relative = (pivot.abs() / reference).max(0.0);
+        if relative < self.relative {
+            *self = Self { row, relative };
+        }
+    }
+}
+
 impl TreeLu {
     pub(crate) fn new(elimination: &Elimination) -> Self {
         Self {
@@ -94,7 +108,7 @@ impl TreeLu {
         {
             *reference = self.upper[end - 1].abs().max(scale * factor);
         }
-        let mut smallest = SmallestPivot { row: 0, relative: 1.0 };
+        let mut smallest = SmallestPivot::NONE;
         for k in (0..elimination.len()).rev() {
             let start = elimination.offsets[k];
             let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
@@ -102,11 +116,7 @@ impl TreeLu {
             let (upper_above, upper_row) = self.upper.split_at_mut(start);
             let (lower_above, lower_row) = self.lower.split_at_mut(start);
             let pivot = upper_row[depth];
-            // A NaN counts as zero.
-            let relative = (pivot.abs() / self.reference[k]).max(0.0);
-            if relative < smallest.relative {
-                smallest = SmallestPivot { row: k, relative };
-            }
+            smallest.see(k, pivot, self.reference[k]);
             let inverse = 1.0 / pivot;
             self.inverse_pivot[k] = inverse;
             for entry in &mut upper_row[..depth] {

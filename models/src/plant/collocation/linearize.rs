@@ -53,10 +53,7 @@ impl Collocation {
         let h = at.settings.time_step_s;
         let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
         let stride = padded((next + d.prescribed).max(1));
-        let system = match &mut self.system {
-            Some(system) => system,
-            system => system.insert(Box::new(System::new(model, &self.tableau))),
-        };
+        let system = self.system.get_or_insert_with(|| Box::new(System::new(model, &self.tableau)));
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {
                 time_step_s: h,

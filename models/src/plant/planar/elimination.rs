@@ -151,7 +151,7 @@ impl Elimination {
         let motion = if of == Of::Masses { 0.0 } else { 1.0 };
         let (half, inverse) = (0.5 * step * motion, 1.0 / step);
         self.step = step;
-        let mut smallest = SmallestPivot { row: 0, relative: 1.0 };
+        let mut smallest = SmallestPivot::NONE;
         for ((row, joint), (added, inertia)) in
             joints.iter().enumerate().zip(diagonal.iter().zip(inertia)).rev()
         {
@@ -169,10 +169,7 @@ impl Elimination {
             let pushed = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
             let own = dot3(minus, upper) + added;
             let pivot = own + dot3(minus, pushed);
-            let relative = (pivot.abs() / own.abs().max(inertia * inverse)).max(0.0);
-            if relative < smallest.relative {
-                smallest = SmallestPivot { row, relative };
-            }
+            smallest.see(row, pivot, own.abs().max(inertia * inverse));
             let inverse_pivot = 1.0 / pivot;
             let above = add_scaled(upper, 1.0, pushed);
             let across = add_scaled(lower, minus[0], a);
