@@ -14,7 +14,7 @@ pub(crate) mod closure;
 mod collocation;
 pub(crate) mod conditioning;
 mod curvature;
-mod dense_lu;
+mod dense_inverse;
 mod diagnose;
 mod forces;
 mod initial;

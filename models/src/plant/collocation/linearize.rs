@@ -11,7 +11,7 @@
 use super::Collocation;
 use super::system::System;
 use crate::plant::StepError;
-use crate::plant::dense_lu::DenseLu;
+use crate::plant::dense_inverse::DenseInverse;
 use crate::plant::linearize::Linearization;
 use crate::plant::newton::{At, Workspace};
 use crate::plant::rows::{Term, add_rows, padded};
@@ -35,7 +35,7 @@ pub(crate) struct StageTangents {
     /// `Σ ∂P_i/∂Y`, row-major, n by `n s`.
     pub(crate) slopes: Vec<f64>,
     /// The factors of `∂R/∂Y`.
-    pub(crate) matrix: DenseLu,
+    pub(crate) matrix: DenseInverse,
     terms: Vec<Term>,
 }
 
@@ -81,7 +81,7 @@ impl Collocation {
         tangents.inputs.copy_from_slice(&self.inputs);
         workspace.prepare(at);
         system.fill_matrix(n);
-        if !system.matrix.factor() {
+        if !system.matrix.invert() {
             return Err(StepError::NotFinite { iterations: 0 });
         }
         let (hessian, width) = system.hessian();
@@ -148,7 +148,7 @@ impl Collocation {
         }
 
         tangents.time_step_s = h;
-        tangents.matrix.take_factors_of(&system.matrix);
+        tangents.matrix.take_inverse_of(&system.matrix);
         out.keep_stages(tangents);
         Ok(())
     }

@@ -5,7 +5,7 @@
 
 use crate::Model;
 use crate::plant::closure::{larger, largest};
-use crate::plant::dense_lu::DenseLu;
+use crate::plant::dense_inverse::DenseInverse;
 use crate::plant::forces;
 use crate::plant::mechanics::Mechanics;
 use crate::plant::newton::{At, CHORD_FLOOR, FLOOR, Workspace};
@@ -53,7 +53,7 @@ pub(crate) struct System {
     l_v: Vec<Lanes>,
     hessian: Hessian,
     /// Derivatives of the residuals by all `Y`; entry `a·count + i` belongs to stage `i` of coordinate `a`.
-    pub(super) matrix: DenseLu,
+    pub(super) matrix: DenseInverse,
     residual: Vec<f64>,
 }
 
@@ -97,7 +97,7 @@ impl System {
             l_q: lanes(d.dynamic),
             l_v: lanes(d.dynamic),
             hessian: Hessian::new(model, width),
-            matrix: DenseLu::new(count * d.dynamic, width - count),
+            matrix: DenseInverse::new(count * d.dynamic, width - count),
             residual: vec![0.0; count * d.dynamic],
         }
     }
@@ -342,7 +342,7 @@ impl System {
                 self.differentiate(workspace, at, inputs);
                 self.fill_matrix(n);
                 report.factorizations += 1;
-                if !self.matrix.factor() {
+                if !self.matrix.invert() {
                     return Err(StepError::NotConverged { iterations: iteration, residual: size });
                 }
             }
