@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::elimination::Elimination;
-use crate::planar::PlanarJoint;
+use crate::planar::{PlanarJoint, PlanarJoints};
 use crate::plant::conditioning::Conditioning;
 use crate::scene::{CoordinateKind, Scene};
 use crate::signal::{Signal, Target};
@@ -25,7 +25,7 @@ pub struct Model {
     /// Joints that carry inertia or springs: what a step walks at the midpoint.
     pub(crate) dynamics: Tree,
     /// The same as a planar tree, where it is one and nothing needs its poses in space.
-    pub(crate) planar: Option<Vec<PlanarJoint>>,
+    pub(crate) planar: Option<PlanarJoints>,
     /// How a step solves for corrections.
     pub(crate) solver: Solver,
     /// `None` without gravity.

@@ -1,38 +1,109 @@
 //! Joint trees that move in planes: all that turns in a tree turns about parallel axes, all that slides
 //! does so across them. Their mechanics is that of vectors of three numbers, not of six.
 
+use std::ops::Deref;
+
+use crate::scalar::Lanes;
 use crate::spatial::{Mat3, Vec3};
 use crate::tree::{JointKind, Rotational, Tree, WORLD};
 
 /// Sine of the angle below which two axes count as parallel: what rounding leaves of a rotation.
 const PARALLEL: f64 = 1e-15;
 
-/// A joint with everything that is fixed to it, in the axes of its tree's plane at the configuration zero.
+/// What is fixed to a joint, in the axes of its tree's plane at the configuration zero: of one joint, or of
+/// several side by side.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Body<C = f64> {
+    /// How far it turns in the plane for a unit of its coordinate: 1, −1, or 0 for a slider.
+    pub(crate) turn: C,
+    /// How far it slides; zero for a hinge.
+    pub(crate) slide: [C; 2],
+    /// From the parent joint to this one.
+    pub(crate) offset: [C; 2],
+    /// From the joint to the centre of mass.
+    pub(crate) center: [C; 2],
+    pub(crate) mass: C,
+    /// About the centre of mass and the normal of the plane.
+    pub(crate) inertia: C,
+    /// Mass of the joint's subtree.
+    pub(crate) subtree_mass: C,
+    /// Gravity in the plane; zero without.
+    pub(crate) gravity: [C; 2],
+}
+
+/// A joint with everything that is fixed to it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PlanarJoint {
     /// Index of the parent joint plus one; 0 for the world.
     pub(crate) parent: usize,
     /// Index of the coordinate.
     pub(crate) coordinate: usize,
-    /// How far it turns in the plane for a unit of its coordinate: 1, −1, or 0 for a slider.
-    pub(crate) turn: f64,
-    /// How far it slides; zero for a hinge.
-    pub(crate) slide: [f64; 2],
-    /// From the parent joint to this one.
-    pub(crate) offset: [f64; 2],
-    /// From the joint to the centre of mass.
-    pub(crate) center: [f64; 2],
-    pub(crate) mass: f64,
-    /// About the centre of mass and the normal of the plane.
-    pub(crate) inertia: f64,
-    /// Mass of the joint's subtree.
-    pub(crate) subtree_mass: f64,
-    /// Gravity in the plane; zero without.
-    pub(crate) gravity: [f64; 2],
+    pub(crate) body: Body,
     /// Joints below this one: they follow it in the list.
     pub(crate) descendants: usize,
+    /// Whether the next joint in the list is a child, and whether there are others.
+    pub(crate) is_followed: bool,
+    pub(crate) has_branches: bool,
     /// The evaluation's origin moves to this joint, as in [`Tree`].
     pub(crate) anchor: bool,
+}
+
+/// The joints of trees in planes, parents before children.
+#[derive(Clone, Debug)]
+pub(crate) struct PlanarJoints {
+    joints: Vec<PlanarJoint>,
+    /// Four joints side by side; what is beyond the last one weighs nothing.
+    pub(crate) fours: Vec<Body<Lanes>>,
+    /// Whether the joints are in the order of their coordinates.
+    pub(crate) are_in_order: bool,
+    /// Whether some are sliders.
+    pub(crate) have_sliders: bool,
+}
+
+impl Deref for PlanarJoints {
+    type Target = [PlanarJoint];
+
+    fn deref(&self) -> &[PlanarJoint] {
+        &self.joints
+    }
+}
+
+impl PlanarJoints {
+    fn new(mut joints: Vec<PlanarJoint>) -> Self {
+        for i in (0..joints.len()).rev() {
+            if let Some(parent) = joints[i].parent.checked_sub(1) {
+                joints[parent].descendants += joints[i].descendants + 1;
+                let (is_next, above) = (parent + 1 == i, &mut joints[parent]);
+                above.is_followed |= is_next;
+                above.has_branches |= !is_next;
+            }
+        }
+        let fours = joints.chunks(Lanes::COUNT).map(side_by_side).collect();
+        let are_in_order = joints.iter().enumerate().all(|(i, joint)| joint.coordinate == i);
+        let have_sliders = joints.iter().any(|joint| joint.body.turn == 0.0);
+        Self { joints, fours, are_in_order, have_sliders }
+    }
+}
+
+/// The bodies of a few joints, side by side.
+fn side_by_side(joints: &[PlanarJoint]) -> Body<Lanes> {
+    let lanes = |number: &dyn Fn(&Body) -> f64| {
+        let mut lanes = Lanes::default();
+        lanes.0.iter_mut().zip(joints).for_each(|(lane, joint)| *lane = number(&joint.body));
+        lanes
+    };
+    let vector =
+        |vector: &dyn Fn(&Body) -> [f64; 2]| [0, 1].map(|k| lanes(&|body| vector(body)[k]));
+    Body {
+        turn: lanes(&|body| body.turn),
+        slide: vector(&|body| body.slide),
+        offset: vector(&|body| body.offset),
+        center: vector(&|body| body.center),
+        mass: lanes(&|body| body.mass),
+        inertia: lanes(&|body| body.inertia),
+        subtree_mass: lanes(&|body| body.subtree_mass),
+        gravity: vector(&|body| body.gravity),
+    }
 }
 
 /// Axes of a tree's plane in the world, its normal last, and the pose of a joint at the configuration
@@ -44,7 +115,7 @@ struct Zero {
 }
 
 /// The joints of a tree in their planes, one plane for each root; `None` if some tree has none.
-pub(crate) fn planar(tree: &Tree, gravity: Option<Vec3>) -> Option<Vec<PlanarJoint>> {
+pub(crate) fn planar(tree: &Tree, gravity: Option<Vec3>) -> Option<PlanarJoints> {
     let mut zero: Vec<Zero> = Vec::with_capacity(tree.joints.len());
     let mut joints: Vec<PlanarJoint> = Vec::with_capacity(tree.joints.len());
     for (i, joint) in tree.joints.iter().enumerate() {
@@ -76,25 +147,24 @@ pub(crate) fn planar(tree: &Tree, gravity: Option<Vec3>) -> Option<Vec<PlanarJoi
         joints.push(PlanarJoint {
             parent: if joint.parent == WORLD { 0 } else { joint.parent + 1 },
             coordinate: joint.coordinate,
-            turn,
-            slide,
-            offset,
-            center: local(rotation.apply(joint.body.center)).0,
-            mass: joint.body.mass,
-            inertia,
-            subtree_mass: joint.subtree_mass,
-            gravity: gravity.map_or([0.0; 2], |g| local(g).0),
+            body: Body {
+                turn,
+                slide,
+                offset,
+                center: local(rotation.apply(joint.body.center)).0,
+                mass: joint.body.mass,
+                inertia,
+                subtree_mass: joint.subtree_mass,
+                gravity: gravity.map_or([0.0; 2], |g| local(g).0),
+            },
             descendants: 0,
+            is_followed: false,
+            has_branches: false,
             anchor: joint.anchor,
         });
         zero.push(Zero { plane, rotation });
     }
-    for i in (0..joints.len()).rev() {
-        if let Some(parent) = joints[i].parent.checked_sub(1) {
-            joints[parent].descendants += joints[i].descendants + 1;
-        }
-    }
-    Some(joints)
+    Some(PlanarJoints::new(joints))
 }
 
 /// The plane across the first hinge of the tree with this root.

@@ -5,13 +5,12 @@ use crate::Model;
 use crate::plant::curvature::{Curvature, SecondDerivatives};
 use crate::plant::kinematics::Poses;
 use crate::plant::momenta::Momenta;
-use crate::plant::planar::PlanarTree;
-use crate::scalar::Scalar;
+use crate::plant::planar::{Planar, PlanarTree};
 use crate::spatial::Mat3;
 
 /// What its derivatives are found from.
 #[derive(Clone, Debug)]
-pub(crate) struct Mechanics<S = f64> {
+pub(crate) struct Mechanics<S: Planar = f64> {
     /// In place of all others, where the scene is planar.
     pub(crate) planar: Option<Box<PlanarTree<S>>>,
     pub(crate) poses: Poses<S>,
@@ -19,7 +18,7 @@ pub(crate) struct Mechanics<S = f64> {
     pub(crate) curvature: Curvature<S>,
 }
 
-impl<S: Scalar> Mechanics<S> {
+impl<S: Planar> Mechanics<S> {
     pub(crate) fn new(model: &Model) -> Self {
         Self {
             planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
@@ -51,10 +50,7 @@ impl<S: Scalar> Mechanics<S> {
     /// Prepares second derivatives at the last gradient, for [`Mechanics::pair`].
     pub(crate) fn differentiate(&mut self, model: &Model) {
         match (&mut self.planar, &model.planar) {
-            (Some(planar), Some(joints)) => {
-                planar.differentiate(joints);
-                planar.place(joints);
-            }
+            (Some(planar), Some(joints)) => planar.differentiate(joints),
             _ => self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta),
         }
     }

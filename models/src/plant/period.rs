@@ -213,6 +213,7 @@ impl Plant {
 }
 
 /// Takes a step and linearizes it if asked to; the solution is in the workspace.
+#[inline]
 fn take(
     workspace: &mut Workspace,
     collocation: &mut Option<Box<Collocation>>,

@@ -15,6 +15,9 @@
 //!
 //! and second derivatives are products of these as in space. Turning by an angle is a complex number.
 //!
+//! Only sums along the tree need one joint after the other: directions, velocities, momenta, moments and
+//! inertia. All else is the same for each joint, and is computed for four of them side by side ([`Fours`]).
+//!
 //! [`Momenta`]: crate::plant::momenta::Momenta
 //! [`Curvature`]: crate::plant::curvature::Curvature
 
@@ -22,11 +25,15 @@ mod elimination;
 
 pub(crate) use self::elimination::{Diagonal, Elimination, Of};
 
+use std::fmt::Debug;
+use std::marker::PhantomData;
+use std::ops::{Mul, Range};
+
 use crate::model::Pair;
-use crate::planar::PlanarJoint;
+use crate::planar::{Body, PlanarJoint, PlanarJoints};
 use crate::plant::curvature::SecondDerivatives;
 use crate::plant::tree_lu::TreeLu;
-use crate::scalar::Scalar;
+use crate::scalar::{Lanes, Scalar};
 use crate::wide::wide;
 
 /// A vector in the plane.
@@ -34,208 +41,216 @@ type Vec2<S = f64> = [S; 2];
 /// A twist or a wrench: the angular part first.
 type Vec3<S = f64> = [S; 3];
 
-/// A joint at a configuration and velocity.
-#[derive(Clone, Copy, Debug, Default)]
-struct Link<S = f64> {
-    /// From the parent joint to this one.
-    edge: Vec2<S>,
-    /// Where the joint is, from the origin of the tree; set by [`PlanarTree::differentiate`].
-    position: Vec2<S>,
-    /// `d` of a slider; zero for a hinge.
-    slide: Vec2<S>,
-    /// Linear part of `J̇`.
-    rate: Vec2<S>,
-    /// Twist of the body.
-    twist: Vec3<S>,
-    /// Momentum of the subtree, and its first moment of mass.
-    momentum: Vec3<S>,
-    moment: Vec2<S>,
-    /// Inertia of the body, and a sum over what hangs from it.
-    inertia: S,
-    inertia_below: S,
-    /// `F`.
-    force: Vec3<S>,
-    /// `P`.
-    slope: Vec3<S>,
-    /// `f × g` for the linear part `f` of `F`.
-    weight: S,
+/// How numbers of joints lie: those of several side by side, or one after the other.
+pub(crate) trait Arrangement: Clone + Debug {
+    type Number: Scalar;
+    type Several: Scalar + Mul<Self::Constant, Output = Self::Several>;
+    type Constant: Copy;
+    /// Joints of a block.
+    const COUNT: usize;
+    /// Blocks that go through a part of a pass together.
+    const TOGETHER: usize;
+    /// What is fixed to the joints of a block.
+    fn body(joints: &PlanarJoints, block: usize) -> &Body<Self::Constant>;
+    fn one(several: &Self::Several, lane: usize) -> Self::Number;
+    fn put(number: Self::Number, several: &mut Self::Several, lane: usize);
+    /// The numbers of a block from a list of those of coordinates.
+    fn gather(joints: &PlanarJoints, block: usize, list: &[Self::Number]) -> Self::Several;
+    /// The way back, but for what is beyond the list.
+    fn scatter(
+        joints: &PlanarJoints,
+        block: usize,
+        several: Self::Several,
+        list: &mut [Self::Number],
+    );
+    /// The numbers of a block, those of each joint together.
+    fn spread(numbers: [Self::Several; 4], joints: &mut [[Self::Number; 4]]);
+    /// The way back.
+    fn collect(joints: &[[Self::Number; 4]]) -> [Self::Several; 4];
 }
 
-/// A planar tree at a configuration and velocity. The first entry of each list is the world.
-#[derive(Clone, Debug)]
-pub(crate) struct PlanarTree<S = f64> {
-    links: Vec<Link<S>>,
-    angles: Vec<S>,
-    /// Sine and cosine of the angle of each body.
-    directions: Vec<Vec2<S>>,
-}
+/// Four joints side by side.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Fours;
 
-#[inline(always)]
-fn cross<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> S {
-    a[0] * b[1] - a[1] * b[0]
-}
+impl Arrangement for Fours {
+    type Number = f64;
+    type Several = Lanes;
+    type Constant = Lanes;
+    const COUNT: usize = Lanes::COUNT;
+    const TOGETHER: usize = usize::MAX;
 
-#[inline(always)]
-fn dot<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> S {
-    a[0] * b[0] + a[1] * b[1]
-}
-
-#[inline(always)]
-fn add<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> Vec2<S> {
-    [a[0] + b[0], a[1] + b[1]]
-}
-
-/// `ẑ × v`, times `w`.
-#[inline(always)]
-fn spun<S: Scalar>(w: S, v: Vec2<S>) -> Vec2<S> {
-    [-w * v[1], w * v[0]]
-}
-
-/// `v` turned by the angle of which sine and cosine are given.
-#[inline(always)]
-fn turned<S: Scalar>([s, c]: Vec2<S>, v: Vec2) -> Vec2<S> {
-    [c * v[0] - s * v[1], s * v[0] + c * v[1]]
-}
-
-/// One turn after the other.
-#[inline(always)]
-fn combined<S: Scalar>([s, c]: Vec2<S>, [s1, c1]: Vec2<S>) -> Vec2<S> {
-    [s * c1 + c * s1, c * c1 - s * s1]
-}
-
-#[inline(always)]
-fn linear<S: Scalar>(v: Vec3<S>) -> Vec2<S> {
-    [v[1], v[2]]
-}
-
-impl<S: Scalar> PlanarTree<S> {
-    pub(crate) fn new(joints: &[PlanarJoint]) -> Self {
-        let n = joints.len() + 1;
-        Self {
-            links: vec![Link::default(); n],
-            angles: vec![S::ZERO; joints.len()],
-            directions: vec![[S::ZERO, S::ONE]; n],
-        }
-    }
-
-    wide! {
-        /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones, without
-        /// springs: two passes over the joints, about 60 flops each beside a sine and a cosine.
-        #[inline(never)]
-        pub(crate) fn gradient(
-            mut self,
-            joints: &[PlanarJoint],
-            q: &[S],
-            velocity: &[S],
-            l_q: &mut [S],
-            l_v: &mut [S],
-        ) = gradient_portable, gradient_avx2;
+    #[inline(always)]
+    fn body(joints: &PlanarJoints, block: usize) -> &Body<Lanes> {
+        &joints.fours[block]
     }
 
     #[inline(always)]
-    fn gradient_portable(
+    fn one(several: &Lanes, lane: usize) -> f64 {
+        several.0[lane]
+    }
+
+    #[inline(always)]
+    fn put(number: f64, several: &mut Lanes, lane: usize) {
+        several.0[lane] = number;
+    }
+
+    #[inline(always)]
+    fn gather(joints: &PlanarJoints, block: usize, list: &[f64]) -> Lanes {
+        let first = Self::COUNT * block;
+        let mut lanes = Lanes::ZERO;
+        match list.get(first..first + Self::COUNT) {
+            Some(four) if joints.are_in_order => lanes.0.copy_from_slice(four),
+            _ => {
+                for (lane, joint) in lanes.0.iter_mut().zip(&joints[first..]) {
+                    *lane = list[joint.coordinate];
+                }
+            }
+        }
+        lanes
+    }
+
+    #[inline(always)]
+    fn scatter(joints: &PlanarJoints, block: usize, lanes: Lanes, list: &mut [f64]) {
+        let first = Self::COUNT * block;
+        match list.get_mut(first..first + Self::COUNT) {
+            Some(four) if joints.are_in_order => four.copy_from_slice(&lanes.0),
+            _ => {
+                for (lane, joint) in lanes.0.iter().zip(&joints[first..]) {
+                    if let Some(entry) = list.get_mut(joint.coordinate) {
+                        *entry = *lane;
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn spread([a, b, c, d]: [Lanes; 4], joints: &mut [[f64; 4]]) {
+        for (lane, joint) in joints[..4].iter_mut().enumerate() {
+            *joint = [a.0[lane], b.0[lane], c.0[lane], d.0[lane]];
+        }
+    }
+
+    #[inline(always)]
+    fn collect(joints: &[[f64; 4]]) -> [Lanes; 4] {
+        let mut numbers = [Lanes::ZERO; 4];
+        for (lane, joint) in joints[..4].iter().enumerate() {
+            for (number, to) in joint.iter().zip(&mut numbers) {
+                to.0[lane] = *number;
+            }
+        }
+        numbers
+    }
+}
+
+/// One joint after the other.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Ones<S>(PhantomData<S>);
+
+impl<S: Scalar> Arrangement for Ones<S> {
+    type Number = S;
+    type Several = S;
+    type Constant = f64;
+    const COUNT: usize = 1;
+    const TOGETHER: usize = 1;
+
+    #[inline(always)]
+    fn body(joints: &PlanarJoints, block: usize) -> &Body {
+        &joints[block].body
+    }
+
+    #[inline(always)]
+    fn one(several: &S, _: usize) -> S {
+        *several
+    }
+
+    #[inline(always)]
+    fn put(number: S, several: &mut S, _: usize) {
+        *several = number;
+    }
+
+    #[inline(always)]
+    fn gather(joints: &PlanarJoints, block: usize, list: &[S]) -> S {
+        list[joints[block].coordinate]
+    }
+
+    #[inline(always)]
+    fn scatter(joints: &PlanarJoints, block: usize, several: S, list: &mut [S]) {
+        if let Some(entry) = list.get_mut(joints[block].coordinate) {
+            *entry = several;
+        }
+    }
+
+    #[inline(always)]
+    fn spread(numbers: [S; 4], joints: &mut [[S; 4]]) {
+        joints[0] = numbers;
+    }
+
+    #[inline(always)]
+    fn collect(joints: &[[S; 4]]) -> [S; 4] {
+        joints[0]
+    }
+}
+
+/// Numbers of which planar trees are computed.
+pub(crate) trait Planar: Scalar {
+    /// Of many joints.
+    type Many: Arrangement<Number = Self>;
+}
+
+impl Planar for f64 {
+    type Many = Fours;
+}
+
+impl Planar for Lanes {
+    type Many = Ones<Self>;
+}
+
+/// Joints up to which one after the other is faster.
+const FEW: usize = 3;
+
+/// A planar tree at a configuration and velocity.
+#[derive(Clone, Debug)]
+pub(crate) enum PlanarTree<S: Planar = f64> {
+    Few(Joints<Ones<S>>),
+    Many(Joints<S::Many>),
+}
+
+impl<S: Planar> PlanarTree<S> {
+    pub(crate) fn new(joints: &PlanarJoints) -> Self {
+        if joints.len() > FEW {
+            Self::Many(Joints::new(joints))
+        } else {
+            Self::Few(Joints::new(joints))
+        }
+    }
+
+    /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones, without springs.
+    pub(crate) fn gradient(
         &mut self,
-        joints: &[PlanarJoint],
+        joints: &PlanarJoints,
         q: &[S],
         velocity: &[S],
         l_q: &mut [S],
         l_v: &mut [S],
     ) {
-        for (i, joint) in joints.iter().enumerate() {
-            self.angles[i] = q[joint.coordinate] * joint.turn;
-        }
-        S::sin_cos_of_all(&self.angles, &mut self.directions[1..]);
-        let (links, directions) = (&mut self.links[..], &mut self.directions[..]);
-        for (i, joint) in joints.iter().enumerate() {
-            let (parent, above) = (links[joint.parent].twist, directions[joint.parent]);
-            let direction = combined(above, directions[i + 1]);
-            directions[i + 1] = direction;
-            let (w, rate) = (parent[0], velocity[joint.coordinate]);
-            let link = &mut links[i + 1];
-            let twist;
-            if joint.turn == 0.0 {
-                let slide = turned(above, joint.slide);
-                let slid = slide.map(|d| d * q[joint.coordinate]);
-                link.edge = add(turned(above, joint.offset), slid);
-                let v = add(linear(parent), spun(w, link.edge));
-                (link.slide, link.rate) = (slide, spun(w, slide));
-                twist = [w, v[0] + slide[0] * rate, v[1] + slide[1] * rate];
-            } else {
-                link.edge = turned(above, joint.offset);
-                let v = add(linear(parent), spun(w, link.edge));
-                link.rate = spun(S::constant(-joint.turn), v);
-                twist = [w + rate * joint.turn, v[0], v[1]];
-            }
-            let arm = turned(direction, joint.center);
-            let f = add(linear(twist), spun(twist[0], arm)).map(|v| v * joint.mass);
-            link.twist = twist;
-            link.momentum = [twist[0] * joint.inertia + cross(arm, f), f[0], f[1]];
-            link.moment = arm.map(|x| x * joint.mass);
-            link.inertia = dot(arm, arm) * joint.mass + joint.inertia;
-        }
-        for (i, joint) in joints.iter().enumerate().rev() {
-            let Link { edge, momentum, moment, slide, rate, .. } = links[i + 1];
-            let (f, mass) = (linear(momentum), joint.subtree_mass);
-            if joint.parent > 0 {
-                let parent = &mut links[joint.parent];
-                parent.momentum[0] += momentum[0] + cross(edge, f);
-                parent.momentum[1] += f[0];
-                parent.momentum[2] += f[1];
-                parent.moment[0] += moment[0] + edge[0] * mass;
-                parent.moment[1] += moment[1] + edge[1] * mass;
-            }
-            if let (Some(l_q), Some(l_v)) =
-                (l_q.get_mut(joint.coordinate), l_v.get_mut(joint.coordinate))
-            {
-                let (s, g) = (joint.turn, joint.gravity.map(S::constant));
-                *l_v = momentum[0] * s + dot(slide, f);
-                *l_q = dot(rate, f) + cross(moment, g) * s + dot(slide, g) * mass;
-            }
+        match self {
+            Self::Few(tree) => tree.gradient(joints, q, velocity, l_q, l_v),
+            Self::Many(tree) => tree.gradient(joints, q, velocity, l_q, l_v),
         }
     }
 
-    /// Computes `F` and `P` of each joint at the last gradient.
-    #[inline(never)]
-    pub(crate) fn differentiate(&mut self, joints: &[PlanarJoint]) {
-        let links = &mut self.links[..];
-        for (i, joint) in joints.iter().enumerate().rev() {
-            let link = &mut links[i + 1];
-            let inertia = link.inertia + std::mem::take(&mut link.inertia_below);
-            let (edge, moment, slide, rate) = (link.edge, link.moment, link.slide, link.rate);
-            let (s, mass, f) = (joint.turn, joint.subtree_mass, linear(link.momentum));
-            let turn = S::constant(s);
-            let push = add(spun(turn, moment), slide.map(|d| d * mass));
-            link.force = [inertia * s + cross(moment, slide), push[0], push[1]];
-            let pull = add(spun(turn, f), rate.map(|a| a * mass));
-            link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
-            link.weight = cross(push, joint.gravity.map(S::constant));
-            if joint.parent > 0 {
-                links[joint.parent].inertia_below +=
-                    inertia + dot(edge, moment) * 2.0 + dot(edge, edge) * mass;
+    /// Prepares second derivatives at the last gradient, for [`PlanarTree::pair`].
+    pub(crate) fn differentiate(&mut self, joints: &PlanarJoints) {
+        match self {
+            Self::Few(tree) => {
+                tree.differentiate(joints);
+                tree.place(joints);
             }
-        }
-    }
-
-    /// Places the joints, for [`PlanarTree::pair`] and [`PlanarTree::fill_newton_matrix`].
-    #[inline(never)]
-    pub(crate) fn place(&mut self, joints: &[PlanarJoint]) {
-        let links = &mut self.links[..];
-        for (i, joint) in joints.iter().enumerate() {
-            // The root of a tree is its origin, unless that moves on.
-            links[i + 1].position = match joint.parent {
-                0 => [S::ZERO; 2],
-                parent => add(links[parent].position, links[i + 1].edge),
-            };
-            if joint.anchor {
-                // All joints placed so far in its tree are its ancestors.
-                links[i + 1].position = [S::ZERO; 2];
-                let mut below = i + 1;
-                while joints[below - 1].parent > 0 {
-                    let parent = joints[below - 1].parent;
-                    let Link { position, edge, .. } = links[below];
-                    links[parent].position = [position[0] - edge[0], position[1] - edge[1]];
-                    below = parent;
-                }
+            Self::Many(tree) => {
+                tree.differentiate(joints);
+                tree.place(joints);
             }
         }
     }
@@ -248,10 +263,548 @@ impl<S: Scalar> PlanarTree<S> {
         ancestor: usize,
         descendant: usize,
     ) -> SecondDerivatives<S> {
-        let (above, below) = (&self.links[ancestor + 1], &self.links[descendant + 1]);
-        let s = joints[ancestor].turn;
-        let arm = [below.position[0] - above.position[0], below.position[1] - above.position[1]];
-        let along = |wrench: Vec3<S>| {
+        match self {
+            Self::Few(tree) => tree.pair(joints, ancestor, descendant),
+            Self::Many(tree) => tree.pair(joints, ancestor, descendant),
+        }
+    }
+}
+
+impl PlanarTree {
+    /// The joints of a tree of more than a few.
+    pub(crate) fn many(&self) -> Option<&Joints<Fours>> {
+        match self {
+            Self::Many(tree) => Some(tree),
+            Self::Few(_) => None,
+        }
+    }
+
+    /// Writes the Jacobian of the residual by the increment, without springs and forces, entry by entry.
+    pub(crate) fn fill_newton_matrix(
+        &self,
+        joints: &[PlanarJoint],
+        pairs: &[Pair],
+        step: f64,
+        matrix: &mut TreeLu,
+    ) {
+        match self {
+            Self::Few(tree) => tree.fill_newton_matrix(joints, pairs, step, matrix),
+            Self::Many(tree) => tree.fill_newton_matrix(joints, pairs, step, matrix),
+        }
+    }
+}
+
+/// Joints at a configuration and velocity.
+#[derive(Clone, Copy, Debug, Default)]
+struct Links<P> {
+    q: P,
+    speed: P,
+    /// Sine and cosine of the angle of the joint; of the parent's body, and of the body.
+    own: Vec2<P>,
+    above: Vec2<P>,
+    direction: Vec2<P>,
+    /// Angular velocity of the parent's body, and of the body.
+    spin_above: P,
+    spin: P,
+    /// Velocity of the joint, and how much more it is than that of the parent.
+    velocity: Vec2<P>,
+    faster: Vec2<P>,
+    /// From the parent joint to this one.
+    edge: Vec2<P>,
+    /// The same times the mass of the subtree.
+    lever: Vec2<P>,
+    /// `d` of a slider; zero for a hinge.
+    slide: Vec2<P>,
+    /// Linear part of `J̇`.
+    rate: Vec2<P>,
+    /// Angular momentum, momentum and first moment of mass of the subtree; of the momentum about the parent.
+    turning: P,
+    momentum: Vec2<P>,
+    moment: Vec2<P>,
+    torque: P,
+    /// Inertia of the body, that of the subtree, and what is added to it about the parent.
+    inertia: P,
+    total_inertia: P,
+    moved: P,
+    /// `F`.
+    force: Vec3<P>,
+    /// `P`.
+    slope: Vec3<P>,
+    /// `f × g` for the linear part `f` of `F`.
+    weight: P,
+}
+
+/// What a joint passes on to those below it: sine and cosine of the angle of its body, the angular velocity,
+/// and its own velocity.
+#[derive(Clone, Copy, Debug)]
+struct Motion<S> {
+    direction: Vec2<S>,
+    spin: S,
+    velocity: Vec2<S>,
+}
+
+impl<S: Scalar> Motion<S> {
+    const NONE: Self = Self { direction: [S::ZERO, S::ONE], spin: S::ZERO, velocity: [S::ZERO; 2] };
+}
+
+/// What the joint after this one passes on to it: momentum and moment of its subtree, and angular momentum.
+#[derive(Clone, Copy, Debug)]
+struct Below<S> {
+    sums: [S; 4],
+    turning: S,
+}
+
+impl<S: Scalar> Below<S> {
+    const NONE: Self = Self { sums: [S::ZERO; 4], turning: S::ZERO };
+}
+
+/// The joints of a planar tree at a configuration and velocity, block by block.
+#[derive(Clone, Debug)]
+pub(crate) struct Joints<A: Arrangement> {
+    links: Vec<Links<A::Several>>,
+    /// Momentum and first moment of mass, joint by joint, to the end of the last block.
+    sums: Vec<[A::Number; 4]>,
+    /// Sums over children that do not follow their parent in the list; zero but within a pass.
+    branches: Vec<Below<A::Number>>,
+    inertia_of_branches: Vec<A::Number>,
+    /// Where the joints are, from the origin of the tree; set by [`Joints::place`].
+    positions: Vec<Vec2<A::Number>>,
+}
+
+/// A joint at a configuration and velocity.
+#[derive(Clone, Copy, Debug)]
+struct Link<S> {
+    edge: Vec2<S>,
+    slide: Vec2<S>,
+    rate: Vec2<S>,
+    force: Vec3<S>,
+    slope: Vec3<S>,
+    weight: S,
+}
+
+#[inline(always)]
+fn cross<A, B: Copy>(a: Vec2<A>, b: Vec2<B>) -> A
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    a[0] * b[1] - a[1] * b[0]
+}
+
+#[inline(always)]
+fn dot<A, B: Copy>(a: Vec2<A>, b: Vec2<B>) -> A
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    a[0] * b[0] + a[1] * b[1]
+}
+
+#[inline(always)]
+fn add<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> Vec2<S> {
+    [a[0] + b[0], a[1] + b[1]]
+}
+
+#[inline(always)]
+fn times<A, B: Copy>(a: Vec2<A>, b: B) -> Vec2<A>
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    [a[0] * b, a[1] * b]
+}
+
+/// `ẑ × v`, times `w`.
+#[inline(always)]
+fn spun<A, B: Copy>(v: Vec2<A>, w: B) -> Vec2<A>
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    [-(v[1] * w), v[0] * w]
+}
+
+/// `v` turned by the angle of which sine and cosine are given.
+#[inline(always)]
+fn turned<A, B: Copy>([s, c]: Vec2<A>, v: Vec2<B>) -> Vec2<A>
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    [c * v[0] - s * v[1], s * v[0] + c * v[1]]
+}
+
+/// One turn after the other.
+#[inline(always)]
+fn combined<S: Scalar>([s, c]: Vec2<S>, [s1, c1]: Vec2<S>) -> Vec2<S> {
+    [s * c1 + c * s1, c * c1 - s * s1]
+}
+
+#[inline(always)]
+fn add4<S: Scalar>(a: [S; 4], b: [S; 4]) -> [S; 4] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]]
+}
+
+#[inline(always)]
+fn linear<S: Scalar>(v: Vec3<S>) -> Vec2<S> {
+    [v[1], v[2]]
+}
+
+#[inline(always)]
+fn one2<A: Arrangement>(v: &Vec2<A::Several>, lane: usize) -> Vec2<A::Number> {
+    [A::one(&v[0], lane), A::one(&v[1], lane)]
+}
+
+#[inline(always)]
+fn one3<A: Arrangement>(v: &Vec3<A::Several>, lane: usize) -> Vec3<A::Number> {
+    [A::one(&v[0], lane), A::one(&v[1], lane), A::one(&v[2], lane)]
+}
+
+#[inline(always)]
+fn put2<A: Arrangement>(v: Vec2<A::Number>, to: &mut Vec2<A::Several>, lane: usize) {
+    A::put(v[0], &mut to[0], lane);
+    A::put(v[1], &mut to[1], lane);
+}
+
+impl<A: Arrangement> Joints<A> {
+    pub(crate) fn new(joints: &PlanarJoints) -> Self {
+        let n = joints.len();
+        Self {
+            links: vec![Links::default(); n.div_ceil(A::COUNT)],
+            sums: vec![[A::Number::ZERO; 4]; n.next_multiple_of(A::COUNT)],
+            branches: vec![Below::NONE; n],
+            inertia_of_branches: vec![A::Number::ZERO; n],
+            positions: vec![[A::Number::ZERO; 2]; n],
+        }
+    }
+
+    wide! {
+        /// Three passes over the joints, about 60 flops each beside a sine and a cosine.
+        #[inline(never)]
+        fn gradient(
+            mut self,
+            joints: &PlanarJoints,
+            q: &[A::Number],
+            velocity: &[A::Number],
+            l_q: &mut [A::Number],
+            l_v: &mut [A::Number],
+        ) = gradient_portable, gradient_avx2;
+
+        /// Computes `F` and `P` of each joint at the last gradient.
+        #[inline(never)]
+        pub(crate) fn differentiate(mut self, joints: &PlanarJoints)
+            = differentiate_portable, differentiate_avx2;
+    }
+
+    #[inline(always)]
+    fn gradient_portable(
+        &mut self,
+        joints: &PlanarJoints,
+        q: &[A::Number],
+        velocity: &[A::Number],
+        l_q: &mut [A::Number],
+        l_v: &mut [A::Number],
+    ) {
+        if joints.have_sliders {
+            self.walk::<true>(joints, q, velocity, l_q, l_v);
+        } else {
+            self.walk::<false>(joints, q, velocity, l_q, l_v);
+        }
+    }
+
+    /// `SLIDES`: some joint is a slider.
+    #[inline(always)]
+    fn walk<const SLIDES: bool>(
+        &mut self,
+        joints: &PlanarJoints,
+        q: &[A::Number],
+        velocity: &[A::Number],
+        l_q: &mut [A::Number],
+        l_v: &mut [A::Number],
+    ) {
+        let blocks = self.links.len();
+        let parts = blocks.div_ceil(A::TOGETHER);
+        let part = |i: usize| match A::TOGETHER {
+            1 => i..i + 1,
+            _ => 0..blocks,
+        };
+        let mut last = Motion::NONE;
+        for i in 0..parts {
+            last = self.descend::<SLIDES>(joints, part(i), q, velocity, last);
+        }
+        let mut below = Below::NONE;
+        for i in (0..parts).rev() {
+            below = self.ascend::<SLIDES>(joints, part(i), l_q, l_v, below);
+        }
+    }
+
+    /// Where joints are and how fast, and the momenta of their bodies, for some blocks.
+    #[inline(always)]
+    fn descend<const SLIDES: bool>(
+        &mut self,
+        joints: &PlanarJoints,
+        blocks: Range<usize>,
+        q: &[A::Number],
+        velocity: &[A::Number],
+        mut last: Motion<A::Number>,
+    ) -> Motion<A::Number> {
+        for block in blocks.clone() {
+            let (link, body) = (&mut self.links[block], A::body(joints, block));
+            link.q = A::gather(joints, block, q);
+            link.speed = A::gather(joints, block, velocity);
+            link.own = (link.q * body.turn).sin_cos().into();
+            link.spin = link.speed * body.turn;
+        }
+        self.turn(joints, blocks.clone(), &mut last);
+        for block in blocks.clone() {
+            let (link, body) = (&mut self.links[block], A::body(joints, block));
+            let Links { q, speed, above, spin_above, .. } = *link;
+            let mut edge = turned(above, body.offset);
+            link.faster = if SLIDES {
+                link.slide = turned(above, body.slide);
+                edge = add(edge, times(link.slide, q));
+                add(spun(edge, spin_above), times(link.slide, speed))
+            } else {
+                spun(edge, spin_above)
+            };
+            link.lever = times(edge, body.subtree_mass);
+            link.edge = edge;
+        }
+        self.go_on(joints, blocks.clone(), &mut last);
+        for block in blocks {
+            let (link, body) = (&mut self.links[block], A::body(joints, block));
+            let Links { direction, slide, spin_above, spin, velocity, .. } = *link;
+            let arm = turned(direction, body.center);
+            let f = times(add(velocity, spun(arm, spin)), body.mass);
+            let moment = times(arm, body.mass);
+            let [x, y] = spun(velocity, body.turn);
+            link.rate = [-x, -y];
+            if SLIDES {
+                // A hinge has no slide, and a slider no turn.
+                link.rate = add(link.rate, spun(slide, spin_above));
+            }
+            link.turning = spin * body.inertia + cross(arm, f);
+            link.inertia = dot(arm, arm) * body.mass + A::Several::ONE * body.inertia;
+            let sums = &mut self.sums[A::COUNT * block..];
+            A::spread([f[0], f[1], moment[0], moment[1]], sums);
+        }
+        last
+    }
+
+    /// Angles and angular velocities of bodies.
+    #[inline(always)]
+    fn turn(&mut self, joints: &PlanarJoints, blocks: Range<usize>, last: &mut Motion<A::Number>) {
+        let links = &mut self.links[..];
+        let Motion { mut direction, mut spin, .. } = *last;
+        for block in blocks {
+            let first = A::COUNT * block;
+            for (lane, joint) in joints[first..].iter().take(A::COUNT).enumerate() {
+                match joint.parent {
+                    0 => Motion { direction, spin, .. } = Motion::NONE,
+                    parent if parent == first + lane => {}
+                    parent => {
+                        let (above, lane) =
+                            (&links[(parent - 1) / A::COUNT], (parent - 1) % A::COUNT);
+                        direction = one2::<A>(&above.direction, lane);
+                        spin = A::one(&above.spin, lane);
+                    }
+                }
+                let link = &mut links[block];
+                put2::<A>(direction, &mut link.above, lane);
+                A::put(spin, &mut link.spin_above, lane);
+                direction = combined(direction, one2::<A>(&link.own, lane));
+                spin += A::one(&link.spin, lane);
+                put2::<A>(direction, &mut link.direction, lane);
+                A::put(spin, &mut link.spin, lane);
+            }
+        }
+        (last.direction, last.spin) = (direction, spin);
+    }
+
+    /// Velocities of joints.
+    #[inline(always)]
+    fn go_on(&mut self, joints: &PlanarJoints, blocks: Range<usize>, last: &mut Motion<A::Number>) {
+        let links = &mut self.links[..];
+        let mut velocity = last.velocity;
+        for block in blocks {
+            let first = A::COUNT * block;
+            for (lane, joint) in joints[first..].iter().take(A::COUNT).enumerate() {
+                match joint.parent {
+                    0 => velocity = [A::Number::ZERO; 2],
+                    parent if parent == first + lane => {}
+                    parent => {
+                        let above = &links[(parent - 1) / A::COUNT].velocity;
+                        velocity = one2::<A>(above, (parent - 1) % A::COUNT);
+                    }
+                }
+                let link = &mut links[block];
+                velocity = add(velocity, one2::<A>(&link.faster, lane));
+                put2::<A>(velocity, &mut link.velocity, lane);
+            }
+        }
+        last.velocity = velocity;
+    }
+
+    /// Momenta and moments of subtrees, and the derivatives, for some blocks.
+    #[inline(always)]
+    fn ascend<const SLIDES: bool>(
+        &mut self,
+        joints: &PlanarJoints,
+        blocks: Range<usize>,
+        l_q: &mut [A::Number],
+        l_v: &mut [A::Number],
+        mut below: Below<A::Number>,
+    ) -> Below<A::Number> {
+        let of = |blocks: &Range<usize>| {
+            A::COUNT * blocks.start..joints.len().min(A::COUNT * blocks.end)
+        };
+        for i in of(&blocks).rev() {
+            let joint = &joints[i];
+            let mut sum = self.sums[i];
+            if joint.is_followed {
+                sum = add4(sum, below.sums);
+            }
+            if joint.has_branches {
+                sum = add4(sum, std::mem::replace(&mut self.branches[i].sums, Below::NONE.sums));
+            }
+            if joint.descendants > 0 {
+                self.sums[i] = sum;
+            }
+            let [x, y] = one2::<A>(&self.links[i / A::COUNT].lever, i % A::COUNT);
+            let sum = [sum[0], sum[1], sum[2] + x, sum[3] + y];
+            match joint.parent {
+                0 => {}
+                parent if parent == i => below.sums = sum,
+                parent => {
+                    let others = &mut self.branches[parent - 1].sums;
+                    *others = add4(*others, sum);
+                }
+            }
+        }
+        for block in blocks.clone() {
+            let link = &mut self.links[block];
+            let [fx, fy, x, y] = A::collect(&self.sums[A::COUNT * block..]);
+            (link.momentum, link.moment) = ([fx, fy], [x, y]);
+            link.torque = cross(link.edge, [fx, fy]);
+        }
+        for i in of(&blocks).rev() {
+            let (joint, lane) = (&joints[i], i % A::COUNT);
+            let link = &mut self.links[i / A::COUNT];
+            let mut sum = A::one(&link.turning, lane);
+            if joint.is_followed {
+                sum += below.turning;
+            }
+            if joint.has_branches {
+                sum += std::mem::take(&mut self.branches[i].turning);
+            }
+            A::put(sum, &mut link.turning, lane);
+            sum += A::one(&link.torque, lane);
+            match joint.parent {
+                0 => {}
+                parent if parent == i => below.turning = sum,
+                parent => self.branches[parent - 1].turning += sum,
+            }
+        }
+        for block in blocks {
+            let (link, body) = (&self.links[block], A::body(joints, block));
+            let Links { slide, rate, turning, momentum: f, moment, .. } = *link;
+            let mut by_velocity = turning * body.turn;
+            let mut by_position = dot(rate, f) + cross(moment, body.gravity) * body.turn;
+            if SLIDES {
+                by_velocity += dot(slide, f);
+                by_position += dot(slide, body.gravity) * body.subtree_mass;
+            }
+            A::scatter(joints, block, by_velocity, l_v);
+            A::scatter(joints, block, by_position, l_q);
+        }
+        below
+    }
+
+    #[inline(always)]
+    fn differentiate_portable(&mut self, joints: &PlanarJoints) {
+        for link in &mut self.links {
+            link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
+        }
+        let branches = &mut self.inertia_of_branches[..];
+        let mut below = A::Number::ZERO;
+        for (block, link) in self.links.iter_mut().enumerate().rev() {
+            let first = A::COUNT * block;
+            let count = A::COUNT.min(joints.len() - first);
+            for (lane, joint) in joints[first..][..count].iter().enumerate().rev() {
+                let mut sum = A::one(&link.inertia, lane);
+                if joint.is_followed {
+                    sum += below;
+                }
+                if joint.has_branches {
+                    sum += std::mem::take(&mut branches[first + lane]);
+                }
+                A::put(sum, &mut link.total_inertia, lane);
+                sum += A::one(&link.moved, lane);
+                match joint.parent {
+                    parent if parent == first + lane => below = sum,
+                    0 => {}
+                    parent => branches[parent - 1] += sum,
+                }
+            }
+        }
+        for (block, link) in self.links.iter_mut().enumerate() {
+            let Links { slide, rate, momentum, moment, total_inertia, .. } = *link;
+            let (body, f) = (A::body(joints, block), momentum);
+            let push = add(spun(moment, body.turn), times(slide, body.subtree_mass));
+            let pull = add(spun(f, body.turn), times(rate, body.subtree_mass));
+            link.force = [total_inertia * body.turn + cross(moment, slide), push[0], push[1]];
+            link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
+            link.weight = cross(push, body.gravity);
+        }
+    }
+
+    /// Places the joints, for [`PlanarTree::pair`].
+    #[inline(never)]
+    fn place(&mut self, joints: &[PlanarJoint]) {
+        for (i, joint) in joints.iter().enumerate() {
+            // The root of a tree is its origin, unless that moves on.
+            self.positions[i] = match joint.parent {
+                0 => [A::Number::ZERO; 2],
+                parent => add(self.positions[parent - 1], self.edge(i)),
+            };
+            if joint.anchor {
+                // All joints placed so far in its tree are its ancestors.
+                self.positions[i] = [A::Number::ZERO; 2];
+                let mut below = i;
+                while joints[below].parent > 0 {
+                    let (parent, edge) = (joints[below].parent - 1, self.edge(below));
+                    let position = self.positions[below];
+                    self.positions[parent] = [position[0] - edge[0], position[1] - edge[1]];
+                    below = parent;
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn edge(&self, joint: usize) -> Vec2<A::Number> {
+        one2::<A>(&self.links[joint / A::COUNT].edge, joint % A::COUNT)
+    }
+
+    #[inline(always)]
+    fn link(&self, joint: usize) -> Link<A::Number> {
+        let (links, lane) = (&self.links[joint / A::COUNT], joint % A::COUNT);
+        Link {
+            edge: one2::<A>(&links.edge, lane),
+            slide: one2::<A>(&links.slide, lane),
+            rate: one2::<A>(&links.rate, lane),
+            force: one3::<A>(&links.force, lane),
+            slope: one3::<A>(&links.slope, lane),
+            weight: A::one(&links.weight, lane),
+        }
+    }
+
+    #[inline(always)]
+    fn pair(
+        &self,
+        joints: &[PlanarJoint],
+        ancestor: usize,
+        descendant: usize,
+    ) -> SecondDerivatives<A::Number> {
+        let (above, below) = (self.link(ancestor), self.link(descendant));
+        let ([x0, y0], [x, y]) = (self.positions[ancestor], self.positions[descendant]);
+        let (s, arm) = (joints[ancestor].body.turn, [x - x0, y - y0]);
+        let along = |wrench: Vec3<A::Number>| {
             let f = linear(wrench);
             (wrench[0] + cross(arm, f)) * s + dot(above.slide, f)
         };
@@ -264,11 +817,10 @@ impl<S: Scalar> PlanarTree<S> {
     }
 }
 
-impl PlanarTree {
-    /// Writes the Jacobian of the residual by the increment, without springs and forces, entry by entry.
+impl<A: Arrangement<Number = f64>> Joints<A> {
     #[inline(never)]
-    pub(crate) fn fill_newton_matrix(
-        &mut self,
+    fn fill_newton_matrix(
+        &self,
         joints: &[PlanarJoint],
         pairs: &[Pair],
         step: f64,

@@ -93,7 +93,7 @@ impl TreeLu {
             x: &mut [f64],
             stride: usize,
             columns: usize,
-        ) = solve_rows_portable, solve_rows_avx2;
+        ) = solve_rows_portable, solve_rows_avx2, solve_rows_avx512;
     }
 
     #[inline(always)]

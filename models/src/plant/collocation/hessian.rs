@@ -3,6 +3,7 @@
 use crate::Model;
 use crate::plant::mechanics::Mechanics;
 use crate::plant::newton::Workspace;
+use crate::plant::planar::Planar;
 use crate::plant::potentials;
 use crate::scalar::Side;
 
@@ -33,7 +34,7 @@ impl Hessian {
     }
 
     /// Takes the derivatives at the last gradient, of the stages from one on.
-    pub(super) fn take<S: Side>(
+    pub(super) fn take<S: Planar + Side>(
         &mut self,
         model: &Model,
         mechanics: &mut Mechanics<S>,

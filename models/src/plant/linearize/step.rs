@@ -87,8 +87,9 @@ impl Workspace {
             place.momentum = at.settings.time_step_s * input.gain;
             place.residual = out.at_start * place.momentum;
         }
-        let (Some(planar), Some(joints), Some(generators)) =
-            (&self.mechanics.planar, &model.planar, self.factors.planar())
+        let tree = self.mechanics.planar.as_deref().and_then(planar::PlanarTree::many);
+        let (Some(tree), Some(joints), Some(generators)) =
+            (tree, &model.planar, self.factors.planar())
         else {
             return Ok(());
         };
@@ -110,7 +111,7 @@ impl Workspace {
         }
         let diagonal = planar::Diagonal { residual, momentum: slope };
         let (increment, momentum) = (&mut out.increment, &mut out.momentum);
-        generators.linearize(planar, joints, &diagonal, increment, momentum, out.stride);
+        generators.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
         Ok(())
     }
 

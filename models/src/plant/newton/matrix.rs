@@ -6,7 +6,7 @@ use crate::model::{Forces, Solver};
 use crate::plant::closure::Closure;
 use crate::plant::mechanics::Mechanics;
 use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::planar::{self, Of};
+use crate::plant::planar::{self, Of, PlanarTree};
 use crate::plant::rows::padded;
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
 use crate::plant::{Settings, StepError, potentials, space};
@@ -60,8 +60,9 @@ impl Factors {
         let inertia = &model.conditioning.inertia;
         match (self.generators.as_deref_mut()?, &mut mechanics.planar, &model.planar) {
             (Generators::Planar(generators), Some(planar), Some(joints)) => {
-                planar.differentiate(joints);
-                Some(generators.factor(planar, joints, diagonal, inertia, step, of))
+                let PlanarTree::Many(tree) = &mut **planar else { return None };
+                tree.differentiate(joints);
+                Some(generators.factor(tree, joints, diagonal, inertia, step, of))
             }
             (Generators::Spatial(generators), ..) => {
                 mechanics.differentiate(model);

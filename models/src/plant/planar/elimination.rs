@@ -19,7 +19,7 @@
 //! and `d_j` are the pivots of an elimination from the leaves to the root. As each sum is about its own
 //! joint, long chains lose no digits.
 
-use super::{PlanarTree, Vec2, Vec3, cross, dot, linear, spun};
+use super::{Fours, Joints, Vec2, Vec3, cross, dot, linear};
 use crate::planar::PlanarJoint;
 use crate::plant::rows::{Block, LANES};
 use crate::plant::tree_lu::SmallestPivot;
@@ -31,15 +31,24 @@ struct Generator {
     edge: Vec2,
     minus: Vec3,
     plus: Vec3,
-    above: Vec3,
-    /// Divided by the pivot.
-    across: Vec3,
     inverse_pivot: f64,
     /// For the derivative of the momentum: `P + ½h γ e`, and linear parts of `½h P + F`, after `½h γ`, and of
     /// `J̇`.
     slope: Vec3,
     push: Vec3,
     rate: Vec2,
+}
+
+/// How right-hand sides pass a joint when it has been eliminated: what is below reaches the parent as
+/// `up · flow + drive · b`, and what is above the children as `down · flow + plus · x`. These wait for one
+/// product each, not for the solution.
+#[derive(Clone, Copy, Debug, Default)]
+struct Passage {
+    up: [Vec3; 3],
+    drive: Vec3,
+    down: [Vec3; 3],
+    /// What the flow from the parent takes from the solution.
+    taken: Vec3,
 }
 
 /// What springs and dampers of coordinates add: `−½h V_ii` to the derivative of the residual by the
@@ -62,10 +71,12 @@ pub(crate) enum Of {
 #[derive(Clone, Debug)]
 pub(crate) struct Elimination {
     generators: Vec<Generator>,
+    passages: Vec<Passage>,
     step: f64,
-    /// `A` of each joint.
-    sums: Vec<[Vec3; 3]>,
+    /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
+    branches: Vec<[Vec3; 3]>,
     /// The same for right-hand sides, and twists that belong to solutions: one, and a block of them.
+    flows_of_branches: Vec<Vec3>,
     flow: Vec<Vec3>,
     flows: Vec<[Block; 3]>,
     /// A block of columns of the derivatives.
@@ -76,6 +87,26 @@ pub(crate) struct Elimination {
 #[inline(always)]
 fn dot3(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+fn plus3(a: Vec3, b: Vec3) -> Vec3 {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+/// `matrix · flow + b · drive`: a product and two sums behind the flow.
+#[inline(always)]
+fn passed(matrix: &[Vec3; 3], flow: Vec3, b: f64, drive: Vec3) -> Vec3 {
+    let [r, s, t] = matrix;
+    let of = |row: &Vec3, drive: f64| {
+        (row[0] * flow[0] + row[1] * flow[1]) + (row[2] * flow[2] + drive * b)
+    };
+    [of(r, drive[0]), of(s, drive[1]), of(t, drive[2])]
+}
+
+#[inline(always)]
+fn plus33([a, b, c]: [Vec3; 3], [d, e, f]: [Vec3; 3]) -> [Vec3; 3] {
+    [plus3(a, d), plus3(b, e), plus3(c, f)]
 }
 
 #[inline(always)]
@@ -93,8 +124,10 @@ impl Elimination {
         Self {
             generators: vec![Generator::default(); joints + 1],
             step: 0.0,
-            sums: vec![[[0.0; 3]; 3]; joints + 1],
-            flow: vec![[0.0; 3]; joints + 1],
+            passages: vec![Passage::default(); joints],
+            branches: vec![[[0.0; 3]; 3]; joints],
+            flows_of_branches: vec![[0.0; 3]; joints],
+            flow: vec![[0.0; 3]; joints],
             flows: vec![[Block::ZERO; 3]; joints + 1],
             increment: vec![Block::ZERO; joints],
             momentum: vec![Block::ZERO; joints],
@@ -108,7 +141,7 @@ impl Elimination {
         #[inline(never)]
         pub(crate) fn factor(
             mut self,
-            tree: &PlanarTree,
+            tree: &Joints<Fours>,
             joints: &[PlanarJoint],
             diagonal: &[f64],
             inertia: &[f64],
@@ -129,19 +162,19 @@ impl Elimination {
         #[inline(never)]
         pub(crate) fn linearize(
             mut self,
-            tree: &PlanarTree,
+            tree: &Joints<Fours>,
             joints: &[PlanarJoint],
             diagonal: &Diagonal<'_>,
             increment: &mut [f64],
             momentum: &mut [f64],
             stride: usize,
-        ) = linearize_portable, linearize_avx2;
+        ) = linearize_portable, linearize_avx2, linearize_avx512;
     }
 
     #[inline(always)]
     fn factor_portable(
         &mut self,
-        tree: &PlanarTree,
+        tree: &Joints<Fours>,
         joints: &[PlanarJoint],
         diagonal: &[f64],
         inertia: &[f64],
@@ -152,14 +185,19 @@ impl Elimination {
         let (half, inverse) = (0.5 * step * motion, 1.0 / step);
         self.step = step;
         let mut smallest = SmallestPivot::NONE;
-        for ((row, joint), (added, inertia)) in
-            joints.iter().enumerate().zip(diagonal.iter().zip(inertia)).rev()
-        {
-            let link = &tree.links[row + 1];
-            let [a, b, c] = std::mem::take(&mut self.sums[row + 1]);
+        // `A` of the joint that follows, about its parent.
+        let mut below = [[0.0; 3]; 3];
+        for (row, joint) in joints.iter().enumerate().rev() {
+            let link = tree.link(row);
+            let mut sum = if joint.is_followed { below } else { [[0.0; 3]; 3] };
+            if joint.has_branches {
+                sum = plus33(sum, std::mem::take(&mut self.branches[row]));
+            }
+            let [a, b, c] = sum;
             let ([dx, dy], [rx, ry]) = (link.slide, [half * link.rate[0], half * link.rate[1]]);
-            let plus = [joint.turn, rx + dx, ry + dy];
-            let minus = [-joint.turn, rx - dx, ry - dy];
+            let turn = joint.body.turn;
+            let plus = [turn, rx + dx, ry + dy];
+            let minus = [-turn, rx - dx, ry - dy];
             let (weight, slope) = (half * link.weight, link.slope);
             let mut upper = add_scaled(scaled(0.5 * motion, slope), inverse, link.force);
             let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
@@ -167,33 +205,49 @@ impl Elimination {
             lower[0] += 0.5 * weight;
 
             let pushed = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
-            let own = dot3(minus, upper) + added;
+            let own = dot3(minus, upper) + diagonal[row];
             let pivot = own + dot3(minus, pushed);
-            smallest.see(row, pivot, own.abs().max(inertia * inverse));
+            smallest.see(row, pivot, own.abs().max(inertia[row] * inverse));
             let inverse_pivot = 1.0 / pivot;
-            let above = add_scaled(upper, 1.0, pushed);
-            let across = add_scaled(lower, minus[0], a);
-            let across = add_scaled(add_scaled(across, minus[1], b), minus[2], c);
-            let across = scaled(inverse_pivot, across);
-            if joint.parent > 0 {
-                let a = add_scaled(a, -above[0], across);
-                let b = add_scaled(b, -above[1], across);
-                let c = add_scaled(c, -above[2], across);
-                let [ex, ey] = link.edge;
-                let a = add_scaled(add_scaled(a, ex, c), -ey, b);
-                let sums = &mut self.sums[joint.parent];
-                for (sum, row) in sums.iter_mut().zip([a, b, c]) {
-                    sum[0] += row[0] + cross(link.edge, linear(row));
-                    sum[1] += row[1];
-                    sum[2] += row[2];
+            let pulled = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
+            let (above, across) = (plus3(upper, pushed), plus3(lower, pulled));
+            // About the parent: all that can be done before the pivot is known.
+            let [ex, ey] = link.edge;
+            let moved = |v: Vec3| [v[0] + cross(link.edge, linear(v)), v[1], v[2]];
+            let (a, b, c) = (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
+            let (above_there, taken) = (moved(above), scaled(inverse_pivot, moved(across)));
+            let sum = [
+                add_scaled(a, -above_there[0], taken),
+                add_scaled(b, -above_there[1], taken),
+                add_scaled(c, -above_there[2], taken),
+            ];
+            match joint.parent {
+                0 => {}
+                parent if parent == row => below = sum,
+                parent => {
+                    self.branches[parent - 1] = plus33(self.branches[parent - 1], sum);
                 }
             }
+            let (drive, wrench) = (scaled(inverse_pivot, above_there), [1.0, -ey, ex]);
+            let unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+            self.passages[row] = Passage {
+                up: [
+                    add_scaled(wrench, -drive[0], minus),
+                    add_scaled(unit[1], -drive[1], minus),
+                    add_scaled(unit[2], -drive[2], minus),
+                ],
+                drive,
+                down: [
+                    add_scaled(unit[0], -plus[0], taken),
+                    add_scaled([-ey, 1.0, 0.0], -plus[1], taken),
+                    add_scaled([ex, 0.0, 1.0], -plus[2], taken),
+                ],
+                taken,
+            };
             self.generators[row + 1] = Generator {
                 edge: link.edge,
                 minus,
                 plus,
-                above,
-                across,
                 inverse_pivot,
                 slope: [slope[0] + weight, slope[1], slope[2]],
                 push: [weight, link.force[1] + half * slope[1], link.force[2] + half * slope[2]],
@@ -205,36 +259,44 @@ impl Elimination {
 
     #[inline(always)]
     fn solve_portable(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
-        let (generators, flows) = (&self.generators[1..], &mut self.flow[..]);
-        flows.fill([0.0; 3]);
-        for (i, ((joint, generator), x)) in
-            joints.iter().zip(generators).zip(&mut *x).enumerate().rev()
-        {
-            let flow = flows[i + 1];
-            *x = (*x - dot3(generator.minus, flow)) * generator.inverse_pivot;
-            if joint.parent > 0 {
-                let flow = add_scaled(flow, *x, generator.above);
-                let parent = &mut flows[joint.parent];
-                parent[0] += flow[0] + cross(generator.edge, linear(flow));
-                parent[1] += flow[1];
-                parent[2] += flow[2];
+        let Self { passages, flows_of_branches: branches, flow: flows, .. } = self;
+        let generators = &self.generators[1..];
+        let mut below = [0.0; 3];
+        for (i, joint) in joints.iter().enumerate().rev() {
+            let (Generator { minus, inverse_pivot, .. }, passage) = (&generators[i], &passages[i]);
+            let mut flow = if joint.is_followed { below } else { [0.0; 3] };
+            if joint.has_branches {
+                flow = plus3(flow, std::mem::take(&mut branches[i]));
+            }
+            let b = x[i];
+            x[i] = (b - dot3(*minus, flow)) * inverse_pivot;
+            let up = passed(&passage.up, flow, b, passage.drive);
+            match joint.parent {
+                0 => {}
+                parent if parent == i => below = up,
+                parent => branches[parent - 1] = plus3(branches[parent - 1], up),
             }
         }
-        for (i, ((joint, generator), x)) in joints.iter().zip(generators).zip(x).enumerate() {
-            let mut flow = flows[joint.parent];
-            if joint.parent > 0 {
-                let moved = spun(flow[0], generator.edge);
-                flow = [flow[0], flow[1] + moved[0], flow[2] + moved[1]];
+        let mut above = [0.0; 3];
+        for (i, joint) in joints.iter().enumerate() {
+            let flow = match joint.parent {
+                0 => [0.0; 3],
+                parent if parent == i => above,
+                parent => flows[parent - 1],
+            };
+            let (own, passage) = (x[i], &passages[i]);
+            x[i] = own - dot3(passage.taken, flow);
+            above = passed(&passage.down, flow, own, generators[i].plus);
+            if joint.has_branches {
+                flows[i] = above;
             }
-            *x -= dot3(generator.across, flow);
-            flows[i + 1] = add_scaled(flow, *x, generator.plus);
         }
     }
 
     #[inline(always)]
     fn linearize_portable(
         &mut self,
-        tree: &PlanarTree,
+        tree: &Joints<Fours>,
         joints: &[PlanarJoint],
         diagonal: &Diagonal<'_>,
         increment: &mut [f64],
@@ -272,17 +334,17 @@ impl Elimination {
     #[inline(always)]
     fn by_configuration(
         &mut self,
-        tree: &PlanarTree,
+        tree: &Joints<Fours>,
         joints: &[PlanarJoint],
         diagonal: &Diagonal<'_>,
         column: usize,
         lane: usize,
     ) {
-        let (step, own, turn) = (self.step, &tree.links[column + 1], joints[column].turn);
+        let (step, own, turn) = (self.step, tree.link(column), joints[column].body.turn);
         // Rows of joints above, with the wrench moved to each of them, and of the joint itself.
         let (mut wrench, push, mut i) = (own.slope, linear(own.slope), column + 1);
         while i > 0 {
-            let (link, s) = (&tree.links[i], joints[i - 1].turn);
+            let (link, s) = (tree.link(i - 1), joints[i - 1].body.turn);
             let stiffness = step * (dot(link.rate, push) + s * own.weight);
             self.increment[i - 1].0[lane] =
                 0.5 * stiffness - (s * wrench[0] + dot(link.slide, push));
@@ -293,7 +355,8 @@ impl Elimination {
         // Rows of joints below.
         let below = column + 1..column + 1 + joints[column].descendants;
         let rows = self.increment[below.clone()].iter_mut().zip(&mut self.momentum[below.clone()]);
-        for ((x, p), link) in rows.zip(&tree.links[column + 2..]) {
+        for ((x, p), i) in rows.zip(below) {
+            let link = tree.link(i);
             let stiffness = step * (dot(own.rate, linear(link.slope)) + turn * link.weight);
             x.0[lane] = 0.5 * stiffness - dot(own.rate, linear(link.force));
             p.0[lane] = stiffness;
@@ -306,16 +369,17 @@ impl Elimination {
     #[inline(always)]
     fn eliminate(&mut self, joints: &[PlanarJoint]) {
         self.flows.fill([Block::ZERO; 3]);
-        for (i, (joint, row)) in joints.iter().zip(&mut self.increment).enumerate().rev() {
-            let Generator { edge, minus, above, inverse_pivot, .. } = self.generators[i + 1];
-            let [n, fx, fy] = self.flows[i + 1];
-            let pulled = n.times(minus[0]).plus(fx.times(minus[1])).plus(fy.times(minus[2]));
-            let x = row.plus(pulled).times(-inverse_pivot);
-            *row = x;
+        let passages = self.generators[1..].iter().zip(&self.passages);
+        for (i, ((joint, row), (generator, passage))) in
+            joints.iter().zip(&mut self.increment).zip(passages).enumerate().rev()
+        {
+            let flow = self.flows[i + 1];
+            let right = row.times(-1.0);
+            let pulled = product(generator.minus, flow);
+            *row = row.plus(pulled).times(-generator.inverse_pivot);
             if joint.parent > 0 {
-                let (fx, fy) = (fx.plus(x.times(above[1])), fy.plus(x.times(above[2])));
-                let n = n.plus(x.times(above[0])).plus(fy.times(edge[0])).plus(fx.times(-edge[1]));
-                add_to(&mut self.flows[joint.parent], [n, fx, fy]);
+                let up = passed_by_all(&passage.up, flow, right, passage.drive);
+                add_to(&mut self.flows[joint.parent], up);
             }
         }
     }
@@ -324,19 +388,17 @@ impl Elimination {
     #[inline(always)]
     fn substitute(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
         let rows = self.increment.iter_mut().zip(&mut self.momentum);
-        for (i, ((joint, (row, momentum)), own)) in
-            joints.iter().zip(rows).zip(diagonal.momentum).enumerate()
+        let passages = self.generators[1..].iter().zip(&self.passages);
+        for (i, (((joint, (row, momentum)), own), (generator, passage))) in
+            joints.iter().zip(rows).zip(diagonal.momentum).zip(passages).enumerate()
         {
-            let Generator { edge, plus, across, slope, .. } = self.generators[i + 1];
-            let [w, vx, vy] = self.flows[joint.parent];
-            let (vx, vy) = (vx.plus(w.times(-edge[1])), vy.plus(w.times(edge[0])));
-            let taken = w.times(across[0]).plus(vx.times(across[1])).plus(vy.times(across[2]));
-            let x = row.plus(taken.times(-1.0));
-            let moved = w.times(slope[0]).plus(vx.times(slope[1])).plus(vy.times(slope[2]));
+            let Generator { edge, plus, slope, .. } = *generator;
+            let (flow, right) = (self.flows[joint.parent], *row);
+            let slope = [slope[0] + cross(edge, linear(slope)), slope[1], slope[2]];
+            let x = right.plus(product(passage.taken, flow).times(-1.0));
             *row = x;
-            *momentum = momentum.plus(moved).plus(x.times(*own));
-            self.flows[i + 1] =
-                [w.plus(x.times(plus[0])), vx.plus(x.times(plus[1])), vy.plus(x.times(plus[2]))];
+            *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
+            self.flows[i + 1] = passed_by_all(&passage.down, flow, right, plus);
         }
     }
 
@@ -357,6 +419,23 @@ impl Elimination {
             }
         }
     }
+}
+
+#[inline(always)]
+fn product(vector: Vec3, [n, fx, fy]: [Block; 3]) -> Block {
+    n.times(vector[0]).plus(fx.times(vector[1])).plus(fy.times(vector[2]))
+}
+
+/// [`passed`] for a block of right-hand sides.
+#[inline(always)]
+fn passed_by_all(matrix: &[Vec3; 3], flow: [Block; 3], b: Block, drive: Vec3) -> [Block; 3] {
+    let [r, s, t] = matrix;
+    let [n, fx, fy] = flow;
+    let of = |row: &Vec3, drive: f64| {
+        let first = n.times(row[0]).plus(fx.times(row[1]));
+        first.plus(fy.times(row[2]).plus(b.times(drive)))
+    };
+    [of(r, drive[0]), of(s, drive[1]), of(t, drive[2])]
 }
 
 #[inline(always)]

@@ -60,7 +60,7 @@ fn assert_close(a: f64, b: f64, scale: f64, what: &str) {
 fn gradients_and_second_derivatives_are_those_in_space() {
     for model in [oblique(12, ""), oblique(3, ""), oblique(12, "kind = \"prescribed\"")] {
         let model = Arc::new(model);
-        let joints = model.planar.as_deref().expect("the tree is planar");
+        let joints = model.planar.as_ref().expect("the tree is planar");
         let n = model.dimensions.coordinates();
         let mut spatial = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
         let q: Vec<f64> = (0..n).map(|i| 3.0 * wave(i + 100)).collect();
@@ -73,7 +73,6 @@ fn gradients_and_second_derivatives_are_those_in_space() {
             planar.gradient(joints, &q, &v, &mut l_q, &mut l_v);
             planar.differentiate(joints);
         }
-        planar.place(joints);
         let workspace = &mut spatial.workspace;
         workspace.mechanics.poses.evaluate(&model.dynamics, &q, &[]);
         let (mut in_space_q, mut in_space_v) = (vec![0.0; nd], vec![0.0; nd]);
@@ -170,7 +169,7 @@ fn generators_stand_for_the_newton_matrix() {
             slow.step_and_linearize(&u, &mut by_entries).unwrap();
             for (a, b) in [(by_generators.a(), by_entries.a()), (by_generators.b(), by_entries.b())]
             {
-                assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
+                assert!((&a - &b).amax() <= 3e-9 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
             }
             // In long chains sums about each joint keep digits that those about one origin lose.
             if model.damping.is_empty() {
