@@ -14,6 +14,9 @@ pub(crate) struct Poses<S = f64> {
     pub(crate) origin: Vec<Vec3<S>>,
     /// Position of a joint relative to its parent.
     edge: Vec<Vec3<S>>,
+    /// Angles by which joints turn about their axes, and their sines and cosines.
+    angles: Vec<S>,
+    turns: Vec<[S; 2]>,
 }
 
 impl<S: Scalar> Poses<S> {
@@ -24,6 +27,8 @@ impl<S: Scalar> Poses<S> {
             position: vec![Vec3::ZERO; n],
             origin: vec![Vec3::ZERO; n],
             edge: vec![Vec3::ZERO; n],
+            angles: vec![S::ZERO; n],
+            turns: vec![[S::ZERO, S::ONE]; n],
         }
     }
 
@@ -53,34 +58,40 @@ impl<S: Scalar> Poses<S> {
     /// `OTHER`: some joint is neither revolute nor prismatic.
     #[inline(always)]
     fn walk<const OTHER: bool>(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
+        for (angle, joint) in self.angles.iter_mut().zip(&tree.joints) {
+            if matches!(joint.kind, JointKind::Revolute | JointKind::Screw(_)) {
+                *angle = q[joint.coordinate];
+            }
+        }
+        S::sin_cos_of_all(&self.angles, &mut self.turns);
         for (i, joint) in tree.joints.iter().enumerate() {
+            // In the parent's frame, which nothing waits for.
+            let own = match joint.kind {
+                JointKind::Prismatic => Mat3::lift(joint.rotation),
+                JointKind::Ball(_) if OTHER => Mat3::lift(joint.rotation),
+                _ => turned_about_z(&joint.rotation, self.turns[i]),
+            };
             let (turned, mut edge) = if joint.parent == WORLD {
                 self.origin[i] = Vec3::lift(joint.translation);
-                (Mat3::lift(joint.rotation), Vec3::ZERO)
+                (own, Vec3::ZERO)
             } else {
                 let parent = &self.rotation[joint.parent];
-                let offset = parent.apply(Vec3::lift(joint.translation));
-                (parent.times(&Mat3::lift(joint.rotation)), offset)
+                (parent.times(&own), parent.apply(Vec3::lift(joint.translation)))
             };
             let Mat3([x, y, z]) = turned;
-            match joint.kind {
-                JointKind::Revolute => {
-                    self.rotation[i] = turned_about_z(&turned, q[joint.coordinate])
-                }
-                JointKind::Screw(pitch) if OTHER => {
-                    self.rotation[i] = turned_about_z(&turned, q[joint.coordinate]);
-                    edge += z * (q[joint.coordinate] * pitch);
-                }
+            self.rotation[i] = match joint.kind {
                 JointKind::Ball(0) if OTHER => {
                     let Mat3([x, y, z]) = turned.times(&orientations[joint.orientation]);
-                    self.rotation[i] = Mat3([y, z, x]);
+                    Mat3([y, z, x])
                 }
                 // The entry before has turned already.
-                JointKind::Ball(_) if OTHER => self.rotation[i] = Mat3([y, z, x]),
-                _ => {
-                    self.rotation[i] = turned;
-                    edge += z * q[joint.coordinate];
-                }
+                JointKind::Ball(_) if OTHER => Mat3([y, z, x]),
+                _ => turned,
+            };
+            match joint.kind {
+                JointKind::Prismatic => edge += z * q[joint.coordinate],
+                JointKind::Screw(pitch) if OTHER => edge += z * (q[joint.coordinate] * pitch),
+                _ => {}
             }
             self.edge[i] = edge;
             self.position[i] =
@@ -160,8 +171,7 @@ impl<S: Scalar> Poses<S> {
 }
 
 #[inline(always)]
-fn turned_about_z<S: Scalar>(frame: &Mat3<S>, angle: S) -> Mat3<S> {
-    let Mat3([x, y, z]) = *frame;
-    let (s, c) = angle.sin_cos();
+fn turned_about_z<S: Scalar>(frame: &Mat3, [s, c]: [S; 2]) -> Mat3<S> {
+    let Mat3([x, y, z]) = Mat3::lift(*frame);
     Mat3([x * c + y * s, y * c - x * s, z])
 }
