@@ -76,6 +76,9 @@ pub struct Settings {
     /// Scheduling priority of those workers.
     #[arg(long, env = "PLANTD_WORKER_PRIORITY")]
     pub worker_priority: Option<Priority>,
+    /// Threads of one search for a trajectory; 0 means one for each processor.
+    #[arg(long, env = "PLANTD_SEARCH_THREADS", value_name = "COUNT")]
+    pub search_threads: Option<usize>,
     /// Seconds for open calls to end at shutdown.
     #[arg(long, env = "PLANTD_SHUTDOWN_GRACE_S", value_name = "SECONDS")]
     pub shutdown_grace_s: Option<f64>,
@@ -129,6 +132,7 @@ impl Settings {
         replace(&mut config.threads, self.threads);
         replace(&mut config.workers, self.workers);
         replace(&mut config.worker_priority, self.worker_priority);
+        replace(&mut config.search_threads, self.search_threads);
         replace(&mut config.shutdown_grace_s, self.shutdown_grace_s);
         replace(&mut config.state_interval_s, self.state_interval_s);
         replace(&mut config.log.filter, self.log);

@@ -51,6 +51,9 @@ pub struct Config {
     pub workers: usize,
     /// Scheduling priority of those workers.
     pub worker_priority: Priority,
+    /// Threads that one search for a trajectory takes, its worker among them; 0 means one for each
+    /// processor.
+    pub search_threads: usize,
     /// Time for open calls to end at shutdown before they are cut off, s.
     pub shutdown_grace_s: f64,
     /// Logging.
@@ -77,6 +80,7 @@ impl Default for Config {
             threads: 0,
             workers: 0,
             worker_priority: Priority::default(),
+            search_threads: 1,
             shutdown_grace_s: 5.0,
             log: LogConfig::default(),
             link: LinkSettings::default(),
@@ -277,6 +281,7 @@ impl Config {
             Scheduling::Fifo(priority) => priority,
         };
         for (key, value, low, high) in [
+            ("search_threads", self.search_threads as u64, 0, 64),
             ("realtime.threads", realtime.threads as u64, 1, 64),
             ("realtime.spin_us", realtime.spin_us, 0, 1000),
             ("realtime.scheduling.fifo", priority.into(), 1, 99),
@@ -304,6 +309,11 @@ impl Config {
     /// Number of workers.
     pub fn worker_count(&self) -> usize {
         count_or_processors(self.workers)
+    }
+
+    /// Number of threads that one search takes.
+    pub fn search_thread_count(&self) -> usize {
+        count_or_processors(self.search_threads)
     }
 
     /// Number of threads that serve connections.

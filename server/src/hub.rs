@@ -47,6 +47,8 @@ pub struct Hub {
     pub watch_room: Arc<Room>,
     /// Cancelled when the server begins to shut down: streams end.
     pub ending: CancellationToken,
+    /// Threads of one search.
+    pub search_threads: usize,
     /// Recordings of plants.
     pub recordings: Option<Recordings>,
     /// Directory in which plants survive the server.
@@ -88,6 +90,7 @@ impl Hub {
                 limits.watch_numbers,
             ),
             ending: CancellationToken::new(),
+            search_threads: 1,
             recordings: None,
             state: None,
             realtime,

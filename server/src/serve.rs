@@ -108,6 +108,7 @@ impl RunningServer {
             config.realtime.clone(),
             links,
         );
+        hub.search_threads = config.search_thread_count();
         if let Some(path) = &config.state_directory {
             let state = StateDirectory::open(path);
             hub.state = Some(state.with_context(|| format!("plants in {}", path.display()))?);

@@ -50,7 +50,7 @@ impl Search {
         let cost = trajectory_cost(cost, steps, &model)?;
         let bounds = bounds(request.bounds.unwrap_or_default(), &model)?;
         let free = request.free_initial.map(|free| free_initial(free, &model)).transpose()?;
-        let optimizer = match start {
+        let mut optimizer = match start {
             Start::Guess(plant, inputs) => {
                 Optimizer::new(*plant, inputs, cost, &bounds, free, given)?
             }
@@ -58,6 +58,7 @@ impl Search {
                 Optimizer::resume(*plant, cost, &bounds, free, given, &checkpoint)?
             }
         };
+        optimizer.set_threads(hub.search_threads);
         let time_step_s = settings.time_step_s;
         Ok(Self { optimizer, time_step_s, checkpoint_every, _permit: permit })
     }
