@@ -253,13 +253,8 @@ impl Scalar for Lanes {
     }
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
-        let mut both = [[0.0; 2]; 4];
-        trigonometry::sin_cos(&self.0, &mut both);
-        let (mut s, mut c) = (self, self);
-        for (i, [sine, cosine]) in both.into_iter().enumerate() {
-            (s.0[i], c.0[i]) = (sine, cosine);
-        }
-        (s, c)
+        let [s, c] = trigonometry::sin_cos_of_four(self.0);
+        (Self(s), Self(c))
     }
     #[inline(always)]
     fn sqrt(self) -> Self {

@@ -75,6 +75,22 @@ pub(crate) fn sin_cos(angles: &[f64], out: &mut [[f64; 2]]) {
     }
 }
 
+/// The sines and the cosines of four angles.
+#[inline(always)]
+pub(crate) fn sin_cos_of_four(angles: [f64; 4]) -> [[f64; 4]; 2] {
+    let ([mut sines, mut cosines], mut all_small) = ([[0.0; 4]; 2], true);
+    for (i, angle) in angles.iter().enumerate() {
+        all_small &= angle.abs() <= LARGEST;
+        [sines[i], cosines[i]] = reduced(*angle);
+    }
+    if !all_small {
+        for (i, angle) in angles.iter().enumerate() {
+            (sines[i], cosines[i]) = sin_cos_of(*angle);
+        }
+    }
+    [sines, cosines]
+}
+
 /// The sine and the cosine of one angle.
 #[inline(always)]
 pub(crate) fn sin_cos_of(angle: f64) -> (f64, f64) {
