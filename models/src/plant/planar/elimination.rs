@@ -137,7 +137,7 @@ impl Elimination {
     wide! {
         /// Factors the matrix that belongs to the second derivatives of `tree`; all joints are dynamic, in
         /// the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
-        /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 90 flops a joint.
+        /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 150 flops a joint.
         #[inline(never)]
         pub(crate) fn factor(
             mut self,
@@ -149,7 +149,7 @@ impl Elimination {
             of: Of,
         ) -> SmallestPivot = factor_portable, factor_avx2;
 
-        /// Solves `K x = b` in place, about 30 flops a joint.
+        /// Solves `K x = b` in place, about 55 flops a joint.
         #[inline(never)]
         pub(crate) fn solve(mut self, joints: &[PlanarJoint], x: &mut [f64])
             = solve_portable, solve_avx2;
@@ -157,7 +157,7 @@ impl Elimination {
         /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
         /// momentum, `[h L_qq 1] + (½h L_qq + L_qv) X`, by configuration and momentum; springs and dampers
         /// of coordinates are added by `diagonal`s. Rows are those of coordinates, `stride` apart and whole
-        /// blocks. Four passes over the joints for each block of columns, about 75 flops a joint and
+        /// blocks. Four passes over the joints for each block of columns, about 95 flops a joint and
         /// column.
         #[inline(never)]
         pub(crate) fn linearize(
