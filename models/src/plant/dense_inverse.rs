@@ -157,7 +157,9 @@ mod tests {
             for (i, row) in inverse.matrix.chunks_exact_mut(inverse.stride).enumerate() {
                 row[..order].iter_mut().zip(&matrix.row(i)).for_each(|(to, from)| *to = *from);
             }
-            assert!(inverse.invert());
+            let mut narrow = inverse.clone();
+            assert!(inverse.invert() && narrow.invert_portable());
+            assert_eq!(inverse.matrix, narrow.matrix, "the same bits in any register");
             let right = DVector::from_fn(order, |i, _| 1.0 + i as f64);
             let expected = matrix.clone().lu().solve(&right).unwrap();
             let mut x = right.as_slice().to_vec();

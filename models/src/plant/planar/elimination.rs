@@ -294,7 +294,7 @@ impl Elimination {
     }
 
     #[inline(always)]
-    fn linearize_portable(
+    pub(super) fn linearize_portable(
         &mut self,
         tree: &Joints<Fours>,
         joints: &[PlanarJoint],

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::model::Solver;
-use crate::plant::planar::PlanarTree;
+use crate::plant::planar::{Diagonal, PlanarTree};
+use crate::plant::rows::padded;
 use crate::plant::{Initial, Linearization, Plant, Settings};
 use crate::scene::{Coordinate, CoordinateKind};
 use crate::{Model, Scene, builtin};
@@ -180,6 +181,28 @@ fn generators_stand_for_the_newton_matrix() {
                 assert_close(*a, *b, 10.0, "q");
             }
         }
+    }
+}
+
+#[test]
+fn linearizations_have_the_same_bits_in_any_register() {
+    for model in [oblique(12, ""), oblique(21, "damping = 0.3")] {
+        let model = Arc::new(model);
+        let n = model.dimensions.dynamic;
+        let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        plant.step(&vec![0.0; model.dimensions.input()]).unwrap();
+        let mechanics = &plant.workspace.mechanics;
+        let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
+        let (joints, stride) = (model.planar.as_ref().unwrap(), padded(2 * n));
+        let numbers: Vec<f64> = (0..n).map(wave).collect();
+        let diagonal = Diagonal { residual: &numbers, momentum: &numbers };
+        let mut wide = plant.workspace.factors.planar().unwrap().clone();
+        let mut narrow = wide.clone();
+        let [mut x, mut p, mut narrow_x, mut narrow_p] = [0; 4].map(|_| vec![0.0; n * stride]);
+        wide.linearize(tree, joints, &diagonal, &mut x, &mut p, stride);
+        narrow.linearize_portable(tree, joints, &diagonal, &mut narrow_x, &mut narrow_p, stride);
+        assert!(x.iter().any(|x| *x != 0.0) && x.iter().chain(&p).all(|x| x.is_finite()));
+        assert!(x == narrow_x && p == narrow_p);
     }
 }
 
