@@ -23,50 +23,35 @@ macro_rules! wide {
         [$self:ident] $arguments:tt $out:tt) => {
         wide!(@all $head $name $portable $wider [&$self] $self $arguments $out);
     };
-    (@all [$($head:tt)*] $name:ident $portable:ident [$avx2:ident]
-        [$($receiver:tt)+] $self:ident [$($argument:ident: $type:ty),*] [$($out:ty)?]) => {
-        $($head)* fn $name($($receiver)+, $($argument: $type),*) $(-> $out)? {
+    (@all [$($head:tt)*] $name:ident $portable:ident [$avx2:ident $($avx512:ident)?]
+        $receiver:tt $self:ident $arguments:tt $out:tt) => {
+        wide!(@function [$($head)*] $name $receiver $arguments $out {
+            $(wide!(@try "avx512f" $avx512 $self $arguments);)?
+            wide!(@try "avx2" $avx2 $self $arguments);
+            wide!(@call $portable $self $arguments)
+        });
+        $(wide!(@function [
             #[cfg(target_arch = "x86_64")]
-            if std::arch::is_x86_feature_detected!("avx2") {
-                // SAFETY: the processor has AVX2.
-                return unsafe { $self.$avx2($($argument),*) };
-            }
-            $self.$portable($($argument),*)
-        }
-
+            #[target_feature(enable = "avx512f")]
+        ] $avx512 $receiver $arguments $out { wide!(@call $portable $self $arguments) });)?
+        wide!(@function [
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx2")]
+        ] $avx2 $receiver $arguments $out { wide!(@call $portable $self $arguments) });
+    };
+    (@function [$($head:tt)*] $name:ident [$($receiver:tt)+]
+        [$($argument:ident: $type:ty),*] [$($out:ty)?] $body:block) => {
+        $($head)* fn $name($($receiver)+, $($argument: $type),*) $(-> $out)? $body
+    };
+    (@try $feature:tt $wider:ident $self:ident $arguments:tt) => {
         #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2")]
-        fn $avx2($($receiver)+, $($argument: $type),*) $(-> $out)? {
-            $self.$portable($($argument),*)
+        if std::arch::is_x86_feature_detected!($feature) {
+            // SAFETY: the processor has the feature.
+            return unsafe { wide!(@call $wider $self $arguments) };
         }
     };
-    (@all [$($head:tt)*] $name:ident $portable:ident [$avx2:ident $avx512:ident]
-        [$($receiver:tt)+] $self:ident [$($argument:ident: $type:ty),*] [$($out:ty)?]) => {
-        $($head)* fn $name($($receiver)+, $($argument: $type),*) $(-> $out)? {
-            #[cfg(target_arch = "x86_64")]
-            if std::arch::is_x86_feature_detected!("avx512f") {
-                // SAFETY: the processor has AVX-512.
-                return unsafe { $self.$avx512($($argument),*) };
-            }
-            #[cfg(target_arch = "x86_64")]
-            if std::arch::is_x86_feature_detected!("avx2") {
-                // SAFETY: the processor has AVX2.
-                return unsafe { $self.$avx2($($argument),*) };
-            }
-            $self.$portable($($argument),*)
-        }
-
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx512f")]
-        fn $avx512($($receiver)+, $($argument: $type),*) $(-> $out)? {
-            $self.$portable($($argument),*)
-        }
-
-        #[cfg(target_arch = "x86_64")]
-        #[target_feature(enable = "avx2")]
-        fn $avx2($($receiver)+, $($argument: $type),*) $(-> $out)? {
-            $self.$portable($($argument),*)
-        }
+    (@call $function:ident $self:ident [$($argument:ident: $type:ty),*]) => {
+        $self.$function($($argument),*)
     };
 }
 pub(crate) use wide;

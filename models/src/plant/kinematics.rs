@@ -67,8 +67,7 @@ impl<S: Scalar> Poses<S> {
         for (i, joint) in tree.joints.iter().enumerate() {
             // In the parent's frame, which nothing waits for.
             let own = match joint.kind {
-                JointKind::Prismatic => Mat3::lift(joint.rotation),
-                JointKind::Ball(_) if OTHER => Mat3::lift(joint.rotation),
+                JointKind::Prismatic | JointKind::Ball(_) => Mat3::lift(joint.rotation),
                 _ => turned_about_z(&joint.rotation, self.turns[i]),
             };
             let (turned, mut edge) = if joint.parent == WORLD {

@@ -733,8 +733,8 @@ impl<A: Arrangement> Joints<A> {
                 A::put(sum, &mut link.total_inertia, lane);
                 sum += A::one(&link.moved, lane);
                 match joint.parent {
-                    parent if parent == first + lane => below = sum,
                     0 => {}
+                    parent if parent == first + lane => below = sum,
                     parent => branches[parent - 1] += sum,
                 }
             }

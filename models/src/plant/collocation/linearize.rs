@@ -34,7 +34,7 @@ pub(crate) struct StageTangents {
     impulses: Vec<f64>,
     /// `Σ ∂P_i/∂Y`, row-major, n by `n s`.
     pub(crate) slopes: Vec<f64>,
-    /// The factors of `∂R/∂Y`.
+    /// The inverse of `∂R/∂Y`.
     pub(crate) matrix: DenseInverse,
     terms: Vec<Term>,
 }

@@ -67,7 +67,7 @@ pub(crate) enum Of {
     Masses,
 }
 
-/// The matrix. The first entry of lists of joints is the world.
+/// The matrix.
 #[derive(Clone, Debug)]
 pub(crate) struct Elimination {
     generators: Vec<Generator>,
@@ -75,9 +75,10 @@ pub(crate) struct Elimination {
     step: f64,
     /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
     branches: Vec<[Vec3; 3]>,
-    /// The same for right-hand sides, and twists that belong to solutions: one, and a block of them.
+    /// The same for a right-hand side, and what joints with several children pass down to them.
     flows_of_branches: Vec<Vec3>,
     flow: Vec<Vec3>,
+    /// Both for a block of right-hand sides; the first is that of the world.
     flows: Vec<[Block; 3]>,
     /// A block of columns of the derivatives.
     increment: Vec<Block>,
@@ -122,7 +123,7 @@ fn add_scaled(a: Vec3, s: f64, b: Vec3) -> Vec3 {
 impl Elimination {
     pub(crate) fn new(joints: usize) -> Self {
         Self {
-            generators: vec![Generator::default(); joints + 1],
+            generators: vec![Generator::default(); joints],
             step: 0.0,
             passages: vec![Passage::default(); joints],
             branches: vec![[[0.0; 3]; 3]; joints],
@@ -244,7 +245,7 @@ impl Elimination {
                 ],
                 taken,
             };
-            self.generators[row + 1] = Generator {
+            self.generators[row] = Generator {
                 edge: link.edge,
                 minus,
                 plus,
@@ -259,8 +260,7 @@ impl Elimination {
 
     #[inline(always)]
     fn solve_portable(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
-        let Self { passages, flows_of_branches: branches, flow: flows, .. } = self;
-        let generators = &self.generators[1..];
+        let Self { generators, passages, flows_of_branches: branches, flow: flows, .. } = self;
         let mut below = [0.0; 3];
         for (i, joint) in joints.iter().enumerate().rev() {
             let (Generator { minus, inverse_pivot, .. }, passage) = (&generators[i], &passages[i]);
@@ -369,7 +369,7 @@ impl Elimination {
     #[inline(always)]
     fn eliminate(&mut self, joints: &[PlanarJoint]) {
         self.flows.fill([Block::ZERO; 3]);
-        let passages = self.generators[1..].iter().zip(&self.passages);
+        let passages = self.generators.iter().zip(&self.passages);
         for (i, ((joint, row), (generator, passage))) in
             joints.iter().zip(&mut self.increment).zip(passages).enumerate().rev()
         {
@@ -388,7 +388,7 @@ impl Elimination {
     #[inline(always)]
     fn substitute(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
         let rows = self.increment.iter_mut().zip(&mut self.momentum);
-        let passages = self.generators[1..].iter().zip(&self.passages);
+        let passages = self.generators.iter().zip(&self.passages);
         for (i, (((joint, (row, momentum)), own), (generator, passage))) in
             joints.iter().zip(rows).zip(diagonal.momentum).zip(passages).enumerate()
         {
@@ -408,7 +408,7 @@ impl Elimination {
         self.flows.fill([Block::ZERO; 3]);
         let rows = self.increment.iter().zip(&mut self.momentum);
         for (i, (joint, (x, momentum))) in joints.iter().zip(rows).enumerate().rev() {
-            let Generator { plus, push, rate, .. } = self.generators[i + 1];
+            let Generator { plus, push, rate, .. } = self.generators[i];
             let [n, fx, fy] = self.flows[i + 1];
             let (n, fx, fy) =
                 (n.plus(x.times(push[0])), fx.plus(x.times(push[1])), fy.plus(x.times(push[2])));
