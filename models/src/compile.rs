@@ -85,6 +85,7 @@ fn compile(scene: &Scene) -> Model {
         digest: digest(scene),
         solver: Solver::of(&dynamics, &elimination, planar.as_deref(), needs_poses, dimensions),
         planar,
+        loops: None,
         gravity,
         damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },
         coordinate_inputs: layout.coordinate_inputs(scene),
@@ -104,6 +105,7 @@ fn compile(scene: &Scene) -> Model {
         scene: scene.clone(),
     };
     model.conditioning = Conditioning::new(&model);
+    model.find_loops();
     model
 }
 

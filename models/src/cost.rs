@@ -42,7 +42,7 @@ impl Model {
             Solver::Tree => {
                 (generators * joints + 60.0 * entries + 24.0 * changes, 110.0 + 27.0 * entries)
             }
-            Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
+            Solver::Planar | Solver::Loops => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
             Solver::Spatial => (100.0 + 820.0 * joints, 110.0 + 93.0 * joints),
         };
         let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);

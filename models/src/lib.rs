@@ -22,6 +22,7 @@ mod continuous;
 pub mod control;
 mod cost;
 mod elimination;
+mod loops;
 mod model;
 pub mod optimize;
 mod planar;

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::elimination::Elimination;
+use crate::loops::Loops;
 use crate::planar::{PlanarJoint, PlanarJoints};
 use crate::plant::conditioning::Conditioning;
 use crate::scene::{CoordinateKind, Scene};
@@ -26,6 +27,8 @@ pub struct Model {
     pub(crate) dynamics: Tree,
     /// The same as a planar tree, where it is one and nothing needs its poses in space.
     pub(crate) planar: Option<PlanarJoints>,
+    /// Its loops, where they are eliminated with it.
+    pub(crate) loops: Option<Loops>,
     /// How a step solves for corrections.
     pub(crate) solver: Solver,
     /// `None` without gravity.
@@ -59,6 +62,9 @@ pub(crate) enum Solver {
     /// By the vectors that generate the entries: O(n). In planes, or in space.
     Planar,
     Spatial,
+    /// By generators in planes, together with the constraints, front by front: O(n) for each loop that does
+    /// not lie within others.
+    Loops,
 }
 
 impl Solver {
@@ -518,6 +524,14 @@ impl Model {
                 self.elimination.entries(),
                 d.dynamic * (d.dynamic + 1) / 2,
             ),
+            Solver::Loops => {
+                let plan = self.loops.as_ref().map(|loops| &loops.plan);
+                let most = plan.and_then(|plan| plan.fronts.iter().max()).copied().unwrap_or(0);
+                format!(
+                    "factorization by generators with loops, {} joints in fronts of up to {most} rows, {islands}",
+                    joints.len()
+                )
+            }
             Solver::Planar | Solver::Spatial => {
                 format!("factorization by generators, {} joints, {islands}", joints.len())
             }

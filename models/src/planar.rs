@@ -58,6 +58,8 @@ pub(crate) struct PlanarJoints {
     pub(crate) are_in_order: bool,
     /// Whether some are sliders.
     pub(crate) have_sliders: bool,
+    /// Axes of the plane in the world, its normal last, where all trees have the same.
+    pub(crate) plane: Option<Mat3>,
 }
 
 impl Deref for PlanarJoints {
@@ -69,7 +71,7 @@ impl Deref for PlanarJoints {
 }
 
 impl PlanarJoints {
-    fn new(mut joints: Vec<PlanarJoint>) -> Self {
+    fn new(mut joints: Vec<PlanarJoint>, plane: Option<Mat3>) -> Self {
         for i in (0..joints.len()).rev() {
             if let Some(parent) = joints[i].parent.checked_sub(1) {
                 joints[parent].descendants += joints[i].descendants + 1;
@@ -81,7 +83,7 @@ impl PlanarJoints {
         let fours = joints.chunks(Lanes::COUNT).map(side_by_side).collect();
         let are_in_order = joints.iter().enumerate().all(|(i, joint)| joint.coordinate == i);
         let have_sliders = joints.iter().any(|joint| joint.body.turn == 0.0);
-        Self { joints, fours, are_in_order, have_sliders }
+        Self { joints, fours, are_in_order, have_sliders, plane }
     }
 }
 
@@ -164,7 +166,9 @@ pub(crate) fn planar(tree: &Tree, gravity: Option<Vec3>) -> Option<PlanarJoints>
         });
         zero.push(Zero { plane, rotation });
     }
-    Some(PlanarJoints::new(joints))
+    let plane = zero.first().map(|first| first.plane);
+    let is_one = zero.iter().all(|zero| Some(zero.plane) == plane);
+    Some(PlanarJoints::new(joints, plane.filter(|_| is_one)))
 }
 
 /// The plane across the first hinge of the tree with this root.

@@ -14,6 +14,7 @@
 use crate::model::{
     Alignment, Constraint, ConstraintKind, Length, Model, PathJoint, PointPair, Polynomial,
 };
+use crate::plant::in_plane::InPlane;
 use crate::plant::kinematics::Poses;
 use crate::plant::vectors::{Distance, ProductAt};
 use crate::scalar::Scalar;
@@ -34,6 +35,8 @@ pub(crate) struct Closure<S = f64> {
     coordinate_round_off: Vec<f64>,
     /// What pulls at each joint, for second derivatives.
     pulls: Vec<Pull<S>>,
+    /// In place of the Jacobian, where loops are eliminated in the plane.
+    pub(crate) in_plane: Option<Box<InPlane>>,
 }
 
 /// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
@@ -68,6 +71,7 @@ impl<S: Scalar> Closure<S> {
             jacobian: vec![S::ZERO; nc * model.dimensions.coordinates()],
             coordinate_round_off: vec![0.0; nc],
             pulls: vec![Pull::NONE; model.closure.joints.len()],
+            in_plane: model.loops.as_ref().map(|loops| Box::new(InPlane::new(loops))),
         }
     }
 
@@ -200,6 +204,28 @@ impl<S: Scalar> Closure<S> {
                 }
                 i = above.parent;
             }
+        }
+    }
+}
+
+impl Closure {
+    /// Wrenches of loops at the configuration of the last [`Closure::evaluate`], where there are some.
+    pub(crate) fn place_in_plane(&mut self, model: &Model, q: &[f64]) {
+        if let (Some(in_plane), Some(loops), Some(joints)) =
+            (&mut self.in_plane, &model.loops, &model.planar)
+        {
+            let round_off = &mut self.coordinate_round_off;
+            in_plane.place(model, loops, joints, &self.poses, q, round_off);
+        }
+    }
+
+    /// [`Closure::subtract_impulses`] by wrenches where there are some, else by the Jacobian.
+    pub(crate) fn subtract_pushes(&mut self, model: &Model, multipliers: &[f64], out: &mut [f64]) {
+        match (&mut self.in_plane, &model.loops, &model.planar) {
+            (Some(in_plane), Some(loops), Some(joints)) => {
+                in_plane.subtract_impulses(loops, joints, multipliers, out);
+            }
+            _ => self.subtract_impulses(model, multipliers, out),
         }
     }
 }

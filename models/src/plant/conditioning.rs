@@ -59,7 +59,7 @@ pub(crate) struct Conditioning {
     /// Equations that are independent at the scene's initial configuration or near it, in their order.
     pub(crate) independent: Vec<usize>,
     /// The configuration where they are.
-    regular: Vec<f64>,
+    pub(crate) regular: Vec<f64>,
 }
 
 /// Where corrections towards the constraints lead.

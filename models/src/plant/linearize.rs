@@ -111,6 +111,8 @@ pub(crate) struct SolvedStep {
     pub(crate) responses: Vec<f64>,
     /// The factors of `S`.
     pub(crate) schur: PivotedLu,
+    /// Loops were eliminated without these two.
+    pub(crate) in_loops: bool,
 }
 
 impl SolvedStep {
@@ -128,6 +130,7 @@ impl SolvedStep {
             multipliers: zeros(d.constraints),
             responses: zeros(d.dynamic * padded(d.constraints)),
             schur: PivotedLu::new(&model.conditioning.weight, 1),
+            in_loops: false,
         }
     }
 
@@ -149,8 +152,11 @@ impl SolvedStep {
         }
         if !self.multipliers.is_empty() {
             self.multipliers.copy_from_slice(&workspace.multipliers);
-            self.responses.copy_from_slice(&workspace.responses);
-            self.schur.take_factors_of(&workspace.schur);
+            self.in_loops = workspace.in_loops;
+            if !self.in_loops {
+                self.responses.copy_from_slice(&workspace.responses);
+                self.schur.take_factors_of(&workspace.schur);
+            }
         }
     }
 }

@@ -110,6 +110,8 @@ pub(crate) struct Workspace {
     /// `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
     pub(crate) responses: Vec<f64>,
     pub(crate) schur: PivotedLu,
+    /// The last factorization was one of loops, not of `K` and `S`.
+    pub(crate) in_loops: bool,
     /// `Σ λ D²h`, for the linearization.
     pub(crate) constraint_hessian: Vec<f64>,
     /// `½h L_qq + L_qv`, for the linearization, row-major.
@@ -193,6 +195,7 @@ impl Workspace {
             end_is_exact: false,
             responses: zeros(nd * padded(nc)),
             schur: PivotedLu::new(&model.conditioning.weight, spread(padded(2 * n))),
+            in_loops: false,
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),
             stiffness: zeros(nd * nd),
@@ -237,7 +240,7 @@ impl Workspace {
             self.set_inputs(model, inputs);
         }
         if d.constraints > 0 {
-            self.prepare_start(model, state);
+            self.place_start(model, state);
             // Until the end has a Jacobian of this step: nothing of the last may decide on this one.
             self.end.expect_round_off_of(&self.start);
         }
@@ -252,7 +255,18 @@ impl Workspace {
         }
     }
 
-    /// Constraints at the start of the step, kept from the end of the last one where possible.
+    /// Constraints at the start of the step, kept from the end of the last one where possible; of loops
+    /// without a Jacobian.
+    fn place_start(&mut self, model: &Model, state: &PreciseState) {
+        if model.loops.is_none() {
+            self.prepare_start(model, state);
+        } else if !self.start_is_valid {
+            self.start.evaluate(model, &state.q, &self.orientations_start);
+            self.start.place_in_plane(model, &state.q);
+        }
+    }
+
+    /// The same with a Jacobian.
     pub(crate) fn prepare_start(&mut self, model: &Model, state: &PreciseState) {
         if model.dimensions.constraints > 0 && !self.start_is_valid {
             for (matrix, q) in self.orientations_start.iter_mut().zip(&state.orientations) {
@@ -260,6 +274,7 @@ impl Workspace {
             }
             self.start.evaluate(model, &state.q, &self.orientations_start);
             self.start.differentiate(model, &state.q);
+            self.start.place_in_plane(model, &state.q);
             self.start_is_valid = true;
         }
     }
@@ -277,7 +292,7 @@ impl Workspace {
 
     /// Guess: the velocity that belongs to the momentum goes on.
     pub(crate) fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
-        if self.factors.generators.is_some() {
+        if self.factors.generators.is_some() && model.dimensions.constraints == 0 {
             self.velocity.fill(0.0);
             let (orientations, derivatives) =
                 (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
@@ -327,7 +342,7 @@ impl Workspace {
         // What a factorization costs, in corrections.
         let patience = match model.solver {
             Solver::Tree => 3,
-            Solver::Planar | Solver::Spatial => 2,
+            Solver::Planar | Solver::Spatial | Solver::Loops => 2,
         };
         let enough = settings.precision.residual();
         let mut previous = f64::INFINITY;
@@ -342,7 +357,7 @@ impl Workspace {
             }
             if report.iterations == 1 && size <= CONVERGED {
                 // Nothing to correct, but what is singular shall not pass for solved.
-                self.factor(model, settings)?;
+                self.factor(model, settings, state)?;
                 report.factorizations += 1;
                 return self.accept(model, settings, report);
             }
@@ -357,7 +372,7 @@ impl Workspace {
             let later = (0..patience).fold(size, |size, _| size * rate);
             fresh = !converged && (always_factor || previous.is_infinite() || later > enough);
             if fresh {
-                self.factor(model, settings)?;
+                self.factor(model, settings, state)?;
                 report.factorizations += 1;
             }
             self.correct(model);
@@ -392,7 +407,7 @@ impl Workspace {
             self.turn_residual(model, settings, state);
         }
         if model.dimensions.constraints > 0 {
-            self.start.subtract_impulses(model, &self.multipliers, &mut self.residual);
+            self.start.subtract_pushes(model, &self.multipliers, &mut self.residual);
         }
         largest(&self.residual) / (f64::EPSILON * self.round_off)
     }
@@ -499,6 +514,17 @@ impl Workspace {
 
     /// One correction with the factors at hand.
     fn correct(&mut self, model: &Model) {
+        if self.in_loops {
+            self.constraint_residual.copy_from_slice(&self.end.value);
+            self.factors.solve_loops(model, &mut self.residual, &mut self.constraint_residual);
+            for (lambda, change) in self.multipliers.iter_mut().zip(&self.constraint_residual) {
+                *lambda -= change;
+            }
+            for (x, r) in self.increment.iter_mut().zip(&self.residual) {
+                *x -= r;
+            }
+            return;
+        }
         self.factors.solve(model, &mut self.residual);
         if model.dimensions.constraints > 0 {
             let n = model.dimensions.coordinates();
@@ -552,9 +578,11 @@ impl Workspace {
             self.turn_impulse(model, settings);
         }
         if model.dimensions.constraints > 0 {
-            // The extrapolated guess has the least norm of other configurations.
-            self.schur.remove_null(&mut self.multipliers);
-            self.start.subtract_impulses(model, &self.multipliers, &mut self.impulse);
+            if !self.in_loops {
+                // The extrapolated guess has the least norm of other configurations.
+                self.schur.remove_null(&mut self.multipliers);
+            }
+            self.start.subtract_pushes(model, &self.multipliers, &mut self.impulse);
         }
         self.estimates.write(&mut report);
         Ok(report)
@@ -566,6 +594,7 @@ impl Workspace {
             self.place_end(model, state);
             self.end.evaluate(model, &self.q_end, &self.orientations_end);
             self.end.differentiate(model, &self.q_end);
+            self.end.place_in_plane(model, &self.q_end);
             if !model.orientations.is_empty() {
                 self.turn_end_jacobian(model);
             }

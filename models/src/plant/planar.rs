@@ -22,8 +22,10 @@
 //! [`Curvature`]: crate::plant::curvature::Curvature
 
 mod elimination;
+mod loops;
 
 pub(crate) use self::elimination::{Diagonal, Elimination, Of};
+pub(crate) use self::loops::{Closures, Derivatives, LoopElimination, Mechanism, Scales};
 
 use std::fmt::Debug;
 use std::marker::PhantomData;

@@ -51,6 +51,10 @@ impl Workspace {
             out.solved.remember(self, at);
             return Ok(());
         }
+        if self.linearize_loops(at, out) {
+            out.solved.remember(self, at);
+            return Ok(());
+        }
         self.factor_newton_matrix(at.model, at.settings)?;
         self.fill_right_hand_sides(at, out);
         // Without inertia, springs or forces on prescribed joints, the columns of `k` in r1' are zero.
@@ -66,6 +70,7 @@ impl Workspace {
             columns,
         );
         if d.constraints > 0 {
+            self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
             self.factor_schur(at.model, at.settings)?;
             self.solve_multipliers(at, out);
@@ -83,18 +88,27 @@ impl Workspace {
     ) -> Result<(), StepError> {
         let model = at.model;
         self.factor_generators(model, at.settings)?;
-        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
-            place.momentum = at.settings.time_step_s * input.gain;
-            place.residual = out.at_start * place.momentum;
-        }
+        self.fill_inputs(at, out);
         let tree = self.mechanics.planar.as_deref().and_then(planar::PlanarTree::many);
         let (Some(tree), Some(joints), Some(generators)) =
             (tree, &model.planar, self.factors.planar())
         else {
             return Ok(());
         };
-        let h = at.settings.time_step_s;
-        // Of springs and dampers of coordinates.
+        let [residual, momentum] = &self.diagonals;
+        let diagonal = planar::Diagonal { residual, momentum };
+        let (increment, momentum) = (&mut out.increment, &mut out.momentum);
+        generators.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
+        Ok(())
+    }
+
+    /// Impulses of inputs, and the diagonals of springs and dampers of coordinates.
+    fn fill_inputs(&mut self, at: At<'_>, out: &mut Linearization) {
+        let (model, h) = (at.model, at.settings.time_step_s);
+        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
+            place.momentum = h * input.gain;
+            place.residual = out.at_start * place.momentum;
+        }
         let [residual, slope] = &mut self.diagonals;
         if model.potentials.any {
             residual.fill(0.0);
@@ -109,10 +123,37 @@ impl Workspace {
         for (i, slope) in slope.iter_mut().enumerate() {
             *slope = residual[i] - model.damping.get(i).copied().unwrap_or_default();
         }
-        let diagonal = planar::Diagonal { residual, momentum: slope };
-        let (increment, momentum) = (&mut out.increment, &mut out.momentum);
-        generators.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
-        Ok(())
+    }
+
+    /// The same with loops, where their pivots allow it: O(n²) where their fronts do not grow.
+    fn linearize_loops(&mut self, at: At<'_>, out: &mut Linearization) -> bool {
+        let At { model, settings, state, .. } = at;
+        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
+        self.finish_end(model, state);
+        if !self.factor_loops(model, settings) {
+            return false;
+        }
+        self.start.hessian(model, &state.q, &self.multipliers, &mut self.constraint_hessian);
+        self.fill_inputs(at, out);
+        let tree = self.mechanics.planar.as_deref().and_then(planar::PlanarTree::many);
+        let (Some(tree), Some(start), Some(end), Some(generators)) =
+            (tree, &self.start.in_plane, &self.end.in_plane, self.factors.loops())
+        else {
+            return false;
+        };
+        let [residual, momentum] = &self.diagonals;
+        let diagonal = planar::Diagonal { residual, momentum };
+        let closures =
+            planar::Closures { jacobian: &self.end.jacobian, hessian: &self.constraint_hessian };
+        let derivatives = planar::Derivatives {
+            increment: &mut out.increment,
+            momentum: &mut out.momentum,
+            multipliers: &mut out.multipliers,
+            stride: out.stride,
+        };
+        let mechanism = planar::Mechanism { loops, joints, tree, start, end };
+        generators.linearize(mechanism, &diagonal, &closures, derivatives);
+        true
     }
 
     wide! {

@@ -9,7 +9,10 @@ use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::planar::{self, Of, PlanarTree};
 use crate::plant::rows::padded;
 use crate::plant::tree_lu::{SmallestPivot, TreeLu};
-use crate::plant::{Settings, StepError, potentials, space};
+use crate::plant::{PreciseState, Settings, StepError, potentials, space};
+
+/// Pivots of loops, relative to what they are compared with, from which on they are taken.
+const SAFE: f64 = 1e-6;
 
 /// The Newton matrix `K`, factored.
 #[derive(Clone, Debug)]
@@ -24,6 +27,8 @@ pub(crate) struct Factors {
 #[derive(Clone, Debug)]
 pub(crate) enum Generators {
     Planar(planar::Elimination),
+    /// With the constraints.
+    Loops(Box<planar::LoopElimination>),
     Spatial(space::Elimination),
 }
 
@@ -33,6 +38,10 @@ impl Factors {
         let generators = match model.solver {
             Solver::Tree => None,
             Solver::Planar => Some(Generators::Planar(planar::Elimination::new(joints))),
+            Solver::Loops => {
+                let loops = model.loops.as_ref();
+                loops.map(|loops| Generators::Loops(Box::new(planar::LoopElimination::new(loops))))
+            }
             Solver::Spatial => {
                 Some(Generators::Spatial(space::Elimination::new(&model.dynamics, model.gravity)))
             }
@@ -72,6 +81,21 @@ impl Factors {
         }
     }
 
+    /// Those of a mechanism with loops.
+    pub(crate) fn loops(&mut self) -> Option<&mut planar::LoopElimination> {
+        match self.generators.as_deref_mut() {
+            Some(Generators::Loops(generators)) => Some(generators),
+            _ => None,
+        }
+    }
+
+    /// Solves for increments and multipliers in place.
+    pub(crate) fn solve_loops(&mut self, model: &Model, x: &mut [f64], constraints: &mut [f64]) {
+        if let (Some(generators), Some(loops)) = (self.loops(), &model.loops) {
+            generators.solve(loops, x, constraints);
+        }
+    }
+
     /// Solves `K x = b` in place.
     pub(crate) fn solve(&mut self, model: &Model, x: &mut [f64]) {
         match (self.generators.as_deref_mut(), &model.planar) {
@@ -84,7 +108,22 @@ impl Factors {
 
 impl Workspace {
     /// Factors `K` and `S` at the last evaluation.
-    pub(super) fn factor(&mut self, model: &Model, settings: &Settings) -> Result<(), StepError> {
+    pub(crate) fn factor(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) -> Result<(), StepError> {
+        self.in_loops = false;
+        if model.loops.is_some() {
+            self.end.place_in_plane(model, &self.q_end);
+            if self.factor_loops(model, settings) {
+                return Ok(());
+            }
+            // By all joints together what is singular may not be, and if it is it gets its name.
+            self.start.differentiate(model, &state.q);
+            self.start.place_in_plane(model, &state.q);
+        }
         self.factor_generators(model, settings)?;
         if model.dimensions.constraints > 0 {
             self.end.differentiate(model, &self.q_end);
@@ -94,6 +133,54 @@ impl Workspace {
             self.factor_schur(model, settings)?;
         }
         Ok(())
+    }
+
+    /// Whether the pivots of loops are sound at rest, where the constraints are known to be regular.
+    pub(crate) fn can_eliminate_loops(&mut self, model: &Model) -> bool {
+        let q = &model.conditioning.regular;
+        for (closure, q_there) in
+            [(&mut self.start, &mut self.q_mid), (&mut self.end, &mut self.q_end)]
+        {
+            q_there.copy_from_slice(q);
+            closure.evaluate(model, q, &[]);
+            closure.place_in_plane(model, q);
+        }
+        self.angles.copy_from_slice(q);
+        self.evaluate_lagrangian(model);
+        self.factor_loops(model, &Settings::new(model))
+    }
+
+    /// Factors `K` and the constraints of loops, which are in the plane; whether the pivots allow it.
+    pub(crate) fn factor_loops(&mut self, model: &Model, settings: &Settings) -> bool {
+        self.in_loops = false;
+        self.fill_diagonal(model, settings);
+        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
+        let (Some(start), Some(end)) = (&self.start.in_plane, &self.end.in_plane) else {
+            return false;
+        };
+        let Some(PlanarTree::Many(tree)) = self.mechanics.planar.as_deref_mut() else {
+            return false;
+        };
+        let Some(Generators::Loops(generators)) = self.factors.generators.as_deref_mut() else {
+            return false;
+        };
+        tree.differentiate(joints);
+        let at = planar::Mechanism { loops, joints, tree, start, end };
+        let conditioning = &model.conditioning;
+        let scales =
+            planar::Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
+        let pivots = generators.factor(at, &self.diagonal, scales, settings.time_step_s);
+        if pivots.joints.relative < SAFE
+            || pivots.equations < SAFE
+            || pivots.steepness < settings.singular_below
+        {
+            return false;
+        }
+        self.in_loops = true;
+        self.estimates.matrix = pivots.joints.relative;
+        self.estimates.constraints = pivots.equations.min(pivots.steepness);
+        self.estimates.redundant = (model.constraints.len() - loops.equations.len()) as u32;
+        true
     }
 
     /// Fills `K` at the last evaluation.
@@ -163,6 +250,16 @@ impl Workspace {
         if self.factors.generators.is_none() {
             return self.factor_newton_matrix(model, settings);
         }
+        self.fill_diagonal(model, settings);
+        let (h, diagonal) = (settings.time_step_s, &self.diagonal);
+        match self.factors.generate(model, &mut self.mechanics, diagonal, h, Of::Motion) {
+            Some(pivot) => self.accept_pivot(model, settings, pivot),
+            None => self.factor_newton_matrix(model, settings),
+        }
+    }
+
+    /// What springs and dampers of coordinates add to the diagonal of `K`.
+    fn fill_diagonal(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
         let diagonal = &mut self.diagonal;
         diagonal.fill(0.0);
@@ -178,10 +275,6 @@ impl Workspace {
         let a = settings.force_split.at_start();
         for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
             *entry -= a * c;
-        }
-        match self.factors.generate(model, &mut self.mechanics, diagonal, h, Of::Motion) {
-            Some(pivot) => self.accept_pivot(model, settings, pivot),
-            None => self.factor_newton_matrix(model, settings),
         }
     }
 

@@ -19,7 +19,7 @@
 //! and `d_j` are the pivots of an elimination from the leaves to the root. As each sum is about its own
 //! joint, long chains lose no digits.
 
-use super::{Fours, Joints, Vec2, Vec3, cross, dot, linear};
+use super::{Fours, Joints, Link, Vec2, Vec3, cross, dot, linear};
 use crate::planar::PlanarJoint;
 use crate::plant::rows::{Block, LANES};
 use crate::plant::tree_lu::SmallestPivot;
@@ -27,11 +27,11 @@ use crate::wide::wide;
 
 /// What a joint gives to the matrix, and what is left of it when it has been eliminated.
 #[derive(Clone, Copy, Debug, Default)]
-struct Generator {
-    edge: Vec2,
-    minus: Vec3,
-    plus: Vec3,
-    inverse_pivot: f64,
+pub(super) struct Generator {
+    pub(super) edge: Vec2,
+    pub(super) minus: Vec3,
+    pub(super) plus: Vec3,
+    pub(super) inverse_pivot: f64,
     /// For the derivative of the momentum: `P + ½h γ e`, and linear parts of `½h P + F`, after `½h γ`, and of
     /// `J̇`.
     slope: Vec3,
@@ -67,26 +67,74 @@ pub(crate) enum Of {
     Masses,
 }
 
+/// The matrix of a step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Method {
+    /// 1, or 0 for masses alone.
+    motion: f64,
+    half: f64,
+    pub(super) inverse: f64,
+}
+
+impl Method {
+    #[inline(always)]
+    pub(super) fn new(step: f64, of: Of) -> Self {
+        let motion = if of == Of::Masses { 0.0 } else { 1.0 };
+        Self { motion, half: 0.5 * step * motion, inverse: 1.0 / step }
+    }
+
+    /// What a joint gives to the matrix, `upper` and `lower` first, without a pivot.
+    #[inline(always)]
+    pub(super) fn generator(
+        &self,
+        link: &Link<f64>,
+        joint: &PlanarJoint,
+    ) -> ([Vec3; 2], Generator) {
+        let Self { motion, half, inverse } = *self;
+        let ([dx, dy], [rx, ry]) = (link.slide, [half * link.rate[0], half * link.rate[1]]);
+        let turn = joint.body.turn;
+        let plus = [turn, rx + dx, ry + dy];
+        let minus = [-turn, rx - dx, ry - dy];
+        let (weight, slope) = (half * link.weight, link.slope);
+        let mut upper = add_scaled(scaled(0.5 * motion, slope), inverse, link.force);
+        let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
+        upper[0] -= 0.5 * weight;
+        lower[0] += 0.5 * weight;
+        let generator = Generator {
+            edge: link.edge,
+            minus,
+            plus,
+            inverse_pivot: 0.0,
+            slope: [slope[0] + weight, slope[1], slope[2]],
+            push: [weight, link.force[1] + half * slope[1], link.force[2] + half * slope[2]],
+            rate: link.rate,
+        };
+        ([upper, lower], generator)
+    }
+}
+
 /// The matrix.
 #[derive(Clone, Debug)]
 pub(crate) struct Elimination {
-    generators: Vec<Generator>,
+    pub(super) generators: Vec<Generator>,
     passages: Vec<Passage>,
-    step: f64,
+    pub(super) step: f64,
     /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
     branches: Vec<[Vec3; 3]>,
     /// The same for a right-hand side, and what joints with several children pass down to them.
     flows_of_branches: Vec<Vec3>,
     flow: Vec<Vec3>,
-    /// Both for a block of right-hand sides; the first is that of the world.
+    /// Both for a block of right-hand sides; the first is that of the world. What goes up is zero but within a
+    /// pass.
     flows: Vec<[Block; 3]>,
+    motions: Vec<[Block; 3]>,
     /// A block of columns of the derivatives.
-    increment: Vec<Block>,
-    momentum: Vec<Block>,
+    pub(super) increment: Vec<Block>,
+    pub(super) momentum: Vec<Block>,
 }
 
 #[inline(always)]
-fn dot3(a: Vec3, b: Vec3) -> f64 {
+pub(super) fn dot3(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
@@ -130,6 +178,7 @@ impl Elimination {
             flows_of_branches: vec![[0.0; 3]; joints],
             flow: vec![[0.0; 3]; joints],
             flows: vec![[Block::ZERO; 3]; joints + 1],
+            motions: vec![[Block::ZERO; 3]; joints + 1],
             increment: vec![Block::ZERO; joints],
             momentum: vec![Block::ZERO; joints],
         }
@@ -182,39 +231,31 @@ impl Elimination {
         step: f64,
         of: Of,
     ) -> SmallestPivot {
-        let motion = if of == Of::Masses { 0.0 } else { 1.0 };
-        let (half, inverse) = (0.5 * step * motion, 1.0 / step);
+        let method = Method::new(step, of);
         self.step = step;
         let mut smallest = SmallestPivot::NONE;
         // `A` of the joint that follows, about its parent.
         let mut below = [[0.0; 3]; 3];
         for (row, joint) in joints.iter().enumerate().rev() {
-            let link = tree.link(row);
             let mut sum = if joint.is_followed { below } else { [[0.0; 3]; 3] };
             if joint.has_branches {
                 sum = plus33(sum, std::mem::take(&mut self.branches[row]));
             }
             let [a, b, c] = sum;
-            let ([dx, dy], [rx, ry]) = (link.slide, [half * link.rate[0], half * link.rate[1]]);
-            let turn = joint.body.turn;
-            let plus = [turn, rx + dx, ry + dy];
-            let minus = [-turn, rx - dx, ry - dy];
-            let (weight, slope) = (half * link.weight, link.slope);
-            let mut upper = add_scaled(scaled(0.5 * motion, slope), inverse, link.force);
-            let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
-            upper[0] -= 0.5 * weight;
-            lower[0] += 0.5 * weight;
+            let ([upper, lower], mut generator) = method.generator(&tree.link(row), joint);
+            let Generator { minus, plus, .. } = generator;
 
             let pushed = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
             let own = dot3(minus, upper) + diagonal[row];
             let pivot = own + dot3(minus, pushed);
-            smallest.see(row, pivot, own.abs().max(inertia[row] * inverse));
+            smallest.see(row, pivot, own.abs().max(inertia[row] * method.inverse));
             let inverse_pivot = 1.0 / pivot;
             let pulled = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
             let (above, across) = (plus3(upper, pushed), plus3(lower, pulled));
             // About the parent: all that can be done before the pivot is known.
-            let [ex, ey] = link.edge;
-            let moved = |v: Vec3| [v[0] + cross(link.edge, linear(v)), v[1], v[2]];
+            let edge = generator.edge;
+            let [ex, ey] = edge;
+            let moved = |v: Vec3| [v[0] + cross(edge, linear(v)), v[1], v[2]];
             let (a, b, c) = (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
             let (above_there, taken) = (moved(above), scaled(inverse_pivot, moved(across)));
             let sum = [
@@ -245,15 +286,8 @@ impl Elimination {
                 ],
                 taken,
             };
-            self.generators[row] = Generator {
-                edge: link.edge,
-                minus,
-                plus,
-                inverse_pivot,
-                slope: [slope[0] + weight, slope[1], slope[2]],
-                push: [weight, link.force[1] + half * slope[1], link.force[2] + half * slope[2]],
-                rate: link.rate,
-            };
+            generator.inverse_pivot = inverse_pivot;
+            self.generators[row] = generator;
         }
         smallest
     }
@@ -303,30 +337,52 @@ impl Elimination {
         momentum: &mut [f64],
         stride: usize,
     ) {
-        let n = joints.len();
         for first in (0..stride).step_by(LANES) {
-            self.increment.fill(Block::ZERO);
-            self.momentum.fill(Block::ZERO);
-            for lane in 0..LANES {
-                match first + lane {
-                    column if column < n => {
-                        self.by_configuration(tree, joints, diagonal, column, lane)
-                    }
-                    column if column < 2 * n => {
-                        self.increment[column - n].0[lane] = 1.0;
-                        self.momentum[column - n].0[lane] = 1.0;
-                    }
-                    _ => {}
-                }
-            }
+            self.start_columns(tree, joints, diagonal, first);
             self.eliminate(joints);
             self.substitute(joints, diagonal);
             self.gather(joints);
-            let rows = increment.chunks_exact_mut(stride).zip(momentum.chunks_exact_mut(stride));
-            for ((by_x, by_p), (x, p)) in rows.zip(self.increment.iter().zip(&self.momentum)) {
-                by_x[first..][..LANES].copy_from_slice(&x.0);
-                by_p[first..][..LANES].copy_from_slice(&p.0);
+            self.write_columns(increment, momentum, first, stride);
+        }
+    }
+
+    /// A block of columns of `[G 1]`, and of what the momentum has beside the increment's part.
+    #[inline(always)]
+    pub(super) fn start_columns(
+        &mut self,
+        tree: &Joints<Fours>,
+        joints: &[PlanarJoint],
+        diagonal: &Diagonal<'_>,
+        first: usize,
+    ) {
+        let n = joints.len();
+        for (x, p) in self.increment.iter_mut().zip(&mut self.momentum) {
+            (*x, *p) = (Block::ZERO, Block::ZERO);
+        }
+        for lane in 0..LANES {
+            match first + lane {
+                column if column < n => self.by_configuration(tree, joints, diagonal, column, lane),
+                column if column < 2 * n => {
+                    self.increment[column - n].0[lane] = 1.0;
+                    self.momentum[column - n].0[lane] = 1.0;
+                }
+                _ => {}
             }
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn write_columns(
+        &self,
+        increment: &mut [f64],
+        momentum: &mut [f64],
+        first: usize,
+        stride: usize,
+    ) {
+        let rows = increment.chunks_exact_mut(stride).zip(momentum.chunks_exact_mut(stride));
+        for ((by_x, by_p), (x, p)) in rows.zip(self.increment.iter().zip(&self.momentum)) {
+            by_x[first..][..LANES].copy_from_slice(&x.0);
+            by_p[first..][..LANES].copy_from_slice(&p.0);
         }
     }
 
@@ -368,12 +424,11 @@ impl Elimination {
     /// From the leaves to the root, with the right-hand side taken away.
     #[inline(always)]
     fn eliminate(&mut self, joints: &[PlanarJoint]) {
-        self.flows.fill([Block::ZERO; 3]);
         let passages = self.generators.iter().zip(&self.passages);
         for (i, ((joint, row), (generator, passage))) in
             joints.iter().zip(&mut self.increment).zip(passages).enumerate().rev()
         {
-            let flow = self.flows[i + 1];
+            let flow = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
             let right = row.times(-1.0);
             let pulled = product(generator.minus, flow);
             *row = row.plus(pulled).times(-generator.inverse_pivot);
@@ -393,23 +448,39 @@ impl Elimination {
             joints.iter().zip(rows).zip(diagonal.momentum).zip(passages).enumerate()
         {
             let Generator { edge, plus, slope, .. } = *generator;
-            let (flow, right) = (self.flows[joint.parent], *row);
+            let (flow, right) = (self.motions[joint.parent], *row);
             let slope = [slope[0] + cross(edge, linear(slope)), slope[1], slope[2]];
             let x = right.plus(product(passage.taken, flow).times(-1.0));
             *row = x;
             *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
-            self.flows[i + 1] = passed_by_all(&passage.down, flow, right, plus);
+            self.motions[i + 1] = passed_by_all(&passage.down, flow, right, plus);
+        }
+    }
+
+    /// From the root to the leaves: what joints above add to the momentum, with increments that are known.
+    #[inline(always)]
+    pub(super) fn carry_down(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
+        let rows = self.increment.iter().zip(&mut self.momentum);
+        for (i, ((joint, (x, momentum)), own)) in
+            joints.iter().zip(rows).zip(diagonal.momentum).enumerate()
+        {
+            let Generator { edge: [ex, ey], plus, slope, .. } = self.generators[i];
+            let [turn, vx, vy] = self.motions[joint.parent];
+            let flow = [turn, vx.plus(turn.times(-ey)), vy.plus(turn.times(ex))];
+            *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
+            self.motions[i + 1] = flow;
+            let [n, px, py] = plus;
+            add_to(&mut self.motions[i + 1], [x.times(n), x.times(px), x.times(py)]);
         }
     }
 
     /// From the leaves to the root: what joints below add to the momentum.
     #[inline(always)]
-    fn gather(&mut self, joints: &[PlanarJoint]) {
-        self.flows.fill([Block::ZERO; 3]);
+    pub(super) fn gather(&mut self, joints: &[PlanarJoint]) {
         let rows = self.increment.iter().zip(&mut self.momentum);
         for (i, (joint, (x, momentum))) in joints.iter().zip(rows).enumerate().rev() {
             let Generator { plus, push, rate, .. } = self.generators[i];
-            let [n, fx, fy] = self.flows[i + 1];
+            let [n, fx, fy] = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
             let (n, fx, fy) =
                 (n.plus(x.times(push[0])), fx.plus(x.times(push[1])), fy.plus(x.times(push[2])));
             let moved = n.times(plus[0]).plus(fx.times(rate[0])).plus(fy.times(rate[1]));
@@ -422,7 +493,7 @@ impl Elimination {
 }
 
 #[inline(always)]
-fn product(vector: Vec3, [n, fx, fy]: [Block; 3]) -> Block {
+pub(super) fn product(vector: Vec3, [n, fx, fy]: [Block; 3]) -> Block {
     n.times(vector[0]).plus(fx.times(vector[1])).plus(fy.times(vector[2]))
 }
 
@@ -439,7 +510,7 @@ fn passed_by_all(matrix: &[Vec3; 3], flow: [Block; 3], b: Block, drive: Vec3) ->
 }
 
 #[inline(always)]
-fn add_to(sum: &mut [Block; 3], part: [Block; 3]) {
+pub(super) fn add_to(sum: &mut [Block; 3], part: [Block; 3]) {
     let [n, fx, fy] = *sum;
     *sum = [n.plus(part[0]), fx.plus(part[1]), fy.plus(part[2])];
 }

@@ -22,8 +22,10 @@ use crate::plant::balls::three;
 use crate::plant::blocks::{StepBlocks, non_zero};
 use crate::plant::closure::Closure;
 use crate::plant::linearize::{Linearization, SolvedStep};
+use crate::plant::newton::fill_schur;
 use crate::plant::pivoted_lu::PivotedLu;
 use crate::plant::rows::{Term, add_rows, padded};
+use crate::plant::tree_lu::TreeLu;
 use crate::plant::{Plant, StepError, StepReport};
 use crate::rotation;
 use crate::scalar::Dual;
@@ -48,11 +50,20 @@ pub struct Contraction {
     impulse: Vec<f64>,
     pub(super) quadratic: Quadratic,
     schur: PivotedLu,
+    /// Where loops are eliminated: what a linearization of them leaves out.
+    dense: Option<Dense>,
     /// Constraints at `q[k+1]`.
     end: Closure,
     q_end: Vec<f64>,
     /// Pairs of coordinates that the Lagrangian couples, both ways round.
     pattern: Vec<(usize, usize)>,
+}
+
+/// The Newton matrix, and `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
+#[derive(Clone, Debug)]
+struct Dense {
+    matrix: TreeLu,
+    responses: Vec<f64>,
 }
 
 /// A quadratic form in the start of a step and in what is next, in terms of the parameters `θ` and the
@@ -170,6 +181,10 @@ impl Contraction {
             impulse: vec![0.0; n],
             quadratic: Quadratic::new(layout),
             schur: PivotedLu::new(&model.conditioning.weight, 1),
+            dense: model.loops.as_ref().map(|_| Dense {
+                matrix: TreeLu::new(&model.elimination),
+                responses: vec![0.0; layout.nd * padded(layout.nc)],
+            }),
             end: Closure::new(model),
             q_end: vec![0.0; n],
             pattern: scratch.blocks.mid.coupled_coordinates(model),
@@ -245,6 +260,42 @@ impl Contraction {
         }
     }
 
+    /// `K⁻¹ A0ᵀ` and the factors of `S`, where loops were eliminated without them.
+    fn find_responses(&mut self, model: &Model, step: &SolvedStep) {
+        let Some(Dense { matrix, responses }) = &mut self.dense else { return };
+        let Layout { nd, nc, .. } = self.scratch.layout;
+        let (n, stride) = (self.scratch.layout.n(), padded(nc));
+        let (h, a) = (step.settings.time_step_s, step.settings.force_split.at_start());
+        let StepBlocks { mid, start, .. } = &self.scratch.blocks;
+        let elimination = &model.elimination;
+        matrix.clear();
+        for i in 0..nd {
+            let slots = elimination.offsets[i]..elimination.offsets[i + 1];
+            for &j in &elimination.ancestors[slots] {
+                let entry = |ij: usize, ji: usize| {
+                    let turning = 0.5 * (mid.l_qv[ij].re - mid.l_qv[ji].re);
+                    0.25 * h * mid.l_qq[ij].re - mid.l_vv[ij].re / h + turning
+                };
+                let (ij, ji) = (i * n + j, j * n + i);
+                if i == j {
+                    matrix.add(elimination, i, i, entry(ij, ij) + a * mid.f_v[ij].re);
+                } else {
+                    matrix.add(elimination, i, j, entry(ij, ji));
+                    matrix.add(elimination, j, i, entry(ji, ij));
+                }
+            }
+            for c in 0..nc {
+                responses[i * stride + c] = start.jacobian[c * n + i].re;
+            }
+        }
+        matrix.factor(elimination, &model.conditioning.inertia, 1.0 / h.abs());
+        matrix.solve_rows(elimination, responses, stride, stride);
+        self.end.evaluate(model, &self.q_end, &[]);
+        self.end.differentiate(model, &self.q_end);
+        fill_schur(model, &self.end, responses, &mut self.schur);
+        self.schur.factor();
+    }
+
     /// `μ₂`, with the blocks at the solution: `slopes` are `O_x`, row-major, with rows of `n`.
     fn find_multipliers(
         &mut self,
@@ -256,6 +307,13 @@ impl Contraction {
         let (n, stride) = (self.scratch.layout.n(), padded(nc));
         let blocks = &self.scratch.blocks;
         let z_p = &z[n..][..nd];
+        let responses = match &self.dense {
+            Some(dense) if step.in_loops => &dense.responses,
+            _ => {
+                self.schur.take_factors_of(&step.schur);
+                &step.responses
+            }
+        };
         let (first, second) = self.adjoint.split_at_mut(nd);
         second.fill(0.0);
         for (i, mu) in first.iter().enumerate() {
@@ -263,10 +321,9 @@ impl Contraction {
             let pull = self.weights[i] + moved;
             for (c, entry) in second.iter_mut().enumerate() {
                 let jacobian = blocks.start.jacobian[c * n + i].re;
-                *entry -= step.responses[i * stride + c] * pull + jacobian * mu;
+                *entry -= responses[i * stride + c] * pull + jacobian * mu;
             }
         }
-        self.schur.take_factors_of(&step.schur);
         self.schur.solve_transposed(second);
     }
 
@@ -426,15 +483,18 @@ impl Contraction {
         let blocks = &mut self.scratch.blocks;
         blocks.start.evaluate(model, &blocks.q_start, &[]);
         blocks.start.differentiate(model, &blocks.q_start);
+        for (i, q) in step.q.iter().enumerate() {
+            self.q_end[i] = if i < nd { q + step.increment[i] } else { step.next[i - nd] };
+        }
+        if step.in_loops {
+            self.find_responses(model, step);
+        }
         self.find_multipliers(step, z, |blocks, i, j| {
             let slope = 0.5 * h * blocks.mid.l_qq[i * n + j].re + blocks.mid.l_qv[i * n + j].re;
             if i == j { slope + blocks.mid.f_v[i * n + i].re } else { slope }
         });
         let Self { scratch, quadratic, adjoint, end, q_end, .. } = self;
         let start = &scratch.blocks.start;
-        for (i, q) in step.q.iter().enumerate() {
-            q_end[i] = if i < nd { q + step.increment[i] } else { step.next[i - nd] };
-        }
         end.poses.evaluate(&model.closure, q_end, &[]);
         let equations = model.constraints.iter().zip(&step.multipliers).zip(&adjoint[nd..]);
         for (c, ((constraint, lambda), mu)) in equations.enumerate() {

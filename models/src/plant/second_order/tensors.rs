@@ -252,6 +252,11 @@ impl Plant {
         if self.workspace.factors.planar().is_some() {
             self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
         }
+        if self.workspace.in_loops {
+            self.workspace.prepare_start(&self.model, &self.state);
+            self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
+            self.workspace.factor_schur(&self.model, &self.settings)?;
+        }
         self.differentiate_linearization(first, second);
         Ok(report)
     }

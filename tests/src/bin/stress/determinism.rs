@@ -19,6 +19,7 @@ pub(crate) fn cases() -> Vec<Case> {
         ("tree-30", method(2, 1)),
         ("four-bar", method(2, 1)),
         ("scissor-4", method(2, 1)),
+        ("scissor-16", method(2, 1)),
         ("marionette", method(2, 1)),
         ("random", method(2, 1)),
         ("chain-8", method(8, 1)),
