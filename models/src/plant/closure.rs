@@ -12,7 +12,7 @@
 //! coordinate.
 
 use crate::model::{
-    Alignment, Constraint, ConstraintKind, Length, Model, PathJoint, PointPair, Polynomial,
+    Alignment, Carries, Constraint, ConstraintKind, Length, Model, PathJoint, PointPair, Polynomial,
 };
 use crate::plant::in_plane::InPlane;
 use crate::plant::kinematics::Poses;
@@ -35,6 +35,8 @@ pub(crate) struct Closure<S = f64> {
     coordinate_round_off: Vec<f64>,
     /// What pulls at each joint, for second derivatives.
     pulls: Vec<Pull<S>>,
+    /// Of a distance, by the coordinates on the path between its ends.
+    gradients: Vec<(usize, Vec3<S>)>,
     /// In place of the Jacobian, where loops are eliminated in the plane.
     pub(crate) in_plane: Option<Box<InPlane>>,
 }
@@ -71,6 +73,7 @@ impl<S: Scalar> Closure<S> {
             jacobian: vec![S::ZERO; nc * model.dimensions.coordinates()],
             coordinate_round_off: vec![0.0; nc],
             pulls: vec![Pull::NONE; model.closure.joints.len()],
+            gradients: Vec::with_capacity(model.closure.joints.len()),
             in_plane: model.loops.as_ref().map(|loops| Box::new(InPlane::new(loops))),
         }
     }
@@ -140,7 +143,18 @@ impl<S: Scalar> Closure<S> {
         for (constraint, &lambda) in model.constraints.iter().zip(multipliers) {
             match &constraint.kind {
                 ConstraintKind::Axis(points, axis) if !model.closure.has_other_joints => {
-                    self.pull(model, points, *axis, lambda);
+                    let mut force = Vec3::ZERO;
+                    force.0[*axis] = lambda;
+                    self.pull(model, points, force);
+                    are_pulled = true;
+                }
+                ConstraintKind::Distance(points, length) if points.are_apart(&model.closure) => {
+                    let twice = lambda * 2.0;
+                    let force = self.add_stretch(model, points, twice, out);
+                    self.pull(model, points, force);
+                    if let Length::Driven(length) = *length {
+                        out[length * n + length] -= twice;
+                    }
                     are_pulled = true;
                 }
                 _ => {
@@ -156,16 +170,44 @@ impl<S: Scalar> Closure<S> {
         }
     }
 
-    /// Takes the multiplier of `d · e = 0`, for a world axis `e`, as forces at both points.
-    fn pull(&mut self, model: &Model, points: &PointPair, axis: usize, lambda: S) {
-        for (end, force) in [(&points.a, lambda), (&points.b, -lambda)] {
+    /// Takes a force at the first of two points, and its opposite at the other.
+    fn pull(&mut self, model: &Model, points: &PointPair, force: Vec3<S>) {
+        for (end, force) in [(&points.a, force), (&points.b, -force)] {
             if let Some(pull) = self.pulls.get_mut(end.joint) {
                 pull.is_there = true;
-                pull.force.0[axis] += force;
+                pull.force += force;
                 let (point, _) = self.poses.point(&model.closure, end);
-                pull.product.0[axis] += point * force;
+                for (column, force) in pull.product.0.iter_mut().zip(force.0) {
+                    *column += point * force;
+                }
             }
         }
+    }
+
+    /// Adds `d_i·d_j`, times a factor, by the coordinates between two points; returns `d` times it.
+    fn add_stretch(
+        &mut self,
+        model: &Model,
+        points: &PointPair,
+        factor: S,
+        out: &mut [S],
+    ) -> Vec3<S> {
+        let (n, tree) = (model.dimensions.coordinates(), &model.closure);
+        let at = points.separation(tree, &self.poses);
+        self.gradients.clear();
+        for joint in &points.path {
+            let i = joint.coordinate;
+            let gradient = joint.gradient(tree, &self.poses, &at);
+            let scaled = gradient * factor;
+            for &(j, other) in &self.gradients {
+                let value = scaled.dot(other);
+                out[i * n + j] += value;
+                out[j * n + i] += value;
+            }
+            out[i * n + i] += scaled.dot(gradient);
+            self.gradients.push((i, gradient));
+        }
+        at.difference * factor
     }
 
     /// Adds the second derivatives of `Σ f·p` by the coordinates of hinges and sliders, O(n·depth) for
@@ -262,7 +304,12 @@ impl Constraint {
                 let at = points.separation(tree, poses);
                 let weight = at.difference.scaled(2.0);
                 for joint in &points.path {
-                    row[joint.coordinate] += weight.dot(joint.gradient(tree, poses, &at));
+                    let (point, weight) = match joint.carries {
+                        Carries::A => (at.a, weight),
+                        _ => (at.b, -weight),
+                    };
+                    let gradient = poses.point_gradient(tree, joint.joint, point);
+                    row[joint.coordinate] += weight.dot(gradient);
                 }
             }
             ConstraintKind::Axis(points, axis) => {

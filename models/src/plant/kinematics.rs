@@ -129,7 +129,7 @@ impl<S: Scalar> Poses<S> {
 
     /// Derivative of a point carried by a joint by the joint's coordinate; `point` is relative to the
     /// origin of the joint's tree.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn point_gradient(&self, tree: &Tree, joint: usize, point: Vec3<S>) -> Vec3<S> {
         let axis = self.axis(joint);
         match tree.joints[joint].kind {

@@ -20,6 +20,13 @@ pub(crate) struct Separation<S = f64> {
 }
 
 impl PointPair {
+    /// Whether no joint carries both, and all of them are hinges and sliders.
+    #[inline]
+    pub(crate) fn are_apart(&self, tree: &Tree) -> bool {
+        let root = |joint: usize| tree.joints.get(joint).map(|joint| joint.root);
+        !tree.has_other_joints && (root(self.a.joint) != root(self.b.joint))
+    }
+
     /// The separation of the points. Origins cancel exactly within one tree.
     #[inline]
     pub(crate) fn separation<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>) -> Separation<S> {
@@ -42,7 +49,7 @@ fn size<S: Scalar>(v: Vec3<S>) -> f64 {
 
 impl PathJoint {
     /// Derivative of the difference `a − b` by the joint's coordinate; the joint carries one of them.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn gradient<S: Scalar>(
         &self,
         tree: &Tree,
