@@ -38,11 +38,15 @@ impl Model {
         let others = self.potentials.count() as f64
             + self.forces.as_ref().map_or(0, |f| f.wrenches.len() + f.point_forces.len()) as f64;
         let joints = self.dynamics.joints.len() as f64;
+        // Of loops.
+        let plan = self.loops.as_ref().map(|loops| &loops.plan);
+        let (fronts, rows) = plan.map_or((0.0, 0.0), |plan| (plan.work(), plan.rows() as f64));
         let (factorization, correction) = match self.solver {
             Solver::Tree => {
                 (generators * joints + 60.0 * entries + 24.0 * changes, 110.0 + 27.0 * entries)
             }
-            Solver::Planar | Solver::Loops => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
+            Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
+            Solver::Loops => (5.0 * fronts, 41.0 * rows),
             Solver::Spatial => (100.0 + 820.0 * joints, 110.0 + 93.0 * joints),
         };
         let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);
@@ -58,14 +62,24 @@ impl Model {
         let mut stages = vec![
             stage("evaluation", 3.2, 560.0 + evaluation + 300.0 * others),
             stage("factorization", 1.1, 100.0 + factorization),
-            stage("correction", 3.1, correction + 30.0 * nd * nc),
+            stage(
+                "correction",
+                3.1,
+                correction + if plan.is_some() { 0.0 } else { 30.0 * nd * nc },
+            ),
         ];
         if nc > 0.0 {
             let values = in_space(&self.closure) / 2.0 + 200.0 * nc;
             stages.push(stage("constraints", 3.2, values));
-            stages.push(stage("their Jacobian", 2.0, jacobian));
-            stages.push(stage("their factorization", 1.1, schur));
-            linearization += schur + jacobian + hessians + 300.0 * nd * nc;
+            linearization += jacobian + hessians;
+            if plan.is_some() {
+                stages.push(stage("their wrenches", 2.1, 310.0 * joints));
+                linearization += factorization + 15.0 * rows * columns;
+            } else {
+                stages.push(stage("their Jacobian", 2.0, jacobian));
+                stages.push(stage("their factorization", 1.1, schur));
+                linearization += schur + 300.0 * nd * nc;
+            }
         }
         stages.push(stage("all else", 1.0, 900.0 + 60.0 * nd));
         stages.push(stage("A and B", 0.0, linearization));

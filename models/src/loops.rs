@@ -262,6 +262,11 @@ impl Plan {
         planner.groups.iter().all(|group| group.is_closed).then_some(planner.plan)
     }
 
+    /// Rows of all fronts, each counted as often as joints are eliminated in it.
+    pub(crate) fn rows(&self) -> usize {
+        self.steps.iter().map(|step| step.rows).sum()
+    }
+
     /// Multiplications and additions of a factorization, about.
     pub(crate) fn work(&self) -> f64 {
         let of = |s: &Step| (s.rows * (s.rows * (1 + s.closed.len()) + 20)) as f64;

@@ -180,7 +180,7 @@ const CASES: &[(&str, u64, &[&str])] = &[
     ("tree-127", 5, PLANT),
     ("four-bar", 50, PLANT),
     ("scissor-8", 50, PLANT),
-    ("scissor-32", 5, PLANT),
+    ("scissor-32", 20, PLANT),
     ("marionette", 50, PLANT),
     ("marionette", 10, &["riccati"]),
 ];

@@ -292,27 +292,7 @@ impl Workspace {
 
     /// Guess: the velocity that belongs to the momentum goes on.
     pub(crate) fn ballistic(&mut self, model: &Model, settings: &Settings, state: &PreciseState) {
-        if self.factors.generators.is_some() && model.dimensions.constraints == 0 {
-            self.velocity.fill(0.0);
-            let (orientations, derivatives) =
-                (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
-            self.mechanics.gradient(model, &state.q, orientations, &self.velocity, derivatives);
-            self.diagonal.fill(0.0);
-            self.factors.generate(
-                model,
-                &mut self.mechanics,
-                &self.diagonal,
-                settings.time_step_s,
-                Of::Masses,
-            );
-            for (x, p) in self.increment.iter_mut().zip(&state.p) {
-                *x = -p;
-            }
-            self.factors.solve(model, &mut self.increment);
-            // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
-            for x in self.increment.iter_mut().filter(|x| !x.is_finite()) {
-                *x = 0.0;
-            }
+        if self.coast(model, settings, state) {
             return;
         }
         let is_singular = self.find_velocity(model, state) < settings.singular_below;
@@ -328,6 +308,39 @@ impl Workspace {
         if !model.orientations.is_empty() {
             self.prepare_orientations(model, settings, state);
         }
+    }
+
+    /// The same by generators, where there are some and loops allow it.
+    fn coast(&mut self, model: &Model, settings: &Settings, state: &PreciseState) -> bool {
+        if self.factors.generators.is_none() {
+            return false;
+        }
+        self.velocity.fill(0.0);
+        let (orientations, derivatives) =
+            (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
+        self.mechanics.gradient(model, &state.q, orientations, &self.velocity, derivatives);
+        self.diagonal.fill(0.0);
+        if model.loops.is_none() {
+            let (mechanics, h) = (&mut self.mechanics, settings.time_step_s);
+            self.factors.generate(model, mechanics, &self.diagonal, h, Of::Masses);
+        } else if !self.factor_loops_of(model, settings, Of::Masses) {
+            return false;
+        }
+        for (x, p) in self.increment.iter_mut().zip(&state.p) {
+            *x = -p;
+        }
+        if model.loops.is_none() {
+            self.factors.solve(model, &mut self.increment);
+        } else {
+            self.constraint_residual.fill(0.0);
+            self.factors.solve_loops(model, &mut self.increment, &mut self.constraint_residual);
+            self.multipliers.copy_from_slice(&state.multipliers);
+        }
+        // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
+        for x in self.increment.iter_mut().filter(|x| !x.is_finite()) {
+            *x = 0.0;
+        }
+        true
     }
 
     /// Corrects the guess until the residual is at round-off.

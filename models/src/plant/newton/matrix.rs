@@ -152,10 +152,16 @@ impl Workspace {
 
     /// Factors `K` and the constraints of loops, which are in the plane; whether the pivots allow it.
     pub(crate) fn factor_loops(&mut self, model: &Model, settings: &Settings) -> bool {
-        self.in_loops = false;
         self.fill_diagonal(model, settings);
+        self.factor_loops_of(model, settings, Of::Motion)
+    }
+
+    /// The same with what is in `diagonal`. With masses alone, constraints are those at the start.
+    pub(super) fn factor_loops_of(&mut self, model: &Model, settings: &Settings, of: Of) -> bool {
+        self.in_loops = false;
+        let end = if of == Of::Masses { &self.start } else { &self.end };
         let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
-        let (Some(start), Some(end)) = (&self.start.in_plane, &self.end.in_plane) else {
+        let (Some(start), Some(end)) = (&self.start.in_plane, &end.in_plane) else {
             return false;
         };
         let Some(PlanarTree::Many(tree)) = self.mechanics.planar.as_deref_mut() else {
@@ -169,7 +175,7 @@ impl Workspace {
         let conditioning = &model.conditioning;
         let scales =
             planar::Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
-        let pivots = generators.factor(at, &self.diagonal, scales, settings.time_step_s);
+        let pivots = generators.factor(at, &self.diagonal, scales, settings.time_step_s, of);
         if pivots.joints.relative < SAFE
             || pivots.equations < SAFE
             || pivots.steepness < settings.singular_below

@@ -325,6 +325,7 @@ impl LoopElimination {
             diagonal: &[f64],
             scales: Scales<'_>,
             time_step_s: f64,
+            of: Of,
         ) -> Pivots = factor_portable, factor_avx2, factor_avx512;
 
         /// Solves for `x` and `λ` in place; `constraints` are all that the model has.
@@ -355,9 +356,10 @@ impl LoopElimination {
         diagonal: &[f64],
         scales: Scales<'_>,
         time_step_s: f64,
+        of: Of,
     ) -> Pivots {
         let Mechanism { loops, joints, tree, start, end } = at;
-        let method = Method::new(time_step_s, Of::Motion);
+        let method = Method::new(time_step_s, of);
         self.tree.step = time_step_s;
         self.fronts.fill(0.0);
         let mut pivots = Pivots { joints: SmallestPivot::NONE, equations: 1.0, steepness: 1.0 };

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::model::Solver;
-use crate::plant::newton::Workspace;
-use crate::plant::planar::{Closures, Derivatives, Diagonal, Mechanism, PlanarTree, Scales};
+use crate::plant::newton::{At, Workspace};
+use crate::plant::planar::{Closures, Derivatives, Diagonal, Mechanism, Of, PlanarTree, Scales};
 use crate::plant::rows::padded;
 use crate::scene::Scene;
 use crate::{
@@ -262,6 +262,26 @@ fn linearizing_leaves_the_motion_alone() {
     }
 }
 
+/// The velocity that belongs to a momentum.
+#[test]
+fn the_first_guess_is_that_of_dense_matrices() {
+    for scene in scenes() {
+        let [fast, slow] = both(&scene).map(|model| {
+            let mut plant = plant(&model);
+            let u = vec![0.2; model.dimensions().input()];
+            for _ in 0..5 {
+                plant.step(&u).unwrap();
+            }
+            let Plant { settings, state, workspace, .. } = &mut plant;
+            workspace.prepare(At { model: &model, settings, state, u: &u });
+            workspace.ballistic(&model, settings, state);
+            assert_eq!(workspace.in_loops, model.loops.is_some());
+            workspace.increment.clone()
+        });
+        assert_near(&fast, &slow, 1e-9, &scene.name);
+    }
+}
+
 /// Wrenches stand for the Jacobian.
 #[test]
 fn impulses_are_those_of_the_jacobian() {
@@ -308,8 +328,8 @@ fn wider_registers_give_the_same_bits() {
         let scales = Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
         let mut wide = factors.loops().unwrap().clone();
         let mut narrow = wide.clone();
-        wide.factor(at, &numbers, scales, 0.01);
-        narrow.factor_portable(at, &numbers, scales, 0.01);
+        wide.factor(at, &numbers, scales, 0.01, Of::Motion);
+        narrow.factor_portable(at, &numbers, scales, 0.01, Of::Motion);
         assert_eq!(wide.factors, narrow.factors);
         let [mut x, mut narrow_x] = [0; 2].map(|_| numbers.clone());
         let [mut lambda, mut narrow_lambda] = [0; 2].map(|_| vec![0.3; d.constraints]);
