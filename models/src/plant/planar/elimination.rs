@@ -28,12 +28,17 @@ use crate::wide::wide;
 /// What a joint gives to the matrix, and what is left of it when it has been eliminated.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Generator {
-    pub(super) edge: Vec2,
     pub(super) minus: Vec3,
     pub(super) plus: Vec3,
-    pub(super) inverse_pivot: f64,
-    /// For the derivative of the momentum: `P + ½h γ e`, and linear parts of `½h P + F`, after `½h γ`, and of
-    /// `J̇`.
+    inverse_pivot: f64,
+}
+
+/// What a joint gives to the derivative of the momentum.
+#[derive(Clone, Copy, Debug, Default)]
+struct Slope {
+    edge: Vec2,
+    plus: Vec3,
+    /// `P + ½h γ e`, and linear parts of `½h P + F`, after `½h γ`, and of `J̇`.
     slope: Vec3,
     push: Vec3,
     rate: Vec2,
@@ -95,20 +100,12 @@ impl Method {
         let turn = joint.body.turn;
         let plus = [turn, rx + dx, ry + dy];
         let minus = [-turn, rx - dx, ry - dy];
-        let (weight, slope) = (half * link.weight, link.slope);
-        let mut upper = add_scaled(scaled(0.5 * motion, slope), inverse, link.force);
+        let weight = half * link.weight;
+        let mut upper = add_scaled(scaled(0.5 * motion, link.slope), inverse, link.force);
         let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
         upper[0] -= 0.5 * weight;
         lower[0] += 0.5 * weight;
-        let generator = Generator {
-            edge: link.edge,
-            minus,
-            plus,
-            inverse_pivot: 0.0,
-            slope: [slope[0] + weight, slope[1], slope[2]],
-            push: [weight, link.force[1] + half * slope[1], link.force[2] + half * slope[2]],
-            rate: link.rate,
-        };
+        let generator = Generator { minus, plus, inverse_pivot: 0.0 };
         ([upper, lower], generator)
     }
 }
@@ -116,7 +113,8 @@ impl Method {
 /// The matrix.
 #[derive(Clone, Debug)]
 pub(crate) struct Elimination {
-    pub(super) generators: Vec<Generator>,
+    generators: Vec<Generator>,
+    slopes: Vec<Slope>,
     passages: Vec<Passage>,
     pub(super) step: f64,
     /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
@@ -172,6 +170,7 @@ impl Elimination {
     pub(crate) fn new(joints: usize) -> Self {
         Self {
             generators: vec![Generator::default(); joints],
+            slopes: vec![Slope::default(); joints],
             step: 0.0,
             passages: vec![Passage::default(); joints],
             branches: vec![[[0.0; 3]; 3]; joints],
@@ -242,7 +241,8 @@ impl Elimination {
                 sum = plus33(sum, std::mem::take(&mut self.branches[row]));
             }
             let [a, b, c] = sum;
-            let ([upper, lower], mut generator) = method.generator(&tree.link(row), joint);
+            let link = tree.link(row);
+            let ([upper, lower], mut generator) = method.generator(&link, joint);
             let Generator { minus, plus, .. } = generator;
 
             let pushed = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
@@ -253,7 +253,7 @@ impl Elimination {
             let pulled = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
             let (above, across) = (plus3(upper, pushed), plus3(lower, pulled));
             // About the parent: all that can be done before the pivot is known.
-            let edge = generator.edge;
+            let edge = link.edge;
             let [ex, ey] = edge;
             let moved = |v: Vec3| [v[0] + cross(edge, linear(v)), v[1], v[2]];
             let (a, b, c) = (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
@@ -337,12 +337,31 @@ impl Elimination {
         momentum: &mut [f64],
         stride: usize,
     ) {
+        self.find_slopes(tree, joints);
         for first in (0..stride).step_by(LANES) {
             self.start_columns(tree, joints, diagonal, first);
             self.eliminate(joints);
             self.substitute(joints, diagonal);
             self.gather(joints);
             self.write_columns(increment, momentum, first, stride);
+        }
+    }
+
+    /// At the second derivatives of the last factorization.
+    #[inline(always)]
+    pub(super) fn find_slopes(&mut self, tree: &Joints<Fours>, joints: &[PlanarJoint]) {
+        let half = 0.5 * self.step;
+        for (i, (joint, to)) in joints.iter().zip(&mut self.slopes).enumerate() {
+            let link = tree.link(i);
+            let ([dx, dy], [rx, ry]) = (link.slide, link.rate);
+            let (weight, [turn, px, py]) = (half * link.weight, link.slope);
+            *to = Slope {
+                edge: link.edge,
+                plus: [joint.body.turn, half * rx + dx, half * ry + dy],
+                slope: [turn + weight, px, py],
+                push: [weight, link.force[1] + half * px, link.force[2] + half * py],
+                rate: link.rate,
+            };
         }
     }
 
@@ -443,11 +462,11 @@ impl Elimination {
     #[inline(always)]
     fn substitute(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
         let rows = self.increment.iter_mut().zip(&mut self.momentum);
-        let passages = self.generators.iter().zip(&self.passages);
-        for (i, (((joint, (row, momentum)), own), (generator, passage))) in
+        let passages = self.slopes.iter().zip(&self.passages);
+        for (i, (((joint, (row, momentum)), own), (slope, passage))) in
             joints.iter().zip(rows).zip(diagonal.momentum).zip(passages).enumerate()
         {
-            let Generator { edge, plus, slope, .. } = *generator;
+            let Slope { edge, plus, slope, .. } = *slope;
             let (flow, right) = (self.motions[joint.parent], *row);
             let slope = [slope[0] + cross(edge, linear(slope)), slope[1], slope[2]];
             let x = right.plus(product(passage.taken, flow).times(-1.0));
@@ -464,7 +483,7 @@ impl Elimination {
         for (i, ((joint, (x, momentum)), own)) in
             joints.iter().zip(rows).zip(diagonal.momentum).enumerate()
         {
-            let Generator { edge: [ex, ey], plus, slope, .. } = self.generators[i];
+            let Slope { edge: [ex, ey], plus, slope, .. } = self.slopes[i];
             let [turn, vx, vy] = self.motions[joint.parent];
             let flow = [turn, vx.plus(turn.times(-ey)), vy.plus(turn.times(ex))];
             *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
@@ -479,7 +498,7 @@ impl Elimination {
     pub(super) fn gather(&mut self, joints: &[PlanarJoint]) {
         let rows = self.increment.iter().zip(&mut self.momentum);
         for (i, (joint, (x, momentum))) in joints.iter().zip(rows).enumerate().rev() {
-            let Generator { plus, push, rate, .. } = self.generators[i];
+            let Slope { plus, push, rate, .. } = self.slopes[i];
             let [n, fx, fy] = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
             let (n, fx, fy) =
                 (n.plus(x.times(push[0])), fx.plus(x.times(push[1])), fy.plus(x.times(push[2])));

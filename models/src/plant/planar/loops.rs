@@ -376,7 +376,8 @@ impl LoopElimination {
             }
 
             let joint = &joints[i];
-            let ([upper, lower], generator) = method.generator(&tree.link(i), joint);
+            let link = tree.link(i);
+            let ([upper, lower], generator) = method.generator(&link, joint);
             let turn = joint.body.turn;
             let minus = six(generator.minus, [turn, start.slide[i][0], start.slide[i][1]]);
             let plus = six(generator.plus, [turn, end.slide[i][0], end.slide[i][1]]);
@@ -419,10 +420,9 @@ impl LoopElimination {
                 front.close(closed, take_mut(&mut factors, stride));
             }
 
-            let edges = [generator.edge, start.edge[i], end.edge[i]];
+            let edges = [link.edge, start.edge[i], end.edge[i]];
             front.pass_on(step, edges);
             self.pivots[i] = Pivot { minus, plus, inverse, edges };
-            self.tree.generators[i] = generator;
         }
         pivots
     }
@@ -556,6 +556,7 @@ impl LoopElimination {
         let Mechanism { loops, joints, tree, start, .. } = at;
         let (n, stride) = (joints.len(), out.stride);
         out.multipliers.fill(0.0);
+        self.tree.find_slopes(tree, joints);
         for first in (0..stride).step_by(LANES) {
             self.tree.start_columns(tree, joints, diagonal, first);
             let columns = first..n.min(first + LANES);
