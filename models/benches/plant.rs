@@ -29,7 +29,8 @@ const SMALL: &[&str] = &[
     "tree-15",
     "tree-30",
 ];
-const MIDDLE: &[&str] = &["chain-64", "chain-128", "tree-63", "tree-127"];
+const MIDDLE: &[&str] =
+    &["chain-64", "chain-128", "tree-63", "tree-127", "scissor-16", "scissor-32", "scissor-64"];
 const LARGE: &[&str] =
     &["chain-256", "chain-512", "chain-1024", "tree-255", "tree-511", "tree-1023"];
 

@@ -33,6 +33,7 @@ const SCENES: &[Row] = &[
     ("chain-32", 0.0025, None),
     ("four-bar", 0.01, None),
     ("scissor-8", 0.01, Some([536.0, 239.0, 3295.0])),
+    ("scissor-32", 0.01, None),
     ("marionette", 0.01, Some([1317.0, 598.0, 21_008.0])),
 ];
 

@@ -62,8 +62,7 @@ pub(crate) enum Solver {
     /// By the vectors that generate the entries: O(n). In planes, or in space.
     Planar,
     Spatial,
-    /// By generators in planes, together with the constraints, front by front: O(n) for each loop that does
-    /// not lie within others.
+    /// By generators in planes, together with the constraints, front by front.
     Loops,
 }
 

@@ -368,7 +368,7 @@ impl Plant {
     }
 
     /// Linearizes the map at the current state and `u`, and stays there. Costs a step, a
-    /// factorization, and O(n²·depth) for `n` coordinates.
+    /// factorization, and O(n²·depth) for `n` coordinates; O(n²) in planes.
     ///
     /// # Panics
     ///

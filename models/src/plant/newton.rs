@@ -8,7 +8,8 @@
 //! ```
 //!
 //! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
-//! measured in units of its own round-off; the solver stops where arithmetic does.
+//! measured in units of its own round-off; the solver stops where arithmetic does. Loops in planes are
+//! factored with `K` in place of `S` ([`crate::plant::planar::LoopElimination`]).
 
 mod matrix;
 

@@ -39,6 +39,7 @@ impl Past {
     }
 
     /// Takes note of a step of length `h`. The error of all coordinates is weighed by their `inertia`.
+    #[inline(never)]
     pub(crate) fn record(&mut self, h: f64, increments: &[f64], inertia: &[f64]) {
         match self {
             Self::Increments(past) => past.record(increments, inertia),

@@ -56,7 +56,7 @@ pub(crate) fn cases() -> Vec<Case> {
         finding.note(format!("{count} trees, {steps} steps each"));
         Ok(())
     }));
-    let symplectic: [(&str, Make, Method, u64); 14] = [
+    let symplectic: [(&str, Make, Method, u64); 15] = [
         ("pendulum", || Ok(plants::scene("pendulum")), 0.05.into(), 1_000_000),
         ("double pendulum", || Ok(plants::scene("double-pendulum")), 0.01.into(), 1_000_000),
         ("spherical pendulum", || Ok(plants::scene("spherical-pendulum")), 0.01.into(), 1_000_000),
@@ -64,6 +64,7 @@ pub(crate) fn cases() -> Vec<Case> {
         ("chain of 12 rods", || Ok(plants::scene("chain-12")), 2e-3.into(), 1_000_000),
         ("four-bar linkage", || Ok(plants::scene("four-bar")), 0.01.into(), 1_000_000),
         ("scissor of 4", || Ok(plants::scene("scissor-4")), 2e-3.into(), 200_000),
+        ("scissor of 16", || Ok(plants::scene("scissor-16")), 2e-3.into(), 20_000),
         ("marionette", || Ok(plants::undamped("marionette")), 5e-3.into(), 100_000),
         (
             "double pendulum",
@@ -92,9 +93,10 @@ pub(crate) fn cases() -> Vec<Case> {
         let method = method.name();
         cases.push(Case::new(format!("symplectic: {name}{method}"), criterion, run));
     }
-    let constrained: [(&str, Make, f64); 6] = [
+    let constrained: [(&str, Make, f64); 7] = [
         ("four-bar linkage", || Ok(plants::scene("four-bar")), 0.01),
         ("scissor of 4", || Ok(plants::scene("scissor-4")), 2e-3),
+        ("scissor of 16", || Ok(plants::scene("scissor-16")), 2e-3),
         ("marionette, moved", || Ok(plants::scene("marionette")), 0.01),
         ("weld", || element(include_str!("../../../../models/scenes/elements/weld.toml")), 2e-3),
         ("hoist", || element(include_str!("../../../../models/scenes/elements/hoist.toml")), 5e-3),
