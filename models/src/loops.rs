@@ -19,6 +19,8 @@ use crate::tree::{Tree, WORLD};
 pub(crate) const BODY: usize = 6;
 /// How many times the work of fronts dense matrices must be to take as long.
 const MARGIN: f64 = 2.0;
+/// Entries of fronts that are always few.
+const ROOM: usize = 1 << 16;
 /// Most joints more than needed that an equation waits for.
 const SPARE_MOST: usize = 2;
 
@@ -53,6 +55,7 @@ impl Loops {
         closure: &Tree,
         weight: &[f64],
         spare: usize,
+        work: f64,
     ) -> Option<Self> {
         let plane = joints.plane?;
         let mut in_closure = vec![WORLD; joints.len()];
@@ -69,7 +72,7 @@ impl Loops {
             equations.push(Equation { constraint: c, bodies, ancestor });
         }
         let bodies: Vec<_> = equations.iter().map(|equation| equation.bodies).collect();
-        let plan = Plan::new(joints, &bodies, spare)?;
+        let plan = Plan::new(joints, &bodies, spare, work)?;
         Some(Self { plan, equations, plane, in_closure })
     }
 }
@@ -108,6 +111,12 @@ pub(crate) struct Step {
     pub(crate) opened: Vec<Opened>,
     /// Equations, and their rows.
     pub(crate) closed: Vec<(usize, usize)>,
+}
+
+impl Step {
+    fn work(&self) -> f64 {
+        (self.rows * (self.rows * (1 + self.closed.len()) + 20)) as f64
+    }
 }
 
 /// Where the body of the parent is.
@@ -215,17 +224,22 @@ struct Planner<'a> {
     parts: Vec<Part>,
     fates: Vec<Fate>,
     children: Vec<usize>,
+    /// Rows of the front in which each joint would be eliminated, where they are known.
+    rows: Vec<Option<usize>>,
     spare: usize,
     plan: Plan,
 }
 
 impl Plan {
     /// The order for joints, listed depth first, and equations, each about two bodies: those that the joints
-    /// carry, or the world. `None` where equations outnumber the joints that they are about.
+    /// carry, or the world. `None` where equations outnumber the joints that they are about, and where fronts
+    /// take more than `work` or more room than one dense matrix of everything. O(n²) for `n` joints and
+    /// equations, but for the fronts' sizes.
     pub(crate) fn new(
         joints: &[PlanarJoint],
         equations: &[[Option<usize>; 2]],
         spare: usize,
+        work: f64,
     ) -> Option<Self> {
         let mut groups: Vec<Group> = Vec::new();
         for (equation, &bodies) in equations.iter().enumerate() {
@@ -250,14 +264,19 @@ impl Plan {
             parts: Vec::new(),
             fates: vec![Fate::Remaining; joints.len()],
             children,
+            rows: vec![None; joints.len()],
             spare,
             plan: Self::default(),
         };
+        let (most, mut spent) = ((joints.len() + equations.len()).pow(2).max(ROOM), 0.0);
         for _ in 0..joints.len() {
-            let leaves = (0..joints.len())
-                .filter(|&i| planner.fates[i] == Fate::Remaining && planner.children[i] == 0);
-            let next = leaves.rev().min_by_key(|&i| planner.rows_with(i))?;
+            let next = planner.next()?;
             planner.eliminate(next);
+            spent += planner.plan.steps.last().map_or(0.0, Step::work);
+            let room: usize = planner.plan.fronts.iter().map(|rows| rows * rows).sum();
+            if spent > work || room > most {
+                return None;
+            }
         }
         planner.groups.iter().all(|group| group.is_closed).then_some(planner.plan)
     }
@@ -269,8 +288,7 @@ impl Plan {
 
     /// Multiplications and additions of a factorization, about.
     pub(crate) fn work(&self) -> f64 {
-        let of = |s: &Step| (s.rows * (s.rows * (1 + s.closed.len()) + 20)) as f64;
-        self.steps.iter().map(of).sum()
+        self.steps.iter().map(Step::work).sum()
     }
 }
 
@@ -293,6 +311,18 @@ impl Planner<'_> {
             .filter(move |group| !group.is_open && group.bodies.contains(&Some(joint)))
     }
 
+    /// The leaf with the smallest front.
+    fn next(&mut self) -> Option<usize> {
+        let is_leaf = |i: &usize| self.fates[*i] == Fate::Remaining && self.children[*i] == 0;
+        let leaves: Vec<usize> = (0..self.joints.len()).rev().filter(is_leaf).collect();
+        for &i in &leaves {
+            if self.rows[i].is_none() {
+                self.rows[i] = Some(self.rows_with(i));
+            }
+        }
+        leaves.into_iter().min_by_key(|&i| self.rows[i])
+    }
+
     /// Rows of the front in which a joint would be eliminated, with those of its parent.
     fn rows_with(&self, joint: usize) -> usize {
         let mut vars = vec![Var::Body(joint)];
@@ -310,9 +340,8 @@ impl Planner<'_> {
 
     fn eliminate(&mut self, joint: usize) {
         let body = Var::Body(joint);
-        let (mut touching, others): (Vec<Part>, Vec<Part>) =
-            std::mem::take(&mut self.parts).into_iter().partition(|p| p.place(body).is_some());
-        self.parts = others;
+        let touches = |part: &mut Part| part.place(body).is_some();
+        let mut touching: Vec<Part> = self.parts.extract_if(.., touches).collect();
         touching.sort_by_key(|part| part.used.len());
         let mut part = touching.pop().unwrap_or_else(|| {
             self.plan.fronts.push(0);
@@ -362,6 +391,11 @@ impl Planner<'_> {
         while part.used.last() == Some(&false) {
             part.used.pop();
         }
+        for (var, _) in &part.places {
+            if let Var::Body(body) = var {
+                self.rows[*body] = None;
+            }
+        }
         if !part.places.is_empty() {
             self.parts.push(part);
         }
@@ -404,16 +438,16 @@ impl Model {
     ///             4: 3.0, 4.7   8: 9.2, 12     16: 42, 35   32: 245, 117   64: 1970, 436
     /// ```
     pub(crate) fn find_loops(&mut self) {
-        let Some(loops) = self.loops() else { return };
-        if MARGIN * loops.plan.work() < self.dense_work() {
+        if let Some(loops) = self.loops_within(self.dense_work() / MARGIN) {
             self.take_loops(loops);
         }
     }
 
-    /// The loops, in an order of which the pivots are sound at the configuration that [`Conditioning`] found.
+    /// The loops, in an order that takes no more than some work and of which the pivots are sound at the
+    /// configuration that [`Conditioning`] found.
     ///
     /// [`Conditioning`]: crate::plant::conditioning::Conditioning
-    pub(crate) fn loops(&mut self) -> Option<Loops> {
+    pub(crate) fn loops_within(&mut self, work: f64) -> Option<Loops> {
         let (d, conditioning) = (self.dimensions, &self.conditioning);
         let are_all = self.dynamics.joints.iter().map(|joint| joint.coordinate).eq(0..d.dynamic);
         let moved = conditioning.weight.iter().filter(|weight| **weight > 0.0).count();
@@ -423,7 +457,7 @@ impl Model {
         let solver = self.solver;
         let found = (0..=SPARE_MOST).find_map(|spare| {
             let (joints, weight) = (self.planar.as_ref()?, &self.conditioning.weight);
-            let loops = Loops::new(joints, &self.constraints, &self.closure, weight, spare)?;
+            let loops = Loops::new(joints, &self.constraints, &self.closure, weight, spare, work)?;
             self.take_loops(loops);
             let are_sound = Workspace::new(self).can_eliminate_loops(self);
             self.loops.take().filter(|_| are_sound)

@@ -173,7 +173,8 @@ fn scenes() -> Vec<Scene> {
 /// With loops, and without.
 fn both(scene: &Scene) -> [Arc<Model>; 2] {
     let [mut model, mut dense] = [0; 2].map(|_| Model::compile(scene).unwrap());
-    let loops = model.loops().unwrap_or_else(|| panic!("{} has loops", scene.name));
+    let loops =
+        model.loops_within(f64::INFINITY).unwrap_or_else(|| panic!("{} has loops", scene.name));
     model.take_loops(loops);
     (dense.loops, dense.solver) = (None, Solver::Tree);
     [Arc::new(model), Arc::new(dense)]
@@ -369,6 +370,19 @@ fn fronts_stay_small() {
     assert_eq!(most(&scissor(4)), 14);
     assert_eq!(most(&scissor(40)), 14);
     assert_eq!(most(&rope()), 8);
+}
+
+/// Rods between far parts of a chain make fronts grow: dense matrices are less work.
+#[test]
+fn fronts_that_grow_are_given_up() {
+    let mut sketch = Sketch::default();
+    let angles: Vec<f64> = (0..120).map(|k| 0.9 * (1.7 * k as f64).sin()).collect();
+    sketch.chain(None, [0.0, 0.0], &angles);
+    for k in 0..40 {
+        sketch.rod(k, 60 + (k * 37) % 60);
+    }
+    let model = Model::compile(&sketch.scene("tangle")).unwrap();
+    assert!(model.loops.is_none());
 }
 
 /// Where loops cannot be taken one by one, all equations are taken together, and named if they are singular.
