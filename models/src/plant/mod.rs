@@ -107,8 +107,8 @@ pub struct StepReport {
     pub reciprocal_condition: f64,
     /// Estimate of the reciprocal condition of `Dh(q[k+1]) M[k+1]⁻¹ Dh(q[k])ᵀ`, at most 1: its
     /// smallest pivot that does not belong to a redundant equation, relative to the largest, each
-    /// equation scaled by the steepest that it gets. Of the last factorization of the step; 1 without
-    /// constraints.
+    /// equation scaled by the steepest that it gets; where loops are eliminated one after the other, that
+    /// of their own pivots. Of the last factorization of the step; 1 without constraints.
     pub constraint_reciprocal_condition: f64,
     /// Equations of constraints that depend on others.
     pub redundant_constraints: u32,
