@@ -219,6 +219,28 @@ fn loops_move_and_linearize_as_with_dense_matrices() {
     }
 }
 
+/// Steps and linearizations where no pivot counts as sound: all equations are taken together.
+#[test]
+fn dense_matrices_stand_in_for_loops() {
+    for scene in scenes() {
+        let [model, dense] = both(&scene);
+        let mut model = Arc::into_inner(model).unwrap();
+        model.conditioning.inertia.iter_mut().for_each(|inertia| *inertia *= 1e9);
+        let (mut refused, mut slow) = (plant(&Arc::new(model)), plant(&dense));
+        let [mut a, mut b] = [&dense, &dense].map(|model| Linearization::new(model));
+        let u = vec![0.4; dense.dimensions().input()];
+        for _ in 0..10 {
+            refused.step(&u).unwrap();
+            slow.step(&u).unwrap();
+            assert!(!refused.workspace.in_loops);
+            assert_near(refused.q(), slow.q(), 1e-9, &scene.name);
+        }
+        refused.linearize(&u, &mut a).unwrap();
+        slow.linearize(&u, &mut b).unwrap();
+        assert_near(a.a().as_slice(), b.a().as_slice(), 1e-6, &scene.name);
+    }
+}
+
 #[test]
 fn second_order_is_that_of_dense_matrices() {
     for scene in [rungs(), builtin::scene("scissor-4").unwrap()] {
