@@ -118,6 +118,10 @@ pub struct Assessment {
     pub constraint: String,
     /// Largest entry of a generalized force that neither inputs nor constraints exert, N or N·m.
     pub unexplained_force: f64,
+    /// The row of that force.
+    pub unexplained_force_step: usize,
+    /// The coordinate of that entry; empty where nothing is left to explain.
+    pub unexplained_force_coordinate: String,
     /// Largest acceleration that such a force makes, m/s² or rad/s².
     pub unexplained_acceleration: f64,
     /// The row of that acceleration.
@@ -356,6 +360,8 @@ impl<'a> Assess<'a> {
             constraint_violation_step: 0,
             constraint: String::new(),
             unexplained_force: 0.0,
+            unexplained_force_step: 0,
+            unexplained_force_coordinate: String::new(),
             unexplained_acceleration: 0.0,
             unexplained_step: 0,
             unexplained_coordinate: String::new(),
@@ -376,7 +382,11 @@ impl<'a> Assess<'a> {
             let force = node.factor.l() * white;
             for i in 0..nd {
                 let (force, acceleration) = (force[i].abs() / h, acceleration[i].abs() / h);
-                assessment.unexplained_force = assessment.unexplained_force.max(force);
+                if force > assessment.unexplained_force {
+                    assessment.unexplained_force = force;
+                    assessment.unexplained_force_step = k;
+                    assessment.unexplained_force_coordinate = model.coordinates()[i].name.clone();
+                }
                 if acceleration > assessment.unexplained_acceleration {
                     assessment.unexplained_acceleration = acceleration;
                     assessment.unexplained_step = k;

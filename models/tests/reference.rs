@@ -95,6 +95,16 @@ fn what_is_no_motion_is_told_and_named() {
     let found = check_reference(&motion.start, &jump, Some(&motion.u)).unwrap();
     assert!(found.unexplained_acceleration > 1.0);
     assert!(found.unexplained_step.abs_diff(40) <= 1, "{}", found.unexplained_step);
+    assert!(found.unexplained_force_step.abs_diff(40) <= 1, "{}", found.unexplained_force_step);
+
+    // The heavy cart is moved by the largest force, the light pole at the largest acceleration.
+    let mut twice = motion.q.clone();
+    twice[(20, theta)] += 2e-3;
+    twice[(60, 1 - theta)] += 1e-3;
+    let found = check_reference(&motion.start, &twice, Some(&motion.u)).unwrap();
+    assert_eq!((found.unexplained_step, found.unexplained_coordinate.as_str()), (20, "theta"));
+    let force = (found.unexplained_force_step, found.unexplained_force_coordinate.as_str());
+    assert_eq!(force, (60, "x"));
 
     // The cart has its input: any motion of it alone can be had, given the pole's reaction.
     let mut shifted = motion.q.clone();

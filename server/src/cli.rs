@@ -9,7 +9,7 @@ use crate::priority::Priority;
 
 /// Simulated plants for real-time controllers.
 #[derive(Debug, Parser)]
-#[command(name = "plantd", version, about)]
+#[command(name = "plantd", version, about, args_override_self = true)]
 pub struct Cli {
     /// What to do.
     #[command(subcommand)]
@@ -21,7 +21,7 @@ pub struct Cli {
 pub enum Command {
     /// Serve until SIGTERM or SIGINT.
     ///
-    /// Flags win over environment variables, those over the configuration file.
+    /// Flags win over environment variables, those over the configuration file; of two flags the last wins.
     #[command(after_help = "Examples:\n  \
         plantd serve\n  \
         plantd serve --grpc 0.0.0.0:50051 --unix /run/plantd/plantd.sock\n  \
@@ -82,6 +82,9 @@ pub struct Settings {
     /// Seconds for open calls to end at shutdown.
     #[arg(long, env = "PLANTD_SHUTDOWN_GRACE_S", value_name = "SECONDS")]
     pub shutdown_grace_s: Option<f64>,
+    /// Seconds to serve on after SIGTERM, so that balancers that ask for health can look elsewhere.
+    #[arg(long, env = "PLANTD_DRAIN_S", value_name = "SECONDS")]
+    pub drain_s: Option<f64>,
     /// What is logged, like RUST_LOG: `info`, `plantd_server=debug`.
     #[arg(long, env = "PLANTD_LOG", value_name = "FILTER")]
     pub log: Option<String>,
@@ -134,6 +137,7 @@ impl Settings {
         replace(&mut config.worker_priority, self.worker_priority);
         replace(&mut config.search_threads, self.search_threads);
         replace(&mut config.shutdown_grace_s, self.shutdown_grace_s);
+        replace(&mut config.drain_s, self.drain_s);
         replace(&mut config.state_interval_s, self.state_interval_s);
         replace(&mut config.log.filter, self.log);
         replace(&mut config.log.format, self.log_format);

@@ -56,6 +56,9 @@ pub struct Config {
     pub search_threads: usize,
     /// Time for open calls to end at shutdown before they are cut off, s.
     pub shutdown_grace_s: f64,
+    /// Seconds to serve on after SIGTERM, with health NOT_SERVING; nobody waits where nobody has asked for
+    /// the server's health.
+    pub drain_s: f64,
     /// Logging.
     pub log: LogConfig,
     /// Shared-memory links.
@@ -82,6 +85,7 @@ impl Default for Config {
             worker_priority: Priority::default(),
             search_threads: 1,
             shutdown_grace_s: 5.0,
+            drain_s: 5.0,
             log: LogConfig::default(),
             link: LinkSettings::default(),
             realtime: RealTimeSettings::default(),
@@ -268,6 +272,7 @@ impl Config {
         self.limits.check()?;
         for (key, value) in [
             ("shutdown_grace_s", self.shutdown_grace_s),
+            ("drain_s", self.drain_s),
             ("state_interval_s", self.state_interval_s),
             ("link.idle_timeout_s", self.link.idle_timeout_s),
         ] {
@@ -299,6 +304,11 @@ impl Config {
     /// Time for open calls to end at shutdown.
     pub fn shutdown_grace(&self) -> Duration {
         Duration::from_secs_f64(self.shutdown_grace_s)
+    }
+
+    /// Time to serve on after SIGTERM, where somebody asks for the server's health.
+    pub fn drain(&self) -> Duration {
+        Duration::from_secs_f64(self.drain_s)
     }
 
     /// Time between two savings of the plants that change.

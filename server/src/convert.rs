@@ -360,8 +360,7 @@ pub fn trajectory_in(
     };
     let plant = plant(model, settings, &Start::Initial(start), &format!("{field}.initial"))?;
     let width = model.dimensions().input();
-    let inputs = Inputs::new(&format!("{field}.u"), trajectory.u, width)?;
-    LimitExceeded::check("horizon", limits.horizon, "steps", inputs.count())?;
+    let inputs = Inputs::along(&format!("{field}.u"), trajectory.u, width, limits)?;
     Ok((plant, inputs))
 }
 
@@ -390,6 +389,21 @@ impl Inputs {
             return Err(Fault::field(format!("{field}.cols"), problem));
         }
         Ok(Self { columns, count: u.rows as usize, numbers: u.data })
+    }
+
+    /// The inputs of a trajectory: one row at least, and no more than a horizon may have.
+    pub fn along(
+        field: &str,
+        u: Option<v1::Matrix>,
+        columns: usize,
+        limits: &Limits,
+    ) -> Result<Self, Fault> {
+        let inputs = Self::new(field, u, columns)?;
+        LimitExceeded::check("horizon", limits.horizon, "steps", inputs.count)?;
+        if inputs.count == 0 {
+            return Err(Fault::field(field, "is missing: it needs one row at least"));
+        }
+        Ok(inputs)
     }
 
     /// The rows of a matrix.
@@ -736,6 +750,16 @@ pub fn bound(field: &str, bound: &v1::Bound, names: &[String]) -> Result<(usize,
 /// Indices in `x` at which the rotation vectors of ball joints begin.
 pub fn rotations(model: &Model) -> Vec<u32> {
     model.orientations().iter().map(|&start| start as u32).collect()
+}
+
+/// What all gains of a map have in common: of which model and time step they are, and its rotations.
+pub fn gain_of(model: &str, plant: &Plant) -> v1::Gain {
+    v1::Gain {
+        model: model.to_owned(),
+        time_step_s: plant.settings().time_step_s,
+        rotations: rotations(plant.model()),
+        ..Default::default()
+    }
 }
 
 /// Numbers in the message of a linearization.

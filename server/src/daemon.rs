@@ -10,7 +10,7 @@ use tokio::sync::oneshot;
 use tracing_subscriber::EnvFilter;
 
 use crate::config::{Config, LogConfig, LogFormat};
-use crate::serve::{Addresses, run};
+use crate::serve::{Addresses, Shutdown, run};
 
 /// Sets up logging to standard error.
 pub fn start_log(config: &LogConfig) -> Result<()> {
@@ -27,19 +27,22 @@ pub fn start_log(config: &LogConfig) -> Result<()> {
     Ok(())
 }
 
-/// Serves until SIGTERM or SIGINT, or until standard input ends where that is asked for.
+/// Serves until SIGTERM or SIGINT, or until standard input ends where that is asked for. A second signal
+/// cuts short what open calls and balancers are given to end.
 pub async fn serve(config: Config, until_stdin_ends: bool) -> Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let shutdown = async {
-        tokio::select! {
-            _ = terminate.recv() => {}
-            _ = interrupt.recv() => {}
-            () = stdin_ended(), if until_stdin_ends => {}
-        }
+        let shutdown = tokio::select! {
+            _ = terminate.recv() => Shutdown::Drained,
+            _ = interrupt.recv() => Shutdown::Prompt,
+            () = stdin_ended(), if until_stdin_ends => Shutdown::Prompt,
+        };
         tracing::info!("shutting down");
         notify(&[NotifyState::Stopping]);
+        shutdown
     };
+    let hurry = second_signal()?;
     let ready_file = config.ready_file.clone();
     let on_ready = |addresses: &Addresses| {
         tracing::info!(
@@ -56,13 +59,28 @@ pub async fn serve(config: Config, until_stdin_ends: bool) -> Result<()> {
         notify(&[NotifyState::Ready]);
     };
     let watchdog = tokio::spawn(feed_watchdog());
-    let outcome = run(config, shutdown, on_ready).await;
+    let outcome = run(config, shutdown, hurry, on_ready).await;
     watchdog.abort();
     if let Some(path) = &ready_file {
         // It says where a server is that is no longer there; nothing is lost if it stays.
         let _ = std::fs::remove_file(path);
     }
     outcome
+}
+
+/// Completes with the second SIGTERM or SIGINT.
+fn second_signal() -> Result<impl Future<Output = ()>> {
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    Ok(async move {
+        for _ in 0..2 {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = interrupt.recv() => {}
+            }
+        }
+        tracing::warn!("a second signal: ending at once");
+    })
 }
 
 /// Completes when nobody can write to standard input any more.

@@ -271,6 +271,7 @@ impl InForce {
             u_reference: stage.u.clone(),
             rotations,
             feedforward: stage.feedforward.clone(),
+            ..Default::default()
         }
     }
 }

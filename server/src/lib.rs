@@ -23,6 +23,7 @@ pub mod hub;
 pub mod limits;
 pub mod link;
 pub mod listen;
+mod memory;
 pub mod metrics;
 pub mod metrics_http;
 pub mod parameters;

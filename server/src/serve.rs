@@ -1,12 +1,14 @@
 //! Starts a server, keeps it, and ends it.
 
 use std::io;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
-use futures::future;
+use futures::{FutureExt as _, future};
 use plantd_models::Model;
 use plantd_proto::{FILE_DESCRIPTOR_SET, v1};
 use serde::Serialize;
@@ -28,6 +30,7 @@ use v1::recording_service_server::RecordingServiceServer;
 use crate::config::{Config, Listen};
 use crate::grpc::channels::ChannelService;
 use crate::grpc::control::ControlService;
+use crate::grpc::ending::Ending;
 use crate::grpc::model::ModelService;
 use crate::grpc::observe::ObserveLayer;
 use crate::grpc::plant::PlantService;
@@ -37,9 +40,9 @@ use crate::hub::Hub;
 use crate::limits::Limits;
 use crate::link::LinkHost;
 use crate::listen::{UnixSocket, admit, bind_tcp};
-use crate::metrics_http;
 use crate::record::Recordings;
 use crate::state::StateDirectory;
+use crate::{memory, metrics_http};
 
 /// Longest wait at the end for plants to be saved on a disk that does not answer.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
@@ -65,34 +68,54 @@ pub struct RunningServer {
     config: Config,
     addresses: Addresses,
     health: HealthReporter,
+    /// Somebody asks whether the server is healthy, and learns before its end that it is going.
+    is_asked_for_health: Arc<AtomicBool>,
     listeners: JoinSet<Result<(), tonic::transport::Error>>,
     /// Cancelled when listeners stop accepting.
     closing: CancellationToken,
     /// Saves plants that change.
     saver: tokio::task::JoinHandle<()>,
+    /// Gives free memory back to the system.
+    memory: tokio::task::JoinHandle<()>,
     metrics: Option<tokio::task::JoinHandle<()>>,
     /// Removed from the file system when dropped.
     unix: Option<UnixSocket>,
 }
 
-/// Serves until `shutdown` completes, then ends calls in good order, within the configured grace.
+/// Serves until `shutdown` completes, then ends calls in good order, within the configured times, which
+/// `hurry` cuts short.
 pub async fn run(
     config: Config,
-    shutdown: impl Future<Output = ()>,
+    shutdown: impl Future<Output = Shutdown>,
+    hurry: impl Future<Output = ()>,
     on_ready: impl FnOnce(&Addresses),
 ) -> Result<()> {
     let mut server = RunningServer::start(config).await?;
     on_ready(server.addresses());
+    let hurry = hurry.shared();
     tokio::select! {
-        () = shutdown => {}
+        shutdown = shutdown => {
+            if shutdown == Shutdown::Drained {
+                server.drain(hurry.clone()).await;
+            }
+        }
         error = server.listener_failed() => {
             tracing::error!(%error, "a listener failed");
             server.stop().await;
             return Err(error);
         }
     }
-    server.stop().await;
+    server.stop_within(hurry).await;
     Ok(())
+}
+
+/// How a server ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Shutdown {
+    /// As soon as open calls have ended.
+    Prompt,
+    /// Balancers that ask for its health are told first, and given time to look elsewhere.
+    Drained,
 }
 
 impl RunningServer {
@@ -132,12 +155,15 @@ impl RunningServer {
         health.set_serving::<ControlServiceServer<ControlService>>().await;
         health.set_serving::<ChannelServiceServer<ChannelService>>().await;
         health.set_serving::<RecordingServiceServer<RecordingService>>().await;
+        let health_service = Ending::new(health_service, hub.ending.clone());
         let mut server = Self {
+            is_asked_for_health: health_service.was_asked(),
             addresses: Addresses { link_root, pid: std::process::id(), ..Addresses::default() },
             health,
             listeners: JoinSet::new(),
             closing: CancellationToken::new(),
             saver: tokio::spawn(save_plants(Arc::clone(&hub), config.state_interval())),
+            memory: tokio::spawn(memory::give_back()),
             metrics: None,
             unix: None,
             hub,
@@ -162,10 +188,12 @@ impl RunningServer {
         let hub = || Arc::clone(&self.hub);
         let limits = &self.hub.limits;
         let message_bytes = Limits::size(limits.message_bytes);
-        let reflection = tonic_reflection::server::Builder::configure()
-            .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
-            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-            .build_v1()?;
+        let reflection = || {
+            tonic_reflection::server::Builder::configure()
+                .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
+                .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+        };
+        let ending = || self.hub.ending.clone();
         let streams = u32::try_from(limits.streams_per_connection).unwrap_or(u32::MAX);
         Ok(Server::builder()
             // gRPC-Web comes over HTTP/1.1.
@@ -196,7 +224,9 @@ impl RunningServer {
                 RecordingServiceServer::new(RecordingService::new(hub()))
                     .max_decoding_message_size(message_bytes),
             )
-            .add_service(reflection))
+            .add_service(Ending::new(reflection().build_v1()?, ending()))
+            // Older tools know only this one.
+            .add_service(Ending::new(reflection().build_v1alpha()?, ending())))
     }
 
     async fn listen(&mut self, router: Router<Layers>) -> Result<()> {
@@ -204,6 +234,7 @@ impl RunningServer {
         let permits = Arc::new(Semaphore::new(connections));
         if let Listen::At(address) = self.config.grpc {
             let incoming = bind_tcp(address).with_context(|| format!("gRPC on {address}"))?;
+            warn_beyond_loopback("gRPC", address);
             self.addresses.grpc = Some(format!("http://{}", incoming.local_addr()?));
             let incoming = admit(incoming, Arc::clone(&permits));
             let closing = self.closing.clone().cancelled_owned();
@@ -224,6 +255,7 @@ impl RunningServer {
             let listener = TcpListener::bind(address)
                 .await
                 .with_context(|| format!("metrics on {address}"))?;
+            warn_beyond_loopback("metrics", address);
             self.addresses.metrics = Some(format!("http://{}/metrics", listener.local_addr()?));
             let metrics = Arc::clone(&self.hub.metrics);
             self.metrics = Some(tokio::spawn(metrics_http::serve(listener, metrics)));
@@ -241,33 +273,81 @@ impl RunningServer {
         }
     }
 
-    /// Ends: no new connections, streams end with UNAVAILABLE, calls may finish within the grace.
-    /// What is left then ends with the runtime.
-    pub async fn stop(mut self) {
+    /// Says that it is not serving any more, and serves on for the configured time, so that balancers
+    /// send nobody here who would not be let in. Nobody waits where nobody asks for its health.
+    pub async fn drain(&self, hurry: impl Future<Output = ()>) {
+        self.say_not_serving().await;
+        let drain = self.config.drain();
+        if drain.is_zero() || !self.is_asked_for_health.load(Ordering::Relaxed) {
+            return;
+        }
+        tracing::info!("serving for {} s more, until balancers know", drain.as_secs_f64());
+        tokio::select! {
+            () = tokio::time::sleep(drain) => {}
+            () = hurry => {}
+        }
+    }
+
+    async fn say_not_serving(&self) {
         self.health.set_not_serving::<ModelServiceServer<ModelService>>().await;
         self.health.set_not_serving::<PlantServiceServer<PlantService>>().await;
         self.health.set_not_serving::<ControlServiceServer<ControlService>>().await;
         self.health.set_not_serving::<ChannelServiceServer<ChannelService>>().await;
         self.health.set_not_serving::<RecordingServiceServer<RecordingService>>().await;
+    }
+
+    /// Ends: no new connections, streams end with UNAVAILABLE, calls may finish within the grace.
+    /// What is left then ends with the runtime.
+    pub async fn stop(self) {
+        self.stop_within(future::pending()).await;
+    }
+
+    /// The same, with a grace that `hurry` cuts short.
+    async fn stop_within(mut self, hurry: impl Future<Output = ()>) {
+        self.say_not_serving().await;
         self.closing.cancel();
         let hub = Arc::clone(&self.hub);
         let links_closed = tokio::task::spawn_blocking(move || hub.shut_down());
         let calls_ended = async { while self.listeners.join_next().await.is_some() {} };
         let grace = self.config.shutdown_grace();
-        if tokio::time::timeout(grace, calls_ended).await.is_err() {
-            tracing::warn!("open calls are cut off after {} s", grace.as_secs_f64());
+        let is_over = async {
+            tokio::select! {
+                () = tokio::time::sleep(grace) => {}
+                () = hurry => {}
+            }
+        };
+        let have_ended = tokio::select! {
+            biased;
+            () = calls_ended => true,
+            () = is_over => false,
+        };
+        if !have_ended {
+            tracing::warn!("open calls are cut off");
             self.listeners.abort_all();
         }
         if let Err(error) = links_closed.await {
             tracing::error!(%error, "shared-memory links were not closed");
         }
         self.saver.abort();
+        self.memory.abort();
         if tokio::time::timeout(SAVE_WAIT_MAX, save_once(&self.hub)).await.is_err() {
             tracing::error!("the disk does not answer: not all plants were saved");
         }
         if let Some(metrics) = &self.metrics {
             metrics.abort();
         }
+    }
+}
+
+/// Says at every start who can reach the server.
+fn warn_beyond_loopback(what: &str, address: SocketAddr) {
+    if !address.ip().to_canonical().is_loopback() {
+        tracing::warn!(
+            %address,
+            "{what}: other machines can reach this address, and nobody is asked who they are: whoever \
+             reaches it may do everything. Listen on 127.0.0.1 or on a unix-domain socket, or see to it \
+             that the network is closed"
+        );
     }
 }
 

@@ -101,6 +101,14 @@ impl ServerProcess {
         Client::connect(self.address()).await.expect("the server is ready")
     }
 
+    /// Memory of the process that is in use or kept, KiB.
+    pub fn resident_kib(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.pid()));
+        let status = status.expect("the server runs");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")?.strip_suffix("kB"));
+        line.and_then(|kib| kib.trim().parse().ok()).expect("Linux tells what is resident")
+    }
+
     /// What the server has logged so far.
     pub fn log(&self) -> String {
         std::fs::read_to_string(self.directory.path().join("log")).unwrap_or_default()
@@ -113,10 +121,15 @@ impl ServerProcess {
         Ok(())
     }
 
+    /// Asks the server to shut down (SIGTERM).
+    pub fn terminate(&self) -> Result<()> {
+        let pid = rustix::process::Pid::from_child(&self.child);
+        Ok(rustix::process::kill_process(pid, rustix::process::Signal::TERM)?)
+    }
+
     /// Asks the server to shut down (SIGTERM) and waits until it has.
     pub fn stop(&mut self) -> Result<ExitStatus> {
-        let pid = rustix::process::Pid::from_child(&self.child);
-        rustix::process::kill_process(pid, rustix::process::Signal::TERM)?;
+        self.terminate()?;
         self.wait(PATIENCE)
     }
 

@@ -121,7 +121,7 @@ fn ports_and_paths_agree() {
     let stop =
         unit.lines().find_map(|line| line.strip_prefix("TimeoutStopSec=")?.strip_suffix('s'));
     let stop: f64 = stop.expect("the unit bounds the stop").parse().expect("a number");
-    assert!(stop > config.shutdown_grace_s + 5.0);
+    assert!(stop > config.drain_s + config.shutdown_grace_s + 10.0);
 }
 
 #[test]

@@ -98,12 +98,6 @@ async fn driver_of(client: &Client, id: &str) -> String {
     client.get_plant(id).await.unwrap().plant.unwrap().driver
 }
 
-fn resident_kib(server: &ServerProcess) -> u64 {
-    let status = std::fs::read_to_string(format!("/proc/{}/status", server.pid())).unwrap();
-    let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
-    line.split_whitespace().nth(1).unwrap().parse().unwrap()
-}
-
 /// So many, or so many times as many for a long run.
 fn rounds(short: u32, long: u32) -> u32 {
     if std::env::var_os("PLANTD_LONG_FAULTS").is_some() { long } else { short }
@@ -154,7 +148,7 @@ async fn floods_nonsense_and_slowness_stay_with_whoever_causes_them() {
     let _nan = Controller::start(&server, "nonsense", "nan");
     let _slow = Controller::start(&server, "slow", "slow");
     goes_on(&client, "quiet", 200).await;
-    let before_kib = resident_kib(&server);
+    let before_kib = server.resident_kib();
     for _ in 0..rounds(3, 300) {
         for id in ["quiet", "flooded", "nonsense", "slow"] {
             goes_on(&client, id, 200).await;
@@ -166,7 +160,7 @@ async fn floods_nonsense_and_slowness_stay_with_whoever_causes_them() {
     assert!(slow.late_inputs > 0 && slow.safe_inputs > 0, "{slow:?}");
     let state = client.get_plant("nonsense").await.unwrap().plant.unwrap().state.unwrap();
     assert!(state.q.iter().chain(&state.p).all(|number| number.is_finite()), "{state:?}");
-    let grown_kib = resident_kib(&server).saturating_sub(before_kib);
+    let grown_kib = server.resident_kib().saturating_sub(before_kib);
     assert!(grown_kib < GROWTH_MAX_KIB, "the server has grown by {grown_kib} KiB");
 }
 
@@ -178,14 +172,14 @@ async fn a_watcher_that_is_stopped_loses_states_and_holds_nobody_up() {
     let watchers: Vec<Controller> =
         (0..4).map(|_| Controller::start(&server, "a", "watch")).collect();
     goes_on(&client, "a", 200).await;
-    let before_kib = resident_kib(&server);
+    let before_kib = server.resident_kib();
     watchers[0].signal(Signal::STOP);
     watchers[1].signal(Signal::STOP);
     drop(Controller::start(&server, "a", "watch"));
     for _ in 0..rounds(5, 1000) {
         goes_on(&client, "a", 400).await;
     }
-    let grown_kib = resident_kib(&server).saturating_sub(before_kib);
+    let grown_kib = server.resident_kib().saturating_sub(before_kib);
     assert!(grown_kib < GROWTH_MAX_KIB, "the server has grown by {grown_kib} KiB");
     watchers[0].signal(Signal::CONT);
     goes_on(&client, "a", 100).await;
@@ -209,7 +203,7 @@ async fn drivers_that_come_and_go_leave_nothing_behind() {
         let mut driver = driver.unwrap();
         driver.step(&[f64::from(k % 3)]).await.unwrap();
         if k == rounds / 3 {
-            before_kib = resident_kib(&server);
+            before_kib = server.resident_kib();
         }
     }
     let deadline = Instant::now() + PATIENCE;
@@ -217,7 +211,7 @@ async fn drivers_that_come_and_go_leave_nothing_behind() {
         assert!(Instant::now() < deadline, "the last lease is never given up");
         tokio::time::sleep(Duration::from_millis(2)).await;
     }
-    let grown_kib = resident_kib(&server).saturating_sub(before_kib);
+    let grown_kib = server.resident_kib().saturating_sub(before_kib);
     assert!(grown_kib < GROWTH_MAX_KIB / 4, "the server has grown by {grown_kib} KiB");
     goes_on(&client, "a", 100).await;
 }
@@ -230,7 +224,7 @@ async fn long_lockstep_does_not_grow() {
     let id = client.create_plant(request).await.unwrap().id;
     let many = v1::StepRequest { id: id.clone(), hold: 100_000, ..Default::default() };
     client.step(many.clone()).await.unwrap();
-    let before_kib = resident_kib(&server);
+    let before_kib = server.resident_kib();
     // Long: a day at 100 Hz.
     for _ in 0..rounds(2, 86) {
         client.step(many.clone()).await.unwrap();
@@ -239,7 +233,7 @@ async fn long_lockstep_does_not_grow() {
     for k in 0..rounds(2_000, 1_000_000) {
         driver.step(&[f64::from(k).sin()]).await.unwrap();
     }
-    let grown_kib = resident_kib(&server).saturating_sub(before_kib);
+    let grown_kib = server.resident_kib().saturating_sub(before_kib);
     assert!(grown_kib < GROWTH_MAX_KIB / 4, "the server has grown by {grown_kib} KiB");
 }
 

@@ -1,5 +1,6 @@
 """The client against a real server."""
 
+import dataclasses
 import math
 import threading
 
@@ -216,6 +217,46 @@ def test_arguments_that_contradict_each_other(client):
         client.create_plant("pendulum", v=[0.0])
     with pytest.raises(ValueError):
         client.solve_lqr("pendulum", q=np.zeros((2, 2, 2)), r=[1])
+    state = client.create_plant("pendulum").state
+    with pytest.raises(ValueError, match="`at`"):
+        client.linearize("pendulum", at="upright", state=state, u=[0.0])
+    with pytest.raises(ValueError, match="`plant`"):
+        client.linearize(plant="somebody", at="upright")
+    with pytest.raises(ValueError, match="`u`"):
+        client.linearize("pendulum", at="upright", u=[0.0])
+
+
+def test_a_gain_knows_what_it_is_for(client):
+    gain = client.solve_lqr("cart-pole", at="upright", q=np.ones(4), r=[1])
+    assert (gain.model, gain.time_step) == ("cart-pole", 0.01)
+    for wrong in ([0.1], np.zeros(3), np.zeros(5), np.zeros((4, 4))):
+        with pytest.raises(ValueError):
+            gain(wrong)
+    own = client.create_plant("cart-pole").state
+    assert gain(own).tobytes() == gain(own.x).tobytes()
+
+    # Of the same size, and yet another plant; whoever means it says so.
+    double = client.create_plant("double-pendulum", id="double").state
+    slow = client.create_plant("cart-pole", id="slow", dt=0.02).state
+    for state, part in [(double, "double-pendulum"), (slow, "0.02")]:
+        with pytest.raises(ValueError, match=part):
+            gain(state)
+        assert gain(state.x).shape == (1,)
+    with client.drive("slow") as driver, pytest.raises(ValueError, match="0.02"):
+        gain(driver.step([0.0]))
+    for id, field in [("double", "gain.model"), ("slow", "gain.time_step_s")]:
+        with pytest.raises(plantd.PlantdError, match=field):
+            client.set_feedback(id, gain=gain)
+    anybody = dataclasses.replace(gain, model="", time_step=0.0)
+    assert client.set_feedback("slow", gain=anybody).revision == 1
+
+
+def test_a_changed_time_step_is_not_taken_for_another_plants(client):
+    plant = client.create_plant("cart-pole", at="upright").id
+    with client.drive(plant) as driver:
+        client.set_parameters(plant, {}, dt=0.02)
+        gain = client.solve_lqr("cart-pole", at="upright", q=np.ones(4), r=[1], dt=0.02)
+        assert gain(driver.step([0.0])).shape == (1,)
 
 
 def test_modes_and_responses(client):

@@ -60,6 +60,16 @@ pub(super) fn at_point(
     convert::point(point, &model, settings)
 }
 
+/// Name of the model that such a point is of.
+fn model_at(hub: &Hub, model: &str, point: Option<&v1::Point>) -> Result<String, Fault> {
+    match point {
+        Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) => {
+            Ok(hub.session(id)?.model_name().to_owned())
+        }
+        _ => Ok(model.to_owned()),
+    }
+}
+
 /// Refuses matrices that no client would take.
 pub(super) fn check_linearization(hub: &Hub, model: &Model) -> Result<(), Fault> {
     let numbers = convert::linearization_numbers(model.dimensions());
@@ -86,6 +96,7 @@ fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeRe
 
 fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResponse, Fault> {
     let constraints = Constraints::new(request.constraints)?;
+    let model = model_at(hub, &request.model, request.point.as_ref())?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
     let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
@@ -93,12 +104,10 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
     let regulator = regulator::about_point(&mut plant, &u, &weights, momentum, constraints)?;
     Ok(v1::SolveLqrResponse {
         gain: Some(v1::Gain {
-            step: 0,
             k: Some(convert::matrix(&regulator.gain)),
             x_reference: convert::x(&plant),
             u_reference: u,
-            rotations: convert::rotations(plant.model()),
-            feedforward: Vec::new(),
+            ..convert::gain_of(&model, &plant)
         }),
         value: Some(convert::matrix(&regulator.value)),
         spectral_radius: regulator.spectral_radius,
@@ -204,7 +213,8 @@ struct TrajectoryRegulator {
     reciprocal_conditions: std::vec::IntoIter<f64>,
     states: std::vec::IntoIter<State>,
     inputs: Inputs,
-    rotations: Vec<u32>,
+    /// What the gains have in common.
+    common: v1::Gain,
     next: usize,
     /// Room in memory that the server grants.
     _permit: OwnedSemaphorePermit,
@@ -229,6 +239,7 @@ impl TrajectoryRegulator {
         let fields = WeightFields::default();
         let (weights, stages) = (request.weights, request.stages);
         let weights = convert::trajectory_weights(fields, weights, stages, steps, &model)?;
+        let common = convert::gain_of(&request.model, &plant);
         let path = Path::follow(plant, &inputs, momentum, constraints, abandoned)?;
         let solution = path.solve(&weights, values)?;
         Ok(Self {
@@ -238,7 +249,7 @@ impl TrajectoryRegulator {
             reciprocal_conditions: solution.reciprocal_conditions.into_iter(),
             states: path.states.into_iter(),
             inputs,
-            rotations: convert::rotations(&model),
+            common,
             next: 0,
             _permit: permit,
         })
@@ -258,8 +269,8 @@ impl Iterator for TrajectoryRegulator {
             k: self.gains.next().map(|gain| convert::matrix(&gain)),
             x_reference: state.x(),
             u_reference: u,
-            rotations: self.rotations.clone(),
             feedforward: self.feedforward.next().map(convert::vector).unwrap_or_default(),
+            ..self.common.clone()
         };
         let (value, linear) = self.values.next().unzip();
         Some(v1::SolveTrajectoryLqrResponse {

@@ -137,7 +137,7 @@ pub(crate) async fn set_feedback(
             }
             let given = is_trajectory.then(|| request.clone());
             let constraints = Constraints::new(request.constraints)?;
-            let reference = reference(&hub, request.reference, &mechanics)?;
+            let reference = reference(&hub, request.reference, session.model_name(), &mechanics)?;
             let model = &mechanics.model;
             let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
             let (weights, trajectory_weights) = match &reference {
@@ -206,7 +206,12 @@ fn guard(bounds: &[v1::Bound], mode: Mode, model: &Model) -> Result<Vec<GuardBou
     bounds.iter().enumerate().map(bound).collect()
 }
 
-fn reference(hub: &Hub, form: Option<Form>, mechanics: &Mechanics) -> Result<Reference, Fault> {
+fn reference(
+    hub: &Hub,
+    form: Option<Form>,
+    model_name: &str,
+    mechanics: &Mechanics,
+) -> Result<Reference, Fault> {
     let (model, settings) = (&mechanics.model, mechanics.settings);
     let d = model.dimensions();
     let momentum = |state: &v1::State| {
@@ -240,16 +245,29 @@ fn reference(hub: &Hub, form: Option<Form>, mechanics: &Mechanics) -> Result<Ref
         }
         Some(Form::Trajectory(trajectory)) => {
             let start = trajectory.initial.as_ref().map_or(Initial::Scene, momentum);
-            let inputs = Inputs::new("trajectory.u", trajectory.u, d.input())?;
-            let (horizon, steps) = (hub.limits.horizon, inputs.count());
-            LimitExceeded::check("horizon", horizon, "steps", steps)?;
-            if steps == 0 {
-                return Err(Fault::field("trajectory.u", "is missing: it needs one row at least"));
-            }
+            let inputs = Inputs::along("trajectory.u", trajectory.u, d.input(), &hub.limits)?;
             Ok(Reference::Trajectory { start, inputs })
         }
-        Some(Form::Gain(gain)) => Ok(Reference::Gain(stage(gain, model)?)),
+        Some(Form::Gain(gain)) => {
+            check_origin(&gain, model_name, settings.time_step_s)?;
+            Ok(Reference::Gain(stage(gain, model)?))
+        }
     }
+}
+
+/// Refuses a gain that says that it was computed for another model or time step.
+fn check_origin(gain: &v1::Gain, model: &str, time_step_s: f64) -> Result<(), Fault> {
+    let hint = "clear the field to apply it all the same";
+    if !gain.model.is_empty() && gain.model != model {
+        let problem = format!("is `{}`; the plant is made from `{model}`; {hint}", gain.model);
+        return Err(Fault::field("gain.model", problem));
+    }
+    if gain.time_step_s != 0.0 && gain.time_step_s != time_step_s {
+        let given = gain.time_step_s;
+        let problem = format!("is {given} s; the plant's time step is {time_step_s} s; {hint}");
+        return Err(Fault::field("gain.time_step_s", problem));
+    }
+    Ok(())
 }
 
 fn stage(gain: v1::Gain, model: &Model) -> Result<Stage, Fault> {

@@ -6,6 +6,7 @@ pub mod channels;
 pub mod control;
 mod derivatives;
 pub mod drive;
+pub mod ending;
 pub(crate) mod feedback;
 mod kalman;
 pub mod model;

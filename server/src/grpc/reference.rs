@@ -25,7 +25,8 @@ pub(super) struct Projection {
     inputs: DMatrix<f64>,
     states: DMatrix<f64>,
     gains: std::vec::IntoIter<DMatrix<f64>>,
-    rotations: Vec<u32>,
+    /// What the gains have in common.
+    common: v1::Gain,
     next: usize,
     /// Room in memory that the server grants.
     _permit: OwnedSemaphorePermit,
@@ -87,7 +88,7 @@ impl Projection {
         };
         Ok(Self {
             report: Some(report(&assessment, &projected, tolerance, settings.time_step_s)),
-            rotations: convert::rotations(&model),
+            common: convert::gain_of(&request.model, &plant),
             inputs: projected.inputs,
             states: projected.states,
             gains: gains.into_iter(),
@@ -146,6 +147,8 @@ fn report(
         constraint_violation_step: assessment.constraint_violation_step as u32,
         constraint: assessment.constraint.clone(),
         unexplained_force: assessment.unexplained_force,
+        unexplained_force_step: assessment.unexplained_force_step as u32,
+        unexplained_force_coordinate: assessment.unexplained_force_coordinate.clone(),
         unexplained_acceleration: assessment.unexplained_acceleration,
         unexplained_step: assessment.unexplained_step as u32,
         unexplained_coordinate: assessment.unexplained_coordinate.clone(),
@@ -178,8 +181,7 @@ impl Iterator for Projection {
                     k: self.gains.next().map(|gain| convert::matrix(&gain)),
                     x_reference: row(&self.states, k),
                     u_reference: row(&self.inputs, k),
-                    rotations: self.rotations.clone(),
-                    feedforward: Vec::new(),
+                    ..self.common.clone()
                 })
             }
         };

@@ -224,7 +224,7 @@ impl Analysis {
                 x_reference: state.x(),
                 u_reference: frame.input.clone(),
                 rotations: convert::rotations(self.plant.model()),
-                feedforward: Vec::new(),
+                ..Default::default()
             });
         }
         Ok(())

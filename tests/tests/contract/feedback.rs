@@ -33,6 +33,11 @@ fn about(id: &str, point: v1::Point, mode: Mode) -> v1::SetFeedbackRequest {
     v1::SetFeedbackRequest { reference: Some(Reference::Point(point)), ..along(id, mode) }
 }
 
+/// A gain that does not say what it was computed for, as those that follow a plant.
+fn anonymous(gain: v1::Gain) -> v1::Gain {
+    v1::Gain { model: String::new(), time_step_s: 0.0, ..gain }
+}
+
 /// What SolveTrajectoryLqr answers for the same reference.
 async fn solved(client: &Client) -> Vec<v1::Gain> {
     let request = v1::SolveTrajectoryLqrRequest {
@@ -43,7 +48,7 @@ async fn solved(client: &Client) -> Vec<v1::Gain> {
     };
     let stream = client.solve_trajectory_lqr(request).await.unwrap();
     let answers = stream.collect().await.unwrap();
-    answers.into_iter().map(|answer| answer.gain.unwrap()).collect()
+    answers.into_iter().map(|answer| anonymous(answer.gain.unwrap())).collect()
 }
 
 async fn next<T: std::fmt::Debug>(stream: &mut Answers<T>) -> T {
@@ -288,7 +293,7 @@ async fn gains_are_computed_anew_when_parameters_change() {
             weights: Some(unit_weights(4, 1)),
             ..Default::default()
         };
-        client.solve_lqr(request).await.unwrap().gain.unwrap()
+        anonymous(client.solve_lqr(request).await.unwrap().gain.unwrap())
     };
     assert_eq!(first.gain.unwrap(), solve(0.0).await);
 
@@ -314,6 +319,8 @@ async fn gains_are_computed_anew_when_parameters_change() {
         ..Default::default()
     };
     let heavy = client.solve_lqr(request).await.unwrap().gain.unwrap();
+    assert_eq!((heavy.model.as_str(), heavy.time_step_s), ("heavy", 0.02));
+    let heavy = anonymous(heavy);
     assert_eq!(third.gain.unwrap(), v1::Gain { step: 5, ..heavy });
     assert_eq!(info(&client, &id).await.feedback.unwrap().revision, 3);
 }
@@ -362,7 +369,7 @@ async fn a_gain_as_it_stands() {
         x_reference: vec![0.1, 0.2, 0.3, 0.4],
         u_reference: vec![0.5],
         feedforward: vec![0.25],
-        rotations: Vec::new(),
+        ..Default::default()
     };
     let request = |gain: v1::Gain| v1::SetFeedbackRequest {
         reference: Some(Reference::Gain(gain)),
@@ -370,6 +377,10 @@ async fn a_gain_as_it_stands() {
         ..along(&id, Mode::Replace)
     };
     client.set_feedback(request(gain.clone())).await.unwrap();
+    let foreign = v1::Gain { model: "double-pendulum".to_owned(), ..gain.clone() };
+    assert_bad_field(client.set_feedback(request(foreign)).await, "gain.model");
+    let slower = v1::Gain { time_step_s: 0.02, ..gain.clone() };
+    assert_bad_field(client.set_feedback(request(slower)).await, "gain.time_step_s");
     let mut stream = client.watch_gains(&id).await.unwrap();
     let message = next(&mut stream).await;
     assert_eq!(message.gain, Some(v1::Gain { step: 0, ..gain.clone() }));

@@ -306,6 +306,30 @@ async fn trajectories_are_checked_and_failures_say_how_far_they_came() {
 }
 
 #[tokio::test]
+async fn a_trajectory_without_steps_is_no_trajectory() {
+    let (_server, client) = server().await;
+    for u in [None, Some(v1::Matrix { rows: 0, cols: 1, data: Vec::new() })] {
+        let model = || "pendulum".to_owned();
+        let trajectory = || Some(v1::Trajectory { initial: None, u: u.clone() });
+        let request = v1::LinearizeTrajectoryRequest {
+            model: model(),
+            trajectory: trajectory(),
+            ..Default::default()
+        };
+        let linearized = opened(client.linearize_trajectory(request).await).await;
+        assert_bad_field(linearized, "trajectory.u");
+        let request = v1::SolveTrajectoryLqrRequest {
+            model: model(),
+            trajectory: trajectory(),
+            weights: Some(unit_weights(2, 1)),
+            ..Default::default()
+        };
+        let solved = opened(client.solve_trajectory_lqr(request).await).await;
+        assert_bad_field(solved, "trajectory.u");
+    }
+}
+
+#[tokio::test]
 async fn snapshots_of_other_models_and_settings_are_refused() {
     let (_server, client) = server().await;
     let pendulum = plant(&client, "pendulum").await;

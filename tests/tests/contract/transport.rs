@@ -2,10 +2,13 @@
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use plantd_client::{Client, Code, Error, v1};
-use tonic_health::pb::{HealthCheckRequest, health_check_response, health_client::HealthClient};
+use plantd_tests::server::{ServerProcess, binary};
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
 use tonic_reflection::pb::v1::{
     ServerReflectionRequest, server_reflection_client::ServerReflectionClient,
     server_reflection_request::MessageRequest, server_reflection_response::MessageResponse,
@@ -34,7 +37,7 @@ async fn health_is_reported_for_each_service() {
     for service in SERVICES.into_iter().chain([""]) {
         let request = HealthCheckRequest { service: service.to_owned() };
         let answer = health.check(request).await.unwrap().into_inner();
-        assert_eq!(answer.status(), health_check_response::ServingStatus::Serving, "{service}");
+        assert_eq!(answer.status(), ServingStatus::Serving, "{service}");
     }
     let request = HealthCheckRequest { service: "plantd.v1.Nothing".to_owned() };
     assert_eq!(health.check(request).await.unwrap_err().code(), Code::NotFound);
@@ -65,6 +68,24 @@ async fn reflection_lists_and_describes_the_services() {
         };
         assert!(!files.file_descriptor_proto.is_empty());
     }
+}
+
+#[tokio::test]
+async fn a_server_that_other_machines_reach_says_so() {
+    let warning = "other machines can reach this address";
+    let (inside, _client) = server().await;
+    assert!(!inside.log().contains(warning), "{}", inside.log());
+
+    let open = Command::new(binary("plantd").unwrap())
+        .args(["serve", "--grpc", "0.0.0.0:0", "--metrics", "[::]:0", "--link", "off"])
+        .arg("--until-stdin-ends")
+        .stdin(Stdio::null())
+        .stderr(Stdio::piped())
+        .output()
+        .unwrap();
+    let log = String::from_utf8(open.stderr).unwrap();
+    assert!(open.status.success(), "{log}");
+    assert_eq!(log.matches(warning).count(), 2, "{log}");
 }
 
 /// A browser's request: HTTP/1.1, a frame of a length and a message, trailers in the body.
@@ -103,6 +124,82 @@ fn post_grpc_web(address: &str, method: &str, message: &[u8]) -> (String, Vec<u8
     let end = answer.windows(4).position(|w| w == b"\r\n\r\n").expect("a head");
     let body = answer.split_off(end + 4);
     (String::from_utf8(answer).unwrap(), body)
+}
+
+/// Older tools, and Python's own reflection client, ask for v1alpha.
+#[tokio::test]
+async fn reflection_is_there_in_its_older_version() {
+    use tonic_reflection::pb::v1alpha;
+    use v1alpha::server_reflection_client::ServerReflectionClient as Reflection;
+    use v1alpha::server_reflection_request::MessageRequest;
+    use v1alpha::server_reflection_response::MessageResponse;
+
+    let (_server, client) = server().await;
+    let request = v1alpha::ServerReflectionRequest {
+        host: String::new(),
+        message_request: Some(MessageRequest::ListServices(String::new())),
+    };
+    let mut reflection = Reflection::new(client.channel());
+    let answers = reflection.server_reflection_info(tokio_stream::iter([request])).await;
+    let answer = soon(answers.unwrap().into_inner().message()).await.unwrap().unwrap();
+    let Some(MessageResponse::ListServicesResponse(list)) = answer.message_response else {
+        panic!("not a list of services")
+    };
+    for service in SERVICES {
+        assert!(list.service.iter().any(|listed| listed.name == service), "{service}");
+    }
+}
+
+/// A server whose drain and grace outlast the test, and a watcher of its health that has heard that it
+/// serves.
+async fn watched_for_health(flags: &[&str]) -> (ServerProcess, Client, HealthWatch) {
+    let flags = [&["--shutdown-grace-s", "100"], flags].concat();
+    let (server, client) = server_with(&flags).await;
+    let mut health = HealthClient::new(client.channel());
+    let request = HealthCheckRequest { service: "plantd.v1.PlantService".to_owned() };
+    let mut watch = health.watch(request).await.unwrap().into_inner();
+    let first = soon(watch.message()).await.unwrap().unwrap();
+    assert_eq!(first.status(), ServingStatus::Serving);
+    (server, client, watch)
+}
+
+type HealthWatch = tonic::Streaming<tonic_health::pb::HealthCheckResponse>;
+
+#[tokio::test]
+async fn a_watch_of_health_hears_of_the_end_and_does_not_delay_it() {
+    let (mut server, client, mut watch) = watched_for_health(&["--drain-s", "0"]).await;
+    let mut reflection = ServerReflectionClient::new(client.channel());
+    // A stream of reflection that asks nothing.
+    let asking = reflection.server_reflection_info(tokio_stream::pending()).await.unwrap();
+    let stopped = tokio::task::spawn_blocking(move || server.stop());
+    let last = soon(watch.message()).await.unwrap().unwrap();
+    assert_eq!(last.status(), ServingStatus::NotServing);
+    let end = soon(watch.message()).await.unwrap_err();
+    assert_eq!(end.code(), Code::Unavailable);
+    let end = soon(asking.into_inner().message()).await.unwrap_err();
+    assert_eq!(end.code(), Code::Unavailable);
+    assert!(soon(stopped).await.unwrap().unwrap().success());
+}
+
+#[tokio::test]
+async fn a_draining_server_serves_on_until_a_second_signal() {
+    let (mut server, client, mut watch) = watched_for_health(&["--drain-s", "100"]).await;
+    let id = plant(&client, "pendulum").await.id;
+    server.terminate().unwrap();
+    let last = soon(watch.message()).await.unwrap().unwrap();
+    assert_eq!(last.status(), ServingStatus::NotServing);
+    // New connections too, and a health check by itself: what balancers do.
+    let newcomer = server.client().await;
+    newcomer.get_plant(&id).await.unwrap();
+    let mut health = HealthClient::new(newcomer.channel());
+    let request = HealthCheckRequest { service: "plantd.v1.PlantService".to_owned() };
+    let answer = health.check(request).await.unwrap().into_inner();
+    assert_eq!(answer.status(), ServingStatus::NotServing);
+    // An open stream would hold the end up for the grace as well, but for the second signal.
+    let mut driver = newcomer.drive(&id).await.unwrap();
+    driver.step(&[0.0]).await.unwrap();
+    let stopped = tokio::task::spawn_blocking(move || server.stop());
+    assert!(soon(stopped).await.unwrap().unwrap().success());
 }
 
 #[tokio::test]

@@ -436,10 +436,14 @@ class Client:
 
         The reference is one of: an equilibrium (``at``, or ``state`` with ``u``, or where ``plant``
         is), a ``trajectory``, which begins at the plant's step ``first_step`` or at the present one,
-        or a ``gain`` as it stands. ``mode`` is what the feedback does in the plant's own loop, ``law``
-        standing for its input: ``watch`` nothing; ``replace`` u = law; ``add`` u = law + what the
-        driver sends; ``guard`` u = law from the first step on at which an entry of x - x_reference
-        leaves its bounds in ``guard``.
+        or a ``gain`` as it stands, which must not say that it is for another model or time step. When
+        parameters change, the reference of a trajectory is the motion of the changed plant from the
+        same initial state under the same inputs.
+
+        ``mode`` is what the feedback does in the plant's own loop, ``law`` standing for its input:
+        ``watch`` nothing; ``replace`` u = law; ``add`` u = law + what the driver sends; ``guard``
+        u = law from the first step on at which an entry of x - x_reference leaves its bounds in
+        ``guard``.
         """
         forms = [at is not None, state is not None, bool(plant), trajectory is not None]
         if sum([*forms, gain is not None]) != 1:
@@ -457,7 +461,7 @@ class Client:
         elif trajectory is not None:
             request.trajectory.CopyFrom(trajectory._message())
         else:
-            request.point.CopyFrom(point(at or "", state, u, plant))
+            request.point.CopyFrom(point(at, state, u, plant))
         given = _trajectory_weights(q, r, q_final, s, projected_momentum)
         if given is not None:
             request.weights.CopyFrom(given)
@@ -619,14 +623,15 @@ class Client:
         self,
         model: str = "",
         *,
-        at: str = "initial",
+        at: str | None = None,
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
         **stepping: Unpack[Stepping],
     ) -> Linearization:
-        """Linearizes the map of a model at an operating point, or at ``state`` with input ``u``; or
-        that of a ``plant``, where it is."""
+        """Linearizes the map of a model at the operating point ``at``, by default ``initial``, or at
+        ``state`` with input ``u``; or that of a ``plant``, where it is. Two of them raise `ValueError`.
+        """
         request = control_service_pb2.LinearizeRequest(
             model=model, settings=settings(**stepping), point=point(at, state, u, plant)
         )
@@ -644,7 +649,7 @@ class Client:
         self,
         model: str = "",
         *,
-        at: str = "initial",
+        at: str | None = None,
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
@@ -662,7 +667,7 @@ class Client:
         weights: Vector = (),
         *,
         multiplier_weights: Vector = (),
-        at: str = "initial",
+        at: str | None = None,
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
@@ -714,7 +719,7 @@ class Client:
         *,
         outputs: Sequence[str] | npt.ArrayLike = (),
         frequencies: Vector = (),
-        at: str = "initial",
+        at: str | None = None,
         state: State | None = None,
         u: Vector = (),
         plant: str = "",
@@ -748,7 +753,7 @@ class Client:
         r: npt.ArrayLike,
         s: npt.ArrayLike | None = None,
         projected_momentum: bool = False,
-        at: str = "initial",
+        at: str | None = None,
         state: State | None = None,
         u: Vector = (),
         full: bool = False,
@@ -957,7 +962,7 @@ class Client:
         measurement_noise: npt.ArrayLike,
         process_noise: npt.ArrayLike | None = None,
         input_noise: npt.ArrayLike | None = None,
-        at: str = "initial",
+        at: str | None = None,
         state: State | None = None,
         u: Vector = (),
         plant: str = "",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 from typing import Any
 
+from plantd.v1 import common_pb2
 from plantd.v1 import plant_service_pb2 as pb
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
@@ -100,7 +101,13 @@ class Driver:
         self.outputs = Outputs._from(answer.step.outputs) if has_outputs else None
         if answer.step.HasField("linearization"):
             self.linearization = Linearization._from(answer.step.linearization)
-        return State._from(answer.step.state)
+        return State._from(answer.step.state, self.plant.model, self._time_step(answer.step.state))
+
+    def _time_step(self, state: common_pb2.State) -> float:
+        """The plant's time step when it was opened, or 0 if another one is seen to be in force."""
+        start, time_step = self.plant.state, self.plant.time_step
+        steps = (state.time_s - start.time) / time_step
+        return time_step if abs(steps - (state.step - start.step)) < 0.5 else 0.0
 
     def close(self) -> None:
         """Gives the lease back and waits until the server has done so."""

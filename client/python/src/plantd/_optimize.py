@@ -220,9 +220,11 @@ class ProjectedReference:
     constraint_violation: float
     constraint_violation_step: int
     constraint: str
-    #: Largest force that neither inputs nor constraints can exert, and the same as an acceleration;
-    #: its step and the coordinate on which it acts.
+    #: Largest force that neither inputs nor constraints can exert; its step and its coordinate.
     unexplained_force: float
+    unexplained_force_step: int
+    unexplained_force_coordinate: str
+    #: Largest acceleration that such forces make; its step and its coordinate.
     unexplained_acceleration: float
     unexplained_step: int
     unexplained_coordinate: str
@@ -259,6 +261,8 @@ class ProjectedReference:
             report.constraint_violation_step,
             report.constraint,
             report.unexplained_force,
+            report.unexplained_force_step,
+            report.unexplained_force_coordinate,
             report.unexplained_acceleration,
             report.unexplained_step,
             report.unexplained_coordinate,

@@ -79,11 +79,15 @@ def initial_state(
     return common_pb2.InitialState(velocity=velocity)
 
 
-def point(at: str, state: State | None, u: Vector, plant: str = "") -> common_pb2.Point:
+def point(at: str | None, state: State | None, u: Vector, plant: str = "") -> common_pb2.Point:
+    if sum((at is not None, state is not None, bool(plant))) > 1:
+        raise ValueError("give one of `at`, `state` and `plant`")
+    if state is None and len(vector(u)):
+        raise ValueError("`u` needs `state`: operating points and plants have inputs of their own")
     if plant:
         return common_pb2.Point(plant=plant)
     if state is None:
-        return common_pb2.Point(operating_point=at)
+        return common_pb2.Point(operating_point="initial" if at is None else at)
     here = common_pb2.StateAndInput(state=state._message(), u=vector(u))
     return common_pb2.Point(state_and_input=here)
 

@@ -42,6 +42,10 @@ class State:
     v: Array
     #: Constraint impulses of the last step; divide by the time step for forces.
     multipliers: Array
+    #: Model of the plant whose state it is; empty where that is not known.
+    model: str = ""
+    #: Time step of that plant, s; 0 where it is not known.
+    time_step: float = 0.0
 
     @cached_property
     def x(self) -> Array:
@@ -49,8 +53,9 @@ class State:
         return np.concatenate((self.q, self.p, self.v))
 
     @classmethod
-    def _from(cls, m: common_pb2.State) -> State:
-        return cls(m.step, m.time_s, *map(array, (m.q, m.p, m.v, m.multipliers)))
+    def _from(cls, m: common_pb2.State, model: str = "", time_step: float = 0.0) -> State:
+        arrays = map(array, (m.q, m.p, m.v, m.multipliers))
+        return cls(m.step, m.time_s, *arrays, model=model, time_step=time_step)
 
     def _message(self) -> common_pb2.State:
         return common_pb2.State(q=self.q, p=self.p, v=self.v)
@@ -392,7 +397,9 @@ class Diagnostics:
 class Gain:
     """The feedback law u = u_reference + feedforward - k (x - x_reference); call it with a state.
 
-    Differences of orientations of ball joints are those of `plantd.difference`.
+    Differences of orientations of ball joints are those of `plantd.difference`. A state of another
+    length is refused with `ValueError`, and so is the `State` of a plant of another model or time step
+    than those that the gain was computed for; its vector ``state.x`` is taken all the same.
     """
 
     #: Step index from which it holds.
@@ -405,10 +412,32 @@ class Gain:
     rotations: tuple[int, ...]
     #: Added to the reference's input.
     feedforward: Array
+    #: Model that it was computed for; empty where that is not said.
+    model: str = field(default="", kw_only=True)
+    #: Time step that it was computed for, s; 0 where that is not said.
+    time_step: float = field(default=0.0, kw_only=True)
 
     def __call__(self, state: State | npt.ArrayLike) -> Array:
-        error = difference(self.x_reference, state_vector(state), self.rotations)
+        x = state_vector(state)
+        if x.shape != self.x_reference.shape:
+            raise ValueError(f"a state has {self.x_reference.size} entries here, not {x.size}")
+        if isinstance(state, State):
+            self._check_origin(state)
+        error = difference(self.x_reference, x, self.rotations)
         return self.u_reference + self.feedforward - self.k @ error
+
+    def _check_origin(self, state: State) -> None:
+        """Refuses the state of a plant that the gain was not computed for."""
+        hint = "give `state.x` to apply it all the same"
+        if self.model and state.model and self.model != state.model:
+            raise ValueError(
+                f"the gain is for model `{self.model}`, the state of a plant of `{state.model}`; {hint}"
+            )
+        if self.time_step and state.time_step and self.time_step != state.time_step:
+            raise ValueError(
+                f"the gain is for time step {self.time_step} s, the state of a plant whose time step "
+                f"is {state.time_step} s; {hint}"
+            )
 
     @classmethod
     def _from(cls, m: common_pb2.Gain) -> Gain:
@@ -424,6 +453,8 @@ class Gain:
             "u_reference": reference,
             "rotations": tuple(m.rotations),
             "feedforward": array(m.feedforward) if m.feedforward else np.zeros_like(reference),
+            "model": m.model,
+            "time_step": m.time_step_s,
         }
 
     def _message(self) -> common_pb2.Gain:
@@ -434,6 +465,8 @@ class Gain:
             u_reference=self.u_reference,
             rotations=self.rotations,
             feedforward=self.feedforward,
+            model=self.model,
+            time_step_s=self.time_step,
         )
 
 
@@ -582,7 +615,7 @@ class Plant:
             m.id,
             m.model,
             m.settings.time_step_s,
-            State._from(m.state),
+            State._from(m.state, m.model, m.settings.time_step_s),
             m.driver,
             m.link_open,
             energy,

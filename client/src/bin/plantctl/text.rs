@@ -666,11 +666,17 @@ pub(crate) fn reference(report: &v1::ReferenceReport) -> String {
     }
     let _ = writeln!(
         text,
-        "  forces: {} of {} at step {} cannot be exerted (an acceleration of {})",
+        "  forces: {} of {} at step {} cannot be exerted",
         number(report.unexplained_force),
+        report.unexplained_force_coordinate,
+        report.unexplained_force_step
+    );
+    let _ = writeln!(
+        text,
+        "  accelerations: {} of {} at step {} cannot be had",
+        number(report.unexplained_acceleration),
         report.unexplained_coordinate,
-        report.unexplained_step,
-        number(report.unexplained_acceleration)
+        report.unexplained_step
     );
     let _ = writeln!(
         text,
