@@ -2,14 +2,32 @@
  * plantd_link.h: layout of the shared-memory link of plantd, version 4.
  *
  * A message is one plantd_link_header (the user header of an iceoryx2 sample) and a slice of
- * double. Each open plant has, in the iceoryx2 domain of the server,
+ * double. Each open plant has, in an iceoryx2 domain of the server,
  *
  *     plantd/4/<plant>/input   publish-subscribe and event, drivers to server
  *     plantd/4/<plant>/state   publish-subscribe and event, server to drivers
  *
- * The domain is an iceoryx2 0.10 configuration with the server's root path and the prefix
- * plantd4_<hash>_, where <hash> is the 64-bit FNV-1a hash of the root path, its two halves combined
- * by exclusive or, as eight hexadecimal digits. The publish-subscribe services have the payload type
+ * Each start of a server has a domain of its own under the server's root path. The file
+ * <root>/<plant>.link says in which one a plant's link is: its first line is the name <domain>, six
+ * hexadecimal digits; each further line is the size in bytes and the name of a segment in /dev/shm that
+ * the server has made. Without further lines the link is not open yet. The server lives as long as a
+ * shared flock of the directory <root>/<domain> fails with EWOULDBLOCK. To become a member, a driver
+ *
+ * - makes sure that the root is no symbolic link, and that it belongs to its own user and to nobody
+ *   else (mode 0700);
+ * - opens or creates the file <root>/<domain>/<pid>.member (mode 0600) and keeps a shared flock of it
+ *   until it has left the domain; <pid> is the first number of the line NSpid in /proc/self/status.
+ *   If the path then names another file or none, it was too late, and the driver does so again;
+ * - makes sure that the segments in the link file are its own user's, closed to others (mode 0600), and
+ *   of the sizes given there;
+ * - opens the services with an iceoryx2 0.10 configuration with the root path <root>/<domain> and the
+ *   prefix plantd4_<domain>_, without clean-up of dead nodes: the server does it.
+ *
+ * Who leaves a domain that has neither server nor members any more may remove its segments and then its
+ * directory, under an exclusive flock of the root; the next server does so in any case. When the file
+ * <root>/<plant>.link names another domain than the driver's, the server has restarted.
+ *
+ * The publish-subscribe services have the payload type
  * "f64" (dynamic), the user header type PLANTD_LINK_TYPE_NAME, and the attributes
  * plantd.layout = "4" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
  *

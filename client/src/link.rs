@@ -20,8 +20,8 @@ use std::time::Duration;
 
 use iceoryx2::identifiers::UniquePublisherId;
 use plantd_proto::link::{
-    Code, Domain, DomainError, Endpoint, Header, Kind, LIVE, LinkNode, Message, ProcessIdentity,
-    default_root, monotonic_ns, random_instance,
+    Code, Domain, DomainError, Endpoint, Header, Kind, LIVE, LinkNode, Message, default_root,
+    monotonic_ns, random_instance,
 };
 
 pub use error::{LeaseHolder, LinkError, StepFailure};
@@ -127,9 +127,8 @@ pub struct LinkDriver {
     endpoint: Endpoint,
     /// What the driver's own headers have in common: `driver` and `server`.
     header: Header,
-    server: ProcessIdentity,
-    /// The server's process can be seen from here: it is not in another pid namespace.
-    is_server_visible: bool,
+    /// Process id of the server.
+    server_pid: u32,
     server_port: Option<UniquePublisherId>,
     server_poll_end_ns: u64,
     sequence: u64,
@@ -148,11 +147,14 @@ impl LinkDriver {
         let deadline_ns = after(options.connect_timeout);
         let mut room = INPUT_LEN_USUAL;
         loop {
-            let driver = Self::connect_with_room(plant, &options, room, deadline_ns)?;
-            if driver.last.input_len() <= room {
-                return Ok(driver);
+            match Self::connect_with_room(plant, &options, room, deadline_ns) {
+                Ok(driver) if driver.last.input_len() <= room => return Ok(driver),
+                Ok(driver) => room = driver.last.input_len(),
+                // The server has died meanwhile: the next one may be about to start.
+                Err(LinkError::Domain(DomainError::NotOpen { .. }))
+                    if monotonic_ns() < deadline_ns => {}
+                Err(error) => return Err(error),
             }
-            room = driver.last.input_len();
         }
     }
 
@@ -271,8 +273,7 @@ impl LinkDriver {
             options: options.clone(),
             endpoint,
             header: Header { driver: random_instance(), ..Header::new(Kind::Attach) },
-            server: ProcessIdentity { pid: 0, start: 0 },
-            is_server_visible: false,
+            server_pid: 0,
             server_port: None,
             server_poll_end_ns: 0,
             sequence: 0,
@@ -306,15 +307,16 @@ impl LinkDriver {
             if monotonic_ns() >= deadline_ns {
                 return Err(LinkError::Timeout { after: self.options.connect_timeout });
             }
-            // Without it the ports of a server that was killed would hide the new one's.
-            self.node.clean_up();
+            if !self.node.is_served() {
+                let (plant, root) = (self.plant.clone(), self.options.root.clone());
+                return Err(DomainError::NotOpen { plant, root }.into());
+            }
         }
     }
 
     fn note_attached(&mut self, answer: &Header, message: &Message) -> Result<(), LinkError> {
         self.header.server = answer.server;
-        self.server = ProcessIdentity { pid: answer.pid, start: answer.process_start };
-        self.is_server_visible = self.server.is_running();
+        self.server_pid = answer.pid;
         self.server_port = Some(message.origin());
         self.note_state(answer, message.payload())
     }
@@ -387,11 +389,12 @@ impl LinkDriver {
 
     /// Off the fast path: nothing has come for a while.
     fn check_server(&self) -> Result<(), LinkError> {
-        let is_dead = self.is_server_visible && !self.server.is_running();
-        // What a dead process leaves behind hides it from the second question.
-        self.node.clean_up();
+        if self.node.is_elsewhere(&self.plant) {
+            return Err(LinkError::ServerRestarted);
+        }
+        let is_dead = !self.node.is_served();
         if is_dead || !self.server_port.is_some_and(|port| self.endpoint.is_connected(port)) {
-            return Err(LinkError::ServerGone { pid: self.server.pid });
+            return Err(LinkError::ServerGone { pid: self.server_pid });
         }
         Ok(())
     }
@@ -413,7 +416,7 @@ fn open_endpoint(
     deadline_ns: u64,
 ) -> Result<(LinkNode, Endpoint), LinkError> {
     loop {
-        let opened = Domain::open(&options.root).and_then(|domain| {
+        let opened = Domain::find(&options.root, plant).and_then(|domain| {
             domain.check_shared_memory(room)?;
             let node = domain.join("plantd-driver")?;
             let endpoint = Endpoint::driver(node.open_services(plant)?, room, options.wait)?;
@@ -428,10 +431,12 @@ fn open_endpoint(
     }
 }
 
-/// A server that starts may still make it so.
+/// A server that starts, or drivers that come and go at this time, may still make it so.
 fn is_not_yet(error: &DomainError) -> bool {
     match error {
-        DomainError::NotOpen { .. } => true,
+        DomainError::NotOpen { .. }
+        | DomainError::TooManyDrivers
+        | DomainError::SegmentSize { .. } => true,
         DomainError::Root { source, .. } => source.kind() == std::io::ErrorKind::NotFound,
         _ => false,
     }

@@ -8,13 +8,16 @@ mod worker;
 
 use std::collections::HashMap;
 use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use plantd_proto::link::{Domain, DomainError, LAYOUT_VERSION, LinkNode, Wait, default_root};
+use plantd_proto::link::{
+    Domain, DomainError, LAYOUT_VERSION, Leftovers, LinkNode, Wait, default_root,
+};
 
 use crate::frame::OUTPUTS_MAX;
 use crate::session::Session;
@@ -64,7 +67,7 @@ pub enum LinkError {
     /// The system gave no thread.
     #[error("no thread for the link: {0}")]
     Thread(#[from] io::Error),
-    /// The link's thread ended while it started.
+    /// The link's thread panicked while it started.
     #[error("the thread of the link of plant `{plant}` failed")]
     Failed {
         /// Plant.
@@ -81,7 +84,6 @@ pub enum LinkError {
 /// All links of a server.
 pub struct LinkHost {
     config: LinkConfig,
-    domain: Domain,
     node: Arc<LinkNode>,
     state: Mutex<State>,
 }
@@ -99,15 +101,15 @@ struct Thread {
 }
 
 impl LinkHost {
-    /// Joins the domain and removes what a server that was killed has left behind. Takes
+    /// Makes a domain and removes what servers that were killed have left behind. Takes
     /// milliseconds.
     pub fn new(config: LinkConfig) -> Result<Self, LinkError> {
         let domain = Domain::create(&config.root)?;
         domain.check_shared_memory(0)?;
-        let node = Arc::new(domain.join("plantd")?);
+        let node = Arc::new(domain.found("plantd")?);
         let housekeeper = Some(start_housekeeper(Arc::clone(&node), config.clean_up_period)?);
         let state = Mutex::new(State { links: HashMap::new(), housekeeper });
-        Ok(Self { config, domain, node, state })
+        Ok(Self { config, node, state })
     }
 
     /// Opens the link of a plant; one that is open stays open. Blocks for tens of milliseconds.
@@ -115,14 +117,18 @@ impl LinkHost {
         let plant = session.id().to_owned();
         let info = LinkInfo {
             service: format!("plantd/{LAYOUT_VERSION}/{plant}"),
-            root: self.domain.root().to_owned(),
+            root: self.node.domain().root().to_owned(),
             layout_version: LAYOUT_VERSION,
         };
         let mut state = self.state();
         if state.housekeeper.is_none() || session.is_closed() {
             return Err(LinkError::Closing { plant });
         }
-        if state.links.get(&plant).is_none_or(|link| link.handle.is_finished()) {
+        if !session.link_open() || !state.links.contains_key(&plant) {
+            // The thread of one that has failed may not have ended yet.
+            if let Some(link) = state.links.remove(&plant) {
+                link.stop();
+            }
             let link = self.start_worker(session)?;
             state.links.insert(plant, link);
         }
@@ -157,22 +163,37 @@ impl LinkHost {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Starts the thread of a link and waits until its ports exist.
+    /// Starts the thread of a link and waits until drivers can find it.
     fn start_worker(&self, session: Arc<Session>) -> Result<Thread, LinkError> {
         let plant = session.id().to_owned();
-        self.domain
-            .check_shared_memory(3 * (session.model().dimensions().state() + OUTPUTS_MAX))?;
+        let state_len = 3 * (session.model().dimensions().state() + OUTPUTS_MAX);
+        self.node.domain().check_shared_memory(state_len)?;
+        let started = self.spawn_worker(session);
+        if started.is_err()
+            && let Err(error) = self.node.withdraw(&plant)
+        {
+            tracing::debug!(plant, %error, "shared-memory link, not opened");
+        }
+        started
+    }
+
+    fn spawn_worker(&self, session: Arc<Session>) -> Result<Thread, LinkError> {
+        let plant = session.id().to_owned();
         let services = self.node.create_services(&plant)?;
         let stop = Arc::new(AtomicBool::new(false));
         let (report, reported) = mpsc::sync_channel(1);
         let handle = {
             let (config, stop) = (self.config.clone(), Arc::clone(&stop));
+            let node = Arc::clone(&self.node);
             std::thread::Builder::new().name(format!("link-{plant}")).spawn(move || {
-                match Worker::new(session, services, &config, stop) {
+                let made = || Worker::new(session, services, &config, stop);
+                let made = catch_unwind(AssertUnwindSafe(made));
+                let Ok(made) = made else { return };
+                // The receiver waits for this message: sending cannot fail.
+                match made.and_then(|worker| worker.publish(&node)) {
                     Ok(worker) => {
-                        // The receiver waits for this message: sending cannot fail.
                         let _ = report.send(Ok(()));
-                        worker.run();
+                        serve(worker, &node);
                     }
                     Err(error) => {
                         let _ = report.send(Err(error));
@@ -183,6 +204,19 @@ impl LinkHost {
         reported.recv().map_err(|_| LinkError::Failed { plant })??;
         Ok(Thread { stop, handle })
     }
+}
+
+/// Serves a link until it ends. What panics in it, the library on segments that somebody has overwritten
+/// for one, ends this link and nothing else.
+fn serve(mut worker: Worker, node: &LinkNode) {
+    let plant = worker.plant().to_owned();
+    if catch_unwind(AssertUnwindSafe(|| worker.run())).is_err() {
+        tracing::error!(plant, "the thread of the shared-memory link has panicked; link closed");
+    }
+    if let Err(error) = node.withdraw(&plant) {
+        tracing::warn!(plant, %error, "shared-memory link, closing");
+    }
+    worker.close();
 }
 
 impl Drop for LinkHost {
@@ -207,8 +241,9 @@ fn start_housekeeper(node: Arc<LinkNode>, period: Duration) -> Result<Thread, Li
     let handle = {
         let stop = Arc::clone(&stop);
         std::thread::Builder::new().name("link-housekeeper".into()).spawn(move || {
+            let mut leftovers = Leftovers::default();
             while !stop.load(Ordering::Acquire) {
-                let removed = node.clean_up();
+                let removed = node.clean_up(&mut leftovers);
                 if removed > 0 {
                     tracing::info!(removed, "removed shared memory of dead processes");
                 }
@@ -217,4 +252,84 @@ fn start_housekeeper(node: Arc<LinkNode>, period: Duration) -> Result<Thread, Li
         })?
     };
     Ok(Thread { stop, handle })
+}
+
+#[cfg(test)]
+mod tests {
+    use plantd_models::{Model, Plant, Settings, builtin};
+    use plantd_proto::link::{Code, Endpoint, Header, Kind, monotonic_ns, random_instance};
+
+    use super::*;
+    use crate::metrics::Metrics;
+    use crate::realtime::{RealTime, RealTimeSettings};
+
+    /// The kind of a message on which the thread of a link panics.
+    pub(super) const PANIC: u32 = 0xdead;
+
+    fn new_session(id: &str) -> Arc<Session> {
+        let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
+        let settings = Settings::new(&model);
+        let plant = Plant::new(model, settings).unwrap();
+        let metrics = Arc::new(Metrics::default());
+        let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
+        Session::new(id.to_owned(), "pendulum".to_owned(), plant, None, metrics, realtime)
+    }
+
+    struct Driver {
+        endpoint: Endpoint,
+        header: Header,
+        /// Declared last: the ports go before the membership.
+        _node: LinkNode,
+    }
+
+    impl Driver {
+        fn attach(root: &std::path::Path, plant: &str) -> Self {
+            let node = Domain::find(root, plant).unwrap().join("driver").unwrap();
+            let services = node.open_services(plant).unwrap();
+            let endpoint = Endpoint::driver(services, 1, Wait::default()).unwrap();
+            let header = Header { driver: random_instance(), ..Header::new(Kind::Attach) };
+            let mut driver = Self { endpoint, header, _node: node };
+            driver.header.server = driver.ask(header, &[]).server;
+            driver
+        }
+
+        fn ask(&mut self, header: Header, payload: &[f64]) -> Header {
+            self.endpoint.send(header, &[payload], 0).unwrap();
+            let deadline_ns = monotonic_ns() + 10_000_000_000;
+            *self.endpoint.receive(deadline_ns).unwrap().expect("an answer").user_header()
+        }
+
+        fn step(&mut self, sequence: u64) -> Header {
+            self.ask(Header { kind: Kind::Input as u32, sequence, ..self.header }, &[0.0])
+        }
+    }
+
+    #[test]
+    fn a_thread_that_panics_closes_its_link_and_no_other() {
+        let directory = tempfile::Builder::new().prefix("plantd-").tempdir().unwrap();
+        let root = directory.path().join("link");
+        let host =
+            LinkHost::new(LinkConfig { root: root.clone(), ..LinkConfig::default() }).unwrap();
+        let sessions = ["broken", "whole"].map(new_session);
+        for session in &sessions {
+            host.open(Arc::clone(session)).unwrap();
+        }
+        let mut drivers = ["broken", "whole"].map(|plant| Driver::attach(&root, plant));
+        for driver in &mut drivers {
+            assert_eq!(driver.step(1).kind, Kind::State as u32);
+        }
+        let told = drivers[0].ask(Header { kind: PANIC, ..drivers[0].header }, &[]);
+        assert_eq!((told.kind, told.code), (Kind::Closed as u32, Code::LinkClosed as u32));
+        let deadline_ns = monotonic_ns() + 10_000_000_000;
+        while sessions[0].link_open() && monotonic_ns() < deadline_ns {
+            std::thread::yield_now();
+        }
+        assert_eq!((sessions[0].link_open(), sessions[0].driver()), (false, None));
+        assert!(sessions[1].link_open());
+        assert_eq!(drivers[1].step(2).kind, Kind::State as u32);
+        // It can be opened again.
+        host.open(Arc::clone(&sessions[0])).unwrap();
+        let mut again = Driver::attach(&root, "broken");
+        assert_eq!(again.step(1).step, 2);
+    }
 }

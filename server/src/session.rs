@@ -103,6 +103,7 @@ pub struct Session {
     is_recomputing: AtomicBool,
     driver: AtomicU8,
     link_open: AtomicBool,
+    link_was_opened: AtomicBool,
     is_closed: AtomicBool,
     closed: CancellationToken,
     watchers: Watchers,
@@ -148,6 +149,7 @@ impl Session {
             is_recomputing: AtomicBool::new(false),
             driver: AtomicU8::new(0),
             link_open: AtomicBool::new(false),
+            link_was_opened: AtomicBool::new(false),
             is_closed: AtomicBool::new(false),
             closed: CancellationToken::new(),
             watchers: Watchers::default(),
@@ -246,8 +248,15 @@ impl Session {
         self.link_open.load(Ordering::Acquire)
     }
 
+    /// Whether the next server that has this plant opens its link: it was open with this one. A server
+    /// that ends in good order closes its links before it saves the plants.
+    pub fn keeps_link(&self) -> bool {
+        self.link_was_opened.load(Ordering::Acquire)
+    }
+
     /// Notes whether the shared-memory link is open.
     pub fn set_link_open(&self, open: bool) {
+        self.link_was_opened.fetch_or(open, Ordering::AcqRel);
         match (self.link_open.swap(open, Ordering::AcqRel), open) {
             (false, true) => self.metrics.link_opened(),
             (true, false) => self.metrics.link_closed(),

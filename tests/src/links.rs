@@ -1,15 +1,16 @@
 //! Plants with an open shared-memory link, in this process and in others.
 
+use std::collections::BTreeSet;
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Stdio};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, anyhow, ensure};
 use plantd_client::link::{LinkDriver, LinkError, LinkOptions, Wait};
 use plantd_models::{Model, Plant, Settings, builtin};
-use plantd_proto::link::{Domain, SHARED_MEMORY_DIRECTORY};
+use plantd_proto::link::SHARED_MEMORY_DIRECTORY;
 use plantd_server::link::{LinkConfig, LinkHost};
 use plantd_server::metrics::Metrics;
 use plantd_server::realtime::{RealTime, RealTimeSettings};
@@ -97,21 +98,29 @@ pub fn wiggle(plant: &Plant, k: u64, u: &mut [f64]) {
     }
 }
 
-/// The files of a domain: in its root path, and with its prefix in shared memory.
-pub fn files_of_domain(root: &Path) -> Result<Vec<PathBuf>> {
+/// The files of links: under their root path, and in shared memory those of the domains that are there
+/// or were when this was last asked.
+pub fn files_of_links(root: &Path) -> Result<Vec<PathBuf>> {
+    static SEEN: Mutex<BTreeSet<(PathBuf, String)>> = Mutex::new(BTreeSet::new());
+    let mut seen = SEEN.lock().map_err(|_| anyhow!("another test has failed"))?;
     let mut files = Vec::new();
     let mut directories = vec![root.to_owned()];
     while let Some(directory) = directories.pop() {
-        for entry in std::fs::read_dir(directory)? {
-            let entry = entry?;
-            let list = if entry.file_type()?.is_dir() { &mut directories } else { &mut files };
-            list.push(entry.path());
+        // Members may come and go meanwhile.
+        for entry in std::fs::read_dir(directory).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.is_dir() && path.parent() == Some(root) {
+                seen.insert((root.to_owned(), entry.file_name().to_string_lossy().into_owned()));
+            }
+            if path.is_dir() { &mut directories } else { &mut files }.push(path);
         }
     }
-    let prefix = Domain::open(root)?.prefix();
+    let own = seen.iter().filter(|(under, _)| under == root);
+    let prefixes: Vec<_> = own.map(|(_, domain)| format!("plantd4_{domain}_")).collect();
     for entry in std::fs::read_dir(SHARED_MEMORY_DIRECTORY)? {
         let entry = entry?;
-        if entry.file_name().to_string_lossy().starts_with(&prefix) {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if prefixes.iter().any(|prefix| name.starts_with(prefix)) {
             files.push(entry.path());
         }
     }

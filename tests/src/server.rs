@@ -41,6 +41,14 @@ impl ServerProcess {
     /// Starts a server after `configure` has added flags or environment variables to
     /// `plantd serve`.
     pub fn start_with(configure: impl FnOnce(&mut Command)) -> Result<Self> {
+        let mut server = Self::start_unready(configure)?;
+        let ready = server.directory.path().join("ready.json");
+        server.addresses = server.wait_until_ready(&ready)?;
+        Ok(server)
+    }
+
+    /// The same, without waiting for it to serve: its addresses are empty.
+    pub fn start_unready(configure: impl FnOnce(&mut Command)) -> Result<Self> {
         let directory = tempfile::Builder::new().prefix("plantd-test-").tempdir()?;
         let ready = directory.path().join("ready.json");
         let log = File::create(directory.path().join("log"))?;
@@ -66,9 +74,7 @@ impl ServerProcess {
         let child = command.spawn().with_context(|| format!("cannot start {command:?}"))?;
         // From here on the process is this value's to kill.
         let nowhere = Addresses { grpc: String::new(), unix: String::new(), metrics: None };
-        let mut server = Self { child, addresses: nowhere, directory };
-        server.addresses = server.wait_until_ready(&ready)?;
-        Ok(server)
+        Ok(Self { child, addresses: nowhere, directory })
     }
 
     /// Address over TCP, `http://127.0.0.1:port`.

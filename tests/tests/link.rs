@@ -13,8 +13,8 @@ use plantd_proto::link::{
 use plantd_server::link::{LinkConfig, LinkError as HostError, LinkHost};
 use plantd_server::session::{DriverKind, PlantSnapshot};
 use plantd_tests::links::{
-    ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_domain, new_plant, new_session,
-    wait_until, wiggle,
+    ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_links, new_plant, new_session, wait_until,
+    wiggle,
 };
 
 /// Never polls: each answer comes by a notification.
@@ -162,7 +162,7 @@ struct RawDriver {
 
 impl RawDriver {
     fn connect(fixture: &LinkFixture) -> Self {
-        let node = Domain::open(&fixture.root()).unwrap().join("raw").unwrap();
+        let node = Domain::find(&fixture.root(), PLANT).unwrap().join("raw").unwrap();
         let services = node.open_services(PLANT).unwrap();
         let endpoint = Endpoint::driver(services, 8, SLEEP).unwrap();
         let header = Header { driver: random_instance(), ..Header::new(Kind::Attach) };
@@ -248,7 +248,7 @@ fn the_lease_of_a_killed_driver_comes_back() {
 #[test]
 fn many_killed_drivers_leave_no_files_behind() {
     let fixture = LinkFixture::new("pendulum").unwrap();
-    let before = files_of_domain(&fixture.root()).unwrap();
+    let before = files_of_links(&fixture.root()).unwrap();
     for _ in 0..4 {
         let mut victim = start_driver(&fixture.root(), &[]);
         victim.wait_for_line("attached").unwrap();
@@ -256,8 +256,8 @@ fn many_killed_drivers_leave_no_files_behind() {
         victim.kill().unwrap();
         wait_until("the lease", || fixture.session.driver().is_none()).unwrap();
     }
-    wait_until("the housekeeping", || files_of_domain(&fixture.root()).unwrap() == before)
-        .unwrap_or_else(|e| panic!("{e}: {:#?}", files_of_domain(&fixture.root()).unwrap()));
+    wait_until("the housekeeping", || files_of_links(&fixture.root()).unwrap() == before)
+        .unwrap_or_else(|e| panic!("{e}: {:#?}", files_of_links(&fixture.root()).unwrap()));
 }
 
 #[test]
@@ -357,7 +357,7 @@ fn one_plant_id_under_one_root_path_belongs_to_one_server() {
 #[test]
 fn a_link_has_room_for_eight_drivers_that_are_connected() {
     let fixture = LinkFixture::new("pendulum").unwrap();
-    let node = Domain::open(&fixture.root()).unwrap().join("many").unwrap();
+    let node = Domain::find(&fixture.root(), PLANT).unwrap().join("many").unwrap();
     let connect = || Endpoint::driver(node.open_services(PLANT)?, 1, SLEEP);
     let endpoints: Vec<Endpoint> = (0..8).map(|_| connect().unwrap()).collect();
     assert!(matches!(connect().unwrap_err(), DomainError::TooManyDrivers));
@@ -371,11 +371,11 @@ fn nothing_is_left_behind_when_everybody_leaves() {
     let mut driver = fixture.connect(SLEEP).unwrap();
     driver.step(&[0.0]).unwrap();
     let root = fixture.root();
-    assert!(!files_of_domain(&root).unwrap().is_empty());
+    assert!(!files_of_links(&root).unwrap().is_empty());
     drop(driver);
     let LinkFixture { host, directory: _directory, .. } = fixture;
     drop(host);
-    assert_eq!(files_of_domain(&root).unwrap(), Vec::<PathBuf>::new());
+    assert_eq!(files_of_links(&root).unwrap(), Vec::<PathBuf>::new());
 }
 
 #[test]
@@ -417,7 +417,7 @@ fn a_driver_survives_a_killed_server_and_connects_to_the_next() {
     let error = driver.step(&[0.0]).unwrap_err();
     assert!(matches!(error, LinkError::Closed { is_deleted: false }), "{error}");
     drop(driver);
-    assert_eq!(files_of_domain(&root).unwrap(), Vec::<PathBuf>::new());
+    assert_eq!(files_of_links(&root).unwrap(), Vec::<PathBuf>::new());
 }
 
 #[test]
@@ -431,12 +431,12 @@ fn a_server_comes_up_clean_over_the_remains_of_killed_ones() {
         driver.wait_for_line("stepped").unwrap();
         host.kill().unwrap();
         driver.kill().unwrap();
-        assert!(!files_of_domain(&root).unwrap().is_empty());
+        assert!(!files_of_links(&root).unwrap().is_empty());
     }
     let mut host = start_host(&root);
     assert!(start_driver(&root, &["--steps", "5"]).finish().unwrap());
     assert!(host.finish().unwrap());
-    assert_eq!(files_of_domain(&root).unwrap(), Vec::<PathBuf>::new());
+    assert_eq!(files_of_links(&root).unwrap(), Vec::<PathBuf>::new());
 }
 
 /// Compiles a program that prints what the C header says, and compares it with the Rust side.

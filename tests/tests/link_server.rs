@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use plantd_client::link::{LeaseHolder, LinkDriver, LinkError, LinkOptions, StateView};
 use plantd_client::{Client, Code, v1};
 use plantd_models::{Plant, Snapshot};
-use plantd_tests::links::{PATIENCE, files_of_domain, new_plant_of_order, wait_until, wiggle};
+use plantd_tests::links::{PATIENCE, files_of_links, new_plant_of_order, wait_until, wiggle};
 use plantd_tests::server::ServerProcess;
 
 /// Models with and without inputs, prescribed coordinates and constraints, and orders.
@@ -156,7 +156,7 @@ async fn in_process_over_shared_memory_and_over_grpc_the_motion_is_the_same_bit_
         }
     }
     assert!(server.stop().unwrap().success());
-    assert_eq!(files_of_domain(&root).unwrap(), Vec::<PathBuf>::new());
+    assert_eq!(files_of_links(&root).unwrap(), Vec::<PathBuf>::new());
 }
 
 /// The same seed gives the same outputs over shared memory and over gRPC.
@@ -291,5 +291,5 @@ async fn a_driver_recovers_from_a_killed_server() {
     let error = driver.step(&[0.1]).unwrap_err();
     assert!(matches!(error, LinkError::Closed { .. }), "{error}");
     drop(driver);
-    wait_until("clean shared memory", || files_of_domain(&root).unwrap().is_empty()).unwrap();
+    wait_until("clean shared memory", || files_of_links(&root).unwrap().is_empty()).unwrap();
 }

@@ -1,8 +1,13 @@
 """The driver over shared memory against a real server."""
 
+import json
 import math
+import os
 import subprocess
 import sys
+import tempfile
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -107,3 +112,77 @@ def test_streamed_gains_drive_over_shared_memory(client, connect):
         for _ in range(100):
             driver.step(law(driver.state))
         assert abs(driver.state.q[0] - math.pi) < 1e-9
+
+
+@pytest.fixture
+def serve(tmp_path_factory):
+    """Starts servers with the same plants under the same root path."""
+    folder = tmp_path_factory.mktemp("l")
+    servers = []
+
+    def serve():
+        ready = folder / f"ready-{len(servers)}"
+        arguments = ["serve", "--grpc", "127.0.0.1:0", "--unix", str(folder / "plantd.sock")]
+        arguments += ["--link-root", str(root), "--state-directory", str(folder / "state")]
+        arguments += ["--state-interval-s", "0.05", "--ready-file", str(ready)]
+        with (folder / "log").open("a") as log:
+            server = subprocess.Popen([os.environ["PLANTD_SERVER"], *arguments], stdout=log, stderr=log)
+        servers.append(server)
+        deadline = time.monotonic() + 30
+        while not ready.exists():
+            assert server.poll() is None and time.monotonic() < deadline, (folder / "log").read_text()
+            time.sleep(0.01)
+        return server, root, json.loads(ready.read_text())["grpc"]
+
+    with tempfile.TemporaryDirectory(prefix="plantd-") as short:
+        root = Path(short) / "link"
+        yield serve
+        for server in servers:
+            server.kill()
+            server.wait()
+
+
+def test_a_driver_finds_the_next_server_and_the_last_one_to_leave_removes_what_is_left(serve):
+    server, root, address = serve()
+    with plantd.connect(address) as client:
+        client.create_plant("pendulum", id="arm", open_link=True)
+    server.terminate()
+    assert server.wait(30) == 0
+    assert not list(root.iterdir())
+
+    server, _, _ = serve()
+    driver = LinkDriver("arm", root=root, connect_timeout_s=10, timeout_s=10)
+    assert driver.step(0.0).step == 1
+    prefix = driver._prefix()
+    server.kill()
+    server.wait()
+    with pytest.raises(LinkError, match="SERVER_GONE"):
+        driver.step(0.0)
+    server, _, _ = serve()
+    with pytest.raises(LinkError, match="SERVER_RESTARTED"):
+        driver.step(0.0)
+    with LinkDriver("arm", root=root, connect_timeout_s=10, timeout_s=10) as again:
+        again.step(0.0)
+    assert list(Path("/dev/shm").glob(f"{prefix}*"))
+    driver.close()
+    assert not list(Path("/dev/shm").glob(f"{prefix}*"))
+    assert not (root / prefix.split("_")[1]).exists()
+
+
+def test_segments_and_roots_that_are_not_what_they_must_be_are_refused_by_name(serve):
+    _, root, address = serve()
+    with plantd.connect(address) as client:
+        client.create_plant("pendulum", id="arm", open_link=True)
+    size, name = (root / "arm.link").read_text().splitlines()[1].split()
+    segment = Path("/dev/shm") / name
+    segment.chmod(0o666)
+    with pytest.raises(LinkError, match=f"SEGMENT_NOT_PRIVATE.*{name}"):
+        LinkDriver("arm", root=root)
+    segment.chmod(0o600)
+    os.truncate(segment, 0)
+    with pytest.raises(LinkError, match=f"{name} has 0 bytes, not the {size}"):
+        LinkDriver("arm", root=root, connect_timeout_s=0.1)
+    other = root.parent / "other"
+    other.symlink_to(root)
+    with pytest.raises(LinkError, match=f"ROOT_NOT_PRIVATE.*{other} is a symbolic link"):
+        LinkDriver("arm", root=other)

@@ -1,35 +1,26 @@
-//! The iceoryx2 domain of plantd: one root path and one file-name prefix, apart from every other
-//! user of iceoryx2 on the machine.
+//! The iceoryx2 domain of one start of a server, and the services of links in it.
 
-use std::fs::{self, DirBuilder};
-use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::collections::HashSet;
+use std::fs::File;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use iceoryx2::prelude::{
-    AttributeVerifier, CallbackProgression, Config, FileName, LogLevel, Node, NodeBuilder,
-    NodeName, SemanticString as _, ServiceName, SignalHandlingMode, ipc, set_log_level_from_env_or,
+    AttributeVerifier, Config, FileName, LogLevel, Node, NodeBuilder, NodeName,
+    SemanticString as _, ServiceName, SignalHandlingMode, ipc, set_log_level_from_env_or,
 };
 use iceoryx2::service::attribute::{AttributeKey, AttributeValue};
 use iceoryx2::service::builder::{event, publish_subscribe};
 use iceoryx2::service::port_factory;
 
-use super::header::{FNV_BASIS, Header, LAYOUT_VERSION, SCHEMA_HASH, fnv1a};
-
-/// Where the system keeps shared memory.
-pub const SHARED_MEMORY_DIRECTORY: &str = "/dev/shm";
+use super::error::DomainError;
+use super::header::{Header, LAYOUT_VERSION, SCHEMA_HASH};
+use super::root::{Root, host_pid};
+use super::segments::{self, Leftovers, SHARED_MEMORY_DIRECTORY};
 
 /// Shared memory that must be free before a link is opened, beside what its messages need, bytes:
 /// writing to shared memory that is full kills the process.
 const SHARED_MEMORY_FREE_MIN: u64 = 8 << 20;
-
-/// Longest root path, bytes: a socket's path has 107, of which the prefix, a 128-bit number in
-/// decimal, a suffix and a separator take the rest.
-const ROOT_LENGTH_MAX: usize = 107 - PREFIX_LENGTH - 39 - ".event".len() - 1;
-
-/// Length of [`Domain::prefix`].
-const PREFIX_LENGTH: usize = "plantd4_00000000_".len();
 
 /// Drivers, connected or trying to, that one link has room for.
 const DRIVERS_MAX: usize = 8;
@@ -48,88 +39,15 @@ pub type Channel = port_factory::publish_subscribe::PortFactory<ipc::Service, [f
 /// Event service of a link.
 pub type Bell = port_factory::event::PortFactory<ipc::Service>;
 
-/// Why the shared-memory domain cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum DomainError {
-    /// The root path cannot be made or read.
-    #[error("root path `{path}` of the shared-memory link: {source}")]
-    Root {
-        /// Path.
-        path: PathBuf,
-        /// Cause.
-        source: io::Error,
-    },
-    /// The root path is somebody else's, or open to others.
-    #[error("root path `{path}` must belong to user {uid} and be closed to others (mode 0700)")]
-    RootNotPrivate {
-        /// Path.
-        path: PathBuf,
-        /// The user that runs this process.
-        uid: u32,
-    },
-    /// The root path is no absolute path that iceoryx2 can use.
-    #[error("root path `{path}` must be absolute and at most {max} bytes long")]
-    RootPath {
-        /// Path.
-        path: PathBuf,
-        /// Limit.
-        max: usize,
-    },
-    /// Too little shared memory.
-    #[error(
-        "{directory} has {free} bytes free; the shared-memory link needs {needed} (in a container: raise --shm-size)"
-    )]
-    SharedMemoryFull {
-        /// Where shared memory lives.
-        directory: &'static str,
-        /// Free bytes.
-        free: u64,
-        /// Needed bytes.
-        needed: u64,
-    },
-    /// The plant's id cannot be part of a service name.
-    #[error("`{plant}` is no plant id: 1 to 63 lower-case letters, digits and hyphens")]
-    PlantId {
-        /// Id as given.
-        plant: String,
-    },
-    /// No server has opened the link of this plant.
-    #[error("plant `{plant}` has no open link under `{root}`")]
-    NotOpen {
-        /// Plant.
-        plant: String,
-        /// Root path.
-        root: PathBuf,
-    },
-    /// The services exist with another layout.
-    #[error(
-        "the link of plant `{plant}` has another layout than version {LAYOUT_VERSION}: server and client are of different versions"
-    )]
-    OtherLayout {
-        /// Plant.
-        plant: String,
-    },
-    /// Another server has opened the link of a plant with this id.
-    #[error("another server has opened the link of this plant under the same root path")]
-    ServedElsewhere,
-    /// The link has no room for another driver.
-    #[error("as many drivers as the link has room for are connected to it already")]
-    TooManyDrivers,
-    /// iceoryx2 failed.
-    #[error("shared-memory link, {what}: {cause}")]
-    Transport {
-        /// What was being done.
-        what: &'static str,
-        /// iceoryx2's own error.
-        cause: String,
-    },
-}
-
-/// The iceoryx2 domain of plantd under one root path.
-#[derive(Clone, Debug)]
+/// The domain of one start of a server: an iceoryx2 configuration of its own, which nobody can know
+/// beforehand and nobody uses again. What happens to its files ends with it.
+#[derive(Debug)]
 pub struct Domain {
     config: Config,
-    root: PathBuf,
+    root: Root,
+    name: String,
+    /// The lock that says that this process lives: of the domain's directory, or of a member.
+    hold: Option<File>,
 }
 
 /// Root path when none is given: `$XDG_RUNTIME_DIR/plantd`, or `/tmp/plantd-<uid>` without it.
@@ -141,56 +59,55 @@ pub fn default_root() -> PathBuf {
 }
 
 impl Domain {
-    /// The domain under `root`, which is made (mode 0700) when it does not exist.
+    /// A new domain under `root`, for a server. The root is made (mode 0700) when it does not exist, and
+    /// domains in it without living processes are removed.
     pub fn create(root: &Path) -> Result<Self, DomainError> {
-        let domain = Self::configure(root)?;
-        let error = |source| DomainError::Root { path: root.to_owned(), source };
-        DirBuilder::new().recursive(true).mode(0o700).create(root).map_err(error)?;
-        domain.check_root()?;
-        Ok(domain)
+        let root = Root::create(root)?;
+        let (name, hold) = root.make_domain()?;
+        Self::new(root, name, hold)
     }
 
-    /// The domain under `root`, which must exist.
-    pub fn open(root: &Path) -> Result<Self, DomainError> {
-        let domain = Self::configure(root)?;
-        domain.check_root()?;
-        Ok(domain)
+    /// The domain in which the link of a plant is open, for a driver. Nothing of it is mapped before the
+    /// segments of the link are found to be whole, and this user's alone.
+    pub fn find(root: &Path, plant: &str) -> Result<Self, DomainError> {
+        check_plant_id(plant)?;
+        let root = Root::open(root)?;
+        let link = root.read_link(plant)?;
+        let is_open = |domain: &str| root.is_served(domain);
+        let link = link.filter(|link| !link.segments.is_empty() && is_open(&link.domain));
+        let Some(link) = link else {
+            let (plant, root) = (plant.to_owned(), root.path().to_owned());
+            return Err(DomainError::NotOpen { plant, root });
+        };
+        let hold = root.enter(&link.domain)?;
+        segments::check(&link.segments)?;
+        Self::new(root, link.domain, hold)
     }
 
-    fn configure(root: &Path) -> Result<Self, DomainError> {
-        let invalid = || DomainError::RootPath { path: root.to_owned(), max: ROOT_LENGTH_MAX };
-        let bytes = root.as_os_str().as_encoded_bytes();
-        if !root.is_absolute() || bytes.len() > ROOT_LENGTH_MAX {
-            return Err(invalid());
-        }
+    fn new(root: Root, name: String, hold: File) -> Result<Self, DomainError> {
         let mut config = Config::default();
-        let path = iceoryx2::prelude::Path::new(bytes).map_err(|_| invalid())?;
+        let directory = root.directory(&name);
+        let path = iceoryx2::prelude::Path::new(directory.as_os_str().as_encoded_bytes())
+            .map_err(transport("path of the domain"))?;
         config.global.set_root_path(&path);
-        config.global.prefix = FileName::new(prefix(root).as_bytes()).map_err(|_| invalid())?;
-        Ok(Self { config, root: root.to_owned() })
-    }
-
-    /// A root path that others can write to would let them put their files under our names.
-    fn check_root(&self) -> Result<(), DomainError> {
-        let path = || self.root.clone();
-        let metadata = fs::metadata(&self.root)
-            .map_err(|source| DomainError::Root { path: path(), source })?;
-        let uid = rustix::process::getuid().as_raw();
-        if !metadata.is_dir() || metadata.uid() != uid || metadata.mode() & 0o077 != 0 {
-            return Err(DomainError::RootNotPrivate { path: path(), uid });
-        }
-        Ok(())
+        config.global.prefix = FileName::new(segments::prefix(&name).as_bytes())
+            .map_err(transport("prefix of the domain"))?;
+        // Only the server's housekeeping cleans up: one that is killed while it does ends the domain.
+        config.global.node.cleanup_dead_nodes_on_creation = false;
+        config.global.node.cleanup_dead_nodes_on_destruction = false;
+        config.global.service.cleanup_dead_nodes_on_open = false;
+        Ok(Self { config, root, name, hold: Some(hold) })
     }
 
     /// Root path.
     pub fn root(&self) -> &Path {
-        &self.root
+        self.root.path()
     }
 
-    /// Start of the name of every file of this domain, in the root path and in
-    /// [`SHARED_MEMORY_DIRECTORY`]: `plantd<layout version>_<hash of the root path>_`.
+    /// Start of the name of every file of this domain, in its directory and in
+    /// [`SHARED_MEMORY_DIRECTORY`]: `plantd<layout version>_<domain>_`.
     pub fn prefix(&self) -> String {
-        prefix(&self.root)
+        segments::prefix(&self.name)
     }
 
     /// Fails when [`SHARED_MEMORY_DIRECTORY`] is nearly full, or has no room for a link whose
@@ -209,8 +126,8 @@ impl Domain {
         Ok(())
     }
 
-    /// Joins the domain. Removes what dead processes have left behind.
-    pub fn join(&self, name: &str) -> Result<LinkNode, DomainError> {
+    /// Joins the domain.
+    pub fn join(self, name: &str) -> Result<LinkNode, DomainError> {
         // Its own default prints every handled error; ours are typed.
         set_log_level_from_env_or(LogLevel::Fatal);
         let name = NodeName::new(name).map_err(transport("name of the node"))?;
@@ -221,38 +138,16 @@ impl Domain {
         let node = catch_unwind(AssertUnwindSafe(|| builder.create::<ipc::Service>()))
             .map_err(|_| transport("joining the domain")("panic inside iceoryx2"))?
             .map_err(transport("joining the domain"))?;
-        Ok(LinkNode { node: Some(node), domain: self.clone() })
+        Ok(LinkNode { node: Some(node), domain: self })
     }
 
-    /// Removes what iceoryx2 keeps for a domain without members: the counter that its nodes are
-    /// numbered with. Whoever joins next begins a new one; numbers stay unique, because they also hold
-    /// process id and time.
-    fn remove_if_empty(&self) {
-        let mut is_empty = true;
-        let listed = Node::<ipc::Service>::list(&self.config, |_| {
-            is_empty = false;
-            CallbackProgression::Stop
-        });
-        let Ok(entries) = fs::read_dir(SHARED_MEMORY_DIRECTORY) else { return };
-        if listed.is_err() || !is_empty {
-            return;
-        }
-        let (prefix, suffix) = (self.prefix(), self.config.global.node.global_mgmt_suffix);
-        for entry in entries.flatten() {
-            let name = entry.file_name();
-            let name = name.as_encoded_bytes();
-            if name.starts_with(prefix.as_bytes()) && name.ends_with(suffix.as_bytes()) {
-                // Another member that leaves at the same time may have removed it.
-                let _ = fs::remove_file(entry.path());
-            }
-        }
+    /// Joins the domain as its server, before anybody else can.
+    pub fn found(self, name: &str) -> Result<LinkNode, DomainError> {
+        let node = self.join(name)?;
+        segments::take_numbering(&node.domain.name)
+            .map_err(transport("closing the domain to other users"))?;
+        Ok(node)
     }
-}
-
-/// See [`Domain::prefix`].
-fn prefix(root: &Path) -> String {
-    let hash = fnv1a(FNV_BASIS, root.as_os_str().as_encoded_bytes());
-    format!("plantd{LAYOUT_VERSION}_{:08x}_", (hash >> 32) as u32 ^ hash as u32)
 }
 
 /// Wraps an error of iceoryx2.
@@ -287,9 +182,16 @@ pub struct LinkServices {
 }
 
 impl LinkNode {
-    /// Creates the services of a plant's link, or joins those that drivers have kept alive since
-    /// another server died.
+    /// The domain.
+    pub fn domain(&self) -> &Domain {
+        &self.domain
+    }
+
+    /// Claims the link of a plant, and creates its services or joins those that drivers have kept alive
+    /// since the link was closed. Drivers find it when it is [`published`](Self::publish).
     pub fn create_services(&self, plant: &str) -> Result<LinkServices, DomainError> {
+        check_plant_id(plant)?;
+        self.domain.root.write_link(plant, &self.domain.name, &[])?;
         Ok(LinkServices {
             input: self.create_direction(plant, "input", DRIVERS_MAX, 1)?,
             state: self.create_direction(plant, "state", 1, DRIVERS_MAX)?,
@@ -343,8 +245,10 @@ impl LinkNode {
         use publish_subscribe::PublishSubscribeOpenError as OpenError;
 
         let name = service_name(plant, direction)?;
-        let not_open =
-            || DomainError::NotOpen { plant: plant.to_owned(), root: self.domain.root.clone() };
+        let not_open = || DomainError::NotOpen {
+            plant: plant.to_owned(),
+            root: self.domain.root().to_owned(),
+        };
         let channel = self
             .node()
             .service_builder(&name)
@@ -367,13 +271,48 @@ impl LinkNode {
         Ok(Direction { channel, bell })
     }
 
-    /// Removes what dead members of the domain have left behind; takes milliseconds. Returns how
-    /// many were removed.
-    pub fn clean_up(&self) -> u64 {
+    /// Tells drivers that the link of a plant is open.
+    pub fn publish(&self, plant: &str) -> Result<(), DomainError> {
+        let Domain { root, name, .. } = &self.domain;
+        let others = root.other_links(plant, name);
+        let others: HashSet<_> = others.iter().flat_map(|link| &link.segments).collect();
+        let mut segments = segments::made_by(name, host_pid());
+        segments.retain(|own| segments::is_common(&own.0) || !others.contains(own));
+        root.write_link(plant, name, &segments)
+    }
+
+    /// Tells drivers that the link of a plant is not open, or no longer.
+    pub fn withdraw(&self, plant: &str) -> Result<(), DomainError> {
+        self.domain.root.remove_link(plant, &self.domain.name)
+    }
+
+    /// Whether the server of the domain lives.
+    pub fn is_served(&self) -> bool {
+        self.domain.root.is_served(&self.domain.name)
+    }
+
+    /// Whether the link of a plant is in the domain of another server now.
+    pub fn is_elsewhere(&self, plant: &str) -> bool {
+        let link = self.domain.root.read_link(plant);
+        link.is_ok_and(|link| link.is_some_and(|link| link.domain != self.domain.name))
+    }
+
+    /// Removes what dead members of the domain have left behind, and domains without living processes;
+    /// takes milliseconds. Returns how much was removed.
+    pub fn clean_up(&self, leftovers: &mut Leftovers) -> u64 {
+        let Domain { root, name, .. } = &self.domain;
+        let empty = segments::empty(name);
+        let mut living = root.members(name);
+        living.push(host_pid());
+        segments::remove_unfinished(name, &empty, &living);
         // The library may panic here when members come and go at the same time (eclipse-iceoryx
         // issue 1880); what was not removed is removed the next time.
-        catch_unwind(AssertUnwindSafe(|| self.node().try_cleanup_dead_nodes()))
-            .map_or(0, |state| state.cleanups)
+        let removed = catch_unwind(AssertUnwindSafe(|| self.node().try_cleanup_dead_nodes()))
+            .map_or(0, |state| state.cleanups);
+        let files = leftovers.remove(name, &root.directory(name), &living);
+        // What cannot be removed now is looked at again the next time.
+        let domains = root.remove_dead().unwrap_or(0);
+        removed + (files + domains) as u64
     }
 
     fn node(&self) -> &Node<ipc::Service> {
@@ -382,23 +321,30 @@ impl LinkNode {
 }
 
 impl Drop for LinkNode {
-    /// Leaving the domain cleans up after dead members too.
+    /// The last one to leave a domain without server removes it.
     fn drop(&mut self) {
         let node = self.node.take();
-        // A node that panicked while it was dropped is cleaned up by the next member that comes.
+        // What a node that panics while it is dropped leaves behind goes with the domain.
         let _ = catch_unwind(AssertUnwindSafe(move || drop(node)));
-        self.domain.remove_if_empty();
+        drop(self.domain.hold.take());
+        // Should it fail, the next server does it.
+        let _ = self.domain.root.remove_dead();
     }
 }
 
 /// `plantd/<layout version>/<plant>/<direction>`.
 fn service_name(plant: &str, direction: &str) -> Result<ServiceName, DomainError> {
+    check_plant_id(plant)?;
+    ServiceName::new(&format!("plantd/{LAYOUT_VERSION}/{plant}/{direction}"))
+        .map_err(transport("name of a service"))
+}
+
+fn check_plant_id(plant: &str) -> Result<(), DomainError> {
     let valid = |c: u8| c.is_ascii_lowercase() || c.is_ascii_digit() || c == b'-';
     if plant.is_empty() || plant.len() > 63 || !plant.bytes().all(valid) {
         return Err(DomainError::PlantId { plant: plant.to_owned() });
     }
-    ServiceName::new(&format!("plantd/{LAYOUT_VERSION}/{plant}/{direction}"))
-        .map_err(transport("name of a service"))
+    Ok(())
 }
 
 /// What both sides demand of a service, and the server defines when it creates one.
@@ -415,24 +361,7 @@ fn required_attributes() -> Result<AttributeVerifier, DomainError> {
 
 #[cfg(test)]
 mod tests {
-    use std::os::unix::fs::PermissionsExt;
-
     use super::*;
-
-    #[test]
-    fn the_root_path_must_be_private_absolute_and_short() {
-        let base = std::env::temp_dir().join(format!("plantd-domain-{}", std::process::id()));
-        let root = base.join("root");
-        let domain = Domain::create(&root).unwrap();
-        assert_eq!(domain.prefix().len(), PREFIX_LENGTH);
-        fs::set_permissions(&root, fs::Permissions::from_mode(0o755)).unwrap();
-        assert!(matches!(Domain::open(&root), Err(DomainError::RootNotPrivate { .. })));
-        fs::remove_dir_all(&base).unwrap();
-        assert!(matches!(Domain::open(&root), Err(DomainError::Root { .. })));
-        assert!(matches!(Domain::open(Path::new("here")), Err(DomainError::RootPath { .. })));
-        let long = PathBuf::from(format!("/{}", "x".repeat(ROOT_LENGTH_MAX)));
-        assert!(matches!(Domain::create(&long), Err(DomainError::RootPath { .. })));
-    }
 
     #[test]
     fn a_service_name_takes_only_a_plant_id() {

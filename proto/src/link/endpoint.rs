@@ -1,5 +1,6 @@
 //! One side of a link: its ports, and when to poll, sleep and notify.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{Ordering, fence};
 use std::time::Duration;
 
@@ -14,8 +15,8 @@ use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::port_factory::PortFactory as _;
 
-use super::domain::{Channel, Direction, DomainError, transport};
-use super::{Header, LinkServices, POLL_FOREVER_NS, ProcessIdentity, monotonic_ns};
+use super::domain::{Channel, Direction, transport};
+use super::{DomainError, Header, LinkServices, POLL_FOREVER_NS, ProcessIdentity, monotonic_ns};
 
 /// A received message.
 pub type Message = Sample<ipc::Service, [f64], Header>;
@@ -217,5 +218,20 @@ impl Endpoint {
             if found { CallbackProgression::Stop } else { CallbackProgression::Continue }
         });
         found
+    }
+
+    /// Closes the ports one by one: one that panics, as ports on segments that somebody has overwritten
+    /// may do, keeps neither the others open nor the caller from going on.
+    pub fn close(self) {
+        fn close<T>(port: T) {
+            let _ = catch_unwind(AssertUnwindSafe(move || drop(port)));
+        }
+        let Self { publisher, subscriber, notifier, listener, spare, incoming, .. } = self;
+        close(spare);
+        close(publisher);
+        close(notifier);
+        close(subscriber);
+        close(listener);
+        close(incoming);
     }
 }

@@ -151,10 +151,10 @@ pub const SCHEMA_HASH: u64 = {
 };
 
 /// Start value of 64-bit FNV-1a.
-pub(super) const FNV_BASIS: u64 = 0xcbf2_9ce4_8422_2325;
+const FNV_BASIS: u64 = 0xcbf2_9ce4_8422_2325;
 
 /// Continues a 64-bit FNV-1a hash.
-pub(super) const fn fnv1a(mut hash: u64, bytes: &[u8]) -> u64 {
+const fn fnv1a(mut hash: u64, bytes: &[u8]) -> u64 {
     let mut i = 0;
     while i < bytes.len() {
         hash = (hash ^ bytes[i] as u64).wrapping_mul(0x0000_0100_0000_01b3);

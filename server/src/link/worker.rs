@@ -1,5 +1,6 @@
 //! The thread of one link.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -7,7 +8,7 @@ use std::time::Duration;
 use iceoryx2::identifiers::UniquePublisherId;
 use plantd_models::{StepError, StepReport};
 use plantd_proto::link::{
-    Code, DomainError, Endpoint, Header, Holder, Kind, LIVE, LinkServices, Message,
+    Code, DomainError, Endpoint, Header, Holder, Kind, LIVE, LinkNode, LinkServices, Message,
     ProcessIdentity, monotonic_ns, random_instance,
 };
 
@@ -90,8 +91,6 @@ impl Worker {
             ..Header::new(Kind::State)
         };
         let endpoint = Endpoint::server(services, header.state_len() + OUTPUTS_MAX, config.wait)?;
-        session.set_link_open(true);
-        tracing::info!(plant = session.id(), "shared-memory link is open");
         Ok(Self {
             session,
             endpoint,
@@ -105,8 +104,23 @@ impl Worker {
         })
     }
 
+    /// Lets drivers find the link.
+    pub(super) fn publish(self, node: &LinkNode) -> Result<Self, DomainError> {
+        if let Err(error) = node.publish(self.plant()) {
+            self.endpoint.close();
+            return Err(error);
+        }
+        self.session.set_link_open(true);
+        tracing::info!(plant = self.plant(), "shared-memory link is open");
+        Ok(self)
+    }
+
+    pub(super) fn plant(&self) -> &str {
+        self.session.id()
+    }
+
     /// Serves drivers until the link is closed or the plant deleted.
-    pub(super) fn run(mut self) {
+    pub(super) fn run(&mut self) {
         while !self.stop.load(Ordering::Acquire) && !self.session.is_closed() {
             let outcome = match self.endpoint.receive(self.next_look_ns()) {
                 Ok(Some(message)) => self.handle(&message),
@@ -216,6 +230,8 @@ impl Worker {
 
     fn handle(&mut self, message: &Message) -> Result<(), DomainError> {
         let request = *message.user_header();
+        #[cfg(test)]
+        assert_ne!(request.kind, super::tests::PANIC, "as a test demands");
         if !request.is_of_this_layout() {
             return self.refuse(&request, Failure::new(Code::Layout));
         }
@@ -330,19 +346,24 @@ impl Worker {
         };
         self.endpoint.send(header, &[], request.poll_end_ns())
     }
-}
 
-impl Drop for Worker {
-    /// Tells all drivers that the link ends.
-    fn drop(&mut self) {
-        let is_deleted = self.session.is_closed();
-        let code = if is_deleted { Code::PlantDeleted } else { Code::LinkClosed };
+    /// Gives the lease back and tells all drivers that the link ends. Does not panic, whatever state the
+    /// ports are in.
+    pub(super) fn close(mut self) {
+        self.driver = None;
+        let code = match self.session.is_closed() {
+            true => Code::PlantDeleted,
+            false => Code::LinkClosed,
+        };
         let header = Header { kind: Kind::Closed as u32, code: code as u32, ..self.header };
-        if let Err(error) = self.endpoint.send(header, &[], 0) {
+        let send = || self.endpoint.send(header, &[], 0);
+        let sent = catch_unwind(AssertUnwindSafe(send));
+        if let Ok(Err(error)) = sent {
             tracing::debug!(plant = self.session.id(), %error, "shared-memory link, closing");
         }
         self.session.set_link_open(false);
         tracing::info!(plant = self.session.id(), "shared-memory link is closed");
+        self.endpoint.close();
     }
 }
 

@@ -73,7 +73,7 @@ impl Session {
             model: self.model_name.clone(),
             settings: Some(convert::settings_message(&base.settings)),
             state: Some(convert::state(&view.state, view.time_s)),
-            link_open: self.link_open(),
+            link_open: self.keeps_link(),
             feedback: feedback_info,
             accuracy: self.accuracy,
             parameters: convert::parameters(&base.parameters),

@@ -13,9 +13,14 @@ The layout and the conversation are described in ``client/c/plantd_link.h``.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import fcntl
 import os
+import re
 import secrets
+import shutil
+import stat
 import time
 from pathlib import Path
 
@@ -190,6 +195,7 @@ class LinkError(PlantdError):
     ``NOT_OPEN``: the plant has no open link. ``LEASE_HELD``: somebody else drives it. ``TIMEOUT``: no
     answer in time; a step may still be taken. ``SERVER_GONE``, ``SERVER_RESTARTED``, ``LEASE_LOST``,
     ``LINK_CLOSED``, ``PLANT_DELETED``: this connection has ended, make a new one.
+    ``ROOT_NOT_PRIVATE``, ``SEGMENT_NOT_PRIVATE``: files of the link are not this user's alone.
     """
 
 
@@ -309,7 +315,7 @@ class LinkDriver:
     def _connect(self, room: int, deadline_ns: int) -> None:
         self._driver = secrets.randbits(63) + 1
         self._server = 0
-        self._server_process = (0, 0)
+        self._server_pid = 0
         self._sequence = 0
         self._poll_end_ns = 0
         self._server_poll_end_ns = 0
@@ -324,9 +330,9 @@ class LinkDriver:
     def _open_ports(self, room: int, deadline_ns: int) -> None:
         iox2.set_log_level_from_env_or(iox2.LogLevel.Fatal)
         while True:
+            self._member = None
             try:
-                if not self._root.is_dir():
-                    raise _not_open(f"there is no server under {self._root}")
+                self._enter()
                 self._node = (
                     iox2.NodeBuilder.new()
                     .name(iox2.NodeName.new("plantd-driver-python"))
@@ -348,19 +354,44 @@ class LinkDriver:
                 )
                 return
             except LinkError as error:
+                self._leave_domain()
                 if error.reason != "NOT_OPEN" or time.monotonic_ns() >= deadline_ns:
                     raise
                 time.sleep(_LOOK_PERIOD_S)
 
+    def _enter(self) -> None:
+        """Finds the domain that the plant's link is in, becomes a member, and looks at its segments."""
+        _check_private(self._root)
+        link = _read_link(self._root, self._plant)
+        if link is None or not link[1] or not _is_locked(self._root / link[0]):
+            raise _not_open(f"plant `{self._plant}` has no open link under {self._root}")
+        self._domain, segments = link
+        path = self._root / self._domain / f"{_host_pid()}.member"
+        try:
+            while self._member is None:
+                member = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+                fcntl.flock(member, fcntl.LOCK_SH)
+                # It may have been removed between the two, as that of a process that has gone.
+                if path.exists() and os.path.samestat(os.fstat(member), os.stat(path)):
+                    self._member = member
+                else:
+                    os.close(member)
+        except FileNotFoundError:
+            raise _not_open(f"the server under {self._root} has ended") from None
+        _check_segments(segments)
+
     def _prefix(self) -> str:
         """Start of the name of every file of the domain."""
-        digest = _fnv1a(os.fsencode(self._root))
-        return f"plantd{LAYOUT_VERSION}_{(digest >> 32) ^ (digest & 0xFFFFFFFF):08x}_"
+        return f"plantd{LAYOUT_VERSION}_{self._domain}_"
 
     def _config(self) -> iox2.config.Config:
         config = iox2.config.default()
-        config.global_cfg.root_path = iox2.Path.new(str(self._root))
+        config.global_cfg.root_path = iox2.Path.new(str(self._root / self._domain))
         config.global_cfg.prefix = iox2.FileName.new(self._prefix())
+        # The server cleans up after dead drivers.
+        config.global_cfg.node.cleanup_dead_nodes_on_creation = False
+        config.global_cfg.node.cleanup_dead_nodes_on_destruction = False
+        config.global_cfg.service.cleanup_dead_nodes_on_open = False
         return config
 
     def _open_services(self, direction: str) -> tuple:
@@ -391,10 +422,26 @@ class LinkDriver:
             port.delete()
         del self._publisher, self._notifier, self._subscriber, self._listener
         del self._states, self._node
-        # The last one to leave removes the counter that numbers the members.
-        if not any((self._root / "nodes").glob("*.node_monitor")):
-            for counter in _SHARED_MEMORY.glob(f"{self._prefix()}*.global_mgmt"):
-                counter.unlink(missing_ok=True)
+        self._leave_domain()
+
+    def _leave_domain(self) -> None:
+        """Ends the membership; the last one to leave a domain without server removes it."""
+        if self._member is None:
+            return
+        os.close(self._member)
+        self._member = None
+        directory = self._root / self._domain
+        with contextlib.suppress(OSError):
+            root = os.open(self._root, os.O_RDONLY)
+            try:
+                fcntl.flock(root, fcntl.LOCK_EX)
+                members = directory.glob("*.member")
+                if not _is_locked(directory) and not any(map(_is_locked, members)):
+                    for segment in _SHARED_MEMORY.glob(f"{self._prefix()}*"):
+                        segment.unlink(missing_ok=True)
+                    shutil.rmtree(directory)
+            finally:
+                os.close(root)
 
     def _send(self, kind: int, u: Array, peer_poll_end_ns: int) -> None:
         sample = self._publisher.loan_slice_uninit(len(u))
@@ -450,13 +497,11 @@ class LinkDriver:
                 if header.kind != ATTACHED:
                     raise _error(header)
                 self._server = header.server
-                self._server_process = (header.pid, header.process_start)
-                self._is_server_visible = _process_start(header.pid) == header.process_start
+                self._server_pid = header.pid
                 self._note_state(header, payload)
                 return
             if time.monotonic_ns() >= deadline_ns:
                 raise _timeout("the server does not answer")
-            self._node.try_cleanup_dead_nodes()
 
     def _wait_for_answer(self, deadline_ns: int) -> State:
         while True:
@@ -464,8 +509,7 @@ class LinkDriver:
             while (message := self._receive(check_ns)) is not None:
                 header, payload = message
                 if header.server != self._server:
-                    message = "the server has restarted, or has reopened the link"
-                    raise LinkError("ABORTED", message, "SERVER_RESTARTED")
+                    raise _restarted()
                 if header.kind == CLOSED:
                     raise _error(header)
                 if header.driver != self._driver or header.sequence != self._sequence:
@@ -479,10 +523,12 @@ class LinkDriver:
 
     def _check_server(self) -> None:
         """Off the fast path: nothing has come for a while."""
-        pid, start = self._server_process
-        is_dead = self._is_server_visible and _process_start(pid) != start
-        self._node.try_cleanup_dead_nodes()
+        link = _read_link(self._root, self._plant)
+        if link is not None and link[0] != self._domain:
+            raise _restarted()
+        is_dead = not _is_locked(self._root / self._domain)
         if is_dead or self._states.dynamic_config.number_of_publishers == 0:
+            pid = self._server_pid
             raise LinkError("UNAVAILABLE", f"the server (process {pid}) is gone", "SERVER_GONE")
 
     def _note_state(self, header: Header, payload: Array) -> State:
@@ -525,6 +571,72 @@ def _process_start(pid: int) -> int | None:
     except OSError:
         return None
     return None if fields[0] in "ZXx" else int(fields[19])
+
+
+def _host_pid() -> int:
+    """Process id of this process in the outermost pid namespace that can be seen."""
+    found = re.search(r"^NSpid:\s*(\d+)", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return int(found[1]) if found else os.getpid()
+
+
+def _check_private(path: Path) -> None:
+    """A directory that others can write to would let them put their files under our names."""
+    try:
+        status = path.lstat()
+    except FileNotFoundError:
+        raise _not_open(f"there is no server under {path}") from None
+    if stat.S_ISLNK(status.st_mode):
+        raise LinkError("FAILED_PRECONDITION", f"{path} is a symbolic link", "ROOT_NOT_PRIVATE")
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        message = f"{path} must belong to user {os.getuid()} and be closed to others (mode 0700)"
+        raise LinkError("FAILED_PRECONDITION", message, "ROOT_NOT_PRIVATE")
+
+
+def _check_segments(expected: dict[str, int]) -> None:
+    """Segments of the link must be this user's alone, and as the server has made them."""
+    for name, size in expected.items():
+        path, found = _SHARED_MEMORY / name, 0
+        with contextlib.suppress(FileNotFoundError):
+            status = path.lstat()
+            found = status.st_size
+            is_private = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077
+            if not is_private or status.st_uid != os.getuid():
+                message = f"{path} must belong to user {os.getuid()} and be closed to others (mode 0600)"
+                raise LinkError("FAILED_PRECONDITION", message, "SEGMENT_NOT_PRIVATE")
+        if found != size:
+            raise _not_open(f"{path} has {found} bytes, not the {size} that the server has given it")
+
+
+def _read_link(root: Path, plant: str) -> tuple[str, dict[str, int]] | None:
+    """The domain that a plant's link is in, and sizes of segments: none until the link is open."""
+    try:
+        domain, *lines = (root / f"{plant}.link").read_text().splitlines()
+        if not re.fullmatch("[0-9a-f]{6}", domain):
+            return None
+        return domain, {name: int(size) for size, name in map(str.split, lines)}
+    except (OSError, ValueError):
+        return None
+
+
+def _is_locked(path: Path) -> bool:
+    """Whether a living process has locked a file or directory for itself or, of a member, shared."""
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        kind = fcntl.LOCK_SH if path.is_dir() else fcntl.LOCK_EX
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(file)
+    return False
+
+
+def _restarted() -> LinkError:
+    message = "the server has restarted, or has reopened the link"
+    return LinkError("ABORTED", message, "SERVER_RESTARTED")
 
 
 def _error(header: Header) -> PlantdError:

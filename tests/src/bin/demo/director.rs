@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use indicatif::ProgressBar;
-use plantd_proto::link::{Domain, SHARED_MEMORY_DIRECTORY};
 use plantd_tests::server::{ServerProcess, binary};
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -129,17 +128,10 @@ impl SharedMemory {
         self.directory.path().join("link")
     }
 
-    /// Names of what is left of the domain.
+    /// What is left under the root. The directory of a domain goes after its segments.
     fn residue(&self) -> Result<Vec<String>> {
-        let prefix = Domain::open(&self.root())?.prefix();
-        let mut names = Vec::new();
-        for entry in std::fs::read_dir(SHARED_MEMORY_DIRECTORY)? {
-            let name = entry?.file_name().to_string_lossy().into_owned();
-            if name.starts_with(&prefix) {
-                names.push(name);
-            }
-        }
-        Ok(names)
+        let entries = std::fs::read_dir(self.root())?;
+        entries.map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned())).collect()
     }
 }
 
@@ -149,7 +141,7 @@ fn clear(server: &mut ServerProcess, memory: &SharedMemory) -> Result<()> {
     ensure!(status.success(), "the server ended with {status}:\n{}", server.log());
     let residue = memory.residue()?;
     if !residue.is_empty() {
-        bail!("the server left in {SHARED_MEMORY_DIRECTORY}: {}", residue.join(", "));
+        bail!("the server left in {}: {}", memory.root().display(), residue.join(", "));
     }
     Ok(())
 }
