@@ -46,6 +46,22 @@ pub struct Settings {
     /// Prometheus metrics over HTTP; `off` for none.
     #[arg(long, env = "PLANTD_METRICS", value_name = "ADDRESS:PORT")]
     pub metrics: Option<Listen>,
+    /// Origin of pages that may call, such as `https://panel.example`; may be repeated.
+    #[arg(
+        long = "allow-origin",
+        env = "PLANTD_ALLOWED_ORIGINS",
+        value_name = "ORIGIN",
+        value_delimiter = ','
+    )]
+    pub allowed_origins: Vec<String>,
+    /// Host name under which the server may be called; may be repeated.
+    #[arg(
+        long = "allow-host",
+        env = "PLANTD_ALLOWED_HOSTS",
+        value_name = "NAME",
+        value_delimiter = ','
+    )]
+    pub allowed_hosts: Vec<String>,
     /// Shared-memory links.
     #[arg(long, env = "PLANTD_LINK")]
     pub link: Option<Switch>,
@@ -148,6 +164,8 @@ impl Settings {
         config.state_directory = self.state_directory.or(config.state_directory);
         config.recordings = self.recordings.or(config.recordings);
         config.ready_file = self.ready_file.or(config.ready_file);
+        config.allowed_origins.extend(self.allowed_origins);
+        config.allowed_hosts.extend(self.allowed_hosts);
         for (name, value) in &self.limits {
             config.limits.set(name, *value)?;
         }

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::{LimitError, Limits};
 use crate::link::LinkConfig;
+use crate::names::{Names, is_host_name, is_origin};
 use crate::priority::{Priority, Scheduling};
 use crate::realtime::RealTimeSettings;
 
@@ -31,6 +32,10 @@ pub struct Config {
     pub unix: Option<PathBuf>,
     /// Metrics at `http://address:port/metrics`, or `off`.
     pub metrics: Listen,
+    /// Origins of pages that may call, besides the server's own: `https://panel.example`.
+    pub allowed_origins: Vec<String>,
+    /// Host names under which it may be called, besides `localhost` and IP addresses.
+    pub allowed_hosts: Vec<String>,
     /// Directory of scenes (`*.toml`, `*.json`) to load as models at the start.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scenes: Option<PathBuf>,
@@ -75,6 +80,8 @@ impl Default for Config {
             grpc: Listen::At(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT))),
             unix: None,
             metrics: Listen::Off,
+            allowed_origins: Vec::new(),
+            allowed_hosts: Vec::new(),
             scenes: None,
             state_directory: None,
             state_interval_s: 2.0,
@@ -102,6 +109,13 @@ pub enum Listen {
     Off,
     /// At this address.
     At(SocketAddr),
+}
+
+impl Listen {
+    /// Others than this machine can connect.
+    pub fn is_beyond_loopback(self) -> bool {
+        matches!(self, Self::At(address) if !address.ip().to_canonical().is_loopback())
+    }
 }
 
 /// Not an address.
@@ -250,6 +264,16 @@ pub enum ConfigError {
         /// Largest value.
         high: u64,
     },
+    /// A name of `allowed_origins` or `allowed_hosts` is none.
+    #[error("`{key}` has `{value}`; it takes {what}")]
+    Name {
+        /// Key.
+        key: &'static str,
+        /// Value.
+        value: String,
+        /// What is allowed.
+        what: &'static str,
+    },
     /// A limit is unknown or out of range.
     #[error(transparent)]
     Limit(#[from] LimitError),
@@ -295,10 +319,29 @@ impl Config {
                 return Err(ConfigError::NotBetween { key, value, low, high });
             }
         }
+        self.check_names()?;
         if self.grpc == Listen::Off && self.unix.is_none() {
             return Err(ConfigError::Nowhere);
         }
         Ok(())
+    }
+
+    fn check_names(&self) -> Result<(), ConfigError> {
+        let wrong =
+            |key, value: &String, what| Err(ConfigError::Name { key, value: value.clone(), what });
+        if let Some(origin) = self.allowed_origins.iter().find(|text| !is_origin(text)) {
+            return wrong("allowed_origins", origin, "origins such as `https://panel.example`");
+        }
+        match self.allowed_hosts.iter().find(|text| !is_host_name(text)) {
+            Some(host) => wrong("allowed_hosts", host, "host names without port"),
+            None => Ok(()),
+        }
+    }
+
+    /// By which names the server may be called.
+    pub fn names(&self) -> Names {
+        let Self { allowed_hosts: hosts, allowed_origins: origins, grpc, .. } = self.clone();
+        Names { hosts, origins, any_host: grpc.is_beyond_loopback() }
     }
 
     /// Time for open calls to end at shutdown.
@@ -394,10 +437,22 @@ mod tests {
         assert!(config("shutdown_grace_s = nan").check().is_err());
         assert!(config("grpc = \"off\"").check().is_err());
         assert!(config("grpc = \"off\"\nunix = \"/s\"").check().is_ok());
+        assert!(config("allowed_hosts = [\"plants.lab\"]").check().is_ok());
+        assert!(config("allowed_hosts = [\"plants.lab:1\"]").check().is_err());
+        assert!(config("allowed_origins = [\"panel.example\"]").check().is_err());
         assert!(config("[limits]\nconnections = 0").check().is_err());
         assert!(config("[realtime]\nthreads = 0").check().is_err());
         assert!(config("[realtime]\nscheduling = { fifo = 100 }").check().is_err());
         assert!(config("[realtime]\nscheduling = { fifo = 80 }\nspin_us = 200").check().is_ok());
         assert!(toml::from_str::<Config>("grpc = \"localhost\"").is_err());
+    }
+    #[test]
+    fn programs_reach_a_server_beyond_loopback_by_any_name() {
+        for (grpc, any_host) in
+            [("127.0.0.1:1", false), ("[::1]:1", false), ("off", false), ("0.0.0.0:1", true)]
+        {
+            let config = Config { grpc: grpc.parse().unwrap(), ..Config::default() };
+            assert_eq!(config.names().any_host, any_host, "{grpc}");
+        }
     }
 }

@@ -10,6 +10,7 @@
 //!
 //! [`serve::run`] is the whole server; [`daemon`] makes a process of it.
 
+pub mod admission;
 pub mod catalog;
 pub mod channels;
 pub mod cli;
@@ -26,6 +27,7 @@ pub mod listen;
 mod memory;
 pub mod metrics;
 pub mod metrics_http;
+pub mod names;
 pub mod parameters;
 pub mod priority;
 pub mod realtime;

@@ -46,12 +46,20 @@ macro_rules! limits {
 }
 
 limits! {
-    /// Connections at a time; more wait to be accepted.
+    /// Connections at a time; silent and idle ones give way to newcomers, which otherwise wait.
     connections = 1024 in 1..=1_000_000;
+    /// Connections at a time from one other machine; beyond, its own silent and idle ones give way, or newcomers are closed.
+    connections_per_peer = 256 in 1..=1_000_000;
+    /// Seconds in which a connection must make its first request.
+    first_request_s = 20 in 1..=86_400;
     /// Streams and calls at a time on one connection; more wait in the client.
     streams_per_connection = 256 in 1..=1_000_000;
     /// Bytes of one message to the server.
     message_bytes = 16_777_216 in 4096..=1_073_741_824;
+    /// Bytes of messages to the server that are held until they are whole, together.
+    unfinished_message_bytes = 268_435_456 in 4096..=1_000_000_000_000;
+    /// Seconds for which a message that has begun may stand still, and in which it must come, with one more for each 64 KiB of it.
+    message_s = 20 in 1..=86_400;
     /// Bytes of a scene.
     scene_bytes = 4_194_304 in 64..=1_073_741_824;
     /// Frames, springs, inputs, forces, signals, constraints, coordinate settings or operating points of a scene, each.

@@ -1,19 +1,13 @@
-//! Listening sockets: TCP without delay, unix-domain, and a bound on connections.
+//! Listening sockets: TCP without delay, unix-domain.
 
 use std::io;
 use std::net::SocketAddr;
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
-use std::pin::Pin;
-use std::sync::Arc;
-use std::task::{Context, Poll};
 
-use futures::{Stream, StreamExt, stream};
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_stream::wrappers::UnixListenerStream;
-use tonic::transport::server::{Connected, TcpIncoming};
+use tonic::transport::server::TcpIncoming;
 
 use crate::grpc::KEEP_ALIVE_INTERVAL;
 
@@ -67,79 +61,9 @@ impl Drop for UnixSocket {
     }
 }
 
-/// Accepts connections only while there are permits.
-pub fn admit<S, IO>(
-    incoming: S,
-    permits: Arc<Semaphore>,
-) -> impl Stream<Item = io::Result<Admitted<IO>>>
-where
-    S: Stream<Item = io::Result<IO>> + Unpin,
-{
-    stream::unfold((incoming, permits), |(mut incoming, permits)| async {
-        // The semaphore is never closed.
-        let permit = Arc::clone(&permits).acquire_owned().await.ok()?;
-        let connection = incoming.next().await?;
-        let admitted = connection.map(|io| Admitted { io, _permit: permit });
-        Some((admitted, (incoming, permits)))
-    })
-}
-
-/// A connection that holds a permit.
-pub struct Admitted<IO> {
-    io: IO,
-    _permit: OwnedSemaphorePermit,
-}
-
-impl<IO: Connected> Connected for Admitted<IO> {
-    type ConnectInfo = IO::ConnectInfo;
-
-    fn connect_info(&self) -> Self::ConnectInfo {
-        self.io.connect_info()
-    }
-}
-
-impl<IO: AsyncRead + Unpin> AsyncRead for Admitted<IO> {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.io).poll_read(context, buffer)
-    }
-}
-
-impl<IO: AsyncWrite + Unpin> AsyncWrite for Admitted<IO> {
-    fn poll_write(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        bytes: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.io).poll_write(context, bytes)
-    }
-
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        slices: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.io).poll_write_vectored(context, slices)
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        self.io.is_write_vectored()
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.io).poll_flush(context)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.io).poll_shutdown(context)
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use futures::StreamExt as _;
     use tokio::net::TcpStream;
 
     use super::*;
@@ -164,19 +88,5 @@ mod tests {
         assert_eq!(error.kind(), io::ErrorKind::AddrInUse);
         drop(socket);
         assert!(!path.exists());
-    }
-
-    #[tokio::test]
-    async fn a_connection_waits_for_a_permit() {
-        let connections = stream::iter([1_u8, 2].map(|n| Ok(tokio_test_io(n))));
-        let mut admitted = Box::pin(admit(connections, Arc::new(Semaphore::new(1))));
-        let first = admitted.next().await.unwrap().unwrap();
-        assert!(futures::poll!(admitted.next()).is_pending());
-        drop(first);
-        assert!(admitted.next().await.unwrap().is_ok());
-    }
-
-    fn tokio_test_io(_: u8) -> tokio::io::DuplexStream {
-        tokio::io::duplex(1).0
     }
 }

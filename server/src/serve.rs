@@ -13,7 +13,6 @@ use plantd_models::Model;
 use plantd_proto::{FILE_DESCRIPTOR_SET, v1};
 use serde::Serialize;
 use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Server;
@@ -27,10 +26,12 @@ use v1::model_service_server::ModelServiceServer;
 use v1::plant_service_server::PlantServiceServer;
 use v1::recording_service_server::RecordingServiceServer;
 
+use crate::admission::Places;
 use crate::config::{Config, Listen};
 use crate::grpc::channels::ChannelService;
 use crate::grpc::control::ControlService;
 use crate::grpc::ending::Ending;
+use crate::grpc::gate::GateLayer;
 use crate::grpc::model::ModelService;
 use crate::grpc::observe::ObserveLayer;
 use crate::grpc::plant::PlantService;
@@ -39,7 +40,7 @@ use crate::grpc::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT};
 use crate::hub::Hub;
 use crate::limits::Limits;
 use crate::link::LinkHost;
-use crate::listen::{UnixSocket, admit, bind_tcp};
+use crate::listen::{UnixSocket, bind_tcp};
 use crate::record::Recordings;
 use crate::state::StateDirectory;
 use crate::{memory, metrics_http};
@@ -202,6 +203,7 @@ impl RunningServer {
             // A client whose machine is gone is found out; its lease ends.
             .http2_keepalive_interval(Some(KEEP_ALIVE_INTERVAL))
             .http2_keepalive_timeout(Some(KEEP_ALIVE_TIMEOUT))
+            .layer(GateLayer::new(self.config.names()))
             .layer(GrpcWebLayer::new())
             .layer(ObserveLayer::new(Arc::clone(&self.hub.metrics), limits.clone()))
             .add_service(
@@ -230,13 +232,12 @@ impl RunningServer {
     }
 
     async fn listen(&mut self, router: Router<Layers>) -> Result<()> {
-        let connections = Limits::size(self.hub.limits.connections).min(Semaphore::MAX_PERMITS);
-        let permits = Arc::new(Semaphore::new(connections));
+        let places = Arc::new(Places::new(&self.hub.limits));
         if let Listen::At(address) = self.config.grpc {
             let incoming = bind_tcp(address).with_context(|| format!("gRPC on {address}"))?;
             warn_beyond_loopback("gRPC", address);
             self.addresses.grpc = Some(format!("http://{}", incoming.local_addr()?));
-            let incoming = admit(incoming, Arc::clone(&permits));
+            let incoming = Arc::clone(&places).admit(incoming);
             let closing = self.closing.clone().cancelled_owned();
             self.listeners.spawn(router.clone().serve_with_incoming_shutdown(incoming, closing));
         }
@@ -247,7 +248,7 @@ impl RunningServer {
                 .with_context(|| format!("gRPC on socket {}", path.display()))?;
             self.addresses.unix = Some(format!("unix:{}", socket.path().display()));
             self.unix = Some(socket);
-            let incoming = admit(incoming, permits);
+            let incoming = places.admit(incoming);
             let closing = self.closing.clone().cancelled_owned();
             self.listeners.spawn(router.serve_with_incoming_shutdown(incoming, closing));
         }
@@ -258,7 +259,8 @@ impl RunningServer {
             warn_beyond_loopback("metrics", address);
             self.addresses.metrics = Some(format!("http://{}/metrics", listener.local_addr()?));
             let metrics = Arc::clone(&self.hub.metrics);
-            self.metrics = Some(tokio::spawn(metrics_http::serve(listener, metrics)));
+            let names = self.config.names().strict();
+            self.metrics = Some(tokio::spawn(metrics_http::serve(listener, metrics, names)));
         }
         Ok(())
     }
@@ -370,7 +372,7 @@ async fn save_once(hub: &Arc<Hub>) {
     }
 }
 
-type Layers = Stack<ObserveLayer, Stack<GrpcWebLayer, Identity>>;
+type Layers = Stack<ObserveLayer, Stack<GrpcWebLayer, Stack<GateLayer, Identity>>>;
 
 /// Loads every scene of a directory as a model under the scene's own name.
 fn load_scenes(hub: &Hub, directory: &Path) -> Result<()> {

@@ -38,6 +38,7 @@
 //! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
 //! | FAILED_PRECONDITION | `RECORDINGS_DISABLED` | PreconditionFailure | the server has no directory for recordings |
 //! | FAILED_PRECONDITION | `RECORDING_ACTIVE` | PreconditionFailure | the plant is being recorded, or the recording is in progress |
+//! | PERMISSION_DENIED | `FOREIGN_HOST`, `FOREIGN_ORIGIN` | | with HTTP status 403: the request comes from a page of a stranger, see [`crate::names`] |
 //! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::limits`] |
 //! | UNAVAILABLE | `SHUTTING_DOWN` | | the server ends; try again |
 //! | UNAVAILABLE | `LINK_FAILED` | | shared memory could not be set up |

@@ -8,6 +8,7 @@ mod derivatives;
 pub mod drive;
 pub mod ending;
 pub(crate) mod feedback;
+pub mod gate;
 mod kalman;
 pub mod model;
 pub mod observe;
@@ -18,6 +19,7 @@ mod reference;
 mod rollout;
 pub(crate) mod run;
 mod settle;
+mod unfinished;
 pub mod watch;
 
 use std::pin::Pin;

@@ -1,5 +1,6 @@
-//! A layer around all services: counts calls by method and code, and gives the one error that tonic
-//! itself makes of a request, an oversized message, its documented code and details.
+//! A layer around all services: counts calls by method and code, keeps the places of connections with
+//! open calls, bounds what unfinished messages take, and gives the one error that tonic itself makes
+//! of a request, an oversized message, its documented code and details.
 
 use std::collections::HashSet;
 use std::pin::Pin;
@@ -16,6 +17,8 @@ use tonic::codegen::http::{HeaderMap, Request, Response};
 use tonic::{Code, Status};
 use tower::{Layer, Service};
 
+use super::unfinished::Budget;
+use crate::admission::{OpenCall, Place};
 use crate::limits::{LimitExceeded, Limits};
 use crate::metrics::Metrics;
 use crate::status::Fault;
@@ -60,12 +63,14 @@ pub(super) fn with_limit_details(status: Status, limits: &Limits) -> Status {
 pub struct ObserveLayer {
     metrics: Arc<Metrics>,
     limits: Arc<Limits>,
+    unfinished: Arc<Budget>,
 }
 
 impl ObserveLayer {
     /// A layer that counts into `metrics`.
     pub fn new(metrics: Arc<Metrics>, limits: Limits) -> Self {
-        Self { metrics, limits: Arc::new(limits) }
+        let unfinished = Arc::new(Budget::new(&limits));
+        Self { metrics, limits: Arc::new(limits), unfinished }
     }
 }
 
@@ -102,9 +107,10 @@ where
             metrics: Arc::clone(&self.layer.metrics),
             method: method_label(request.uri().path()),
             code: None,
+            _open: request.extensions().get::<Arc<Place>>().cloned().map(Place::call),
         };
         let limits = Arc::clone(&self.layer.limits);
-        let response = self.inner.call(request);
+        let response = self.inner.call(request.map(|body| self.layer.unfinished.follow(body)));
         Box::pin(async move {
             let mut response = response.await?;
             if let Some(status) = Status::from_header_map(response.headers()) {
@@ -123,6 +129,8 @@ struct Call {
     metrics: Arc<Metrics>,
     method: &'static str,
     code: Option<Code>,
+    /// Keeps its connection's place.
+    _open: Option<OpenCall>,
 }
 
 impl Call {

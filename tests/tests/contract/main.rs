@@ -18,6 +18,7 @@ mod realtime;
 mod refusals;
 mod rest;
 mod running;
+mod strangers;
 mod support;
 mod transport;
 mod watch;
