@@ -84,7 +84,6 @@ pub enum LinkError {
 /// All links of a server.
 pub struct LinkHost {
     config: LinkConfig,
-    node: Arc<LinkNode>,
     state: Mutex<State>,
 }
 
@@ -92,6 +91,8 @@ struct State {
     links: HashMap<String, Thread>,
     /// Cleans up; gone after the shutdown.
     housekeeper: Option<Thread>,
+    /// Membership of the domain; gone after the shutdown, and the domain with it.
+    node: Option<Arc<LinkNode>>,
 }
 
 /// A running thread that ends soon after it is told so.
@@ -108,8 +109,8 @@ impl LinkHost {
         domain.check_shared_memory(0)?;
         let node = Arc::new(domain.found("plantd")?);
         let housekeeper = Some(start_housekeeper(Arc::clone(&node), config.clean_up_period)?);
-        let state = Mutex::new(State { links: HashMap::new(), housekeeper });
-        Ok(Self { config, node, state })
+        let state = State { links: HashMap::new(), housekeeper, node: Some(node) };
+        Ok(Self { config, state: Mutex::new(state) })
     }
 
     /// Opens the link of a plant; one that is open stays open. Blocks for tens of milliseconds.
@@ -117,19 +118,19 @@ impl LinkHost {
         let plant = session.id().to_owned();
         let info = LinkInfo {
             service: format!("plantd/{LAYOUT_VERSION}/{plant}"),
-            root: self.node.domain().root().to_owned(),
+            root: self.config.root.clone(),
             layout_version: LAYOUT_VERSION,
         };
         let mut state = self.state();
-        if state.housekeeper.is_none() || session.is_closed() {
+        let Some(node) = state.node.clone().filter(|_| !session.is_closed()) else {
             return Err(LinkError::Closing { plant });
-        }
+        };
         if !session.link_open() || !state.links.contains_key(&plant) {
             // The thread of one that has failed may not have ended yet.
             if let Some(link) = state.links.remove(&plant) {
                 link.stop();
             }
-            let link = self.start_worker(session)?;
+            let link = self.start_worker(session, &node)?;
             state.links.insert(plant, link);
         }
         Ok(info)
@@ -143,11 +144,12 @@ impl LinkHost {
         }
     }
 
-    /// Closes all links and ends the housekeeping. Blocks for a fraction of a second.
+    /// Closes all links, ends the housekeeping and leaves the domain. Blocks for a fraction of a second.
     pub fn shutdown(&self) {
-        let (links, housekeeper) = {
+        // Declared first and so dropped last: the domain is left when all threads have ended.
+        let (_node, links, housekeeper) = {
             let mut state = self.state();
-            (std::mem::take(&mut state.links), state.housekeeper.take())
+            (state.node.take(), std::mem::take(&mut state.links), state.housekeeper.take())
         };
         let threads: Vec<Thread> = links.into_values().chain(housekeeper).collect();
         for thread in &threads {
@@ -164,27 +166,35 @@ impl LinkHost {
     }
 
     /// Starts the thread of a link and waits until drivers can find it.
-    fn start_worker(&self, session: Arc<Session>) -> Result<Thread, LinkError> {
+    fn start_worker(
+        &self,
+        session: Arc<Session>,
+        node: &Arc<LinkNode>,
+    ) -> Result<Thread, LinkError> {
         let plant = session.id().to_owned();
         let state_len = 3 * (session.model().dimensions().state() + OUTPUTS_MAX);
-        self.node.domain().check_shared_memory(state_len)?;
-        let started = self.spawn_worker(session);
+        node.domain().check_shared_memory(state_len)?;
+        let started = self.spawn_worker(session, node);
         if started.is_err()
-            && let Err(error) = self.node.withdraw(&plant)
+            && let Err(error) = node.withdraw(&plant)
         {
             tracing::debug!(plant, %error, "shared-memory link, not opened");
         }
         started
     }
 
-    fn spawn_worker(&self, session: Arc<Session>) -> Result<Thread, LinkError> {
+    fn spawn_worker(
+        &self,
+        session: Arc<Session>,
+        node: &Arc<LinkNode>,
+    ) -> Result<Thread, LinkError> {
         let plant = session.id().to_owned();
-        let services = self.node.create_services(&plant)?;
+        let services = node.create_services(&plant)?;
         let stop = Arc::new(AtomicBool::new(false));
         let (report, reported) = mpsc::sync_channel(1);
         let handle = {
             let (config, stop) = (self.config.clone(), Arc::clone(&stop));
-            let node = Arc::clone(&self.node);
+            let node = Arc::clone(node);
             std::thread::Builder::new().name(format!("link-{plant}")).spawn(move || {
                 let made = || Worker::new(session, services, &config, stop);
                 let made = catch_unwind(AssertUnwindSafe(made));

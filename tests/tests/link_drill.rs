@@ -258,7 +258,10 @@ async fn a_driver_names_a_segment_that_was_cut_off_and_does_not_hang() {
         }
     }
     assert_open(&server.client().await).await;
+    // The next one removes what is left of it.
     server.kill().unwrap();
+    assert!(house.serve().stop().unwrap().success());
+    assert_eq!(house.files(), Vec::<PathBuf>::new());
 }
 
 /// What a dead server has left, whatever became of it, is in nobody's way.

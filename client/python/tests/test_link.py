@@ -140,6 +140,11 @@ def serve(tmp_path_factory):
         for server in servers:
             server.kill()
             server.wait()
+        # The next one removes what is left of them.
+        server, _, _ = serve()
+        server.terminate()
+        assert server.wait(30) == 0
+        assert not list(root.iterdir())
 
 
 def test_a_driver_finds_the_next_server_and_the_last_one_to_leave_removes_what_is_left(serve):
