@@ -156,9 +156,11 @@ fn check_method(settings: &Settings, model: &Model, limits: &Limits) -> Result<(
     Ok(())
 }
 
-/// Coordinates that a control period moves, over its steps and stages: its time goes with them.
-pub fn period_work(settings: &Settings, d: Dimensions) -> usize {
-    d.coordinates() * settings.substeps as usize * (settings.order as usize - 1)
+/// About how many instructions a control period takes whose steps would take `step` of them at order 2:
+/// at worst the stages of a higher order are solved together.
+pub fn period_instructions(step: f64, settings: &Settings) -> f64 {
+    let stages = f64::from(settings.order) / 2.0;
+    step * f64::from(settings.substeps) * stages.powi(3)
 }
 
 /// What output channels deliver, if there are any; flags are 1 where numbers stand for lost ones.

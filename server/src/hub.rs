@@ -37,6 +37,9 @@ pub struct Hub {
     /// Workers for what belongs to the running of plants, at the usual priority: long computations do
     /// not keep it waiting.
     pub attendants: Workers,
+    /// Workers for steps in lockstep that take long, alone or together: the attendants stay free for
+    /// others.
+    pub steppers: Workers,
     /// Models.
     pub catalog: Catalog,
     /// Permits to hold a trajectory's regulator, filter or optimisation in memory.
@@ -69,14 +72,11 @@ impl Hub {
     ) -> Self {
         let metrics = Arc::new(Metrics::default());
         let realtime = RealTime::new(realtime, &metrics);
+        let usual = |name| Workers::new(name, worker_count, limits.queued_jobs, Priority::Normal);
         Self {
             workers: Workers::new("worker", worker_count, limits.queued_jobs, priority),
-            attendants: Workers::new(
-                "attendant",
-                worker_count,
-                limits.queued_jobs,
-                Priority::Normal,
-            ),
+            attendants: usual("attendant"),
+            steppers: usual("stepper"),
             catalog: Catalog::new(limits.models, Arc::clone(&metrics)),
             trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
             feedback_room: Room::new(

@@ -29,6 +29,7 @@ pub mod metrics;
 pub mod metrics_http;
 pub mod names;
 pub mod parameters;
+pub mod peer;
 pub mod priority;
 pub mod realtime;
 pub mod record;

@@ -68,6 +68,8 @@ pub struct Session {
     model_name: String,
     /// The model at the time of creation; later ones differ from it in numbers only.
     model: Arc<Model>,
+    /// About how many instructions a step of order 2 takes.
+    step_instructions: f64,
     start: Snapshot,
     start_state: State,
     start_settings: Settings,
@@ -130,6 +132,7 @@ impl Session {
             start_state: plant.state(),
             start_settings: *plant.settings(),
             accuracy,
+            step_instructions: step_instructions(plant.model()),
             model: Arc::clone(plant.model()),
             place: Mutex::new(Place::Rest(Box::new(Core::new(plant, Arc::clone(&events))))),
             run: Mutex::new(Run { is_running: true, ..Run::default() }),
@@ -172,6 +175,11 @@ impl Session {
     /// names and sizes.
     pub fn model(&self) -> &Arc<Model> {
         &self.model
+    }
+
+    /// About how many instructions a step of order 2 takes.
+    pub fn step_instructions(&self) -> f64 {
+        self.step_instructions
     }
 
     /// What was promised when the method was chosen by a tolerance.
@@ -433,6 +441,10 @@ impl Session {
         let ring = Arc::new(Ring::new(RING_RECORDS, record_words(self.model.dimensions())));
         self.with_core(move |core| core.ring_or(ring))
     }
+}
+
+fn step_instructions(model: &Model) -> f64 {
+    model.stage_costs().iter().map(|stage| stage.times * stage.instructions).sum()
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

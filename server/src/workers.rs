@@ -3,21 +3,27 @@
 //! more.
 //!
 //! ```text
-//!  run, resume ──► queue: first come, first served ──► turns, `count` of them ──► threads
-//!                    ▲                                   │
-//!                    └── a job that has had its time ◄───┘
+//!  start ──► queue: peers and lanes take turns ──► turns, `count` of them ──► threads
+//!              ▲                                     │
+//!              └──── a job that has had its time ◄───┘
 //! ```
 //!
 //! Whoever computes has a turn. A job that asks [`Abandoned::check`] now and then, as every long one
 //! must, gives its turn to the next in the queue when it has had it for 20 ms, and queues again: however
-//! many long computations there are, a short one waits for no more than one such time for each job
+//! many long computations there are, a short one waits for no more than one such time for each peer
 //! before it. What a job has begun stays on the stack of its thread meanwhile; there are a few more
-//! threads than turns for that.
+//! threads than turns for that. A job in parts ([`Workers::in_parts`]) keeps no thread.
+//!
+//! A job that keeps its turn for longer, because it waits for a plant or cannot be interrupted, keeps it
+//! from its own peer alone: others get a turn besides, and the system shares the processors out.
 //!
 //! Threads have the priority of their pool ([`crate::priority`]), and so have the threads that a job
 //! starts.
 
-use std::collections::VecDeque;
+mod queue;
+
+use std::cell::Cell;
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -27,15 +33,25 @@ use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 
+pub(crate) use self::queue::Lane;
+use self::queue::{Baton, May, Queue, Ticket};
 use crate::limits::LimitExceeded;
+use crate::peer::Peer;
 use crate::priority::Priority;
 use crate::status::Fault;
 
 /// How long a job keeps its turn while others wait for one.
 const TURN: Duration = Duration::from_millis(20);
 
+/// After how long a turn that is not passed on is no longer counted for others; also how often whoever
+/// waits looks for such turns.
+const TURN_OVERDUE: Duration = Duration::from_millis(40);
+
 /// Threads for each turn, at most: those that wait for their next turn included.
-const THREADS_PER_TURN: usize = 8;
+const THREADS_PER_TURN: usize = 32;
+
+/// The same of the jobs of one peer.
+const PEER_THREADS_PER_TURN: usize = 8;
 
 /// Runs a long computation, or a wait, on this thread, while the runtime that it may belong to moves its
 /// other tasks to another one.
@@ -50,7 +66,8 @@ pub(crate) fn beside_other_tasks<R>(compute: impl FnOnce() -> R) -> R {
 pub struct Abandoned {
     token: CancellationToken,
     pool: Arc<Pool>,
-    turn_began: std::cell::Cell<Instant>,
+    id: u64,
+    turn_began: Cell<Instant>,
 }
 
 impl fmt::Debug for Abandoned {
@@ -63,14 +80,27 @@ impl Abandoned {
     /// Nobody waits for the result; a long job asks this every few milliseconds and ends early. May
     /// wait until other jobs have had their turn: ask it without holding a lock.
     pub fn check(&self) -> Result<(), Fault> {
-        if self.token.is_cancelled() {
-            return Err(Fault::cancelled());
-        }
+        self.check_caller()?;
         if self.turn_began.get().elapsed() >= TURN {
-            self.pool.pass_on();
+            self.pool.pass_on(self.id);
             self.turn_began.set(Instant::now());
         }
         Ok(())
+    }
+
+    /// For a job in parts: true when this part has taken its time and others wait, an error when nobody
+    /// waits for the result. Waits for nothing.
+    pub fn part_is_over(&self) -> Result<bool, Fault> {
+        self.check_caller()?;
+        if self.turn_began.get().elapsed() < TURN {
+            return Ok(false);
+        }
+        self.turn_began.set(Instant::now());
+        Ok(self.pool.keep_turn(self.id))
+    }
+
+    fn check_caller(&self) -> Result<(), Fault> {
+        if self.token.is_cancelled() { Err(Fault::cancelled()) } else { Ok(()) }
     }
 }
 
@@ -107,7 +137,7 @@ impl Workers {
         &self,
         job: impl FnOnce(&Abandoned) -> Result<T, Fault> + Send + 'static,
     ) -> Result<T, Fault> {
-        self.start(Admission::Bounded, job).await
+        self.start(Admission::Bounded, Lane::Short, job).await
     }
 
     /// Runs the next part of a stream that was admitted: waits however long the queue is. The limit
@@ -116,27 +146,53 @@ impl Workers {
         &self,
         job: impl FnOnce(&Abandoned) -> Result<T, Fault> + Send + 'static,
     ) -> Result<T, Fault> {
-        self.start(Admission::Granted, job).await
+        self.start(Admission::Granted, Lane::Short, job).await
     }
 
-    async fn start<T: Send + 'static>(
+    /// Runs a long job part by part: `part` returns nothing when there is more to do and
+    /// [`Abandoned::part_is_over`]. Between two parts it keeps neither a turn nor a thread.
+    pub(crate) async fn in_parts<T: Send + 'static>(
         &self,
         admission: Admission,
+        part: impl FnMut(&Abandoned) -> Result<Option<T>, Fault> + Send + 'static,
+    ) -> Result<T, Fault> {
+        let (mut admission, mut next) = (admission, part);
+        loop {
+            let mut part = next;
+            let job = move |abandoned: &Abandoned| Ok((part(abandoned)?, part));
+            let (outcome, rest) = self.start(admission, Lane::Long, job).await?;
+            if let Some(outcome) = outcome {
+                return Ok(outcome);
+            }
+            (admission, next) = (Admission::Granted, rest);
+        }
+    }
+
+    /// Runs a job that waits in a lane.
+    pub(crate) async fn start<T: Send + 'static>(
+        &self,
+        admission: Admission,
+        lane: Lane,
         job: impl FnOnce(&Abandoned) -> Result<T, Fault> + Send + 'static,
     ) -> Result<T, Fault> {
         let token = CancellationToken::new();
-        let (sender, receiver) = oneshot::channel();
+        let (sender, mut receiver) = oneshot::channel();
         let work = {
             let (token, pool) = (token.clone(), Arc::clone(&self.pool));
-            Box::new(move || {
-                let turn_began = std::cell::Cell::new(Instant::now());
+            Box::new(move |id| {
+                let turn_began = Cell::new(Instant::now());
                 // Nobody may wait any more.
-                let _ = sender.send(job(&Abandoned { token, pool, turn_began }));
+                let _ = sender.send(job(&Abandoned { token, pool, id, turn_began }));
             })
         };
-        let id = self.pool.submit(admission, work)?;
+        let id = self.pool.submit(admission, lane, work)?;
         let mut caller = Caller { pool: &self.pool, id, token, waits: true };
-        let outcome = receiver.await;
+        let outcome = loop {
+            match tokio::time::timeout(TURN_OVERDUE, &mut receiver).await {
+                Ok(outcome) => break outcome,
+                Err(_) => self.pool.look_after(),
+            }
+        };
         caller.waits = false;
         outcome.unwrap_or_else(|_| {
             tracing::error!("a computation broke off");
@@ -145,10 +201,12 @@ impl Workers {
     }
 }
 
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Admission {
+/// Whether a job counts against the limit of those that wait.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Admission {
     /// Refused when the queue is full.
     Bounded,
+    /// Part of something that was admitted.
     Granted,
 }
 
@@ -179,7 +237,8 @@ impl Drop for End {
     }
 }
 
-type Work = Box<dyn FnOnce() + Send>;
+/// A job, told its number.
+type Work = Box<dyn FnOnce(u64) + Send>;
 
 struct Pool {
     name: &'static str,
@@ -194,39 +253,47 @@ struct Pool {
 #[derive(Default)]
 struct State {
     /// What waits for a turn.
-    queue: VecDeque<Ticket>,
+    queue: Queue,
+    /// Jobs that have begun and not ended, by number.
+    begun: BTreeMap<u64, Begun>,
     /// What has a turn, and waits for a thread.
-    granted: VecDeque<Work>,
-    /// Turns that are taken.
-    taken: usize,
+    granted: VecDeque<(u64, Work)>,
     threads: usize,
     idle: usize,
     last_id: u64,
+    last_look: Option<Instant>,
     is_ending: bool,
 }
 
-enum Ticket {
-    Begin { id: u64, admission: Admission, work: Work },
-    GoOn(Arc<Baton>),
+struct Begun {
+    peer: Peer,
+    /// Since when it has its turn; none while it waits for the next one.
+    turn: Option<Instant>,
 }
 
-/// What a thread waits for that has passed its turn on.
-#[derive(Default)]
-struct Baton {
-    is_here: Mutex<bool>,
-    arrived: Condvar,
-}
-
-impl Baton {
-    fn pass(&self) {
-        *lock(&self.is_here) = true;
-        self.arrived.notify_one();
+impl State {
+    /// The next in the queue for whom there is a turn.
+    fn next(&mut self, pool: &Pool) -> Option<(Peer, Ticket)> {
+        let Self { queue, begun, granted, threads, idle, .. } = self;
+        let has_thread = *idle > granted.len() || *threads < THREADS_PER_TURN * pool.count;
+        let now = Instant::now();
+        queue.pop(|peer| {
+            let is_counted = |job: &&Begun| {
+                let is_new = |since: Instant| now.duration_since(since) < TURN_OVERDUE;
+                job.turn.is_some_and(|since| job.peer == peer || is_new(since))
+            };
+            if begun.values().filter(is_counted).count() >= pool.count {
+                return May::Nothing;
+            }
+            let held = begun.values().filter(|job| job.peer == peer).count();
+            let may_begin = has_thread && held < PEER_THREADS_PER_TURN * pool.count;
+            if may_begin { May::Begin } else { May::GoOn }
+        })
     }
 
-    fn wait(&self) {
-        let mut is_here = lock(&self.is_here);
-        while !*is_here {
-            is_here = self.arrived.wait(is_here).unwrap_or_else(PoisonError::into_inner);
+    fn set_turn(&mut self, id: u64, turn: Option<Instant>) {
+        if let Some(job) = self.begun.get_mut(&id) {
+            job.turn = turn;
         }
     }
 }
@@ -236,41 +303,67 @@ impl Pool {
         lock(&self.state)
     }
 
-    /// Queues work, or begins it at once; returns its number.
-    fn submit(self: &Arc<Self>, admission: Admission, work: Work) -> Result<u64, Fault> {
+    /// Queues work, or begins it at once; returns its number. However long the queue is, each peer may have
+    /// one job in it.
+    fn submit(
+        self: &Arc<Self>,
+        admission: Admission,
+        lane: Lane,
+        work: Work,
+    ) -> Result<u64, Fault> {
+        let peer = Peer::current();
         let mut state = self.state();
         state.last_id += 1;
         let id = state.last_id;
-        if state.taken < self.count {
-            state.taken += 1;
-            self.grant(&mut state, work);
-            return Ok(id);
-        }
-        if admission == Admission::Bounded {
-            let is_bounded = |ticket: &&Ticket| {
-                matches!(ticket, Ticket::Begin { admission: Admission::Bounded, .. })
-            };
-            let waiting = state.queue.iter().filter(is_bounded).count() + 1;
+        state.queue.push(lane, peer, Ticket::Begin { id, admission, work });
+        self.hand_out(&mut state);
+        if admission == Admission::Bounded && state.queue.holds(id) {
+            let (of_peer, of_all) = state.queue.counted(peer);
             let (name, what) = ("queued_jobs", "jobs wait for a worker");
-            LimitExceeded::check(name, self.queued_jobs, what, waiting)?;
+            let is_within = LimitExceeded::check(name, self.queued_jobs, what, of_all);
+            if let Err(error) = is_within
+                && of_peer > 1
+            {
+                let refused = state.queue.remove(id);
+                drop(state);
+                drop(refused);
+                return Err(error.into());
+            }
         }
-        state.queue.push_back(Ticket::Begin { id, admission, work });
         Ok(id)
     }
 
     /// Takes work that has not begun out of the queue.
     fn withdraw(&self, id: u64) {
-        let mut state = self.state();
-        let is_it = |ticket: &Ticket| matches!(ticket, Ticket::Begin { id: i, .. } if *i == id);
-        let ticket = state.queue.iter().position(is_it).and_then(|i| state.queue.remove(i));
-        drop(state);
+        let ticket = self.state().queue.remove(id);
         // What the job holds is dropped without the lock.
         drop(ticket);
     }
 
-    /// Gives work that has a turn to a thread.
-    fn grant(self: &Arc<Self>, state: &mut State, work: Work) {
-        state.granted.push_back(work);
+    /// Hands turns out as long as there are some for those who wait.
+    fn hand_out(self: &Arc<Self>, state: &mut State) {
+        while let Some((peer, ticket)) = state.next(self) {
+            self.give_turn(state, peer, ticket);
+        }
+    }
+
+    fn give_turn(self: &Arc<Self>, state: &mut State, peer: Peer, ticket: Ticket) {
+        let turn = Some(Instant::now());
+        match ticket {
+            Ticket::GoOn { id, baton } => {
+                state.set_turn(id, turn);
+                baton.pass();
+            }
+            Ticket::Begin { id, work, .. } => {
+                state.begun.insert(id, Begun { peer, turn });
+                state.granted.push_back((id, work));
+                self.find_thread(state);
+            }
+        }
+    }
+
+    /// Finds a thread for the work that was granted last.
+    fn find_thread(self: &Arc<Self>, state: &mut State) {
         if state.idle >= state.granted.len() {
             self.granted.notify_one();
             return;
@@ -284,49 +377,60 @@ impl Pool {
         }
     }
 
-    /// Hands a turn that has become free to the next in the queue.
-    fn hand_on(self: &Arc<Self>, state: &mut State) {
-        match state.queue.pop_front() {
-            None => state.taken -= 1,
-            Some(Ticket::GoOn(baton)) => baton.pass(),
-            Some(Ticket::Begin { work, .. }) => self.grant(state, work),
+    /// Somebody waits: turns that are overdue may make room for it. Asked by many, done now and then.
+    fn look_after(self: &Arc<Self>) {
+        let mut state = self.state();
+        let now = Instant::now();
+        if state.last_look.is_none_or(|last| now.duration_since(last) >= TURN) {
+            state.last_look = Some(now);
+            self.hand_out(&mut state);
         }
     }
 
-    /// Lets the next in the queue compute, and waits for another turn. Returns at once when nobody
-    /// waits, or when there is no thread for what waits.
-    fn pass_on(self: &Arc<Self>) {
+    /// Lets the next in the queue compute, and waits for another turn. Returns at once when there is
+    /// nobody, or no thread, to go on instead.
+    fn pass_on(self: &Arc<Self>, id: u64) {
         let mut state = self.state();
-        let may_pass = match state.queue.front() {
-            None => false,
-            Some(Ticket::GoOn(_)) => true,
-            Some(Ticket::Begin { .. }) => {
-                state.idle > state.granted.len() || state.threads < THREADS_PER_TURN * self.count
-            }
-        };
-        if !may_pass {
+        state.set_turn(id, None);
+        let Some((peer, ticket)) = state.next(self) else {
+            state.set_turn(id, Some(Instant::now()));
             return;
-        }
+        };
         let baton = Arc::new(Baton::default());
-        state.queue.push_back(Ticket::GoOn(Arc::clone(&baton)));
-        self.hand_on(&mut state);
+        let own = Ticket::GoOn { id, baton: Arc::clone(&baton) };
+        let own_peer = state.begun.get(&id).map(|job| job.peer).unwrap_or_default();
+        state.queue.push(Lane::Long, own_peer, own);
+        self.give_turn(&mut state, peer, ticket);
+        self.hand_out(&mut state);
         drop(state);
         baton.wait();
+    }
+
+    /// True when somebody waits for a turn; else a job in parts begins another part.
+    fn keep_turn(&self, id: u64) -> bool {
+        let mut state = self.state();
+        let waits = !state.queue.is_empty();
+        if !waits {
+            state.set_turn(id, Some(Instant::now()));
+        }
+        waits
     }
 
     /// What a thread does.
     fn serve(self: Arc<Self>) {
         self.priority.apply(self.name);
-        while let Some(work) = self.next_work() {
+        while let Some((id, work)) = self.next_work() {
             // The sender of a result that a panic has dropped tells the caller.
-            let _ = catch_unwind(AssertUnwindSafe(work));
-            self.hand_on(&mut self.state());
+            let _ = catch_unwind(AssertUnwindSafe(|| work(id)));
+            let mut state = self.state();
+            state.begun.remove(&id);
+            self.hand_out(&mut state);
         }
         self.state().threads -= 1;
     }
 
     /// Work that has a turn; none when the thread is not needed any more.
-    fn next_work(&self) -> Option<Work> {
+    fn next_work(&self) -> Option<(u64, Work)> {
         let mut state = self.state();
         loop {
             if let Some(work) = state.granted.pop_front() {
@@ -458,12 +562,13 @@ mod tests {
         for _ in 0..3 {
             workers.run(|_| Ok(())).await.unwrap();
         }
-        assert_eq!(workers.pool.state().taken, 2, "no more at a time than turns");
+        let running = |state: &State| state.begun.values().filter(|job| job.turn.is_some()).count();
+        assert!(running(&workers.pool.state()) <= 2, "no more at a time than turns");
         stop.store(true, Ordering::Release);
         for job in jobs {
             job.await.unwrap().unwrap();
         }
-        assert_eq!(workers.pool.state().queue.len(), 0);
+        assert!(workers.pool.state().queue.is_empty());
     }
 
     /// With more long jobs than threads, those that have begun keep on, and all end.
@@ -477,11 +582,11 @@ mod tests {
                 tokio::spawn(async move { workers.run(work).await })
             })
             .collect();
-        while workers.pool.state().threads < THREADS_PER_TURN {
+        while workers.pool.state().threads < PEER_THREADS_PER_TURN {
             tokio::task::yield_now().await;
         }
         tokio::time::sleep(3 * TURN).await;
-        assert_eq!(workers.pool.state().threads, THREADS_PER_TURN);
+        assert_eq!(workers.pool.state().threads, PEER_THREADS_PER_TURN);
         stop.store(true, Ordering::Release);
         for job in jobs {
             job.await.unwrap().unwrap();

@@ -2,13 +2,14 @@
 //!
 //! In lockstep there is one answer per input. The step runs in the task that reads the request and
 //! writes the answer, without a queue or a thread in between: that is what keeps the round trip short.
+//! Only steps that take milliseconds are taken by a worker, so that others are not kept waiting.
 //! While the plant runs by itself, inputs go into its slot and states come from its watchers' slots.
 
 use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use futures::{Stream, StreamExt as _};
 use plantd_models::Linearization;
@@ -23,20 +24,19 @@ use v1::drive_request::Request as Message;
 use v1::drive_response::Response as Answer;
 
 use super::observe::with_limit_details;
-use super::plant::plant_info;
+use super::plant::{INLINE_INSTRUCTIONS_MAX, plant_info};
 use crate::convert;
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
 use crate::session::{DriveError, DriverKind, Lease, RunStatus};
 use crate::status::Fault;
 use crate::watch::Subscription;
-use crate::workers::beside_other_tasks;
+use crate::workers::{Admission, Lane};
 
 /// Answers in a row after which the stream lets others on its thread run.
 const BURST_MAX: u32 = 32;
-/// Work of a control period above which it may take milliseconds, and runs beside the other tasks of its
-/// thread.
-const INLINE_WORK_MAX: usize = 64;
+/// How long a step may take for the next one to be taken in the task itself.
+const INLINE_STEP_MAX: Duration = Duration::from_millis(2);
 /// Longest time for which a lease is kept, s.
 const GRACE_MAX_S: f64 = 3600.0;
 
@@ -52,6 +52,9 @@ pub struct DriveStream {
 /// What a worker does for a stream, because it may have to wait for a step.
 type Job<T> = Pin<Box<dyn Future<Output = Result<T, Fault>> + Send>>;
 
+/// The answer to an input, if there is one by now.
+type Outcome = Result<Option<Answer>, Fault>;
+
 enum Phase {
     /// Waits for `open`.
     Waiting,
@@ -59,6 +62,8 @@ enum Phase {
     Opening(Job<(Box<Driving>, v1::PlantInfo)>),
     /// Holds the lease.
     Driving(Box<Driving>),
+    /// A worker takes a step, with the lease, which is to be kept when the connection breaks or is not.
+    Stepping { step: Job<(Box<Driving>, Outcome)>, is_kept: bool },
     /// Has ended; the lease is given up.
     Ended,
 }
@@ -69,8 +74,8 @@ struct Driving {
     linearization: Option<Linearization>,
     /// Under which name the lease is kept when the connection breaks, and for how long.
     keep: Option<(String, Duration)>,
-    /// A step takes so little time that nobody minds waiting for it.
-    is_short: bool,
+    /// The next step may take long, as the last one did; before the first one it is estimated.
+    is_slow: bool,
     /// Changes of how the plant is run.
     status: WatchStream<RunStatus>,
     /// An input that waits for its step in lockstep: the plant is paused, or slowed.
@@ -115,15 +120,40 @@ impl DriveStream {
                 }));
                 return Ok(None);
             }
-            (Phase::Driving(driving), Some(Message::Input(input))) => match driving.input(input)? {
-                Some(answer) => answer,
-                None => return Ok(None),
-            },
+            (Phase::Driving(driving), Some(Message::Input(input))) => {
+                if driving.is_slow && !driving.lease.session().runs_by_itself() {
+                    self.begin_step(input);
+                    return Ok(None);
+                }
+                match driving.input(input)? {
+                    Some(answer) => answer,
+                    None => return Ok(None),
+                }
+            }
             (Phase::Waiting, _) => return Err(protocol("the first message must be `open`")),
             (_, Some(Message::Open(_))) => return Err(protocol("the stream is open already")),
             (_, _) => return Err(protocol("the message is empty")),
         };
         Ok(Some(v1::DriveResponse { response: Some(response) }))
+    }
+
+    /// Lets a worker take a step.
+    fn begin_step(&mut self, input: v1::DriveInput) {
+        let Phase::Driving(mut driving) = std::mem::replace(&mut self.phase, Phase::Ended) else {
+            return;
+        };
+        let (hub, runtime) = (Arc::clone(&self.hub), Handle::current());
+        let is_kept = driving.keep.is_some();
+        let step = async move {
+            let job = move |_: &_| {
+                // An input that has to wait sets a timer.
+                let _inside = runtime.enter();
+                let outcome = driving.input(input);
+                Ok((driving, outcome))
+            };
+            hub.steppers.start(Admission::Granted, Lane::Long, job).await
+        };
+        self.phase = Phase::Stepping { step: Box::pin(step), is_kept };
     }
 
     /// The reason to end the stream while it waits for the client, or a change of how the plant is run:
@@ -145,14 +175,17 @@ impl DriveStream {
 
     /// The connection broke: keeps the lease for its driver to come back, if that was agreed.
     fn keep_lease(&mut self) {
-        let Phase::Driving(driving) = std::mem::replace(&mut self.phase, Phase::Ended) else {
-            return;
+        let driving: Job<Box<Driving>> = match std::mem::replace(&mut self.phase, Phase::Ended) {
+            Phase::Driving(driving) if driving.keep.is_some() => Box::pin(async { Ok(driving) }),
+            Phase::Stepping { step, is_kept: true } => Box::pin(async { Ok(step.await?.0) }),
+            _ => return,
         };
-        let Driving { lease, keep: Some((_, grace)), .. } = *driving else { return };
         // Without a runtime the server ends.
         let Ok(runtime) = Handle::try_current() else { return };
         let ending = self.hub.ending.clone();
         runtime.spawn(async move {
+            let Ok(driving) = driving.await else { return };
+            let Driving { lease, keep: Some((_, grace)), .. } = *driving else { return };
             let mut status = lease.session().run_status();
             tokio::select! {
                 () = tokio::time::sleep(grace) => {}
@@ -169,7 +202,7 @@ impl DriveStream {
         &mut self,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<v1::DriveRequest, Status>>> {
-        if let Phase::Opening(_) = self.phase {
+        if let Phase::Opening(_) | Phase::Stepping { .. } = self.phase {
             return Poll::Pending;
         }
         if let Phase::Driving(driving) = &mut self.phase
@@ -226,15 +259,15 @@ impl Driving {
             lease.set_name(token.clone());
         }
         let linearization = open.linearization.then(|| Linearization::new(session.model()));
-        let work = convert::period_work(&session.mechanics().settings, dimensions);
-        let is_short = work <= INLINE_WORK_MAX;
+        let settings = session.mechanics().settings;
+        let instructions = convert::period_instructions(session.step_instructions(), &settings);
         Ok(Self {
             deleted: Box::pin(session.closed()),
             status: WatchStream::from_changes(session.run_status()),
             lease,
             linearization,
             keep,
-            is_short,
+            is_slow: instructions > INLINE_INSTRUCTIONS_MAX,
             held: None,
             states: States::None,
         })
@@ -303,22 +336,22 @@ impl Driving {
     /// A step in lockstep.
     fn step(&mut self, sequence: u64, u: &[f64]) -> Result<v1::DriveStep, DriveError> {
         let (lease, linearization) = (&mut self.lease, &mut self.linearization);
-        let is_short = self.is_short;
-        let mut advance = || {
-            lease.step_and(u, linearization.as_mut(), |core| {
-                let state = convert::plant_state(core.plant());
-                v1::DriveStep {
-                    sequence,
-                    clocks: Some(convert::clocks(state.time_s, 0)),
-                    state: Some(state),
-                    report: Some(convert::report(core.report())),
-                    u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
-                    outputs: core.outputs(),
-                    ..Default::default()
-                }
-            })
-        };
-        let mut step = if is_short { advance() } else { beside_other_tasks(advance) }?;
+        let began = Instant::now();
+        let step = lease.step_and(u, linearization.as_mut(), |core| {
+            let state = convert::plant_state(core.plant());
+            v1::DriveStep {
+                sequence,
+                clocks: Some(convert::clocks(state.time_s, 0)),
+                state: Some(state),
+                report: Some(convert::report(core.report())),
+                u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
+                outputs: core.outputs(),
+                ..Default::default()
+            }
+        });
+        // One that failed has taken its time as well.
+        self.is_slow = began.elapsed() > INLINE_STEP_MAX;
+        let mut step = step?;
         if let Some(linearization) = &self.linearization {
             let from = step.state.as_ref().map_or(0, |state| state.step - 1);
             step.linearization = Some(convert::linearization(from, linearization));
@@ -358,6 +391,19 @@ impl Stream for DriveStream {
                         let response = Some(Answer::Opened(opened));
                         break Some(Ok(v1::DriveResponse { response }));
                     }
+                    Err(fault) => break Some(Err(fault.into())),
+                }
+            }
+            if let Phase::Stepping { step, .. } = &mut this.phase
+                && let Poll::Ready(stepped) = step.as_mut().poll(context)
+            {
+                let outcome = stepped.and_then(|(driving, outcome)| {
+                    this.phase = Phase::Driving(driving);
+                    outcome
+                });
+                match outcome {
+                    Ok(None) => {}
+                    Ok(response) => break Some(Ok(v1::DriveResponse { response })),
                     Err(fault) => break Some(Err(fault.into())),
                 }
             }

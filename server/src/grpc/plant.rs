@@ -1,6 +1,7 @@
 //! `plantd.v1.PlantService`.
 
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use plantd_models::{Dimensions, Initial, State};
 use plantd_proto::v1;
@@ -13,11 +14,12 @@ use crate::hub::Hub;
 use crate::limits::LimitExceeded;
 use crate::session::{Core, DriverKind, Lease, PlantSnapshot, Session, View};
 use crate::status::Fault;
-use crate::workers::Abandoned;
+use crate::workers::{Abandoned, Admission};
 
-/// Steps times coordinates up to which a Step call runs at once instead of on a worker: less work
-/// than the way to a worker and back is long for others to wait.
-const INLINE_WORK_MAX: usize = 256;
+/// Instructions of a step up to which a Step call begins at once instead of on a worker: about 0.3 ms.
+pub(super) const INLINE_INSTRUCTIONS_MAX: f64 = 1e6;
+/// How long a Step call goes on there: not much longer than the way to a worker and back.
+const INLINE_TIME_MAX: Duration = Duration::from_micros(300);
 
 /// The service.
 pub struct PlantService {
@@ -92,15 +94,20 @@ impl PlantService {
             let (name, limit) = ("reply_numbers", limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in all states", numbers)?;
         }
-        let mut lease = session.acquire(DriverKind::Step)?;
+        let lease = session.acquire(DriverKind::Step)?;
         let settings = lease.look(|core| *core.plant().settings());
         let settings = settings.map_err(|error| Fault::from_drive(error, session.id()))?;
-        let work = convert::period_work(&settings, dimensions);
-        if plan.steps.saturating_mul(work) <= INLINE_WORK_MAX {
-            return plan.run(&mut lease, None);
+        let instructions = convert::period_instructions(session.step_instructions(), &settings);
+        let mut steps = Steps::new(plan, lease)?;
+        if instructions <= INLINE_INSTRUCTIONS_MAX {
+            let began = Instant::now();
+            let is_over = || Ok(began.elapsed() >= INLINE_TIME_MAX);
+            if let Some(response) = steps.go_on(is_over)? {
+                return Ok(response);
+            }
         }
-        let job = move |abandoned: &Abandoned| plan.run(&mut lease, Some(abandoned));
-        self.hub.attendants.run(job).await
+        let part = move |abandoned: &Abandoned| steps.go_on(|| abandoned.part_is_over());
+        self.hub.steppers.in_parts(Admission::Bounded, part).await
     }
 
     /// Puts a plant into another state under a lease of its own.
@@ -133,45 +140,68 @@ struct StepPlan {
     all_states: bool,
 }
 
-impl StepPlan {
-    fn run(
-        &self,
-        lease: &mut Lease,
-        abandoned: Option<&Abandoned>,
-    ) -> Result<v1::StepResponse, Fault> {
-        let held = match self.inputs.last() {
+/// The same on its way.
+struct Steps {
+    plan: StepPlan,
+    lease: Lease,
+    taken: usize,
+    /// The input of the steps after those that have one of their own.
+    held: Vec<f64>,
+    response: v1::StepResponse,
+}
+
+impl Steps {
+    fn new(plan: StepPlan, lease: Lease) -> Result<Self, Fault> {
+        let held = match plan.inputs.last() {
             Some(last) => last.to_vec(),
             None => lease
                 .look(|core| convert::hold_input(core.plant()))
                 .map_err(|error| Fault::from_drive(error, lease.session().id()))?,
         };
         let mut response = v1::StepResponse::default();
-        response.states.reserve(if self.all_states { self.steps } else { 1 });
-        for k in 0..self.steps {
-            if let Some(abandoned) = abandoned {
-                abandoned.check()?;
+        response.states.reserve(if plan.all_states { plan.steps } else { 1 });
+        Ok(Self { plan, lease, taken: 0, held, response })
+    }
+
+    /// Takes steps until all are taken, or `is_over` after one of them.
+    fn go_on(
+        &mut self,
+        is_over: impl Fn() -> Result<bool, Fault>,
+    ) -> Result<Option<v1::StepResponse>, Fault> {
+        loop {
+            self.step()?;
+            if self.taken == self.plan.steps {
+                return Ok(Some(std::mem::take(&mut self.response)));
             }
-            let u = if k < self.inputs.count() { self.inputs.get(k) } else { &held };
-            let is_last = k + 1 == self.steps;
-            let look = |core: &Core| {
-                if self.all_states || is_last {
-                    response.states.push(convert::plant_state(core.plant()));
-                }
-                if is_last {
-                    response.report = Some(convert::report(core.report()));
-                    response.clocks = Some(convert::clocks(core.plant().time_s(), 0));
-                    response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
-                    response.outputs = core.outputs();
-                }
-            };
-            let pushed = k < self.impulses.count();
-            let impulse = if pushed { self.impulses.get(k) } else { &[] };
-            let taken = lease.step_pushed_and(u, impulse, None, look);
-            taken.map_err(|error| {
-                Fault::from_drive(error, lease.session().id()).with("steps_taken", k)
-            })?;
+            if is_over()? {
+                return Ok(None);
+            }
         }
-        Ok(response)
+    }
+
+    fn step(&mut self) -> Result<(), Fault> {
+        let Self { plan, lease, taken, held, response } = self;
+        let k = *taken;
+        let u = if k < plan.inputs.count() { plan.inputs.get(k) } else { held };
+        let is_last = k + 1 == plan.steps;
+        let look = |core: &Core| {
+            if plan.all_states || is_last {
+                response.states.push(convert::plant_state(core.plant()));
+            }
+            if is_last {
+                response.report = Some(convert::report(core.report()));
+                response.clocks = Some(convert::clocks(core.plant().time_s(), 0));
+                response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
+                response.outputs = core.outputs();
+            }
+        };
+        let impulse = if k < plan.impulses.count() { plan.impulses.get(k) } else { &[] };
+        let stepped = lease.step_pushed_and(u, impulse, None, look);
+        stepped.map_err(|error| {
+            Fault::from_drive(error, lease.session().id()).with("steps_taken", k)
+        })?;
+        *taken += 1;
+        Ok(())
     }
 }
 

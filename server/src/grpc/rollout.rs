@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use futures::{StreamExt, stream};
-use plantd_models::{Model, Settings};
+use plantd_models::{Model, Plant, Settings};
 use plantd_proto::v1;
 
 use super::Answers;
@@ -12,7 +12,7 @@ use crate::convert::{self, Inputs, Start};
 use crate::hub::Hub;
 use crate::limits::LimitExceeded;
 use crate::status::Fault;
-use crate::workers::{Abandoned, Workers};
+use crate::workers::{Abandoned, Admission, Workers};
 
 /// A checked request.
 pub(super) struct Rollout {
@@ -65,52 +65,77 @@ impl Rollout {
         let answers = stream::iter(self.cases).map(move |case| {
             let (workers, shared) = (workers.clone(), Arc::clone(&shared));
             async move {
-                let job = move |abandoned: &Abandoned| case.run(&shared, abandoned);
-                Ok(workers.resume(job).await?)
+                let mut simulation = Simulation::new(case, shared);
+                let part = move |abandoned: &Abandoned| simulation.go_on(abandoned);
+                Ok(workers.in_parts(Admission::Granted, part).await?)
             }
         });
         Box::pin(answers.buffer_unordered(parallel))
     }
 }
 
-impl Case {
-    fn run(&self, shared: &Shared, abandoned: &Abandoned) -> Result<v1::RolloutResponse, Fault> {
-        let mut response = v1::RolloutResponse { case_index: self.index, ..Default::default() };
-        match self.simulate(shared, abandoned, &mut response.states) {
-            Ok(()) => {}
-            Err(fault) if fault.reason() == "CANCELLED" => return Err(fault),
-            Err(fault) => response.failure = Some(fault.into()),
-        }
-        Ok(response)
+/// A case on its way.
+struct Simulation {
+    case: Case,
+    shared: Arc<Shared>,
+    /// Made in the first part.
+    plant: Option<Box<Plant>>,
+    /// The input of the steps after those that have one of their own.
+    held: Vec<f64>,
+    taken: usize,
+    response: v1::RolloutResponse,
+}
+
+impl Simulation {
+    fn new(case: Case, shared: Arc<Shared>) -> Self {
+        let response = v1::RolloutResponse { case_index: case.index, ..Default::default() };
+        Self { case, shared, plant: None, held: Vec::new(), taken: 0, response }
     }
 
-    fn simulate(
-        &self,
-        shared: &Shared,
-        abandoned: &Abandoned,
-        states: &mut Vec<v1::State>,
-    ) -> Result<(), Fault> {
-        let field = format!("cases[{}].initial", self.index);
-        let mut plant = convert::plant(&shared.model, shared.settings, &self.start, &field)?;
-        let held = match self.inputs.last() {
-            Some(last) => last.to_vec(),
-            None => convert::hold_input(&plant),
+    /// Goes on for a part; the answer when the case has ended.
+    fn go_on(&mut self, abandoned: &Abandoned) -> Result<Option<v1::RolloutResponse>, Fault> {
+        match self.simulate(|| abandoned.part_is_over()) {
+            Ok(false) => return Ok(None),
+            Ok(true) => {}
+            Err(fault) if fault.reason() == "CANCELLED" => return Err(fault),
+            Err(fault) => self.response.failure = Some(fault.into()),
+        }
+        Ok(Some(std::mem::take(&mut self.response)))
+    }
+
+    /// Takes steps until all are taken, which is true, or `is_over` after one of them.
+    fn simulate(&mut self, is_over: impl Fn() -> Result<bool, Fault>) -> Result<bool, Fault> {
+        let Self { case, shared, held, taken, response, .. } = self;
+        let plant = match &mut self.plant {
+            Some(plant) => plant,
+            None => {
+                let field = format!("cases[{}].initial", case.index);
+                let plant = convert::plant(&shared.model, shared.settings, &case.start, &field)?;
+                *held = match case.inputs.last() {
+                    Some(last) => last.to_vec(),
+                    None => convert::hold_input(&plant),
+                };
+                self.plant.insert(Box::new(plant))
+            }
         };
         let mut outcome = Ok(());
-        for k in 0..self.steps {
-            abandoned.check()?;
-            let u = if k < self.inputs.count() { self.inputs.get(k) } else { &held };
+        while *taken < case.steps {
+            let u = if *taken < case.inputs.count() { case.inputs.get(*taken) } else { &*held };
             outcome = plant.step(u).map(|_| ());
             if outcome.is_err() {
                 break;
             }
-            if shared.every.is_some_and(|every| (k + 1) % every == 0) {
-                states.push(convert::plant_state(&plant));
+            *taken += 1;
+            if shared.every.is_some_and(|every| *taken % every == 0) {
+                response.states.push(convert::plant_state(plant));
+            }
+            if *taken < case.steps && is_over()? {
+                return Ok(false);
             }
         }
         if shared.every.is_none() {
-            states.push(convert::plant_state(&plant));
+            response.states.push(convert::plant_state(plant));
         }
-        Ok(outcome?)
+        Ok(outcome.map(|()| true)?)
     }
 }

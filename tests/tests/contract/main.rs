@@ -7,6 +7,7 @@ mod channels;
 mod derivatives;
 mod drive;
 mod elements;
+mod fairness;
 mod feedback;
 mod kalman;
 mod limits;
