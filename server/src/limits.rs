@@ -56,6 +56,8 @@ limits! {
     streams_per_connection = 256 in 1..=1_000_000;
     /// Bytes of one message to the server.
     message_bytes = 16_777_216 in 4096..=1_073_741_824;
+    /// Bytes of one message to the channel service, whose many small parts take much more room than they have bytes.
+    channel_message_bytes = 262_144 in 4096..=1_073_741_824;
     /// Bytes of messages to the server that are held until they are whole, together.
     unfinished_message_bytes = 268_435_456 in 4096..=1_000_000_000_000;
     /// Seconds for which a message that has begun may stand still, and in which it must come, with one more for each 64 KiB of it.
@@ -124,7 +126,7 @@ limits! {
     active_recordings = 64 in 0..=10_000;
     /// Bytes of a recording, which ends there.
     recording_bytes = 17_179_869_184 in 1_048_576..=1_000_000_000_000_000;
-    /// Heavy computations that may wait for a worker.
+    /// Heavy computations that may wait for a worker; beyond, each connection may have one.
     queued_jobs = 256 in 1..=1_000_000;
 }
 
@@ -202,6 +204,16 @@ impl Limits {
             }
         }
         Ok(())
+    }
+
+    /// Name and value of the limit on messages to a method, by its path.
+    pub fn message(&self, path: &str) -> (&'static str, u64) {
+        let is_small = path.starts_with("/plantd.v1.ChannelService/");
+        if is_small && self.channel_message_bytes < self.message_bytes {
+            ("channel_message_bytes", self.channel_message_bytes)
+        } else {
+            ("message_bytes", self.message_bytes)
+        }
     }
 
     /// A limit as a size in memory.

@@ -219,8 +219,9 @@ impl RunningServer {
                     .max_decoding_message_size(message_bytes),
             )
             .add_service(
-                ChannelServiceServer::new(ChannelService::new(hub()))
-                    .max_decoding_message_size(message_bytes),
+                ChannelServiceServer::new(ChannelService::new(hub())).max_decoding_message_size(
+                    message_bytes.min(Limits::size(limits.channel_message_bytes)),
+                ),
             )
             .add_service(
                 RecordingServiceServer::new(RecordingService::new(hub()))

@@ -411,7 +411,7 @@ impl Stream for DriveStream {
                 Poll::Ready(None) => break None,
                 Poll::Ready(Some(Err(status))) => {
                     this.keep_lease();
-                    break Some(Err(with_limit_details(status, &this.hub.limits)));
+                    break Some(Err(with_limit_details(status, "", &this.hub.limits)));
                 }
                 Poll::Ready(Some(Ok(request))) => {
                     this.burst += 1;

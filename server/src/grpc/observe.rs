@@ -44,19 +44,19 @@ fn method_label(path: &str) -> &'static str {
 }
 
 /// Turns tonic's refusal of an oversized message into the server's own.
-pub(super) fn with_limit_details(status: Status, limits: &Limits) -> Status {
+pub(super) fn with_limit_details(status: Status, path: &str, limits: &Limits) -> Status {
     // No service of this server answers OUT_OF_RANGE, so this is tonic's decoder.
     if status.code() != Code::OutOfRange {
         return status;
     }
+    let (name, limit) = limits.message(path);
     let actual = status
         .message()
         .split_once("found ")
         .and_then(|(_, rest)| rest.split(' ').next()?.parse().ok())
-        .unwrap_or(limits.message_bytes.saturating_add(1));
+        .unwrap_or(limit.saturating_add(1));
     let what = "bytes in a message";
-    Fault::from(LimitExceeded { name: "message_bytes", limit: limits.message_bytes, what, actual })
-        .into()
+    Fault::from(LimitExceeded { name, limit, what, actual }).into()
 }
 
 /// The layer.
@@ -117,7 +117,7 @@ where
             let mut response = peer.work(response).await?;
             if let Some(status) = Status::from_header_map(response.headers()) {
                 if status.code() == Code::OutOfRange {
-                    response = with_limit_details(status, &limits).into_http();
+                    response = with_limit_details(status, call.method, &limits).into_http();
                 }
                 call.see(response.headers());
             }

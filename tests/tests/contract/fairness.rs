@@ -125,3 +125,25 @@ async fn heavy_calls_of_one_connection_shut_nobody_out() {
     let plants = light.list_plants().await.unwrap();
     assert!(plants.iter().all(|plant| plant.driver.is_empty()), "a lease was kept");
 }
+
+/// Largest resident memory of a process so far, bytes.
+fn peak_bytes(pid: u32) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
+    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    peak.trim_end_matches("kB").trim().parse::<u64>().unwrap() * 1024
+}
+
+/// Small parts take a hundred times their bytes: messages of many are refused before they are read.
+#[tokio::test]
+async fn what_becomes_of_many_empty_channels_is_bounded() {
+    let (server, client) = server().await;
+    let id = plant(&client, "pendulum").await.id;
+    let before = peak_bytes(server.pid());
+    let outputs = vec![v1::OutputChannel::default(); 400_000];
+    let channels = v1::Channels { outputs, ..Default::default() };
+    let error = soon(client.set_channels(&id, channels)).await.unwrap_err();
+    assert_eq!(error.reason(), "LIMIT_EXCEEDED");
+    assert!(error.to_string().contains("channel_message_bytes"), "{error}");
+    let grown = peak_bytes(server.pid()) - before;
+    assert!(grown < 24 << 20, "{grown} bytes more");
+}
