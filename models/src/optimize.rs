@@ -22,8 +22,8 @@
 //!    | [`Method::QuasiNewton`] | of the cost |
 //!    | [`Method::Newton`] | of the cost and of the map, `∇²l + Σ z_i ∇²f_i`, with the adjoint `z[k] = l_x − Kᵀ l_u + (A − BK)ᵀ z[k+1]` |
 //!
-//!    Where the model has no minimum, or the direction does not descend, Newton **falls back** to
-//!    quasi-Newton, and that to steepest descent; but where the weights leave even the last input
+//!    Where the model has no minimum, the direction does not descend or no step along it does, Newton
+//!    **falls back** to quasi-Newton, and that to steepest descent; but where the weights leave even the last input
 //!    without a minimum (`R + BᵀQ_f B` is not positive definite), the search ends and says so;
 //! 3. goes along the direction by Armijo's rule: the longest of the steps `β^m` whose projection
 //!    lowers the cost by at least `α β^m` times what the directional derivative promises.
@@ -65,11 +65,13 @@
 //! **Bounds** are held by an augmented Lagrangian: each end of each bound at each step has a multiplier
 //! `λ` and adds `(max(0, λ + ρ c)² − λ²) / 2ρ` for its excess `c`, whose kink is passed over (semi-smooth
 //! Newton). `ρ` is the penalty times the weight of the entry in the cost, or the mean weight where that
-//! is zero. When the bounds are not met and the directional derivative is within the tolerance, or, if that
-//! is larger, within a hundredth of the penalties' energy `Σ ½ ρ error²` and a millionth of the first cost,
-//! the multipliers are renewed, `λ ← max(0, λ + ρ c)`, and the penalty, 10 at first, grows fourfold if the
-//! error has not fallen to a half. The search has
-//! converged when besides the directional derivative the error, `max |max(c, −λ/ρ)|`, is within
+//! is zero. When the bounds are not met and the directional derivative is within a hundredth of the
+//! penalties' energy `Σ ½ ρ error²` and a millionth of the first cost, the multipliers are renewed,
+//! `λ ← max(0, λ + ρ c)`, and the penalty, 10 at first, grows fourfold if the error has not fallen to a
+//! half. Between two renewals is at least one step, whatever the tolerance: only then the error says what
+//! multipliers and penalty do. Where the promised decrease drowns in the round-off of the cost, steps are
+//! taken that do not raise it beyond that, as long as they lessen the directional derivative. The search
+//! has converged when besides the directional derivative the error, `max |max(c, −λ/ρ)|`, is within
 //! `bound_tolerance`. Bounds of a rotation vector's entries count without their curvature. Equal ends fix
 //! an entry, so that bounds of the final state make terminal constraints.
 //!
@@ -119,7 +121,7 @@ use nalgebra::DMatrix;
 use crate::State;
 use crate::control::{Momentum, TrajectoryWeights, Weights};
 
-pub use error::{BoundFault, OptimizeError, Stuck};
+pub use error::{BoundFault, BoundState, OptimizeError, Stuck};
 pub use search::Optimizer;
 
 /// What a trajectory costs; see the [module](self).
@@ -248,6 +250,8 @@ pub struct Checkpoint {
     pub initial_reference: State,
     /// Shortenings of the last step that was taken.
     pub backtracks: u32,
+    /// Directional derivative of the last step since the multipliers were renewed; 0 before the first.
+    pub last_derivative: f64,
 }
 
 /// What an iteration did.
@@ -285,6 +289,12 @@ pub enum Fallback {
     /// The direction does not descend.
     #[error("the direction does not descend: its derivative is {derivative:e}")]
     Ascent {
+        /// Directional derivative.
+        derivative: f64,
+    },
+    /// No step along the direction lowers the cost enough.
+    #[error("no step along a direction with derivative {derivative:e} lowers the cost")]
+    NoStep {
         /// Directional derivative.
         derivative: f64,
     },

@@ -12,8 +12,8 @@ use plantd_models::control::{
     finite_horizon,
 };
 use plantd_models::optimize::{
-    Bound, BoundFault, Bounds, FreeInitialState, Method, OptimizeError, Optimizer, Options,
-    Progress, Status, Stuck, TrajectoryCost,
+    Bound, BoundFault, BoundState, Bounds, FreeInitialState, Method, OptimizeError, Optimizer,
+    Options, Progress, Status, Stuck, TrajectoryCost,
 };
 use plantd_models::reference::check_reference;
 use plantd_models::{Initial, Linearization, Model, Plant, Scene, Settings};
@@ -479,7 +479,7 @@ fn a_search_that_gets_stuck_says_why() {
     };
     let options = Options { max_iterations: 2000, ..Options::default() };
     let found = stuck(&mut swing.search(&bounds, None, options));
-    let Stuck::BoundsNotMet { violation, .. } = found else { panic!("{found}") };
+    let Stuck::BoundsNotMet(BoundState { violation, .. }) = found else { panic!("{found}") };
     assert!(violation > 0.1, "{violation}");
     assert!(found.to_string().contains("widen the bounds"));
 }

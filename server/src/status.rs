@@ -601,7 +601,7 @@ impl From<Stuck> for Fault {
             Stuck::MaxIterations { .. } => "MAX_ITERATIONS",
             Stuck::NoDescent { .. } => "NO_DESCENT",
             Stuck::NotConvex { .. } | Stuck::WeightsNotConvex { .. } => "NOT_CONVEX",
-            Stuck::BoundsNotMet { .. } => "BOUNDS_NOT_MET",
+            Stuck::BoundsNotMet(_) => "BOUNDS_NOT_MET",
         };
         Self::precondition(reason, "search", stuck.to_string())
     }

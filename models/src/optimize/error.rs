@@ -156,7 +156,8 @@ pub enum BoundFault {
 pub enum Stuck {
     /// As many iterations as allowed.
     #[error(
-        "no convergence within {iterations} iterations: the directional derivative is {derivative:e}, the tolerance {tolerance:e}; allow more iterations, or go on from the checkpoint"
+        "no convergence within {iterations} iterations: the directional derivative is {derivative:e}, the tolerance {tolerance:e}{}; allow more iterations, or go on from the checkpoint",
+        so_far(*bounds)
     )]
     MaxIterations {
         /// Iterations done.
@@ -165,10 +166,14 @@ pub enum Stuck {
         derivative: f64,
         /// Tolerance.
         tolerance: f64,
+        /// How well the bounds are settled; none without any.
+        bounds: Option<BoundState>,
     },
     /// No step along the direction lowers the cost enough.
     #[error(
-        "no step along a direction with derivative {derivative:e} lowers the cost {cost} after {backtracks} shortenings; allow more of them, raise the tolerance above {tolerance:e}, or give a regulator of the projection that holds the motion more firmly"
+        "no step along a direction with derivative {derivative:e} lowers the cost {cost} after {backtracks} shortenings; the tolerance is {tolerance:e}{}. Allow more shortenings, or give a regulator of the projection that holds the motion more firmly; {}",
+        so_far(*bounds),
+        good_enough(derivative.abs(), *bounds)
     )]
     NoDescent {
         /// Directional derivative.
@@ -179,6 +184,8 @@ pub enum Stuck {
         backtracks: u32,
         /// Tolerance.
         tolerance: f64,
+        /// How well the bounds are settled; none without any.
+        bounds: Option<BoundState>,
     },
     /// Not even steepest descent has a direction.
     #[error(
@@ -197,16 +204,55 @@ pub enum Stuck {
         /// The step.
         step: usize,
     },
-    /// The bounds cannot be met.
-    #[error(
-        "a bound stays violated by {violation:e} at penalty {penalty:e}; the tolerance is {tolerance:e}: widen the bounds, lengthen the horizon, or begin with a guess that meets them"
-    )]
-    BoundsNotMet {
-        /// Largest violation.
-        violation: f64,
-        /// Penalty reached.
-        penalty: f64,
-        /// Tolerance.
-        tolerance: f64,
-    },
+    /// The bounds cannot be met, or their multipliers do not settle.
+    #[error("{}", not_met(.0))]
+    BoundsNotMet(BoundState),
+}
+
+/// How well the bounds of a problem are settled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BoundState {
+    /// Largest violation, in the unit of the entry.
+    pub violation: f64,
+    /// The same, and where a bound holds, the distance from it, or, if that is less, of its multiplier
+    /// from zero, in units of the penalty.
+    pub error: f64,
+    /// Error that counts as none.
+    pub tolerance: f64,
+    /// Penalty reached.
+    pub penalty: f64,
+}
+
+fn so_far(bounds: Option<BoundState>) -> String {
+    let Some(BoundState { error, tolerance, .. }) = bounds else { return String::new() };
+    format!(", and the error of the bounds {error:e}, bound_tolerance {tolerance:e}")
+}
+
+/// With which options, or with which guess, the search would not have ended so.
+fn good_enough(derivative: f64, bounds: Option<BoundState>) -> String {
+    let larger = match bounds {
+        Some(BoundState { violation, tolerance, .. }) if violation > tolerance => {
+            return format!(
+                "a bound is violated by {violation:e}: begin with a guess that meets it, or with the optimum of wider bounds"
+            );
+        }
+        Some(BoundState { error, tolerance, .. }) if error > tolerance => {
+            format!("a tolerance above {derivative:e} and a bound_tolerance above {error:e}")
+        }
+        _ => format!("a tolerance above {derivative:e}"),
+    };
+    format!("with {larger} the motion that was found counts as the optimum")
+}
+
+fn not_met(bounds: &BoundState) -> String {
+    let BoundState { violation, error, tolerance, penalty } = bounds;
+    if violation > tolerance {
+        format!(
+            "a bound stays violated by {violation:e} at penalty {penalty:e}; bound_tolerance is {tolerance:e}: widen the bounds, lengthen the horizon, begin with a guess that meets them, or raise bound_tolerance above {violation:e} if that is near enough"
+        )
+    } else {
+        format!(
+            "the bounds are met, but their multipliers do not settle: an error of {error:e} is left at penalty {penalty:e}; raise bound_tolerance from {tolerance:e} above that"
+        )
+    }
 }

@@ -1,18 +1,18 @@
 //! The search, one iteration at a time.
 
 mod direction;
+mod ending;
 
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
 
 use self::direction::{Foresight, block_length, linearize_behind};
-use super::bounds::End;
 use super::problem::{Deviation, Problem, check};
 use super::trajectory::{Trajectory, rows};
 use super::{
-    Bounds, Checkpoint, FreeInitialState, Method, OptimizeError, Options, Progress, Status, Stuck,
-    TrajectoryCost,
+    Bounds, Checkpoint, Fallback, FreeInitialState, Method, OptimizeError, Options, Progress,
+    Status, Stuck, TrajectoryCost,
 };
 use crate::control::Weights;
 use crate::control::lq::{LqRecursion, Map, Stage};
@@ -20,20 +20,6 @@ use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State};
 
 /// Penalty with which a search begins.
 const FIRST_PENALTY: f64 = 10.0;
-/// Growth of the penalty.
-const PENALTY_GROWTH: f64 = 4.0;
-/// The error of bounds that the penalty need not grow for, in units of the error before.
-const PENALTY_WORKS: f64 = 0.5;
-/// Beyond this penalty the bounds are taken to be out of reach.
-const PENALTY_MAX: f64 = 1e9;
-/// Part of the first cost to which the cost is minimised before multipliers are renewed.
-const RENEW_BELOW: f64 = 1e-6;
-/// The same as part of the penalties' energy.
-const RENEW_WITHIN: f64 = 1e-2;
-/// Tolerance where none is given, in units of the first cost.
-const TOLERANCE: f64 = 1e-9;
-/// A promised decrease below this part of the cost drowns in its round-off.
-const ROUND_OFF: f64 = 1e-12;
 /// A step of fewer states is differentiated sooner than a thread starts.
 const STATES_FOR_THREADS: usize = 12;
 /// Steps between two questions whether to go on.
@@ -61,6 +47,8 @@ pub struct Optimizer {
     multipliers: Vec<f64>,
     penalty: f64,
     bound_error: f64,
+    /// Directional derivative of the last step since the multipliers were renewed; 0 before the first.
+    last_derivative: f64,
     iterations: u32,
     first_cost: f64,
     backtracks: u32,
@@ -214,7 +202,8 @@ impl Optimizer {
         fits(sizes, "its initial reference")?;
         let start = (initial, reference);
         let mut search = Self::at(plant, start, inputs, cost, bounds, free, options)?;
-        let numbers = [checkpoint.first_cost, checkpoint.bound_violation];
+        let last = checkpoint.last_derivative;
+        let numbers = [checkpoint.first_cost, checkpoint.bound_violation, last];
         fits(numbers.iter().all(|x| x.is_finite()), "a number is not finite")?;
         let penalty = checkpoint.penalty;
         fits(penalty.is_finite() && penalty > 0.0, "its penalty is not greater than zero")?;
@@ -225,6 +214,7 @@ impl Optimizer {
         search.first_cost = checkpoint.first_cost;
         search.backtracks = checkpoint.backtracks;
         search.bound_error = checkpoint.bound_violation;
+        search.last_derivative = last;
         search.penalty = penalty;
         search.multipliers.copy_from_slice(multipliers);
         search.current.merit = search.merit(&search.current);
@@ -292,6 +282,7 @@ impl Optimizer {
             multipliers: vec![0.0; problem.ends.count],
             penalty: FIRST_PENALTY,
             bound_error: 0.0,
+            last_derivative: 0.0,
             iterations: 0,
             first_cost: 0.0,
             status: Status::Running,
@@ -393,6 +384,7 @@ impl Optimizer {
             bound_violation: self.bound_error,
             initial_reference: self.reference.clone(),
             backtracks: self.backtracks,
+            last_derivative: self.last_derivative,
         }
     }
 
@@ -426,175 +418,66 @@ impl Optimizer {
             Some(first) if self.iterations < self.options.first_iterations => first,
             _ => self.options.method,
         };
-        let (method, fallback, derivative) = self.find_direction(asked, go_on)?;
         let mut progress = Progress {
             iteration: self.iterations,
             cost_before: self.current.merit,
             cost: self.current.merit,
-            directional_derivative: derivative.unwrap_or(f64::NAN),
-            method,
-            fallback,
+            directional_derivative: f64::NAN,
+            method: asked,
+            fallback: None,
             step_length: 0.0,
             backtracks: 0,
             bound_violation: 0.0,
         };
-        let Ok(derivative) = derivative else {
-            let Err(step) = derivative else { unreachable!() };
-            self.status = Status::Stuck(match method {
-                Method::QuasiNewton => Stuck::WeightsNotConvex { step },
-                _ => Stuck::NotConvex { step },
-            });
-            self.iterations += 1;
-            progress.bound_violation = self.bound_violation();
-            return Ok(progress);
-        };
-        if !self.has_ended(derivative) {
-            let found = self.search_along(derivative, &mut progress, go_on)?;
-            let round_off = ROUND_OFF * self.current.merit.abs();
-            if !found && self.can_renew(derivative) {
-                self.renew_multipliers(self.error_of_bounds());
-            } else if !found && derivative.abs() <= round_off {
-                self.end_at_round_off();
-            } else if !found && self.bound_violation() > self.options.bound_tolerance {
-                self.give_up_bounds();
-            } else if !found {
-                self.status = Status::Stuck(Stuck::NoDescent {
-                    derivative,
-                    cost: self.current.merit,
-                    backtracks: self.options.max_backtracks,
-                    tolerance: self.tolerance(),
-                });
-            }
-        }
+        self.step_or_end(asked, &mut progress, go_on)?;
         self.iterations += 1;
-        self.end_by_count(derivative);
+        self.end_by_count(progress.directional_derivative);
         progress.cost = self.current.merit;
         progress.bound_violation = self.bound_violation();
         Ok(progress)
     }
 
-    fn tolerance(&self) -> f64 {
-        self.options.tolerance.unwrap_or(TOLERANCE * self.first_cost.abs())
-    }
-
-    fn end_by_count(&mut self, derivative: f64) {
-        if self.status == Status::Running && self.iterations >= self.options.max_iterations {
-            let (iterations, tolerance) = (self.iterations, self.tolerance());
-            self.status = Status::Stuck(Stuck::MaxIterations { iterations, derivative, tolerance });
-        }
-    }
-
-    /// Whether nothing is to be gained along the direction: the search has converged, or multipliers
-    /// are renewed.
-    fn has_ended(&mut self, derivative: f64) -> bool {
-        let (size, tolerance) = (derivative.abs(), self.tolerance());
-        if !self.problem.has_bounds() {
-            if size <= tolerance {
-                self.status = Status::Converged;
-            }
-            return size <= tolerance;
-        }
-        let error = self.error_of_bounds();
-        if error <= self.options.bound_tolerance {
-            if size <= tolerance {
-                self.status = Status::Converged;
-            }
-            return size <= tolerance;
-        }
-        if size <= tolerance.max(self.renew_below()) {
-            self.renew_multipliers(error);
-            return true;
-        }
-        false
-    }
-
-    /// Whether other multipliers may help where the kinks of the penalties let no step descend.
-    fn can_renew(&self, derivative: f64) -> bool {
-        self.problem.has_bounds()
-            && derivative.abs() <= RENEW_BELOW * self.first_cost.abs()
-            && self.error_of_bounds() > self.options.bound_tolerance
-    }
-
-    /// The directional derivative at which multipliers are renewed: so small that the errors of bounds are
-    /// those of the penalty, not of a minimum that is not reached yet.
-    fn renew_below(&self) -> f64 {
-        let energy = self.sum(|end, number, multiplier| {
-            let error = end.error(number, multiplier, self.penalty);
-            0.5 * end.weight(self.penalty) * error * error
-        });
-        (RENEW_WITHIN * energy).min(RENEW_BELOW * self.first_cost.abs())
-    }
-
-    /// The cost is as low as its own round-off lets it be.
-    fn end_at_round_off(&mut self) {
-        let error = self.error_of_bounds();
-        if error <= self.options.bound_tolerance {
-            self.status = Status::Converged;
-        } else {
-            self.renew_multipliers(error);
-        }
-    }
-
-    fn renew_multipliers(&mut self, error: f64) {
-        let Self { problem, current, multipliers, penalty, .. } = self;
-        for k in 0..=problem.steps {
-            for (end, place) in problem.ends.at(false, k) {
-                let number = current.x(k)[end.index];
-                multipliers[place] = end.renewed(number, multipliers[place], *penalty);
-            }
-            if k < problem.steps {
-                for (end, place) in problem.ends.at(true, k) {
-                    let number = current.u(k)[end.index];
-                    multipliers[place] = end.renewed(number, multipliers[place], *penalty);
+    /// A step along the direction of the method asked for, or of the first that has one after it; or what
+    /// is to be done where nothing descends.
+    fn step_or_end(
+        &mut self,
+        mut asked: Method,
+        progress: &mut Progress,
+        go_on: Go<'_>,
+    ) -> Result<(), OptimizeError> {
+        loop {
+            let (method, fallback, derivative) = self.find_direction(asked, go_on)?;
+            progress.method = method;
+            progress.fallback = progress.fallback.or(fallback);
+            progress.directional_derivative = derivative.unwrap_or(f64::NAN);
+            let derivative = match derivative {
+                Ok(derivative) => derivative,
+                Err(step) => {
+                    self.status = Status::Stuck(match method {
+                        Method::QuasiNewton => Stuck::WeightsNotConvex { step },
+                        _ => Stuck::NotConvex { step },
+                    });
+                    return Ok(());
                 }
+            };
+            if self.has_ended(derivative) {
+                return Ok(());
             }
-        }
-        if !(error <= PENALTY_WORKS * self.bound_error) {
-            self.penalty *= PENALTY_GROWTH;
-        }
-        self.bound_error = error;
-        if self.penalty > PENALTY_MAX {
-            self.give_up_bounds();
-        }
-        self.current.merit = self.merit(&self.current);
-    }
-
-    fn give_up_bounds(&mut self) {
-        self.status = Status::Stuck(Stuck::BoundsNotMet {
-            violation: self.bound_violation(),
-            penalty: self.penalty,
-            tolerance: self.options.bound_tolerance,
-        });
-    }
-
-    /// Largest violation of a bound, or distance of a multiplier from what it may be.
-    fn error_of_bounds(&self) -> f64 {
-        self.worst(|end, number, multiplier| end.error(number, multiplier, self.penalty))
-    }
-
-    fn worst(&self, measure: impl Fn(&End, f64, f64) -> f64) -> f64 {
-        self.fold_bounds(|worst, end, number, multiplier| {
-            worst.max(measure(end, number, multiplier))
-        })
-    }
-
-    fn sum(&self, measure: impl Fn(&End, f64, f64) -> f64) -> f64 {
-        self.fold_bounds(|sum, end, number, multiplier| sum + measure(end, number, multiplier))
-    }
-
-    /// Over all ends of bounds at all steps, with the number that is bounded and its multiplier.
-    fn fold_bounds(&self, fold: impl Fn(f64, &End, f64, f64) -> f64) -> f64 {
-        let (problem, current) = (&self.problem, &self.current);
-        let mut value = 0.0;
-        for k in 0..=problem.steps {
-            for (end, place) in problem.ends.at(false, k) {
-                value = fold(value, end, current.x(k)[end.index], self.multipliers[place]);
+            if self.search_along(derivative, progress, go_on)? {
+                self.last_derivative = derivative.min(-f64::MIN_POSITIVE);
+                return Ok(());
             }
-            for (end, place) in problem.ends.at(true, k).filter(|_| k < problem.steps) {
-                value = fold(value, end, current.u(k)[end.index], self.multipliers[place]);
-            }
+            let is_spent = self.ends_at(derivative) || self.renews_at(derivative);
+            asked = match method {
+                Method::Newton if !is_spent => Method::QuasiNewton,
+                Method::QuasiNewton if !is_spent => Method::Steepest,
+                _ => {
+                    self.end_without_step(derivative);
+                    return Ok(());
+                }
+            };
+            progress.fallback = progress.fallback.or(Some(Fallback::NoStep { derivative }));
         }
-        value
     }
 
     /// Cost with the penalties of bounds.
@@ -701,7 +584,8 @@ impl Optimizer {
         go_on: Go<'_>,
     ) -> Result<bool, OptimizeError> {
         let length = self.length(backtracks);
-        let enough = self.current.merit + self.options.alpha * length * derivative;
+        let descent = self.options.alpha * length * derivative;
+        let enough = self.current.merit + descent + self.slack(derivative);
         Ok(self.try_step(length, enough, go_on)? && self.trial.merit < enough)
     }
 
@@ -727,7 +611,9 @@ impl Optimizer {
         let may_stop_early = problem.is_nonnegative && !problem.has_bounds();
         self.foreseen.fill(false);
         if self.workers.len() > 1 {
+            // The maps of the trial take their place.
             self.linearized.fill(false);
+            self.has_gains = false;
         }
         let foresight = Foresight {
             helpers: &mut self.workers[1..],

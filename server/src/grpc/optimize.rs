@@ -137,6 +137,7 @@ impl Search {
             bound_violation,
             initial_reference,
             backtracks,
+            last_derivative,
         } = self.optimizer.checkpoint();
         let state =
             |state: &State| Some(convert::state(state, state.step as f64 * self.time_step_s));
@@ -150,6 +151,7 @@ impl Search {
             bound_violation,
             initial_reference: state(&initial_reference),
             backtracks,
+            last_derivative,
         }
     }
 
@@ -205,6 +207,7 @@ impl Start {
                     bound_violation: resume.bound_violation,
                     initial_reference,
                     backtracks: resume.backtracks,
+                    last_derivative: resume.last_derivative,
                 };
                 Ok(Self::Resume(Box::new(plant), Box::new(checkpoint)))
             }

@@ -153,6 +153,64 @@ async fn a_search_goes_on_bit_for_bit_where_it_was_left() {
     assert_eq!(run(&client, resumed).await.1, whole);
 }
 
+/// A cart that goes home by a metre, with a force of 11 N at most where it would take 25 N.
+fn home() -> v1::OptimizeTrajectoryRequest {
+    let steps = 150;
+    let weights = v1::LqrWeights {
+        q: Some(plantd_client::diagonal([10.0, 10.0, 0.1, 0.1])),
+        r: Some(plantd_client::diagonal([0.01])),
+        q_final: Some(plantd_client::diagonal([100.0, 100.0, 10.0, 10.0])),
+        ..Default::default()
+    };
+    let initial = v1::State { q: vec![1.0, 0.0], p: vec![0.0; 2], ..Default::default() };
+    let limit = v1::Bound { entry: "force".to_owned(), min: Some(-11.0), max: Some(11.0) };
+    v1::OptimizeTrajectoryRequest {
+        model: "cart-pole".to_owned(),
+        cost: Some(v1::TrajectoryCost {
+            x: Some(zeros(steps + 1, 4)),
+            weights: Some(weights),
+            ..Default::default()
+        }),
+        guess: Some(v1::Trajectory { initial: Some(initial), u: Some(zeros(steps, 1)) }),
+        bounds: Some(v1::TrajectoryBounds { input: vec![limit], ..Default::default() }),
+        ..Default::default()
+    }
+}
+
+#[tokio::test]
+async fn a_limit_of_a_force_is_met_with_default_options_and_whatever_the_tolerance() {
+    let (_server, client) = server().await;
+    for tolerance in [0.0, 1e-3, 1e-9] {
+        let options = v1::OptimizationOptions { tolerance, ..Default::default() };
+        let request = v1::OptimizeTrajectoryRequest { options: Some(options), ..home() };
+        let (_, result) = run(&client, request).await;
+        assert!(result.converged && result.bound_violation <= 1e-6, "{:?}", result.failure);
+    }
+
+    // From any checkpoint the search goes on bit for bit, in the midst of renewing multipliers, too.
+    let options = v1::OptimizationOptions { checkpoint_every: 1, ..Default::default() };
+    let request = v1::OptimizeTrajectoryRequest { options: Some(options.clone()), ..home() };
+    let (progress, whole) = run(&client, request).await;
+    for (k, message) in progress.iter().enumerate().take(progress.len() - 1) {
+        let resumed = v1::OptimizeTrajectoryRequest {
+            guess: None,
+            resume: message.checkpoint.clone(),
+            options: Some(options.clone()),
+            ..home()
+        };
+        let (rest, result) = run(&client, resumed).await;
+        assert!(rest == progress[k + 1..] && result == whole, "from {k}");
+    }
+
+    // What stops early says how far the bounds are.
+    let few = v1::OptimizationOptions { max_iterations: 6, ..Default::default() };
+    let (_, stopped) =
+        run(&client, v1::OptimizeTrajectoryRequest { options: Some(few), ..home() }).await;
+    let failure = stopped.failure.unwrap();
+    assert_eq!(failure.reason, "MAX_ITERATIONS");
+    assert!(failure.message.contains("bound_tolerance 1e-6"), "{}", failure.message);
+}
+
 #[tokio::test]
 async fn bounds_and_a_free_initial_state_are_named_like_the_plants_entries() {
     let (_server, client) = server().await;

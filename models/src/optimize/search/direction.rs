@@ -197,8 +197,9 @@ impl Optimizer {
                 Direction::NotConvex { step } if method == Method::QuasiNewton && step == last => {
                     return Ok((method, fallback, Err(step)));
                 }
-                Direction::Found { derivative } if derivative <= 0.0 => {
-                    return Ok((method, fallback, Ok(derivative)));
+                // At a minimum, round-off gives it either sign.
+                Direction::Found { derivative } if derivative <= self.round_off() => {
+                    return Ok((method, fallback, Ok(derivative.min(0.0))));
                 }
                 Direction::Found { derivative } => Fallback::Ascent { derivative },
                 Direction::NotConvex { step } => Fallback::NotConvex { step },
@@ -206,12 +207,10 @@ impl Optimizer {
             method = match (method, reason) {
                 (Method::Newton, _) => Method::QuasiNewton,
                 (Method::QuasiNewton, _) => Method::Steepest,
-                (Method::Steepest, Fallback::Ascent { .. }) => {
-                    return Ok((method, fallback, Err(0)));
-                }
                 (Method::Steepest, Fallback::NotConvex { step }) => {
                     return Ok((method, fallback, Err(step)));
                 }
+                (Method::Steepest, _) => return Ok((method, fallback, Err(0))),
             };
             fallback = Some(fallback.unwrap_or(reason));
         }
