@@ -5,6 +5,7 @@
 
 mod forces;
 mod limits;
+mod number_or_name;
 mod signals;
 mod text;
 mod validate;
@@ -18,7 +19,9 @@ pub use limits::{
 pub use signals::{Interpolation, Signal};
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
+
+use number_or_name::{NumberOrName, field, number_or_name};
 
 /// A mechanism: a tree of frames with joints and bodies, what acts on it, and what constrains it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -351,6 +354,7 @@ pub enum Constraint {
         /// Other end.
         b: Point,
         /// Length.
+        #[serde(deserialize_with = "length")]
         length: Length,
     },
     /// `h = (a − b)·e` for each listed world axis `e`.
@@ -410,6 +414,7 @@ pub enum Constraint {
         /// Two or more points, in the order of the path.
         points: Vec<Point>,
         /// Length.
+        #[serde(deserialize_with = "length")]
         length: Length,
     },
 }
@@ -438,13 +443,39 @@ pub struct CouplingTerm {
 }
 
 /// Length of a distance or of a path.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case", deny_unknown_fields, untagged)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[serde(untagged)]
 pub enum Length {
     /// Fixed, m; greater than zero.
     Fixed(f64),
     /// Name of a prescribed coordinate.
     Coordinate(String),
+}
+
+impl From<f64> for Length {
+    fn from(length: f64) -> Self {
+        Self::Fixed(length)
+    }
+}
+
+impl From<String> for Length {
+    fn from(name: String) -> Self {
+        Self::Coordinate(name)
+    }
+}
+
+impl NumberOrName for Length {
+    const ALLOWED: &'static str = "a number of metres or the name of a prescribed coordinate";
+}
+
+impl<'de> Deserialize<'de> for Length {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        number_or_name(deserializer)
+    }
+}
+
+fn length<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Length, D::Error> {
+    field("length", deserializer)
 }
 
 /// A world axis.

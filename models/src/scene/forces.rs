@@ -1,8 +1,9 @@
 //! Forces that do not come from a potential, and that are not the damping of a coordinate.
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
+use super::number_or_name::{NumberOrName, field, number_or_name};
 use super::{Point, is_zero3, one};
 
 /// A force. Forces act on dynamic coordinates; velocities include those of prescribed ones.
@@ -16,10 +17,10 @@ pub enum Force {
         /// Frame on which it acts.
         frame: String,
         /// Force, frame axes, N.
-        #[serde(default, skip_serializing_if = "are_zero")]
+        #[serde(default, deserialize_with = "force", skip_serializing_if = "are_zero")]
         force: [Component; 3],
         /// Torque about the frame's origin, frame axes, N·m.
-        #[serde(default, skip_serializing_if = "are_zero")]
+        #[serde(default, deserialize_with = "torque", skip_serializing_if = "are_zero")]
         torque: [Component; 3],
     },
     /// A wrench in world axes, about the world's origin: its line of action stays in the world.
@@ -27,10 +28,10 @@ pub enum Force {
         /// Frame on which it acts.
         frame: String,
         /// Force, world axes, N.
-        #[serde(default, skip_serializing_if = "are_zero")]
+        #[serde(default, deserialize_with = "force", skip_serializing_if = "are_zero")]
         force: [Component; 3],
         /// Torque about the world's origin, world axes, N·m.
-        #[serde(default, skip_serializing_if = "are_zero")]
+        #[serde(default, deserialize_with = "torque", skip_serializing_if = "are_zero")]
         torque: [Component; 3],
     },
     /// A wrench in world axes, at the origin of a frame: it moves with the frame and does not turn.
@@ -38,10 +39,10 @@ pub enum Force {
         /// Frame on which it acts.
         frame: String,
         /// Force, world axes, N.
-        #[serde(default, skip_serializing_if = "are_zero")]
+        #[serde(default, deserialize_with = "force", skip_serializing_if = "are_zero")]
         force: [Component; 3],
         /// Torque about the frame's origin, world axes, N·m.
-        #[serde(default, skip_serializing_if = "are_zero")]
+        #[serde(default, deserialize_with = "torque", skip_serializing_if = "are_zero")]
         torque: [Component; 3],
     },
     /// `F = gain · u · axis` at a point of a frame, along an axis of that frame.
@@ -97,13 +98,43 @@ pub enum Force {
 }
 
 /// A component of a wrench.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Component {
     /// Constant.
     Constant(f64),
     /// Name of an input.
     Input(String),
+}
+
+impl From<f64> for Component {
+    fn from(constant: f64) -> Self {
+        Self::Constant(constant)
+    }
+}
+
+impl From<String> for Component {
+    fn from(input: String) -> Self {
+        Self::Input(input)
+    }
+}
+
+impl NumberOrName for Component {
+    const ALLOWED: &'static str = "a number or the name of an input";
+}
+
+impl<'de> Deserialize<'de> for Component {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        number_or_name(deserializer)
+    }
+}
+
+fn force<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[Component; 3], D::Error> {
+    field("force", deserializer)
+}
+
+fn torque<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[Component; 3], D::Error> {
+    field("torque", deserializer)
 }
 
 impl Default for Component {

@@ -1,5 +1,6 @@
 //! Scenes as text: TOML, JSON, and the JSON Schema.
 
+use super::number_or_name::SEPARATOR;
 use super::{MAX_TEXT_BYTES, Problem, Scene, SceneError};
 
 impl Scene {
@@ -8,16 +9,22 @@ impl Scene {
         check_size(text)?;
         let deserializer =
             toml::Deserializer::parse(text).map_err(|e| toml_error(String::new(), &e, text))?;
-        serde_path_to_error::deserialize(deserializer)
-            .map_err(|e| toml_error(path_of(e.path()), e.inner(), text))
+        serde_path_to_error::deserialize(deserializer).map_err(|e| {
+            let path = path_of(e.path());
+            within(&path, e.inner().message()).unwrap_or_else(|| toml_error(path, e.inner(), text))
+        })
     }
 
     /// Reads JSON.
     pub fn from_json(text: &str) -> Result<Self, SceneError> {
         check_size(text)?;
         let mut deserializer = serde_json::Deserializer::from_str(text);
-        let scene = serde_path_to_error::deserialize(&mut deserializer)
-            .map_err(|e| single(path_of(e.path()), e.inner().to_string()))?;
+        let scene = serde_path_to_error::deserialize(&mut deserializer).map_err(|e| {
+            let (path, message) = (path_of(e.path()), e.inner().to_string());
+            let position = format!(" at line {} column {}", e.inner().line(), e.inner().column());
+            let alone = message.strip_suffix(&position).unwrap_or(&message);
+            within(&path, alone).unwrap_or_else(|| single(path, message))
+        })?;
         deserializer.end().map_err(|e| single(String::new(), e.to_string()))?;
         Ok(scene)
     }
@@ -57,6 +64,13 @@ fn single(path: String, message: String) -> SceneError {
 /// The path as a person writes it; empty for the scene itself.
 fn path_of(path: &serde_path_to_error::Path) -> String {
     if path.iter().next().is_none() { String::new() } else { path.to_string() }
+}
+
+/// The error of a message that says where in the element at `path` it belongs. The position that goes with
+/// it is the element's, and is left out.
+fn within(path: &str, message: &str) -> Option<SceneError> {
+    let (field, message) = message.strip_prefix(SEPARATOR)?.split_once(SEPARATOR)?;
+    Some(single(format!("{path}.{field}"), message.to_owned()))
 }
 
 fn toml_error(path: String, error: &toml::de::Error, text: &str) -> SceneError {
@@ -113,11 +127,37 @@ mod tests {
                 "unknown variant",
             ),
             (
+                &format!(
+                    "{good}[[forces]]\ntype = \"body_wrench\"\nframe = \"arm\"\ntorque = [0, \"tau\", true]"
+                ),
+                "forces[0].torque[2]",
+                "invalid type: boolean `true`, expected a number or the name of an input",
+            ),
+            (
+                &format!(
+                    "{good}[[forces]]\ntype = \"hybrid_wrench\"\nframe = \"arm\"\nforce = [0, 1]"
+                ),
+                "forces[0].force",
+                "an array of length 3",
+            ),
+            (
+                &format!(
+                    "{good}[[constraints]]\ntype = \"distance\"\nname = \"rod\"\na = {{ frame = \"arm\" }}\nb = {{ frame = \"world\" }}\nlength = [1.0]"
+                ),
+                "constraints[0].length",
+                "expected a number of metres or the name of a prescribed coordinate",
+            ),
+            (
                 &format!("{good}joint = {{ type = \"revolute\", axis = [1, 0] }}"),
                 "frames[0].joint",
                 "an array of length 3",
             ),
             ("format = 1\nname = \"a\"", "", "missing field `frames`"),
+            (
+                "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, {}, 1]}]}",
+                "forces[0].force[1]",
+                "invalid type: map, expected a number or the name of an input",
+            ),
             ("{\"format\": 1, \"name\": 3, \"frames\": []}", "name", "line 1 column 23"),
             ("{\"format\": 1, \"name\": \"a\", \"frames\": []} x", "", "trailing characters"),
             (

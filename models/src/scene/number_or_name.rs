@@ -1,0 +1,65 @@
+//! Values that are a number or a name, and where among the fields of an element they stand.
+
+use std::fmt;
+use std::marker::PhantomData;
+
+use serde::de::{Deserialize, Deserializer, Error, Visitor};
+
+/// Sets a path within an element off from what is wrong there, in the message of an error: the derived code
+/// of tagged elements reads them from a copy, and forgets where it is.
+pub(super) const SEPARATOR: char = '\u{1f}';
+
+/// Reads a field of a tagged element; errors say which field, and where in it.
+pub(super) fn field<'de, T, D>(name: &str, deserializer: D) -> Result<T, D::Error>
+where
+    T: Deserialize<'de>,
+    D: Deserializer<'de>,
+{
+    serde_path_to_error::deserialize(deserializer).map_err(|error| {
+        let path = error.path();
+        let within = if path.iter().next().is_none() { String::new() } else { path.to_string() };
+        let problem = error.inner();
+        D::Error::custom(format_args!("{SEPARATOR}{name}{within}{SEPARATOR}{problem}"))
+    })
+}
+
+/// A number, or else the name of something.
+pub(super) trait NumberOrName: From<f64> + From<String> {
+    /// What is allowed, in words.
+    const ALLOWED: &'static str;
+}
+
+/// Reads one or the other.
+pub(super) fn number_or_name<'de, T, D>(deserializer: D) -> Result<T, D::Error>
+where
+    T: NumberOrName,
+    D: Deserializer<'de>,
+{
+    deserializer.deserialize_any(Either(PhantomData))
+}
+
+struct Either<T>(PhantomData<T>);
+
+impl<T: NumberOrName> Visitor<'_> for Either<T> {
+    type Value = T;
+
+    fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(T::ALLOWED)
+    }
+
+    fn visit_f64<E: Error>(self, number: f64) -> Result<T, E> {
+        Ok(number.into())
+    }
+
+    fn visit_i64<E: Error>(self, number: i64) -> Result<T, E> {
+        Ok((number as f64).into())
+    }
+
+    fn visit_u64<E: Error>(self, number: u64) -> Result<T, E> {
+        Ok((number as f64).into())
+    }
+
+    fn visit_str<E: Error>(self, name: &str) -> Result<T, E> {
+        Ok(name.to_owned().into())
+    }
+}
