@@ -384,7 +384,9 @@ impl Workspace {
             // A new Jacobian squares the rate: it pays where the old one needs many corrections more.
             let rate = size / previous;
             let later = (0..patience).fold(size, |size, _| size * rate);
-            fresh = !converged && (always_factor || previous.is_infinite() || later > enough);
+            // The first correction is one with this step's Jacobian, also where it is the last: factors of
+            // another step would be memory beside the state.
+            fresh = previous.is_infinite() || (!converged && (always_factor || later > enough));
             if fresh {
                 self.factor(model, settings, state)?;
                 report.factorizations += 1;

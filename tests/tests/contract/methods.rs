@@ -220,3 +220,21 @@ async fn a_tolerance_chooses_the_method() {
     let refused = create("double-pendulum", fast).await;
     assert!(refused.is_err(), "{refused:?}");
 }
+
+/// A fast plant remembers nothing that its snapshot does not have.
+#[tokio::test]
+async fn fast_plants_are_restored_bit_for_bit() {
+    let (_server, client) = server().await;
+    let fast = v1::PlantSettings { precision: v1::Precision::Fast.into(), ..Default::default() };
+    let step = async |id: &str, hold| {
+        let request =
+            v1::StepRequest { id: id.to_owned(), hold, all_states: true, ..Default::default() };
+        client.step(request).await.unwrap().states.iter().map(bits).collect::<Vec<_>>()
+    };
+    let first = client.create_plant(with("cart-pole", fast)).await.unwrap().id;
+    let other = client.create_plant(with("cart-pole", fast)).await.unwrap().id;
+    step(&first, 2).await;
+    let snapshot = client.snapshot(&first).await.unwrap();
+    client.restore(&other, snapshot).await.unwrap();
+    assert_eq!(step(&first, 20).await, step(&other, 20).await);
+}
