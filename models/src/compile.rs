@@ -80,6 +80,7 @@ fn compile(scene: &Scene) -> Model {
     };
     let mut model = Model {
         conditioning: Conditioning::default(),
+        initial_violations: Vec::new(),
         dimensions,
         operating_points: layout.operating_points(scene),
         digest: digest(scene),
@@ -104,6 +105,7 @@ fn compile(scene: &Scene) -> Model {
         orientations: layout.orientations,
         scene: scene.clone(),
     };
+    model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);
     model.find_loops();
     model

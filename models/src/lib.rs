@@ -43,11 +43,11 @@ pub use continuous::{
     Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,
 };
 pub use cost::StageCost;
-pub use model::{Coordinate, Dimensions, Model, OperatingPoint};
+pub use model::{Coordinate, Dimensions, Model, OperatingPoint, Violation};
 pub use plant::{
     Choice, ChoiceError, Contraction, Diagnostics, Energy, Equilibrium, ErrorEstimate, ForceSplit,
     HALVINGS_MAX, Initial, InitialError, Linearization, Plant, Pose, Precision, SUBSTEPS_MAX,
-    SecondOrder, Settings, SettleError, SettleRequest, Site, Snapshot, SnapshotError, State,
+    SecondOrder, Settings, SettleError, SettleRequest, Site, Snapshot, SnapshotError, Spare, State,
     StepError, StepReport, TooLarge,
 };
 pub use scene::{Problem, Scene, SceneError};

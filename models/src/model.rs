@@ -52,6 +52,16 @@ pub struct Model {
     pub(crate) mixed_pairs: Vec<MixedPair>,
     /// What pivots are compared with.
     pub(crate) conditioning: Conditioning,
+    pub(crate) initial_violations: Vec<Violation>,
+}
+
+/// An equation of a constraint that a configuration violates.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Violation {
+    /// Name of the equation.
+    pub constraint: String,
+    /// Its value `h(q)`.
+    pub value: f64,
 }
 
 /// How a step solves with its Newton matrix.
@@ -441,6 +451,12 @@ impl Model {
     /// Operating points, first one `initial`: the initial configuration without input forces.
     pub fn operating_points(&self) -> &[OperatingPoint] {
         &self.operating_points
+    }
+
+    /// Equations that the scene's initial configuration violates by more than a millionth of the lengths
+    /// involved: with any, that configuration is only a guess, and a plant has to start elsewhere.
+    pub fn initial_violations(&self) -> &[Violation] {
+        &self.initial_violations
     }
 
     /// First of the three coordinates of each orientation (ball joint): a rotation vector.

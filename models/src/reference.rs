@@ -28,7 +28,7 @@ use crate::control::{
     finite_horizon_on_manifold, tangent_basis,
 };
 use crate::plant::known::KnownStep;
-use crate::{Initial, InitialError, Linearization, Plant, State, StepError};
+use crate::{Initial, InitialError, Linearization, Plant, Spare, State, StepError};
 
 /// Weight of changes of the inputs, relative to what they explain: decides only between inputs that
 /// explain a motion equally well.
@@ -207,12 +207,12 @@ struct Node {
 
 /// Compares a configuration trajectory with the motions of a plant. Row k of `q` is the configuration
 /// at the end of step k, n + 1 rows of nd + nk; row k of `u`, if given, is the planned `u[k]`, n rows of
-/// ni + nk, else inputs are fitted and prescribed positions are those of `q`. The plant's model, settings
-/// and step index count, not its state.
+/// ni + nk, else inputs are fitted and prescribed positions are those of `q`. The reference begins at the
+/// plant's count of steps.
 ///
 /// Costs for each row a linearization, `nd` gradients, and O(nd³).
 pub fn check_reference(
-    plant: &Plant,
+    plant: &Spare,
     q: &DMatrix<f64>,
     u: Option<&DMatrix<f64>>,
 ) -> Result<Assessment, ReferenceError> {
@@ -231,7 +231,7 @@ struct Assess<'a> {
 
 impl<'a> Assess<'a> {
     fn new(
-        plant: &Plant,
+        Spare(plant): &Spare,
         q: &'a DMatrix<f64>,
         u: Option<&DMatrix<f64>>,
     ) -> Result<Self, ReferenceError> {
@@ -519,16 +519,16 @@ fn fit(nodes: &[Node], steps: usize, inputs: usize) -> Vec<DVector<f64>> {
 /// `weights` are those of the regulator, identities if not given; on the manifold of the constraints
 /// with `on_manifold`.
 pub fn project(
-    plant: &Plant,
+    spare: &Spare,
     q: &DMatrix<f64>,
     assessment: &Assessment,
     weights: Option<&Weights>,
     on_manifold: bool,
 ) -> Result<Projected, ReferenceError> {
-    let model = plant.model().clone();
+    let model = spare.0.model().clone();
     let d = model.dimensions();
     let (n, nd) = (d.coordinates(), d.dynamic);
-    let mut assess = Assess::new(plant, q, Some(&assessment.inputs))?;
+    let mut assess = Assess::new(spare, q, Some(&assessment.inputs))?;
     let steps = assess.steps;
     check("the states of the assessment", &assessment.states, steps + 1, d.state())?;
     check("the multipliers of the assessment", &assessment.multipliers, steps, d.constraints)?;
@@ -552,17 +552,13 @@ pub fn project(
         finite_horizon(&samples, &weights.into(), Values::Drop)?.gains
     };
 
-    let mut plant = plant.clone();
-    let first_step = plant.step_index();
     let first = row(&assessment.states, 0);
-    let mut start = first[..n].to_vec();
-    if d.constraints > 0 {
-        plant.initialize(&Initial::Projection { q: start.clone(), hold: vec![] })?;
-        start.copy_from_slice(plant.q());
-    }
+    let start = Initial::Projection { q: first[..n].to_vec(), hold: vec![] };
+    let mut plant = spare.clone().start(&start)?;
+    let q0 = plant.q().to_vec();
     let (p, v) = (first[n..n + nd].to_vec(), first[n + nd..].to_vec());
-    plant.initialize(&Initial::Momentum { q: start, p, v })?;
-    plant.set_step_index(first_step);
+    plant.initialize(&Initial::Momentum { q: q0, p, v })?;
+    plant.set_step_index(spare.0.step_index());
 
     let mut projected = Projected {
         initial: plant.state(),

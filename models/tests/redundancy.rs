@@ -563,7 +563,7 @@ terms = [
     assert!((e.energy.kinetic_j - f.energy.kinetic_j).abs() < 1e-9);
     let rest = [&one, &two].map(|plant| {
         let request = plantd_models::SettleRequest { q: plant.q().to_vec(), ..Default::default() };
-        plant.settle(&request).unwrap()
+        plant.model().settle(&request).unwrap()
     });
     assert!((rest[0].potential_j - rest[1].potential_j).abs() < 1e-10, "{rest:?}");
     assert!(rest[1].stable, "{rest:?}");

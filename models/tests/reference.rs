@@ -5,11 +5,11 @@ mod common;
 use common::{builtin, plant, waving_input};
 use nalgebra::DMatrix;
 use plantd_models::reference::{ReferenceError, check_reference, project};
-use plantd_models::{ForceSplit, Plant};
+use plantd_models::{ForceSplit, Spare};
 
 /// Configurations and inputs of a motion under waving inputs.
 struct Motion {
-    start: Plant,
+    start: Spare,
     q: DMatrix<f64>,
     u: DMatrix<f64>,
 }
@@ -18,7 +18,7 @@ impl Motion {
     fn new(name: &str, split: ForceSplit, steps: usize) -> Self {
         let mut plant = plant(&builtin(name), |s| s.force_split = split);
         let d = plant.model().dimensions();
-        let start = plant.clone();
+        let start = Spare::from(plant.clone());
         let mut q = DMatrix::zeros(steps + 1, d.coordinates());
         let mut u = DMatrix::zeros(steps, d.input());
         for k in 0..=steps {

@@ -10,7 +10,7 @@ use plantd_models::{Equilibrium, Initial, InitialError, Plant, Scene, SettleErro
 
 fn settle(plant: &Plant, q: &[f64], hold: &[&str]) -> Result<Equilibrium, SettleError> {
     let hold = hold.iter().map(|name| (*name).to_owned()).collect();
-    plant.settle(&SettleRequest { q: q.to_vec(), hold, inputs: vec![] })
+    plant.model().settle(&SettleRequest { q: q.to_vec(), hold, inputs: vec![] })
 }
 
 /// Potential energy less the work of inputs, near `q` on the constraints.
@@ -142,14 +142,14 @@ fn constant_inputs_do_work() {
     let moment = body.mass * body.center_of_mass[1].abs() * scene.gravity[1].abs();
     let input = 0.4 * moment / scene.inputs[0].gain;
     let request = SettleRequest { q: vec![0.0], hold: vec![], inputs: vec![input] };
-    let rest = plant.settle(&request).unwrap();
+    let rest = plant.model().settle(&request).unwrap();
     assert!((rest.q[0].sin() - 0.4).abs() < 1e-13 && rest.q[0].abs() < 1.0, "{rest:?}");
     assert!((rest.smallest_stiffness / (moment * rest.q[0].cos()) - 1.0).abs() < 1e-12);
     assert_minimum(&scene, &rest);
     assert_rest(&scene, &[0.0], &[], &[input]);
     // A torque that gravity cannot balance turns it on and on.
     let request = SettleRequest { inputs: vec![1.5 * moment / scene.inputs[0].gain], ..request };
-    let error = plant.settle(&request).unwrap_err();
+    let error = plant.model().settle(&request).unwrap_err();
     assert!(matches!(error, SettleError::Unbounded { .. }), "{error}");
 }
 
@@ -175,7 +175,7 @@ fn requests_that_make_no_sense() {
     let error = settle(&plant, &q, &["nobody"]).unwrap_err();
     assert_eq!(error, SettleError::Unknown { name: "nobody".to_owned() });
     let request = SettleRequest { q, hold: vec![], inputs: vec![1.0, 2.0] };
-    let error = plant.settle(&request).unwrap_err();
+    let error = plant.model().settle(&request).unwrap_err();
     assert_eq!(error, SettleError::Dimension { name: "inputs", expected: 1, actual: 2 });
     // A crank that points away from a rocker held far off cannot be reached.
     let error = settle(&plant, &[PI / 2.0, 0.0, -PI / 2.0], &["crank", "rocker"]).unwrap_err();
@@ -223,7 +223,7 @@ fn guesses_out_of_range() {
         }
         let inputs = vec![1e300; plant.model().dimensions().inputs];
         let request = SettleRequest { q: plant.q().to_vec(), hold: vec![], inputs };
-        if let Ok(rest) = plant.settle(&request) {
+        if let Ok(rest) = plant.model().settle(&request) {
             assert!(rest.residual.is_finite() && rest.q.iter().all(|q| q.is_finite()));
         }
     }
@@ -315,7 +315,7 @@ fn loops_settle_under_inputs_and_with_held_coordinates() {
     let scene = builtin("four-bar");
     let plant = plant(&scene, |_| ());
     let request = SettleRequest { q: plant.q().to_vec(), hold: vec![], inputs: vec![-2.0] };
-    let rest = plant.settle(&request).unwrap();
+    let rest = plant.model().settle(&request).unwrap();
     assert!(rest.residual < 1e-12 && rest.stable, "{rest:?}");
     assert_minimum(&scene, &rest);
     assert_rest(&scene, plant.q(), &[], &[-2.0]);

@@ -8,7 +8,7 @@ use plantd_models::control::{Momentum, StageWeights, TrajectoryWeights, Weights,
 use plantd_models::scene::Signal;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
-    Plant, Precision, Scene, SceneError, Settings, State, StepReport,
+    Plant, Precision, Scene, SceneError, Settings, Spare, State, StepReport, Violation,
 };
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
@@ -271,16 +271,12 @@ pub fn plant(
     start: &Start,
     field: &str,
 ) -> Result<Plant, Fault> {
-    let mut plant = Plant::new(Arc::clone(model), settings)
-        .map_err(|error| Fault::from_initial(error, field))?;
+    let refused = |error| Fault::from_initial(error, field);
+    let spare = Spare::new(Arc::clone(model), settings).map_err(refused)?;
     match start {
-        Start::Initial(Initial::Scene) => {}
-        Start::Initial(initial) => {
-            plant.initialize(initial).map_err(|error| Fault::from_initial(error, field))?;
-        }
-        Start::Snapshot(snapshot) => plant.restore(&snapshot.plant)?,
+        Start::Initial(initial) => spare.start(initial).map_err(refused),
+        Start::Snapshot(snapshot) => Ok(spare.restore(&snapshot.plant)?),
     }
-    Ok(plant)
 }
 
 /// A plant in its initial state, with the order and the substeps that a tolerance asks for.
@@ -755,11 +751,11 @@ pub fn rotations(model: &Model) -> Vec<u32> {
 }
 
 /// What all gains of a map have in common: of which model and time step they are, and its rotations.
-pub fn gain_of(model: &str, plant: &Plant) -> v1::Gain {
+pub fn gain_of(name: &str, model: &Model, settings: &Settings) -> v1::Gain {
     v1::Gain {
-        model: model.to_owned(),
-        time_step_s: plant.settings().time_step_s,
-        rotations: rotations(plant.model()),
+        model: name.to_owned(),
+        time_step_s: settings.time_step_s,
+        rotations: rotations(model),
         ..Default::default()
     }
 }
@@ -824,7 +820,13 @@ pub fn model(name: &str, builtin: bool, model: &Model, with_texts: bool) -> v1::
         plan: if with_texts { model.plan() } else { String::new() },
         time_step_s: scene.time_step_s,
         signals: signals(model),
+        initial_violations: model.initial_violations().iter().map(violation).collect(),
     }
+}
+
+fn violation(violation: &Violation) -> v1::ConstraintViolation {
+    let Violation { constraint, value } = violation;
+    v1::ConstraintViolation { constraint: constraint.clone(), value: *value }
 }
 
 fn signals(model: &Model) -> Vec<v1::Signal> {

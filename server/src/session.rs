@@ -16,7 +16,7 @@ use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
 
 use plantd_models::{
-    Initial, InitialError, Model, Plant, Settings, Snapshot, SnapshotError, State,
+    Initial, InitialError, Model, Plant, Settings, Snapshot, SnapshotError, Spare, State,
 };
 use plantd_proto::v1::{self, MarkReason};
 use tokio::sync::watch;
@@ -237,7 +237,7 @@ impl Session {
     }
 
     /// Copies of all plants that can be in force; the first is the one without changes that faults make.
-    pub(crate) fn copy_plants(&self) -> Vec<Plant> {
+    pub(crate) fn copy_plants(&self) -> Vec<Spare> {
         self.with_core(|core| core.copy_plants())
     }
 
@@ -392,10 +392,7 @@ impl Session {
         snapshot: PlantSnapshot,
     ) -> Result<(State, f64), SnapshotError> {
         let _replacing = lock(&self.replacing);
-        let mut plants = self.copy_plants();
-        let fits = plants.iter_mut().position(|plant| plant.restore(&snapshot.plant).is_ok());
-        let mut plant = plants.swap_remove(fits.unwrap_or(0));
-        plant.restore(&snapshot.plant)?;
+        let plant = self.plant_of(&snapshot.plant)?;
         Ok(self.replace_plant(plant, snapshot.channels))
     }
 
@@ -424,16 +421,22 @@ impl Session {
 
     /// A copy of the plant, put back into the state in which the session began; changed parameters stay.
     fn plant_at_start(&self) -> Result<Plant, InitialError> {
-        let mut plants = self.copy_plants();
-        let restored = plants.iter_mut().position(|plant| plant.restore(&self.start).is_ok());
-        let mut plant = plants.swap_remove(restored.unwrap_or(0));
-        if restored.is_none() {
-            // Of other parameters or another time step: what can be kept is x.
-            let State { step, q, p, v, .. } = self.start_state.clone();
-            plant.initialize(&Initial::Momentum { q, p, v })?;
-            plant.set_step_index(step);
+        if let Ok(plant) = self.plant_of(&self.start) {
+            return Ok(plant);
         }
+        // Of other parameters or another time step: what can be kept is x.
+        let State { step, q, p, v, .. } = self.start_state.clone();
+        let spare = self.copy_plants().swap_remove(0);
+        let mut plant = spare.start(&Initial::Momentum { q, p, v })?;
+        plant.set_step_index(step);
         Ok(plant)
+    }
+
+    /// The plant of a snapshot, among those that can be in force. The error is that of the first.
+    fn plant_of(&self, snapshot: &Snapshot) -> Result<Plant, SnapshotError> {
+        let mut plants = self.copy_plants().into_iter().map(|spare| spare.restore(snapshot));
+        let first = plants.next().unwrap_or(Err(SnapshotError::Mismatch("model")));
+        first.or_else(|error| plants.find_map(Result::ok).ok_or(error))
     }
 
     /// The ring into which each step is written; made at the first call.

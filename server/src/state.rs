@@ -10,12 +10,12 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use anyhow::{Context as _, Result, bail};
-use plantd_models::{Initial, Model, Plant, Snapshot};
+use plantd_models::{Initial, Model, Snapshot, Spare};
 use plantd_proto::v1;
 use prost::Message as _;
 
 use crate::channels::noise::hash;
-use crate::convert::{self, Start};
+use crate::convert;
 use crate::grpc::feedback::set_feedback;
 use crate::grpc::model::compile;
 use crate::grpc::run::{protect, run, run_info};
@@ -198,19 +198,23 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
         }
         _ => start_model,
     };
-    let plant = |model: &Arc<Model>, settings| -> Result<Plant> {
+    let spare = |model: &Arc<Model>, settings| -> Result<Spare> {
         let settings = convert::settings(settings, model, &hub.limits).map_err(sentence)?;
-        convert::plant(model, settings, &Start::Initial(Initial::Scene), "model").map_err(sentence)
+        Ok(Spare::new(Arc::clone(model), settings)?)
     };
-    let mut start = plant(&start_model, start_settings)?;
-    start.restore(&Snapshot::from_bytes(&record.start_snapshot)?)?;
+    let start = Snapshot::from_bytes(&record.start_snapshot)?;
+    let start = spare(&start_model, start_settings)?.restore(&start)?;
     let is_changed = in_force.digest() != start_model.digest();
     let in_force = if is_changed { in_force } else { start_model };
-    let mut present = plant(&in_force, info.settings)?;
-    let has_changes = record.faults.iter().any(is_change);
-    if !has_changes {
-        present.restore(&snapshot.plant)?;
-    }
+    let present = spare(&in_force, info.settings)?;
+    let present = if record.faults.iter().any(is_change) {
+        // The snapshot may be of a changed plant: until that is there, the plant rests nearby.
+        let nearby = || convert::initial_configuration(&in_force);
+        let q = info.state.as_ref().map_or_else(nearby, |state| state.q.clone());
+        present.start(&Initial::Projection { q, hold: Vec::new() })?
+    } else {
+        present.restore(&snapshot.plant)?
+    };
     let session = hub.insert(id.to_owned(), info.model, start, info.accuracy).map_err(sentence)?;
     let changed = info.parameters.into_iter().map(|p| (p.path, p.value)).collect();
     session.resume(present, changed);

@@ -328,7 +328,8 @@ impl Fault {
                 Self::field(format!("{field}.{name}[{index}]"), message)
             }
             InitialError::Unknown { .. } => Self::field(field, message),
-            InitialError::OffConstraint { constraint, .. } => {
+            InitialError::OffConstraint { constraint, .. }
+            | InitialError::SceneIsGuess { constraint, .. } => {
                 Self::field_because("OFF_CONSTRAINT", field, message).with("constraint", constraint)
             }
             InitialError::Degenerate { constraint, .. } => {

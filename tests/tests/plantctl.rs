@@ -198,6 +198,33 @@ fn a_settled_configuration_can_be_pasted_into_the_scene() {
     assert_eq!(run(&server, &["settle", "pendulum", "--guess", "theta"]).status.code(), Some(2));
 }
 
+/// The four-bar with an initial configuration that does not close the loop.
+#[test]
+fn a_scene_that_starts_at_a_guess_settles() {
+    let server = ServerProcess::start().unwrap();
+    let scene = json(&server, &["show", "model", "four-bar"])["scene_toml"].clone();
+    let scene = scene.as_str().unwrap().replace("\"four-bar\"", "\"four-bar-guess\"");
+    let file = server.directory().join("four-bar-guess.toml");
+    std::fs::write(&file, scene.replace("0.27841001304404134", "0.0")).unwrap();
+    let file = file.to_str().unwrap();
+
+    let validated = json(&server, &["validate", file]);
+    let violations = validated["model"]["initial_violations"].as_array().unwrap();
+    assert_eq!(violations.len(), 2, "{violations:?}");
+    assert!(text(&server, &["validate", file]).contains("only a guess, which violates pin.x by"));
+    json(&server, &["upload", file]);
+    let settle = ["settle", "four-bar-guess", "--constraints", "--hold", "crank"];
+    let held = json(&server, &settle);
+    assert_eq!(held["q"][0], -1.2);
+    assert!(json(&server, &["settle", "four-bar-guess"])["equilibrium"]["stable"] == true);
+
+    json(&server, &["create", "four-bar-guess", "--id", "g", "--at", "rest"]);
+    json(&server, &["step", "g", "--count", "5"]);
+    let refused = run(&server, &["create", "four-bar-guess", "--id", "h"]);
+    let message = String::from_utf8(refused.stderr).unwrap();
+    assert!(message.contains("initial configuration is only a guess"), "{message}");
+}
+
 #[test]
 fn a_state_is_diagnosed() {
     let server = ServerProcess::start().unwrap();

@@ -111,9 +111,8 @@ impl Probe<'_> {
             Scheme::Gauss(stages) => stages as u64,
             Scheme::Midpoint | Scheme::Composition(_) => 1,
         };
-        let mut plant = Plant::new(model, settings)?;
         let State { q, p, v, step, .. } = self.state.clone();
-        plant.initialize(&Initial::Momentum { q: q.clone(), p, v })?;
+        let mut plant = Plant::at(model, settings, &Initial::Momentum { q, p, v })?;
         plant.set_step_index(step);
         let start = plant.q().to_vec();
         let mut u = vec![0.0; plant.model().dimensions().input()];

@@ -21,6 +21,9 @@ use crate::scalar::Scalar;
 use crate::spatial::{Mat3, Vec3};
 use crate::tree::{JointKind, Tree};
 
+/// A configuration may violate a constraint by this fraction of the lengths involved.
+const TOLERANCE: f64 = 1e-6;
+
 /// The constraints at a configuration.
 #[derive(Clone, Debug)]
 pub(crate) struct Closure<S = f64> {
@@ -60,6 +63,27 @@ impl<S: Scalar> Pull<S> {
         for (column, other) in self.product.0.iter_mut().zip(other.product.0) {
             *column += other;
         }
+    }
+}
+
+impl Closure {
+    /// The equations that `q` violates by more than a millionth of the lengths involved, with their values
+    /// `h(q)`. Leaves values and Jacobian at `q`.
+    pub(crate) fn violated(
+        &mut self,
+        model: &Model,
+        q: &[f64],
+        orientations: &[Mat3],
+    ) -> impl Iterator<Item = (usize, f64)> {
+        self.evaluate(model, q, orientations);
+        self.differentiate(model, q);
+        // With the round-off of the coordinates, which the Jacobian tells.
+        self.evaluate(model, q, orientations);
+        let equations = self.value.iter().zip(&self.round_off).enumerate();
+        equations.filter_map(|(c, (value, round_off))| {
+            let is_satisfied = value.abs() <= round_off / f64::EPSILON * TOLERANCE;
+            (!is_satisfied).then_some((c, *value))
+        })
     }
 }
 

@@ -9,7 +9,8 @@
 //! - a pivot of `S = Dh(q[k+1]) K⁻¹ Dh(q[k])ᵀ` with the steepest that its constraint gets over a
 //!   sample of configurations.
 //!
-//! **Redundant or singular?** Equations that depend on others at the scene's initial configuration,
+//! **Redundant or singular?** Equations that depend on others at the scene's initial configuration
+//! (where that is only a guess, at one near it that satisfies the constraints),
 //! and at configurations near it that satisfy the constraints, are redundant: they get least-norm
 //! multipliers and are counted. Where fewer equations are independent than there, the configuration
 //! is singular. A step names the constraints that lost their independence if its estimate falls below
@@ -88,6 +89,16 @@ impl Conditioning {
         let d = model.dimensions;
         let mut closure = Closure::new(model);
         let mut q = sample(model, 0, 0.0);
+        if !model.initial_violations.is_empty() && d.constraints <= MOST_EQUATIONS {
+            // Off the constraints, redundant equations may be independent; how much they are goes with the
+            // root of the violation.
+            let mut near = q.clone();
+            self.approach(model, &mut closure, &mut near, 1.0);
+            let there = orientations(model, &near);
+            if closure.violated(model, &near, &there).next().is_none() {
+                q = near;
+            }
+        }
         self.independent = independent(&self.rows(model, &mut closure, &q));
         let deficient = self.independent.len() < d.constraints.min(d.dynamic);
         if deficient && d.constraints <= MOST_EQUATIONS {
@@ -96,7 +107,8 @@ impl Conditioning {
                 for (i, x) in near[..d.dynamic].iter_mut().enumerate() {
                     *x += size * (1.0 + i as f64).sin();
                 }
-                if matches!(self.approach(model, &mut closure, &mut near), Reached::Satisfied) {
+                let reached = self.approach(model, &mut closure, &mut near, VIOLATED);
+                if matches!(reached, Reached::Satisfied) {
                     let found = independent(&self.rows(model, &mut closure, &near));
                     if found.len() > self.independent.len() {
                         (self.independent, q) = (found, near);
@@ -107,8 +119,15 @@ impl Conditioning {
         self.regular = q;
     }
 
-    /// Newton's method with the shortest correction towards the constraints, from `q`.
-    fn approach(&self, model: &Model, closure: &mut Closure, q: &mut Vec<f64>) -> Reached {
+    /// Newton's method with the shortest correction towards the constraints, from `q`, until they are
+    /// violated by no more than `enough`, in units of round-off.
+    fn approach(
+        &self,
+        model: &Model,
+        closure: &mut Closure,
+        q: &mut Vec<f64>,
+        enough: f64,
+    ) -> Reached {
         let d = model.dimensions;
         for _ in 0..CORRECTIONS {
             let rows = self.rows(model, closure, q);
@@ -118,7 +137,7 @@ impl Conditioning {
                 let weight = self.weight[c];
                 -closure.value[c] * if weight > 0.0 { weight } else { 1.0 }
             });
-            if closure.violation() <= VIOLATED {
+            if closure.violation() <= enough {
                 return Reached::Satisfied;
             }
             let finite = rows.iter().chain(value.iter()).all(|x| x.is_finite());
@@ -372,7 +391,7 @@ impl Model {
         // Is there a configuration that satisfies the constraints at the end of the step?
         let mut q = state.q.clone();
         q[self.dimensions.dynamic..].copy_from_slice(&q_end[self.dimensions.dynamic..]);
-        match conditioning.approach(self, &mut closure, &mut q) {
+        match conditioning.approach(self, &mut closure, &mut q, VIOLATED) {
             Reached::Violated => {
                 let relative = |c: usize| (closure.value[c] / closure.round_off[c]).abs();
                 let names = self.constraint_names.iter().enumerate();

@@ -2,6 +2,7 @@
 //! velocity and energy that belong to a state.
 
 use crate::Model;
+use crate::model::Violation;
 use crate::plant::balls::{orientations, three};
 use crate::plant::closure::Closure;
 use crate::plant::kinematics::Poses;
@@ -13,8 +14,6 @@ use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, pote
 use crate::rotation::{self, Quaternion};
 use crate::spatial::Vec3;
 
-/// A configuration may violate a constraint by this fraction of the lengths involved.
-const CONSTRAINT_TOLERANCE: f64 = 1e-6;
 /// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
 /// half turns about an axis and for cyclic exchanges of the axes, it is −1 or 0.
 const ALIGNED: f64 = 2.0;
@@ -54,7 +53,7 @@ pub enum Initial {
         /// At the start.
         q1: Vec<f64>,
     },
-    /// The equilibrium that [`Plant::settle`] finds from a guess, at rest with its inputs.
+    /// The equilibrium that [`Model::settle`] finds from a guess, at rest with its inputs.
     Equilibrium {
         /// The guess.
         q: Vec<f64>,
@@ -112,6 +111,16 @@ pub enum InitialError {
         /// Its value `h(q)`.
         violation: f64,
     },
+    /// The scene's initial configuration violates a constraint by more than that.
+    #[error(
+        "the scene's initial configuration is only a guess: it violates constraint `{constraint}` by {violation:e}; start at a configuration that satisfies the constraints, which a projection or settling finds"
+    )]
+    SceneIsGuess {
+        /// Name of the constraint equation.
+        constraint: String,
+        /// Its value `h(q)`.
+        violation: f64,
+    },
     /// The configuration satisfies a constraint in a way in which it must not be used.
     #[error("constraint `{constraint}`: {what}")]
     Degenerate {
@@ -163,11 +172,41 @@ pub enum InitialError {
     },
 }
 
+impl Model {
+    /// Equations that the initial configuration violates.
+    pub(crate) fn violations_at_start(&self) -> Vec<Violation> {
+        if self.dimensions.constraints == 0 {
+            return Vec::new();
+        }
+        let q: Vec<f64> = self.coordinates.iter().map(|c| c.initial).collect();
+        let (mut closure, orientations) = (Closure::new(self), orientations(self, &q));
+        let violated = closure.violated(self, &q, &orientations);
+        let name = |c: usize| self.constraint_names[c].clone();
+        violated.map(|(c, value)| Violation { constraint: name(c), value }).collect()
+    }
+}
+
+impl Initial {
+    /// Whether it asks for the scene's initial configuration.
+    fn is_of_scene(&self) -> bool {
+        match self {
+            Self::Scene => true,
+            Self::OperatingPoint(name) => name == "initial",
+            _ => false,
+        }
+    }
+}
+
 impl Plant {
     /// Puts the plant into a state, step 0.
     pub fn initialize(&mut self, initial: &Initial) -> Result<(), InitialError> {
         let state = self.state_of(initial)?;
-        self.check_constraints(&state.q)?;
+        self.check_constraints(&state.q).map_err(|error| match error {
+            InitialError::OffConstraint { constraint, violation } if initial.is_of_scene() => {
+                InitialError::SceneIsGuess { constraint, violation }
+            }
+            error => error,
+        })?;
         self.state = state;
         self.workspace.forget();
         Ok(())
@@ -209,7 +248,7 @@ impl Plant {
             }
             Initial::Equilibrium { q, hold, inputs } => {
                 let (q, hold, inputs) = (q.clone(), hold.clone(), inputs.clone());
-                let rest = self.settle(&SettleRequest { q, hold, inputs })?;
+                let rest = self.model.settle(&SettleRequest { q, hold, inputs })?;
                 state.p = self.momentum_between(&rest.q, &rest.q, &rest.inputs);
                 state.q = rest.q;
             }
@@ -280,14 +319,10 @@ impl Plant {
         for (orientation, &i) in orientations.iter_mut().zip(&self.model.orientations) {
             *orientation = Quaternion::exp(three(q, i)).matrix();
         }
-        closure.evaluate(&self.model, q, orientations);
-        closure.differentiate(&self.model, q);
-        closure.evaluate(&self.model, q, orientations);
-        for (c, (value, round_off)) in closure.value.iter().zip(&closure.round_off).enumerate() {
-            if !(value.abs() <= round_off / f64::EPSILON * CONSTRAINT_TOLERANCE) {
-                let constraint = self.model.constraint_names[c].clone();
-                return Err(InitialError::OffConstraint { constraint, violation: *value });
-            }
+        let first = closure.violated(&self.model, q, orientations).next();
+        if let Some((c, violation)) = first {
+            let constraint = self.model.constraint_names[c].clone();
+            return Err(InitialError::OffConstraint { constraint, violation });
         }
         let (model, poses) = (&self.model, &closure.poses);
         for (constraint, name) in model.constraints.iter().zip(&model.constraint_names) {

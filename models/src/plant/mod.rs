@@ -5,7 +5,8 @@
 //! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
 //! [`linearize`]; [`scheme`], [`collocation`] and [`period`] (higher order, substeps); [`blocks`] and
 //! [`second_order`]; then
-//! [`choice`] (accuracy mode), [`projected`] (momentum), [`known`], [`diagnose`], [`settle`], [`site`], [`snapshot`].
+//! [`choice`] (accuracy mode), [`projected`] (momentum), [`known`], [`diagnose`], [`settle`], [`site`], [`snapshot`],
+//! [`spare`] (plants made ahead).
 
 pub(crate) mod balls;
 pub(crate) mod blocks;
@@ -41,6 +42,7 @@ mod settle;
 mod site;
 mod snapshot;
 mod space;
+mod spare;
 pub(crate) mod tree_lu;
 mod vectors;
 
@@ -66,6 +68,7 @@ pub use settle::{Equilibrium, SettleError, SettleRequest};
 pub(crate) use site::SiteJoint;
 pub use site::{Pose, Site};
 pub use snapshot::{Snapshot, SnapshotError};
+pub use spare::Spare;
 
 /// A state, by value.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -324,19 +327,19 @@ pub struct Plant {
 }
 
 impl Plant {
-    /// A plant in the scene's initial configuration, at rest.
+    /// A plant in the scene's initial configuration, at rest. Refused where that is only a guess
+    /// ([`Model::initial_violations`]): [`Plant::at`] starts elsewhere.
     pub fn new(model: Arc<Model>, settings: Settings) -> Result<Self, InitialError> {
-        let scheme = settings.check(&model)?;
-        let state = PreciseState::new(&model, scheme);
-        let mut plant = Self {
-            period: Period::new(&model, scheme, &state),
-            state,
-            workspace: Workspace::new(&model),
-            settings,
-            model,
-        };
-        plant.initialize(&Initial::Scene)?;
-        Ok(plant)
+        Self::at(model, settings, &Initial::Scene)
+    }
+
+    /// A plant in a state, step 0.
+    pub fn at(
+        model: Arc<Model>,
+        settings: Settings,
+        initial: &Initial,
+    ) -> Result<Self, InitialError> {
+        Spare::new(model, settings)?.start(initial)
     }
 
     /// The model.

@@ -17,7 +17,6 @@ use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::Model;
 use crate::control::tangent_basis;
-use crate::plant::Plant;
 use crate::plant::balls::orientations;
 use crate::plant::blocks::Blocks;
 use crate::plant::closure::Closure;
@@ -134,9 +133,9 @@ pub enum SettleError {
     },
 }
 
-impl Plant {
-    /// Finds a configuration near the guess where the plant rests: a minimum of the potential energy
-    /// less the work of constant inputs, subject to the constraints. The plant stays as it is.
+impl Model {
+    /// Finds a configuration near the guess where a plant rests: a minimum of the potential energy
+    /// less the work of constant inputs, subject to the constraints.
     ///
     /// Costs O(n³) for each of up to 300 iterations, and memory for a few matrices of n².
     pub fn settle(&self, request: &SettleRequest) -> Result<Equilibrium, SettleError> {
@@ -186,8 +185,7 @@ impl Point {
 }
 
 impl<'a> Search<'a> {
-    fn new(plant: &'a Plant, request: &SettleRequest) -> Result<Self, SettleError> {
-        let model: &Model = &plant.model;
+    fn new(model: &'a Model, request: &SettleRequest) -> Result<Self, SettleError> {
         let d = model.dimensions;
         check("q", &request.q, d.coordinates())?;
         let inputs =

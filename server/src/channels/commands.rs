@@ -5,7 +5,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use plantd_models::{Model, Plant, Settings, Site};
+use plantd_models::{Model, Settings, Site};
 use plantd_proto::v1;
 use v1::fault_spec::{Kind, Target};
 use v1::output_channel::Source;
@@ -67,6 +67,16 @@ impl Present {
             is_scheduled: channels.timeline.is_some(),
         }
     }
+
+    /// Channels without any, to hold faults, where there are none.
+    fn spare_channels(&self, limits: &Limits) -> Result<Option<Box<Channels>>, Fault> {
+        if self.is_there {
+            return Ok(None);
+        }
+        let (model, h) = (&self.base.model, self.base.settings.time_step_s);
+        let channels = declare::channels(v1::Channels::default(), model, h, limits)?;
+        Ok(Some(Box::new(channels)))
+    }
 }
 
 impl PresentFault {
@@ -111,8 +121,8 @@ impl Session {
     ) -> Result<(Arc<v1::ChannelsInfo>, Vec<f64>), Fault> {
         let _replacing = self.replacing();
         let present = self.with_core(|core| Present::of(core));
-        let mut plant = self.copy_plants().swap_remove(0);
-        let mut channels = declare::channels(declared, &mut plant, limits)?;
+        let (model, h) = (&present.base.model, present.base.settings.time_step_s);
+        let mut channels = declare::channels(declared, model, h, limits)?;
         channels.timeline =
             timeline(&present.base, &channels.declared, present.faults.iter(), limits)?;
         // Where the faults of outputs go.
@@ -188,7 +198,7 @@ impl Session {
         let all = stay.chain(std::iter::once(&next));
         let timeline = timeline(&present.base, &present.declared, all, limits)?;
         check_numbers(present.numbers.saturating_add(fault.numbers()), limits)?;
-        let spare = self.spare_channels(&present, limits)?;
+        let spare = present.spare_channels(limits)?;
         let room = Vec::with_capacity(count);
         let (info, former, spent) = self
             .with_core(move |core| {
@@ -212,20 +222,6 @@ impl Session {
             .ok_or_else(|| Fault::internal("channels are gone"))?;
         drop((former, spent));
         Ok(info)
-    }
-
-    /// Channels without any, to hold faults, where there are none.
-    fn spare_channels(
-        &self,
-        present: &Present,
-        limits: &Limits,
-    ) -> Result<Option<Box<Channels>>, Fault> {
-        if present.is_there {
-            return Ok(None);
-        }
-        let mut plant = self.copy_plants().swap_remove(0);
-        let channels = declare::channels(v1::Channels::default(), &mut plant, limits)?;
-        Ok(Some(Box::new(channels)))
     }
 
     /// Gives a plant without faults those that it was saved with, `count` of them so far. The plant is to be
@@ -254,7 +250,7 @@ impl Session {
         number_changes(&mut faults);
         let all: Vec<_> = faults.iter().map(PresentFault::of).collect();
         let timeline = timeline(&present.base, &present.declared, all.iter(), limits)?;
-        let spare = if faults.is_empty() { None } else { self.spare_channels(&present, limits)? };
+        let spare = if faults.is_empty() { None } else { present.spare_channels(limits)? };
         self.with_core(move |core| {
             core.faults = count;
             if core.channels.is_none() {
@@ -329,11 +325,10 @@ impl Session {
         if settings.time_step_s == time_step_s {
             return Ok(Renewed::Sites(sites(model, &present.declared, present.faults.iter())));
         }
-        let mut plant = Plant::new(Arc::clone(model), settings)
-            .map_err(|error| Fault::from_initial(error, "parameters"))?;
-        let mut channels = declare::channels((*present.declared).clone(), &mut plant, limits)?;
+        let h = settings.time_step_s;
+        let mut channels = declare::channels((*present.declared).clone(), model, h, limits)?;
         for PresentFault { id, given, start, .. } in present.faults {
-            let (given, h) = ((*given).clone(), settings.time_step_s);
+            let given = (*given).clone();
             let mut fault = declare::fault(id, given, model, h, &channels.info, limits)?;
             fault.start = start;
             channels.faults.push(fault);

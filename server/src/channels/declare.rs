@@ -2,9 +2,8 @@
 
 use std::collections::HashSet;
 use std::ops::Range;
-use std::sync::Arc;
 
-use plantd_models::{Model, Plant, Site};
+use plantd_models::{Model, Site};
 use plantd_proto::v1;
 use v1::fault_spec::{Kind, Pattern as GivenPattern, Start as GivenStart, Target};
 use v1::output_channel::Source as GivenSource;
@@ -227,14 +226,14 @@ fn actuator(
     Ok(Actuator::new(entry, settings))
 }
 
-/// Channels at the present state of a plant, without faults.
+/// Channels without faults, before they begin at a state.
 pub(crate) fn channels(
     declared: v1::Channels,
-    plant: &mut Plant,
+    model: &Model,
+    time_step_s: f64,
     limits: &Limits,
 ) -> Result<Channels, Fault> {
-    let model = Arc::clone(plant.model());
-    let clock = Clock { time_step_s: plant.settings().time_step_s };
+    let clock = Clock { time_step_s };
     let count = declared.outputs.len() + declared.inputs.len();
     LimitExceeded::check("channels", limits.channels, "channels", count)?;
     let mut in_force = declared.clone();
@@ -245,7 +244,7 @@ pub(crate) fn channels(
         if given.name.is_empty() {
             return Err(Fault::field(format!("{field}.name"), "is missing"));
         }
-        let sensor = sensor(given, &field, &model, clock, limits)?;
+        let sensor = sensor(given, &field, model, clock, limits)?;
         let names = names(&given.name, &sensor.source);
         let mut taken = names.iter().chain((names.len() > 1).then_some(&given.name));
         if let Some(name) = taken.find(|name| !seen.insert((*name).clone())) {
@@ -260,7 +259,7 @@ pub(crate) fn channels(
     let mut actuators: Vec<Actuator> = Vec::new();
     for (index, given) in in_force.inputs.iter_mut().enumerate() {
         let field = format!("channels.inputs[{index}]");
-        let actuator = actuator(given, &field, &model, clock, limits)?;
+        let actuator = actuator(given, &field, model, clock, limits)?;
         if actuators.iter().any(|other| other.entry == actuator.entry) {
             let problem = format!("another channel has the input `{}`", given.input);
             return Err(Fault::field(format!("{field}.input"), problem));
@@ -269,7 +268,7 @@ pub(crate) fn channels(
     }
     let seed = declared.seed;
     let info = v1::ChannelsInfo { channels: Some(in_force), names: all_names };
-    let channels = Channels::new(seed, sensors, actuators, declared, info, plant);
+    let channels = Channels::new(seed, sensors, actuators, declared, info, model);
     check_numbers(channels.numbers(), limits)?;
     Ok(channels)
 }

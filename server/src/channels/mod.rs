@@ -16,7 +16,7 @@ pub(crate) mod timeline;
 
 use std::sync::Arc;
 
-use plantd_models::{Plant, Site};
+use plantd_models::{Model, Plant, Site};
 use plantd_proto::v1;
 use prost::Message as _;
 
@@ -59,16 +59,16 @@ struct Rates {
 }
 
 impl Channels {
-    /// Channels at the present state of a plant.
+    /// Channels before they begin at a state.
     pub(crate) fn new(
         seed: u64,
         sensors: Vec<Sensor>,
         actuators: Vec<Actuator>,
         declared: v1::Channels,
         info: v1::ChannelsInfo,
-        plant: &mut Plant,
+        model: &Model,
     ) -> Self {
-        let n = plant.q().len();
+        let n = model.dimensions().coordinates();
         let needs_rates = |sensor: &Sensor| {
             matches!(sensor.source, sensor::Source::Velocity(_) | sensor::Source::Acceleration(_))
         };
@@ -77,7 +77,7 @@ impl Channels {
             let (q, velocity, acceleration, change) = (zeros(), zeros(), zeros(), zeros());
             Box::new(Rates { q, velocity, acceleration, change, age: 0.0 })
         });
-        let mut channels = Self {
+        Self {
             seed,
             output: vec![0.0; sensors.iter().map(|sensor| sensor.source.width()).sum()],
             lost: vec![0.0; sensors.len()],
@@ -89,11 +89,7 @@ impl Channels {
             declared: Arc::new(declared),
             info: Arc::new(info),
             rates,
-        };
-        let mut input = vec![0.0; plant.model().dimensions().input()];
-        plant.hold_input(&mut input);
-        channels.begin(plant, &input);
-        channels
+        }
     }
 
     /// Nothing is declared and nothing is wrong.

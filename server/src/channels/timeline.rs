@@ -1,12 +1,12 @@
 //! Numbers of the scene that change on schedule.
 //!
-//! For each set of changes that can be in force together a plant is made ahead, off the control path. A step
-//! looks which set is wanted, and if it is another one, that plant takes over the state.
+//! For each set of changes that can be in force together a spare plant is made ahead, off the control path.
+//! A step looks which set is wanted, and if it is another one, that plant takes over the state.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use plantd_models::{Model, Plant, Settings, Site};
+use plantd_models::{Model, Plant, Settings, Site, Spare};
 
 use super::fault::{Pattern, Schedule};
 use crate::limits::{LimitExceeded, Limits};
@@ -40,7 +40,7 @@ struct Entry {
     set: Set,
     /// Of the set's model, wherever its plant is.
     digest: u64,
-    plant: Plant,
+    plant: Spare,
     parameters: Arc<Parameters>,
     /// Those of outputs and pushes, in the order of [`super::Channels::sites_mut`].
     sites: Vec<Site>,
@@ -94,7 +94,7 @@ impl Timeline {
             let (what, count) = ("numbers of the scene changed", parameters.len());
             LimitExceeded::check("parameters", limits.parameters, what, count)?;
             let (digest, sites) = (model.digest(), sites(&model));
-            let plant = Plant::new(model, base.settings);
+            let plant = Spare::new(model, base.settings);
             let plant = plant.map_err(|error| Fault::from_initial(error, "fault.parameters"))?;
             entries.push(Entry { set, digest, plant, parameters, sites });
         }
@@ -128,10 +128,10 @@ impl Timeline {
             return false;
         }
         self.asked = Some(set);
+        let was = self.current;
         let wanted = self.entries.iter().position(|entry| entry.set == set);
-        let taken = wanted.filter(|wanted| self.can_enter(*wanted, plant));
-        self.is_refused = taken.is_none();
-        taken.is_some_and(|wanted| self.enter(wanted, plant, sites))
+        self.is_refused = !wanted.is_some_and(|wanted| self.relieve(wanted, plant, sites));
+        self.current != was
     }
 
     /// Finds the plant that the core has among its own, or one that is equal.
@@ -140,23 +140,31 @@ impl Timeline {
         plant: &mut Plant,
         sites: impl Iterator<Item = &'a mut Site>,
     ) {
-        let same = self.entries.iter().position(|entry| entry.digest == plant.model().digest());
-        if let Some(same) = same.filter(|same| self.can_enter(*same, plant)) {
-            self.enter(same, plant, sites);
+        if let Some(same) = self.entry_of(plant) {
+            self.relieve(same, plant, sites);
         }
     }
 
-    /// A copy of one of the plants is to take the place of the one in force: prepares everything else for
-    /// it. True when it is another one.
-    pub(crate) fn prepare_for<'a>(
+    /// A copy of one of the plants has taken the place of the one that was in force, the `former`, which is
+    /// put where it belongs; what comes back in its stead is not needed any more. True when the copy is of
+    /// another set.
+    pub(crate) fn follow<'a>(
         &mut self,
         copy: &Plant,
-        plant: &mut Plant,
+        former: &mut Spare,
         sites: impl Iterator<Item = &'a mut Site>,
     ) -> bool {
-        let digest = copy.model().digest();
-        let same = self.entries.iter().position(|entry| entry.digest == digest);
-        same.is_some_and(|same| self.enter(same, plant, sites))
+        let other = self.entry_of(copy).filter(|same| self.current != Some(*same));
+        if let Some(other) = other {
+            std::mem::swap(former, &mut self.entries[other].plant);
+            self.enter(other, sites);
+        }
+        other.is_some()
+    }
+
+    /// The entry of a plant's model.
+    fn entry_of(&self, plant: &Plant) -> Option<usize> {
+        self.entries.iter().position(|entry| entry.digest == plant.model().digest())
     }
 
     /// The plant is in another state: what could not be done may be possible.
@@ -165,23 +173,26 @@ impl Timeline {
         self.is_refused = false;
     }
 
-    fn can_enter(&mut self, wanted: usize, plant: &Plant) -> bool {
-        Some(wanted) == self.current || self.entries[wanted].plant.go_on_from(plant).is_ok()
-    }
-
-    /// Changes places with an entry, if it is not in force.
-    fn enter<'a>(
+    /// Puts an entry in force, if it is not and its constraints allow it; whether it is then.
+    fn relieve<'a>(
         &mut self,
         wanted: usize,
         plant: &mut Plant,
         sites: impl Iterator<Item = &'a mut Site>,
     ) -> bool {
         if Some(wanted) == self.current {
-            return false;
+            return true;
         }
-        let entry = &mut self.entries[wanted];
-        std::mem::swap(plant, &mut entry.plant);
-        for (present, site) in sites.zip(&mut entry.sites) {
+        let is_relieved = self.entries[wanted].plant.relieve(plant).is_ok();
+        if is_relieved {
+            self.enter(wanted, sites);
+        }
+        is_relieved
+    }
+
+    /// An entry has changed places with the plant in force: all else of it does, too.
+    fn enter<'a>(&mut self, wanted: usize, sites: impl Iterator<Item = &'a mut Site>) {
+        for (present, site) in sites.zip(&mut self.entries[wanted].sites) {
             std::mem::swap(present, site);
         }
         // What was in force goes from the place of its successor to its own.
@@ -192,7 +203,6 @@ impl Timeline {
             std::mem::swap(&mut from.sites, &mut to.sites);
         }
         self.current = Some(wanted);
-        true
     }
 
     /// Numbers that are changed in the set in force.
@@ -201,9 +211,9 @@ impl Timeline {
     }
 
     /// Copies of all plants, the one in the core's hands among them.
-    pub(crate) fn copies(&self, present: &Plant) -> Vec<Plant> {
+    pub(crate) fn copies(&self, present: &Plant) -> Vec<Spare> {
         let plant = |(index, entry): (usize, &Entry)| {
-            if self.current == Some(index) { present.clone() } else { entry.plant.clone() }
+            if self.current == Some(index) { present.clone().into() } else { entry.plant.clone() }
         };
         self.entries.iter().enumerate().map(plant).collect()
     }

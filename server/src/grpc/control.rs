@@ -107,7 +107,7 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
             k: Some(convert::matrix(&regulator.gain)),
             x_reference: convert::x(&plant),
             u_reference: u,
-            ..convert::gain_of(&model, &plant)
+            ..convert::gain_of(&model, plant.model(), plant.settings())
         }),
         value: Some(convert::matrix(&regulator.value)),
         spectral_radius: regulator.spectral_radius,
@@ -239,7 +239,7 @@ impl TrajectoryRegulator {
         let fields = WeightFields::default();
         let (weights, stages) = (request.weights, request.stages);
         let weights = convert::trajectory_weights(fields, weights, stages, steps, &model)?;
-        let common = convert::gain_of(&request.model, &plant);
+        let common = convert::gain_of(&request.model, plant.model(), plant.settings());
         let path = Path::follow(plant, &inputs, momentum, constraints, abandoned)?;
         let solution = path.solve(&weights, values)?;
         Ok(Self {

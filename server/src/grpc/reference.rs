@@ -1,7 +1,7 @@
 //! `ControlService.ProjectReference`: references from outside.
 
 use nalgebra::DMatrix;
-use plantd_models::Plant;
+use plantd_models::Spare;
 use plantd_models::control::Values;
 use plantd_models::reference::{self, Assessment, Projected};
 use plantd_proto::v1;
@@ -66,15 +66,15 @@ impl Projection {
             given => Some(convert::weights(given, &model)?),
         };
 
-        let plant = Plant::new(model.clone(), settings)
-            .map_err(|error| Fault::from_initial(error, "model"))?;
-        let assessment = reference::check_reference(&plant, &q, u.as_ref())?;
+        let spare = Spare::new(model.clone(), settings)
+            .map_err(|error| Fault::from_initial(error, "settings"))?;
+        let assessment = reference::check_reference(&spare, &q, u.as_ref())?;
         abandoned.check()?;
         if request.strict && !assessment.is_feasible(tolerance) {
             return Err(infeasible(&assessment, tolerance));
         }
         let on_manifold = constraints == Constraints::Manifold;
-        let projected = reference::project(&plant, &q, &assessment, pull.as_ref(), on_manifold)?;
+        let projected = reference::project(&spare, &q, &assessment, pull.as_ref(), on_manifold)?;
         abandoned.check()?;
         let gains = match weights {
             None => Vec::new(),
@@ -88,7 +88,7 @@ impl Projection {
         };
         Ok(Self {
             report: Some(report(&assessment, &projected, tolerance, settings.time_step_s)),
-            common: convert::gain_of(&request.model, &plant),
+            common: convert::gain_of(&request.model, &model, &settings),
             inputs: projected.inputs,
             states: projected.states,
             gains: gains.into_iter(),

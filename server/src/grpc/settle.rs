@@ -17,17 +17,15 @@ pub(super) fn settle(hub: &Hub, request: v1::SettleRequest) -> Result<v1::Settle
         .map_err(|_| Fault::field("goal", format!("{} is no such goal", request.goal)))?;
     let guess = guess(&model, request.q, &request.guess)?;
     let inputs = inputs(&model, &request.inputs)?;
-    let settings = Settings::new(&model);
-    let mut plant = Plant::new(Arc::clone(&model), settings)
-        .map_err(|error| Fault::from_initial(error, "model"))?;
     if goal == v1::SettleGoal::Constraints {
         let projection = Initial::Projection { q: guess, hold: request.hold };
-        plant.initialize(&projection).map_err(|error| Fault::from_initial(error, "guess"))?;
+        let plant = Plant::at(Arc::clone(&model), Settings::new(&model), &projection)
+            .map_err(|error| Fault::from_initial(error, "guess"))?;
         let q = plant.q().to_vec();
         return Ok(v1::SettleResponse { u: input(&model, &inputs, &q), q, equilibrium: None });
     }
     convert::check_settling(&model, &hub.limits)?;
-    let rest = plant
+    let rest = model
         .settle(&SettleRequest { q: guess, hold: request.hold, inputs })
         .map_err(|error| Fault::from_settle(error, "guess"))?;
     Ok(v1::SettleResponse {

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use plantd_models::{
-    Initial, InitialError, Linearization, Model, Plant, Settings, State, StepError, StepReport,
+    Initial, InitialError, Linearization, Model, Plant, Settings, Spare, State, StepError,
+    StepReport,
 };
 use plantd_proto::v1::{self, MarkReason};
 
@@ -305,9 +306,12 @@ impl Core {
     }
 
     /// Plants that can be in force: the first is the one without changes that faults make.
-    pub(crate) fn copy_plants(&self) -> Vec<Plant> {
+    pub(crate) fn copy_plants(&self) -> Vec<Spare> {
         let timeline = self.channels.as_ref().and_then(|channels| channels.timeline.as_ref());
-        timeline.map_or_else(|| vec![self.plant.clone()], |timeline| timeline.copies(&self.plant))
+        timeline.map_or_else(
+            || vec![self.plant.clone().into()],
+            |timeline| timeline.copies(&self.plant),
+        )
     }
 
     /// Gives the plants of changed parameters their places: `timeline` knows the changes of the faults that
@@ -440,24 +444,24 @@ impl Core {
         &mut self,
         plant: Plant,
         memory: Option<&v1::ChannelMemory>,
-    ) -> Plant {
+    ) -> Spare {
         plant.hold_input(&mut self.input);
         self.release();
         self.has_applied = false;
         self.impulse.clear();
         self.report = StepReport::default();
         self.timing = Timing::default();
+        let mut former = Spare::from(std::mem::replace(&mut self.plant, plant));
         if let Some(channels) = &mut self.channels
             && let Some(mut timeline) = channels.timeline.take()
         {
-            let is_new = timeline.prepare_for(&plant, &mut self.plant, channels.sites_mut());
+            let is_new = timeline.follow(&self.plant, &mut former, channels.sites_mut());
             let parameters = timeline.parameters().filter(|_| is_new);
             channels.timeline = Some(timeline);
             if let Some(parameters) = parameters {
                 self.note_changed(parameters);
             }
         }
-        let former = std::mem::replace(&mut self.plant, plant);
         if let Some(channels) = &mut self.channels {
             channels.begin(&mut self.plant, &self.input);
             if let Some(memory) = memory {
@@ -472,17 +476,19 @@ impl Core {
     /// stay, time goes on. The plant that was there comes back.
     pub(crate) fn change_plant(
         &mut self,
-        mut plant: Plant,
+        spare: Spare,
+        settings: Settings,
         parameters: Arc<Parameters>,
     ) -> Result<Plant, InitialError> {
-        if plant.settings() == self.plant.settings() {
-            plant.go_on_from(&self.plant)?;
+        let plant = if settings == *self.plant.settings() {
+            spare.go_on_from(&self.plant)?
         } else {
             let (State { step, q, p, v, .. }, time_s) = self.state();
-            plant.initialize(&Initial::Momentum { q, p, v })?;
+            let mut plant = spare.start(&Initial::Momentum { q, p, v })?;
             plant.set_step_index(step);
             plant.set_time_s(time_s);
-        }
+            plant
+        };
         self.parameters = parameters;
         self.generation += 1;
         let former = std::mem::replace(&mut self.plant, plant);

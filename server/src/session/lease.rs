@@ -291,8 +291,7 @@ impl Lease {
     /// Puts the plant into a state, step 0, and tells it.
     pub fn initialize(&mut self, initial: &Initial) -> Result<(State, f64), InitialError> {
         let _replacing = lock(&self.session.replacing);
-        let mut plant = self.session.copy_plants().swap_remove(0);
-        plant.initialize(initial)?;
+        let plant = self.session.copy_plants().swap_remove(0).start(initial)?;
         Ok(self.session.replace_plant(plant, None))
     }
 

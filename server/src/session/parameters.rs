@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use plantd_models::{InitialError, Plant, Settings};
+use plantd_models::{InitialError, Settings, Spare};
 use plantd_proto::v1::MarkReason;
 
 use super::{Session, lock};
@@ -36,9 +36,9 @@ impl Session {
             ..before.settings
         };
         let renewed = self.renewed_channels(&model, settings, limits)?;
-        let plant = Plant::new(model, settings)?;
+        let spare = Spare::new(model, settings)?;
         let changed = self.with_core(move |core| {
-            let former = core.change_plant(plant, parameters)?;
+            let former = core.change_plant(spare, settings, parameters)?;
             let former = (former, core.renew_channels(renewed));
             core.mark(MarkReason::Parameters);
             let is_outdated = match &mut core.feedback {

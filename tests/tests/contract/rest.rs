@@ -243,3 +243,81 @@ async fn singular_constraints_are_named() {
         assert_bad_field(client.create_plant(turning(0.1, bad)).await, "settings.singular_below");
     }
 }
+
+/// A scene may begin at a guess: only what starts at that very configuration is refused.
+#[tokio::test]
+async fn what_does_not_start_at_a_guess_is_answered() {
+    let (_server, client) = server().await;
+    let scene = client.get_model("four-bar").await.unwrap().scene_toml;
+    let scene = scene.replace("\"four-bar\"", "\"guess\"").replace("0.27841001304404134", "0.0");
+    let validated = client.validate_scene(scene.clone()).await.unwrap();
+    assert!(validated.problems.is_empty());
+    let model = client.create_model(scene).await.unwrap();
+    assert_eq!(validated.model.unwrap().initial_violations, model.initial_violations);
+    let violated: Vec<_> = model.initial_violations.iter().map(|v| v.constraint.clone()).collect();
+    assert_eq!(violated, ["pin.x", "pin.z"]);
+    assert!(model.initial_violations.iter().all(|v| v.value.abs() > 1e-3));
+
+    let request = v1::SettleRequest {
+        hold: vec!["crank".to_owned()],
+        goal: v1::SettleGoal::Constraints.into(),
+        ..settle("guess")
+    };
+    let q = client.settle(request).await.unwrap().q;
+    assert!(client.settle(settle("guess")).await.unwrap().equilibrium.unwrap().stable);
+
+    let create = async |form: Option<v1::initial_state::Form>| {
+        let request = v1::CreatePlantRequest {
+            model: "guess".to_owned(),
+            initial: form.map(|form| v1::InitialState { form: Some(form) }),
+            ..Default::default()
+        };
+        client.create_plant(request).await
+    };
+    let refused = create(None).await;
+    let message = refused.as_ref().unwrap_err().to_string();
+    assert!(message.contains("only a guess") && message.contains("projection"), "{message}");
+    assert_refused(refused, Code::InvalidArgument, "OFF_CONSTRAINT", "initial");
+    let projection =
+        v1::initial_state::Projection { q: q.iter().map(|q| q + 0.01).collect(), hold: vec![] };
+    create(Some(v1::initial_state::Form::Projection(projection))).await.unwrap();
+    let momentum = v1::initial_state::Momentum { q: q.clone(), p: vec![0.0; 3], v: Vec::new() };
+    let plant = create(Some(v1::initial_state::Form::Momentum(momentum))).await.unwrap();
+
+    // A fault prepares plants of other parameters, and a change of parameters makes another one.
+    let fault = v1::FaultSpec {
+        kind: Some(v1::fault_spec::Kind::Parameters(v1::ParameterChange {
+            parameters: vec![v1::Parameter {
+                path: "frames[rocker].body.mass".to_owned(),
+                value: 2.0,
+            }],
+        })),
+        ..Default::default()
+    };
+    client.inject_fault(&plant.id, fault).await.unwrap();
+    let step = v1::StepRequest { id: plant.id.clone(), hold: 3, ..Default::default() };
+    client.step(step).await.unwrap();
+
+    let state = v1::State { q: q.clone(), p: vec![0.0; 3], ..Default::default() };
+    let here = v1::StateAndInput { state: Some(state.clone()), u: Vec::new() };
+    let point = v1::Point { source: Some(v1::point::Source::StateAndInput(here)) };
+    let request = v1::LinearizeRequest {
+        model: "guess".to_owned(),
+        point: Some(point),
+        ..Default::default()
+    };
+    client.linearize(request).await.unwrap();
+    let case = |initial| v1::RolloutCase { initial, hold: 5, ..Default::default() };
+    let momentum = v1::initial_state::Momentum { q: q.clone(), p: vec![0.0; 3], v: Vec::new() };
+    let form = v1::initial_state::Form::Momentum(momentum);
+    let request = v1::RolloutRequest {
+        model: "guess".to_owned(),
+        cases: vec![case(Some(v1::InitialState { form: Some(form) })), case(None)],
+        ..Default::default()
+    };
+    let mut answers = client.rollout(request).await.unwrap().collect().await.unwrap();
+    answers.sort_by_key(|answer| answer.case_index);
+    assert!(answers[0].failure.is_none(), "{:?}", answers[0].failure);
+    let failure = answers[1].failure.as_ref().expect("the second case starts at the guess");
+    assert!(failure.message.contains("only a guess"), "{failure:?}");
+}

@@ -127,7 +127,25 @@ pub(crate) fn model(model: &v1::Model) -> String {
         let rows: Vec<_> = model.signals.iter().map(row).collect();
         let _ = write!(text, "\n{}", table(&["signal drives", "kind", "effect"], &rows));
     }
+    text.push_str(&guess(&model.initial_violations));
     text
+}
+
+/// Warns of an initial configuration that is only a guess; the first few of many violations.
+fn guess(violations: &[v1::ConstraintViolation]) -> String {
+    const SHOWN: usize = 8;
+    if violations.is_empty() {
+        return String::new();
+    }
+    let by = |v: &v1::ConstraintViolation| format!("{} by {:.3e}", v.constraint, v.value);
+    let mut shown: Vec<_> = violations.iter().take(SHOWN).map(by).collect();
+    if violations.len() > SHOWN {
+        shown.push(format!("{} more", violations.len() - SHOWN));
+    }
+    format!(
+        "\nwarning: the initial configuration is only a guess, which violates {}; no plant starts there: `plantctl settle` finds one that satisfies the constraints\n",
+        shown.join(", ")
+    )
 }
 
 fn coordinate(c: &v1::Coordinate) -> Vec<String> {
