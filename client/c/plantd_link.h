@@ -103,7 +103,10 @@ enum plantd_link_code {
     PLANTD_LINK_CODE_INCONSISTENT_CONSTRAINTS = 15, /* detail_a, detail_b: as above; detail_value: the
                                                        largest violation */
     PLANTD_LINK_CODE_WATCHDOG = 16         /* a watchdog holds the plant; detail_a: its index;
-                                              detail_value: its quantity */
+                                              detail_value: its quantity; residual: the bound that it
+                                              left; detail_b: which quantity, 1 + the index of a
+                                              coordinate, a coordinate's velocity, a constraint or
+                                              the energy, with 0, 1, 2 or 3 in the upper half */
 };
 
 /* In code of a STATE: the plant runs by itself, the message answers no input, and sequence is that of the

@@ -1,9 +1,14 @@
 //! Connections: addresses, timeouts and limits.
 
+use std::io;
+use std::os::unix::fs::FileTypeExt as _;
+use std::path::Path;
 use std::time::Duration;
 
+use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::{Channel, Endpoint};
 
+use crate::error::{ConnectProblem, root_cause};
 use crate::{Error, Result};
 
 /// Where a server listens unless it is told otherwise.
@@ -50,16 +55,76 @@ pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<C
         .http2_keep_alive_interval(Duration::from_secs(30))
         .user_agent(concat!("plantd-client/", env!("CARGO_PKG_VERSION")))
         .expect("the user agent is a valid header");
-    let channel = tokio::time::timeout(options.connect_timeout, endpoint.connect()).await;
-    let failed = |source| Error::Connect { address: address.to_owned(), source };
-    match channel {
-        Ok(channel) => channel.map_err(failed),
-        Err(_) => Err(tonic::Status::unavailable(format!(
-            "no connection to {address} within {:?}",
-            options.connect_timeout
-        ))
-        .into()),
+    let failed = |problem| Error::Connect { address: address.to_owned(), problem };
+    let limit = options.connect_timeout;
+    let channel = match tokio::time::timeout(limit, endpoint.connect()).await {
+        Ok(Ok(channel)) => channel,
+        Ok(Err(error)) => return Err(failed(problem(address, &error, limit))),
+        Err(_) => return Err(failed(ConnectProblem::TimedOut(limit))),
+    };
+    match tokio::time::timeout(limit, speaks_grpc(channel.clone())).await {
+        Ok(Ok(())) => Ok(channel),
+        Ok(Err(problem)) => Err(failed(problem)),
+        Err(_) => Err(failed(ConnectProblem::Silent(limit))),
     }
+}
+
+/// Why a connection could not be made.
+fn problem(
+    address: &str,
+    error: &(dyn std::error::Error + 'static),
+    limit: Duration,
+) -> ConnectProblem {
+    let socket = address.strip_prefix("unix:").map(|path| Path::new(path.trim_start_matches("//")));
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        if error.to_string() == "dns error" {
+            return ConnectProblem::UnknownHost;
+        }
+        cause = error.source();
+    }
+    let cause = root_cause(error);
+    let kind = cause.downcast_ref::<io::Error>().map(io::Error::kind);
+    match (kind, socket) {
+        (Some(io::ErrorKind::ConnectionRefused), None) => ConnectProblem::Refused,
+        (Some(io::ErrorKind::ConnectionRefused), Some(path)) if is_socket(path) => {
+            ConnectProblem::DeadSocket
+        }
+        (Some(io::ErrorKind::ConnectionRefused), Some(_)) => ConnectProblem::NotASocket,
+        (Some(io::ErrorKind::NotFound), Some(_)) => ConnectProblem::NoSocket,
+        (Some(io::ErrorKind::PermissionDenied), Some(_)) => ConnectProblem::Denied,
+        (Some(io::ErrorKind::TimedOut), _) => ConnectProblem::TimedOut(limit),
+        _ => ConnectProblem::Other(cause.to_string()),
+    }
+}
+
+fn is_socket(path: &Path) -> bool {
+    std::fs::metadata(path).is_ok_and(|metadata| metadata.file_type().is_socket())
+}
+
+/// Whether there is a gRPC server at the other end: any answer to a question for its health will do. HTTP/2
+/// does not wait for the other side before it calls a connection made.
+async fn speaks_grpc(channel: Channel) -> Result<(), ConnectProblem> {
+    let mut stub = tonic::client::Grpc::new(channel);
+    let path = PathAndQuery::from_static("/grpc.health.v1.Health/Check");
+    let not_grpc = |error: &(dyn std::error::Error + 'static)| {
+        Err(ConnectProblem::NotGrpc(root_cause(error).to_string()))
+    };
+    if let Err(error) = stub.ready().await {
+        return not_grpc(&error);
+    }
+    // Asked for the whole server, a question is an empty message.
+    let codec = tonic_prost::ProstCodec::<(), ()>::default();
+    match stub.unary(tonic::Request::new(()), path, codec).await {
+        Err(status) if is_local(&status) => not_grpc(&status),
+        _ => Ok(()),
+    }
+}
+
+/// No gRPC server has said it.
+fn is_local(status: &tonic::Status) -> bool {
+    std::error::Error::source(status).is_some()
+        || status.message().starts_with("grpc-status header missing")
 }
 
 /// Waits for `work`, but not longer than `limit`. Unlike a deadline sent with the request it does not
@@ -75,21 +140,26 @@ pub(crate) async fn within<T, E: Into<Error>>(
 }
 
 fn endpoint(address: &str) -> Result<Endpoint> {
-    let refused = || Error::Address { address: address.to_owned() };
+    let refused = |problem| Error::Address { address: address.to_owned(), problem };
     let url = if address.contains("://") || address.starts_with("unix:") {
         address.to_owned()
     } else {
         format!("http://{address}")
     };
-    let has_place = match url.split_once(':') {
-        Some(("unix", path)) => path.trim_start_matches("//").starts_with('/'),
-        Some(("http", rest)) => rest.strip_prefix("//").is_some_and(|host| !host.is_empty()),
-        _ => false,
+    let problem = match url.split_once(':') {
+        Some(("unix", path)) if path.trim_start_matches("//").starts_with('/') => None,
+        Some(("unix", _)) => Some("the path of a socket begins with `/`"),
+        Some(("http", rest)) => {
+            let has_host = rest.strip_prefix("//").is_some_and(|host| !host.is_empty());
+            (!has_host).then_some("it names no host")
+        }
+        Some(("https", _)) => Some("plantd does not speak TLS"),
+        _ => Some("the scheme is unknown"),
     };
-    if !has_place {
-        return Err(refused());
+    if let Some(problem) = problem {
+        return Err(refused(problem));
     }
-    Endpoint::from_shared(url).map_err(|_| refused())
+    Endpoint::from_shared(url).map_err(|_| refused("it cannot be read"))
 }
 
 #[cfg(test)]
@@ -102,17 +172,72 @@ mod tests {
         {
             assert!(endpoint(good).is_ok(), "{good}");
         }
-        for bad in ["", "http://", "unix:", "unix:relative", "ftp://a:1", "https://a:1", "a b"] {
-            assert!(matches!(endpoint(bad), Err(Error::Address { .. })), "{bad}");
+        for (bad, said) in [
+            ("", "no host"),
+            ("http://", "no host"),
+            ("unix:", "begins with `/`"),
+            ("unix:relative", "begins with `/`"),
+            ("ftp://a:1", "scheme"),
+            ("https://a:1", "TLS"),
+            ("a b", "cannot be read"),
+        ] {
+            let error = endpoint(bad).unwrap_err();
+            assert!(matches!(error, Error::Address { .. }), "{bad}");
+            assert!(error.to_string().contains(said), "{bad}: {error}");
+        }
+    }
+
+    /// What is said of an address, which the sentence names.
+    async fn failure(address: &str) -> ConnectProblem {
+        let options =
+            ConnectOptions { connect_timeout: Duration::from_millis(500), ..Default::default() };
+        let error = connect(address, &options).await.unwrap_err();
+        let sentence = error.to_string();
+        assert!(sentence.contains(address) && !sentence.contains("transport error"), "{sentence}");
+        match error {
+            Error::Connect { problem, .. } => problem,
+            other => panic!("{other}"),
         }
     }
 
     #[tokio::test]
-    async fn a_refused_connection_names_address_and_cause() {
+    async fn each_mistake_has_a_name_of_its_own() {
         // Bound and dropped: a port that nobody listens on.
         let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let address = format!("http://127.0.0.1:{port}");
-        let error = connect(&address, &ConnectOptions::default()).await.unwrap_err().to_string();
-        assert!(error.contains(&address) && error.contains("refused"), "{error}");
+        assert_eq!(failure(&format!("http://127.0.0.1:{port}")).await, ConnectProblem::Refused);
+        let unknown = failure("http://no-such-host.invalid:1").await;
+        assert!(
+            matches!(unknown, ConnectProblem::UnknownHost | ConnectProblem::TimedOut(_)),
+            "{unknown}"
+        );
+
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| format!("unix:{}", directory.path().join(name).display());
+        assert_eq!(failure(&path("nothing")).await, ConnectProblem::NoSocket);
+        std::fs::write(directory.path().join("file"), "").unwrap();
+        assert_eq!(failure(&path("file")).await, ConnectProblem::NotASocket);
+        let listener = std::os::unix::net::UnixListener::bind(directory.path().join("socket"));
+        drop(listener.unwrap());
+        assert_eq!(failure(&path("socket")).await, ConnectProblem::DeadSocket);
+    }
+
+    #[tokio::test]
+    async fn servers_of_something_else_are_told_from_those_that_are_not_there() {
+        use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let silent = failure(&address).await;
+        assert_eq!(silent, ConnectProblem::Silent(Duration::from_millis(500)));
+
+        tokio::spawn(async move {
+            while let Ok((mut stream, _)) = listener.accept().await {
+                tokio::spawn(async move {
+                    let _ = stream.read(&mut [0; 1024]).await;
+                    let _ = stream.write_all(b"HTTP/1.1 400 Bad Request\r\n\r\n").await;
+                });
+            }
+        });
+        let other = failure(&address).await;
+        assert!(matches!(other, ConnectProblem::NotGrpc(_)), "{other}");
     }
 }

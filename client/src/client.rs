@@ -21,7 +21,11 @@ pub struct Client {
 }
 
 impl Client {
-    /// Connects to `http://host:port` (or just `host:port`) or `unix:/path`.
+    /// Connects to `http://host:port` (or just `host:port`) or `unix:/path`, where a gRPC server has to
+    /// answer.
+    ///
+    /// # Errors
+    /// [`Error::Address`] and [`Error::Connect`] say what is wrong with the address, or what there is.
     pub async fn connect(address: impl AsRef<str>) -> Result<Self> {
         Self::connect_with(address, ConnectOptions::default()).await
     }
@@ -429,7 +433,8 @@ impl Client {
         self.open(stub.solve_trajectory_kalman(request)).await
     }
 
-    /// Runs many simulations at once; answers come in the order in which they end.
+    /// Runs many simulations at once; answers come in the order in which they end. Each may have failed by
+    /// itself: [`RolloutExt::into_states`](crate::RolloutExt::into_states) says so.
     pub async fn rollout(
         &self,
         request: v1::RolloutRequest,

@@ -14,18 +14,20 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The address is neither `http://host:port` nor `unix:/path`.
-    #[error("`{address}` is not an address; write http://host:port or unix:/path")]
+    #[error("`{address}` is not an address: {problem}; write http://host:port or unix:/path")]
     Address {
         /// What was given.
         address: String,
+        /// What is wrong with it.
+        problem: &'static str,
     },
-    /// Nobody answers there.
-    #[error("cannot connect to {address}: {}", root_cause(.source))]
+    /// There is no server at the address.
+    #[error("cannot connect to {address}: {problem}")]
     Connect {
         /// Where.
         address: String,
         /// Why not.
-        source: tonic::transport::Error,
+        problem: ConnectProblem,
     },
     /// The call was refused or failed, or a stream ended with an error.
     #[error("{0}")]
@@ -67,6 +69,59 @@ pub enum Error {
     /// The server sent something that the contract does not allow: versions do not fit.
     #[error("unexpected answer from the server: {0}")]
     Protocol(&'static str),
+}
+
+/// Why there is no connection, and what helps.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConnectProblem {
+    /// The host is there, the port is closed.
+    #[error(
+        "connection refused: no server listens there; is plantd running, and is this its port?"
+    )]
+    Refused,
+    /// There is no file at the socket's path.
+    #[error("there is no such socket; plantd makes it when it starts, with `--unix` and this path")]
+    NoSocket,
+    /// The file at the socket's path is something else.
+    #[error("there is a file of that name, but it is no socket")]
+    NotASocket,
+    /// The socket was left behind.
+    #[error("connection refused: the server of this socket has ended; start it again")]
+    DeadSocket,
+    /// The socket is not for this user.
+    #[error(
+        "permission denied: to write to the socket you have to be its owner or in its group, unless the \
+         server's `unix_mode` says otherwise"
+    )]
+    Denied,
+    /// The name of the host is unknown.
+    #[error(
+        "there is no host of that name; is it spelt right? A number such as 127.0.0.1 will do too"
+    )]
+    UnknownHost,
+    /// Nothing came back.
+    #[error(
+        "no answer within {} s; is the host right and running, and does a firewall keep the port closed?",
+        .0.as_secs_f64()
+    )]
+    TimedOut(std::time::Duration),
+    /// There is a server, but it says nothing.
+    #[error(
+        "somebody accepts the connection, but does not answer within {} s: it is no plantd, or has no \
+         room for more connections (its limit `connections`)",
+        .0.as_secs_f64()
+    )]
+    Silent(std::time::Duration),
+    /// There is a server, of something else.
+    #[error(
+        "what answers there does not speak gRPC without TLS ({0}); is this the port of plantd's gRPC, and \
+         not that of its metrics or of another server?"
+    )]
+    NotGrpc(String),
+    /// Something else.
+    #[error("{0}")]
+    Other(String),
 }
 
 impl Error {
@@ -178,12 +233,14 @@ impl fmt::Display for Refusal {
 }
 
 /// The innermost error, which is the one that a person can act on ("connection refused").
-fn root_cause(error: &dyn std::error::Error) -> String {
+pub(crate) fn root_cause<'a>(
+    error: &'a (dyn std::error::Error + 'static),
+) -> &'a (dyn std::error::Error + 'static) {
     let mut cause = error;
     while let Some(inner) = cause.source() {
         cause = inner;
     }
-    cause.to_string()
+    cause
 }
 
 #[cfg(test)]

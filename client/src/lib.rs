@@ -64,12 +64,12 @@ mod stream;
 pub use channel::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use client::Client;
 pub use driver::Driver;
-pub use error::{Error, Refusal, Result, Violation};
+pub use error::{ConnectProblem, Error, Refusal, Result, Violation};
 pub use estimator::Estimator;
 pub use follower::{Follower, GainSchedule, LawState};
 pub use matrix::{
-    GainExt, MatrixExt, StateExt, WeightsExt, diagonal, full, operating_point, present_state,
-    weights,
+    GainExt, MatrixExt, RolloutExt, StateExt, WeightsExt, diagonal, full, operating_point,
+    present_state, weights,
 };
 pub use recording::{RecordingEntry, RecordingReader};
 pub use rotation::{compose, difference, rotations};

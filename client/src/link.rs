@@ -24,7 +24,7 @@ use plantd_proto::link::{
     monotonic_ns, random_instance,
 };
 
-pub use error::{LeaseHolder, LinkError, StepFailure};
+pub use error::{Guarded, LeaseHolder, LinkError, StepFailure};
 pub use plantd_proto::link::Wait;
 
 /// How often a driver that waits looks whether the server lives, ns.

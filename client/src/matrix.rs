@@ -3,6 +3,7 @@
 use plantd_proto::v1;
 
 use crate::rotation::difference;
+use crate::{Error, Result};
 
 /// Reading and writing of [`v1::Matrix`].
 pub trait MatrixExt: Sized {
@@ -50,6 +51,25 @@ impl MatrixExt for v1::Matrix {
         assert_eq!(vector.len(), self.cols as usize, "length of the vector");
         let dot = |row: &[f64]| row.iter().zip(vector).map(|(a, b)| a * b).sum();
         self.rows_iter().map(dot).collect()
+    }
+}
+
+/// Reading of [`v1::RolloutResponse`].
+pub trait RolloutExt {
+    /// The states of a case that came to its end.
+    ///
+    /// # Errors
+    /// What kept it from that: its initial state was refused, and there are no states, or a step failed, and
+    /// the message holds those before.
+    fn into_states(self) -> Result<Vec<v1::State>>;
+}
+
+impl RolloutExt for v1::RolloutResponse {
+    fn into_states(self) -> Result<Vec<v1::State>> {
+        match self.failure {
+            Some(failure) => Err(Error::Rpc(Box::new(failure.into()))),
+            None => Ok(self.states),
+        }
     }
 }
 

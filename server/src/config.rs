@@ -223,24 +223,25 @@ pub enum LinkWaitMode {
     Poll,
 }
 
-/// Why there is no configuration.
+/// Why there is no configuration. Each is a whole sentence: a cause is told by it, and is no `source`, which
+/// would be told once more.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("configuration file `{path}`: {source}")]
+    #[error("configuration file `{path}`: {cause}")]
     Read {
         /// Path.
         path: PathBuf,
         /// Cause.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file is not a configuration.
-    #[error("configuration file `{path}`: {source}")]
+    #[error("configuration file `{path}`: {cause}")]
     Parse {
         /// Path.
         path: PathBuf,
         /// Cause; names the key.
-        source: Box<toml::de::Error>,
+        cause: Box<toml::de::Error>,
     },
     /// A value is out of range.
     #[error("{key} is {value}; it must lie between 0 and {max}")]
@@ -286,9 +287,9 @@ impl Config {
     /// Reads a file in TOML. Unknown keys are errors.
     pub fn from_file(path: &Path) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path)
-            .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+            .map_err(|cause| ConfigError::Read { path: path.to_owned(), cause })?;
         toml::from_str(&text)
-            .map_err(|source| ConfigError::Parse { path: path.to_owned(), source: source.into() })
+            .map_err(|cause| ConfigError::Parse { path: path.to_owned(), cause: cause.into() })
     }
 
     /// Refuses values that are out of range.

@@ -1,5 +1,6 @@
 //! The `plantd` server binary.
 
+use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
@@ -11,8 +12,18 @@ use plantd_server::limits::Limits;
 /// Time for computations that nobody waits for any more to notice that the server has ended.
 const LEFTOVERS_MAX: Duration = Duration::from_secs(1);
 
-fn main() -> Result<()> {
-    match Cli::parse().command {
+fn main() -> ExitCode {
+    match run(Cli::parse().command) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("plantd: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(command: Command) -> Result<()> {
+    match command {
         Command::Serve(settings) => serve(*settings),
         Command::Limits(settings) => {
             print_limits(&settings.resolve()?.limits);

@@ -20,7 +20,6 @@ use crate::grpc::feedback::set_feedback;
 use crate::grpc::model::compile;
 use crate::grpc::run::{protect, run, run_info};
 use crate::hub::Hub;
-use crate::realtime::watchdog::{Trip, WatchdogAction};
 use crate::session::{PlantSnapshot, Session};
 use crate::status::Fault;
 
@@ -248,9 +247,8 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     {
         tracing::warn!(plant = id, error = %sentence(fault), "the plant does not run by itself");
     }
-    if let Some(v1::WatchdogTrip { watchdog, value, step }) = frozen {
-        let (watchdog, action) = (watchdog as usize, WatchdogAction::Freeze);
-        session.resume_frozen(Trip { watchdog, value, action, step });
+    if let Some(trip) = frozen {
+        session.resume_frozen(trip);
     }
     Ok(session)
 }

@@ -20,7 +20,7 @@
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
 //! | FAILED_PRECONDITION | `LEASE_LOST` | PreconditionFailure | the lease that a driver wants to go on with has ended |
 //! | FAILED_PRECONDITION | `RUNNING`, `PAUSED` | PreconditionFailure | the plant runs by itself, or is paused |
-//! | FAILED_PRECONDITION | `WATCHDOG`, `INPUT_LOST` | PreconditionFailure | the plant stands still because it left bounds, or had no valid input |
+//! | FAILED_PRECONDITION | `WATCHDOG`, `INPUT_LOST` | PreconditionFailure; metadata of `WATCHDOG`: `quantity`, `value`, `bound`, `step` | the plant stands still because it left bounds, or had no valid input |
 //! | ABORTED | `LEASE_REVOKED` | | a watchdog has taken the lease away, or its driver goes on with it in another stream |
 //! | UNAVAILABLE | `LOOP_FAILED` | | the system gave no thread for plants that run |
 //! | FAILED_PRECONDITION | `BUILTIN_MODEL` | PreconditionFailure | built-in models cannot be deleted |
@@ -33,6 +33,7 @@
 //! | FAILED_PRECONDITION | `INFEASIBLE_REFERENCE` | PreconditionFailure; metadata `unexplained_acceleration`, `unexplained_coordinate`, `unexplained_step`, `constraint_violation`, `constraint_violation_step` | a reference is no motion of the plant, and `strict` was asked for |
 //! | FAILED_PRECONDITION | `NO_FEEDBACK` | PreconditionFailure | the plant has no feedback whose gains could be watched |
 //! | FAILED_PRECONDITION | `PARAMETERS_SCHEDULED` | PreconditionFailure | faults of the plant change its parameters: clear them first |
+//! | FAILED_PRECONDITION | `START_PASSED` | PreconditionFailure; metadata `start_step`, `step` | a fault was to begin at a step that the plant has left behind |
 //! | FAILED_PRECONDITION | `TIME_STEP_CHANGED` | PreconditionFailure | the trajectory of a feedback was given for another time step: set a new one |
 //! | FAILED_PRECONDITION | `POLE` | PreconditionFailure; metadata `frequency_hz` | the frequency response is infinite |
 //! | FAILED_PRECONDITION | `LINK_DISABLED` | PreconditionFailure | the server runs without shared memory |
@@ -60,7 +61,7 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::limits::LimitExceeded;
-use crate::realtime::watchdog::Trip;
+use crate::realtime::watchdog::{Quantity, Trip};
 use crate::session::{DriveError, LeaseHeld, Session};
 
 /// Longest text of one message, name or description, bytes. Statuses travel in trailers, of which
@@ -207,6 +208,17 @@ impl Fault {
     pub fn parameters_scheduled(id: &str) -> Self {
         let message = format!("faults of plant `{id}` change its parameters; ClearFault ends them");
         Self::precondition("PARAMETERS_SCHEDULED", format!("plant:{id}"), message)
+    }
+
+    /// A fault was to begin before the step at which the plant is.
+    pub fn start_passed(start: u64, step: u64) -> Self {
+        let message = format!(
+            "the fault was to begin at step {start}, and the plant is at step {step}: give a later start, \
+             or none to begin with the next step, or reset the plant first"
+        );
+        Self::precondition("START_PASSED", "fault.start", message)
+            .with("start_step", start)
+            .with("step", step)
     }
 
     /// A trajectory belongs to another time step than the plant's.
@@ -435,8 +447,9 @@ impl From<StepError> for Fault {
 }
 
 impl Fault {
-    /// The fault of a lease's operation on the plant `id`.
-    pub fn from_drive(error: DriveError, id: &str) -> Self {
+    /// The fault of a lease's operation on a plant.
+    pub fn from_drive(error: DriveError, session: &Session) -> Self {
+        let id = session.id();
         match error {
             DriveError::Closed => Self::plant_deleted(id),
             DriveError::Step(error) => error.into(),
@@ -444,13 +457,7 @@ impl Fault {
             DriveError::Paused | DriveError::NotDue(_) => {
                 Self::precondition("PAUSED", id, format!("plant `{id}` is paused"))
             }
-            DriveError::Frozen(trip) => {
-                let why = format!(
-                    "a watchdog has stopped plant `{id}` at step {}: {} left its bounds",
-                    trip.step, trip.value
-                );
-                Self::precondition("WATCHDOG", id, why)
-            }
+            DriveError::Frozen(trip) => Self::watchdog(session, &trip),
             DriveError::Revoked => {
                 let why = format!(
                     "the lease of plant `{id}` was taken away, by a watchdog or by its own driver"
@@ -468,7 +475,20 @@ impl Fault {
 
     /// A watchdog has stopped the plant.
     pub fn watchdog(session: &Session, trip: &Trip) -> Self {
-        Self::from_drive(DriveError::Frozen(*trip), session.id())
+        let (id, Trip { watchdog, value, step, .. }) = (session.id(), *trip);
+        let quantity = Quantity::name(trip.dog.quantity.code(), session.model());
+        let (bound, relation) =
+            (trip.bound(), if value < trip.dog.min { "below" } else { "above" });
+        let why = format!(
+            "watchdog {watchdog} has stopped plant `{id}` at step {step}: {quantity} is {value}, {relation} \
+             its bound {bound}; Run lets it go on from there, Reset and Restore put it elsewhere, SetSafety \
+             sets other bounds"
+        );
+        Self::precondition("WATCHDOG", id, why)
+            .with("quantity", quantity)
+            .with("value", value)
+            .with("bound", bound)
+            .with("step", step)
     }
 
     /// The plant was to stop without a valid input.

@@ -12,7 +12,7 @@
 //! must, gives its turn to the next in the queue when it has had it for 20 ms, and queues again: however
 //! many long computations there are, a short one waits for no more than one such time for each peer
 //! before it. What a job has begun stays on the stack of its thread meanwhile; there are a few more
-//! threads than turns for that. A job in parts ([`Workers::in_parts`]) keeps no thread.
+//! threads than turns for that. A job in parts (`in_parts`) keeps no thread.
 //!
 //! A job that keeps its turn for longer, because it waits for a plant or cannot be interrupted, keeps it
 //! from its own peer alone: others get a turn besides, and the system shares the processors out.

@@ -252,6 +252,9 @@ fn scenes_are_checked_explained_and_uploaded() {
     let (good, bad) = (good.to_str().unwrap(), bad.to_str().unwrap());
 
     assert_eq!(json(&server, &["validate", good])["model"]["name"], "slider");
+    let shown = text(&server, &["validate", good]);
+    assert!(shown.contains("valid, not uploaded"), "{shown}");
+    assert!(!run(&server, &["show", "model", "slider"]).status.success());
     let output = run(&server, &["validate", bad]);
     assert_eq!(output.status.code(), Some(1));
     let problems = String::from_utf8(output.stdout).unwrap();
@@ -317,6 +320,140 @@ fn refusals_go_to_standard_error_with_their_exit_code() {
     assert!(stderr(&nowhere).contains("refused"), "{}", stderr(&nowhere));
 }
 
+/// What is wrong with an address is said in one sentence, each time another one, with the address.
+#[test]
+fn each_wrong_address_gets_a_sentence_of_its_own() {
+    let server = ServerProcess::start().unwrap();
+    let metrics = server.addresses().metrics.clone().unwrap().replace("/metrics", "");
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let path = |name: &str| format!("unix:{}", server.directory().join(name).display());
+    std::fs::write(server.directory().join("file"), "").unwrap();
+    let socket = std::os::unix::net::UnixListener::bind(server.directory().join("dead")).unwrap();
+    drop(socket);
+    let (refused, none, file, dead) =
+        (format!("http://127.0.0.1:{port}"), path("none"), path("file"), path("dead"));
+    let mut sentences = std::collections::BTreeSet::new();
+    for (address, code, said) in [
+        (refused.as_str(), 3, "no server listens there"),
+        (&none, 3, "there is no such socket"),
+        (&file, 3, "no socket"),
+        (&dead, 3, "has ended"),
+        (&metrics, 3, "does not speak gRPC"),
+        ("https://127.0.0.1:1", 2, "TLS"),
+        ("ftp://127.0.0.1:1", 2, "scheme"),
+        ("unix:relative", 2, "begins with `/`"),
+    ] {
+        let output = plantctl(address, &["list"]).output().unwrap();
+        let error = stderr(&output);
+        assert_eq!(output.status.code(), Some(code), "{address}: {error}");
+        assert!(error.contains(address) && error.contains(said), "{address}: {error}");
+        assert_eq!(error.lines().count(), 1, "{error}");
+        for chain in ["transport error", "os error"] {
+            assert!(!error.contains(chain), "{error}");
+        }
+        sentences.insert(error.replace(address, ""));
+    }
+    assert_eq!(sentences.len(), 8);
+}
+
+/// The output of a command that finds things as they were asked for: it succeeds, and says so.
+#[track_caller]
+fn nothing_to_do(server: &ServerProcess, arguments: &[&str], said: &str) {
+    let output = run(server, arguments);
+    assert!(output.status.success(), "{arguments:?}: {}", stderr(&output));
+    let note = stderr(&output);
+    assert!(note.contains("nothing to do") && note.contains(said), "{arguments:?}: {note}");
+}
+
+#[test]
+fn a_command_that_does_nothing_says_so() {
+    let server = ServerProcess::start().unwrap();
+    json(&server, &["create", "pendulum", "--id", "p"]);
+    nothing_to_do(&server, &["fault", "clear", "p", "--all"], "no faults");
+    nothing_to_do(&server, &["channels", "clear", "p"], "no channels");
+    nothing_to_do(&server, &["feedback", "clear", "p"], "no feedback");
+    nothing_to_do(&server, &["guard", "p"], "nothing protects");
+    nothing_to_do(&server, &["run", "p"], "--pace paced");
+    assert_eq!(text(&server, &["fault", "list", "p"]), "no faults\n");
+    let note = run(&server, &["guard", "p", "--json"]);
+    let note: Value = serde_json::from_str(&stderr(&note)).unwrap();
+    assert!(note["note"]["message"].is_string());
+
+    text(&server, &["pause", "p"]);
+    nothing_to_do(&server, &["pause", "p"], "paused already");
+    text(&server, &["run", "p"]);
+    json(&server, &["fault", "inject", "p", "input=tau", "stuck=true"]);
+    text(&server, &["fault", "clear", "p", "--all"]);
+    text(&server, &["guard", "p", "theta<1"]);
+    text(&server, &["guard", "p"]);
+
+    for missing in [
+        ["fault", "clear", "p", "7"],
+        ["delete", "plant", "nobody", "--json"],
+        ["record", "stop", "nothing", "--json"],
+    ] {
+        assert_eq!(run(&server, &missing).status.code(), Some(1), "{missing:?}");
+    }
+    for zero in [
+        &["step", "p", "--count", "0"][..],
+        &["watch", "p", "--count", "0"],
+        &["events", "p", "--count", "0"],
+        &["gains", "p", "--count", "0"],
+        &["run", "p", "--steps", "0"],
+        &["optimize", "-", "--iterations", "0"],
+    ] {
+        assert_eq!(run(&server, zero).status.code(), Some(2), "{zero:?}");
+    }
+}
+
+#[test]
+fn what_comes_to_nothing_does_not_end_as_a_success() {
+    let server = ServerProcess::start().unwrap();
+    json(&server, &["create", "pendulum", "--id", "p", "--q", "1"]);
+    json(&server, &["step", "p", "--count", "20"]);
+    let late = ["fault", "inject", "p", "input=tau", "stuck=true", "start_step=5"];
+    let late = run(&server, &late);
+    assert_eq!(late.status.code(), Some(1));
+    assert!(stderr(&late).contains("START_PASSED"), "{}", stderr(&late));
+
+    // A run that a watchdog stops is not the one that was asked for.
+    json(&server, &["guard", "p", "theta>0.5"]);
+    let stopped = run(&server, &["run", "p", "--pace", "free", "-n", "100000", "--wait"]);
+    assert_eq!(stopped.status.code(), Some(1));
+    for part in ["WATCHDOG", "theta is", "bound 0.5"] {
+        assert!(stderr(&stopped).contains(part), "no `{part}` in {}", stderr(&stopped));
+    }
+}
+
+#[test]
+fn the_version_is_that_of_plantctl() {
+    let output = plantctl("unix:/nowhere", &["--version"]).output().unwrap();
+    let version = String::from_utf8(output.stdout).unwrap();
+    assert!(version.starts_with("plantctl "), "{version}");
+}
+
+/// Once, in a line of its own, with what is wrong; not a second time as its own cause.
+#[test]
+fn errors_of_the_configuration_are_printed_once() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("plantd.toml");
+    std::fs::write(&file, "bogus = 3\n").unwrap();
+    let file = file.to_str().unwrap();
+    for (arguments, said) in [
+        (["--config", file], "unknown field `bogus`"),
+        (["--config", "/nowhere/plantd.toml"], "No such file"),
+        (["--limit", "plant=3"], "there is no limit `plant`"),
+    ] {
+        let mut server = Command::new(binary("plantd").unwrap());
+        let output = server.arg("serve").args(arguments).env_remove("RUST_BACKTRACE").output();
+        let output = output.unwrap();
+        let error = stderr(&output);
+        assert_eq!(output.status.code(), Some(1), "{error}");
+        assert_eq!(error.matches(said).count(), 1, "{error}");
+        assert!(error.starts_with("plantd: "), "{error}");
+    }
+}
+
 /// Lines of JSON.
 #[track_caller]
 fn json_lines(server: &ServerProcess, arguments: &[&str]) -> Vec<Value> {
@@ -365,7 +502,11 @@ fn a_search_is_saved_resumed_and_used_as_a_guess() {
 
     // Six iterations, then the rest: the same bits, and the same number of them.
     let stopped = run(&server, &["optimize", &problem, "--iterations", "6", "--save", &part]);
-    assert_eq!(stopped.status.code(), Some(1));
+    assert_eq!(stopped.status.code(), Some(4));
+    let why = stderr(&stopped);
+    for said in ["MAX_ITERATIONS", "--iterations", &format!("--resume {part}")] {
+        assert!(why.contains(said), "no `{said}` in {why}");
+    }
     let stopped = String::from_utf8(stopped.stdout).unwrap();
     assert!(stopped.contains("quasi-newton") && stopped.contains("MAX_ITERATIONS"), "{stopped}");
     let resumed = json_lines(&server, &["optimize", &problem, "--resume", &part]);

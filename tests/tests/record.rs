@@ -243,6 +243,7 @@ async fn faults_are_replayed_whatever_they_do() {
     setup.client.set_parameters(request).await.unwrap();
     setup.step(&id, 10, 10).await;
     let longer = change("frames[pole].translation[1]", 0.2, 0, 1000, 4);
+    setup.client.reset(&id).await.unwrap();
     setup.client.inject_fault(&id, longer).await.unwrap();
     setup.step(&id, 10, 11).await;
     setup.client.reset(&id).await.unwrap();

@@ -158,6 +158,22 @@ def test_rollout(client):
     assert all(not end.failure and end.states[-1].step == 10 for end in ends)
 
 
+def test_a_case_of_a_rollout_that_is_refused_says_so(client):
+    def case(*q):
+        velocity = common_pb2.InitialState.Velocity(q=q, v=[0.0])
+        return control_service_pb2.RolloutCase(
+            initial=common_pb2.InitialState(velocity=velocity), hold=10
+        )
+
+    good, refused = sorted(
+        client.rollout("pendulum", [case(0.1), case(0.1, 0.2)]), key=lambda end: end.case
+    )
+    assert good.error is None and good.states[-1].step == 10
+    assert refused.error.code == "INVALID_ARGUMENT" and "cases[1].initial" in refused.failure
+    with pytest.raises(plantd.PlantdError, match=r"cases\[1\]\.initial"):
+        refused.states[-1]
+
+
 def test_models(client):
     assert "marionette" in [model.name for model in client.list_models()]
     assert client.validate_scene(SCENE) == []

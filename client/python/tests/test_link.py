@@ -67,6 +67,17 @@ def test_failures_come_in_band_and_move_nothing(client, connect):
         assert link.step(0.1).step == 1
 
 
+def test_a_watchdog_says_what_it_holds(client, connect):
+    plant, driver = connect("cart-pole")
+    client.set_safety(plant, [dict(quantity="v(x)", max=0.5)])
+    with driver() as link, pytest.raises(plantd.StepError) as held:
+        while True:
+            link.step([20.0])
+    assert held.value.reason == "WATCHDOG"
+    for part in ["the velocity of coordinate 0 is ", "the bound 0.5", "Reset"]:
+        assert part in held.value.message
+
+
 def test_one_driver_at_a_time(client, connect):
     plant, driver = connect("pendulum")
     with driver():

@@ -43,6 +43,7 @@ def test_watchdogs_hold_a_plant_and_say_why(client):
         while True:
             driver.step([20.0])
     assert stopped.value.reason == "WATCHDOG"
+    assert "x is 0.2" in stopped.value.message and "bound 0.2" in stopped.value.message
     frozen = client.get_plant(id).safety.frozen
     assert frozen.value > 0.2 and frozen.step == client.get_plant(id).state.step
     for event in client.watch_events(id, since=0):

@@ -137,13 +137,62 @@ pub enum StepFailure {
         violation: f64,
     },
     /// A watchdog holds the plant.
-    #[error("watchdog {watchdog} holds the plant: its quantity is {value}")]
+    #[error(
+        "watchdog {watchdog} holds the plant: {quantity} is {value}, beyond the bound {bound}; Run lets it go \
+         on, Reset and Restore put it elsewhere, SetSafety sets other bounds"
+    )]
     Watchdog {
         /// Index of the watchdog.
         watchdog: usize,
-        /// Value of its quantity.
+        /// What it looks at.
+        quantity: Guarded,
+        /// Value of that.
         value: f64,
+        /// Bound that it left.
+        bound: f64,
     },
+}
+
+/// What a watchdog looks at. The link has no room for names: they are in the order of the plant's model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Guarded {
+    /// A coordinate.
+    Coordinate(usize),
+    /// The mean velocity of a coordinate over the last step.
+    Velocity(usize),
+    /// The force of a constraint equation.
+    Force(usize),
+    /// Kinetic and potential energy.
+    Energy,
+    /// The server does not tell.
+    Unknown,
+}
+
+impl Guarded {
+    /// What `detail_b` of the failure says.
+    fn from_number(number: u64) -> Self {
+        let Some(code) = number.checked_sub(1) else { return Self::Unknown };
+        let index = (code & u64::from(u32::MAX)) as usize;
+        match code >> 32 {
+            0 => Self::Coordinate(index),
+            1 => Self::Velocity(index),
+            2 => Self::Force(index),
+            3 => Self::Energy,
+            _ => Self::Unknown,
+        }
+    }
+}
+
+impl std::fmt::Display for Guarded {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Coordinate(index) => write!(f, "coordinate {index}"),
+            Self::Velocity(index) => write!(f, "the velocity of coordinate {index}"),
+            Self::Force(index) => write!(f, "the force of constraint equation {index}"),
+            Self::Energy => f.write_str("the energy"),
+            Self::Unknown => f.write_str("its quantity"),
+        }
+    }
 }
 
 /// Who drives a plant.
@@ -193,7 +242,12 @@ pub(super) fn from_failure(answer: &Header) -> LinkError {
         Some(Code::InconsistentConstraints) => {
             StepFailure::InconsistentConstraints { constraint: a, count: b, violation: value }
         }
-        Some(Code::Watchdog) => StepFailure::Watchdog { watchdog: a, value },
+        Some(Code::Watchdog) => StepFailure::Watchdog {
+            watchdog: a,
+            quantity: Guarded::from_number(answer.detail_b),
+            value,
+            bound: answer.residual,
+        },
         Some(Code::Dimension) => return LinkError::Dimension { expected: a, actual: b },
         Some(Code::Sequence) => return LinkError::Sequence { expected: answer.detail_a },
         Some(Code::LeaseHeld) => return LinkError::LeaseHeld { by: holder(answer) },

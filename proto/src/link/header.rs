@@ -259,7 +259,10 @@ numbered! {
         /// Constraint equations contradict each other: `detail_a` is the index of the first
         /// concerned, `detail_b` their number, `detail_value` the largest violation.
         InconsistentConstraints = 15,
-        /// A watchdog holds the plant: `detail_a` is its index, `detail_value` the value of its quantity.
+        /// A watchdog holds the plant: `detail_a` is its index, `detail_value` the value of its quantity,
+        /// `residual` the bound that it left. `detail_b`, if it is not zero, says which quantity that is: 1
+        /// more than the index of a coordinate, a coordinate's velocity, a constraint's force, or the energy,
+        /// with 0, 1, 2 or 3 in its upper half.
         Watchdog = 16,
     }
 }

@@ -193,6 +193,9 @@ impl Session {
         let (model, info) = (&present.base.model, &present.info);
         let mut fault = declare::fault(id, given, model, time_step_s, info, limits)?;
         fault.schedule(step, time_s, time_step_s);
+        if fault.is_late(step) {
+            return Err(Fault::start_passed(fault.schedule.start, step));
+        }
         let next = PresentFault::next(&fault);
         let stay = present.faults.iter().filter(|fault| !gone.contains(&fault.id));
         let all = stay.chain(std::iter::once(&next));
@@ -200,28 +203,35 @@ impl Session {
         check_numbers(present.numbers.saturating_add(fault.numbers()), limits)?;
         let spare = present.spare_channels(limits)?;
         let room = Vec::with_capacity(count);
-        let (info, former, spent) = self
-            .with_core(move |core| {
-                core.faults = id;
-                if core.channels.is_none() {
-                    core.channels = spare;
-                }
-                let spent = core.install(timeline);
-                let channels = core.channels.as_mut()?;
-                let mut former = std::mem::replace(&mut channels.faults, room);
-                // Those that are over stay behind.
-                for kept in former.extract_if(.., |fault| !gone.contains(&fault.id)) {
-                    channels.faults.push(kept);
-                }
-                fault.place(&core.plant, &core.input, channels.output());
-                let info = fault.info(core.plant.step_index(), time_step_s);
-                channels.faults.push(fault);
-                number_changes(&mut channels.faults);
-                Some((info, former, spent))
-            })
-            .ok_or_else(|| Fault::internal("channels are gone"))?;
-        drop((former, spent));
-        Ok(info)
+        // What is left over is given back by whoever asked, not in the core's hands.
+        let (injected, _left_over) = self.with_core(move |core| {
+            let (step, time_s) = (core.plant.step_index(), core.plant.time_s());
+            fault.schedule(step, time_s, time_step_s);
+            // A plant that runs has gone on since.
+            if fault.is_late(step) {
+                let late = Fault::start_passed(fault.schedule.start, step);
+                return (Err(late), (Some(fault), room, timeline, spare));
+            }
+            core.faults = id;
+            if core.channels.is_none() {
+                core.channels = spare;
+            }
+            let spent = core.install(timeline);
+            let Some(channels) = core.channels.as_mut() else {
+                return (Err(Fault::internal("channels are gone")), (None, room, spent, None));
+            };
+            let mut former = std::mem::replace(&mut channels.faults, room);
+            // Those that are over stay behind.
+            for kept in former.extract_if(.., |fault| !gone.contains(&fault.id)) {
+                channels.faults.push(kept);
+            }
+            fault.place(&core.plant, &core.input, channels.output());
+            let info = fault.info(step, time_step_s);
+            channels.faults.push(fault);
+            number_changes(&mut channels.faults);
+            (Ok(info), (None, former, spent, None))
+        });
+        injected
     }
 
     /// Gives a plant without faults those that it was saved with, `count` of them so far. The plant is to be

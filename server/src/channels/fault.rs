@@ -267,6 +267,14 @@ impl Injected {
         self.begin_at(self.start.step(step, time_s, time_step_s, is_output));
     }
 
+    /// Its start lies before a step of the plant, or all of it: it would not do what was asked for. A start
+    /// at the present outputs, which have been delivered, is taken for the next ones.
+    pub(crate) fn is_late(&self, step: u64) -> bool {
+        let is_output = matches!(self.effect, Effect::Output { .. });
+        let next = step.saturating_add(is_output.into());
+        self.schedule.start < step || self.schedule.is_over(next)
+    }
+
     /// Binds it to the step with which it begins.
     pub(crate) fn begin_at(&mut self, step: u64) {
         self.schedule.start = step;

@@ -167,7 +167,7 @@ impl DriveStream {
             return Poll::Ready(Some(Fault::plant_deleted(driving.lease.session().id())));
         }
         if driving.status.poll_next_unpin(context).is_ready() {
-            let revoked = || Fault::from_drive(DriveError::Revoked, driving.lease.session().id());
+            let revoked = || Fault::from_drive(DriveError::Revoked, driving.lease.session());
             return Poll::Ready(driving.lease.is_revoked().then(revoked));
         }
         Poll::Pending
@@ -291,11 +291,11 @@ impl Driving {
                 Some(Box::pin(tokio::time::sleep(wait)))
             }
             Err(error @ (DriveError::Step(_) | DriveError::Frozen(_))) => {
-                let fault = Fault::from_drive(error, self.lease.session().id());
+                let fault = Fault::from_drive(error, self.lease.session());
                 let failure = Some(fault.into());
                 return Ok(Some(Answer::Failure(v1::DriveFailure { sequence, failure })));
             }
-            Err(error) => return Err(Fault::from_drive(error, self.lease.session().id())),
+            Err(error) => return Err(Fault::from_drive(error, self.lease.session())),
         };
         self.held = Some(Held { input, until, is_ready: false });
         Ok(None)

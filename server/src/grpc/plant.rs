@@ -96,7 +96,7 @@ impl PlantService {
         }
         let lease = session.acquire(DriverKind::Step)?;
         let settings = lease.look(|core| *core.plant().settings());
-        let settings = settings.map_err(|error| Fault::from_drive(error, session.id()))?;
+        let settings = settings.map_err(|error| Fault::from_drive(error, &session))?;
         let instructions = convert::period_instructions(session.step_instructions(), &settings);
         let mut steps = Steps::new(plan, lease)?;
         if instructions <= INLINE_INSTRUCTIONS_MAX {
@@ -156,7 +156,7 @@ impl Steps {
             Some(last) => last.to_vec(),
             None => lease
                 .look(|core| convert::hold_input(core.plant()))
-                .map_err(|error| Fault::from_drive(error, lease.session().id()))?,
+                .map_err(|error| Fault::from_drive(error, lease.session()))?,
         };
         let mut response = v1::StepResponse::default();
         response.states.reserve(if plan.all_states { plan.steps } else { 1 });
@@ -197,9 +197,8 @@ impl Steps {
         };
         let impulse = if k < plan.impulses.count() { plan.impulses.get(k) } else { &[] };
         let stepped = lease.step_pushed_and(u, impulse, None, look);
-        stepped.map_err(|error| {
-            Fault::from_drive(error, lease.session().id()).with("steps_taken", k)
-        })?;
+        stepped
+            .map_err(|error| Fault::from_drive(error, lease.session()).with("steps_taken", k))?;
         *taken += 1;
         Ok(())
     }

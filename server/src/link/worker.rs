@@ -303,7 +303,9 @@ impl Worker {
             Err(DriveError::Revoked) => Failure::new(Code::NotAttached),
             Err(DriveError::Frozen(trip)) => Failure {
                 a: trip.watchdog as u64,
+                b: trip.dog.quantity.code() + 1,
                 value: trip.value,
+                report: StepReport { residual: trip.bound(), ..StepReport::default() },
                 ..Failure::new(Code::Watchdog)
             },
             Err(DriveError::Step(error)) => Failure::step(&error, &self.session),

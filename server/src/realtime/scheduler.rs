@@ -337,7 +337,7 @@ impl Runner {
         let next_ns = self.schedule(timing.ended_ns);
         self.count(&timing);
         if let Some(trip) = self.core.take_trip() {
-            match trip.action {
+            match trip.dog.action {
                 WatchdogAction::Freeze => {
                     return Err(Stop::Fault(Fault::watchdog(&self.session, &trip)));
                 }
@@ -419,7 +419,7 @@ impl Runner {
         if action == Some(WatchdogAction::Disconnect) {
             self.session.revoke_lease();
         }
-        Err(Stop::Fault(Fault::from_drive(error, self.session.id())))
+        Err(Stop::Fault(Fault::from_drive(error, &self.session)))
     }
 
     /// Counts the times of a step.

@@ -86,12 +86,19 @@ impl Safety {
 pub struct Trip {
     /// Index of the watchdog.
     pub watchdog: usize,
+    /// The watchdog.
+    pub dog: Watchdog,
     /// Value of the quantity.
     pub value: f64,
-    /// What is to be done.
-    pub action: WatchdogAction,
     /// Step of the plant.
     pub step: u64,
+}
+
+impl Trip {
+    /// The bound that was left.
+    pub fn bound(&self) -> f64 {
+        if self.value < self.dog.min { self.dog.min } else { self.dog.max }
+    }
 }
 
 /// The watchdogs of a plant at work. Allocates nothing after its construction.
@@ -139,8 +146,7 @@ impl Guard {
                 }
             };
             if !(value >= dog.min && value <= dog.max) {
-                let (action, step) = (dog.action, plant.step_index());
-                return Some(Trip { watchdog, value, action, step });
+                return Some(Trip { watchdog, dog: *dog, value, step: plant.step_index() });
             }
         }
         None

@@ -192,10 +192,8 @@ impl Core {
     /// A bound was left: what can be done here is done, the rest is the driver's to find in `trip`.
     fn act_on(&mut self, trip: Trip) {
         self.trip = Some(trip);
-        let quantity = self.guard.as_ref().map(|guard| &guard.safety.watchdogs[trip.watchdog]);
-        let code = quantity.map_or(0, |watchdog| watchdog.quantity.code());
-        self.note(EventKind::Watchdog, code, trip.value);
-        match trip.action {
+        self.note(EventKind::Watchdog, trip.dog.quantity.code(), trip.value);
+        match trip.dog.action {
             WatchdogAction::Freeze => self.frozen = Some(trip),
             WatchdogAction::Reset => {
                 self.go_home();
@@ -240,9 +238,11 @@ impl Core {
         std::mem::replace(&mut self.guard, guard)
     }
 
-    /// Lets a plant stand still because of a watchdog.
-    pub(super) fn freeze(&mut self, trip: Trip) {
-        self.frozen = Some(trip);
+    /// Lets a plant stand still because of its watchdog of that index, which found a value at a step.
+    pub(super) fn freeze(&mut self, watchdog: usize, value: f64, step: u64) {
+        let dogs = self.guard.as_ref().map(|guard| &guard.safety.watchdogs);
+        let dog = dogs.and_then(|dogs| dogs.get(watchdog)).copied();
+        self.frozen = dog.map(|dog| Trip { watchdog, dog, value, step });
     }
 
     /// Lets a plant go on that stands still because of a watchdog.

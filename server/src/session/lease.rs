@@ -229,7 +229,7 @@ impl Lease {
         let trip = core.take_trip();
         let (seen, full) = (look(core), core.full_tap());
         drop(place);
-        if trip.is_some_and(|trip| trip.action == WatchdogAction::Disconnect) {
+        if trip.is_some_and(|trip| trip.dog.action == WatchdogAction::Disconnect) {
             session.revoke_lease();
         }
         if is_last {

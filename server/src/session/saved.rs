@@ -13,7 +13,6 @@ use crate::convert;
 use crate::feedback::{GuardBound, InForce, Trip};
 use crate::grpc::run::safety_info;
 use crate::parameters::Parameters;
-use crate::realtime::watchdog;
 use crate::regulator::Spec;
 
 /// Everything that a session's plant needs to go on bit for bit.
@@ -112,8 +111,9 @@ impl Session {
     }
 
     /// Lets the plant stand still where a watchdog had stopped it.
-    pub fn resume_frozen(&self, trip: watchdog::Trip) {
-        self.with_core(move |core| core.freeze(trip));
+    pub fn resume_frozen(&self, trip: v1::WatchdogTrip) {
+        let v1::WatchdogTrip { watchdog, value, step } = trip;
+        self.with_core(move |core| core.freeze(watchdog as usize, value, step));
     }
 
     /// Notes that the feedback's watchdog had taken over.

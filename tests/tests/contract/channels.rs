@@ -213,6 +213,7 @@ async fn disturb(client: &Client, id: &str, seed: u64) {
     let noisy = v1::OutputChannel { noise: 0.1, drop_out: 0.2, latency_s: H, ..theta("noisy") };
     let declared = v1::Channels { seed, ..outputs(vec![noisy, theta("angle")]) };
     client.set_channels(id, declared).await.unwrap();
+    client.reset(id).await.unwrap();
     let noise = |deviation| Kind::Noise(v1::ExtraNoise { deviation });
     let chance = v1::Chance { window_s: 5.0 * H, probability: 0.5 };
     let at_times = |fault| v1::FaultSpec { pattern: Some(Pattern::Chance(chance)), ..fault };
@@ -352,7 +353,7 @@ async fn a_restored_plant_goes_on_with_what_was_under_way() {
     let late = v1::OutputChannel { latency_s: 7.0 * H, ..theta("late") };
     client.clear_fault(&a, 0).await.unwrap();
     client.set_channels(&a, outputs(vec![late])).await.unwrap();
-    let fault = from_step(0, 0.0, on_output("late", Kind::Delay(v1::ExtraDelay { delay_s: H })));
+    let fault = on_output("late", Kind::Delay(v1::ExtraDelay { delay_s: H }));
     client.inject_fault(&a, fault).await.unwrap();
     drive(&client, &a, 20).await;
     client.restore(&a, snapshot).await.unwrap();
@@ -463,6 +464,7 @@ async fn actuators_and_faults_of_inputs_are_exact() {
     ];
     for (kind, expected) in cases {
         let fault = from_step(20, 10.0, on_input(kind));
+        client.reset(&id).await.unwrap();
         let injected = client.inject_fault(&id, fault.clone()).await.unwrap();
         let expected = |k| if in_middle(k) { expected(k) } else { force(k) };
         assert_moves_as(&client, &id, expected).await;
@@ -476,6 +478,7 @@ async fn actuators_and_faults_of_inputs_are_exact() {
         pattern: Some(Pattern::Intermittent(blink)),
         ..on_input(Kind::Off(true))
     };
+    client.reset(&id).await.unwrap();
     client.inject_fault(&id, fault).await.unwrap();
     let off = |k| [20, 24, 28].contains(&k);
     assert_moves_as(&client, &id, |k| if off(k) { 0.0 } else { force(k) }).await;
@@ -809,8 +812,9 @@ async fn what_cannot_be_is_refused_and_changes_nothing() {
     assert_eq!(client.get_channels(&id).await.unwrap(), before);
 
     // Those that are over make room.
-    let short = from_step(0, 1.0, fault.clone());
+    let short = v1::FaultSpec { duration_s: H, ..fault.clone() };
     client.inject_fault(&id, short).await.unwrap();
+    drive(&client, &id, 1).await;
     client.inject_fault(&id, fault.clone()).await.unwrap();
     client.inject_fault(&id, fault.clone()).await.unwrap();
     let error = client.inject_fault(&id, fault).await.unwrap_err();

@@ -22,4 +22,5 @@ mod running;
 mod strangers;
 mod support;
 mod transport;
+mod usage;
 mod watch;

@@ -25,8 +25,9 @@ from plantd.v1.model_service_pb2_grpc import ModelServiceStub
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 from plantd.v1.recording_service_pb2_grpc import RecordingServiceStub
 
+from ._connect import open_channel
 from ._drive import Driver
-from ._errors import PlantdError, translate, translated
+from ._errors import translate, translated
 from ._feedback import Follower
 from ._kalman import Kalman, TrajectoryKalman
 from ._optimize import Checkpoint, Method, Optimum, ProjectedReference, Search, method_number
@@ -84,18 +85,12 @@ DEFAULT_ADDRESS = "http://127.0.0.1:50051"
 
 Field = Literal["state", "report", "energy", "linearization", "gain", "input", "outputs"]
 
-#: Answers hold no more than a request asked for; this only stops a runaway peer.
-_MAX_RECEIVE_BYTES = 256 << 20
-
-#: Longest wait for a connection.
-_CONNECT_SECONDS = 5.0
-
 
 def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
     """Connects to ``http://host:port``, ``host:port`` or ``unix:/path``.
 
-    A server that is just starting is waited for, 5 seconds at most. ``timeout`` in seconds limits
-    each call that is not a stream.
+    A server that is just starting is waited for, 5 seconds at most; after that the error says what
+    there is in its place. ``timeout`` in seconds limits each call that is not a stream.
     """
     return Client(address, timeout=timeout)
 
@@ -108,16 +103,7 @@ class Client:
     """
 
     def __init__(self, address: str, *, timeout: float = 60.0):
-        options: list[tuple[str, Any]] = [("grpc.max_receive_message_length", _MAX_RECEIVE_BYTES)]
-        if address.startswith("unix:"):
-            # Without it gRPC sends the path as the authority, which HTTP/2 servers refuse.
-            options.append(("grpc.default_authority", "localhost"))
-        self._channel = grpc.insecure_channel(address.removeprefix("http://"), options)
-        try:
-            grpc.channel_ready_future(self._channel).result(timeout=_CONNECT_SECONDS)
-        except grpc.FutureTimeoutError:
-            self._channel.close()
-            raise PlantdError("UNAVAILABLE", f"no server at {address}") from None
+        self._channel = open_channel(address)
         self._timeout = timeout
         self.models = ModelServiceStub(self._channel)
         self.plants = PlantServiceStub(self._channel)
@@ -1024,7 +1010,10 @@ class Client:
         every: int = 0,
         **stepping: Unpack[Stepping],
     ) -> Iterator[Rollout]:
-        """Runs many simulations at once; answers come in the order in which they end."""
+        """Runs many simulations at once; answers come in the order in which they end.
+
+        A case that cannot be started or stepped does not disturb the others: its ``error`` says why.
+        """
         request = control_service_pb2.RolloutRequest(
             model=model, settings=settings(**stepping), cases=cases, every=every
         )

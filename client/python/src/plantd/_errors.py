@@ -52,9 +52,9 @@ class StepError(PlantdError):
     """A step was refused or failed; the plant is where it was and the driver goes on."""
 
 
-def from_failure(failure: common_pb2.Failure) -> StepError:
-    """The error of a step that failed in band."""
-    return StepError(_code_name(failure.code), failure.message, failure.reason)
+def from_failure(failure: common_pb2.Failure, kind: type[PlantdError] = StepError) -> PlantdError:
+    """The error of a step, or of something else, that failed in band."""
+    return kind(_code_name(failure.code), failure.message, failure.reason)
 
 
 def from_rpc_error(error: grpc.RpcError) -> PlantdError:

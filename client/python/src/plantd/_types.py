@@ -20,6 +20,7 @@ from plantd.v1 import (
     recording_service_pb2,
 )
 
+from ._errors import PlantdError, from_failure
 from ._rotation import difference
 
 Array = npt.NDArray[np.float64]
@@ -795,13 +796,27 @@ class Rollout:
 
     #: Index of the case.
     case: int
-    states: list[State]
-    #: Why it ended early; empty if it did not.
-    failure: str
+    #: Why it ended early, or was not begun; ``None`` if it came to its end.
+    error: PlantdError | None
+    _states: list[State]
+
+    @property
+    def states(self) -> list[State]:
+        """The states that were asked for, up to the last good one. Raises ``error`` where it left none: the
+        case's initial state was refused, or no step of it succeeded."""
+        if self.error and not self._states:
+            raise self.error
+        return self._states
+
+    @property
+    def failure(self) -> str:
+        """Why it ended early; empty if it did not."""
+        return f"{self.error.reason}: {self.error.message}" if self.error else ""
 
     @classmethod
     def _from(cls, m: control_service_pb2.RolloutResponse) -> Rollout:
-        return cls(m.case_index, [State._from(state) for state in m.states], failure_text(m))
+        error = from_failure(m.failure, PlantdError) if m.HasField("failure") else None
+        return cls(m.case_index, error, [State._from(state) for state in m.states])
 
 
 def failure_text(m: Any) -> str:

@@ -102,7 +102,8 @@ _STEP_ERRORS = {
     CODE_WATCHDOG: (
         "FAILED_PRECONDITION",
         "WATCHDOG",
-        "watchdog {h.detail_a} holds the plant: its quantity is {h.detail_value:g}",
+        "watchdog {h.detail_a} holds the plant: {guarded} is {h.detail_value:g}, beyond the bound "
+        "{h.residual:g}; Run lets it go on, Reset and Restore put it elsewhere, SetSafety sets other bounds",
     ),
     CODE_INCONSISTENT_CONSTRAINTS: (
         "FAILED_PRECONDITION",
@@ -643,7 +644,7 @@ def _error(header: Header) -> PlantdError:
     """The error that a failure message speaks of."""
     if header.code in _STEP_ERRORS:
         code, reason, message = _STEP_ERRORS[header.code]
-        return StepError(code, message.format(h=header), reason)
+        return StepError(code, message.format(h=header, guarded=_guarded(header)), reason)
     if header.code in _LINK_ERRORS:
         code, reason, message = _LINK_ERRORS[header.code]
         return LinkError(code, message, reason)
@@ -653,6 +654,16 @@ def _error(header: Header) -> PlantdError:
         message = f"the plant is driven by {holder}{process}"
         return LinkError("FAILED_PRECONDITION", message, "LEASE_HELD")
     return LinkError("INTERNAL", f"the server refused a message (code {header.code})")
+
+
+def _guarded(header: Header) -> str:
+    """What a watchdog looks at, as a failure says it; the link has no room for names."""
+    if not header.detail_b:
+        return "its quantity"
+    kind, index = divmod(header.detail_b - 1, 1 << 32)
+    names = [f"coordinate {index}", f"the velocity of coordinate {index}"]
+    names += [f"the force of constraint equation {index}", "the energy"]
+    return names[kind] if kind < len(names) else "its quantity"
 
 
 def _not_open(message: str) -> LinkError:

@@ -17,7 +17,7 @@ use crate::{channels, run, test};
 
 /// Looks at, drives and asks a plantd server.
 #[derive(Debug, Parser)]
-#[command(version, before_help = EXAMPLES, after_help = EXIT_CODES, max_term_width = 100)]
+#[command(name = "plantctl", version, before_help = EXAMPLES, after_help = EXIT_CODES, max_term_width = 100)]
 pub(crate) struct Args {
     /// Server: http://host:port or unix:/path.
     /// http://127.0.0.1:50051 if not given; `test` then starts a server of its own.
@@ -79,7 +79,7 @@ pub(crate) enum Command {
         #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
         u: Vec<Numbers>,
         /// Number of steps; those after the last `--u` repeat it.
-        #[arg(long, short = 'n')]
+        #[arg(long, short = 'n', value_parser = clap::value_parser!(u32).range(1..))]
         count: Option<u32>,
         /// Print every state, not only the last.
         #[arg(long)]
@@ -99,7 +99,7 @@ pub(crate) enum Command {
         #[arg(long, value_delimiter = ',')]
         coordinates: Vec<String>,
         /// End after this many messages.
-        #[arg(long, short = 'n')]
+        #[arg(long, short = 'n', value_parser = clap::value_parser!(u64).range(1..))]
         count: Option<u64>,
         /// Messages that may wait to be printed; of more, the oldest are lost.
         #[arg(long, value_name = "N", default_value_t = 1)]
@@ -196,7 +196,7 @@ pub(crate) enum Command {
         #[arg(long)]
         method: Option<Method>,
         /// Iterations at most, in place of the problem's `options.max_iterations`.
-        #[arg(long, value_name = "N")]
+        #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
         iterations: Option<u32>,
     },
     /// Finds a motion of a model that follows configurations from elsewhere. The configurations come,
@@ -297,7 +297,7 @@ pub(crate) enum Command {
         #[arg(long)]
         since: Option<u64>,
         /// End after this many events.
-        #[arg(long, short = 'n')]
+        #[arg(long, short = 'n', value_parser = clap::value_parser!(u64).range(1..))]
         count: Option<u64>,
     },
     /// Lets something go wrong on a plant.
@@ -308,7 +308,7 @@ pub(crate) enum Command {
         /// Plant.
         id: String,
         /// End after this many messages.
-        #[arg(long, short = 'n')]
+        #[arg(long, short = 'n', value_parser = clap::value_parser!(u64).range(1..))]
         count: Option<u64>,
     },
     /// Finds a configuration in which a model rests, from a guess.

@@ -27,7 +27,11 @@ pub(crate) async fn run(client: &Client, output: Output, command: ChannelsComman
             Ok(output.print(|| json::message("GetChannelsResponse", &answer), as_text)?)
         }
         ChannelsCommand::Clear { id } => {
+            let had = client.get_channels(&id).await?.info.and_then(|info| info.channels);
             client.set_channels(&id, v1::Channels::default()).await?;
+            if had.is_none_or(|had| had.outputs.is_empty() && had.inputs.is_empty()) {
+                output.nothing_to_do(&format!("plant `{id}` has no channels"));
+            }
             Ok(output.done(json!({ "cleared": { "plant": id } }))?)
         }
     }
@@ -43,10 +47,17 @@ pub(crate) async fn fault(client: &Client, output: Output, command: FaultCommand
         }
         FaultCommand::List { id } => {
             let all = client.list_faults(id).await?;
-            Ok(output.print(|| json::messages("FaultInfo", &all), || faults(&all))?)
+            let as_text = || match all.as_slice() {
+                [] => "no faults\n".to_owned(),
+                all => faults(all),
+            };
+            Ok(output.print(|| json::messages("FaultInfo", &all), as_text)?)
         }
         FaultCommand::Clear { id, fault, all: _ } => {
             let cleared = client.clear_fault(&id, fault.unwrap_or(0)).await?;
+            if cleared == 0 {
+                output.nothing_to_do(&format!("plant `{id}` has no faults"));
+            }
             Ok(output.done(json!({ "cleared": { "plant": id, "faults": cleared } }))?)
         }
     }

@@ -109,7 +109,7 @@ pub(crate) async fn run(args: Args) -> Result<ExitCode> {
         }
         Command::Optimize { problem, save, resume, guess, method, iterations } => {
             let files = optimize::Files { problem, save, resume, guess };
-            return optimize::optimize(&client, output, files, method, iterations).await;
+            optimize::optimize(&client, output, files, method, iterations).await?;
         }
         Command::ProjectReference { model, reference, u, settings, weights, tolerance, strict } => {
             let request = v1::ProjectReferenceRequest {
@@ -251,6 +251,15 @@ impl Output {
         out.flush()
     }
 
+    /// Says on standard error that there was nothing to do.
+    pub(crate) fn nothing_to_do(self, message: &str) {
+        if self.json {
+            eprintln!("{}", json!({ "note": { "message": message } }));
+        } else {
+            eprintln!("plantctl: nothing to do: {message}");
+        }
+    }
+
     /// Confirms what has no result of its own; people see that it went well by the silence.
     pub(crate) fn done(self, json: Value) -> std::io::Result<()> {
         self.print(|| json, String::new)
@@ -342,7 +351,7 @@ async fn watch(
 ) -> Result<()> {
     let named = fields.iter().any(|f| matches!(f, Field::Linearization | Field::Gain));
     let model = if named {
-        let plant = client.get_plant(&request.id).await?.plant.context("no plant in the answer")?;
+        let plant = plant(client, &request.id).await?;
         client.get_model(plant.model).await?
     } else {
         v1::Model::default()
@@ -358,6 +367,11 @@ async fn watch(
         seen += 1;
     }
     Ok(())
+}
+
+/// A plant as it is now.
+pub(crate) async fn plant(client: &Client, id: &str) -> Result<v1::PlantInfo> {
+    client.get_plant(id).await?.plant.context("no plant in the answer")
 }
 
 /// The next message; none at the end of the stream, or when Ctrl-C is pressed.
@@ -401,7 +415,7 @@ async fn resolve(
         let model = client.get_model(point.model.unwrap_or_default()).await?;
         return Ok((model, settings.into(), plantd_client::operating_point(point.at)));
     };
-    let plant = client.get_plant(id).await?.plant.context("no plant in the answer")?;
+    let plant = plant(client, &id).await?;
     let model = client.get_model(plant.model).await?;
     Ok((model, plant.settings.unwrap_or_default(), plantd_client::present_state(plant.id)))
 }
@@ -530,7 +544,7 @@ async fn diagnose(client: &Client, output: Output, request: v1::DiagnoseRequest)
     let name = if request.id.is_empty() {
         request.model.clone()
     } else {
-        client.get_plant(&request.id).await?.plant.context("no plant in the answer")?.model
+        plant(client, &request.id).await?.model
     };
     let model = client.get_model(name).await?;
     let answer = client.diagnose(request).await?;
@@ -553,7 +567,7 @@ async fn validate(client: &Client, output: Output, scene: &Path) -> Result<ExitC
     output.print(
         || json::message("ValidateSceneResponse", &answer),
         || match &answer.model {
-            Some(model) if answer.problems.is_empty() => text::model(model),
+            Some(model) if answer.problems.is_empty() => text::validated(model),
             _ => problems(&answer.problems),
         },
     )?;

@@ -5,7 +5,7 @@ use plantd_client::{Client, operating_point, present_state, v1};
 use serde_json::json;
 
 use crate::args::{Feedback, Reference};
-use crate::commands::{Output, next_or_interrupt, space};
+use crate::commands::{Output, next_or_interrupt, plant, space};
 use crate::optimize::read_result;
 use crate::{json, text};
 
@@ -13,7 +13,11 @@ use crate::{json, text};
 pub(crate) async fn run(client: &Client, output: Output, command: Feedback) -> Result<()> {
     let (id, reference, weights, full, mode, first_step, guard) = match command {
         Feedback::Clear { id } => {
+            let had = plant(client, &id).await?.feedback;
             client.clear_feedback(&id).await?;
+            if had.is_none() {
+                output.nothing_to_do(&format!("plant `{id}` has no feedback"));
+            }
             return Ok(output.done(json!({ "cleared": { "plant": id } }))?);
         }
         Feedback::Set { id, reference, weights, full, mode, first_step, guard } => {
@@ -67,6 +71,5 @@ pub(crate) async fn gains(
 }
 
 async fn model_of(client: &Client, id: &str) -> Result<v1::Model> {
-    let plant = client.get_plant(id).await?.plant.context("no plant in the answer")?;
-    Ok(client.get_model(plant.model).await?)
+    Ok(client.get_model(plant(client, id).await?.model).await?)
 }

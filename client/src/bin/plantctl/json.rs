@@ -7,6 +7,8 @@ use plantd_client::Error;
 use prost_reflect::{DescriptorPool, DynamicMessage, SerializeOptions};
 use serde_json::{Value, json};
 
+use crate::optimize::SearchStopped;
+
 static CONTRACT: LazyLock<DescriptorPool> = LazyLock::new(|| {
     DescriptorPool::decode(plantd_proto::FILE_DESCRIPTOR_SET).expect("the contract is well-formed")
 });
@@ -47,7 +49,8 @@ pub(crate) fn messages<M: prost::Message>(name: &str, all: &[M]) -> Value {
 
 /// An error as JSON.
 pub(crate) fn error(error: &anyhow::Error) -> Value {
-    let refusal = error.downcast_ref::<Error>().and_then(Error::refusal);
+    let stopped = error.downcast_ref::<SearchStopped>().map(|stopped| &stopped.refusal);
+    let refusal = error.downcast_ref::<Error>().and_then(Error::refusal).or(stopped);
     let Some(refusal) = refusal else {
         return json!({ "error": { "message": format!("{error:#}") } });
     };

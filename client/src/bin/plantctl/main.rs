@@ -19,8 +19,12 @@ use plantd_client::Error;
 
 /// The server refused, a stream broke, or a file could not be read or written.
 const FAILED: u8 = 1;
-/// Nobody answers at the address.
+/// What was asked for makes no sense; clap's code for it.
+const WRONG_USAGE: u8 = 2;
+/// There is no server at the address.
 const NO_SERVER: u8 = 3;
+/// A search ended before it converged; what it found is there.
+const STOPPED_EARLY: u8 = 4;
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> ExitCode {
@@ -36,11 +40,17 @@ async fn main() -> ExitCode {
             } else {
                 eprintln!("plantctl: {error:#}");
             }
-            match error.downcast_ref::<Error>() {
-                Some(Error::Connect { .. }) => ExitCode::from(NO_SERVER),
-                _ => ExitCode::from(FAILED),
-            }
+            ExitCode::from(code(&error))
         }
+    }
+}
+
+fn code(error: &anyhow::Error) -> u8 {
+    match error.downcast_ref::<Error>() {
+        Some(Error::Address { .. }) => WRONG_USAGE,
+        Some(Error::Connect { .. }) => NO_SERVER,
+        _ if error.is::<optimize::SearchStopped>() => STOPPED_EARLY,
+        _ => FAILED,
     }
 }
 

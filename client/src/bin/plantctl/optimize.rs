@@ -3,15 +3,14 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use anyhow::{Context as _, Result, ensure};
-use plantd_client::{Client, MatrixExt as _, WeightsExt as _, diagonal, full, v1};
+use plantd_client::{Client, MatrixExt as _, Refusal, WeightsExt as _, diagonal, full, v1};
 use serde::Deserialize;
 
 use crate::args::{Method, Weights};
 use crate::commands::{Output, read_text};
-use crate::{FAILED, json, text};
+use crate::{json, text};
 
 /// Files that `optimize` reads and writes.
 pub(crate) struct Files {
@@ -289,7 +288,7 @@ pub(crate) async fn optimize(
     files: Files,
     method: Option<Method>,
     iterations: Option<u32>,
-) -> Result<ExitCode> {
+) -> Result<()> {
     let text = read_text(&files.problem)?;
     let mut problem = Problem::parse(&text).with_context(|| files.problem.display().to_string())?;
     problem.options.method = method.or(problem.options.method);
@@ -332,7 +331,39 @@ pub(crate) async fn optimize(
         let text = format!("{}\n", json::message("OptimizationResult", &result));
         std::fs::write(file, text).with_context(|| format!("cannot write {}", file.display()))?;
     }
-    Ok(if result.converged { ExitCode::SUCCESS } else { ExitCode::from(FAILED) })
+    match result.converged {
+        true => Ok(()),
+        false => Err(SearchStopped::new(result, files.save.as_deref()).into()),
+    }
+}
+
+/// A search that ended before it converged.
+#[derive(Debug, thiserror::Error)]
+#[error("the search stopped before it converged: {refusal}\n{help}")]
+pub(crate) struct SearchStopped {
+    pub(crate) refusal: Refusal,
+    help: String,
+}
+
+impl SearchStopped {
+    fn new(result: v1::OptimizationResult, saved: Option<&Path>) -> Self {
+        let failure = result.failure.unwrap_or_default();
+        let mut help = match failure.reason.as_str() {
+            "MAX_ITERATIONS" => "more iterations (`--iterations`) may help".to_owned(),
+            _ => "another guess (`--guess`), method (`--method`) or tolerance may help".to_owned(),
+        };
+        let _ = match saved {
+            Some(file) => {
+                let file = file.display();
+                write!(help, "; what was found is in {file}: `--resume {file}` goes on with it")
+            }
+            None => write!(
+                help,
+                "; `--save FILE` keeps what was found, `--resume FILE` goes on with it"
+            ),
+        };
+        Self { refusal: failure.into(), help }
+    }
 }
 
 async fn search(

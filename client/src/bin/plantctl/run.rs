@@ -4,11 +4,11 @@ use std::fmt::Write as _;
 
 use anyhow::Result;
 use clap::ValueEnum;
-use plantd_client::{Client, v1};
+use plantd_client::{Client, Error, v1};
 use serde_json::json;
 
 use crate::args::{Numbers, numbers};
-use crate::commands::Output;
+use crate::commands::{Output, plant};
 use crate::{json, text};
 
 /// Arguments of `run`.
@@ -23,7 +23,7 @@ pub(crate) struct RunArgs {
     #[arg(long, requires = "pace")]
     pub(crate) speed: Option<f64>,
     /// Pause again after this many steps.
-    #[arg(long, short = 'n')]
+    #[arg(long, short = 'n', value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) steps: Option<u64>,
     /// Wait until the plant stands still again: the steps are taken, or something has stopped it.
     #[arg(long)]
@@ -101,13 +101,45 @@ pub(crate) async fn run(client: &Client, output: Output, args: RunArgs) -> Resul
         speed: speed.unwrap_or(0.0),
         input: policy,
     });
+    if settings.is_none() && steps.is_none() {
+        say_if_it_runs(client, output, &id).await?;
+    }
     let request = v1::RunRequest { id, settings, steps: steps.unwrap_or(0), wait };
     let run = client.run(request).await?;
-    Ok(output.print(|| json::message("RunInfo", &run), String::new)?)
+    output.print(|| json::message("RunInfo", &run), String::new)?;
+    match run.stopped_by {
+        Some(failure) if wait => Err(Error::Rpc(Box::new(failure.into())).into()),
+        _ => Ok(()),
+    }
+}
+
+/// `run` without more lets a plant go on that stands still; any other stays as it is.
+async fn say_if_it_runs(client: &Client, output: Output, id: &str) -> Result<()> {
+    let plant = plant(client, id).await?;
+    let run = plant.run.unwrap_or_default();
+    let is_frozen = plant.safety.is_some_and(|safety| safety.frozen.is_some());
+    if !run.running || is_frozen || run.steps_left > 0 {
+        return Ok(());
+    }
+    output.nothing_to_do(&match run.settings.unwrap_or_default().pace() {
+        v1::Pace::Unspecified | v1::Pace::Lockstep => format!(
+            "plant `{id}` is in lockstep, one step for each input of its driver; with `--pace paced` it \
+             runs by itself"
+        ),
+        v1::Pace::Paced | v1::Pace::Free => format!("plant `{id}` runs already"),
+    });
+    Ok(())
 }
 
 /// `pause`.
 pub(crate) async fn pause(client: &Client, output: Output, id: String) -> Result<()> {
+    let run = plant(client, &id).await?.run.unwrap_or_default();
+    if !run.running {
+        output.nothing_to_do(&match run.stopped_by {
+            Some(failure) => format!("plant `{id}` stands still already: {}", failure.message),
+            None => format!("plant `{id}` is paused already"),
+        });
+    }
     let paused = client.pause(id).await?;
     let as_text = || paused.state.as_ref().map(text::state).unwrap_or_default();
     Ok(output.print(|| json::message("PauseResponse", &paused), as_text)?)
@@ -122,6 +154,9 @@ pub(crate) async fn guard(
 ) -> Result<()> {
     let watchdogs: Vec<v1::Watchdog> = watchdogs.into_iter().map(|dog| dog.0).collect();
     let count = watchdogs.len();
+    if count == 0 && plant(client, &id).await?.safety.is_none() {
+        output.nothing_to_do(&format!("nothing protects plant `{id}`"));
+    }
     let request = v1::SetSafetyRequest { id: id.clone(), watchdogs, on_step_failure: 0 };
     client.set_safety(request).await?;
     Ok(output.done(json!({ "guarded": { "plant": id, "watchdogs": count } }))?)

@@ -106,8 +106,16 @@ pub(crate) fn input_names(model: &v1::Model) -> Vec<String> {
 
 /// A model.
 pub(crate) fn model(model: &v1::Model) -> String {
+    described(model, if model.builtin { "built in" } else { "uploaded" })
+}
+
+/// The model of a scene that was only looked at.
+pub(crate) fn validated(model: &v1::Model) -> String {
+    described(model, "valid, not uploaded")
+}
+
+fn described(model: &v1::Model, origin: &str) -> String {
     let mut text = format!("{}: {}\n", model.name, model.description);
-    let origin = if model.builtin { "built in" } else { "uploaded" };
     let _ = writeln!(text, "{origin}, time step {} s", number(model.time_step_s));
     let rows: Vec<_> = model.coordinates.iter().map(coordinate).collect();
     let _ = write!(text, "\n{}", table(&["coordinate", "kind", "unit", "initial"], &rows));
@@ -656,7 +664,8 @@ fn method(method: v1::DescentMethod) -> &'static str {
 /// The end of a search.
 pub(crate) fn optimum(result: &v1::OptimizationResult) -> String {
     let mut text = match &result.failure {
-        Some(failure) => format!("{}: {}\n", failure.reason, failure.message),
+        // Standard error says why, and what helps.
+        Some(failure) => format!("stopped early: {}\n", failure.reason),
         None => "converged\n".to_owned(),
     };
     let _ = write!(text, "cost {}", number(result.cost));

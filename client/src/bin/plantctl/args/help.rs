@@ -27,10 +27,12 @@ pub(crate) const EXIT_CODES: &str = "\
 Data goes to standard output, messages to standard error.
 
 Exit codes:
-  0  done
-  1  refused by the server, or failed; `validate`: the scene has errors; `replay`: a step differs
+  0  done; where things already were as asked for, a message says so
+  1  refused by the server, or failed; `validate`: the scene has errors; `replay`: a step differs;
+     `run --wait`: something else has stopped the plant
   2  wrong usage
-  3  no server at the address";
+  3  no server at the address
+  4  `optimize`: the search stopped before it converged; what it found is printed, and saved if asked for";
 
 pub(crate) const PROBLEM: &str = "\
 The problem, here the swing-up of a pendulum; only model, steps and cost must be there:
