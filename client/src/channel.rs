@@ -102,18 +102,17 @@ fn is_socket(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|metadata| metadata.file_type().is_socket())
 }
 
-/// Whether there is a gRPC server at the other end: any answer to a question for its health will do. HTTP/2
-/// does not wait for the other side before it calls a connection made.
+/// Whether there is a gRPC server at the other end: it says of a method that nobody has that it has none.
+/// HTTP/2 does not wait for the other side before it calls a connection made.
 async fn speaks_grpc(channel: Channel) -> Result<(), ConnectProblem> {
     let mut stub = tonic::client::Grpc::new(channel);
-    let path = PathAndQuery::from_static("/grpc.health.v1.Health/Check");
+    let path = PathAndQuery::from_static("/plantd.v1.Connection/Probe");
     let not_grpc = |error: &(dyn std::error::Error + 'static)| {
         Err(ConnectProblem::NotGrpc(root_cause(error).to_string()))
     };
     if let Err(error) = stub.ready().await {
         return not_grpc(&error);
     }
-    // Asked for the whole server, a question is an empty message.
     let codec = tonic_prost::ProstCodec::<(), ()>::default();
     match stub.unary(tonic::Request::new(()), path, codec).await {
         Err(status) if is_local(&status) => not_grpc(&status),
