@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::config::{Config, ConfigError, Listen, LogFormat};
+use crate::modes::Mode;
 use crate::priority::Priority;
 
 /// Simulated plants for real-time controllers.
@@ -43,6 +44,12 @@ pub struct Settings {
     /// gRPC over a unix-domain socket.
     #[arg(long, env = "PLANTD_UNIX", value_name = "PATH")]
     pub unix: Option<PathBuf>,
+    /// Mode of that socket, octal: who may connect.
+    #[arg(long, env = "PLANTD_UNIX_MODE", value_name = "MODE")]
+    pub unix_mode: Option<Mode>,
+    /// Mode of saved plants and recordings, octal.
+    #[arg(long, env = "PLANTD_FILE_MODE", value_name = "MODE")]
+    pub file_mode: Option<Mode>,
     /// Prometheus metrics over HTTP; `off` for none.
     #[arg(long, env = "PLANTD_METRICS", value_name = "ADDRESS:PORT")]
     pub metrics: Option<Listen>,
@@ -148,6 +155,8 @@ impl Settings {
         };
         replace(&mut config.grpc, self.grpc);
         replace(&mut config.metrics, self.metrics);
+        replace(&mut config.unix_mode, self.unix_mode);
+        replace(&mut config.file_mode, self.file_mode);
         replace(&mut config.threads, self.threads);
         replace(&mut config.workers, self.workers);
         replace(&mut config.worker_priority, self.worker_priority);

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits::{LimitError, Limits};
 use crate::link::LinkConfig;
+use crate::modes::Mode;
 use crate::names::{Names, is_host_name, is_origin};
 use crate::priority::{Priority, Scheduling};
 use crate::realtime::RealTimeSettings;
@@ -30,6 +31,11 @@ pub struct Config {
     /// gRPC over a unix-domain socket at this path; not given means none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub unix: Option<PathBuf>,
+    /// Mode of that socket, whatever the umask: who may connect.
+    pub unix_mode: Mode,
+    /// Mode of saved plants and recordings, whatever the umask. Directories that are made for them may be
+    /// entered by those who may read the files.
+    pub file_mode: Mode,
     /// Metrics at `http://address:port/metrics`, or `off`.
     pub metrics: Listen,
     /// Origins of pages that may call, besides the server's own: `https://panel.example`.
@@ -79,6 +85,8 @@ impl Default for Config {
         Self {
             grpc: Listen::At(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT))),
             unix: None,
+            unix_mode: Mode::GROUP,
+            file_mode: Mode::PRIVATE,
             metrics: Listen::Off,
             allowed_origins: Vec::new(),
             allowed_hosts: Vec::new(),
@@ -446,6 +454,9 @@ mod tests {
         assert!(config("[realtime]\nscheduling = { fifo = 100 }").check().is_err());
         assert!(config("[realtime]\nscheduling = { fifo = 80 }\nspin_us = 200").check().is_ok());
         assert!(toml::from_str::<Config>("grpc = \"localhost\"").is_err());
+        assert!(config("unix_mode = \"0600\"").check().is_ok());
+        let error = toml::from_str::<Config>("file_mode = \"0777\"").unwrap_err().to_string();
+        assert!(error.contains("0777") && error.contains("octal"), "{error}");
     }
     #[test]
     fn programs_reach_a_server_beyond_loopback_by_any_name() {

@@ -10,6 +10,7 @@ use tokio::sync::oneshot;
 use tracing_subscriber::EnvFilter;
 
 use crate::config::{Config, LogConfig, LogFormat};
+use crate::modes::Mode;
 use crate::serve::{Addresses, Shutdown, run};
 
 /// Sets up logging to standard error.
@@ -99,7 +100,8 @@ async fn stdin_ended() {
 fn write_ready_file(path: &Path, addresses: &Addresses) -> Result<()> {
     let mut partial = path.as_os_str().to_owned();
     partial.push(".partial");
-    let mut file = std::fs::File::create(&partial)?;
+    // Clients trust it: others may read it, and not write to it.
+    let mut file = Mode::PUBLIC.create(Path::new(&partial))?;
     serde_json::to_writer(&mut file, addresses)?;
     file.write_all(b"\n")?;
     drop(file);

@@ -27,6 +27,7 @@ pub mod listen;
 mod memory;
 pub mod metrics;
 pub mod metrics_http;
+pub mod modes;
 pub mod names;
 pub mod parameters;
 pub mod peer;

@@ -1,15 +1,17 @@
 //! Listening sockets: TCP without delay, unix-domain.
 
+use std::fs::Permissions;
 use std::io;
 use std::net::SocketAddr;
-use std::os::unix::fs::FileTypeExt;
+use std::os::unix::fs::{FileTypeExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 
-use tokio::net::{UnixListener, UnixStream};
+use tokio::net::UnixStream;
 use tokio_stream::wrappers::UnixListenerStream;
 use tonic::transport::server::TcpIncoming;
 
 use crate::grpc::KEEP_ALIVE_INTERVAL;
+use crate::modes::Mode;
 
 /// Listens on a TCP address. Small answers are sent at once: with Nagle's algorithm a call takes
 /// 40 ms.
@@ -19,14 +21,18 @@ pub fn bind_tcp(address: SocketAddr) -> io::Result<TcpIncoming> {
         .with_keepalive(Some(KEEP_ALIVE_INTERVAL)))
 }
 
+/// Connections that may wait to be accepted.
+const BACKLOG: u32 = 1024;
+
 /// A unix-domain socket that disappears with its listener.
 pub struct UnixSocket {
     path: PathBuf,
 }
 
 impl UnixSocket {
-    /// Listens on a path. A socket that a dead server has left there is replaced.
-    pub async fn bind(path: &Path) -> io::Result<(Self, UnixListenerStream)> {
+    /// Listens on a path. A socket that a dead server has left there is replaced. Who may connect is what the
+    /// mode says; at no time may others.
+    pub async fn bind(path: &Path, mode: Mode) -> io::Result<(Self, UnixListenerStream)> {
         if is_socket(path) {
             match UnixStream::connect(path).await {
                 Ok(_) => {
@@ -39,8 +45,14 @@ impl UnixSocket {
                 Err(error) => return Err(error),
             }
         }
-        let listener = UnixListener::bind(path)?;
-        Ok((Self { path: path.to_owned() }, UnixListenerStream::new(listener)))
+        let socket = tokio::net::UnixSocket::new_stream()?;
+        // The file gets the mode that the socket has when it is bound, less the umask.
+        let bits = rustix::fs::Mode::from_bits_truncate(mode.bits() as rustix::fs::RawMode);
+        rustix::fs::fchmod(&socket, bits)?;
+        socket.bind(path)?;
+        let bound = Self { path: path.to_owned() };
+        std::fs::set_permissions(path, Permissions::from_mode(mode.bits()))?;
+        Ok((bound, UnixListenerStream::new(socket.listen(BACKLOG)?)))
     }
 
     /// Where it is.
@@ -81,10 +93,10 @@ mod tests {
     async fn a_dead_servers_socket_is_replaced_and_a_live_ones_is_not() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("plantd.sock");
-        drop(UnixListener::bind(&path).unwrap());
+        drop(tokio::net::UnixListener::bind(&path).unwrap());
         assert!(is_socket(&path));
-        let (socket, _listener) = UnixSocket::bind(&path).await.unwrap();
-        let Err(error) = UnixSocket::bind(&path).await else { panic!("bound twice") };
+        let (socket, _listener) = UnixSocket::bind(&path, Mode::GROUP).await.unwrap();
+        let Err(error) = UnixSocket::bind(&path, Mode::GROUP).await else { panic!("bound twice") };
         assert_eq!(error.kind(), io::ErrorKind::AddrInUse);
         drop(socket);
         assert!(!path.exists());

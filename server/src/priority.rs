@@ -48,7 +48,7 @@ impl Scheduling {
     /// says so.
     pub fn apply(self) {
         let Self::Fifo(priority) = self else { return };
-        if let Err(error) = schedule_first_come(priority) {
+        if let Err(error) = schedule(priority) {
             tracing::warn!(priority, %error, "paced plants run without SCHED_FIFO: steps may be late");
         }
     }
@@ -66,6 +66,12 @@ pub fn allow_cpus(cpus: &[usize]) {
     }
 }
 
+/// Whether the calling thread may run on a processor.
+pub fn usable_cpus() -> std::io::Result<impl Fn(usize) -> bool> {
+    let set = rustix::thread::sched_getaffinity(None)?;
+    Ok(move |cpu| cpu < rustix::thread::CpuSet::MAX_CPU && set.is_set(cpu))
+}
+
 /// Lets sleeps of the calling thread end as soon as the system can, not up to 50 µs later.
 pub fn sharpen_timers() {
     let slack_ns = std::num::NonZeroU64::MIN;
@@ -80,8 +86,9 @@ pub fn lock_memory() -> std::io::Result<()> {
     Ok(mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE)?)
 }
 
+/// Schedules the calling thread by SCHED_FIFO.
 #[cfg(target_os = "linux")]
-fn schedule_first_come(priority: u8) -> std::io::Result<()> {
+pub(crate) fn schedule(priority: u8) -> std::io::Result<()> {
     let parameters = libc::sched_param { sched_priority: priority.into() };
     // SAFETY: the call reads `parameters`, which lives until it returns; 0 is the calling thread.
     match unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const parameters) } {
@@ -91,7 +98,7 @@ fn schedule_first_come(priority: u8) -> std::io::Result<()> {
 }
 
 #[cfg(not(target_os = "linux"))]
-fn schedule_first_come(_: u8) -> std::io::Result<()> {
+pub(crate) fn schedule(_: u8) -> std::io::Result<()> {
     Err(std::io::ErrorKind::Unsupported.into())
 }
 

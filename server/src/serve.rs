@@ -134,11 +134,11 @@ impl RunningServer {
         );
         hub.search_threads = config.search_thread_count();
         if let Some(path) = &config.state_directory {
-            let state = StateDirectory::open(path);
+            let state = StateDirectory::open(path, config.file_mode);
             hub.state = Some(state.with_context(|| format!("plants in {}", path.display()))?);
         }
         if let Some(path) = &config.recordings {
-            let recordings = Recordings::open(path, config.limits.clone());
+            let recordings = Recordings::open(path, config.file_mode, config.limits.clone());
             let recordings =
                 recordings.with_context(|| format!("recordings in {}", path.display()));
             hub.recordings = Some(recordings?);
@@ -244,7 +244,7 @@ impl RunningServer {
         }
         if let Some(path) = &self.config.unix {
             let path = std::path::absolute(path)?;
-            let (socket, incoming) = UnixSocket::bind(&path)
+            let (socket, incoming) = UnixSocket::bind(&path, self.config.unix_mode)
                 .await
                 .with_context(|| format!("gRPC on socket {}", path.display()))?;
             self.addresses.unix = Some(format!("unix:{}", socket.path().display()));

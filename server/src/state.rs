@@ -4,7 +4,7 @@
 //! written aside and renamed: what is there is complete.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
@@ -20,6 +20,7 @@ use crate::grpc::feedback::set_feedback;
 use crate::grpc::model::compile;
 use crate::grpc::run::{protect, run, run_info};
 use crate::hub::Hub;
+use crate::modes::Mode;
 use crate::session::{PlantSnapshot, Session};
 use crate::status::Fault;
 
@@ -28,6 +29,7 @@ const EXTENSION: &str = "plant";
 /// A directory in which plants survive their server.
 pub struct StateDirectory {
     path: PathBuf,
+    mode: Mode,
     saved: Mutex<BTreeMap<String, Saved>>,
     /// Ids of the plants that were not paused when the server began to pause them all.
     running: OnceLock<BTreeSet<String>>,
@@ -47,10 +49,10 @@ enum Saved {
 }
 
 impl StateDirectory {
-    /// The directory at a path, made if there is none.
-    pub fn open(path: &Path) -> io::Result<Self> {
-        fs::create_dir_all(path)?;
-        Ok(Self { path: path.to_owned(), saved: Mutex::default(), running: OnceLock::new() })
+    /// The directory at a path, made if there is none; the mode is that of its files.
+    pub fn open(path: &Path, mode: Mode) -> io::Result<Self> {
+        mode.create_directory(path)?;
+        Ok(Self { path: path.to_owned(), mode, saved: Mutex::default(), running: OnceLock::new() })
     }
 
     /// Makes the plants anew that the directory holds. What cannot be used is named in the log and
@@ -147,7 +149,7 @@ impl StateDirectory {
         bytes.extend(hash(&bytes).to_le_bytes());
         let path = self.file(id);
         let aside = path.with_extension("partial");
-        let mut file = File::create(&aside)?;
+        let mut file = self.mode.create(&aside)?;
         file.write_all(&bytes)?;
         file.sync_data()?;
         drop(file);

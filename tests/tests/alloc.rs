@@ -12,6 +12,7 @@ use plantd_proto::v1;
 use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
 use plantd_server::limits::Limits;
 use plantd_server::metrics::Metrics;
+use plantd_server::modes;
 use plantd_server::realtime::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
 use plantd_server::realtime::{Pace, RealTime, RealTimeSettings, RunSettings};
 use plantd_server::record::Recordings;
@@ -290,7 +291,8 @@ fn a_recorded_step_allocates_nothing() {
     let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("a plant");
     let session = new_session(plant);
     let directory = tempfile::tempdir().expect("a directory");
-    let recordings = Recordings::open(directory.path(), Limits::default()).expect("opened");
+    let recordings = Recordings::open(directory.path(), modes::Mode::PRIVATE, Limits::default())
+        .expect("opened");
     recordings.start(&session, "steps".to_owned(), 0.0).expect("it can be recorded");
     let mut lease = session.acquire(DriverKind::Step).expect("nobody has it");
     // More than the ring holds, so that some steps wait for the recorder.

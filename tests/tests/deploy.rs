@@ -100,6 +100,29 @@ fn the_list_of_metrics_is_complete() {
     assert_eq!(described, registered);
 }
 
+/// Priorities that the documents recommend, and those that the unit grants.
+#[test]
+fn recommended_priorities_are_granted() {
+    let unit = read("deploy/plantd.service");
+    let granted = unit.lines().find_map(|line| line.strip_prefix("LimitRTPRIO=")).expect("a limit");
+    let granted: u8 = granted.parse().expect("a number");
+    let mut recommended = 0;
+    for document in ["server/REALTIME.md", "README.md", "deploy/plantd.toml"] {
+        let text = read(document);
+        for rest in text.split("fifo = ").skip(1) {
+            let digits: String = rest.chars().take_while(char::is_ascii_digit).collect();
+            let Ok(priority) = digits.parse::<u8>() else { continue };
+            assert!(
+                priority <= granted,
+                "{document} recommends {priority}, the unit grants {granted}"
+            );
+            recommended += 1;
+        }
+    }
+    assert!(recommended > 0);
+    assert!(read("deploy/plantd.toml").contains(&format!("grants up to {granted}\n")));
+}
+
 #[test]
 fn ports_and_paths_agree() {
     let config: Config = toml::from_str(&read("deploy/plantd.toml")).expect("it is read");

@@ -15,6 +15,7 @@ pub mod alarm;
 pub mod event;
 pub mod histogram;
 pub mod input;
+mod permissions;
 mod pump;
 mod scheduler;
 pub mod slot;
@@ -35,7 +36,7 @@ pub(crate) use self::scheduler::{Handle, Runner, Stop};
 use self::slot::InputSlot;
 use crate::limits::LimitExceeded;
 use crate::metrics::Metrics;
-use crate::priority::{Scheduling, lock_memory};
+use crate::priority::Scheduling;
 
 /// A plant that is late by up to this long takes its steps one after the other until it has caught up;
 /// beyond it goes on from where it is, and the schedule has slipped.
@@ -198,10 +199,8 @@ pub struct RealTime {
 impl RealTime {
     /// Loops that are started when they are needed.
     pub fn new(settings: RealTimeSettings, metrics: &Metrics) -> Arc<Self> {
-        if settings.lock_memory
-            && let Err(error) = lock_memory()
-        {
-            tracing::warn!(%error, "the server's memory is not locked");
+        for refused in permissions::claim(&settings) {
+            tracing::warn!("{refused}");
         }
         Arc::new(Self {
             settings,

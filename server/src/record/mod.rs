@@ -30,6 +30,7 @@ use tonic::Code;
 use self::recorder::{Options, Recorder, StartError, sentence};
 use crate::convert::check_name;
 use crate::limits::{LimitExceeded, Limits};
+use crate::modes::Mode;
 use crate::session::Session;
 use crate::status::Fault;
 
@@ -45,6 +46,7 @@ const WAITING_MAX: usize = 8;
 /// The recordings in a directory.
 pub struct Recordings {
     directory: PathBuf,
+    mode: Mode,
     limits: Limits,
     /// Those that this server has begun; none while it begins. Nobody waits for the disk with this in hand.
     own: Mutex<BTreeMap<String, Option<Arc<Recorder>>>>,
@@ -53,11 +55,11 @@ pub struct Recordings {
 }
 
 impl Recordings {
-    /// The recordings in a directory, made if there is none.
-    pub fn open(directory: &Path, limits: Limits) -> io::Result<Self> {
-        fs::create_dir_all(directory)?;
+    /// The recordings in a directory, made if there is none; the mode is that of its files.
+    pub fn open(directory: &Path, mode: Mode, limits: Limits) -> io::Result<Self> {
+        mode.create_directory(directory)?;
         let permits = Arc::new(Semaphore::new(WAITING_MAX));
-        Ok(Self { directory: directory.to_owned(), limits, own: Mutex::default(), permits })
+        Ok(Self { directory: directory.to_owned(), mode, limits, own: Mutex::default(), permits })
     }
 
     /// Does something for which the disk is waited for, on a thread that may wait.
@@ -127,7 +129,7 @@ impl Recordings {
         let count = self.files().map_err(|error| failed(&error))?.len() + 1;
         LimitExceeded::check("recordings", self.limits.recordings, "recordings", count)?;
         let path = self.path(name);
-        let file = File::create_new(&path).map_err(|error| match error.kind() {
+        let file = self.mode.create_new(&path).map_err(|error| match error.kind() {
             io::ErrorKind::AlreadyExists => Fault::recording_exists(name),
             _ => failed(&error),
         })?;
