@@ -596,15 +596,18 @@ def _check_private(path: Path) -> None:
 def _check_segments(expected: dict[str, int]) -> None:
     """Segments of the link must be this user's alone, and as the server has made them."""
     for name, size in expected.items():
-        path, found = _SHARED_MEMORY / name, 0
-        with contextlib.suppress(FileNotFoundError):
+        path = _SHARED_MEMORY / name
+        try:
             status = path.lstat()
+        except FileNotFoundError:
+            # Those of other links of the server are listed as well, and go with them.
+            continue
+        is_private = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077
+        if not is_private or status.st_uid != os.getuid():
+            message = f"{path} must belong to user {os.getuid()} and be closed to others (mode 0600)"
+            raise LinkError("FAILED_PRECONDITION", message, "SEGMENT_NOT_PRIVATE")
+        if status.st_size != size:
             found = status.st_size
-            is_private = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077
-            if not is_private or status.st_uid != os.getuid():
-                message = f"{path} must belong to user {os.getuid()} and be closed to others (mode 0600)"
-                raise LinkError("FAILED_PRECONDITION", message, "SEGMENT_NOT_PRIVATE")
-        if found != size:
             raise _not_open(f"{path} has {found} bytes, not the {size} that the server has given it")
 
 
