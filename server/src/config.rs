@@ -458,6 +458,7 @@ mod tests {
         let error = toml::from_str::<Config>("file_mode = \"0777\"").unwrap_err().to_string();
         assert!(error.contains("0777") && error.contains("octal"), "{error}");
     }
+
     #[test]
     fn programs_reach_a_server_beyond_loopback_by_any_name() {
         for (grpc, any_host) in

@@ -15,11 +15,13 @@ use serde::Serialize;
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
+use tonic::service::LayerExt as _;
 use tonic::transport::Server;
 use tonic::transport::server::Router;
 use tonic_health::server::HealthReporter;
 use tonic_web::GrpcWebLayer;
 use tower::layer::util::{Identity, Stack};
+use tower::util::MapRequestLayer;
 use v1::channel_service_server::ChannelServiceServer;
 use v1::control_service_server::ControlServiceServer;
 use v1::model_service_server::ModelServiceServer;
@@ -30,7 +32,7 @@ use crate::admission::Places;
 use crate::config::{Config, Listen};
 use crate::grpc::channels::ChannelService;
 use crate::grpc::control::ControlService;
-use crate::grpc::ending::Ending;
+use crate::grpc::ending::ending_with;
 use crate::grpc::gate::GateLayer;
 use crate::grpc::model::ModelService;
 use crate::grpc::observe::ObserveLayer;
@@ -156,9 +158,15 @@ impl RunningServer {
         health.set_serving::<ControlServiceServer<ControlService>>().await;
         health.set_serving::<ChannelServiceServer<ChannelService>>().await;
         health.set_serving::<RecordingServiceServer<RecordingService>>().await;
-        let health_service = Ending::new(health_service, hub.ending.clone());
+        let is_asked_for_health = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&is_asked_for_health);
+        let note = MapRequestLayer::new(move |request| {
+            asked.store(true, Ordering::Relaxed);
+            request
+        });
+        let health_service = ending_with(note.named_layer(health_service), hub.ending.clone());
         let mut server = Self {
-            is_asked_for_health: health_service.was_asked(),
+            is_asked_for_health,
             addresses: Addresses { link_root, pid: std::process::id(), ..Addresses::default() },
             health,
             listeners: JoinSet::new(),
@@ -227,9 +235,9 @@ impl RunningServer {
                 RecordingServiceServer::new(RecordingService::new(hub()))
                     .max_decoding_message_size(message_bytes),
             )
-            .add_service(Ending::new(reflection().build_v1()?, ending()))
+            .add_service(ending_with(reflection().build_v1()?, ending()))
             // Older tools know only this one.
-            .add_service(Ending::new(reflection().build_v1alpha()?, ending())))
+            .add_service(ending_with(reflection().build_v1alpha()?, ending())))
     }
 
     async fn listen(&mut self, router: Router<Layers>) -> Result<()> {
@@ -344,7 +352,7 @@ impl RunningServer {
 
 /// Says at every start who can reach the server.
 fn warn_beyond_loopback(what: &str, address: SocketAddr) {
-    if !address.ip().to_canonical().is_loopback() {
+    if Listen::At(address).is_beyond_loopback() {
         tracing::warn!(
             %address,
             "{what}: other machines can reach this address, and nobody is asked who they are: whoever \

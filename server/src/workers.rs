@@ -3,19 +3,19 @@
 //! more.
 //!
 //! ```text
-//!  start ──► queue: peers and lanes take turns ──► turns, `count` of them ──► threads
+//!  start ──► queue: connections and lanes take turns ──► turns, `count` of them ──► threads
 //!              ▲                                     │
 //!              └──── a job that has had its time ◄───┘
 //! ```
 //!
 //! Whoever computes has a turn. A job that asks [`Abandoned::check`] now and then, as every long one
 //! must, gives its turn to the next in the queue when it has had it for 20 ms, and queues again: however
-//! many long computations there are, a short one waits for no more than one such time for each peer
+//! many long computations there are, a short one waits for no more than one such time for each connection
 //! before it. What a job has begun stays on the stack of its thread meanwhile; there are a few more
 //! threads than turns for that. A job in parts (`in_parts`) keeps no thread.
 //!
 //! A job that keeps its turn for longer, because it waits for a plant or cannot be interrupted, keeps it
-//! from its own peer alone: others get a turn besides, and the system shares the processors out.
+//! from its own connection alone: others get a turn besides, and the system shares the processors out.
 //!
 //! Threads have the priority of their pool ([`crate::priority`]), and so have the threads that a job
 //! starts.
@@ -35,8 +35,8 @@ use tokio_util::sync::CancellationToken;
 
 pub(crate) use self::queue::Lane;
 use self::queue::{Baton, May, Queue, Ticket};
+use crate::connection::Connection;
 use crate::limits::LimitExceeded;
-use crate::peer::Peer;
 use crate::priority::Priority;
 use crate::status::Fault;
 
@@ -50,8 +50,8 @@ const TURN_OVERDUE: Duration = Duration::from_millis(40);
 /// Threads for each turn, at most: those that wait for their next turn included.
 const THREADS_PER_TURN: usize = 32;
 
-/// The same of the jobs of one peer.
-const PEER_THREADS_PER_TURN: usize = 8;
+/// The same of the jobs of one connection.
+const CONNECTION_THREADS_PER_TURN: usize = 8;
 
 /// Runs a long computation, or a wait, on this thread, while the runtime that it may belong to moves its
 /// other tasks to another one.
@@ -266,27 +266,27 @@ struct State {
 }
 
 struct Begun {
-    peer: Peer,
+    connection: Connection,
     /// Since when it has its turn; none while it waits for the next one.
     turn: Option<Instant>,
 }
 
 impl State {
     /// The next in the queue for whom there is a turn.
-    fn next(&mut self, pool: &Pool) -> Option<(Peer, Ticket)> {
+    fn next(&mut self, pool: &Pool) -> Option<(Connection, Ticket)> {
         let Self { queue, begun, granted, threads, idle, .. } = self;
         let has_thread = *idle > granted.len() || *threads < THREADS_PER_TURN * pool.count;
         let now = Instant::now();
-        queue.pop(|peer| {
+        queue.pop(|connection| {
             let is_counted = |job: &&Begun| {
                 let is_new = |since: Instant| now.duration_since(since) < TURN_OVERDUE;
-                job.turn.is_some_and(|since| job.peer == peer || is_new(since))
+                job.turn.is_some_and(|since| job.connection == connection || is_new(since))
             };
             if begun.values().filter(is_counted).count() >= pool.count {
                 return May::Nothing;
             }
-            let held = begun.values().filter(|job| job.peer == peer).count();
-            let may_begin = has_thread && held < PEER_THREADS_PER_TURN * pool.count;
+            let held = begun.values().filter(|job| job.connection == connection).count();
+            let may_begin = has_thread && held < CONNECTION_THREADS_PER_TURN * pool.count;
             if may_begin { May::Begin } else { May::GoOn }
         })
     }
@@ -303,7 +303,7 @@ impl Pool {
         lock(&self.state)
     }
 
-    /// Queues work, or begins it at once; returns its number. However long the queue is, each peer may have
+    /// Queues work, or begins it at once; returns its number. However long the queue is, each connection may have
     /// one job in it.
     fn submit(
         self: &Arc<Self>,
@@ -311,18 +311,18 @@ impl Pool {
         lane: Lane,
         work: Work,
     ) -> Result<u64, Fault> {
-        let peer = Peer::current();
+        let connection = Connection::current();
         let mut state = self.state();
         state.last_id += 1;
         let id = state.last_id;
-        state.queue.push(lane, peer, Ticket::Begin { id, admission, work });
+        state.queue.push(lane, connection, Ticket::Begin { id, admission, work });
         self.hand_out(&mut state);
         if admission == Admission::Bounded && state.queue.holds(id) {
-            let (of_peer, of_all) = state.queue.counted(peer);
+            let (of_connection, of_all) = state.queue.counted(connection);
             let (name, what) = ("queued_jobs", "jobs wait for a worker");
             let is_within = LimitExceeded::check(name, self.queued_jobs, what, of_all);
             if let Err(error) = is_within
-                && of_peer > 1
+                && of_connection > 1
             {
                 let refused = state.queue.remove(id);
                 drop(state);
@@ -342,12 +342,12 @@ impl Pool {
 
     /// Hands turns out as long as there are some for those who wait.
     fn hand_out(self: &Arc<Self>, state: &mut State) {
-        while let Some((peer, ticket)) = state.next(self) {
-            self.give_turn(state, peer, ticket);
+        while let Some((connection, ticket)) = state.next(self) {
+            self.give_turn(state, connection, ticket);
         }
     }
 
-    fn give_turn(self: &Arc<Self>, state: &mut State, peer: Peer, ticket: Ticket) {
+    fn give_turn(self: &Arc<Self>, state: &mut State, connection: Connection, ticket: Ticket) {
         let turn = Some(Instant::now());
         match ticket {
             Ticket::GoOn { id, baton } => {
@@ -355,7 +355,7 @@ impl Pool {
                 baton.pass();
             }
             Ticket::Begin { id, work, .. } => {
-                state.begun.insert(id, Begun { peer, turn });
+                state.begun.insert(id, Begun { connection, turn });
                 state.granted.push_back((id, work));
                 self.find_thread(state);
             }
@@ -392,15 +392,15 @@ impl Pool {
     fn pass_on(self: &Arc<Self>, id: u64) {
         let mut state = self.state();
         state.set_turn(id, None);
-        let Some((peer, ticket)) = state.next(self) else {
+        let Some((connection, ticket)) = state.next(self) else {
             state.set_turn(id, Some(Instant::now()));
             return;
         };
         let baton = Arc::new(Baton::default());
         let own = Ticket::GoOn { id, baton: Arc::clone(&baton) };
-        let own_peer = state.begun.get(&id).map(|job| job.peer).unwrap_or_default();
-        state.queue.push(Lane::Long, own_peer, own);
-        self.give_turn(&mut state, peer, ticket);
+        let own_connection = state.begun.get(&id).map(|job| job.connection).unwrap_or_default();
+        state.queue.push(Lane::Long, own_connection, own);
+        self.give_turn(&mut state, connection, ticket);
         self.hand_out(&mut state);
         drop(state);
         baton.wait();
@@ -582,11 +582,11 @@ mod tests {
                 tokio::spawn(async move { workers.run(work).await })
             })
             .collect();
-        while workers.pool.state().threads < PEER_THREADS_PER_TURN {
+        while workers.pool.state().threads < CONNECTION_THREADS_PER_TURN {
             tokio::task::yield_now().await;
         }
         tokio::time::sleep(3 * TURN).await;
-        assert_eq!(workers.pool.state().threads, PEER_THREADS_PER_TURN);
+        assert_eq!(workers.pool.state().threads, CONNECTION_THREADS_PER_TURN);
         stop.store(true, Ordering::Release);
         for job in jobs {
             job.await.unwrap().unwrap();

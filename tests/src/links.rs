@@ -68,10 +68,15 @@ impl LinkFixture {
 
 /// A session of a plant of a built-in model.
 pub fn new_session(model: &str) -> Result<Arc<Session>> {
+    new_session_of(PLANT, model)
+}
+
+/// The same, of a plant with another id.
+pub fn new_session_of(id: &str, model: &str) -> Result<Arc<Session>> {
     let plant = new_plant(model)?;
     let metrics = Arc::new(Metrics::default());
     let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
-    Ok(Session::new(PLANT.to_owned(), model.to_owned(), plant, None, metrics, realtime))
+    Ok(Session::new(id.to_owned(), model.to_owned(), plant, None, metrics, realtime))
 }
 
 /// A plant of a built-in model.

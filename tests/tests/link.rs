@@ -13,8 +13,8 @@ use plantd_proto::link::{
 use plantd_server::link::{LinkConfig, LinkError as HostError, LinkHost};
 use plantd_server::session::{DriverKind, PlantSnapshot};
 use plantd_tests::links::{
-    ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_links, new_plant, new_session, wait_until,
-    wiggle,
+    ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_links, new_plant, new_session,
+    new_session_of, wait_until, wiggle,
 };
 
 /// Never polls: each answer comes by a notification.
@@ -70,6 +70,15 @@ fn a_sleeping_driver_sees_the_motion_of_the_plant_itself_bit_for_bit() {
 fn a_polling_driver_sees_the_motion_of_the_plant_itself_bit_for_bit() {
     assert_same_motion("pendulum", Wait::Poll, 200);
     assert_same_motion("marionette", Wait::default(), 50);
+}
+
+#[test]
+fn a_link_goes_on_when_another_one_closes() {
+    let fixture = LinkFixture::new("pendulum").unwrap();
+    fixture.host.open(new_session_of("other", "pendulum").unwrap()).unwrap();
+    fixture.host.close(PLANT);
+    let mut driver = LinkDriver::connect("other", fixture.options()).unwrap();
+    assert_eq!(driver.step(&[0.0]).unwrap().step, 1);
 }
 
 #[test]

@@ -2,68 +2,45 @@
 //! would hold up its end. Those of this crate end by themselves, with details.
 
 use std::pin::Pin;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll};
 
 use futures::FutureExt as _;
-use futures::future::BoxFuture;
 use http_body::{Body as HttpBody, Frame};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::http::{HeaderMap, Request, Response};
 use tonic::server::NamedService;
+use tonic::service::LayerExt as _;
 use tower::Service;
+use tower::util::{MapRequestLayer, MapResponseLayer};
 
-/// A service whose streams end with UNAVAILABLE when the server does.
-#[derive(Clone)]
-pub struct Ending<S> {
-    inner: S,
+/// The service, whose streams end with UNAVAILABLE when `ending` is cancelled.
+pub fn ending_with<S>(
+    service: S,
     ending: CancellationToken,
-    was_asked: Arc<AtomicBool>,
-}
-
-impl<S> Ending<S> {
-    /// The service, ending with `ending`.
-    pub fn new(inner: S, ending: CancellationToken) -> Self {
-        Self { inner, ending, was_asked: Arc::default() }
-    }
-
-    /// Set by the first call.
-    pub fn was_asked(&self) -> Arc<AtomicBool> {
-        Arc::clone(&self.was_asked)
-    }
-}
-
-impl<S: NamedService> NamedService for Ending<S> {
-    const NAME: &'static str = S::NAME;
-}
-
-impl<S> Service<Request<Body>> for Ending<S>
+) -> impl Service<Request<Body>, Response = Response<Body>, Error = S::Error, Future: Send>
++ NamedService
++ Clone
++ Send
++ Sync
++ 'static
 where
-    S: Service<Request<Body>, Response = Response<Body>>,
-    S::Future: Send + 'static,
+    S: Service<Request<Body>, Response = Response<Body>, Future: Send>,
+    S: NamedService + Clone + Send + Sync + 'static,
 {
-    type Response = Response<Body>;
-    type Error = S::Error;
-    type Future = BoxFuture<'static, Result<Self::Response, Self::Error>>;
-
-    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Self::Error>> {
-        self.inner.poll_ready(context)
-    }
-
-    fn call(&mut self, request: Request<Body>) -> Self::Future {
-        self.was_asked.store(true, Ordering::Relaxed);
-        let until = |ended: Pin<Box<WaitForCancellationFutureOwned>>, farewell| {
-            move |body| Body::new(EndingBody { body, ended, has_ended: false, farewell })
-        };
-        let ended = || Box::pin(self.ending.clone().cancelled_owned());
-        // Whoever still reads requests would keep the connection open.
-        let (to_request, to_response) = (until(ended(), false), until(ended(), true));
-        let response = self.inner.call(request.map(to_request));
-        Box::pin(async move { Ok(response.await?.map(to_response)) })
-    }
+    let wrap = move |farewell| {
+        let ending = ending.clone();
+        move |body| {
+            let ended = Box::pin(ending.clone().cancelled_owned());
+            Body::new(EndingBody { body, ended, has_ended: false, farewell })
+        }
+    };
+    // Whoever still reads requests would keep the connection open.
+    let (question, answer) = (wrap(false), wrap(true));
+    let questions = MapRequestLayer::new(move |request: Request<Body>| request.map(&question));
+    let answers = MapResponseLayer::new(move |response: Response<Body>| response.map(&answer));
+    answers.named_layer(questions.named_layer(service))
 }
 
 /// A body that ends with the server: what is ready comes first, then the end, of an answer with its status.

@@ -1,4 +1,4 @@
-//! A layer around all services: counts calls by method and code, knows for whom they are, keeps the places
+//! A layer around all services: counts calls by method and code, knows for which connection they are, keeps the places
 //! of connections with open calls, bounds what unfinished messages take, and gives the one error that
 //! tonic itself makes of a request, an oversized message, its documented code and details.
 
@@ -19,9 +19,9 @@ use tower::{Layer, Service};
 
 use super::unfinished::Budget;
 use crate::admission::{OpenCall, Place};
+use crate::connection::Connection;
 use crate::limits::{LimitExceeded, Limits};
 use crate::metrics::Metrics;
-use crate::peer::Peer;
 use crate::status::Fault;
 
 /// Paths of all methods of `plantd.v1`: the only ones that become labels of metrics.
@@ -111,17 +111,17 @@ where
             _open: request.extensions().get::<Arc<Place>>().cloned().map(Place::call),
         };
         let limits = Arc::clone(&self.layer.limits);
-        let peer = Peer::of(request.extensions());
+        let connection = Connection::of(request.extensions());
         let response = self.inner.call(request.map(|body| self.layer.unfinished.follow(body)));
         Box::pin(async move {
-            let mut response = peer.work(response).await?;
+            let mut response = connection.work(response).await?;
             if let Some(status) = Status::from_header_map(response.headers()) {
                 if status.code() == Code::OutOfRange {
                     response = with_limit_details(status, call.method, &limits).into_http();
                 }
                 call.see(response.headers());
             }
-            Ok(response.map(|body| Body::new(Observed { body, call, peer })))
+            Ok(response.map(|body| Body::new(Observed { body, call, connection })))
         })
     }
 }
@@ -155,7 +155,7 @@ impl Drop for Call {
 struct Observed {
     body: Body,
     call: Call,
-    peer: Peer,
+    connection: Connection,
 }
 
 impl HttpBody for Observed {
@@ -167,7 +167,7 @@ impl HttpBody for Observed {
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Self::Data>, Self::Error>>> {
         let this = &mut *self;
-        let frame = this.peer.scope(|| Pin::new(&mut this.body).poll_frame(context));
+        let frame = this.connection.scope(|| Pin::new(&mut this.body).poll_frame(context));
         if let Poll::Ready(Some(Ok(frame))) = &frame
             && let Some(trailers) = frame.trailers_ref()
         {

@@ -1,11 +1,11 @@
-//! What waits for a turn. The peers take turns in each of two lanes, and the lanes take turns: one is for
+//! What waits for a turn. The connections take turns in each of two lanes, and the lanes take turns: one is for
 //! what has just come and may be short, the other for what is known to be long.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use super::{Admission, Work, lock};
-use crate::peer::Peer;
+use crate::connection::Connection;
 
 /// Where a job waits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,7 +36,7 @@ impl Ticket {
     }
 }
 
-/// What the next turn of a peer may be for.
+/// What the next turn of a connection may be for.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum May {
     /// It has all the turns that it may have.
@@ -76,14 +76,14 @@ impl Baton {
     }
 }
 
-/// The tickets of a lane; the peers in the order in which it is their turn.
-type Peers = VecDeque<(Peer, VecDeque<Ticket>)>;
+/// The tickets of a lane; the connections in the order in which it is their turn.
+type Connections = VecDeque<(Connection, VecDeque<Ticket>)>;
 
 /// The queue.
 #[derive(Default)]
 pub(super) struct Queue {
-    short: Peers,
-    long: Peers,
+    short: Connections,
+    long: Connections,
     last_was_short: bool,
 }
 
@@ -92,22 +92,22 @@ impl Queue {
         self.short.is_empty() && self.long.is_empty()
     }
 
-    pub(super) fn push(&mut self, lane: Lane, peer: Peer, ticket: Ticket) {
-        let peers = match lane {
+    pub(super) fn push(&mut self, lane: Lane, connection: Connection, ticket: Ticket) {
+        let connections = match lane {
             Lane::Short => &mut self.short,
             Lane::Long => &mut self.long,
         };
-        match peers.iter_mut().find(|(owner, _)| *owner == peer) {
+        match connections.iter_mut().find(|(owner, _)| *owner == connection) {
             Some((_, tickets)) => tickets.push_back(ticket),
-            None => peers.push_back((peer, VecDeque::from([ticket]))),
+            None => connections.push_back((connection, VecDeque::from([ticket]))),
         }
     }
 
     /// The next that may have a turn.
-    pub(super) fn pop(&mut self, may: impl Fn(Peer) -> May) -> Option<(Peer, Ticket)> {
+    pub(super) fn pop(&mut self, may: impl Fn(Connection) -> May) -> Option<(Connection, Ticket)> {
         for is_short in [!self.last_was_short, self.last_was_short] {
-            let peers = if is_short { &mut self.short } else { &mut self.long };
-            if let Some(next) = pop(peers, &may) {
+            let connections = if is_short { &mut self.short } else { &mut self.long };
+            if let Some(next) = pop(connections, &may) {
                 self.last_was_short = is_short;
                 return Some(next);
             }
@@ -118,10 +118,14 @@ impl Queue {
     /// Takes what has not begun out.
     pub(super) fn remove(&mut self, id: u64) -> Option<Ticket> {
         let is_it = |ticket: &Ticket| matches!(ticket, Ticket::Begin { .. }) && ticket.id() == id;
-        [&mut self.short, &mut self.long].into_iter().find_map(|peers| {
-            let place = |(_, tickets): &(Peer, VecDeque<Ticket>)| tickets.iter().position(is_it);
-            let (i, k) = peers.iter().enumerate().find_map(|(i, peer)| Some((i, place(peer)?)))?;
-            take(peers, i, k).map(|(_, ticket)| ticket)
+        [&mut self.short, &mut self.long].into_iter().find_map(|connections| {
+            let place =
+                |(_, tickets): &(Connection, VecDeque<Ticket>)| tickets.iter().position(is_it);
+            let (i, k) = connections
+                .iter()
+                .enumerate()
+                .find_map(|(i, connection)| Some((i, place(connection)?)))?;
+            take(connections, i, k).map(|(_, ticket)| ticket)
         })
     }
 
@@ -129,44 +133,49 @@ impl Queue {
         self.tickets().any(|(_, ticket)| ticket.id() == id)
     }
 
-    /// Jobs of a peer that wait to begin and are counted, and those of all peers.
-    pub(super) fn counted(&self, peer: Peer) -> (usize, usize) {
+    /// Jobs of a connection that wait to begin and are counted, and those of all connections.
+    pub(super) fn counted(&self, connection: Connection) -> (usize, usize) {
         let counted = || self.tickets().filter(|(_, ticket)| ticket.is_bounded());
-        (counted().filter(|(owner, _)| *owner == peer).count(), counted().count())
+        (counted().filter(|(owner, _)| *owner == connection).count(), counted().count())
     }
 
-    fn tickets(&self) -> impl Iterator<Item = (Peer, &Ticket)> {
-        let peers = self.short.iter().chain(&self.long);
-        peers.flat_map(|(peer, tickets)| tickets.iter().map(|ticket| (*peer, ticket)))
+    fn tickets(&self) -> impl Iterator<Item = (Connection, &Ticket)> {
+        let connections = self.short.iter().chain(&self.long);
+        connections
+            .flat_map(|(connection, tickets)| tickets.iter().map(|ticket| (*connection, ticket)))
     }
 }
 
-fn pop(peers: &mut Peers, may: &impl Fn(Peer) -> May) -> Option<(Peer, Ticket)> {
-    let place = |(peer, tickets): &(Peer, VecDeque<Ticket>)| {
-        let may = may(*peer);
+fn pop(
+    connections: &mut Connections,
+    may: &impl Fn(Connection) -> May,
+) -> Option<(Connection, Ticket)> {
+    let place = |(connection, tickets): &(Connection, VecDeque<Ticket>)| {
+        let may = may(*connection);
         if may == May::Nothing {
             return None;
         }
         tickets.iter().position(|ticket| may.admits(ticket))
     };
-    let (i, k) = peers.iter().enumerate().find_map(|(i, peer)| Some((i, place(peer)?)))?;
-    take(peers, i, k)
+    let (i, k) =
+        connections.iter().enumerate().find_map(|(i, connection)| Some((i, place(connection)?)))?;
+    take(connections, i, k)
 }
 
-/// Takes a ticket of a peer, who is the last one after that.
-fn take(peers: &mut Peers, i: usize, k: usize) -> Option<(Peer, Ticket)> {
-    let (peer, mut tickets) = peers.remove(i)?;
+/// Takes a ticket of a connection, who is the last one after that.
+fn take(connections: &mut Connections, i: usize, k: usize) -> Option<(Connection, Ticket)> {
+    let (connection, mut tickets) = connections.remove(i)?;
     let ticket = tickets.remove(k)?;
     if !tickets.is_empty() {
-        peers.push_back((peer, tickets));
+        connections.push_back((connection, tickets));
     }
-    Some((peer, ticket))
+    Some((connection, ticket))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::peer::tests::peer;
+    use crate::connection::tests::connection;
 
     fn begin(id: u64) -> Ticket {
         Ticket::Begin { id, admission: Admission::Bounded, work: Box::new(|_| {}) }
@@ -176,19 +185,19 @@ mod tests {
         Ticket::GoOn { id, baton: Arc::default() }
     }
 
-    fn ids(queue: &mut Queue, may: impl Fn(Peer) -> May) -> Vec<u64> {
+    fn ids(queue: &mut Queue, may: impl Fn(Connection) -> May) -> Vec<u64> {
         std::iter::from_fn(|| queue.pop(&may)).map(|(_, ticket)| ticket.id()).collect()
     }
 
     #[test]
-    fn peers_and_lanes_take_turns() {
+    fn connections_and_lanes_take_turns() {
         let mut queue = Queue::default();
         for id in 10..14 {
-            queue.push(Lane::Long, peer(1), begin(id));
+            queue.push(Lane::Long, connection(1), begin(id));
         }
-        queue.push(Lane::Long, peer(2), begin(20));
-        queue.push(Lane::Short, peer(1), begin(30));
-        queue.push(Lane::Short, peer(3), begin(31));
+        queue.push(Lane::Long, connection(2), begin(20));
+        queue.push(Lane::Short, connection(1), begin(30));
+        queue.push(Lane::Short, connection(3), begin(31));
         assert_eq!(ids(&mut queue, |_| May::Begin), [30, 10, 31, 20, 11, 12, 13]);
         assert!(queue.is_empty());
     }
@@ -196,18 +205,18 @@ mod tests {
     #[test]
     fn nobody_waits_for_those_who_may_not() {
         let mut queue = Queue::default();
-        queue.push(Lane::Long, peer(1), begin(10));
-        queue.push(Lane::Long, peer(1), go_on(11));
-        queue.push(Lane::Long, peer(2), begin(20));
-        queue.push(Lane::Long, peer(3), begin(30));
+        queue.push(Lane::Long, connection(1), begin(10));
+        queue.push(Lane::Long, connection(1), go_on(11));
+        queue.push(Lane::Long, connection(2), begin(20));
+        queue.push(Lane::Long, connection(3), begin(30));
         let may = |owner| match owner {
-            owner if owner == peer(1) => May::GoOn,
-            owner if owner == peer(2) => May::Nothing,
+            owner if owner == connection(1) => May::GoOn,
+            owner if owner == connection(2) => May::Nothing,
             _ => May::Begin,
         };
         assert_eq!(ids(&mut queue, may), [11, 30]);
         assert!(queue.holds(20) && !queue.holds(30));
-        assert_eq!(queue.counted(peer(2)), (1, 2));
+        assert_eq!(queue.counted(connection(2)), (1, 2));
         assert!(queue.remove(20).is_some() && queue.remove(20).is_none());
         assert_eq!(ids(&mut queue, |_| May::Begin), [10]);
     }

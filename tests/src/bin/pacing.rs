@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 use clap::Parser;
 use plantd_client::v1;
 use plantd_proto::link::monotonic_ns;
@@ -83,14 +83,14 @@ async fn main() -> Result<()> {
     for (_, id) in &ids {
         client.timing(id, true).await?;
     }
-    let before_kib = resident_kib(server.pid())?;
+    let before_kib = server.resident_kib();
     let processors = std::thread::available_parallelism().map_or(1, usize::from);
     let beside = EmptyLoop::start(&arguments, processors - 1);
     let started = Instant::now();
     tokio::time::sleep(time).await;
     let elapsed_s = started.elapsed().as_secs_f64();
     let beside = beside.stop();
-    let after_kib = resident_kib(server.pid())?;
+    let after_kib = server.resident_kib();
 
     println!(
         "{} pendulums, {} marionettes, {} s at {} Hz on processor 0, {scheduling}, spin {spin_us} us",
@@ -192,11 +192,4 @@ impl EmptyLoop {
         self.is_over.store(true, Ordering::Relaxed);
         self.thread.join().expect("an empty loop does not panic")
     }
-}
-
-/// Memory of a process that is in use.
-fn resident_kib(pid: u32) -> Result<u64> {
-    let status = std::fs::read_to_string(format!("/proc/{pid}/status"))?;
-    let line = status.lines().find(|line| line.starts_with("VmRSS:")).context("no VmRSS")?;
-    Ok(line.split_whitespace().nth(1).context("no number")?.parse()?)
 }
