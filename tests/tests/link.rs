@@ -73,15 +73,6 @@ fn a_polling_driver_sees_the_motion_of_the_plant_itself_bit_for_bit() {
 }
 
 #[test]
-fn a_link_goes_on_when_another_one_closes() {
-    let fixture = LinkFixture::new("pendulum").unwrap();
-    fixture.host.open(new_session_of("other", "pendulum").unwrap()).unwrap();
-    fixture.host.close(PLANT);
-    let mut driver = LinkDriver::connect("other", fixture.options()).unwrap();
-    assert_eq!(driver.step(&[0.0]).unwrap().step, 1);
-}
-
-#[test]
 fn a_polling_host_serves_a_sleeping_driver() {
     let fixture = LinkFixture::with_config("pendulum", |config| config.wait = Wait::Poll).unwrap();
     let mut driver = fixture.connect(SLEEP).unwrap();
@@ -252,6 +243,28 @@ fn the_lease_of_a_killed_driver_comes_back() {
         drop(next);
         wait_until("the lease", || fixture.session.driver().is_none()).unwrap();
     }
+}
+
+/// What a killed driver has kept of a link that is closed is still there when another link opens, and goes
+/// with the housekeeping.
+#[test]
+fn a_link_does_not_depend_on_what_is_left_of_another_one() {
+    let fixture =
+        LinkFixture::with_config("pendulum", |config| config.clean_up_period = PATIENCE / 20)
+            .unwrap();
+    let mut victim = start_driver(&fixture.root(), &[]);
+    victim.wait_for_line("attached").unwrap();
+    victim.wait_for_line("stepped").unwrap();
+    victim.kill().unwrap();
+    fixture.host.close(PLANT);
+    let left = files_of_links(&fixture.root()).unwrap();
+    fixture.host.open(new_session_of("other", "pendulum").unwrap()).unwrap();
+    let services = |file: &&PathBuf| file.extension().is_some_and(|kind| kind == "dynamic");
+    assert!(left.iter().any(|file| services(&file)), "a service of the link is left");
+    let is_gone = || left.iter().filter(services).all(|file| !file.exists());
+    wait_until("the housekeeping", is_gone).unwrap();
+    let mut driver = LinkDriver::connect("other", fixture.options()).unwrap();
+    assert_eq!(driver.step(&[0.0]).unwrap().step, 1);
 }
 
 #[test]

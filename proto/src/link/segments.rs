@@ -66,7 +66,7 @@ pub(super) fn check(expected: &[(String, u64)]) -> Result<(), DomainError> {
     let uid = rustix::process::getuid().as_raw();
     for (name, expected) in expected {
         let path = Path::new(SHARED_MEMORY_DIRECTORY).join(name);
-        // Those of other links of the server are listed as well, and go with them.
+        // What killed drivers have kept of a closed link may be listed as well, and goes in time.
         let Ok(metadata) = fs::symlink_metadata(&path) else { continue };
         let size = metadata.len();
         let is_private =

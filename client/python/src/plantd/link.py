@@ -600,7 +600,7 @@ def _check_segments(expected: dict[str, int]) -> None:
         try:
             status = path.lstat()
         except FileNotFoundError:
-            # Those of other links of the server are listed as well, and go with them.
+            # What killed drivers have kept of a closed link may be listed as well, and goes in time.
             continue
         is_private = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077
         if not is_private or status.st_uid != os.getuid():
