@@ -2,11 +2,10 @@
 
 use std::f64::consts::{FRAC_PI_6, PI};
 
-use crate::Scene;
+use crate::math::trigonometry::sin_cos_of;
 use crate::scene::{
-    Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Point,
+    Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Point, Scene,
 };
-use crate::trigonometry::sin_cos_of;
 
 /// Names of the built-in scenes. `chain-N`, `tree-N` and `scissor-N` stand for whole families.
 pub const NAMES: &[&str] = &[
@@ -230,7 +229,10 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::{Initial, Model, Plant, Settings};
+    use crate::integrator::settings::Settings;
+    use crate::model::mechanism::Model;
+    use crate::plant::facade::Plant;
+    use crate::plant::initial::Initial;
 
     #[test]
     fn every_scene_is_valid_and_bears_its_name() {

@@ -25,16 +25,16 @@ use std::sync::Arc;
 
 use nalgebra::DMatrix;
 
-use crate::Model;
-use crate::plant::balls::{orientations, three};
-use crate::plant::blocks::Blocks;
-use crate::plant::closure::Closure;
-use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::rows::padded;
-use crate::plant::tree_lu::TreeLu;
-use crate::rotation;
-use crate::scalar::{Dual, Scalar};
-use crate::spatial::{Mat3, Vec3};
+use crate::constraints::closure::Closure;
+use crate::integrator::balls::{orientations, three};
+use crate::integrator::blocks::Blocks;
+use crate::math::pivoted_lu::PivotedLu;
+use crate::math::rotation;
+use crate::math::rows::padded;
+use crate::math::scalar::{Dual, Scalar};
+use crate::math::spatial::{Mat3, Vec3};
+use crate::math::tree_lu::TreeLu;
+use crate::model::mechanism::Model;
 
 /// A pivot of the mass matrix below this fraction of the largest inertia of its coordinate is zero.
 const SINGULAR: f64 = 1e-14;

@@ -17,19 +17,18 @@
 //! Everything here allocates and may take milliseconds to seconds: it belongs on a worker, never
 //! on a control path. Costs are given in flops of `n` states and `m` inputs.
 
-pub(crate) mod blocked;
-mod controllability;
-mod doubling;
-mod error;
-mod finite_horizon;
-mod frequency;
-mod infinite_horizon;
-mod kalman;
+pub(crate) mod controllability;
+pub(crate) mod doubling;
+pub(crate) mod error;
+pub(crate) mod finite_horizon;
+pub(crate) mod frequency;
+pub(crate) mod infinite_horizon;
+pub(crate) mod kalman;
 pub(crate) mod lq;
-mod manifold;
-mod modes;
-mod spectrum;
-mod weights;
+pub(crate) mod manifold;
+pub(crate) mod modes;
+pub(crate) mod spectrum;
+pub(crate) mod weights;
 
 pub use controllability::{controllability_rank, observability_rank};
 pub use error::{AnalysisError, RiccatiError};

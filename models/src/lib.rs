@@ -18,36 +18,37 @@
 
 pub mod builtin;
 mod compile;
+mod constraints;
 mod continuous;
 pub mod control;
-mod cost;
-mod elimination;
-mod loops;
+mod integrator;
+mod kkt;
+mod lagrangian;
+mod linearization;
+mod math;
 mod model;
 pub mod optimize;
-mod planar;
 mod plant;
 pub mod reference;
-mod rotation;
-#[allow(dead_code, reason = "derivatives of second order use all of it")]
-mod scalar;
 pub mod scene;
-mod signal;
-mod spatial;
-mod spline;
-mod tree;
-mod trigonometry;
-mod wide;
 
-pub use continuous::{
+pub use crate::compile::cost::StageCost;
+pub use crate::continuous::{
     Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,
 };
-pub use cost::StageCost;
-pub use model::{Coordinate, Dimensions, Model, OperatingPoint, Violation};
-pub use plant::{
-    Choice, ChoiceError, Contraction, Diagnostics, Energy, Equilibrium, ErrorEstimate, ForceSplit,
-    HALVINGS_MAX, Initial, InitialError, Linearization, Plant, Pose, Precision, SUBSTEPS_MAX,
-    SecondOrder, Settings, SettleError, SettleRequest, Site, Snapshot, SnapshotError, Spare, State,
-    StepError, StepReport, TooLarge,
+pub use crate::integrator::settings::{
+    ForceSplit, HALVINGS_MAX, Precision, SUBSTEPS_MAX, Settings,
 };
-pub use scene::{Problem, Scene, SceneError};
+pub use crate::linearization::linearize::Linearization;
+pub use crate::linearization::second_order::contraction::Contraction;
+pub use crate::linearization::second_order::tensors::{SecondOrder, TooLarge};
+pub use crate::model::mechanism::{Coordinate, Dimensions, Model, OperatingPoint, Violation};
+pub use crate::plant::choice::{Choice, ChoiceError, ErrorEstimate};
+pub use crate::plant::diagnose::Diagnostics;
+pub use crate::plant::facade::{Energy, Plant, State, StepError, StepReport};
+pub use crate::plant::initial::{Initial, InitialError};
+pub use crate::plant::settle::{Equilibrium, SettleError, SettleRequest};
+pub use crate::plant::site::{Pose, Site};
+pub use crate::plant::snapshot::{Snapshot, SnapshotError};
+pub use crate::plant::spare::Spare;
+pub use crate::scene::{Problem, Scene, SceneError};

@@ -118,8 +118,8 @@ mod trajectory;
 
 use nalgebra::DMatrix;
 
-use crate::State;
 use crate::control::{Momentum, TrajectoryWeights, Weights};
+use crate::plant::facade::State;
 
 pub use error::{BoundFault, BoundState, OptimizeError, Stuck};
 pub use search::Optimizer;

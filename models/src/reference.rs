@@ -23,12 +23,16 @@
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
-use crate::control::{
-    RiccatiError, Sample, Tangent, Values, Weights, WeightsError, finite_horizon,
-    finite_horizon_on_manifold, tangent_basis,
-};
+use crate::control::error::RiccatiError;
+use crate::control::finite_horizon;
+use crate::control::finite_horizon::{Sample, Values, finite_horizon_on_manifold};
+use crate::control::manifold::{Tangent, tangent_basis};
+use crate::control::weights::{Weights, WeightsError};
+use crate::linearization::linearize::Linearization;
+use crate::plant::facade::{Plant, State, StepError};
+use crate::plant::initial::{Initial, InitialError};
 use crate::plant::known::KnownStep;
-use crate::{Initial, InitialError, Linearization, Plant, Spare, State, StepError};
+use crate::plant::spare::Spare;
 
 /// Weight of changes of the inputs, relative to what they explain: decides only between inputs that
 /// explain a motion equally well.

@@ -3,25 +3,25 @@
 //! All quantities are SI; angles are radians. Unknown keys are errors. [`crate::Model::compile`]
 //! reports every error of a scene at once, each with its path.
 
-mod forces;
+pub(crate) mod forces;
 mod limits;
 mod number_or_name;
-mod signals;
+pub(crate) mod signals;
 mod text;
 mod validate;
 
-pub use forces::{Component, Force};
-pub use limits::{
+pub use crate::scene::forces::{Component, Force};
+pub use crate::scene::limits::{
     MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES, MAX_FRAMES, MAX_INPUTS,
     MAX_KNOTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER, MAX_SIGNAL_POINTS,
     MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES,
 };
-pub use signals::{Interpolation, Signal};
+pub use crate::scene::signals::{Interpolation, Signal};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use number_or_name::{NumberOrName, field, number_or_name};
+use crate::scene::number_or_name::{NumberOrName, field, number_or_name};
 
 /// A mechanism: a tree of frames with joints and bodies, what acts on it, and what constrains it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -2,15 +2,17 @@
 
 use std::collections::BTreeMap;
 
-use super::{Layout, Places};
-use crate::model::{
+use crate::compile::scene::{Layout, Places};
+use crate::math::spatial::{Force, Mat3, Vec3};
+use crate::model::mechanism::{
     CoordinateForce, CoordinateInput, CoordinateLaw, Forces, PointForce, PointLaw, Wrench,
     WrenchKind,
 };
-use crate::scene::{self, Component, Point, Scene};
-use crate::signal::{Signal, Target};
-use crate::spatial::{Force, Mat3, Vec3};
-use crate::tree::{Attachment, Tree, WORLD};
+use crate::model::signal::{Signal, Target};
+use crate::model::tree::{Attachment, Tree, WORLD};
+use crate::scene;
+use crate::scene::forces::Component;
+use crate::scene::{Point, Scene};
 
 /// The forces of a scene over the joints of a tree.
 struct Resolver<'a> {

@@ -2,8 +2,11 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::lq::{LqRecursion, Map, NotConvex, Stage};
+use super::lq::LqRecursion;
+use super::lq::NotConvex;
+use super::lq::Stage;
 use super::{RiccatiError, StageWeights, Tangent, TrajectoryWeights, all_finite};
+use crate::math::sparse_map::Map;
 
 /// The linearized map of one step, `dx[k+1] = A dx[k] + B du[k]`.
 #[derive(Clone, Debug, PartialEq)]

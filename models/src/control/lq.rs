@@ -8,14 +8,12 @@
 //! added entry by entry, and where a zero column leaves `P` as the weight is, its zeros are not
 //! multiplied either. Of symmetric results the lower triangle is computed.
 
-mod map;
-
 use nalgebra::{DMatrix, DVector};
 
-pub(crate) use self::map::Map;
-use super::blocked::{Into, LANES, Operand, Scratch, mirror_head, product, transpose};
-use crate::plant::rows::{Term, add_rows_portable};
-use crate::wide::wide;
+use crate::math::gemm::{Into, LANES, Operand, Scratch, mirror_head, product, transpose};
+use crate::math::rows::{Term, add_rows_portable};
+use crate::math::simd::wide;
+use crate::math::sparse_map::Map;
 
 /// One stage of the cost,
 /// `½ xᵀQx + xᵀSu + ½ uᵀRu + x_linearᵀx + u_linearᵀu`. Nothing here need be definite.
@@ -383,7 +381,7 @@ impl LqRecursion {
     }
 
     wide! {
-        fn step_narrow(
+        pub(crate) fn step_narrow(
             mut self,
             map: &Map,
             stage: Stage<'_>,

@@ -1,7 +1,8 @@
 //! Why a problem is refused, and why a search ends without having converged.
 
+use crate::InitialError;
 use crate::control::WeightsError;
-use crate::{InitialError, StepError};
+use crate::plant::facade::StepError;
 
 /// Why a problem was refused, or an iteration failed. An optimizer is as it was before.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

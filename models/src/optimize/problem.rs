@@ -10,11 +10,13 @@ use super::{Bounds, FreeInitialState, OptimizeError, TrajectoryCost};
 use crate::control::{
     Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError, symmetrize,
 };
-use crate::plant::balls::three;
-use crate::rotation::{self, Quaternion};
-use crate::scalar::Dual;
-use crate::spatial::{Mat3, Vec3};
-use crate::{Model, Plant};
+use crate::integrator::balls::three;
+use crate::math::rotation;
+use crate::math::rotation::Quaternion;
+use crate::math::scalar::Dual;
+use crate::math::spatial::{Mat3, Vec3};
+use crate::model::mechanism::Model;
+use crate::plant::facade::Plant;
 
 /// A symmetric weight, which is diagonal more often than not.
 #[derive(Clone, Debug)]

@@ -14,9 +14,14 @@ use super::{
     Bounds, Checkpoint, Fallback, FreeInitialState, Method, OptimizeError, Options, Progress,
     Status, Stuck, TrajectoryCost,
 };
+use crate::Initial;
+use crate::Snapshot;
 use crate::control::Weights;
-use crate::control::lq::{LqRecursion, Map, Stage};
-use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State};
+use crate::control::lq::{LqRecursion, Stage};
+use crate::linearization::linearize::Linearization;
+use crate::linearization::second_order::contraction::Contraction;
+use crate::math::sparse_map::Map;
+use crate::plant::facade::{Plant, State};
 
 /// Penalty with which a search begins.
 const FIRST_PENALTY: f64 = 10.0;

@@ -4,9 +4,12 @@ use nalgebra::{DMatrix, DVector};
 
 use super::search::Optimizer;
 use super::{Bound, Bounds, FreeInitialState, Method, Options, TrajectoryCost};
+use crate::builtin;
 use crate::control::{Momentum, StageWeights, TrajectoryWeights, Weights};
-use crate::plant::samples;
-use crate::{ForceSplit, Model, Plant, Settings, builtin};
+use crate::integrator::settings::{ForceSplit, Settings};
+use crate::lagrangian::samples;
+use crate::model::mechanism::Model;
+use crate::plant::facade::Plant;
 use std::sync::Arc;
 
 const STEPS: usize = 12;

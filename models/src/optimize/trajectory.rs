@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use nalgebra::DMatrix;
 
-use crate::Dimensions;
+use crate::model::mechanism::Dimensions;
 
 /// States, inputs and constraint impulses of a motion, row-major.
 #[derive(Clone, Debug, Default)]

@@ -9,9 +9,10 @@
 
 use std::sync::Arc;
 
-use crate::plant::scheme::Scheme;
-use crate::plant::settings::{SUBSTEPS_MAX, Settings};
-use crate::plant::{Initial, InitialError, Plant, State, StepError};
+use crate::integrator::scheme::Scheme;
+use crate::integrator::settings::{SUBSTEPS_MAX, Settings};
+use crate::plant::facade::{Plant, State, StepError};
+use crate::plant::initial::{Initial, InitialError};
 
 /// Control periods of the probe.
 const PERIODS: u32 = 50;

@@ -1,18 +1,21 @@
 //! Where a plant starts: states from momenta, velocities, two configurations, or a guess; and the
 //! velocity and energy that belong to a state.
 
-use crate::Model;
-use crate::model::Violation;
-use crate::plant::balls::{orientations, three};
-use crate::plant::closure::Closure;
-use crate::plant::kinematics::Poses;
-use crate::plant::momenta::Momenta;
-use crate::plant::newton::{Workspace, fill_schur};
-use crate::plant::pivoted_lu::PivotedLu;
-use crate::plant::rows::padded;
-use crate::plant::{Energy, Plant, PreciseState, SettleError, SettleRequest, potentials};
-use crate::rotation::{self, Quaternion};
-use crate::spatial::Vec3;
+use crate::constraints::closure::Closure;
+use crate::integrator::balls::{orientations, three};
+use crate::integrator::matrix::fill_schur;
+use crate::integrator::newton::Workspace;
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::momenta::Momenta;
+use crate::lagrangian::potentials;
+use crate::math::pivoted_lu::PivotedLu;
+use crate::math::rotation;
+use crate::math::rotation::Quaternion;
+use crate::math::rows::padded;
+use crate::math::spatial::Vec3;
+use crate::model::mechanism::{Model, Violation};
+use crate::plant::facade::{Energy, Plant, PreciseState};
+use crate::plant::settle::{SettleError, SettleRequest};
 
 /// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
 /// half turns about an axis and for cyclic exchanges of the axes, it is −1 or 0.

@@ -2,11 +2,11 @@
 
 use nalgebra::DMatrix;
 
-use crate::plant::balls::orientations;
-use crate::plant::linearize::Linearization;
-use crate::plant::newton::At;
-use crate::plant::scheme::Scheme;
-use crate::plant::{Plant, StepError};
+use crate::integrator::balls::orientations;
+use crate::integrator::newton::At;
+use crate::integrator::scheme::Scheme;
+use crate::linearization::linearize::Linearization;
+use crate::plant::facade::{Plant, StepError};
 
 /// A step that was taken before, or one that a reference asks for.
 #[derive(Clone, Copy, Debug)]

@@ -9,15 +9,16 @@
 //! The next period begins with as many; after four that went well, half as many are tried. How often a
 //! period was halved is in its report: it is another map then.
 
-use crate::Model;
-use crate::plant::collocation::Collocation;
-use crate::plant::linearize::{Chain, Linearization};
-use crate::plant::newton::{At, Workspace};
-use crate::plant::predictor::Past;
-use crate::plant::scheme::Scheme;
-use crate::plant::settings::STEPS_MAX;
-use crate::plant::{Plant, PreciseState, Settings, StepError, StepReport, two_sum};
-use crate::signal::Target;
+use crate::integrator::collocation::Collocation;
+use crate::integrator::newton::{At, Workspace};
+use crate::integrator::predictor::Past;
+use crate::integrator::scheme::Scheme;
+use crate::integrator::settings::{STEPS_MAX, Settings};
+use crate::linearization::chain::Chain;
+use crate::linearization::linearize::Linearization;
+use crate::model::mechanism::Model;
+use crate::model::signal::Target;
+use crate::plant::facade::{Plant, PreciseState, StepError, StepReport, two_sum};
 
 /// Periods that must go well before fewer steps are tried.
 const CALM: u8 = 4;

@@ -16,8 +16,8 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use crate::plant::Plant;
-use crate::plant::blocks::Blocks;
+use crate::integrator::blocks::Blocks;
+use crate::plant::facade::Plant;
 
 /// Eigenvalues of `Dh M⁻¹ Dhᵀ` below this, relative to the largest, belong to redundant equations.
 const REDUNDANT: f64 = 1e-11;

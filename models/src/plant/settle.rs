@@ -15,11 +15,11 @@
 
 use nalgebra::{DMatrix, DVector, SVD};
 
-use crate::Model;
-use crate::control::tangent_basis;
-use crate::plant::balls::orientations;
-use crate::plant::blocks::Blocks;
-use crate::plant::closure::Closure;
+use crate::constraints::closure::Closure;
+use crate::control::manifold::tangent_basis;
+use crate::integrator::balls::orientations;
+use crate::integrator::blocks::Blocks;
+use crate::model::mechanism::Model;
 use crate::plant::initial::potential_energy;
 
 /// Iterations before the search is given up.

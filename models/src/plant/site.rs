@@ -11,12 +11,12 @@
 //!
 //! with the joint's axis `a_j` through `o_j`, and the point `x`.
 
-use crate::Model;
-use crate::plant::{Plant, StepError, two_sum};
-use crate::rotation::Quaternion;
-use crate::spatial::{Mat3, Vec3};
-use crate::tree::JointKind;
-use crate::trigonometry::sin_cos_of;
+use crate::math::rotation::Quaternion;
+use crate::math::spatial::{Mat3, Vec3};
+use crate::math::trigonometry::sin_cos_of;
+use crate::model::mechanism::Model;
+use crate::model::tree::JointKind;
+use crate::plant::facade::{Plant, StepError, two_sum};
 
 /// A frame of a model, with a point of it.
 #[derive(Clone, Debug)]
@@ -148,7 +148,7 @@ impl Model {
     /// The site at a point of a frame, in the frame's axes; `world` is a frame, too. `None` if there is no
     /// such frame. Allocates.
     pub fn site(&self, frame: &str, at: [f64; 3]) -> Option<Site> {
-        crate::compile::site(&self.scene, frame, at)
+        crate::compile::scene::site(&self.scene, frame, at)
     }
 }
 

@@ -6,11 +6,11 @@
 //! halvings of the last period and good ones since (u8 each), what the next step is guessed from (its kind and
 //! two of its counts, u8 each), the numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
-use crate::compile::fnv1a;
-use crate::plant::predictor::Past;
-use crate::plant::settings::{ForceSplit, HALVINGS_MAX, Precision, Settings};
-use crate::plant::{Plant, PreciseState};
-use crate::rotation::Quaternion;
+use crate::compile::scene::fnv1a;
+use crate::integrator::predictor::Past;
+use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, Precision, Settings};
+use crate::math::rotation::Quaternion;
+use crate::plant::facade::{Plant, PreciseState};
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
 const VERSION: u32 = 5;

@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
-use crate::Model;
+use crate::integrator::newton::Workspace;
+use crate::integrator::settings::Settings;
+use crate::model::mechanism::Model;
+use crate::plant::facade::{Plant, PreciseState};
+use crate::plant::initial::{Initial, InitialError};
 use crate::plant::period::Period;
-use crate::plant::{
-    Initial, InitialError, Plant, PreciseState, Settings, Snapshot, SnapshotError, Workspace,
-};
+use crate::plant::snapshot::{Snapshot, SnapshotError};
 
 /// A plant that is made ahead: it has its model, its settings and its memory, and becomes a [`Plant`] with
 /// the state that it is given. The scene's initial configuration need not satisfy the constraints.

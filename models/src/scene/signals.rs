@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{Knot, is_zero};
+use crate::scene::{Knot, is_zero};
 
 /// A function of time `t`, seconds since the plant was initialised.
 ///

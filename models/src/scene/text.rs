@@ -1,7 +1,8 @@
 //! Scenes as text: TOML, JSON, and the JSON Schema.
 
-use super::number_or_name::SEPARATOR;
-use super::{MAX_TEXT_BYTES, Problem, Scene, SceneError};
+use crate::scene::limits::MAX_TEXT_BYTES;
+use crate::scene::number_or_name::SEPARATOR;
+use crate::scene::{Problem, Scene, SceneError};
 
 impl Scene {
     /// Reads TOML.

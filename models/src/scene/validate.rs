@@ -11,13 +11,15 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use super::{
-    Constraint, CoordinateKind, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES,
-    MAX_FRAMES, MAX_INPUTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS,
-    MAX_SIGNAL_POINTS, MAX_SIGNALS, MAX_SPRINGS, Motion, Problem, Scene, Signal, Spring,
+use crate::scene::limits::{
+    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES, MAX_FRAMES, MAX_INPUTS,
+    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_SIGNAL_POINTS, MAX_SIGNALS,
+    MAX_SPRINGS,
 };
+use crate::scene::signals::Signal;
+use crate::scene::{Constraint, CoordinateKind, Motion, Problem, Scene, Spring};
 
-use crate::Model;
+use crate::model::mechanism::Model;
 
 impl Scene {
     /// Everything that is wrong with the scene; empty when it will compile.

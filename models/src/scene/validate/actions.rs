@@ -2,9 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Check;
+use crate::scene::limits::MAX_POWER;
+use crate::scene::validate::Check;
 use crate::scene::{
-    Axis, Constraint, CoordinateKind, CouplingTerm, Length, MAX_POWER, Motion, Plane, Point, Spring,
+    Axis, Constraint, CoordinateKind, CouplingTerm, Length, Motion, Plane, Point, Spring,
 };
 
 /// A frame; the world has no index.

@@ -2,8 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Check;
-use crate::scene::{Constraint, CoordinateKind, Force, Motion, Signal};
+use crate::scene::forces::Force;
+use crate::scene::signals::Signal;
+use crate::scene::validate::Check;
+use crate::scene::{Constraint, CoordinateKind, Motion};
 
 impl<'a> Check<'a> {
     pub(super) fn coordinates(&mut self) {

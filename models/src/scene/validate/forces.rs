@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use super::Check;
-use crate::scene::{Component, Force};
+use crate::scene::forces::{Component, Force};
+use crate::scene::validate::Check;
 
 impl Check<'_> {
     pub(super) fn forces(&mut self) {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::Check;
+use crate::scene::validate::Check;
 use crate::scene::{CoordinateKind, Joint, Motion};
 
 impl Check<'_> {

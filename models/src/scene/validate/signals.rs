@@ -2,8 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::Check;
-use crate::scene::{CoordinateKind, Signal};
+use crate::scene::CoordinateKind;
+use crate::scene::signals::Signal;
+use crate::scene::validate::Check;
 
 impl Check<'_> {
     pub(super) fn signals(&mut self) {

@@ -1,7 +1,7 @@
 //! Faulty scenes as data: what is changed in a good scene, and where the problems must be.
 
-use super::*;
 use crate::builtin;
+use crate::scene::validate::*;
 
 /// A good scene with one of everything.
 const GOOD: &str = r#"
@@ -404,7 +404,7 @@ fn paths_couplings_and_splines_have_limits() {
     assert!(scene.validate()[0].message.contains("terms of couplings"));
     let mut scene = Scene::from_toml(&element("spline-spring")).unwrap();
     let Spring::Spline { knots, .. } = &mut scene.springs[0] else { panic!() };
-    *knots = vec![knots[0]; crate::scene::MAX_KNOTS + 1];
+    *knots = vec![knots[0]; crate::scene::limits::MAX_KNOTS + 1];
     assert_eq!(scene.validate()[0].path, "springs[0].knots");
 }
 
@@ -437,7 +437,7 @@ fn several_faults_are_reported_at_once() {
         .replace("\"good\"", "\"Good\"")
         .replace("torque = 1.0", "tork = 1.0");
     let problems = Scene::from_toml(&text).unwrap().validate();
-    let error = crate::SceneError { problems }.to_string();
+    let error = crate::scene::SceneError { problems }.to_string();
     for path in ["name: ", "frames[3].body.mass: ", "operating_points[0].inputs.tork: "] {
         assert!(error.contains(path), "{error}");
     }

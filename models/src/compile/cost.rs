@@ -1,0 +1,98 @@
+//! What a step costs, estimated from a model alone: for people who ask what their scene spends its time on.
+//!
+//! The coefficients are instructions on x86-64 with AVX2, read from callgrind on the built-in scenes; the
+//! sums are right to a factor of two, which the tests of the instruction counts hold them to.
+
+use crate::model::mechanism::{ConstraintKind, Model, Solver};
+use crate::model::tree::{Rotational, Tree};
+
+/// A part of a step of the midpoint rule, or of its linearization.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StageCost {
+    /// What is done.
+    pub name: &'static str,
+    /// How often a step does it, on a smooth motion; zero for what only a linearization does.
+    pub times: f64,
+    /// Instructions each time.
+    pub instructions: f64,
+}
+
+impl Model {
+    /// The parts of a step, and the linearization last.
+    pub fn stage_costs(&self) -> Vec<StageCost> {
+        let d = self.dimensions();
+        let (nd, nc) = (d.dynamic as f64, d.constraints as f64);
+        let entries = self.elimination.entries() as f64;
+        // Of a factorization entry by entry: each row changes those of its ancestors.
+        let changes: f64 =
+            self.elimination.offsets.windows(2).map(|row| ((row[1] - row[0]) as f64).powi(2)).sum();
+        let support: Vec<f64> =
+            self.constraints.iter().map(|c| c.coordinates.len() as f64).collect();
+
+        let (evaluation, generators) = if self.planar.is_some() {
+            (230.0 * self.dynamics.joints.len() as f64, 200.0)
+        } else {
+            (in_space(&self.dynamics), 340.0)
+        };
+        let others = self.potentials.count() as f64
+            + self.forces.as_ref().map_or(0, |f| f.wrenches.len() + f.point_forces.len()) as f64;
+        let joints = self.dynamics.joints.len() as f64;
+        // Of loops.
+        let plan = self.loops.as_ref().map(|loops| &loops.plan);
+        let (fronts, rows) = plan.map_or((0.0, 0.0), |plan| (plan.work(), plan.rows() as f64));
+        let (factorization, correction) = match self.solver {
+            Solver::Tree => {
+                (generators * joints + 60.0 * entries + 24.0 * changes, 110.0 + 27.0 * entries)
+            }
+            Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
+            Solver::Loops => (5.0 * fronts, 41.0 * rows),
+            Solver::Spatial => (100.0 + 820.0 * joints, 110.0 + 93.0 * joints),
+        };
+        let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);
+        let jacobian = 71.0 * support.iter().sum::<f64>();
+        // Equations along world axes share what their second derivatives are made of.
+        let alone = self.constraints.iter().zip(&support);
+        let alone = alone.filter(|(c, _)| !matches!(c.kind, ConstraintKind::Axis(..)));
+        let hessians = 50.0 * alone.map(|(_, size)| size * size).sum::<f64>() + 40.0 * entries;
+        let columns = (d.coordinates() + d.dynamic + d.prescribed) as f64;
+        let mut linearization = 84.0 * nd * columns;
+
+        let stage = |name, times, instructions| StageCost { name, times, instructions };
+        let mut stages = vec![
+            stage("evaluation", 3.2, 560.0 + evaluation + 300.0 * others),
+            stage("factorization", 1.1, 100.0 + factorization),
+            stage(
+                "correction",
+                3.1,
+                correction + if plan.is_some() { 0.0 } else { 30.0 * nd * nc },
+            ),
+        ];
+        if nc > 0.0 {
+            let values = in_space(&self.closure) / 2.0 + 200.0 * nc;
+            stages.push(stage("constraints", 3.2, values));
+            linearization += jacobian + hessians;
+            if plan.is_some() {
+                stages.push(stage("their wrenches", 2.1, 310.0 * joints));
+                linearization += factorization + 15.0 * rows * columns;
+            } else {
+                stages.push(stage("their Jacobian", 2.0, jacobian));
+                stages.push(stage("their factorization", 1.1, schur));
+                linearization += schur + 300.0 * nd * nc;
+            }
+        }
+        stages.push(stage("all else", 1.0, 900.0 + 60.0 * nd));
+        stages.push(stage("A and B", 0.0, linearization));
+        stages
+    }
+}
+
+/// An evaluation of a tree in space.
+fn in_space(tree: &Tree) -> f64 {
+    let of = |inertia: &Rotational| match inertia {
+        Rotational::None => 250.0,
+        Rotational::Point => 320.0,
+        Rotational::Isotropic(_) => 360.0,
+        Rotational::Full(_) => 600.0,
+    };
+    tree.joints.iter().map(|joint| of(&joint.body.inertia)).sum()
+}

@@ -1,0 +1,6 @@
+//! From scene to model.
+
+pub(crate) mod cost;
+pub(crate) mod forces;
+pub(crate) mod loops;
+pub(crate) mod scene;

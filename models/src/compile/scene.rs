@@ -1,0 +1,763 @@
+//! From scene to model: names resolved, fixed joints merged, bodies lumped, what is not needed
+//! dropped.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::integrator::conditioning::Conditioning;
+use crate::math::elimination::Elimination;
+use crate::math::rotation::Quaternion;
+use crate::math::spatial::{Mat3, Sym3, Vec3};
+use crate::math::spline::Spline;
+use crate::math::trigonometry::sin_cos_of;
+use crate::model::mechanism::{
+    Alignment, Carries, Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions,
+    Forces, Length, MixedPair, Model, OperatingPoint, Pair, PathJoint, PathSpring, PointPair,
+    PointSpring, Polynomial, Potentials, Product, Solver, SplineSpring, Vector,
+};
+use crate::model::planar_tree::planar;
+use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
+use crate::plant::site::{Site, SiteJoint};
+use crate::scene;
+use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
+
+impl Model {
+    /// Compiles a scene. All errors of the scene are reported at once.
+    pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
+        let problems = scene.problems();
+        if !problems.is_empty() {
+            return Err(SceneError { problems });
+        }
+        let model = compile(scene);
+        match model.always_singular() {
+            None => Ok(model),
+            Some(coordinate) => {
+                let moves = |frame: &scene::Frame| {
+                    frame.motions().iter().any(|(name, _)| name == coordinate)
+                };
+                let frame = scene.frames.iter().position(moves).unwrap_or_default();
+                let path = format!("frames[{frame}].joint");
+                let message = format!(
+                    "nothing resists coordinate `{coordinate}` in any configuration: no inertia, spring or damping that other coordinates do not meet too"
+                );
+                Err(SceneError { problems: vec![Problem { path, message }] })
+            }
+        }
+    }
+}
+
+/// Compiles a scene that has been validated.
+fn compile(scene: &Scene) -> Model {
+    let layout = Layout::new(scene);
+    let needs = layout.needs(scene);
+    let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &needs.dynamics);
+    let (closure, in_closure) = Tree::pruned(&layout.joints, &needs.closure);
+    let dynamic = layout.dynamic;
+
+    let potentials = layout.potentials(scene, &dynamics, &in_dynamics);
+    let equations = layout.equations(scene, &closure, &in_closure);
+
+    let forces = layout.forces(scene, &dynamics, &in_dynamics);
+    let couplings = couplings(dynamic, &dynamics, &potentials, forces.as_ref());
+    let elimination = Elimination::new(&couplings);
+    let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
+
+    let damping: Vec<f64> = layout.coordinates[..dynamic]
+        .iter()
+        .map(|c| settings(scene, &c.name).and_then(|s| s.damping).unwrap_or(scene.damping))
+        .collect();
+    let gravity = Vec3(scene.gravity);
+    let gravity = (gravity != Vec3::ZERO).then_some(gravity);
+    let needs_poses = forces.is_some()
+        || !potentials.point_springs.is_empty()
+        || !potentials.path_springs.is_empty();
+    let planar = if needs_poses { None } else { planar(&dynamics, gravity) };
+    let dimensions = Dimensions {
+        dynamic,
+        prescribed: layout.coordinates.len() - dynamic,
+        inputs: scene.inputs.len(),
+        constraints: equations.constraints.len(),
+    };
+    let mut model = Model {
+        conditioning: Conditioning::default(),
+        initial_violations: Vec::new(),
+        dimensions,
+        operating_points: layout.operating_points(scene),
+        digest: digest(scene),
+        solver: Solver::of(&dynamics, &elimination, planar.as_deref(), needs_poses, dimensions),
+        planar,
+        loops: None,
+        gravity,
+        damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },
+        coordinate_inputs: layout.coordinate_inputs(scene),
+        forces,
+        signals: layout.signals(scene),
+        potentials,
+        constraints: equations.constraints,
+        constraint_names: equations.names,
+        alignments: equations.alignments,
+        dynamics,
+        closure,
+        elimination,
+        pairs,
+        mixed_pairs,
+        coordinates: layout.coordinates,
+        orientations: layout.orientations,
+        scene: scene.clone(),
+    };
+    model.initial_violations = model.violations_at_start();
+    model.conditioning = Conditioning::new(&model);
+    model.find_loops();
+    model
+}
+
+/// The site at a point of a frame of a scene that compiles.
+pub(crate) fn site(scene: &Scene, frame: &str, at: [f64; 3]) -> Option<Site> {
+    let layout = Layout::new(scene);
+    let placement = layout.frames.get(frame)?;
+    let mut joints = Vec::new();
+    let mut index = placement.joint;
+    while let Some(joint) = layout.joints.get(index) {
+        joints.push(SiteJoint {
+            kind: joint.kind,
+            coordinate: joint.coordinate,
+            orientation: joint.orientation,
+            rotation: joint.rotation,
+            translation: joint.translation,
+        });
+        index = joint.parent;
+    }
+    joints.reverse();
+    let point = layout.fixed(frame, at).point;
+    Some(Site { joints, rotation: placement.rotation, point })
+}
+
+fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {
+    scene.coordinates.iter().find(|c| c.name == name)
+}
+
+/// The coordinate's own, unless a signal drives it.
+fn initial(scene: &Scene, name: &str) -> f64 {
+    let is_input = scene.inputs.iter().any(|input| input.name == name);
+    let signal = scene.signals.iter().find(|signal| signal.drives() == name && !is_input);
+    match signal {
+        Some(signal) => signal.initial(),
+        None => settings(scene, name).map_or(0.0, |c| c.initial),
+    }
+}
+
+/// Where a frame is: fixed in the frame of a joint (or the world).
+#[derive(Clone, Copy)]
+pub(crate) struct Placement {
+    pub(crate) joint: usize,
+    pub(crate) rotation: Mat3,
+    pub(crate) translation: Vec3,
+}
+
+/// The scene with its names resolved.
+pub(crate) struct Layout {
+    pub(crate) joints: Vec<Joint>,
+    pub(crate) frames: BTreeMap<String, Placement>,
+    pub(crate) coordinates: Vec<Coordinate>,
+    pub(crate) dynamic: usize,
+    pub(crate) index: BTreeMap<String, usize>,
+    /// First coordinate of each orientation.
+    pub(crate) orientations: Vec<usize>,
+}
+
+/// Which joints which walk needs.
+struct Needs {
+    dynamics: Vec<bool>,
+    closure: Vec<bool>,
+}
+
+impl Layout {
+    fn new(scene: &Scene) -> Self {
+        let mut children: BTreeMap<&str, Vec<&scene::Frame>> = BTreeMap::new();
+        for frame in &scene.frames {
+            children.entry(&frame.parent).or_default().push(frame);
+        }
+        let world = Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
+        let mut layout = Self {
+            joints: Vec::new(),
+            frames: BTreeMap::from([("world".to_owned(), world)]),
+            coordinates: Vec::new(),
+            dynamic: 0,
+            index: BTreeMap::new(),
+            orientations: Vec::new(),
+        };
+        let mut names = Vec::new();
+        let mut stack: Vec<&scene::Frame> =
+            children.get("world").map(|c| c.iter().rev().copied().collect()).unwrap_or_default();
+        while let Some(frame) = stack.pop() {
+            layout.place(frame, &mut names);
+            stack.extend(children.get(frame.name.as_str()).into_iter().flatten().rev());
+        }
+        layout.number(scene, &names);
+        layout.lump_subtrees();
+        layout
+    }
+
+    /// Places one frame, whose parent is placed, and its body.
+    fn place(&mut self, frame: &scene::Frame, names: &mut Vec<String>) {
+        let parent = self.frames[&frame.parent];
+        let mut placement = Placement {
+            joint: parent.joint,
+            rotation: parent.rotation.times(&rotation(frame.rotation.as_ref())),
+            translation: parent.translation + parent.rotation.apply(Vec3(frame.translation)),
+        };
+        for (name, motion) in frame.motions() {
+            let (kind, turned) = joint(&motion);
+            if motion == Motion::Ball(0) {
+                self.orientations.push(usize::MAX);
+            }
+            let index = self.joints.len();
+            self.joints.push(Joint {
+                parent: placement.joint,
+                root: if placement.joint == WORLD {
+                    index
+                } else {
+                    self.joints[placement.joint].root
+                },
+                kind,
+                rotation: placement.rotation.times(&turned),
+                translation: placement.translation,
+                coordinate: usize::MAX,
+                orientation: self.orientations.len().wrapping_sub(1),
+                body: Body::default(),
+                subtree_mass: 0.0,
+                anchor: false,
+            });
+            names.push(name);
+            placement =
+                Placement { joint: index, rotation: turned.transpose(), translation: Vec3::ZERO };
+        }
+        if let (Some(body), true) = (&frame.body, placement.joint != WORLD) {
+            let joint = &mut self.joints[placement.joint];
+            joint.body = lumped(&joint.body, &placed(body, &placement));
+        }
+        self.frames.insert(frame.name.clone(), placement);
+    }
+
+    /// Orders the coordinates: dynamic ones depth first, prescribed ones as listed.
+    fn number(&mut self, scene: &Scene, joint_names: &[String]) {
+        let prescribed = |name: &str| {
+            settings(scene, name).is_some_and(|c| c.kind == CoordinateKind::Prescribed)
+        };
+        let dynamic = joint_names.iter().filter(|name| !prescribed(name)).cloned();
+        let listed = scene
+            .coordinates
+            .iter()
+            .filter(|c| c.kind == CoordinateKind::Prescribed)
+            .map(|c| c.name.clone());
+        let order: Vec<String> = dynamic.chain(listed).collect();
+        self.dynamic = joint_names.iter().filter(|name| !prescribed(name)).count();
+        self.index = order.iter().cloned().enumerate().map(|(i, name)| (name, i)).collect();
+        for (joint, name) in self.joints.iter_mut().zip(joint_names) {
+            joint.coordinate = self.index[name];
+            if joint.kind == JointKind::Ball(0) {
+                self.orientations[joint.orientation] = joint.coordinate;
+            }
+        }
+        self.coordinates = order
+            .into_iter()
+            .map(|name| {
+                let joint = joint_names.iter().position(|n| *n == name);
+                Coordinate {
+                    kind: if prescribed(&name) {
+                        CoordinateKind::Prescribed
+                    } else {
+                        CoordinateKind::Dynamic
+                    },
+                    is_angle: joint.is_some_and(|j| self.joints[j].kind != JointKind::Prismatic),
+                    initial: initial(scene, &name),
+                    name,
+                }
+            })
+            .collect();
+    }
+
+    fn lump_subtrees(&mut self) {
+        for i in (0..self.joints.len()).rev() {
+            self.joints[i].subtree_mass += self.joints[i].body.mass;
+            let (mass, parent) = (self.joints[i].subtree_mass, self.joints[i].parent);
+            if parent != WORLD {
+                self.joints[parent].subtree_mass += mass;
+            }
+        }
+    }
+
+    pub(crate) fn attachment(&self, point: &scene::Point) -> Attachment {
+        self.fixed(&point.frame, point.at)
+    }
+
+    /// A point fixed in a frame.
+    fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
+        let frame = self.frames[frame];
+        Attachment { joint: frame.joint, point: frame.translation + frame.rotation.apply(Vec3(at)) }
+    }
+
+    /// A direction fixed in a frame, in the frame of the joint that carries it.
+    fn direction(&self, frame: &str, direction: Vec3) -> Vec3 {
+        self.frames[frame].rotation.apply(direction)
+    }
+
+    /// A joint is needed where it, or a joint below it, carries what the walk evaluates.
+    fn needs(&self, scene: &Scene) -> Needs {
+        let mut needs = Needs {
+            dynamics: self
+                .joints
+                .iter()
+                .map(|j| !matches!(j.body.inertia, Rotational::None))
+                .collect(),
+            closure: vec![false; self.joints.len()],
+        };
+        let mark = |needed: &mut Vec<bool>, frame: &str| {
+            let joint = self.frames[frame].joint;
+            if joint != WORLD {
+                needed[joint] = true;
+            }
+        };
+        for spring in &scene.springs {
+            match spring {
+                Spring::TwoPoint { a, b, .. } => {
+                    mark(&mut needs.dynamics, &a.frame);
+                    mark(&mut needs.dynamics, &b.frame);
+                }
+                Spring::Path { points, .. } => {
+                    points.iter().for_each(|point| mark(&mut needs.dynamics, &point.frame));
+                }
+                Spring::Coordinate { .. } | Spring::Spline { .. } => {}
+            }
+        }
+        for force in &scene.forces {
+            force.points().for_each(|point| mark(&mut needs.dynamics, &point.frame));
+        }
+        for constraint in &scene.constraints {
+            let frames = constraint.frames();
+            frames.into_iter().for_each(|frame| mark(&mut needs.closure, frame));
+        }
+        for i in (0..self.joints.len()).rev() {
+            let parent = self.joints[i].parent;
+            if parent != WORLD {
+                needs.dynamics[parent] |= needs.dynamics[i];
+                needs.closure[parent] |= needs.closure[i];
+            }
+        }
+        needs
+    }
+
+    fn potentials(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Potentials {
+        let places = Places { layout: self, tree, index };
+        let mut potentials = Potentials::default();
+        for spring in &scene.springs {
+            match spring {
+                Spring::TwoPoint { a, b, stiffness, rest_length } => {
+                    potentials.point_springs.push(PointSpring {
+                        ends: places.between(self.attachment(a), self.attachment(b)),
+                        stiffness: *stiffness,
+                        rest_length: *rest_length,
+                    });
+                }
+                Spring::Coordinate { coordinate, stiffness, rest } => {
+                    potentials.coordinate_springs.push(CoordinateSpring {
+                        coordinate: self.index[coordinate],
+                        stiffness: *stiffness,
+                        rest: *rest,
+                    });
+                }
+                Spring::Spline { coordinate, knots } => {
+                    // Validation has found that the knots determine a spline.
+                    potentials.spline_springs.extend(
+                        Spline::new(knots).map(|force| SplineSpring {
+                            coordinate: self.index[coordinate],
+                            force,
+                        }),
+                    );
+                }
+                Spring::Path { points, stiffness, rest_length } => {
+                    potentials.path_springs.push(PathSpring {
+                        segments: places.segments(points),
+                        stiffness: *stiffness,
+                        rest_length: *rest_length,
+                    });
+                }
+            }
+        }
+        potentials.any = potentials.count() > 0;
+        potentials.couple_branches =
+            !potentials.point_springs.is_empty() || !potentials.path_springs.is_empty();
+        potentials
+    }
+
+    fn equations(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Equations {
+        let places = Places { layout: self, tree, index };
+        let mut equations = Equations { dynamic: self.dynamic, ..Equations::default() };
+        for constraint in &scene.constraints {
+            let name = constraint.name();
+            match constraint {
+                scene::Constraint::Distance { a, b, length, .. } => {
+                    let points = places.between(self.attachment(a), self.attachment(b));
+                    let kind = ConstraintKind::Distance(points, self.length(length));
+                    equations.push(name.to_owned(), kind);
+                }
+                scene::Constraint::PointToPoint { a, b, axes, .. } => {
+                    let points = places.between_in_world(self.attachment(a), self.attachment(b));
+                    for &axis in axes {
+                        let axis = axis as usize;
+                        let kind = ConstraintKind::Axis(points.clone(), axis);
+                        equations.push(format!("{name}.{}", AXES[axis]), kind);
+                    }
+                }
+                scene::Constraint::PointOnPlane { plane, point, .. } => {
+                    let normal = self.direction(&plane.frame, Vec3(plane.normal));
+                    let a = self.fixed(&plane.frame, plane.at);
+                    let product = Product {
+                        points: places.between(a, self.attachment(point)),
+                        u: Vector::Difference,
+                        w: Vector::WithA(normal),
+                    };
+                    equations.push(name.to_owned(), product.into());
+                }
+                scene::Constraint::Orientation { a, b, .. } => {
+                    equations.align(name, a, b, &places);
+                }
+                scene::Constraint::Weld { a, b, .. } => {
+                    let points = places.between(self.fixed(a, [0.0; 3]), self.fixed(b, [0.0; 3]));
+                    for (letter, axis) in AXES.iter().zip(Mat3::IDENTITY.0) {
+                        let product = Product {
+                            points: points.clone(),
+                            u: Vector::Difference,
+                            w: Vector::WithA(self.direction(a, axis)),
+                        };
+                        equations.push(format!("{name}.{letter}"), product.into());
+                    }
+                    equations.align(name, a, b, &places);
+                }
+                scene::Constraint::Coupling { terms, constant, .. } => {
+                    let terms = terms.iter().map(|term| Polynomial {
+                        coordinate: self.index[&term.coordinate],
+                        coefficients: term.coefficients.clone(),
+                    });
+                    let kind = ConstraintKind::Coupling(terms.collect(), *constant);
+                    equations.push(name.to_owned(), kind);
+                }
+                scene::Constraint::PathLength { points, length, .. } => {
+                    let kind =
+                        ConstraintKind::PathLength(places.segments(points), self.length(length));
+                    equations.push(name.to_owned(), kind);
+                }
+            }
+        }
+        equations
+    }
+
+    fn length(&self, length: &scene::Length) -> Length {
+        match length {
+            scene::Length::Fixed(length) => Length::Fixed(*length),
+            scene::Length::Coordinate(name) => Length::Driven(self.index[name]),
+        }
+    }
+
+    fn operating_points(&self, scene: &Scene) -> Vec<OperatingPoint> {
+        let initial: Vec<f64> = self.coordinates.iter().map(|c| c.initial).collect();
+        let at = |name: &str, q: Vec<f64>, inputs: &BTreeMap<String, f64>| {
+            let forces =
+                scene.inputs.iter().map(|i| inputs.get(&i.name).copied().unwrap_or_default());
+            let u = forces.chain(q[self.dynamic..].iter().copied()).collect();
+            OperatingPoint { name: name.to_owned(), q, u }
+        };
+        let mut points = vec![at("initial", initial.clone(), &BTreeMap::new())];
+        for point in &scene.operating_points {
+            let mut q = initial.clone();
+            for (name, value) in &point.coordinates {
+                q[self.index[name]] = *value;
+            }
+            points.push(at(&point.name, q, &point.inputs));
+        }
+        points
+    }
+}
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+
+/// Points of the scene in a pruned tree.
+pub(crate) struct Places<'a> {
+    pub(crate) layout: &'a Layout,
+    pub(crate) tree: &'a Tree,
+    /// From joints of the layout to those of the tree.
+    pub(crate) index: &'a [usize],
+}
+
+impl Places<'_> {
+    /// Two points; joints that carry both drop out.
+    pub(crate) fn between(&self, a: Attachment, b: Attachment) -> PointPair {
+        let mut pair = self.between_in_world(a, b);
+        pair.path.retain(|joint| joint.carries != Carries::Both);
+        pair
+    }
+
+    /// Two points; joints that carry both drop out if they do not turn.
+    fn between_in_world(&self, a: Attachment, b: Attachment) -> PointPair {
+        let resolve = |at: Attachment| {
+            let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
+            Attachment { joint, ..at }
+        };
+        let (a, b) = (resolve(a), resolve(b));
+        let (path_a, path_b) = (self.tree.path(a.joint), self.tree.path(b.joint));
+        let common = path_a.iter().zip(&path_b).take_while(|(x, y)| x == y).count();
+        let entry = |carries| {
+            let joints = &self.tree.joints;
+            move |&joint: &usize| PathJoint { joint, coordinate: joints[joint].coordinate, carries }
+        };
+        let turns = |joint: &&usize| self.tree.joints[**joint].kind != JointKind::Prismatic;
+        let path = path_a[..common]
+            .iter()
+            .filter(turns)
+            .map(entry(Carries::Both))
+            .chain(path_a[common..].iter().map(entry(Carries::A)))
+            .chain(path_b[common..].iter().map(entry(Carries::B)))
+            .collect();
+        PointPair { a, b, path }
+    }
+
+    /// The segments of a path from point to point.
+    fn segments(&self, points: &[scene::Point]) -> Vec<PointPair> {
+        let ends = points.windows(2);
+        ends.map(|ends| {
+            self.between(self.layout.attachment(&ends[0]), self.layout.attachment(&ends[1]))
+        })
+        .collect()
+    }
+}
+
+/// The constraint equations so far.
+#[derive(Default)]
+struct Equations {
+    dynamic: usize,
+    constraints: Vec<Constraint>,
+    names: Vec<String>,
+    alignments: Vec<Alignment>,
+}
+
+impl Equations {
+    fn push(&mut self, name: String, kind: ConstraintKind) {
+        let all: Vec<usize> = match &kind {
+            ConstraintKind::Distance(points, _) | ConstraintKind::Axis(points, _) => {
+                coordinates_of(points).collect()
+            }
+            ConstraintKind::Product(product) => coordinates_of(&product.points).collect(),
+            ConstraintKind::PathLength(segments, _) => {
+                segments.iter().flat_map(coordinates_of).collect()
+            }
+            ConstraintKind::Coupling(terms, _) => terms.iter().map(|t| t.coordinate).collect(),
+        };
+        let mut seen = BTreeSet::new();
+        let (mut coordinates, prescribed): (Vec<usize>, Vec<usize>) =
+            all.into_iter().filter(|c| seen.insert(*c)).partition(|c| *c < self.dynamic);
+        let dynamic = coordinates.len();
+        coordinates.extend(prescribed);
+        self.constraints.push(Constraint { kind, coordinates, dynamic });
+        self.names.push(name);
+    }
+
+    /// `y_a·z_b`, `z_a·x_b`, `x_a·y_b`: what a small turn of frame `b` about x, y, z changes.
+    fn align(&mut self, name: &str, a: &str, b: &str, places: &Places<'_>) {
+        let layout = places.layout;
+        let points = places.between(layout.fixed(a, [0.0; 3]), layout.fixed(b, [0.0; 3]));
+        let product = |i: usize, j: usize| Product {
+            points: points.clone(),
+            u: Vector::WithA(layout.direction(a, Mat3::IDENTITY.0[i])),
+            w: Vector::WithB(layout.direction(b, Mat3::IDENTITY.0[j])),
+        };
+        for (letter, (i, j)) in AXES.iter().zip([(1, 2), (2, 0), (0, 1)]) {
+            self.push(format!("{name}.r{letter}"), product(i, j).into());
+        }
+        let axes = [0, 1, 2].map(|i| product(i, i));
+        self.alignments.push(Alignment { name: name.to_owned(), axes });
+    }
+}
+
+impl From<Product> for ConstraintKind {
+    fn from(product: Product) -> Self {
+        Self::Product(product)
+    }
+}
+
+fn coordinates_of(points: &PointPair) -> impl Iterator<Item = usize> {
+    points.path.iter().map(|joint| joint.coordinate)
+}
+
+/// The joint of one motion, and the rotation that takes its axis to z.
+fn joint(motion: &Motion) -> (JointKind, Mat3) {
+    let turned = |axis: &[f64; 3]| {
+        let axis = Vec3(*axis);
+        Mat3::with_z_along(axis * (1.0 / axis.norm()))
+    };
+    match motion {
+        Motion::Revolute(axis) => (JointKind::Revolute, turned(axis)),
+        Motion::Prismatic(axis) => (JointKind::Prismatic, turned(axis)),
+        Motion::Screw(axis, pitch) => (JointKind::Screw(*pitch), turned(axis)),
+        Motion::Ball(axis) => (JointKind::Ball(*axis), Mat3::IDENTITY),
+    }
+}
+
+fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
+    match rotation {
+        None => Mat3::IDENTITY,
+        Some(scene::Rotation::Matrix(rows)) => Mat3::from_rows(*rows),
+        Some(scene::Rotation::Rpy([roll, pitch, yaw])) => {
+            about_z(*yaw).times(&about_y(*pitch)).times(&about_x(*roll))
+        }
+        Some(scene::Rotation::Quaternion(q)) => {
+            let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
+            Quaternion(q.map(|c| c / norm)).matrix()
+        }
+    }
+}
+
+fn about_x(angle: f64) -> Mat3 {
+    let (s, c) = sin_cos_of(angle);
+    Mat3::from_rows([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+}
+
+fn about_y(angle: f64) -> Mat3 {
+    let (s, c) = sin_cos_of(angle);
+    Mat3::from_rows([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+}
+
+fn about_z(angle: f64) -> Mat3 {
+    let (s, c) = sin_cos_of(angle);
+    Mat3::from_rows([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+}
+
+/// A body of the scene in the frame of the joint that carries it.
+fn placed(body: &scene::Body, placement: &Placement) -> Body {
+    let center = placement.translation + placement.rotation.apply(Vec3(body.center_of_mass));
+    let inertia = match body.inertia[..] {
+        [xx, yy, zz] => Sym3 { xx, yy, zz, ..Sym3::default() },
+        [xx, yy, zz, xy, xz, yz] => Sym3 { xx, yy, zz, xy, xz, yz },
+        _ => Sym3::default(),
+    };
+    let isotropic =
+        inertia == Sym3 { xx: inertia.xx, yy: inertia.xx, zz: inertia.xx, ..Sym3::default() };
+    let rotated = if isotropic { inertia } else { inertia.rotated(&placement.rotation) };
+    Body { mass: body.mass, center, inertia: classified(body.mass, rotated) }
+}
+
+/// Two bodies in one frame as one.
+fn lumped(a: &Body, b: &Body) -> Body {
+    if matches!(a.inertia, Rotational::None) {
+        return *b;
+    }
+    if matches!(b.inertia, Rotational::None) {
+        return *a;
+    }
+    let mass = a.mass + b.mass;
+    let center = if mass > 0.0 {
+        (a.center * a.mass + b.center * b.mass) * (1.0 / mass)
+    } else {
+        Vec3::ZERO
+    };
+    let about_center =
+        |body: &Body| full(&body.inertia).add(&Sym3::of_point(body.mass, body.center - center));
+    Body { mass, center, inertia: classified(mass, about_center(a).add(&about_center(b))) }
+}
+
+fn full(inertia: &Rotational) -> Sym3 {
+    match *inertia {
+        Rotational::None | Rotational::Point => Sym3::default(),
+        Rotational::Isotropic(i) => Sym3 { xx: i, yy: i, zz: i, ..Sym3::default() },
+        Rotational::Full(tensor) => tensor,
+    }
+}
+
+fn classified(mass: f64, tensor: Sym3) -> Rotational {
+    if tensor == Sym3::default() {
+        if mass == 0.0 { Rotational::None } else { Rotational::Point }
+    } else if tensor == full(&Rotational::Isotropic(tensor.xx)) {
+        Rotational::Isotropic(tensor.xx)
+    } else {
+        Rotational::Full(tensor)
+    }
+}
+
+/// Which dynamic coordinates each one is coupled with, among those before it.
+fn couplings(
+    dynamic: usize,
+    tree: &Tree,
+    potentials: &Potentials,
+    forces: Option<&Forces>,
+) -> Vec<BTreeSet<usize>> {
+    let mut couplings = vec![BTreeSet::new(); dynamic];
+    let mut couple = |coordinates: &[usize]| {
+        for (k, &later) in coordinates.iter().enumerate() {
+            for &earlier in &coordinates[..k] {
+                couplings[later.max(earlier)].insert(later.min(earlier));
+            }
+        }
+    };
+    let dynamic_only = |c: &usize| *c < dynamic;
+    for joint in 0..tree.joints.len() {
+        // Those above are coupled when it is their turn.
+        for above in tree.path(joint) {
+            let pair = [tree.joints[above].coordinate, tree.joints[joint].coordinate];
+            if above != joint && pair.iter().all(dynamic_only) {
+                couple(&pair);
+            }
+        }
+    }
+    for spring in &potentials.point_springs {
+        couple(&coordinates_of(&spring.ends).filter(dynamic_only).collect::<Vec<_>>());
+    }
+    for spring in &potentials.path_springs {
+        let path: BTreeSet<_> = spring.segments.iter().flat_map(coordinates_of).collect();
+        couple(&path.into_iter().filter(dynamic_only).collect::<Vec<_>>());
+    }
+    for force in forces.into_iter().flat_map(|forces| &forces.point_forces) {
+        couple(&coordinates_of(&force.ends).filter(dynamic_only).collect::<Vec<_>>());
+    }
+    couplings
+}
+
+fn joint_pairs(
+    dynamic: usize,
+    tree: &Tree,
+    elimination: &Elimination,
+) -> (Vec<Pair>, Vec<MixedPair>) {
+    let (mut pairs, mut mixed) = (Vec::new(), Vec::new());
+    for (joint, descendant) in tree.joints.iter().enumerate() {
+        for above in tree.path(joint) {
+            let ancestor = &tree.joints[above];
+            match (ancestor.coordinate < dynamic, descendant.coordinate < dynamic) {
+                (true, true) => {
+                    let slot = elimination.slot(descendant.coordinate, ancestor.coordinate);
+                    pairs.push(Pair {
+                        ancestor: above as u32,
+                        descendant: joint as u32,
+                        row: ancestor.coordinate as u32,
+                        column: descendant.coordinate as u32,
+                        slot: slot.expect("coupled coordinates share an elimination path") as u32,
+                    });
+                }
+                (false, false) => {}
+                _ => mixed.push(MixedPair { ancestor: above, descendant: joint }),
+            }
+        }
+    }
+    (pairs, mixed)
+}
+
+/// FNV-1a over the scene without what does not move it.
+fn digest(scene: &Scene) -> u64 {
+    let essence =
+        Scene { description: String::new(), operating_points: Vec::new(), ..scene.clone() };
+    let text = serde_json::to_string(&essence).unwrap_or_default();
+    fnv1a(text.as_bytes())
+}
+
+/// The 64-bit FNV-1a hash.
+pub(crate) fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+    })
+}

@@ -1,0 +1,627 @@
+//! Constraints at one end of a step: values, Jacobian and second derivatives.
+//!
+//! ```text
+//! distance  h = |d|² − l²            h_i = 2 d·d_i          h_ij = 2 (d_i·d_j + d·d_ij)
+//! axis      h = d·e                  h_i = d_i·e            h_ij = d_ij·e
+//! product   h = u·w                  see [`ProductAt`]
+//! path      h = Σ |d_s| − l          see [`Distance`]
+//! coupling  h = Σ c_jk q_j^k + c     h_j = Σ k c_jk q_j^(k−1)
+//! ```
+//!
+//! with the vector `d` between two points, a world axis `e`, and a length `l`, fixed or a prescribed
+//! coordinate.
+
+use crate::constraints::in_plane::InPlane;
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::vectors::{Distance, ProductAt};
+use crate::math::scalar::Scalar;
+use crate::math::spatial::{Mat3, Vec3};
+use crate::model::mechanism::{
+    Alignment, Carries, Constraint, ConstraintKind, Length, Model, PathJoint, PointPair, Polynomial,
+};
+use crate::model::tree::{JointKind, Tree};
+
+/// A configuration may violate a constraint by this fraction of the lengths involved.
+const TOLERANCE: f64 = 1e-6;
+
+/// The constraints at a configuration.
+#[derive(Clone, Debug)]
+pub(crate) struct Closure<S = f64> {
+    pub(crate) poses: Poses<S>,
+    /// Values `h`, one per equation.
+    pub(crate) value: Vec<S>,
+    /// Round-off of each value: what `h` may be at an exact solution.
+    pub(crate) round_off: Vec<f64>,
+    /// `Dh`, row-major, nc by nd + nk.
+    pub(crate) jacobian: Vec<S>,
+    /// Change of `h` by round-off of the coordinates, from the last Jacobian.
+    coordinate_round_off: Vec<f64>,
+    /// What pulls at each joint, for second derivatives.
+    pulls: Vec<Pull<S>>,
+    /// Of a distance, by the coordinates on the path between its ends.
+    gradients: Vec<(usize, Vec3<S>)>,
+    /// In place of the Jacobian, where loops are eliminated in the plane.
+    pub(crate) in_plane: Option<Box<InPlane>>,
+}
+
+/// Multipliers of equations along world axes as forces `f` at the points `p` that a joint carries.
+#[derive(Clone, Copy, Debug)]
+struct Pull<S> {
+    is_there: bool,
+    /// `Σ f`.
+    force: Vec3<S>,
+    /// `Σ p fᵀ`.
+    product: Mat3<S>,
+}
+
+impl<S: Scalar> Pull<S> {
+    const NONE: Self = Self { is_there: false, force: Vec3::ZERO, product: Mat3::ZERO };
+
+    fn add(&mut self, other: &Self) {
+        self.is_there |= other.is_there;
+        self.force += other.force;
+        for (column, other) in self.product.0.iter_mut().zip(other.product.0) {
+            *column += other;
+        }
+    }
+}
+
+impl Closure {
+    /// The equations that `q` violates by more than a millionth of the lengths involved, with their values
+    /// `h(q)`. Leaves values and Jacobian at `q`.
+    pub(crate) fn violated(
+        &mut self,
+        model: &Model,
+        q: &[f64],
+        orientations: &[Mat3],
+    ) -> impl Iterator<Item = (usize, f64)> {
+        self.evaluate(model, q, orientations);
+        self.differentiate(model, q);
+        // With the round-off of the coordinates, which the Jacobian tells.
+        self.evaluate(model, q, orientations);
+        let equations = self.value.iter().zip(&self.round_off).enumerate();
+        equations.filter_map(|(c, (value, round_off))| {
+            let is_satisfied = value.abs() <= round_off / f64::EPSILON * TOLERANCE;
+            (!is_satisfied).then_some((c, *value))
+        })
+    }
+}
+
+impl<S: Scalar> Closure<S> {
+    pub(crate) fn new(model: &Model) -> Self {
+        let nc = model.constraints.len();
+        Self {
+            poses: Poses::new(&model.closure),
+            value: vec![S::ZERO; nc],
+            round_off: vec![0.0; nc],
+            jacobian: vec![S::ZERO; nc * model.dimensions.coordinates()],
+            coordinate_round_off: vec![0.0; nc],
+            pulls: vec![Pull::NONE; model.closure.joints.len()],
+            gradients: Vec::with_capacity(model.closure.joints.len()),
+            in_plane: model.loops.as_ref().map(|loops| Box::new(InPlane::new(loops))),
+        }
+    }
+
+    /// Values at `q`, with the orientations of ball joints.
+    #[inline(never)]
+    pub(crate) fn evaluate(&mut self, model: &Model, q: &[S], orientations: &[Mat3<S>]) {
+        self.poses.evaluate(&model.closure, q, orientations);
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let (value, magnitude) = constraint.value(&model.closure, &self.poses, q);
+            self.value[c] = value;
+            // Not less than what the smallest numbers are rounded by: some terms may all be zero.
+            self.round_off[c] =
+                f64::EPSILON * magnitude + self.coordinate_round_off[c] + f64::MIN_POSITIVE;
+        }
+    }
+
+    /// Takes over how round-off of the coordinates changes the values, until the next Jacobian.
+    pub(crate) fn expect_round_off_of(&mut self, other: &Self) {
+        self.coordinate_round_off.copy_from_slice(&other.coordinate_round_off);
+    }
+
+    /// Jacobian at the configuration of the last [`Closure::evaluate`].
+    #[inline(never)]
+    pub(crate) fn differentiate(&mut self, model: &Model, q: &[S]) {
+        let n = model.dimensions.coordinates();
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let row = &mut self.jacobian[c * n..][..n];
+            for &i in &constraint.coordinates {
+                row[i] = S::ZERO;
+            }
+            constraint.differentiate(&model.closure, &self.poses, q, row);
+            let moved: f64 =
+                constraint.coordinates.iter().map(|&i| (row[i] * q[i]).value().abs()).sum();
+            self.coordinate_round_off[c] = f64::EPSILON * moved;
+        }
+    }
+
+    /// Largest violation in units of its round-off.
+    pub(crate) fn violation(&self) -> f64 {
+        let relative = |(value, round_off): (&S, &f64)| {
+            let value = value.value();
+            if value == 0.0 { 0.0 } else { value.abs() / round_off }
+        };
+        self.value.iter().zip(&self.round_off).map(relative).fold(0.0, larger)
+    }
+
+    /// `out_i −= Σ_c Dh[c, i] λ_c` for the dynamic coordinates.
+    #[inline(never)]
+    pub(crate) fn subtract_impulses(&self, model: &Model, multipliers: &[S], out: &mut [S]) {
+        let n = model.dimensions.coordinates();
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let (row, lambda) = (&self.jacobian[c * n..][..n], multipliers[c]);
+            for &i in constraint.dynamic_coordinates() {
+                out[i] -= row[i] * lambda;
+            }
+        }
+    }
+
+    /// Writes `Σ_c λ_c D²h_c` at `q`, rows and columns over all coordinates, row-major.
+    #[inline(never)]
+    pub(crate) fn hessian(&mut self, model: &Model, q: &[S], multipliers: &[S], out: &mut [S]) {
+        let n = model.dimensions.coordinates();
+        out.fill(S::ZERO);
+        self.pulls.fill(Pull::NONE);
+        let mut are_pulled = false;
+        for (constraint, &lambda) in model.constraints.iter().zip(multipliers) {
+            match &constraint.kind {
+                ConstraintKind::Axis(points, axis) if !model.closure.has_other_joints => {
+                    let mut force = Vec3::ZERO;
+                    force.0[*axis] = lambda;
+                    self.pull(model, points, force);
+                    are_pulled = true;
+                }
+                ConstraintKind::Distance(points, length) if points.are_apart(&model.closure) => {
+                    let twice = lambda * 2.0;
+                    let force = self.add_stretch(model, points, twice, out);
+                    self.pull(model, points, force);
+                    if let Length::Driven(length) = *length {
+                        out[length * n + length] -= twice;
+                    }
+                    are_pulled = true;
+                }
+                _ => {
+                    let (tree, poses) = (&model.closure, &self.poses);
+                    constraint.for_each_second_derivative(tree, poses, q, |i, j, value| {
+                        out[i * n + j] += lambda * value;
+                    });
+                }
+            }
+        }
+        if are_pulled {
+            self.add_pulls(&model.closure, n, out);
+        }
+    }
+
+    /// Takes a force at the first of two points, and its opposite at the other.
+    fn pull(&mut self, model: &Model, points: &PointPair, force: Vec3<S>) {
+        for (end, force) in [(&points.a, force), (&points.b, -force)] {
+            if let Some(pull) = self.pulls.get_mut(end.joint) {
+                pull.is_there = true;
+                pull.force += force;
+                let (point, _) = self.poses.point(&model.closure, end);
+                for (column, force) in pull.product.0.iter_mut().zip(force.0) {
+                    *column += point * force;
+                }
+            }
+        }
+    }
+
+    /// Adds `d_i·d_j`, times a factor, by the coordinates between two points; returns `d` times it.
+    fn add_stretch(
+        &mut self,
+        model: &Model,
+        points: &PointPair,
+        factor: S,
+        out: &mut [S],
+    ) -> Vec3<S> {
+        let (n, tree) = (model.dimensions.coordinates(), &model.closure);
+        let at = points.separation(tree, &self.poses);
+        self.gradients.clear();
+        for joint in &points.path {
+            let i = joint.coordinate;
+            let gradient = joint.gradient(tree, &self.poses, &at);
+            let scaled = gradient * factor;
+            for &(j, other) in &self.gradients {
+                let value = scaled.dot(other);
+                out[i * n + j] += value;
+                out[j * n + i] += value;
+            }
+            out[i * n + i] += scaled.dot(gradient);
+            self.gradients.push((i, gradient));
+        }
+        at.difference * factor
+    }
+
+    /// Adds the second derivatives of `Σ f·p` by the coordinates of hinges and sliders, O(n·depth) for
+    /// however many forces: with joint `i`, axis `w_i`, at or above joint `j`, and the sums over what
+    /// `j` carries,
+    ///
+    /// ```text
+    /// w_i · Σ ∂p/∂q_j × f      hinge: Σ (w × (p − o)) × f = Σ p fᵀ w − o (F·w) − w (Σ p·f − o·F)
+    ///                          slider: w × F
+    /// ```
+    fn add_pulls(&mut self, tree: &Tree, n: usize, out: &mut [S]) {
+        for (j, joint) in tree.joints.iter().enumerate().rev() {
+            let pull = self.pulls[j];
+            if !pull.is_there {
+                continue;
+            }
+            if let Some(parent) = self.pulls.get_mut(joint.parent) {
+                parent.add(&pull);
+            }
+            let (axis, place) = (self.poses.axis(j), self.poses.position[j]);
+            let torque = if joint.kind == JointKind::Revolute {
+                let [x, y, z] = pull.product.0;
+                let along = x[0] + y[1] + z[2] - place.dot(pull.force);
+                pull.product.apply(axis) - place * pull.force.dot(axis) - axis * along
+            } else {
+                axis.cross(pull.force)
+            };
+            let mut i = j;
+            while let Some(above) = tree.joints.get(i) {
+                if above.kind == JointKind::Revolute {
+                    let value = self.poses.axis(i).dot(torque);
+                    out[above.coordinate * n + joint.coordinate] += value;
+                    if i != j {
+                        out[joint.coordinate * n + above.coordinate] += value;
+                    }
+                }
+                i = above.parent;
+            }
+        }
+    }
+}
+
+impl Closure {
+    /// Wrenches of loops at the configuration of the last [`Closure::evaluate`], where there are some.
+    pub(crate) fn place_in_plane(&mut self, model: &Model, q: &[f64]) {
+        if let (Some(in_plane), Some(loops), Some(joints)) =
+            (&mut self.in_plane, &model.loops, &model.planar)
+        {
+            let round_off = &mut self.coordinate_round_off;
+            in_plane.place(model, loops, joints, &self.poses, q, round_off);
+        }
+    }
+
+    /// [`Closure::subtract_impulses`] by wrenches where there are some, else by the Jacobian.
+    pub(crate) fn subtract_pushes(&mut self, model: &Model, multipliers: &[f64], out: &mut [f64]) {
+        match (&mut self.in_plane, &model.loops, &model.planar) {
+            (Some(in_plane), Some(loops), Some(joints)) => {
+                in_plane.subtract_impulses(loops, joints, multipliers, out);
+            }
+            _ => self.subtract_impulses(model, multipliers, out),
+        }
+    }
+}
+
+impl Constraint {
+    /// Value, and the magnitude of what was added for it.
+    #[inline]
+    fn value<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S]) -> (S, f64) {
+        match &self.kind {
+            ConstraintKind::Distance(points, length) => distance(points, tree, poses, length.at(q)),
+            ConstraintKind::Axis(points, axis) => {
+                let at = points.separation(tree, poses);
+                (at.difference[*axis], at.magnitude)
+            }
+            ConstraintKind::Product(product) => {
+                let at = ProductAt::new(product, tree, poses);
+                (at.value(), at.magnitude())
+            }
+            ConstraintKind::PathLength(segments, length) => {
+                path_length(segments, tree, poses, length.at(q))
+            }
+            ConstraintKind::Coupling(terms, constant) => coupling(terms, *constant, q),
+        }
+    }
+
+    /// Writes the derivatives into a row of the Jacobian, whose other entries are zero.
+    #[inline]
+    fn differentiate<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S], row: &mut [S]) {
+        match &self.kind {
+            ConstraintKind::Distance(points, length) => {
+                if let Length::Driven(length) = *length {
+                    row[length] = q[length] * -2.0;
+                }
+                let at = points.separation(tree, poses);
+                let weight = at.difference.scaled(2.0);
+                for joint in &points.path {
+                    let (point, weight) = match joint.carries {
+                        Carries::A => (at.a, weight),
+                        _ => (at.b, -weight),
+                    };
+                    let gradient = poses.point_gradient(tree, joint.joint, point);
+                    row[joint.coordinate] += weight.dot(gradient);
+                }
+            }
+            ConstraintKind::Axis(points, axis) => {
+                let at = points.separation(tree, poses);
+                for joint in &points.path {
+                    let gradient = joint.gradient_in_world(tree, poses, &at);
+                    row[joint.coordinate] += gradient[*axis];
+                }
+            }
+            ConstraintKind::Product(product) => {
+                let at = ProductAt::new(product, tree, poses);
+                at.for_each_derivative(|i, slope| row[i] += slope);
+            }
+            ConstraintKind::PathLength(segments, length) => {
+                if let Length::Driven(length) = *length {
+                    row[length] = -S::ONE;
+                }
+                for segment in segments {
+                    let segment = Distance::new(segment, tree, poses);
+                    segment.for_each_derivative(|i, slope| row[i] += slope);
+                }
+            }
+            ConstraintKind::Coupling(terms, _) => {
+                for term in terms {
+                    row[term.coordinate] += term.slope(q);
+                }
+            }
+        }
+    }
+
+    /// Calls `entry(i, j, h_ij)` for ordered pairs of coordinates; a pair may come more than once, and
+    /// its values add.
+    pub(crate) fn for_each_second_derivative<S: Scalar>(
+        &self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        q: &[S],
+        mut entry: impl FnMut(usize, usize, S),
+    ) {
+        match &self.kind {
+            ConstraintKind::Distance(points, length) => {
+                let at = points.separation(tree, poses);
+                for (k, row) in points.path.iter().enumerate() {
+                    let row_gradient = row.gradient(tree, poses, &at);
+                    for column in &points.path[..=k] {
+                        let gradient = column.gradient(tree, poses, &at);
+                        let both = [(row, row_gradient), (column, gradient)];
+                        let (second, mirrored) = PathJoint::seconds(both, tree, poses);
+                        let product = gradient.dot(row_gradient);
+                        let value = |second: Vec3<S>| (product + at.difference.dot(second)) * 2.0;
+                        entry(row.coordinate, column.coordinate, value(second));
+                        if row.joint != column.joint {
+                            entry(column.coordinate, row.coordinate, value(mirrored));
+                        }
+                    }
+                }
+                if let Length::Driven(length) = *length {
+                    entry(length, length, S::constant(-2.0));
+                }
+            }
+            ConstraintKind::Axis(points, axis) => {
+                let at = points.separation(tree, poses);
+                for (k, row) in points.path.iter().enumerate() {
+                    let row_gradient = row.gradient_in_world(tree, poses, &at);
+                    for column in &points.path[..=k] {
+                        let gradient = column.gradient_in_world(tree, poses, &at);
+                        let (row_at, column_at) = ((row, row_gradient), (column, gradient));
+                        let second = row.second_in_world(row_gradient, tree, poses, column_at);
+                        entry(row.coordinate, column.coordinate, second[*axis]);
+                        if row.joint == column.joint {
+                            continue;
+                        }
+                        // Only within a ball joint does the order matter.
+                        let mirrored = if tree.one_ball(row.joint, column.joint) {
+                            column.second_in_world(gradient, tree, poses, row_at)
+                        } else {
+                            second
+                        };
+                        entry(column.coordinate, row.coordinate, mirrored[*axis]);
+                    }
+                }
+            }
+            ConstraintKind::Product(product) => {
+                ProductAt::new(product, tree, poses).for_each_second_derivative(entry);
+            }
+            ConstraintKind::PathLength(segments, _) => {
+                for segment in segments {
+                    Distance::new(segment, tree, poses).for_each_second_derivative(&mut entry);
+                }
+            }
+            ConstraintKind::Coupling(terms, _) => {
+                for term in terms {
+                    entry(term.coordinate, term.coordinate, term.curvature(q));
+                }
+            }
+        }
+    }
+
+    /// Whether a segment of its path has no length, and so no direction.
+    pub(crate) fn has_empty_segment(&self, tree: &Tree, poses: &Poses) -> bool {
+        let ConstraintKind::PathLength(segments, _) = &self.kind else { return false };
+        segments.iter().any(|segment| {
+            let segment = Distance::new(segment, tree, poses);
+            segment.length <= f64::EPSILON * segment.magnitude()
+        })
+    }
+}
+
+impl Alignment {
+    /// Trace of the rotation between the frames.
+    pub(crate) fn trace(&self, tree: &Tree, poses: &Poses) -> f64 {
+        self.axes.iter().map(|axis| ProductAt::new(axis, tree, poses).value()).sum()
+    }
+}
+
+/// `|d|² − l²`, and its magnitude.
+#[inline(always)]
+fn distance<S: Scalar>(points: &PointPair, tree: &Tree, poses: &Poses<S>, length: S) -> (S, f64) {
+    let at = points.separation(tree, poses);
+    let square = at.difference.dot(at.difference);
+    let squared_length = length * length;
+    let round_off = 2.0 * square.value().sqrt() * at.magnitude + squared_length.value();
+    (square - squared_length, round_off)
+}
+
+/// `Σ |d_s| − l`, and its magnitude.
+#[inline(never)]
+fn path_length<S: Scalar>(
+    segments: &[PointPair],
+    tree: &Tree,
+    poses: &Poses<S>,
+    length: S,
+) -> (S, f64) {
+    let (mut value, mut magnitude) = (-length, length.value());
+    for segment in segments {
+        let segment = Distance::new(segment, tree, poses);
+        value += segment.length;
+        magnitude += segment.magnitude();
+    }
+    (value, magnitude)
+}
+
+/// `Σ c_jk q_j^k + c`, and its magnitude.
+#[inline(never)]
+fn coupling<S: Scalar>(terms: &[Polynomial], constant: f64, q: &[S]) -> (S, f64) {
+    let (mut value, mut magnitude) = (S::constant(constant), constant.abs());
+    for term in terms {
+        let term = term.value(q);
+        value += term;
+        magnitude += term.value().abs();
+    }
+    (value, magnitude)
+}
+
+impl Length {
+    #[inline(always)]
+    fn at<S: Scalar>(self, q: &[S]) -> S {
+        match self {
+            Self::Fixed(length) => S::constant(length),
+            Self::Driven(coordinate) => q[coordinate],
+        }
+    }
+}
+
+impl Polynomial {
+    fn value<S: Scalar>(&self, q: &[S]) -> S {
+        let q = q[self.coordinate];
+        self.coefficients.iter().rev().fold(S::ZERO, |sum, c| (sum + *c) * q)
+    }
+
+    fn slope<S: Scalar>(&self, q: &[S]) -> S {
+        let q = q[self.coordinate];
+        let terms = self.coefficients.iter().enumerate().rev();
+        terms.fold(S::ZERO, |sum, (k, c)| sum * q + c * (k + 1) as f64)
+    }
+
+    fn curvature<S: Scalar>(&self, q: &[S]) -> S {
+        let q = q[self.coordinate];
+        let terms = self.coefficients.iter().enumerate().skip(1).rev();
+        terms.fold(S::ZERO, |sum, (k, c)| sum * q + c * (k * (k + 1)) as f64)
+    }
+}
+
+/// The larger of two numbers; a NaN wins, so that it is never taken for converged.
+///
+/// Both are taken without their signs, and bits of such numbers are in their order.
+#[inline(always)]
+pub(crate) fn larger(a: f64, b: f64) -> f64 {
+    f64::from_bits(a.abs().to_bits().max(b.abs().to_bits()))
+}
+
+/// The largest magnitude of some numbers; NaN if one is not finite.
+pub(crate) fn largest(numbers: &[f64]) -> f64 {
+    let (blocks, rest) = numbers.as_chunks::<4>();
+    let (mut most, mut sum) = ([0.0_f64; 4], [0.0_f64; 4]);
+    let mut see = |i: usize, number: f64| {
+        let size = number.abs();
+        most[i] = if size > most[i] { size } else { most[i] };
+        sum[i] += size;
+    };
+    for block in blocks {
+        for (i, number) in block.iter().enumerate() {
+            see(i, *number);
+        }
+    }
+    rest.iter().for_each(|number| see(0, *number));
+    let most = most.into_iter().fold(0.0, f64::max);
+    if sum.into_iter().sum::<f64>() < f64::INFINITY { most } else { f64::NAN }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lagrangian::samples;
+    use crate::lagrangian::samples::Configuration;
+    use crate::math::scalar::Dual;
+
+    #[test]
+    fn the_largest_number_is_found_and_nothing_infinite_passes() {
+        for len in 0..10 {
+            let mut numbers: Vec<f64> = (0..len).map(|i| -0.5 * f64::from(i)).collect();
+            assert_eq!(largest(&numbers), 0.5 * f64::from((len - 1).max(0)));
+            for place in 0..numbers.len() {
+                let kept = numbers[place];
+                for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+                    numbers[place] = bad;
+                    assert!(largest(&numbers).is_nan(), "{len} {place}");
+                }
+                numbers[place] = kept;
+            }
+        }
+    }
+
+    fn closure<S: Scalar>(model: &Model, at: &Configuration<S>) -> Closure<S> {
+        let mut closure = Closure::new(model);
+        closure.evaluate(model, &at.q, &at.orientations);
+        closure.differentiate(model, &at.q);
+        closure
+    }
+
+    fn hessian<S: Scalar>(model: &Model, at: &Configuration<S>, multipliers: &[S]) -> Vec<S> {
+        let mut out = vec![S::ZERO; at.q.len() * at.q.len()];
+        closure(model, at).hessian(model, &at.q, multipliers, &mut out);
+        out
+    }
+
+    /// Scenes of elements, and random ones.
+    fn models() -> Vec<Model> {
+        let random = samples::random_models(100);
+        assert!(random.len() > 25, "a test of little: {} models", random.len());
+        samples::models().into_iter().chain(random).collect()
+    }
+
+    #[test]
+    fn derivatives_agree_with_differences_and_dual_numbers() {
+        for model in models().iter().filter(|model| !model.constraints.is_empty()) {
+            let (name, d) = (&model.scene.name, model.dimensions);
+            let n = d.coordinates();
+            let multipliers: Vec<f64> =
+                (0..d.constraints).map(|c| (1.3 * c as f64 + 0.5).cos()).collect();
+            for sample in 0..3 {
+                let (q, direction) = samples::configuration(model, sample);
+                let (at, curvature) = (closure(model, &q), hessian(model, &q, &multipliers));
+                for j in 0..n {
+                    let unit = samples::unit(n, j);
+                    let found = samples::slope(model, &q, &unit, |q| closure(model, q).value);
+                    let column: Vec<f64> = at.jacobian.iter().skip(j).step_by(n).copied().collect();
+                    samples::assert_close(&format!("{name} h_{j}"), &column, &found);
+                    let found = samples::slope(model, &q, &unit, |q| {
+                        let jacobian = closure(model, q).jacobian;
+                        let pull = |i| {
+                            let rows = jacobian.iter().skip(i).step_by(n);
+                            rows.zip(&multipliers).map(|(entry, lambda)| entry * lambda).sum()
+                        };
+                        (0..n).map(pull).collect()
+                    });
+                    let column: Vec<f64> = curvature.iter().skip(j).step_by(n).copied().collect();
+                    samples::assert_close(&format!("{name} h_i{j}"), &column, &found);
+                }
+                let dual = samples::along(model, &q, &direction);
+                let lifted: Vec<Dual> = multipliers.iter().map(|x| Dual::constant(*x)).collect();
+                let along = |values: Vec<Dual>| values.iter().map(|x| x.eps).collect::<Vec<_>>();
+                let found =
+                    samples::slope(model, &q, &direction, |q| hessian(model, q, &multipliers));
+                samples::assert_close(name, &along(hessian(model, &dual, &lifted)), &found);
+                let found = samples::slope(model, &q, &direction, |q| closure(model, q).jacobian);
+                samples::assert_close(name, &along(closure(model, &dual).jacobian), &found);
+            }
+        }
+    }
+}

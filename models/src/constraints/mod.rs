@@ -1,0 +1,4 @@
+//! Constraints.
+
+pub(crate) mod closure;
+pub(crate) mod in_plane;

@@ -1,0 +1,330 @@
+//! Ball joints: orientations in place of coordinates.
+//!
+//! A ball joint turns in one step by `R[k+1] = R[k] exp(ξ)`, is at the midpoint at `R[k] exp(ξ/2)`, and
+//! its velocity is `ξ/h`. With the momentum `m = L_v` and the torque `τ = L_q` of the midpoint, in its
+//! own axes,
+//!
+//! ```text
+//! p[k]   = N⁻ m − T⁻ (½h τ + a h f) + Dh(q[k])ᵀ λ
+//! p[k+1] = N⁺ m + T⁺ (½h τ + (1 − a) h f)
+//! ```
+//!
+//! which is what the equations of the other coordinates are with `N = T = 1`. Nothing is singular but
+//! a whole turn in one step. See [`crate::math::rotation`] for the maps.
+
+use crate::integrator::blocks::StepBlocks;
+use crate::integrator::newton::Workspace;
+use crate::integrator::settings::Settings;
+use crate::math::rotation;
+use crate::math::rotation::Quaternion;
+use crate::math::scalar::{Dual, Scalar};
+use crate::math::spatial::{Mat3, Vec3};
+use crate::model::mechanism::Model;
+use crate::plant::facade::PreciseState;
+
+/// The three numbers that begin at `i`: those of a ball joint.
+pub(crate) fn three<S: Scalar>(values: &[S], i: usize) -> Vec3<S> {
+    Vec3([values[i], values[i + 1], values[i + 2]])
+}
+
+/// Orientations of all ball joints at `q`.
+pub(crate) fn orientations(model: &Model, q: &[f64]) -> Vec<Mat3> {
+    let matrix = |&i: &usize| Quaternion::exp(three(q, i)).matrix();
+    model.orientations.iter().map(matrix).collect()
+}
+
+impl Model {
+    /// The configuration that lies `change` beyond `q`: sums, and for ball joints the rotation vector of
+    /// `exp(q) exp(change)`.
+    ///
+    /// # Panics
+    ///
+    /// If a length is not nd + nk.
+    pub fn retract(&self, q: &[f64], change: &[f64]) -> Vec<f64> {
+        let n = self.dimensions.coordinates();
+        assert!(q.len() == n && change.len() == n, "a configuration has {n} coordinates");
+        let mut moved: Vec<f64> = q.iter().zip(change).map(|(q, change)| q + change).collect();
+        for &i in &self.orientations {
+            let turned = Quaternion::exp(three(q, i)).times(Quaternion::exp(three(change, i)));
+            moved[i..i + 3].copy_from_slice(&turned.log().0);
+        }
+        moved
+    }
+
+    /// What [`Model::retract`] takes from `reference` to `q`: differences, and for ball joints the
+    /// rotation vector of `exp(reference)⁻¹ exp(q)`. A feedback `u = u_ref − K (x ⊖ x_ref)` needs it.
+    ///
+    /// # Panics
+    ///
+    /// If a length is not nd + nk.
+    pub fn difference(&self, reference: &[f64], q: &[f64]) -> Vec<f64> {
+        let mut change = vec![0.0; self.dimensions.coordinates()];
+        self.write_difference(reference, q, &mut change);
+        change
+    }
+
+    /// [`Model::difference`] without allocation.
+    ///
+    /// # Panics
+    ///
+    /// If a length is not nd + nk.
+    pub fn write_difference(&self, reference: &[f64], q: &[f64], change: &mut [f64]) {
+        let n = self.dimensions.coordinates();
+        assert!(
+            q.len() == n && reference.len() == n && change.len() == n,
+            "a configuration has {n} coordinates"
+        );
+        for (change, (q, r)) in change.iter_mut().zip(q.iter().zip(reference)) {
+            *change = q - r;
+        }
+        for &i in &self.orientations {
+            let turned =
+                Quaternion::exp(three(reference, i)).inverse().times(Quaternion::exp(three(q, i)));
+            change[i..i + 3].copy_from_slice(&turned.log().0);
+        }
+    }
+}
+
+/// Writes where a step starts and what is next.
+fn place(
+    blocks: &mut StepBlocks,
+    model: &Model,
+    increment: &[f64],
+    q_end: &[f64],
+    (orientations, turns): (&[Mat3], &[Vec3]),
+) {
+    let nd = model.dimensions.dynamic;
+    blocks.orientations[0].copy_from_slice(orientations);
+    blocks.next[..nd].copy_from_slice(increment);
+    blocks.next[nd..].copy_from_slice(&q_end[nd..]);
+    for (&i, turn) in model.orientations.iter().zip(turns) {
+        if i >= nd {
+            blocks.next[i..i + 3].copy_from_slice(&turn.0);
+        }
+    }
+}
+
+/// How one ball joint weighs the derivatives of a step.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Turning<S = f64> {
+    /// First of its three coordinates.
+    pub(crate) coordinate: usize,
+    /// `ξ`.
+    pub(crate) turn: Vec3<S>,
+    /// `N⁻`.
+    pub(crate) momentum: Mat3<S>,
+    /// `T⁻`.
+    pub(crate) torque: Mat3<S>,
+    /// `dexp₋ξ`: how the end turns, in its own axes, as `ξ` changes.
+    pub(crate) to_end: Mat3<S>,
+    /// `exp(−ξ)`: how it turns with the start.
+    pub(crate) carried: Mat3<S>,
+    /// How the midpoint turns, and the velocity changes, with the start: of a dynamic joint at fixed
+    /// `ξ`, of a prescribed one at a fixed end.
+    pub(crate) by_start: (Mat3<S>, Mat3<S>),
+    /// The same with what is next: `ξ` of a dynamic joint, the end of a prescribed one.
+    pub(crate) by_next: (Mat3<S>, Mat3<S>),
+}
+
+impl<S: Scalar> Turning<S> {
+    pub(crate) fn new(model: &Model, coordinate: usize, turn: Vec3<S>, time_step_s: f64) -> Self {
+        let rate = S::constant(1.0 / time_step_s);
+        let half = turn.scaled(0.5);
+        let middle = rotation::dexp(half).scaled(S::constant(0.5));
+        let start = rotation::exp(-half);
+        let momentum = rotation::momentum_at_start(turn);
+        let (by_start, by_next) = if coordinate < model.dimensions.dynamic {
+            ((start, Mat3::ZERO), (middle, Mat3::IDENTITY.scaled(rate)))
+        } else {
+            // ξ' = N⁻ η₁ − N⁺ η₀, with η what turns the ends.
+            let back = momentum.transpose();
+            let turned = middle.times(&back);
+            (
+                (start.minus(&turned), back.scaled(-rate)),
+                (middle.times(&momentum), momentum.scaled(rate)),
+            )
+        };
+        Self {
+            coordinate,
+            turn,
+            momentum,
+            torque: rotation::torque_at_start(turn),
+            to_end: rotation::dexp(turn),
+            carried: rotation::exp(-turn),
+            by_start,
+            by_next,
+        }
+    }
+
+    /// Change of `T⁻ torque − N⁻ momentum` along each axis of `ξ`, and of `(T⁻ − 1) force`.
+    pub(crate) fn by_turn(
+        &self,
+        torque: Vec3<S>,
+        momentum: Vec3<S>,
+        force: Vec3<S>,
+    ) -> [[Vec3<S>; 3]; 2] {
+        let lift = |v: Vec3<S>| Vec3(v.0.map(|x| Dual::new(x, S::ZERO)));
+        let change = |v: Vec3<Dual<S>>| Vec3(v.0.map(|x| x.eps));
+        let along = |axis: usize| {
+            let mut turn = lift(self.turn);
+            turn.0[axis].eps = S::ONE;
+            let weight = rotation::torque_at_start(turn);
+            let carried = rotation::momentum_at_start(turn).apply(lift(momentum));
+            let residual = weight.apply(lift(torque)) - carried;
+            (change(residual), change(weight.apply(lift(force))))
+        };
+        let axes = [along(0), along(1), along(2)];
+        [axes.map(|(residual, _)| residual), axes.map(|(_, force)| force)]
+    }
+}
+
+impl Workspace {
+    /// Starts at the orientations of the state, and finds how prescribed ones turn.
+    pub(crate) fn prepare_orientations(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            self.orientations_start[o] = state.orientations[o].matrix();
+            if i >= model.dimensions.dynamic {
+                let end = Quaternion::exp(three(&self.q_end, i));
+                let turn = state.orientations[o].inverse().times(end).log();
+                self.turns[o] = turn;
+                self.orientations_mid[o] =
+                    self.orientations_start[o].times(&rotation::exp(turn * 0.5));
+                self.orientations_end[o] = end.matrix();
+                let velocity = turn * (1.0 / settings.time_step_s);
+                self.velocity[i..i + 3].copy_from_slice(&velocity.0);
+            }
+        }
+    }
+
+    /// Moves ball joints to the midpoint of the increment.
+    pub(crate) fn turn_to_midpoint(&mut self, model: &Model) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i < model.dimensions.dynamic {
+                let turn = three(&self.increment, i);
+                self.turns[o] = turn;
+                self.orientations_mid[o] =
+                    self.orientations_start[o].times(&rotation::exp(turn * 0.5));
+            }
+        }
+    }
+
+    /// Moves ball joints to the end of the increment.
+    pub(crate) fn turn_to_end(&mut self, model: &Model) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i < model.dimensions.dynamic {
+                let turn = three(&self.increment, i);
+                self.orientations_end[o] = self.orientations_start[o].times(&rotation::exp(turn));
+            }
+        }
+    }
+
+    /// Evaluates the derivatives of the step at the increment, with multipliers and ends.
+    pub(crate) fn evaluate_turned(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) {
+        let Some(blocks) = &mut self.turned else { return };
+        blocks.q_start.copy_from_slice(&state.q);
+        blocks.multipliers.copy_from_slice(&self.multipliers);
+        place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
+        blocks.inputs.copy_from_slice(&self.inputs);
+        blocks.evaluate(model, settings);
+    }
+
+    /// Writes the Jacobian of the residual by the increment.
+    pub(crate) fn fill_turned_newton_matrix(&mut self, model: &Model, settings: &Settings) {
+        let Some(blocks) = &mut self.turned else { return };
+        place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
+        blocks.inputs.copy_from_slice(&self.inputs);
+        blocks.place_midpoint(model, settings.time_step_s);
+        blocks.q_mid.copy_from_slice(&self.q_mid);
+        blocks.velocity.copy_from_slice(&self.velocity);
+        blocks.evaluate_mid(model);
+        blocks.assemble(model, settings);
+        let (n, elimination) = (model.dimensions.coordinates(), &model.elimination);
+        for row in 0..model.dimensions.dynamic {
+            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
+                let ancestor = elimination.ancestors[slot];
+                self.factors.matrix.upper[slot] = blocks.residual_next[ancestor * n + row];
+                self.factors.matrix.lower[slot] = blocks.residual_next[row * n + ancestor];
+            }
+        }
+    }
+
+    /// Turns the constraint Jacobian at the end into one by the increment.
+    pub(crate) fn turn_end_jacobian(&mut self, model: &Model) {
+        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
+        for &i in model.orientations.iter().filter(|i| **i < nd) {
+            let to_end = rotation::dexp(three(&self.increment, i));
+            for row in self.end.jacobian.chunks_exact_mut(n) {
+                let turned = to_end.apply_transposed(three(row, i));
+                row[i..i + 3].copy_from_slice(&turned.0);
+            }
+        }
+    }
+
+    /// The residual of ball joints, `p − N⁻ m + T⁻ (½h τ + a h f)`.
+    pub(crate) fn turn_residual(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) {
+        let h = settings.time_step_s;
+        let weight = settings.force_split.at_start() * h;
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i >= model.dimensions.dynamic {
+                continue;
+            }
+            let turn = self.turns[o];
+            let momentum = three(&self.l_v, i);
+            let torque = three(&self.l_q, i) * (0.5 * h) + three(&self.force, i) * weight;
+            let momentum = rotation::momentum_at_start(turn).apply(momentum);
+            let torque = rotation::torque_at_start(turn).apply(torque);
+            for a in 0..3 {
+                self.residual[i + a] =
+                    ((state.p[i + a] - momentum[a]) + torque[a]) + state.p_low[i + a];
+            }
+        }
+    }
+
+    /// The change of the momentum of ball joints beyond `h (τ + f)`: `−ξ × m + (2a − 1) h (T⁻ − 1) f`.
+    pub(crate) fn turn_impulse(&mut self, model: &Model, settings: &Settings) {
+        let h = settings.time_step_s;
+        let skew = (2.0 * settings.force_split.at_start() - 1.0) * h;
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i >= model.dimensions.dynamic {
+                continue;
+            }
+            let turn = self.turns[o];
+            let carried = three(&self.l_v, i).cross(turn);
+            let force = three(&self.force, i);
+            let split = (rotation::torque_at_start(turn).apply(force) - force) * skew;
+            for a in 0..3 {
+                self.impulse[i + a] += carried[a] + split[a];
+            }
+        }
+    }
+
+    /// Moves the orientations of a state to the end of the step.
+    pub(crate) fn turn(&self, model: &Model, state: &mut PreciseState) {
+        for (o, &i) in model.orientations.iter().enumerate() {
+            let orientation = &mut state.orientations[o];
+            if i < model.dimensions.dynamic {
+                let low = &mut state.orientations_low[o];
+                (*orientation, *low) = orientation.turned(*low, three(&self.increment, i));
+                state.q[i..i + 3].copy_from_slice(&orientation.log().0);
+                state.q_low[i..i + 3].fill(0.0);
+            } else {
+                *orientation = Quaternion::exp(three(&self.q_end, i));
+            }
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! Gauss collocation in Lagrangian form, order `2s` with `s` stages: coupled midpoint rules.
+//!
+//! With the velocities `V_i` at the nodes, `Y_i = h b_i V_i`, and the impulses `P_i = h b_i (L_q + f)`,
+//!
+//! ```text
+//! Q_i = q + Σ_j μ_ij Y_j                    x = Σ Y_j          μ_ij = a_ij / b_j
+//! 0 = p + Σ_j μ_ij P_j − L_v(Q_i, V_i)      p[k+1] = p + Σ P_j
+//! ```
+//!
+//! Since `μ_ii = ½`, each stage is a step of the midpoint rule of length `h b_i`, from what the other
+//! stages give it to begin with: its Newton matrix is that of such a step.
+//!
+//! Few unknowns are corrected all at once, with the dense Jacobian of the guess. Many are corrected stage
+//! after stage, each with its own factors of O(n), until all residuals are at round-off; where that is slow,
+//! because the coupling is stiff, they are taken at once too. `μ_ij + μ_ji = 1` makes the method
+//! symplectic whatever the rounding of the weights.
+//!
+//! Prescribed coordinates move at a constant rate, `c_i` of the way at node `i`. Inputs that signals drive
+//! are taken at the nodes.
+
+pub(crate) mod hessian;
+pub(crate) mod sweep;
+pub(crate) mod system;
+
+use crate::integrator::newton::{At, Workspace};
+use crate::integrator::predictor::Past;
+use crate::integrator::scheme::Tableau;
+use crate::model::mechanism::Model;
+use crate::plant::facade::{StepError, StepReport};
+
+use crate::integrator::collocation::sweep::Sweep;
+use crate::integrator::collocation::system::System;
+
+/// Unknowns up to which all stages are corrected at once.
+const AT_ONCE: usize = 48;
+
+/// A step, and all memory that it needs.
+#[derive(Clone, Debug)]
+pub(crate) struct Collocation {
+    pub(crate) tableau: Tableau,
+    /// Inputs at the stages, one after the other.
+    pub(crate) inputs: Vec<f64>,
+    /// Velocities at the stages, one after the other, then forces `L_q + f`.
+    pub(crate) motion: Vec<f64>,
+    /// One stage after the other, where there are many unknowns.
+    sweep: Option<Box<Sweep>>,
+    /// All at once; also for derivatives. Made when it is first needed.
+    pub(crate) system: Option<Box<System>>,
+}
+
+impl Collocation {
+    pub(crate) fn new(model: &Model, stages: usize) -> Self {
+        let d = model.dimensions;
+        Self {
+            tableau: Tableau::new(stages),
+            inputs: vec![0.0; stages * d.inputs],
+            motion: vec![0.0; 2 * stages * d.dynamic],
+            sweep: (stages * d.dynamic > AT_ONCE).then(|| Box::new(Sweep::new(model, stages))),
+            system: None,
+        }
+    }
+
+    /// Velocities at the stages of the solution, one after the other, then forces.
+    pub(crate) fn motion(&self) -> &[f64] {
+        &self.motion
+    }
+
+    /// Solves one step, which starts at a time; the solution stays here and in the workspace. `u` has no
+    /// signals of inputs.
+    pub(crate) fn solve(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        start_s: f64,
+    ) -> Result<StepReport, StepError> {
+        self.guess(workspace, at, start_s)?;
+        let Self { tableau, inputs, motion, sweep, system } = self;
+        let swept = match sweep {
+            Some(sweep) => sweep.correct(workspace, at, tableau, inputs, motion)?,
+            None => None,
+        };
+        let mut report = match swept {
+            Some(report) => report,
+            None => {
+                let system = system.get_or_insert_with(|| Box::new(System::new(at.model, tableau)));
+                system.begin(at, motion, inputs, &mut workspace.input_force);
+                let report = system.correct(workspace, at, inputs)?;
+                let sums = [&mut *workspace.increment, &mut *workspace.impulse];
+                system.finish(at.model, motion, sums)?;
+                report
+            }
+        };
+        workspace.prepare(at);
+        workspace.estimates.write(&mut report);
+        Ok(report)
+    }
+
+    /// Guesses the motion; takes the inputs of the stages.
+    fn guess(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        start_s: f64,
+    ) -> Result<(), StepError> {
+        let At { model, settings, state, u } = at;
+        let d = model.dimensions;
+        let h = settings.time_step_s;
+        let is_guessed = match &state.past {
+            Past::Stages(past) => past.predict(&self.tableau, &mut self.motion),
+            Past::Increments(_) | Past::Trail(_) => false,
+        };
+        if !is_guessed {
+            workspace.prepare(at);
+            workspace.ballistic(model, settings, state);
+            let half = self.motion.len() / 2;
+            let (velocities, forces) = self.motion.split_at_mut(half);
+            for velocities in velocities.chunks_exact_mut(d.dynamic.max(1)) {
+                let pairs = velocities.iter_mut().zip(&workspace.increment);
+                pairs.for_each(|(v, x)| *v = x / h);
+            }
+            forces.fill(0.0);
+        }
+        if d.inputs == 0 {
+            return Ok(());
+        }
+        for (inputs, node) in self.inputs.chunks_exact_mut(d.inputs).zip(&self.tableau.nodes) {
+            inputs.copy_from_slice(&u[..d.inputs]);
+            if !model.signals.is_empty() {
+                model.add_input_signals(start_s + node * h, inputs);
+                model.check_finite(inputs)?;
+            }
+        }
+        Ok(())
+    }
+}

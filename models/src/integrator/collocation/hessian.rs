@@ -1,0 +1,129 @@
+//! Second derivatives at the stages.
+
+use crate::integrator::newton::Workspace;
+use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::planar::Planar;
+use crate::lagrangian::potentials;
+use crate::math::scalar::Side;
+use crate::model::mechanism::Model;
+
+/// Derivatives of `L` and of the forces: rows of dynamic coordinates, n columns unless said, row-major,
+/// and for each entry those of all stages.
+#[derive(Clone, Debug)]
+pub(crate) struct Hessian {
+    /// Numbers for each entry.
+    width: usize,
+    /// `L_qq + f_q`.
+    pub(crate) qq: Vec<f64>,
+    /// `L_qv + f_v`.
+    pub(crate) qv: Vec<f64>,
+    /// `L_vq`.
+    pub(crate) vq: Vec<f64>,
+    /// `L_vv`.
+    pub(crate) vv: Vec<f64>,
+    /// `f_u`, ni columns.
+    pub(crate) qu: Vec<f64>,
+}
+
+impl Hessian {
+    pub(super) fn new(model: &Model, width: usize) -> Self {
+        let d = model.dimensions;
+        let zeros = || vec![0.0; d.dynamic * d.coordinates() * width];
+        let qu = vec![0.0; d.dynamic * d.inputs * width];
+        Self { width, qq: zeros(), qv: zeros(), vq: zeros(), vv: zeros(), qu }
+    }
+
+    /// Takes the derivatives at the last gradient, of the stages from one on.
+    pub(super) fn take<S: Planar + Side>(
+        &mut self,
+        model: &Model,
+        mechanics: &mut Mechanics<S>,
+        stage: usize,
+    ) {
+        let d = model.dimensions;
+        let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
+        mechanics.differentiate(model);
+        let Self { qq, qv, vq, vv, qu, .. } = self;
+        let place = |row: usize, column: usize| (row * n + column) * width + stage;
+        for pair in &model.pairs {
+            let (i, j) = (pair.row as usize, pair.column as usize);
+            let second = mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
+            let (above, below) = (second.q_above_v_below, second.v_above_q_below);
+            for (at, by_velocity, by_position) in
+                [(place(i, j), above, below), (place(j, i), below, above)]
+            {
+                second.qq.store(&mut qq[at..]);
+                second.vv.store(&mut vv[at..]);
+                by_velocity.store(&mut qv[at..]);
+                by_position.store(&mut vq[at..]);
+            }
+        }
+        for pair in &model.mixed_pairs {
+            let second = mechanics.pair(model, pair.ancestor, pair.descendant);
+            let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
+            let descendant = model.dynamics.joints[pair.descendant].coordinate;
+            let (above, below) = (second.q_above_v_below, second.v_above_q_below);
+            let (at, by_velocity, by_position) = if ancestor < nd {
+                (place(ancestor, descendant), above, below)
+            } else {
+                (place(descendant, ancestor), below, above)
+            };
+            second.qq.store(&mut qq[at..]);
+            second.vv.store(&mut vv[at..]);
+            by_velocity.store(&mut qv[at..]);
+            by_position.store(&mut vq[at..]);
+        }
+        for (i, c) in model.damping.iter().enumerate() {
+            let entry = &mut qv[place(i, i)..];
+            (S::load(entry) - *c).store(entry);
+        }
+        for input in &model.coordinate_inputs {
+            let at = (input.coordinate * d.inputs + input.input) * width + stage;
+            S::ZERO.store(&mut qu[at..]);
+        }
+        for input in &model.coordinate_inputs {
+            let entry = &mut qu[(input.coordinate * d.inputs + input.input) * width + stage..];
+            (S::load(entry) + input.gain).store(entry);
+        }
+    }
+
+    /// Adds springs and forces at the last evaluation of the workspace, of one stage.
+    pub(super) fn add_forces(&mut self, model: &Model, workspace: &Workspace, stage: usize) {
+        let d = model.dimensions;
+        let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
+        let Self { qq, qv, qu, .. } = self;
+        if model.potentials.any {
+            let (tree, poses) = (&model.dynamics, &workspace.mechanics.poses);
+            let q = &workspace.q_mid;
+            potentials::for_each_second_derivative(&model.potentials, tree, poses, q, |i, j, k| {
+                if i < nd {
+                    qq[(i * n + j) * width + stage] -= k;
+                }
+            });
+        }
+        if let Some(forces) = &model.forces {
+            let instant = workspace.instant(model);
+            forces.for_each_derivative(&instant, |i, j, by_q, by_v| {
+                if i < nd {
+                    qq[(i * n + j) * width + stage] += by_q;
+                    qv[(i * n + j) * width + stage] += by_v;
+                }
+            });
+            forces.for_each_input_derivative(&instant, |i, k, by_u| {
+                if i < nd {
+                    qu[(i * d.inputs + k) * width + stage] += by_u;
+                }
+            });
+        }
+    }
+
+    /// Forgets what [`Hessian::take`] does not replace.
+    pub(super) fn clear(&mut self, model: &Model) {
+        if model.potentials.couple_branches || model.forces.is_some() {
+            let Self { qq, qv, vq, vv, qu, .. } = self;
+            for entries in [qq, qv, vq, vv, qu] {
+                entries.fill(0.0);
+            }
+        }
+    }
+}

@@ -1,0 +1,478 @@
+//! All stages corrected at once, and evaluated four side by side.
+//!
+//! What belongs to the stages of a coordinate lies side by side, padded to whole [`Lanes`]: number `i` of
+//! coordinate `a` is entry `a·width + i`.
+
+use crate::constraints::closure::{larger, largest};
+use crate::integrator::newton::{At, CHORD_FLOOR, FLOOR, Workspace};
+use crate::integrator::scheme::Tableau;
+use crate::integrator::settings::Precision;
+use crate::lagrangian::forces;
+use crate::lagrangian::mechanics::Mechanics;
+use crate::math::dense_inverse::DenseInverse;
+use crate::math::scalar::{Lanes, Scalar, Side};
+use crate::math::simd::wide;
+use crate::math::trigonometry::without_turns;
+use crate::model::mechanism::Model;
+use crate::plant::facade::{PreciseState, StepError, StepReport};
+
+use crate::integrator::collocation::hessian::Hessian;
+
+/// Rounds of corrections beyond which shorter steps are the better way.
+const ROUNDS: u32 = 16;
+/// A residual that falls by less than this from one round to the next falls too slowly.
+const SLOW: f64 = 0.5;
+/// What a factorization costs, in rounds of corrections.
+const PATIENCE: i32 = 3;
+
+/// The stages, and all memory that they need.
+#[derive(Clone, Debug)]
+pub(crate) struct System {
+    count: usize,
+    /// The stages, padded.
+    width: usize,
+    /// Of each four stages; none if springs or forces are to be evaluated, one stage after the other.
+    mechanics: Vec<Mechanics<Lanes>>,
+    /// `μ_ij`, row after row, padded both ways.
+    rows: Vec<Lanes>,
+    /// The same, column after column.
+    columns: Vec<Lanes>,
+    weights: Vec<f64>,
+    nodes: Vec<f64>,
+    /// Lengths of the stages `h b_i`, and their inverses.
+    lengths: Vec<f64>,
+    rates: Vec<f64>,
+    /// `Y_i`, `P_i`, `L_v` and the forces of the inputs.
+    increment: Vec<f64>,
+    impulse: Vec<f64>,
+    momentum: Vec<f64>,
+    held: Vec<f64>,
+    /// Configurations and velocities of each four stages, one coordinate after the other.
+    q: Vec<Lanes>,
+    velocity: Vec<Lanes>,
+    l_q: Vec<Lanes>,
+    l_v: Vec<Lanes>,
+    hessian: Hessian,
+    /// Derivatives of the residuals by all `Y`; entry `a·count + i` belongs to stage `i` of coordinate `a`.
+    pub(crate) matrix: DenseInverse,
+    residual: Vec<f64>,
+}
+
+impl System {
+    pub(crate) fn new(model: &Model, tableau: &Tableau) -> Self {
+        let d = model.dimensions;
+        let count = tableau.nodes.len();
+        let width = count.next_multiple_of(Lanes::COUNT);
+        let groups = width / Lanes::COUNT;
+        let is_simple = !model.potentials.any && model.forces.is_none();
+        let padded = |numbers: &[f64]| {
+            let mut numbers = numbers.to_vec();
+            numbers.resize(width, 0.0);
+            numbers
+        };
+        let coupling = |i: usize, j: usize| {
+            if i < count && j < count { tableau.coupling[i * count + j] } else { 0.0 }
+        };
+        let four = |entry: &dyn Fn(usize) -> f64| Lanes([0, 1, 2, 3].map(entry));
+        let entries = (0..width).flat_map(|i| (0..width).step_by(4).map(move |j| (i, j)));
+        let rows = entries.clone().map(|(i, j)| four(&|lane| coupling(i, j + lane))).collect();
+        let columns = entries.map(|(j, i)| four(&|lane| coupling(i + lane, j))).collect();
+        let zeros = || vec![0.0; d.dynamic * width];
+        let lanes = |count: usize| vec![Lanes::ZERO; count];
+        Self {
+            count,
+            width,
+            mechanics: vec![Mechanics::new(model); if is_simple { groups } else { 0 }],
+            rows,
+            columns,
+            weights: padded(&tableau.weights),
+            nodes: padded(&tableau.nodes),
+            lengths: vec![0.0; width],
+            rates: vec![0.0; width],
+            increment: zeros(),
+            impulse: zeros(),
+            momentum: zeros(),
+            held: zeros(),
+            q: lanes(groups * d.coordinates()),
+            velocity: lanes(groups * d.coordinates()),
+            l_q: lanes(d.dynamic),
+            l_v: lanes(d.dynamic),
+            hessian: Hessian::new(model, width),
+            matrix: DenseInverse::new(count * d.dynamic, width - count),
+            residual: vec![0.0; count * d.dynamic],
+        }
+    }
+
+    /// How many times four stages there are.
+    fn groups(&self) -> usize {
+        self.width / Lanes::COUNT
+    }
+
+    /// `Σ_j μ_ij x_j` for four stages `i`.
+    #[inline(always)]
+    fn coupled(columns: &[Lanes], groups: usize, g: usize, x: &[f64]) -> Lanes {
+        let mut sum = Lanes::ZERO;
+        for (column, x) in columns.chunks_exact(groups).zip(x) {
+            sum += column[g] * *x;
+        }
+        sum
+    }
+
+    /// Second derivatives at the stages, entry by entry, and how many numbers each has.
+    pub(crate) fn hessian(&self) -> (&Hessian, usize) {
+        (&self.hessian, self.width)
+    }
+
+    /// Places a workspace at a stage.
+    pub(crate) fn place(&self, workspace: &mut Workspace, state: &PreciseState, stage: usize) {
+        let (n, lane) = (state.q.len(), stage % Lanes::COUNT);
+        let at = stage / Lanes::COUNT * n;
+        for (a, (q, v)) in self.q[at..].iter().zip(&self.velocity[at..]).take(n).enumerate() {
+            let per_radian = workspace.turns_per_radian.get(a).copied().unwrap_or_default();
+            let turns = state.q[a] - without_turns(state.q[a], per_radian)[0];
+            workspace.angles[a] = q.0[lane];
+            workspace.q_mid[a] = q.0[lane] + turns;
+            workspace.velocity[a] = v.0[lane];
+        }
+    }
+
+    /// Takes velocities and forces, stage by stage, and what does not change within the step.
+    pub(crate) fn begin(&mut self, at: At<'_>, motion: &[f64], inputs: &[f64], force: &mut [f64]) {
+        let At { model, settings, state, u } = at;
+        let (d, h) = (model.dimensions, settings.time_step_s);
+        let (nd, n, width) = (d.dynamic, d.coordinates(), self.width);
+        for i in 0..self.count {
+            let length = h * self.weights[i];
+            (self.lengths[i], self.rates[i]) = (length, 1.0 / length);
+            for a in 0..nd {
+                self.increment[a * width + i] = length * motion[i * nd + a];
+                self.impulse[a * width + i] = length * motion[(self.count + i) * nd + a];
+            }
+            if d.inputs > 0 {
+                let inputs = &inputs[i * d.inputs..][..d.inputs];
+                forces::input_forces(&model.coordinate_inputs, inputs, force);
+                for (a, force) in force.iter().enumerate() {
+                    self.held[a * width + i] = *force;
+                }
+            }
+        }
+        for k in 0..d.prescribed {
+            let start = state.q[nd + k];
+            let way = u[d.inputs + k] - start;
+            for g in 0..self.groups() {
+                let node = Lanes::load(&self.nodes[g * Lanes::COUNT..]);
+                self.q[g * n + nd + k] = node * way + start;
+                self.velocity[g * n + nd + k] = Lanes::constant(way / h);
+            }
+        }
+    }
+
+    /// Evaluates all stages; returns what the residuals are the sums of, at most.
+    pub(crate) fn evaluate(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        inputs: &[f64],
+    ) -> f64 {
+        let At { model, state, .. } = at;
+        let n = model.dimensions.coordinates();
+        let mut magnitude = f64::MIN_POSITIVE;
+        for g in 0..self.groups() {
+            self.move_to(state, &workspace.turns_per_radian, n, g);
+            if self.mechanics.is_empty() {
+                for lane in 0..Lanes::COUNT.min(self.count - g * Lanes::COUNT) {
+                    self.evaluate_alone(workspace, at, inputs, g * Lanes::COUNT + lane);
+                }
+            } else {
+                let (q, velocity) = (&self.q[g * n..][..n], &self.velocity[g * n..][..n]);
+                let derivatives = [&mut *self.l_q, &mut *self.l_v];
+                self.mechanics[g].gradient(model, q, &[], velocity, derivatives);
+            }
+            magnitude = magnitude.max(self.take_impulses(state, &model.damping, n, g));
+        }
+        magnitude
+    }
+
+    wide! {
+        /// Configurations and velocities of four stages.
+        pub(crate) fn move_to(mut self, state: &PreciseState, per_radian: &[f64], n: usize, g: usize)
+            = move_to_portable, move_to_avx2;
+
+        /// Impulses of four stages, from the derivatives of `L`.
+        pub(crate) fn take_impulses(
+            mut self,
+            state: &PreciseState,
+            damping: &[f64],
+            n: usize,
+            g: usize,
+        ) -> f64 = take_impulses_portable, take_impulses_avx2;
+
+        /// Writes the residuals of all stages; returns the largest.
+        pub(crate) fn find_residuals(mut self, state: &PreciseState) -> f64
+            = find_residuals_portable, find_residuals_avx2;
+
+        /// Takes the last correction, which `residual` holds, into the impulses, which were evaluated
+        /// before it.
+        pub(crate) fn correct_impulses(mut self, n: usize) = correct_impulses_portable, correct_impulses_avx2;
+
+        /// Derivatives of the residuals `R_i = p + Σ μ_ij P_j − L_v,i` by all `Y`:
+        ///
+        /// ```text
+        /// ∂R_i/∂Y_k = Σ_j μ_ij h_j (L_qq + f_q)_j μ_jk + μ_ik ((L_qv + f_v)_k − (L_vq)_i) − δ_ik (L_vv)_i / h_i
+        /// ```
+        pub(crate) fn fill_matrix(mut self, n: usize) = fill_matrix_portable, fill_matrix_avx2;
+    }
+
+    #[inline(always)]
+    fn move_to_portable(&mut self, state: &PreciseState, per_radian: &[f64], n: usize, g: usize) {
+        let first = g * Lanes::COUNT;
+        let rates = Lanes::load(&self.rates[first..]);
+        for (a, per_radian) in per_radian.iter().enumerate() {
+            let own = &self.increment[a * self.width..][..self.width];
+            let groups = self.groups();
+            let more = Self::coupled(&self.columns, groups, g, &own[..self.count]) + state.q_low[a];
+            let [angle, rest] = without_turns(state.q[a], *per_radian);
+            self.q[g * n + a] = more + rest + angle;
+            self.velocity[g * n + a] = Lanes::load(&own[first..]) * rates;
+        }
+    }
+
+    /// Derivatives of `L` at one stage, with springs and forces.
+    fn evaluate_alone(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        inputs: &[f64],
+        stage: usize,
+    ) {
+        let At { model, state, .. } = at;
+        let d = model.dimensions;
+        if d.inputs > 0 {
+            workspace.set_inputs(model, &inputs[stage * d.inputs..][..d.inputs]);
+        }
+        self.place(workspace, state, stage);
+        workspace.evaluate_lagrangian(model);
+        let lane = stage % Lanes::COUNT;
+        for a in 0..d.dynamic {
+            // Forces count as a part of `L_q`; those of inputs and dampers are added to all stages.
+            let damping = model.damping.get(a).map_or(0.0, |c| c * workspace.velocity[a]);
+            let others = workspace.force[a] - (self.held[a * self.width + stage] - damping);
+            self.l_q[a].0[lane] = workspace.l_q[a] + others;
+            self.l_v[a].0[lane] = workspace.l_v[a];
+        }
+    }
+
+    #[inline(always)]
+    fn take_impulses_portable(
+        &mut self,
+        state: &PreciseState,
+        damping: &[f64],
+        n: usize,
+        g: usize,
+    ) -> f64 {
+        let first = g * Lanes::COUNT;
+        let lengths = Lanes::load(&self.lengths[first..]);
+        let mut largest = [0.0; Lanes::COUNT];
+        for (a, (l_q, l_v)) in self.l_q.iter().zip(&self.l_v).enumerate() {
+            let at = a * self.width + first;
+            let mut force = Lanes::load(&self.held[at..]);
+            if let Some(c) = damping.get(a) {
+                force -= self.velocity[g * n + a] * *c;
+            }
+            let (by_position, by_force) = (*l_q * lengths, force * lengths);
+            (by_position + by_force).store(&mut self.impulse[at..]);
+            l_v.store(&mut self.momentum[at..]);
+            let by_angle = by_position.abs() * (self.q[g * n + a].abs() + 1.0);
+            let size = l_v.abs() + (by_angle + by_force.abs()) * 0.5 + state.p[a].abs();
+            for (largest, size) in largest.iter_mut().zip(size.0) {
+                *largest = if size > *largest { size } else { *largest };
+            }
+        }
+        largest.into_iter().fold(0.0, f64::max)
+    }
+
+    #[inline(always)]
+    fn find_residuals_portable(&mut self, state: &PreciseState) -> f64 {
+        let (groups, mut sizes) = (self.groups(), Lanes::ZERO);
+        for (a, residual) in self.residual.chunks_exact_mut(self.count).enumerate() {
+            let own = &self.impulse[a * self.width..][..self.width];
+            for (g, residual) in residual.chunks_mut(Lanes::COUNT).enumerate() {
+                let first = g * Lanes::COUNT;
+                let sum = Self::coupled(&self.columns, groups, g, &own[..self.count]);
+                let momentum = Lanes::load(&self.momentum[a * self.width + first..]);
+                let value = (-momentum + state.p[a] + sum) + state.p_low[a];
+                residual.copy_from_slice(&value.0[..residual.len()]);
+                for (size, value) in sizes.0.iter_mut().zip(&*residual) {
+                    *size = larger(*size, *value);
+                }
+            }
+        }
+        sizes.0.into_iter().fold(0.0, larger)
+    }
+
+    /// Corrects all stages by chord Newton; the Jacobian is renewed where that saves corrections.
+    pub(super) fn correct(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        inputs: &[f64],
+    ) -> Result<StepReport, StepError> {
+        let At { model, settings, state, .. } = at;
+        let n = model.dimensions.coordinates();
+        let enough = settings.precision.residual();
+        let mut report = StepReport::default();
+        let mut previous = f64::INFINITY;
+        let mut fresh = false;
+        for iteration in 1..=settings.max_iterations.min(ROUNDS) {
+            report.iterations = iteration;
+            let magnitude = self.evaluate(workspace, at, inputs);
+            let size = self.find_residuals(state) / (f64::EPSILON * magnitude);
+            if !size.is_finite() {
+                return Err(StepError::NotFinite { iterations: iteration });
+            }
+            let rate = size / previous;
+            let floor = if fresh { FLOOR } else { CHORD_FLOOR };
+            let left = match settings.precision {
+                // What the correction will leave.
+                Precision::Fast if iteration > 1 => size * rate,
+                _ => size,
+            };
+            let converged = left <= enough || (rate > SLOW && size <= floor);
+            fresh = iteration == 1 || (!converged && size * rate.powi(PATIENCE) > enough);
+            if fresh {
+                self.differentiate(workspace, at, inputs);
+                self.fill_matrix(n);
+                report.factorizations += 1;
+                if !self.matrix.invert() {
+                    return Err(StepError::NotConverged { iterations: iteration, residual: size });
+                }
+            }
+            self.matrix.solve(&mut self.residual);
+            let corrections = self.residual.chunks_exact(self.count);
+            for (own, corrections) in self.increment.chunks_exact_mut(self.width).zip(corrections) {
+                own.iter_mut().zip(corrections).for_each(|(y, c)| *y -= c);
+            }
+            report.residual = size;
+            if converged {
+                self.correct_impulses(n);
+                return Ok(report);
+            }
+            previous = size;
+        }
+        Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
+    }
+
+    /// Takes second derivatives at the last evaluation.
+    pub(crate) fn differentiate(&mut self, workspace: &mut Workspace, at: At<'_>, inputs: &[f64]) {
+        let model = at.model;
+        self.hessian.clear(model);
+        if self.mechanics.is_empty() {
+            for stage in 0..self.count {
+                self.evaluate_alone(workspace, at, inputs, stage);
+                self.hessian.take(model, &mut workspace.mechanics, stage);
+                self.hessian.add_forces(model, workspace, stage);
+            }
+        }
+        for (g, mechanics) in self.mechanics.iter_mut().enumerate() {
+            self.hessian.take(model, mechanics, g * Lanes::COUNT);
+        }
+    }
+
+    #[inline(always)]
+    fn correct_impulses_portable(&mut self, n: usize) {
+        let (count, width, groups) = (self.count, self.width, self.groups());
+        let nd = self.increment.len() / width;
+        for g in 0..groups {
+            let first = g * Lanes::COUNT;
+            let lengths = Lanes::load(&self.lengths[first..]);
+            for b in 0..nd {
+                let corrections = &self.residual[b * count..][..count];
+                let moved = Self::coupled(&self.columns, groups, g, corrections);
+                let mut own = Lanes::ZERO;
+                let rest = &corrections[first..];
+                let length = rest.len().min(Lanes::COUNT);
+                own.0[..length].copy_from_slice(&rest[..length]);
+                for a in 0..nd {
+                    let at = (a * n + b) * width + first;
+                    let by_position = Lanes::load(&self.hessian.qq[at..]) * moved * lengths;
+                    let by_velocity = Lanes::load(&self.hessian.qv[at..]) * own;
+                    let impulse = &mut self.impulse[a * width + first..];
+                    (Lanes::load(impulse) - (by_position + by_velocity)).store(impulse);
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn fill_matrix_portable(&mut self, n: usize) {
+        match self.groups() {
+            1 => self.fill_groups::<1>(n),
+            _ => self.fill_groups::<2>(n),
+        }
+    }
+
+    #[inline(always)]
+    fn fill_groups<const GROUPS: usize>(&mut self, n: usize) {
+        let (count, width) = (self.count, GROUPS * Lanes::COUNT);
+        let nd = self.increment.len() / width;
+        let Self { hessian, matrix, rows, lengths, rates, .. } = self;
+        let load = |numbers: &[f64]| -> [Lanes; GROUPS] {
+            std::array::from_fn(|g| Lanes::load(&numbers[g * Lanes::COUNT..]))
+        };
+        let lengths = load(lengths);
+        let rows = rows.as_chunks::<GROUPS>().0;
+        for a in 0..nd {
+            for b in 0..nd {
+                let at = (a * n + b) * width;
+                let (qq, qv) = (load(&hessian.qq[at..]), load(&hessian.qv[at..]));
+                let (vq, vv) = (&hessian.vq[at..][..count], &hessian.vv[at..][..count]);
+                for (i, (row, vq)) in rows.iter().zip(vq).enumerate() {
+                    let target = &mut matrix.matrix[(a * count + i) * matrix.stride + b * count..];
+                    let mut sums = [Lanes::ZERO; GROUPS];
+                    for g in 0..GROUPS {
+                        sums[g] = row[g] * (qv[g] - *vq);
+                    }
+                    for j in 0..GROUPS {
+                        let weights = row[j] * (lengths[j] * qq[j]);
+                        for (row, weight) in rows[j * Lanes::COUNT..].iter().zip(weights.0) {
+                            for g in 0..GROUPS {
+                                sums[g] += row[g] * weight;
+                            }
+                        }
+                    }
+                    for (g, sum) in sums.into_iter().enumerate() {
+                        sum.store(&mut target[g * Lanes::COUNT..]);
+                    }
+                    target[i] -= rates[i] * vv[i];
+                }
+            }
+        }
+    }
+
+    /// Writes velocities and forces, stage by stage, and their sums over the step.
+    pub(super) fn finish(
+        &self,
+        model: &Model,
+        motion: &mut [f64],
+        [increment, impulse]: [&mut [f64]; 2],
+    ) -> Result<(), StepError> {
+        let (count, width, nd) = (self.count, self.width, increment.len());
+        if !(largest(&self.increment) <= std::f64::consts::PI) {
+            for i in 0..count {
+                let turns: Vec<f64> = (0..nd).map(|a| self.increment[a * width + i]).collect();
+                model.check_turns(&turns)?;
+            }
+        }
+        for a in 0..nd {
+            let stages = a * width..a * width + count;
+            let (turns, impulses) = (&self.increment[stages.clone()], &self.impulse[stages]);
+            increment[a] = turns.iter().sum();
+            impulse[a] = impulses.iter().sum();
+            for i in 0..count {
+                motion[i * nd + a] = self.rates[i] * turns[i];
+                motion[(count + i) * nd + a] = self.rates[i] * impulses[i];
+            }
+        }
+        Ok(())
+    }
+}

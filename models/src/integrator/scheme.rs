@@ -1,0 +1,213 @@
+//! The methods of higher order, and their coefficients.
+//!
+//! **Gauss collocation** with `s` stages has order `2s`; the midpoint rule is the one with `s = 1`. With
+//! the nodes `c_i` and weights `b_i` of Gauss and Legendre on the unit interval, `x = 2c − 1`, and the
+//! Legendre polynomials `P_k`,
+//!
+//! ```text
+//! a_ij = μ_ij b_j        μ_ij = ½ + ½ Σ_k (P_k(x_i) P_{k−1}(x_j) − P_{k−1}(x_i) P_k(x_j)),  k = 1 … s − 1
+//! ```
+//!
+//! of which the sum is skew to the last bit: `μ_ij + μ_ji = 1`, which is what makes the method symplectic.
+//!
+//! **Symmetric compositions** take the midpoint rule with the steps `γ_1 h … γ_m h`, forward and
+//! backward, which keeps constraints and rotations: the five steps of Suzuki (Phys. Lett. A 146, 1990),
+//! and the nine and seventeen of Kahan and Li (Math. Comp. 66, 1997).
+
+use crate::math::trigonometry::sin_cos_of;
+use crate::model::mechanism::Model;
+
+/// Stages at most.
+pub(crate) const STAGES_MAX: usize = 6;
+
+/// How a substep is taken.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Scheme {
+    Midpoint,
+    /// Gauss collocation with so many stages.
+    Gauss(usize),
+    /// The midpoint rule with these fractions of the substep.
+    Composition(&'static [f64]),
+}
+
+const SUZUKI_4: [f64; 5] = {
+    // 1 / (4 − ∛4)
+    const G: f64 = 0.414_490_771_794_375_74;
+    [G, G, 1.0 - 4.0 * G, G, G]
+};
+
+const KAHAN_LI_6: [f64; 9] = {
+    const G: [f64; 5] = [
+        0.392_161_444_007_314_1,
+        0.332_599_136_789_359_44,
+        -0.706_246_172_557_639_3,
+        0.082_213_596_293_550_8,
+        0.798_543_990_934_83,
+    ];
+    [G[0], G[1], G[2], G[3], G[4], G[3], G[2], G[1], G[0]]
+};
+
+const KAHAN_LI_8: [f64; 17] = {
+    const G: [f64; 9] = [
+        0.130_202_483_088_890_08,
+        0.561_162_981_775_108_4,
+        -0.389_474_962_644_847_3,
+        0.158_841_906_555_155_6,
+        -0.395_903_894_133_237_57,
+        0.184_539_640_978_315_7,
+        0.258_374_387_686_322_04,
+        0.295_011_723_609_310_3,
+        -0.605_508_533_830_034_5,
+    ];
+    [
+        G[0], G[1], G[2], G[3], G[4], G[5], G[6], G[7], G[8], G[7], G[6], G[5], G[4], G[3], G[2],
+        G[1], G[0],
+    ]
+};
+
+impl Scheme {
+    /// The method that has the order for a model.
+    pub(crate) fn of_order(order: u32, model: &Model) -> Result<Self, &'static str> {
+        let is_bound = model.dimensions().constraints > 0 || !model.orientations.is_empty();
+        match (order, is_bound) {
+            (2, _) => Ok(Self::Midpoint),
+            (4 | 6 | 8 | 12, false) => Ok(Self::Gauss(order as usize / 2)),
+            (4, true) => Ok(Self::Composition(&SUZUKI_4)),
+            (6, true) => Ok(Self::Composition(&KAHAN_LI_6)),
+            (8, true) => Ok(Self::Composition(&KAHAN_LI_8)),
+            (12, true) => Err("is not there with constraints or ball joints, which go to 8"),
+            _ => Err("is none of 2, 4, 6, 8 and 12"),
+        }
+    }
+
+    /// Steps that one substep takes.
+    pub(crate) fn steps(self) -> usize {
+        match self {
+            Self::Midpoint | Self::Gauss(_) => 1,
+            Self::Composition(fractions) => fractions.len(),
+        }
+    }
+
+    /// The fraction of the substep that step `i` takes.
+    pub(crate) fn fraction(self, i: usize) -> f64 {
+        match self {
+            Self::Midpoint | Self::Gauss(_) => 1.0,
+            Self::Composition(fractions) => fractions[i],
+        }
+    }
+}
+
+/// Coefficients of Gauss collocation.
+#[derive(Clone, Debug)]
+pub(crate) struct Tableau {
+    pub(crate) nodes: Vec<f64>,
+    pub(crate) weights: Vec<f64>,
+    /// `μ_ij`, row-major.
+    pub(crate) coupling: Vec<f64>,
+    /// The velocities of the next step from those of the last: the collocation polynomial one step on,
+    /// column after column.
+    pub(crate) onward: Vec<f64>,
+}
+
+/// `P_0(x) … P_s(x)`.
+fn legendre(x: f64) -> [f64; STAGES_MAX + 1] {
+    let mut p = [1.0; STAGES_MAX + 1];
+    p[1] = x;
+    for k in 1..STAGES_MAX {
+        let order = k as f64;
+        p[k + 1] = ((2.0 * order + 1.0) * x * p[k] - order * p[k - 1]) / (order + 1.0);
+    }
+    p
+}
+
+impl Tableau {
+    pub(crate) fn new(stages: usize) -> Self {
+        let count = stages as f64;
+        // Roots of P_s, by Newton's method from a classical guess; P_s' = s (x P_s − P_{s−1}) / (x² − 1).
+        let slope = |x: f64, p: &[f64]| count * (x * p[stages] - p[stages - 1]) / (x * x - 1.0);
+        let root = |i: usize| {
+            let mut x = sin_cos_of(std::f64::consts::PI * (i as f64 + 0.75) / (count + 0.5)).1;
+            for _ in 0..10 {
+                let p = legendre(x);
+                x -= p[stages] / slope(x, &p);
+            }
+            x
+        };
+        let mut roots: Vec<f64> = (0..stages).rev().map(root).collect();
+        for i in 0..stages {
+            roots[i] = 0.5 * (roots[i] - roots[stages - 1 - i]);
+            roots[stages - 1 - i] = -roots[i];
+        }
+        let nodes: Vec<f64> = roots.iter().map(|x| 0.5 + 0.5 * x).collect();
+        let weight = |x: &f64| 1.0 / ((1.0 - x * x) * slope(*x, &legendre(*x)).powi(2));
+        let weights: Vec<f64> = roots.iter().map(weight).collect();
+        let mut coupling = Vec::with_capacity(stages * stages);
+        let mut onward = Vec::with_capacity(stages * stages);
+        for (i, x) in roots.iter().enumerate() {
+            for (j, y) in roots.iter().enumerate() {
+                let (p, q) = (legendre(*x), legendre(*y));
+                let skew = |k: usize| p[k] * q[k - 1] - p[k - 1] * q[k];
+                let skew: f64 = (1..stages).map(skew).sum();
+                // Two that add up to 1 exactly: the larger is rounded, the smaller what is left.
+                let larger = 0.5 + 0.5 * skew.abs();
+                coupling.push(if skew < 0.0 { 1.0 - larger } else { larger });
+                let others = nodes.iter().enumerate().filter(|(k, _)| *k != i);
+                let factors = others.map(|(_, c)| (1.0 + nodes[j] - c) / (nodes[i] - c));
+                onward.push(factors.product());
+            }
+        }
+        Self { nodes, weights, coupling, onward }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The simplifying assumptions B(2s) and C(s), and symplecticity, which define the method.
+    #[test]
+    fn the_tableaus_are_those_of_gauss() {
+        for stages in [1, 2, 3, 4, 6] {
+            let Tableau { nodes, weights, coupling, .. } = Tableau::new(stages);
+            for k in 1..=2 * stages as i32 {
+                let sum: f64 = weights.iter().zip(&nodes).map(|(b, c)| b * c.powi(k - 1)).sum();
+                assert!((sum - 1.0 / f64::from(k)).abs() < 2e-15, "B({k}), {stages} stages");
+            }
+            for (i, c) in nodes.iter().enumerate() {
+                let row = coupling[i * stages..][..stages].iter().zip(&weights).map(|(m, b)| m * b);
+                for k in 1..=stages as i32 {
+                    let sum: f64 = row.clone().zip(&nodes).map(|(a, c)| a * c.powi(k - 1)).sum();
+                    assert!((sum - c.powi(k) / f64::from(k)).abs() < 2e-15, "C({k})");
+                }
+                for j in 0..stages {
+                    let sum = coupling[i * stages + j] + coupling[j * stages + i];
+                    assert_eq!(sum, 1.0, "symplectic to the last bit");
+                }
+            }
+        }
+    }
+
+    /// A polynomial of degree s − 1 is continued exactly.
+    #[test]
+    fn the_polynomial_goes_on() {
+        let tableau = Tableau::new(4);
+        let motion = |t: f64| 1.0 - t + 0.5 * t * t - 2.0 * t * t * t;
+        for (i, c) in tableau.nodes.iter().enumerate() {
+            let row = tableau.onward.iter().skip(i).step_by(4);
+            let next: f64 = row.zip(&tableau.nodes).map(|(e, c)| e * motion(*c)).sum();
+            assert!((next - motion(1.0 + c)).abs() < 1e-12, "{next}");
+        }
+    }
+
+    /// The sums of odd powers that a symmetric composition of that order must not have.
+    #[test]
+    fn the_fractions_meet_the_conditions_of_order() {
+        for (fractions, order) in [(&SUZUKI_4[..], 4), (&KAHAN_LI_6, 6), (&KAHAN_LI_8, 8)] {
+            for power in (1..order).step_by(2) {
+                let sum: f64 = fractions.iter().map(|g| g.powi(power)).sum();
+                let expected = if power == 1 { 1.0 } else { 0.0 };
+                assert!((sum - expected).abs() < 1e-15, "order {order}: power {power}: {sum:e}");
+            }
+        }
+    }
+}

@@ -1,0 +1,117 @@
+//! How a plant is stepped: what its maker chooses.
+
+use crate::integrator::scheme::Scheme;
+use crate::model::mechanism::Model;
+use crate::plant::initial::InitialError;
+
+/// Most substeps in a control period.
+pub const SUBSTEPS_MAX: u32 = 256;
+/// Most often that a period is halved.
+pub const HALVINGS_MAX: u32 = 8;
+/// Most steps of any length in a period; it is not halved beyond that.
+pub(crate) const STEPS_MAX: usize = 8192;
+
+/// How a plant is stepped.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settings {
+    /// Control period `h`, s: what a controller sees as one step; finite and greater than zero.
+    pub time_step_s: f64,
+    /// Order of accuracy in `h`: 2 is the midpoint rule; 4, 6, 8 and 12 are Gauss collocation, or, with
+    /// constraints or ball joints, symmetric compositions of the midpoint rule, which go to 8.
+    pub order: u32,
+    /// Steps of the method in a control period, 1 to [`SUBSTEPS_MAX`]. The input is held; prescribed
+    /// coordinates move at a constant rate.
+    pub substeps: u32,
+    /// How often a period that cannot be solved is halved, up to [`HALVINGS_MAX`].
+    pub halvings: u32,
+    /// Where the solver stops.
+    pub precision: Precision,
+    /// How forces are split between the ends of a step.
+    pub force_split: ForceSplit,
+    /// Corrections before a step is given up.
+    pub max_iterations: u32,
+    /// A reciprocal condition estimate below this is an error; greater than zero.
+    pub singular_below: f64,
+}
+
+impl Settings {
+    /// The model's time step, order 2 in one step that may be halved 8 times, exact, symmetric split, 40
+    /// iterations, singular below 1e-14.
+    pub fn new(model: &Model) -> Self {
+        Self {
+            time_step_s: model.scene().time_step_s,
+            order: 2,
+            substeps: 1,
+            halvings: HALVINGS_MAX,
+            precision: Precision::default(),
+            force_split: ForceSplit::default(),
+            max_iterations: 40,
+            singular_below: 1e-14,
+        }
+    }
+
+    /// Checks every setting; finds the method that has the order for the model.
+    pub(crate) fn check(&self, model: &Model) -> Result<Scheme, InitialError> {
+        for (name, value) in [
+            ("time_step_s", self.time_step_s),
+            ("max_iterations", f64::from(self.max_iterations)),
+            ("singular_below", self.singular_below),
+        ] {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(InitialError::Settings { name, value });
+            }
+        }
+        let within = |name, value: u32, least: u32, most: u32| {
+            if (least..=most).contains(&value) {
+                Ok(())
+            } else {
+                Err(InitialError::OutOfRange { name, value, least, most })
+            }
+        };
+        within("substeps", self.substeps, 1, SUBSTEPS_MAX)?;
+        within("halvings", self.halvings, 0, HALVINGS_MAX)?;
+        let scheme = Scheme::of_order(self.order, model)
+            .map_err(|what| InitialError::Order { order: self.order, what })?;
+        let order = |what| Err(InitialError::Order { order: self.order, what });
+        if scheme != Scheme::Midpoint && self.force_split == ForceSplit::Paper {
+            return order("needs the symmetric force split");
+        }
+        if model.turns_prescribed() && (self.substeps > 1 || scheme != Scheme::Midpoint) {
+            return order(
+                "and one substep alone are there for prescribed ball joints; use order 2",
+            );
+        }
+        Ok(scheme)
+    }
+}
+
+/// Where the solver of a step stops.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Precision {
+    /// At round-off: energy and momenta do not drift.
+    #[default]
+    Exact,
+    /// At about eleven digits of the increment, which saves an evaluation or so; what conservation laws
+    /// hold then drifts with time.
+    Fast,
+}
+
+/// How the force impulse of a step is split into `F⁻` and `F⁺`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ForceSplit {
+    /// `F⁻ = F⁺ = ½ h f`: second order.
+    #[default]
+    Symmetric,
+    /// `F⁻ = h f`, `F⁺ = 0`, as in the paper: first order with forcing.
+    Paper,
+}
+
+impl ForceSplit {
+    /// Weight `a` of `F⁻`: `F⁻ = a h f`, `F⁺ = (1 − a) h f`.
+    pub(crate) fn at_start(self) -> f64 {
+        match self {
+            Self::Symmetric => 0.5,
+            Self::Paper => 1.0,
+        }
+    }
+}

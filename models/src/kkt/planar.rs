@@ -1,0 +1,538 @@
+//! The Newton matrix of a planar tree as products of vectors, and its elimination in O(n).
+//!
+//! For joint `i` on the path from `j` to the root (or `i = j`), all moved to the same point,
+//!
+//! ```text
+//! K_ij = minus_i · upper_j      minus_i = ½h J̇_i − J_i      upper_j = ½P_j + F_j/h − ¼h γ_j e
+//! K_ji = plus_i · lower_j       plus_i = ½h J̇_i + J_i       lower_j = ½P_j − F_j/h + ¼h γ_j e
+//! ```
+//!
+//! with the weight `γ_j = f_j × g` on the angular part `e`, because that part of `J̇` is zero. Eliminating
+//! a leaf changes the matrix of the others by a product of the same form: what is eliminated below a
+//! joint is summed in a 3 by 3 matrix `A`,
+//!
+//! ```text
+//! d_j = K_jj + minus_jᵀ A_j plus_j      above_j = upper_j + A_j plus_j      across_j = lower_j + A_jᵀ minus_j
+//! A_parent += A_j − above_j across_jᵀ / d_j
+//! ```
+//!
+//! and `d_j` are the pivots of an elimination from the leaves to the root. As each sum is about its own
+//! joint, long chains lose no digits.
+
+use crate::lagrangian::planar::{Fours, Joints, Link, Vec2, Vec3, cross, dot, linear};
+use crate::math::rows::{Block, LANES};
+use crate::math::simd::wide;
+use crate::math::tree_lu::SmallestPivot;
+use crate::model::planar_tree::PlanarJoint;
+
+/// What a joint gives to the matrix, and what is left of it when it has been eliminated.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Generator {
+    pub(super) minus: Vec3,
+    pub(super) plus: Vec3,
+    inverse_pivot: f64,
+}
+
+/// What a joint gives to the derivative of the momentum.
+#[derive(Clone, Copy, Debug, Default)]
+struct Slope {
+    edge: Vec2,
+    plus: Vec3,
+    /// `P + ½h γ e`, and linear parts of `½h P + F`, after `½h γ`, and of `J̇`.
+    slope: Vec3,
+    push: Vec3,
+    rate: Vec2,
+}
+
+/// How right-hand sides pass a joint when it has been eliminated: what is below reaches the parent as
+/// `up · flow + drive · b`, and what is above the children as `down · flow + plus · x`. These wait for one
+/// product each, not for the solution.
+#[derive(Clone, Copy, Debug, Default)]
+struct Passage {
+    up: [Vec3; 3],
+    drive: Vec3,
+    down: [Vec3; 3],
+    /// What the flow from the parent takes from the solution.
+    taken: Vec3,
+}
+
+/// What springs and dampers of coordinates add: `−½h V_ii` to the derivative of the residual by the
+/// configuration, and to that of the momentum by the increment this and `−c`.
+pub(crate) struct Diagonal<'a> {
+    pub(crate) residual: &'a [f64],
+    pub(crate) momentum: &'a [f64],
+}
+
+/// What a matrix is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Of {
+    /// Second derivatives by positions and velocities: the Newton matrix.
+    Motion,
+    /// Those by velocities.
+    Masses,
+}
+
+/// The matrix of a step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Method {
+    /// 1, or 0 for masses alone.
+    motion: f64,
+    half: f64,
+    pub(super) inverse: f64,
+}
+
+impl Method {
+    #[inline(always)]
+    pub(super) fn new(step: f64, of: Of) -> Self {
+        let motion = if of == Of::Masses { 0.0 } else { 1.0 };
+        Self { motion, half: 0.5 * step * motion, inverse: 1.0 / step }
+    }
+
+    /// What a joint gives to the matrix, `upper` and `lower` first, without a pivot.
+    #[inline(always)]
+    pub(super) fn generator(
+        &self,
+        link: &Link<f64>,
+        joint: &PlanarJoint,
+    ) -> ([Vec3; 2], Generator) {
+        let Self { motion, half, inverse } = *self;
+        let ([dx, dy], [rx, ry]) = (link.slide, [half * link.rate[0], half * link.rate[1]]);
+        let turn = joint.body.turn;
+        let plus = [turn, rx + dx, ry + dy];
+        let minus = [-turn, rx - dx, ry - dy];
+        let weight = half * link.weight;
+        let mut upper = add_scaled(scaled(0.5 * motion, link.slope), inverse, link.force);
+        let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
+        upper[0] -= 0.5 * weight;
+        lower[0] += 0.5 * weight;
+        let generator = Generator { minus, plus, inverse_pivot: 0.0 };
+        ([upper, lower], generator)
+    }
+}
+
+/// The matrix.
+#[derive(Clone, Debug)]
+pub(crate) struct Elimination {
+    generators: Vec<Generator>,
+    slopes: Vec<Slope>,
+    passages: Vec<Passage>,
+    pub(super) step: f64,
+    /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
+    branches: Vec<[Vec3; 3]>,
+    /// The same for a right-hand side, and what joints with several children pass down to them.
+    flows_of_branches: Vec<Vec3>,
+    flow: Vec<Vec3>,
+    /// Both for a block of right-hand sides; the first is that of the world. What goes up is zero but within a
+    /// pass.
+    flows: Vec<[Block; 3]>,
+    motions: Vec<[Block; 3]>,
+    /// A block of columns of the derivatives.
+    pub(super) increment: Vec<Block>,
+    pub(super) momentum: Vec<Block>,
+}
+
+#[inline(always)]
+pub(super) fn dot3(a: Vec3, b: Vec3) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+fn plus3(a: Vec3, b: Vec3) -> Vec3 {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+/// `matrix · flow + b · drive`: a product and two sums behind the flow.
+#[inline(always)]
+fn passed(matrix: &[Vec3; 3], flow: Vec3, b: f64, drive: Vec3) -> Vec3 {
+    let [r, s, t] = matrix;
+    let of = |row: &Vec3, drive: f64| {
+        (row[0] * flow[0] + row[1] * flow[1]) + (row[2] * flow[2] + drive * b)
+    };
+    [of(r, drive[0]), of(s, drive[1]), of(t, drive[2])]
+}
+
+#[inline(always)]
+fn plus33([a, b, c]: [Vec3; 3], [d, e, f]: [Vec3; 3]) -> [Vec3; 3] {
+    [plus3(a, d), plus3(b, e), plus3(c, f)]
+}
+
+#[inline(always)]
+fn scaled(s: f64, a: Vec3) -> Vec3 {
+    [s * a[0], s * a[1], s * a[2]]
+}
+
+#[inline(always)]
+fn add_scaled(a: Vec3, s: f64, b: Vec3) -> Vec3 {
+    [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]]
+}
+
+impl Elimination {
+    pub(crate) fn new(joints: usize) -> Self {
+        Self {
+            generators: vec![Generator::default(); joints],
+            slopes: vec![Slope::default(); joints],
+            step: 0.0,
+            passages: vec![Passage::default(); joints],
+            branches: vec![[[0.0; 3]; 3]; joints],
+            flows_of_branches: vec![[0.0; 3]; joints],
+            flow: vec![[0.0; 3]; joints],
+            flows: vec![[Block::ZERO; 3]; joints + 1],
+            motions: vec![[Block::ZERO; 3]; joints + 1],
+            increment: vec![Block::ZERO; joints],
+            momentum: vec![Block::ZERO; joints],
+        }
+    }
+
+    wide! {
+        /// Factors the matrix that belongs to the second derivatives of `tree`; all joints are dynamic, in
+        /// the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
+        /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 150 flops a joint.
+        #[inline(never)]
+        pub(crate) fn factor(
+            mut self,
+            tree: &Joints<Fours>,
+            joints: &[PlanarJoint],
+            diagonal: &[f64],
+            inertia: &[f64],
+            step: f64,
+            of: Of,
+        ) -> SmallestPivot = factor_portable, factor_avx2;
+
+        /// Solves `K x = b` in place, about 55 flops a joint.
+        #[inline(never)]
+        pub(crate) fn solve(mut self, joints: &[PlanarJoint], x: &mut [f64])
+            = solve_portable, solve_avx2;
+
+        /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
+        /// momentum, `[h L_qq 1] + (½h L_qq + L_qv) X`, by configuration and momentum; springs and dampers
+        /// of coordinates are added by `diagonal`s. Rows are those of coordinates, `stride` apart and whole
+        /// blocks. Four passes over the joints for each block of columns, about 95 flops a joint and
+        /// column.
+        #[inline(never)]
+        pub(crate) fn linearize(
+            mut self,
+            tree: &Joints<Fours>,
+            joints: &[PlanarJoint],
+            diagonal: &Diagonal<'_>,
+            increment: &mut [f64],
+            momentum: &mut [f64],
+            stride: usize,
+        ) = linearize_portable, linearize_avx2, linearize_avx512;
+    }
+
+    #[inline(always)]
+    fn factor_portable(
+        &mut self,
+        tree: &Joints<Fours>,
+        joints: &[PlanarJoint],
+        diagonal: &[f64],
+        inertia: &[f64],
+        step: f64,
+        of: Of,
+    ) -> SmallestPivot {
+        let method = Method::new(step, of);
+        self.step = step;
+        let mut smallest = SmallestPivot::NONE;
+        // `A` of the joint that follows, about its parent.
+        let mut below = [[0.0; 3]; 3];
+        for (row, joint) in joints.iter().enumerate().rev() {
+            let mut sum = if joint.is_followed { below } else { [[0.0; 3]; 3] };
+            if joint.has_branches {
+                sum = plus33(sum, std::mem::take(&mut self.branches[row]));
+            }
+            let [a, b, c] = sum;
+            let link = tree.link(row);
+            let ([upper, lower], mut generator) = method.generator(&link, joint);
+            let Generator { minus, plus, .. } = generator;
+
+            let pushed = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
+            let own = dot3(minus, upper) + diagonal[row];
+            let pivot = own + dot3(minus, pushed);
+            smallest.see(row, pivot, own.abs().max(inertia[row] * method.inverse));
+            let inverse_pivot = 1.0 / pivot;
+            let pulled = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
+            let (above, across) = (plus3(upper, pushed), plus3(lower, pulled));
+            // About the parent: all that can be done before the pivot is known.
+            let edge = link.edge;
+            let [ex, ey] = edge;
+            let moved = |v: Vec3| [v[0] + cross(edge, linear(v)), v[1], v[2]];
+            let (a, b, c) = (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
+            let (above_there, taken) = (moved(above), scaled(inverse_pivot, moved(across)));
+            let sum = [
+                add_scaled(a, -above_there[0], taken),
+                add_scaled(b, -above_there[1], taken),
+                add_scaled(c, -above_there[2], taken),
+            ];
+            match joint.parent {
+                0 => {}
+                parent if parent == row => below = sum,
+                parent => {
+                    self.branches[parent - 1] = plus33(self.branches[parent - 1], sum);
+                }
+            }
+            let (drive, wrench) = (scaled(inverse_pivot, above_there), [1.0, -ey, ex]);
+            let unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+            self.passages[row] = Passage {
+                up: [
+                    add_scaled(wrench, -drive[0], minus),
+                    add_scaled(unit[1], -drive[1], minus),
+                    add_scaled(unit[2], -drive[2], minus),
+                ],
+                drive,
+                down: [
+                    add_scaled(unit[0], -plus[0], taken),
+                    add_scaled([-ey, 1.0, 0.0], -plus[1], taken),
+                    add_scaled([ex, 0.0, 1.0], -plus[2], taken),
+                ],
+                taken,
+            };
+            generator.inverse_pivot = inverse_pivot;
+            self.generators[row] = generator;
+        }
+        smallest
+    }
+
+    #[inline(always)]
+    fn solve_portable(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
+        let Self { generators, passages, flows_of_branches: branches, flow: flows, .. } = self;
+        let mut below = [0.0; 3];
+        for (i, joint) in joints.iter().enumerate().rev() {
+            let (Generator { minus, inverse_pivot, .. }, passage) = (&generators[i], &passages[i]);
+            let mut flow = if joint.is_followed { below } else { [0.0; 3] };
+            if joint.has_branches {
+                flow = plus3(flow, std::mem::take(&mut branches[i]));
+            }
+            let b = x[i];
+            x[i] = (b - dot3(*minus, flow)) * inverse_pivot;
+            let up = passed(&passage.up, flow, b, passage.drive);
+            match joint.parent {
+                0 => {}
+                parent if parent == i => below = up,
+                parent => branches[parent - 1] = plus3(branches[parent - 1], up),
+            }
+        }
+        let mut above = [0.0; 3];
+        for (i, joint) in joints.iter().enumerate() {
+            let flow = match joint.parent {
+                0 => [0.0; 3],
+                parent if parent == i => above,
+                parent => flows[parent - 1],
+            };
+            let (own, passage) = (x[i], &passages[i]);
+            x[i] = own - dot3(passage.taken, flow);
+            above = passed(&passage.down, flow, own, generators[i].plus);
+            if joint.has_branches {
+                flows[i] = above;
+            }
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn linearize_portable(
+        &mut self,
+        tree: &Joints<Fours>,
+        joints: &[PlanarJoint],
+        diagonal: &Diagonal<'_>,
+        increment: &mut [f64],
+        momentum: &mut [f64],
+        stride: usize,
+    ) {
+        self.find_slopes(tree, joints);
+        for first in (0..stride).step_by(LANES) {
+            self.start_columns(tree, joints, diagonal, first);
+            self.eliminate(joints);
+            self.substitute(joints, diagonal);
+            self.gather(joints);
+            self.write_columns(increment, momentum, first, stride);
+        }
+    }
+
+    /// At the second derivatives of the last factorization.
+    #[inline(always)]
+    pub(super) fn find_slopes(&mut self, tree: &Joints<Fours>, joints: &[PlanarJoint]) {
+        let half = 0.5 * self.step;
+        for (i, (joint, to)) in joints.iter().zip(&mut self.slopes).enumerate() {
+            let link = tree.link(i);
+            let ([dx, dy], [rx, ry]) = (link.slide, link.rate);
+            let (weight, [turn, px, py]) = (half * link.weight, link.slope);
+            *to = Slope {
+                edge: link.edge,
+                plus: [joint.body.turn, half * rx + dx, half * ry + dy],
+                slope: [turn + weight, px, py],
+                push: [weight, link.force[1] + half * px, link.force[2] + half * py],
+                rate: link.rate,
+            };
+        }
+    }
+
+    /// A block of columns of `[G 1]`, and of what the momentum has beside the increment's part.
+    #[inline(always)]
+    pub(super) fn start_columns(
+        &mut self,
+        tree: &Joints<Fours>,
+        joints: &[PlanarJoint],
+        diagonal: &Diagonal<'_>,
+        first: usize,
+    ) {
+        let n = joints.len();
+        for (x, p) in self.increment.iter_mut().zip(&mut self.momentum) {
+            (*x, *p) = (Block::ZERO, Block::ZERO);
+        }
+        for lane in 0..LANES {
+            match first + lane {
+                column if column < n => self.by_configuration(tree, joints, diagonal, column, lane),
+                column if column < 2 * n => {
+                    self.increment[column - n].0[lane] = 1.0;
+                    self.momentum[column - n].0[lane] = 1.0;
+                }
+                _ => {}
+            }
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn write_columns(
+        &self,
+        increment: &mut [f64],
+        momentum: &mut [f64],
+        first: usize,
+        stride: usize,
+    ) {
+        let rows = increment.chunks_exact_mut(stride).zip(momentum.chunks_exact_mut(stride));
+        for ((by_x, by_p), (x, p)) in rows.zip(self.increment.iter().zip(&self.momentum)) {
+            by_x[first..][..LANES].copy_from_slice(&x.0);
+            by_p[first..][..LANES].copy_from_slice(&p.0);
+        }
+    }
+
+    /// A column of `G` and of `h L_qq`.
+    #[inline(always)]
+    fn by_configuration(
+        &mut self,
+        tree: &Joints<Fours>,
+        joints: &[PlanarJoint],
+        diagonal: &Diagonal<'_>,
+        column: usize,
+        lane: usize,
+    ) {
+        let (step, own, turn) = (self.step, tree.link(column), joints[column].body.turn);
+        // Rows of joints above, with the wrench moved to each of them, and of the joint itself.
+        let (mut wrench, push, mut i) = (own.slope, linear(own.slope), column + 1);
+        while i > 0 {
+            let (link, s) = (tree.link(i - 1), joints[i - 1].body.turn);
+            let stiffness = step * (dot(link.rate, push) + s * own.weight);
+            self.increment[i - 1].0[lane] =
+                0.5 * stiffness - (s * wrench[0] + dot(link.slide, push));
+            self.momentum[i - 1].0[lane] = stiffness;
+            wrench[0] += cross(link.edge, push);
+            i = joints[i - 1].parent;
+        }
+        // Rows of joints below.
+        let below = column + 1..column + 1 + joints[column].descendants;
+        let rows = self.increment[below.clone()].iter_mut().zip(&mut self.momentum[below.clone()]);
+        for ((x, p), i) in rows.zip(below) {
+            let link = tree.link(i);
+            let stiffness = step * (dot(own.rate, linear(link.slope)) + turn * link.weight);
+            x.0[lane] = 0.5 * stiffness - dot(own.rate, linear(link.force));
+            p.0[lane] = stiffness;
+        }
+        self.increment[column].0[lane] += diagonal.residual[column];
+        self.momentum[column].0[lane] += 2.0 * diagonal.residual[column];
+    }
+
+    /// From the leaves to the root, with the right-hand side taken away.
+    #[inline(always)]
+    fn eliminate(&mut self, joints: &[PlanarJoint]) {
+        let passages = self.generators.iter().zip(&self.passages);
+        for (i, ((joint, row), (generator, passage))) in
+            joints.iter().zip(&mut self.increment).zip(passages).enumerate().rev()
+        {
+            let flow = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
+            let right = row.times(-1.0);
+            let pulled = product(generator.minus, flow);
+            *row = row.plus(pulled).times(-generator.inverse_pivot);
+            if joint.parent > 0 {
+                let up = passed_by_all(&passage.up, flow, right, passage.drive);
+                add_to(&mut self.flows[joint.parent], up);
+            }
+        }
+    }
+
+    /// From the root to the leaves: the solution, and what joints above add to the momentum.
+    #[inline(always)]
+    fn substitute(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
+        let rows = self.increment.iter_mut().zip(&mut self.momentum);
+        let passages = self.slopes.iter().zip(&self.passages);
+        for (i, (((joint, (row, momentum)), own), (slope, passage))) in
+            joints.iter().zip(rows).zip(diagonal.momentum).zip(passages).enumerate()
+        {
+            let Slope { edge, plus, slope, .. } = *slope;
+            let (flow, right) = (self.motions[joint.parent], *row);
+            let slope = [slope[0] + cross(edge, linear(slope)), slope[1], slope[2]];
+            let x = right.plus(product(passage.taken, flow).times(-1.0));
+            *row = x;
+            *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
+            self.motions[i + 1] = passed_by_all(&passage.down, flow, right, plus);
+        }
+    }
+
+    /// From the root to the leaves: what joints above add to the momentum, with increments that are known.
+    #[inline(always)]
+    pub(super) fn carry_down(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
+        let rows = self.increment.iter().zip(&mut self.momentum);
+        for (i, ((joint, (x, momentum)), own)) in
+            joints.iter().zip(rows).zip(diagonal.momentum).enumerate()
+        {
+            let Slope { edge: [ex, ey], plus, slope, .. } = self.slopes[i];
+            let [turn, vx, vy] = self.motions[joint.parent];
+            let flow = [turn, vx.plus(turn.times(-ey)), vy.plus(turn.times(ex))];
+            *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
+            self.motions[i + 1] = flow;
+            let [n, px, py] = plus;
+            add_to(&mut self.motions[i + 1], [x.times(n), x.times(px), x.times(py)]);
+        }
+    }
+
+    /// From the leaves to the root: what joints below add to the momentum.
+    #[inline(always)]
+    pub(super) fn gather(&mut self, joints: &[PlanarJoint]) {
+        let rows = self.increment.iter().zip(&mut self.momentum);
+        for (i, (joint, (x, momentum))) in joints.iter().zip(rows).enumerate().rev() {
+            let Slope { plus, push, rate, .. } = self.slopes[i];
+            let [n, fx, fy] = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
+            let (n, fx, fy) =
+                (n.plus(x.times(push[0])), fx.plus(x.times(push[1])), fy.plus(x.times(push[2])));
+            let moved = n.times(plus[0]).plus(fx.times(rate[0])).plus(fy.times(rate[1]));
+            *momentum = momentum.plus(moved);
+            if joint.parent > 0 {
+                add_to(&mut self.flows[joint.parent], [n, fx, fy]);
+            }
+        }
+    }
+}
+
+#[inline(always)]
+pub(super) fn product(vector: Vec3, [n, fx, fy]: [Block; 3]) -> Block {
+    n.times(vector[0]).plus(fx.times(vector[1])).plus(fy.times(vector[2]))
+}
+
+/// [`passed`] for a block of right-hand sides.
+#[inline(always)]
+fn passed_by_all(matrix: &[Vec3; 3], flow: [Block; 3], b: Block, drive: Vec3) -> [Block; 3] {
+    let [r, s, t] = matrix;
+    let [n, fx, fy] = flow;
+    let of = |row: &Vec3, drive: f64| {
+        let first = n.times(row[0]).plus(fx.times(row[1]));
+        first.plus(fy.times(row[2]).plus(b.times(drive)))
+    };
+    [of(r, drive[0]), of(s, drive[1]), of(t, drive[2])]
+}
+
+#[inline(always)]
+pub(super) fn add_to(sum: &mut [Block; 3], part: [Block; 3]) {
+    let [n, fx, fy] = *sum;
+    *sum = [n.plus(part[0]), fx.plus(part[1]), fy.plus(part[2])];
+}
+
+#[cfg(test)]
+mod tests;

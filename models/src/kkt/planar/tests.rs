@@ -1,0 +1,230 @@
+//! Planar trees against the same trees in space.
+
+use std::sync::Arc;
+
+use nalgebra::DMatrix;
+
+use crate::builtin;
+use crate::integrator::settings::Settings;
+use crate::kkt::planar::Diagonal;
+use crate::lagrangian::planar::PlanarTree;
+use crate::linearization::linearize::Linearization;
+use crate::math::rows::padded;
+use crate::model::mechanism::{Model, Solver};
+use crate::plant::facade::Plant;
+use crate::plant::initial::Initial;
+use crate::scene::{Coordinate, CoordinateKind, Scene};
+
+/// A number between −1 and 1 that looks random.
+fn wave(i: usize) -> f64 {
+    (12.9898 * i as f64 + 0.3).sin()
+}
+
+/// Trees in oblique planes: hinges both ways about, sliders, bodies off the plane, two roots, and a floating
+/// base of massless joints. `extra` goes on the coordinates.
+fn oblique(n: usize, extra: &str) -> Model {
+    let mut text = "format = 1\nname = \"oblique\"\ngravity = [1.0, -2.0, -9.0]\n".to_owned();
+    for i in 0..n {
+        let number = |k| wave(17 * i + k);
+        let (parent, turn) = match i {
+            0 | 5 => ("world".to_owned(), format!("[{}, {}, {}]", number(0), number(1), number(2))),
+            // A floating base, and what hangs from it; then branches.
+            1..5 => (format!("f{}", i - 1), format!("[0.0, 0.0, {}]", number(2))),
+            _ => (format!("f{}", 5 + (i - 6) / 2), format!("[0.0, 0.0, {}]", number(2))),
+        };
+        let joint = match i {
+            0 | 1 => format!("type = \"prismatic\", axis = [{}, {}, 0.0]", number(3), number(4)),
+            _ if i % 4 == 3 => "type = \"revolute\", axis = [0.0, 0.0, -1.0]".to_owned(),
+            _ if i % 7 == 6 => "type = \"prismatic\", axis = [0.6, 0.8, 0.0]".to_owned(),
+            _ => "type = \"revolute\", axis = [0.0, 0.0, 1.0]".to_owned(),
+        };
+        let offset = format!("[{}, {}, {}]", number(5), number(6), number(7));
+        text += &format!(
+            "[[frames]]\nname = \"f{i}\"\nparent = \"{parent}\"\ntranslation = {offset}\n\
+             rotation = {{ rpy = {turn} }}\njoint = {{ {joint} }}\n"
+        );
+        if i > 1 {
+            let center = format!("[{}, {}, {}]", number(8), number(9), number(10));
+            text += &format!(
+                "body = {{ mass = {}, center_of_mass = {center}, inertia = [0.2, 0.3, 0.4, 0.01, 0.02, 0.03] }}\n",
+                1.0 + number(11)
+            );
+        }
+    }
+    for i in 0..n {
+        text += &format!("[[coordinates]]\nname = \"f{i}\"\ninitial = {}\n{extra}\n", wave(i));
+    }
+    Model::compile(&Scene::from_toml(&text).unwrap()).unwrap()
+}
+
+fn assert_close(a: f64, b: f64, scale: f64, what: &str) {
+    assert!((a - b).abs() <= 1e-13 * scale, "{what}: {a} {b} of {scale}");
+}
+
+#[test]
+fn gradients_and_second_derivatives_are_those_in_space() {
+    for model in [oblique(12, ""), oblique(3, ""), oblique(12, "kind = \"prescribed\"")] {
+        let model = Arc::new(model);
+        let joints = model.planar.as_ref().expect("the tree is planar");
+        let n = model.dimensions.coordinates();
+        let mut spatial = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        let q: Vec<f64> = (0..n).map(|i| 3.0 * wave(i + 100)).collect();
+        let v: Vec<f64> = (0..n).map(|i| 5.0 * wave(i + 200)).collect();
+        let nd = model.dimensions.dynamic;
+        let mut planar = PlanarTree::new(joints);
+        let (mut l_q, mut l_v) = (vec![0.0; nd], vec![0.0; nd]);
+        // Twice: nothing is left of the first time.
+        for _ in 0..2 {
+            planar.gradient(joints, &q, &v, &mut l_q, &mut l_v);
+            planar.differentiate(joints);
+        }
+        let workspace = &mut spatial.workspace;
+        workspace.mechanics.poses.evaluate(&model.dynamics, &q, &[]);
+        let (mut in_space_q, mut in_space_v) = (vec![0.0; nd], vec![0.0; nd]);
+        workspace.mechanics.momenta.gradient(
+            &model.dynamics,
+            &workspace.mechanics.poses,
+            &v,
+            model.gravity,
+            &mut in_space_q,
+            &mut in_space_v,
+        );
+        workspace.mechanics.curvature.evaluate(
+            &model.dynamics,
+            &workspace.mechanics.poses,
+            &workspace.mechanics.momenta,
+        );
+        let size = |x: &[f64]| 1.0 + x.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
+        for i in 0..nd {
+            assert_close(l_q[i], in_space_q[i], size(&in_space_q), "∂L/∂q");
+            assert_close(l_v[i], in_space_v[i], size(&in_space_v), "∂L/∂v");
+        }
+        for descendant in 0..joints.len() {
+            for ancestor in model.dynamics.path(descendant) {
+                let a = planar.pair(joints, ancestor, descendant);
+                let b = workspace.mechanics.curvature.pair(
+                    &workspace.mechanics.momenta,
+                    model.gravity,
+                    ancestor,
+                    descendant,
+                );
+                let scale = 1e3;
+                assert_close(a.qq, b.qq, scale, "qq");
+                assert_close(a.v_above_q_below, b.v_above_q_below, scale, "vq");
+                assert_close(a.q_above_v_below, b.q_above_v_below, scale, "qv");
+                assert_close(a.vv, b.vv, scale, "vv");
+            }
+        }
+    }
+}
+
+#[test]
+fn trees_that_leave_their_planes_are_not_planar() {
+    let tilted = |axis: &str| {
+        let text = format!(
+            "format = 1\nname = \"t\"\n[[frames]]\nname = \"a\"\njoint = {{ type = \"revolute\", axis = [0.0, 0.0, 1.0] }}\n\
+             body = {{ mass = 1.0, center_of_mass = [1.0, 0.0, 0.0], inertia = [0.1, 0.1, 0.1] }}\n\
+             [[frames]]\nname = \"b\"\nparent = \"a\"\njoint = {{ {axis} }}\nbody = {{ mass = 1.0, center_of_mass = [1.0, 0.0, 0.5], inertia = [0.1, 0.1, 0.1] }}\n"
+        );
+        Model::compile(&Scene::from_toml(&text).unwrap()).unwrap().planar.is_some()
+    };
+    assert!(tilted("type = \"revolute\", axis = [0.0, 0.0, -1.0]"));
+    assert!(tilted("type = \"prismatic\", axis = [1.0, 1.0, 0.0]"));
+    assert!(!tilted("type = \"revolute\", axis = [0.0, 1e-9, 1.0]"));
+    assert!(!tilted("type = \"prismatic\", axis = [1.0, 1.0, 1e-9]"));
+    assert!(!tilted("type = \"ball\""));
+    assert!(!tilted("type = \"screw\", pitch = 0.1, axis = [0.0, 0.0, 1.0]"));
+}
+
+/// What is missing to `AᵀΩA = Ω`.
+fn defect(a: &DMatrix<f64>) -> f64 {
+    let n = a.nrows() / 2;
+    let omega = DMatrix::from_fn(2 * n, 2 * n, |i, j| {
+        if j == i + n {
+            1.0
+        } else if i == j + n {
+            -1.0
+        } else {
+            0.0
+        }
+    });
+    (a.transpose() * &omega * a - omega).amax()
+}
+
+/// Steps and linearizations by generators against those entry by entry, from the same states.
+#[test]
+fn generators_stand_for_the_newton_matrix() {
+    let chain = |n: usize| Model::compile(&builtin::scene(&format!("chain-{n}")).unwrap()).unwrap();
+    for model in [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3")] {
+        let model = Arc::new(model);
+        let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        assert!(fast.workspace.factors.generators.is_some(), "{}", model.scene.name);
+        let n = model.dimensions.dynamic;
+        let q = (0..n).map(|i| 0.3 * wave(i)).collect();
+        let v = (0..n).map(|i| 0.1 * wave(i + 50)).collect();
+        fast.initialize(&Initial::Velocity { q, v }).unwrap();
+        let mut slow = fast.clone();
+        slow.workspace.factors.generators = None;
+        let mut by_generators = Linearization::new(&model);
+        let mut by_entries = Linearization::new(&model);
+        let u: Vec<f64> = (0..model.dimensions.input()).map(wave).collect();
+        for _ in 0..10 {
+            slow.restore(&fast.snapshot()).unwrap();
+            fast.step_and_linearize(&u, &mut by_generators).unwrap();
+            slow.step_and_linearize(&u, &mut by_entries).unwrap();
+            for (a, b) in [(by_generators.a(), by_entries.a()), (by_generators.b(), by_entries.b())]
+            {
+                assert!((&a - &b).amax() <= 3e-9 * b.amax(), "{} {}", (a - &b).amax(), b.amax());
+            }
+            // In long chains sums about each joint keep digits that those about one origin lose.
+            if model.damping.is_empty() {
+                let [own, others] = [by_generators.a(), by_entries.a()].map(|a| defect(&a));
+                assert!(own <= 2.0 * others + 1e-13, "{own} {others}");
+            }
+            for (a, b) in fast.q().iter().zip(slow.q()) {
+                assert_close(*a, *b, 10.0, "q");
+            }
+        }
+    }
+}
+
+#[test]
+fn linearizations_have_the_same_bits_in_any_register() {
+    for model in [oblique(12, ""), oblique(21, "damping = 0.3")] {
+        let model = Arc::new(model);
+        let n = model.dimensions.dynamic;
+        let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        plant.step(&vec![0.0; model.dimensions.input()]).unwrap();
+        let mechanics = &plant.workspace.mechanics;
+        let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
+        let (joints, stride) = (model.planar.as_ref().unwrap(), padded(2 * n));
+        let numbers: Vec<f64> = (0..n).map(wave).collect();
+        let diagonal = Diagonal { residual: &numbers, momentum: &numbers };
+        let mut wide = plant.workspace.factors.planar().unwrap().clone();
+        let mut narrow = wide.clone();
+        let [mut x, mut p, mut narrow_x, mut narrow_p] = [0; 4].map(|_| vec![0.0; n * stride]);
+        wide.linearize(tree, joints, &diagonal, &mut x, &mut p, stride);
+        narrow.linearize_portable(tree, joints, &diagonal, &mut narrow_x, &mut narrow_p, stride);
+        assert!(x.iter().any(|x| *x != 0.0) && x.iter().chain(&p).all(|x| x.is_finite()));
+        assert!(x == narrow_x && p == narrow_p);
+    }
+}
+
+#[test]
+fn a_prescribed_leaf_is_left_to_the_elimination_tree() {
+    let mut scene = builtin::scene("chain-6").unwrap();
+    scene.coordinates.push(Coordinate {
+        name: "link5".to_owned(),
+        kind: CoordinateKind::Prescribed,
+        initial: 0.0,
+        damping: None,
+    });
+    let model = Arc::new(Model::compile(&scene).unwrap());
+    assert_eq!(model.solver, Solver::Tree);
+    let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+    let mut out = Linearization::new(&model);
+    plant.step_and_linearize(&[0.0, 0.001], &mut out).unwrap();
+    // Without the prescribed position and velocity.
+    let (a, place) = (out.a(), |i: usize| if i < 5 { i } else { i + 1 });
+    assert!(defect(&DMatrix::from_fn(10, 10, |i, j| a[(place(i), place(j))])) < 1e-10);
+}

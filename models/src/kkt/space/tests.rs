@@ -1,0 +1,258 @@
+//! Eliminations by generators against dense systems, and motions against those solved entry by entry.
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, DVector};
+
+use crate::builtin;
+use crate::integrator::matrix::Generators;
+use crate::integrator::newton::Workspace;
+use crate::integrator::settings::Settings;
+use crate::kkt::planar::Of;
+use crate::kkt::space::Elimination;
+use crate::linearization::linearize::Linearization;
+use crate::math::tree_lu::TreeLu;
+use crate::model::mechanism::{Model, Solver};
+use crate::plant::facade::{Plant, StepError};
+use crate::plant::initial::Initial;
+use crate::scene::Scene;
+
+/// A number between −1 and 1 that looks random.
+fn wave(i: usize) -> f64 {
+    (12.9898 * i as f64 + 0.3).sin()
+}
+
+fn compiled(text: &str) -> Model {
+    Model::compile(&Scene::from_toml(text).unwrap()).unwrap()
+}
+
+/// Two trees that branch: a floating base of massless joints with hinges, sliders and screws below it, and
+/// one more. `extra` goes on the scene, `more` on the coordinates.
+fn branching(n: usize, extra: &str, more: &str) -> Model {
+    let mut text = format!("format = 1\nname = \"branching\"\n{extra}\n");
+    let axes = ["[1.0, 0.0, 0.0]", "[0.0, 1.0, 0.0]", "[0.0, 0.0, 1.0]"];
+    for i in 0..n {
+        let number = |k| wave(17 * i + k);
+        let parent = match i {
+            0 | 8 => "world".to_owned(),
+            1..8 => format!("f{}", i - 1),
+            _ => format!("f{}", [i - 1, i - 2, 3 + i / 4][i % 3]),
+        };
+        let axis = format!("[{}, {}, {}]", number(0), number(1), number(2));
+        let joint = match i {
+            0..3 => format!("type = \"prismatic\", axis = {}", axes[i]),
+            3..6 => format!("type = \"revolute\", axis = {}", axes[i - 3]),
+            _ if i % 5 == 1 => format!("type = \"prismatic\", axis = {axis}"),
+            _ if i % 5 == 3 => format!("type = \"screw\", pitch = 0.2, axis = {axis}"),
+            _ => format!("type = \"revolute\", axis = {axis}"),
+        };
+        text +=
+            &format!("[[frames]]\nname = \"f{i}\"\nparent = \"{parent}\"\njoint = {{ {joint} }}\n");
+        if i > 4 {
+            let (offset, center) =
+                ([number(3), number(4), number(5)], [number(6), number(7), number(8)]);
+            text += &format!(
+                "translation = {offset:?}\nbody = {{ mass = {}, center_of_mass = {center:?}, inertia = [0.2, 0.3, 0.4, 0.01, 0.02, 0.03] }}\n",
+                1.5 + number(9)
+            );
+        }
+    }
+    for i in 0..n {
+        text += &format!("[[coordinates]]\nname = \"f{i}\"\ninitial = {}\n{more}\n", wave(i));
+    }
+    for i in (0..n).step_by(3) {
+        text += &format!(
+            "[[springs]]\ntype = \"coordinate\"\ncoordinate = \"f{i}\"\nstiffness = 30.0\n"
+        );
+    }
+    compiled(&text)
+}
+
+/// A rope of 1 m and 1 kg: thin rods hinged about x and y by turns.
+fn rope(n: usize, more: &str) -> String {
+    let length = 1.0 / n as f64;
+    let across = length.powi(3) / 12.0;
+    let mut text = format!(
+        "format = 1\nname = \"rope\"\ngravity = [0.0, 0.0, -9.8]\ntime_step_s = {}\n",
+        0.08 * length
+    );
+    for i in 0..n {
+        let (parent, z) =
+            if i == 0 { ("world".to_owned(), 0.0) } else { (format!("f{}", i - 1), -length) };
+        let axis = if i % 2 == 0 { "[1.0, 0.0, 0.0]" } else { "[0.0, 1.0, 0.0]" };
+        text += &format!(
+            "[[frames]]\nname = \"f{i}\"\nparent = \"{parent}\"\ntranslation = [0.0, 0.0, {z}]\n\
+             joint = {{ type = \"revolute\", axis = {axis} }}\n\
+             body = {{ mass = {length}, center_of_mass = [0.0, 0.0, {}], inertia = [{across}, {across}, {}] }}\n",
+            -0.5 * length,
+            0.1 * across
+        );
+    }
+    text + more
+}
+
+/// The matrix that is filled entry by entry.
+fn dense(model: &Model, matrix: &TreeLu) -> DMatrix<f64> {
+    let n = model.dimensions.dynamic;
+    let mut dense = DMatrix::zeros(n, n);
+    for row in 0..n {
+        for slot in model.elimination.offsets[row]..model.elimination.offsets[row + 1] {
+            let ancestor = model.elimination.ancestors[slot];
+            dense[(row, ancestor)] = matrix.lower[slot];
+            dense[(ancestor, row)] = matrix.upper[slot];
+        }
+    }
+    dense
+}
+
+#[test]
+fn a_solution_satisfies_the_dense_system() {
+    let gravity = "gravity = [1.0, -2.0, -9.0]";
+    let cases = [
+        branching(7, "", ""),
+        branching(9, gravity, ""),
+        branching(24, "", ""),
+        branching(24, gravity, ""),
+        branching(40, gravity, "damping = 0.3"),
+        compiled(&rope(64, "")),
+    ];
+    for model in cases {
+        let n = model.dimensions.dynamic;
+        let settings = Settings { time_step_s: 0.02, ..Settings::new(&model) };
+        let mut workspace = Workspace::new(&model);
+        let generators = Elimination::new(&model.dynamics, model.gravity);
+        workspace.factors.generators = Some(Box::new(Generators::Spatial(generators)));
+        for trial in 0..5 {
+            for i in 0..n {
+                workspace.q_mid[i] = wave(100 * trial + i);
+                workspace.angles[i] = workspace.q_mid[i];
+                workspace.velocity[i] = 3.0 * wave(1000 + 100 * trial + i);
+            }
+            workspace.evaluate_lagrangian(&model);
+            workspace.fill_newton_matrix(&model, &settings);
+            let matrix = dense(&model, &workspace.factors.matrix);
+            workspace.factor_generators(&model, &settings).unwrap();
+            assert_solves(&mut workspace, &model, &matrix);
+
+            let Workspace { mechanics, factors, .. } = &mut workspace;
+            factors.matrix.clear();
+            mechanics.curvature.fill_mass_matrix(
+                &model.pairs,
+                &mechanics.momenta,
+                &mut factors.matrix,
+            );
+            let masses = dense(&model, &factors.matrix) * (-1.0 / settings.time_step_s);
+            let diagonal = vec![0.0; n];
+            factors
+                .generate(&model, mechanics, &diagonal, settings.time_step_s, Of::Masses)
+                .unwrap();
+            assert_solves(&mut workspace, &model, &masses);
+        }
+    }
+}
+
+fn assert_solves(workspace: &mut Workspace, model: &Model, matrix: &DMatrix<f64>) {
+    let b = DVector::from_fn(matrix.nrows(), |i, _| wave(i + 7));
+    let mut x = b.clone();
+    workspace.factors.solve(model, x.as_mut_slice());
+    let exact = matrix.clone().lu().solve(&b).unwrap();
+    let error = (&x - &exact).amax() / exact.amax();
+    assert!(error < 1e-9, "{} rows: {error:e}", matrix.nrows());
+}
+
+/// Plants of one model that solve by generators and entry by entry, moving.
+fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
+    let settings = Settings { order, ..Settings::new(model) };
+    let mut fast = Plant::new(Arc::clone(model), settings).unwrap();
+    assert!(order == 2 || model.solver == Solver::Spatial);
+    let generators = Elimination::new(&model.dynamics, model.gravity);
+    fast.workspace.factors.generators = Some(Box::new(Generators::Spatial(generators)));
+    let n = model.dimensions.dynamic;
+    let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
+    let q = (0..n).map(turned).collect();
+    let v = (0..n).map(|i| 0.1 * (0.3 * i as f64).cos()).collect();
+    fast.initialize(&Initial::Velocity { q, v }).unwrap();
+    let mut slow = fast.clone();
+    slow.workspace.factors.generators = None;
+    [fast, slow]
+}
+
+#[test]
+fn long_chains_move_as_they_do_entry_by_entry() {
+    for n in [64, 128] {
+        let [mut fast, mut slow] = both(&Arc::new(compiled(&rope(n, ""))), 2);
+        let start = fast.energy();
+        let (mut more, mut worst) = (0, 0.0_f64);
+        for _ in 0..100 {
+            let own = fast.step(&[]).unwrap();
+            more += own.iterations as i32 - slow.step(&[]).unwrap().iterations as i32;
+            let energy = fast.energy();
+            let gained =
+                energy.kinetic_j + energy.potential_j - start.kinetic_j - start.potential_j;
+            worst = worst.max(gained.abs());
+        }
+        let apart = fast.q().iter().zip(slow.q()).fold(0.0_f64, |m, (a, b)| m.max((a - b).abs()));
+        assert!(apart < 1e-8, "{n}: {apart:e}");
+        assert!(worst < 1e-5 * start.potential_j.abs(), "{n}: {worst:e}");
+        assert!(more <= 20, "{n}: {more} corrections more");
+    }
+}
+
+#[test]
+fn collocation_and_linearization_are_those_entry_by_entry() {
+    for (model, order) in [
+        (compiled(&rope(64, "")), 4),
+        (compiled(&rope(20, "[[inputs]]\nname = \"u\"\ncoordinate = \"f3\"\n")), 2),
+        (branching(40, "gravity = [1.0, -2.0, -9.0]\ntime_step_s = 0.002", "damping = 0.3"), 2),
+    ] {
+        let model = Arc::new(model);
+        let [mut fast, mut slow] = both(&model, order);
+        let u: Vec<f64> = (0..model.dimensions.input()).map(wave).collect();
+        let mut linear = [Linearization::new(&model), Linearization::new(&model)];
+        for _ in 0..10 {
+            fast.step_and_linearize(&u, &mut linear[0]).unwrap();
+            slow.step_and_linearize(&u, &mut linear[1]).unwrap();
+        }
+        let [a, b] = linear.map(|l| l.a());
+        assert!((&a - &b).amax() <= 1e-9 * b.amax(), "{:e} {:e}", (&a - &b).amax(), b.amax());
+        for (a, b) in fast.q().iter().zip(slow.q()) {
+            assert!((a - b).abs() < 1e-10, "{a} {b}");
+        }
+    }
+}
+
+#[test]
+fn a_vanishing_pivot_is_named() {
+    // A hinge that turns nothing but a point on its axis.
+    let idle = "[[frames]]\nname = \"idle\"\nparent = \"f19\"\n\
+                joint = { type = \"revolute\", axis = [0.0, 0.0, 1.0] }\nbody = { mass = 1.0 }\n";
+    let model = Arc::new(compiled(&rope(20, idle)));
+    assert_eq!(model.solver, Solver::Spatial);
+    let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+    match plant.step(&[]) {
+        Err(StepError::Singular { coordinate, pivot }) => {
+            assert_eq!(coordinate, "idle");
+            assert!(pivot < 1e-13, "{pivot}");
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn generators_are_chosen_where_they_stand_for_the_matrix() {
+    let solver = |more: &str| compiled(&rope(32, more)).solver;
+    let spring = "[[springs]]\ntype = \"coordinate\"\ncoordinate = \"f3\"\nstiffness = 30.0\n";
+    assert_eq!(solver(spring), Solver::Spatial);
+    assert!(compiled(&rope(32, "")).plan().contains("by generators, 32 joints"));
+    let between = "[[springs]]\ntype = \"two_point\"\na = { frame = \"f3\" }\nb = { frame = \"f9\" }\nstiffness = 30.0\n";
+    let ball = "[[frames]]\nname = \"ball\"\nparent = \"f31\"\njoint = { type = \"ball\" }\n\
+                body = { mass = 1.0, inertia = [1.0, 1.0, 1.0] }\n";
+    let prescribed = "[[coordinates]]\nname = \"f0\"\nkind = \"prescribed\"\n";
+    for other in [between, ball, prescribed] {
+        assert_eq!(solver(other), Solver::Tree, "{other}");
+    }
+    for bushy in ["tree-30", "marionette", "spherical-pendulum"] {
+        let model = Model::compile(&builtin::scene(bushy).unwrap()).unwrap();
+        assert_eq!(model.solver, Solver::Tree, "{bushy}");
+    }
+}

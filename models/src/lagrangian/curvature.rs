@@ -1,0 +1,186 @@
+//! Second derivatives of the Lagrangian: four dot products for each ancestor and descendant, O(n·depth).
+//!
+//! ```text
+//! leaf to root:  F_j = I^c_j J_j      P_j = J_j ×* H_j + I^c_j J̇_j      I^c: inertia of the subtree
+//! i above j:     ∂²L/∂v_i∂v_j = J_i·F_j      ∂²L/∂v_i∂q_j = J_i·P_j      ∂²L/∂q_i∂v_j = J̇_i·F_j
+//!                ∂²L/∂q_i∂q_j = J̇_i·P_j + w_i·(f_j × g)      w_i: angular part of J_i, f_j: force part of F_j
+//! ```
+
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::momenta::Momenta;
+use crate::math::scalar::Scalar;
+use crate::math::simd::wide;
+use crate::math::spatial::{Force, Inertia, Motion, Sym3, Vec3};
+use crate::math::tree_lu::TreeLu;
+use crate::model::mechanism::Pair;
+use crate::model::tree::{Rotational, Tree, WORLD};
+
+/// Generators of the second derivatives.
+#[derive(Clone, Debug)]
+pub(crate) struct Curvature<S = f64> {
+    tensor: Vec<Sym3<S>>,
+    /// `F`.
+    pub(crate) force: Vec<Force<S>>,
+    /// `P`.
+    pub(crate) rate: Vec<Force<S>>,
+}
+
+/// Second derivatives of `L` for one pair of joints.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct SecondDerivatives<S = f64> {
+    pub(crate) qq: S,
+    /// `∂²L/∂v_ancestor ∂q_descendant`.
+    pub(crate) v_above_q_below: S,
+    /// `∂²L/∂q_ancestor ∂v_descendant`.
+    pub(crate) q_above_v_below: S,
+    pub(crate) vv: S,
+}
+
+impl<S: Scalar> Curvature<S> {
+    pub(crate) fn new(tree: &Tree) -> Self {
+        let n = tree.joints.len();
+        Self {
+            tensor: vec![Sym3::default(); n],
+            force: vec![Force::default(); n],
+            rate: vec![Force::default(); n],
+        }
+    }
+
+    wide! {
+        /// Computes the generators from poses and momenta of the same configuration and velocity.
+        #[inline(never)]
+        pub(crate) fn evaluate(mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>)
+            = evaluate_portable, evaluate_avx2;
+    }
+
+    #[inline(always)]
+    fn evaluate_portable(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
+        for (i, joint) in tree.joints.iter().enumerate() {
+            let rotation = &poses.rotation[i];
+            let spin = match &joint.body.inertia {
+                Rotational::None => {
+                    self.tensor[i] = Sym3::default();
+                    continue;
+                }
+                Rotational::Point => Sym3::default(),
+                Rotational::Isotropic(i) => {
+                    Sym3::lift(Sym3 { xx: *i, yy: *i, zz: *i, ..Sym3::default() })
+                }
+                Rotational::Full(tensor) => Sym3::lift(*tensor).rotated(rotation),
+            };
+            let center = poses.position[i] + rotation.apply(Vec3::lift(joint.body.center));
+            self.tensor[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
+        }
+        for (i, joint) in tree.joints.iter().enumerate().rev() {
+            if joint.parent != WORLD {
+                self.tensor[joint.parent] = self.tensor[joint.parent].add(&self.tensor[i]);
+            }
+            let composite = Inertia {
+                mass: joint.subtree_mass,
+                moment: momenta.moment[i],
+                tensor: self.tensor[i],
+            };
+            let axis = momenta.axis[i];
+            self.force[i] = composite.momentum(axis);
+            self.rate[i] =
+                axis.cross_force(momenta.momentum[i]).add(composite.momentum(momenta.axis_rate[i]));
+        }
+    }
+
+    /// Second derivatives of a pair of joints on one path to the root.
+    #[inline(always)]
+    pub(crate) fn pair(
+        &self,
+        momenta: &Momenta<S>,
+        gravity: Option<Vec3>,
+        ancestor: usize,
+        descendant: usize,
+    ) -> SecondDerivatives<S> {
+        let (axis, axis_rate) = (momenta.axis[ancestor], momenta.axis_rate[ancestor]);
+        let (force, rate) = (self.force[descendant], self.rate[descendant]);
+        let weight = gravity.map_or(S::ZERO, |g| axis.w.dot(force.f.cross(Vec3::lift(g))));
+        SecondDerivatives {
+            qq: axis_rate.dot(rate) + weight,
+            v_above_q_below: axis.dot(rate),
+            q_above_v_below: axis_rate.dot(force),
+            vv: axis.dot(force),
+        }
+    }
+
+    /// For two axes of one ball joint, `∂τ_row/∂ζ_column` and `∂τ_row/∂v_column = ∂m_column/∂ζ_row`.
+    /// The axes turn with the joint: what [`Curvature::pair`] says holds for different joints only.
+    pub(crate) fn within_ball(
+        &self,
+        momenta: &Momenta<S>,
+        gravity: Option<Vec3>,
+        row: usize,
+        column: usize,
+    ) -> (S, S) {
+        let weight = gravity.map_or(S::ZERO, |g| {
+            momenta.axis[column].w.dot(self.force[row].f.cross(Vec3::lift(g)))
+        });
+        (
+            momenta.axis_rate[column].dot(self.rate[row]) + weight,
+            momenta.axis_rate[row].dot(self.force[column]),
+        )
+    }
+}
+
+impl Curvature {
+    wide! {
+        /// Writes the Jacobian of the residual by the increment, without springs and forces:
+        /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
+        ///
+        /// Both entries of a pair come from `½h J̇ ∓ J` of the ancestor and `½P ± F/h` of the descendant.
+        #[inline(never)]
+        pub(crate) fn fill_newton_matrix(
+            self,
+            pairs: &[Pair],
+            momenta: &Momenta,
+            gravity: Option<Vec3>,
+            step: f64,
+            matrix: &mut TreeLu,
+        ) = fill_portable, fill_avx2;
+    }
+
+    #[inline(always)]
+    fn fill_portable(
+        &self,
+        pairs: &[Pair],
+        momenta: &Momenta,
+        gravity: Option<Vec3>,
+        step: f64,
+        matrix: &mut TreeLu,
+    ) {
+        let (half, inverse) = (0.5 * step, 1.0 / step);
+        let (mut plus, mut minus) = (Force::default(), Force::default());
+        let mut weight = Vec3::ZERO;
+        for pair in pairs.iter().rev() {
+            let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
+            if i == j {
+                // Pairs come grouped by descendant, and backwards the descendant itself comes first.
+                let (f, p) = (self.force[j], self.rate[j]);
+                plus = Force::default().add_scaled(0.5, p).add_scaled(inverse, f);
+                minus = Force::default().add_scaled(0.5, p).add_scaled(-inverse, f);
+                weight = gravity.map_or(Vec3::ZERO, |g| f.f.cross(g) * (0.25 * step));
+            }
+            let (axis, axis_rate) = (momenta.axis[i], momenta.axis_rate[i]);
+            let gravity_term = axis.w.dot(weight);
+            let scaled = Motion { w: axis_rate.w * half, v: axis_rate.v * half };
+            matrix.upper[pair.slot as usize] =
+                scaled.add_scaled(-1.0, axis).dot(plus) + gravity_term;
+            matrix.lower[pair.slot as usize] =
+                scaled.add_scaled(1.0, axis).dot(minus) + gravity_term;
+        }
+    }
+
+    /// Writes the mass matrix `L_vv` of the dynamic coordinates.
+    pub(crate) fn fill_mass_matrix(&self, pairs: &[Pair], momenta: &Momenta, matrix: &mut TreeLu) {
+        for pair in pairs {
+            let entry =
+                momenta.axis[pair.ancestor as usize].dot(self.force[pair.descendant as usize]);
+            matrix.upper[pair.slot as usize] = entry;
+            matrix.lower[pair.slot as usize] = entry;
+        }
+    }
+}

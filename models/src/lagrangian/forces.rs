@@ -1,0 +1,93 @@
+//! Forces that do not come from a potential.
+//!
+//! Inputs and damping of coordinates are `f = B u − C v`. All others are generalized forces
+//! `f(q, v, u)` of points, joints and coordinates, with their derivatives.
+
+pub(crate) mod coordinate;
+pub(crate) mod point;
+#[cfg(test)]
+mod tests;
+pub(crate) mod wrench;
+
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::momenta::Momenta;
+use crate::math::scalar::Scalar;
+use crate::model::mechanism::{CoordinateInput, Forces};
+use crate::model::tree::Tree;
+
+/// Writes the input forces of a step; they do not change within it.
+#[inline(never)]
+pub(crate) fn input_forces(inputs: &[CoordinateInput], u: &[f64], force: &mut [f64]) {
+    force.fill(0.0);
+    for input in inputs {
+        force[input.coordinate] += input.gain * u[input.input];
+    }
+}
+
+/// Writes `total = input − C v`.
+#[inline(never)]
+pub(crate) fn add_damping(damping: &[f64], velocity: &[f64], input: &[f64], total: &mut [f64]) {
+    for (((total, input), c), v) in total.iter_mut().zip(input).zip(damping).zip(velocity) {
+        *total = input - c * v;
+    }
+}
+
+/// Where and how fast a mechanism is, and its inputs: what forces depend on.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Instant<'a, S = f64> {
+    pub(crate) tree: &'a Tree,
+    pub(crate) poses: &'a Poses<S>,
+    /// With axes and twists of the same configuration and velocity.
+    pub(crate) momenta: &'a Momenta<S>,
+    /// Of all coordinates.
+    pub(crate) velocity: &'a [S],
+    pub(crate) inputs: &'a [S],
+}
+
+impl Forces {
+    /// Adds the generalized force to `force` (dynamic coordinates).
+    #[inline(never)]
+    pub(crate) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+        for wrench in &self.wrenches {
+            wrench.add(at, force);
+        }
+        for point_force in &self.point_forces {
+            point_force.add(at, force);
+        }
+        for coordinate_force in &self.coordinate_forces {
+            coordinate_force.add(at, force);
+        }
+    }
+
+    /// Calls `entry(i, j, ∂f_i/∂q_j, ∂f_i/∂v_j)` for ordered pairs of coordinates, some of them more
+    /// than once; the derivatives add up.
+    #[inline(never)]
+    pub(crate) fn for_each_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        mut entry: impl FnMut(usize, usize, S, S),
+    ) {
+        for wrench in &self.wrenches {
+            wrench.for_each_derivative(at, &mut entry);
+        }
+        for point_force in &self.point_forces {
+            point_force.for_each_derivative(at, &mut entry);
+        }
+        for coordinate_force in &self.coordinate_forces {
+            coordinate_force.derivative(at, &mut entry);
+        }
+    }
+
+    /// Calls `entry(i, k, ∂f_i/∂u_k)` for coordinates and inputs, in the same order for every
+    /// configuration; the derivatives add up.
+    #[inline(never)]
+    pub(crate) fn for_each_input_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        mut entry: impl FnMut(usize, usize, S),
+    ) {
+        for wrench in &self.wrenches {
+            wrench.for_each_input_derivative(at, &mut entry);
+        }
+    }
+}

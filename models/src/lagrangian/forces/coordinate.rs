@@ -1,0 +1,36 @@
+//! Forces on coordinates that follow from their velocities.
+
+use crate::lagrangian::forces::Instant;
+use crate::math::scalar::Scalar;
+use crate::model::mechanism::{CoordinateForce, CoordinateLaw};
+
+impl CoordinateForce {
+    pub(super) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+        let v = at.velocity[self.coordinate];
+        force[self.coordinate] += match self.law {
+            CoordinateLaw::Drag(c) => magnitude(v) * v * -c,
+            CoordinateLaw::Friction { force, velocity } => (v * (1.0 / velocity)).tanh() * -force,
+        };
+    }
+
+    pub(super) fn derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S, S),
+    ) {
+        let v = at.velocity[self.coordinate];
+        let by_v = match self.law {
+            CoordinateLaw::Drag(c) => magnitude(v) * (-2.0 * c),
+            CoordinateLaw::Friction { force, velocity } => {
+                let t = (v * (1.0 / velocity)).tanh();
+                (S::ONE - t * t) * (-force / velocity)
+            }
+        };
+        entry(self.coordinate, self.coordinate, S::ZERO, by_v);
+    }
+}
+
+/// `|v|`; its derivative at zero is that of the right side.
+fn magnitude<S: Scalar>(v: S) -> S {
+    if v.value() < 0.0 { -v } else { v }
+}

@@ -1,0 +1,141 @@
+//! Forces between two points: `f_i = F(d, ḋ) · ∂d/∂q_i`, `d = a − b`.
+//!
+//! ```text
+//! ∂f_i/∂q_j = F · ∂²d/∂q_i∂q_j + ∂d/∂q_i · (F_d ∂d/∂q_j + F_ḋ ∂ḋ/∂q_j)
+//! ∂f_i/∂v_j = ∂d/∂q_i · F_ḋ ∂d/∂q_j
+//! ```
+//!
+//! The rate of a point `x` carried with twist `V` changes with a joint `j` above it by
+//! `J_j × (V − V_before)` taken at `x`, plus `w × ∂x/∂q_j`, where `V_before` is the twist before `j`.
+
+use crate::lagrangian::forces::Instant;
+use crate::lagrangian::vectors::Separation;
+use crate::math::scalar::Scalar;
+use crate::math::spatial::{Motion, Vec3};
+use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw};
+use crate::model::tree::{Attachment, JointKind, WORLD};
+
+/// Points whose squared distance (m²) or speed (m²/s²) is below this coincide or rest: there is no
+/// force, and no derivative. Above it three derivatives of a root stay within the range of numbers.
+const NOTHING: f64 = 1e-100;
+
+/// The force at one instant.
+struct Acting<S> {
+    law: PointLaw,
+    at: Separation<S>,
+    rate: Vec3<S>,
+    /// Direction of the damper, or zero where its ends coincide.
+    direction: Vec3<S>,
+    /// Inverse of the length or speed, or zero.
+    inverse: S,
+    force: Vec3<S>,
+}
+
+impl<S: Scalar> Acting<S> {
+    fn new(force: &PointForce, at: &Instant<'_, S>) -> Self {
+        let separation = force.ends.separation(at.tree, at.poses);
+        let twists = [&force.ends.a, &force.ends.b].map(|end| twist(at, end));
+        let rate = twists[0].at(separation.a) - twists[1].at(separation.b);
+        let of = match force.law {
+            PointLaw::Damper(_) => separation.difference,
+            PointLaw::Drag(_) => rate,
+        };
+        let square = of.dot(of);
+        let inverse = if square.value() < NOTHING { S::ZERO } else { square.sqrt().recip() };
+        let direction = of * inverse;
+        let force_on_a = match force.law {
+            PointLaw::Damper(c) => direction * (direction.dot(rate) * -c),
+            PointLaw::Drag(c) => rate * (direction.dot(rate) * -c),
+        };
+        Self { law: force.law, at: separation, rate, direction, inverse, force: force_on_a }
+    }
+
+    /// `F_d change + F_ḋ rate_change`.
+    fn change(&self, change: Vec3<S>, rate_change: Vec3<S>) -> Vec3<S> {
+        let along = self.direction;
+        match self.law {
+            PointLaw::Damper(c) => {
+                let turned = (change - along * along.dot(change)) * self.inverse;
+                let speed = along.dot(self.rate);
+                let speed_change = turned.dot(self.rate) + along.dot(rate_change);
+                (turned * speed + along * speed_change).scaled(-c)
+            }
+            PointLaw::Drag(c) => {
+                let speed = along.dot(self.rate);
+                (rate_change * speed + self.rate * along.dot(rate_change)).scaled(-c)
+            }
+        }
+    }
+}
+
+impl PointForce {
+    pub(super) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+        let acting = Acting::new(self, at);
+        for joint in &self.ends.path {
+            if let Some(entry) = force.get_mut(joint.coordinate) {
+                *entry += acting.force.dot(joint.gradient(at.tree, at.poses, &acting.at));
+            }
+        }
+    }
+
+    pub(super) fn for_each_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S, S),
+    ) {
+        let acting = Acting::new(self, at);
+        for column in &self.ends.path {
+            let gradient = column.gradient(at.tree, at.poses, &acting.at);
+            let rate_by_q = self.rate_by_position(at, &acting.at, column, gradient);
+            let by_q = acting.change(gradient, rate_by_q);
+            let by_v = acting.change(Vec3::ZERO, gradient);
+            for row in &self.ends.path {
+                let row_gradient = row.gradient(at.tree, at.poses, &acting.at);
+                let second = row.second(row_gradient, at.tree, at.poses, (column, gradient));
+                entry(
+                    row.coordinate,
+                    column.coordinate,
+                    acting.force.dot(second) + row_gradient.dot(by_q),
+                    row_gradient.dot(by_v),
+                );
+            }
+        }
+    }
+
+    /// `∂ḋ/∂q` of a joint on the path.
+    fn rate_by_position<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        separation: &Separation<S>,
+        joint: &PathJoint,
+        gradient: Vec3<S>,
+    ) -> Vec3<S> {
+        let (end, point) = if joint.carries == Carries::A {
+            (&self.ends.a, separation.a)
+        } else {
+            (&self.ends.b, separation.b)
+        };
+        let carried = twist(at, end);
+        let turned = at.momenta.axis[joint.joint].cross(carried.minus(before(at, joint.joint)));
+        let turned = turned.at(point);
+        let turned = if joint.carries == Carries::A { turned } else { -turned };
+        turned + carried.w.cross(gradient)
+    }
+}
+
+/// Twist of what a point is fixed to.
+fn twist<S: Scalar>(at: &Instant<'_, S>, end: &Attachment) -> Motion<S> {
+    if end.joint == WORLD { Motion::default() } else { at.momenta.twist[end.joint] }
+}
+
+/// Twist of what a joint hangs from; for an axis of a ball joint, what the whole joint hangs from.
+fn before<S: Scalar>(at: &Instant<'_, S>, joint: usize) -> Motion<S> {
+    let first = match at.tree.joints[joint].kind {
+        JointKind::Ball(axis) => joint - axis,
+        _ => joint,
+    };
+    match at.tree.joints[first].parent {
+        WORLD => Motion::default(),
+        parent => at.momenta.twist[parent],
+    }
+}

@@ -1,0 +1,98 @@
+//! Wrenches: `f_i = J_i · W` for the joints `i` that carry the body.
+//!
+//! With `W = [n; f]` about the origin of the evaluation, and `x` the point at which it acts,
+//!
+//! ```text
+//! body wrench, turns with the joint    ∂f_i/∂q_j = (J_i × J_j) · W                   i above j
+//! spatial wrench, fixed in the world   ∂f_i/∂q_j = (J_j × J_i) · W                   j above i
+//! hybrid wrench, moves with its point  ∂f_i/∂q_j = the same + w_i · (∂x/∂q_j × f)
+//! ```
+//!
+//! Two axes of one ball joint: they turn with the joint, so the second line holds for both orders,
+//! and the first for none.
+
+use crate::lagrangian::forces::Instant;
+use crate::math::scalar::Scalar;
+use crate::math::spatial::{Force, Vec3};
+use crate::model::mechanism::{Wrench, WrenchKind};
+
+impl Wrench {
+    /// About the origin of the joint's tree, in world axes.
+    fn in_world<S: Scalar>(&self, at: &Instant<'_, S>, wrench: Force<S>) -> Force<S> {
+        let (point, origin) = at.poses.point(at.tree, &self.at);
+        match self.kind {
+            WrenchKind::Body => {
+                let axes = &at.poses.rotation[self.at.joint];
+                let f = axes.apply(wrench.f);
+                Force { n: axes.apply(wrench.n) + point.cross(f), f }
+            }
+            WrenchKind::Spatial => Force { n: wrench.n - origin.cross(wrench.f), f: wrench.f },
+            WrenchKind::Hybrid => Force { n: wrench.n + point.cross(wrench.f), f: wrench.f },
+        }
+    }
+
+    fn total<S: Scalar>(&self, at: &Instant<'_, S>) -> Force<S> {
+        let mut total = lift(&self.constant);
+        for (input, unit) in &self.inputs {
+            total = total.add_scaled(at.inputs[*input], lift(unit));
+        }
+        self.in_world(at, total)
+    }
+
+    pub(super) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+        let wrench = self.total(at);
+        for &joint in &self.path {
+            if let Some(entry) = force.get_mut(at.tree.joints[joint].coordinate) {
+                *entry += at.momenta.axis[joint].dot(wrench);
+            }
+        }
+    }
+
+    pub(super) fn for_each_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S, S),
+    ) {
+        let wrench = self.total(at);
+        let (point, _) = at.poses.point(at.tree, &self.at);
+        for &column in &self.path {
+            let below = at.momenta.axis[column];
+            let moved = at.poses.point_gradient(at.tree, column, point).cross(wrench.f);
+            for &row in &self.path {
+                let axis = at.momenta.axis[row];
+                let row_turns = row >= column || at.tree.one_ball(row, column);
+                let turned = match self.kind {
+                    WrenchKind::Body if row_turns => continue,
+                    WrenchKind::Body => axis.cross(below).dot(wrench),
+                    _ if row_turns => below.cross(axis).dot(wrench),
+                    WrenchKind::Spatial => continue,
+                    WrenchKind::Hybrid => S::ZERO,
+                };
+                let by_q = match self.kind {
+                    WrenchKind::Hybrid => turned + axis.w.dot(moved),
+                    _ => turned,
+                };
+                let coordinate = |joint: usize| at.tree.joints[joint].coordinate;
+                entry(coordinate(row), coordinate(column), by_q, S::ZERO);
+            }
+        }
+    }
+
+    pub(super) fn for_each_input_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S),
+    ) {
+        for (input, unit) in &self.inputs {
+            let wrench = self.in_world(at, lift(unit));
+            for &joint in &self.path {
+                let by_u = at.momenta.axis[joint].dot(wrench);
+                entry(at.tree.joints[joint].coordinate, *input, by_u);
+            }
+        }
+    }
+}
+
+fn lift<S: Scalar>(wrench: &Force) -> Force<S> {
+    Force { n: Vec3::lift(wrench.n), f: Vec3::lift(wrench.f) }
+}

@@ -1,0 +1,71 @@
+//! The Lagrangian of joint trees at a configuration and velocity, without springs: in the plane where the
+//! scene allows it, else in space.
+
+use crate::lagrangian::curvature::{Curvature, SecondDerivatives};
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::momenta::Momenta;
+use crate::lagrangian::planar::{Planar, PlanarTree};
+use crate::math::spatial::Mat3;
+use crate::model::mechanism::Model;
+
+/// What its derivatives are found from.
+#[derive(Clone, Debug)]
+pub(crate) struct Mechanics<S: Planar = f64> {
+    /// In place of all others, where the scene is planar.
+    pub(crate) planar: Option<Box<PlanarTree<S>>>,
+    pub(crate) poses: Poses<S>,
+    pub(crate) momenta: Momenta<S>,
+    pub(crate) curvature: Curvature<S>,
+}
+
+impl<S: Planar> Mechanics<S> {
+    pub(crate) fn new(model: &Model) -> Self {
+        Self {
+            planar: model.planar.as_ref().map(|joints| Box::new(PlanarTree::new(joints))),
+            poses: Poses::new(&model.dynamics),
+            momenta: Momenta::new(&model.dynamics),
+            curvature: Curvature::new(&model.dynamics),
+        }
+    }
+
+    /// Writes `L_q` and `L_v` of the dynamic coordinates.
+    #[inline(always)]
+    pub(crate) fn gradient(
+        &mut self,
+        model: &Model,
+        q: &[S],
+        orientations: &[Mat3<S>],
+        velocity: &[S],
+        [l_q, l_v]: [&mut [S]; 2],
+    ) {
+        if let (Some(planar), Some(joints)) = (&mut self.planar, &model.planar) {
+            planar.gradient(joints, q, velocity, l_q, l_v);
+        } else {
+            let (tree, gravity) = (&model.dynamics, model.gravity);
+            self.poses.evaluate(tree, q, orientations);
+            self.momenta.gradient(tree, &self.poses, velocity, gravity, l_q, l_v);
+        }
+    }
+
+    /// Prepares second derivatives at the last gradient, for [`Mechanics::pair`].
+    pub(crate) fn differentiate(&mut self, model: &Model) {
+        match (&mut self.planar, &model.planar) {
+            (Some(planar), Some(joints)) => planar.differentiate(joints),
+            _ => self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta),
+        }
+    }
+
+    /// Second derivatives for a pair of joints on one path to the root.
+    #[inline(always)]
+    pub(crate) fn pair(
+        &self,
+        model: &Model,
+        ancestor: usize,
+        descendant: usize,
+    ) -> SecondDerivatives<S> {
+        match (&self.planar, &model.planar) {
+            (Some(planar), Some(joints)) => planar.pair(joints, ancestor, descendant),
+            _ => self.curvature.pair(&self.momenta, model.gravity, ancestor, descendant),
+        }
+    }
+}

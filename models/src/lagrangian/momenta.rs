@@ -1,0 +1,152 @@
+//! The gradient of the Lagrangian at a configuration and velocity, by momentum recursion: O(n).
+//!
+//! ```text
+//! root to leaf:  V_i = V_parent + J_i v_i      J̇_i = V_parent × J_i      H_i = I_i V_i
+//! leaf to root:  H_parent += H_i
+//!                ∂L/∂v_i = J_i · H_i
+//!                ∂L/∂q_i = J̇_i · H_i + J_i · W_i      W_i: weight of the subtree
+//! ```
+
+use crate::lagrangian::kinematics::Poses;
+use crate::math::scalar::Scalar;
+use crate::math::simd::wide;
+use crate::math::spatial::{Force, Motion, Sym3, Vec3};
+use crate::model::tree::{Body, JointKind, Rotational, Tree, WORLD};
+
+/// Twists and momenta of the joints of a tree.
+#[derive(Clone, Debug)]
+pub(crate) struct Momenta<S = f64> {
+    /// Joint axes `J` as twists.
+    pub(crate) axis: Vec<Motion<S>>,
+    /// Their rates `J̇`.
+    pub(crate) axis_rate: Vec<Motion<S>>,
+    /// Twists `V`.
+    pub(crate) twist: Vec<Motion<S>>,
+    /// Momentum `H` of each subtree.
+    pub(crate) momentum: Vec<Force<S>>,
+    /// First moment of mass of each subtree.
+    pub(crate) moment: Vec<Vec3<S>>,
+}
+
+impl<S: Scalar> Momenta<S> {
+    pub(crate) fn new(tree: &Tree) -> Self {
+        let n = tree.joints.len();
+        Self {
+            axis: vec![Motion::default(); n],
+            axis_rate: vec![Motion::default(); n],
+            twist: vec![Motion::default(); n],
+            momentum: vec![Force::default(); n],
+            moment: vec![Vec3::ZERO; n],
+        }
+    }
+
+    wide! {
+        /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones.
+        #[inline(never)]
+        pub(crate) fn gradient(
+            mut self,
+            tree: &Tree,
+            poses: &Poses<S>,
+            velocity: &[S],
+            gravity: Option<Vec3>,
+            l_q: &mut [S],
+            l_v: &mut [S],
+        ) = gradient_portable, gradient_avx2;
+    }
+
+    #[inline(always)]
+    fn gradient_portable(
+        &mut self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        velocity: &[S],
+        gravity: Option<Vec3>,
+        l_q: &mut [S],
+        l_v: &mut [S],
+    ) {
+        if tree.has_other_joints {
+            self.forward::<true>(tree, poses, velocity);
+        } else {
+            self.forward::<false>(tree, poses, velocity);
+        }
+        for (i, joint) in tree.joints.iter().enumerate().rev() {
+            let (momentum, moment) = (self.momentum[i], self.moment[i]);
+            if joint.parent != WORLD {
+                let parent = joint.parent;
+                self.momentum[parent] = self.momentum[parent].add(momentum);
+                self.moment[parent] += moment;
+            }
+            if let Some(l_v) = l_v.get_mut(joint.coordinate) {
+                let axis = self.axis[i];
+                *l_v = axis.dot(momentum);
+                l_q[joint.coordinate] = self.axis_rate[i].dot(momentum)
+                    + gravity.map_or(S::ZERO, |g| {
+                        let (g, mass) = (Vec3::lift(g), joint.subtree_mass);
+                        axis.dot(Force { n: moment.cross(g), f: g.scaled(mass) })
+                    });
+            }
+        }
+    }
+
+    /// `OTHER`: some joint is neither revolute nor prismatic.
+    #[inline(always)]
+    fn forward<const OTHER: bool>(&mut self, tree: &Tree, poses: &Poses<S>, velocity: &[S]) {
+        for (i, joint) in tree.joints.iter().enumerate() {
+            let direction = poses.axis(i);
+            let turning = |v| Motion { w: direction, v };
+            let axis = match joint.kind {
+                JointKind::Revolute => turning(poses.position[i].cross(direction)),
+                JointKind::Ball(_) if OTHER => turning(poses.position[i].cross(direction)),
+                JointKind::Screw(pitch) if OTHER => {
+                    turning(poses.position[i].cross(direction) + direction.scaled(pitch))
+                }
+                _ => Motion { w: Vec3::ZERO, v: direction },
+            };
+            let twist_of =
+                |joint| if joint == WORLD { Motion::default() } else { self.twist[joint] };
+            let parent = twist_of(joint.parent);
+            let twist = parent.add_scaled(velocity[joint.coordinate], axis);
+            self.axis_rate[i] = match joint.kind {
+                // The axes of a ball are carried by what the whole joint hangs from.
+                JointKind::Ball(entry) if OTHER => {
+                    twist_of(tree.joints[i - entry].parent).cross(axis)
+                }
+                _ => parent.cross(axis),
+            };
+            self.axis[i] = axis;
+            self.twist[i] = twist;
+            (self.momentum[i], self.moment[i]) = body_momentum(&joint.body, poses, i, twist);
+        }
+    }
+
+    /// Twice the kinetic energy, `Σ v_i J_i·H_i`, of the last [`Momenta::gradient`].
+    pub(crate) fn twice_kinetic_energy(&self, tree: &Tree, velocity: &[S]) -> S {
+        let mut sum = S::ZERO;
+        for (i, joint) in tree.joints.iter().enumerate() {
+            sum += velocity[joint.coordinate] * self.axis[i].dot(self.momentum[i]);
+        }
+        sum
+    }
+}
+
+/// Momentum and first moment of mass of one body.
+#[inline(always)]
+fn body_momentum<S: Scalar>(
+    body: &Body,
+    poses: &Poses<S>,
+    joint: usize,
+    twist: Motion<S>,
+) -> (Force<S>, Vec3<S>) {
+    let rotation = &poses.rotation[joint];
+    let spin = match &body.inertia {
+        Rotational::None => return (Force::default(), Vec3::ZERO),
+        Rotational::Point => Vec3::ZERO,
+        Rotational::Isotropic(i) => twist.w.scaled(*i),
+        Rotational::Full(tensor) => {
+            rotation.apply(Sym3::lift(*tensor).apply(rotation.apply_transposed(twist.w)))
+        }
+    };
+    let center = poses.position[joint] + rotation.apply(Vec3::lift(body.center));
+    let linear = (twist.v + twist.w.cross(center)).scaled(body.mass);
+    (Force { n: center.cross(linear) + spin, f: linear }, center.scaled(body.mass))
+}

@@ -1,0 +1,831 @@
+//! The Lagrangian of a planar tree: momentum recursion and second derivatives with vectors of three
+//! numbers, a small part of what [`Momenta`] and [`Curvature`] cost.
+//!
+//! A twist is `(w, v)`, a wrench `(n, f)`: an angular part and two linear ones, in world axes and about
+//! the joint that they belong to. From a joint to its parent, `e` away, a wrench moves by `n += e × f`,
+//! and back a twist by `v += w ẑ×e`. About its own joint, with the velocity `v` of the parent's body there,
+//!
+//! ```text
+//! hinge   J = (s, 0)     J̇ = (0, −s ẑ×v)             s = ±1
+//! slider  J = (0, d)     J̇ = (0, w_parent ẑ×d)
+//!
+//! ∂L/∂v = J·H      ∂L/∂q = J̇·H + J·(S×g, m g)       H, S, m: momentum, moment and mass of the subtree
+//! F = I J          P = J ×* H + I J̇                 I: inertia of the subtree
+//! ```
+//!
+//! and second derivatives are products of these as in space. Turning by an angle is a complex number.
+//!
+//! Only sums along the tree need one joint after the other: directions, velocities, momenta, moments and
+//! inertia. All else is the same for each joint, and is computed for four of them side by side ([`Fours`]).
+//!
+//! [`Momenta`]: crate::lagrangian::momenta::Momenta
+//! [`Curvature`]: crate::lagrangian::curvature::Curvature
+
+use std::fmt::Debug;
+use std::marker::PhantomData;
+use std::ops::{Mul, Range};
+
+use crate::lagrangian::curvature::SecondDerivatives;
+use crate::math::scalar::{Lanes, Scalar};
+use crate::math::simd::wide;
+use crate::math::tree_lu::TreeLu;
+use crate::model::mechanism::Pair;
+use crate::model::planar_tree::{Body, PlanarJoint, PlanarJoints};
+
+/// A vector in the plane.
+pub(crate) type Vec2<S = f64> = [S; 2];
+/// A twist or a wrench: the angular part first.
+pub(crate) type Vec3<S = f64> = [S; 3];
+
+/// How numbers of joints lie: those of several side by side, or one after the other.
+pub(crate) trait Arrangement: Clone + Debug {
+    type Number: Scalar;
+    type Several: Scalar + Mul<Self::Constant, Output = Self::Several>;
+    type Constant: Copy;
+    /// Joints of a block.
+    const COUNT: usize;
+    /// Whether each block goes through a whole pass by itself; else all go through a part of it together.
+    const ALONE: bool;
+    /// What is fixed to the joints of a block.
+    fn body(joints: &PlanarJoints, block: usize) -> &Body<Self::Constant>;
+    fn one(several: &Self::Several, lane: usize) -> Self::Number;
+    fn put(number: Self::Number, several: &mut Self::Several, lane: usize);
+    /// The numbers of a block from a list of those of coordinates.
+    fn gather(joints: &PlanarJoints, block: usize, list: &[Self::Number]) -> Self::Several;
+    /// The way back, but for what is beyond the list.
+    fn scatter(
+        joints: &PlanarJoints,
+        block: usize,
+        several: Self::Several,
+        list: &mut [Self::Number],
+    );
+    /// The numbers of a block, those of each joint together.
+    fn spread(numbers: [Self::Several; 4], joints: &mut [[Self::Number; 4]]);
+    /// The way back.
+    fn collect(joints: &[[Self::Number; 4]]) -> [Self::Several; 4];
+}
+
+/// Four joints side by side.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Fours;
+
+impl Arrangement for Fours {
+    type Number = f64;
+    type Several = Lanes;
+    type Constant = Lanes;
+    const COUNT: usize = Lanes::COUNT;
+    const ALONE: bool = false;
+
+    #[inline(always)]
+    fn body(joints: &PlanarJoints, block: usize) -> &Body<Lanes> {
+        &joints.fours[block]
+    }
+
+    #[inline(always)]
+    fn one(several: &Lanes, lane: usize) -> f64 {
+        several.0[lane]
+    }
+
+    #[inline(always)]
+    fn put(number: f64, several: &mut Lanes, lane: usize) {
+        several.0[lane] = number;
+    }
+
+    #[inline(always)]
+    fn gather(joints: &PlanarJoints, block: usize, list: &[f64]) -> Lanes {
+        let first = Self::COUNT * block;
+        let mut lanes = Lanes::ZERO;
+        match list.get(first..first + Self::COUNT) {
+            Some(four) if joints.are_in_order => lanes.0.copy_from_slice(four),
+            _ => {
+                for (lane, joint) in lanes.0.iter_mut().zip(&joints[first..]) {
+                    *lane = list[joint.coordinate];
+                }
+            }
+        }
+        lanes
+    }
+
+    #[inline(always)]
+    fn scatter(joints: &PlanarJoints, block: usize, lanes: Lanes, list: &mut [f64]) {
+        let first = Self::COUNT * block;
+        match list.get_mut(first..first + Self::COUNT) {
+            Some(four) if joints.are_in_order => four.copy_from_slice(&lanes.0),
+            _ => {
+                for (lane, joint) in lanes.0.iter().zip(&joints[first..]) {
+                    if let Some(entry) = list.get_mut(joint.coordinate) {
+                        *entry = *lane;
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn spread([a, b, c, d]: [Lanes; 4], joints: &mut [[f64; 4]]) {
+        for (lane, joint) in joints[..4].iter_mut().enumerate() {
+            *joint = [a.0[lane], b.0[lane], c.0[lane], d.0[lane]];
+        }
+    }
+
+    #[inline(always)]
+    fn collect(joints: &[[f64; 4]]) -> [Lanes; 4] {
+        let mut numbers = [Lanes::ZERO; 4];
+        for (lane, joint) in joints[..4].iter().enumerate() {
+            for (number, to) in joint.iter().zip(&mut numbers) {
+                to.0[lane] = *number;
+            }
+        }
+        numbers
+    }
+}
+
+/// One joint after the other.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Ones<S>(PhantomData<S>);
+
+impl<S: Scalar> Arrangement for Ones<S> {
+    type Number = S;
+    type Several = S;
+    type Constant = f64;
+    const COUNT: usize = 1;
+    const ALONE: bool = true;
+
+    #[inline(always)]
+    fn body(joints: &PlanarJoints, block: usize) -> &Body {
+        &joints[block].body
+    }
+
+    #[inline(always)]
+    fn one(several: &S, _: usize) -> S {
+        *several
+    }
+
+    #[inline(always)]
+    fn put(number: S, several: &mut S, _: usize) {
+        *several = number;
+    }
+
+    #[inline(always)]
+    fn gather(joints: &PlanarJoints, block: usize, list: &[S]) -> S {
+        list[joints[block].coordinate]
+    }
+
+    #[inline(always)]
+    fn scatter(joints: &PlanarJoints, block: usize, several: S, list: &mut [S]) {
+        if let Some(entry) = list.get_mut(joints[block].coordinate) {
+            *entry = several;
+        }
+    }
+
+    #[inline(always)]
+    fn spread(numbers: [S; 4], joints: &mut [[S; 4]]) {
+        joints[0] = numbers;
+    }
+
+    #[inline(always)]
+    fn collect(joints: &[[S; 4]]) -> [S; 4] {
+        joints[0]
+    }
+}
+
+/// Numbers of which planar trees are computed.
+pub(crate) trait Planar: Scalar {
+    /// Of many joints.
+    type Many: Arrangement<Number = Self>;
+}
+
+impl Planar for f64 {
+    type Many = Fours;
+}
+
+impl Planar for Lanes {
+    type Many = Ones<Self>;
+}
+
+/// Joints up to which one after the other is faster.
+const FEW: usize = 3;
+
+/// A planar tree at a configuration and velocity.
+#[derive(Clone, Debug)]
+pub(crate) enum PlanarTree<S: Planar = f64> {
+    Few(Joints<Ones<S>>),
+    Many(Joints<S::Many>),
+}
+
+impl<S: Planar> PlanarTree<S> {
+    pub(crate) fn new(joints: &PlanarJoints) -> Self {
+        if joints.len() > FEW {
+            Self::Many(Joints::new(joints))
+        } else {
+            Self::Few(Joints::new(joints))
+        }
+    }
+
+    /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones, without springs.
+    pub(crate) fn gradient(
+        &mut self,
+        joints: &PlanarJoints,
+        q: &[S],
+        velocity: &[S],
+        l_q: &mut [S],
+        l_v: &mut [S],
+    ) {
+        match self {
+            Self::Few(tree) => tree.gradient(joints, q, velocity, l_q, l_v),
+            Self::Many(tree) => tree.gradient(joints, q, velocity, l_q, l_v),
+        }
+    }
+
+    /// Prepares second derivatives at the last gradient, for [`PlanarTree::pair`].
+    pub(crate) fn differentiate(&mut self, joints: &PlanarJoints) {
+        match self {
+            Self::Few(tree) => {
+                tree.differentiate(joints);
+                tree.place(joints);
+            }
+            Self::Many(tree) => {
+                tree.differentiate(joints);
+                tree.place(joints);
+            }
+        }
+    }
+
+    /// Second derivatives of a pair of joints on one path to the root.
+    #[inline(always)]
+    pub(crate) fn pair(
+        &self,
+        joints: &[PlanarJoint],
+        ancestor: usize,
+        descendant: usize,
+    ) -> SecondDerivatives<S> {
+        match self {
+            Self::Few(tree) => tree.pair(joints, ancestor, descendant),
+            Self::Many(tree) => tree.pair(joints, ancestor, descendant),
+        }
+    }
+}
+
+impl PlanarTree {
+    /// The joints of a tree of more than a few.
+    pub(crate) fn many(&self) -> Option<&Joints<Fours>> {
+        match self {
+            Self::Many(tree) => Some(tree),
+            Self::Few(_) => None,
+        }
+    }
+
+    /// Writes the Jacobian of the residual by the increment, without springs and forces, entry by entry.
+    pub(crate) fn fill_newton_matrix(
+        &self,
+        joints: &[PlanarJoint],
+        pairs: &[Pair],
+        step: f64,
+        matrix: &mut TreeLu,
+    ) {
+        match self {
+            Self::Few(tree) => tree.fill_newton_matrix(joints, pairs, step, matrix),
+            Self::Many(tree) => tree.fill_newton_matrix(joints, pairs, step, matrix),
+        }
+    }
+}
+
+/// Joints at a configuration and velocity.
+#[derive(Clone, Copy, Debug, Default)]
+struct Links<P> {
+    q: P,
+    speed: P,
+    /// Sine and cosine of the angle of the joint; of the parent's body, and of the body.
+    own: Vec2<P>,
+    above: Vec2<P>,
+    direction: Vec2<P>,
+    /// Angular velocity of the parent's body, and of the body.
+    spin_above: P,
+    spin: P,
+    /// Velocity of the joint, and how much more it is than that of the parent.
+    velocity: Vec2<P>,
+    faster: Vec2<P>,
+    /// From the parent joint to this one.
+    edge: Vec2<P>,
+    /// The same times the mass of the subtree.
+    lever: Vec2<P>,
+    /// `d` of a slider; zero for a hinge.
+    slide: Vec2<P>,
+    /// Linear part of `J̇`.
+    rate: Vec2<P>,
+    /// Angular momentum, momentum and first moment of mass of the subtree; of the momentum about the parent.
+    turning: P,
+    momentum: Vec2<P>,
+    moment: Vec2<P>,
+    torque: P,
+    /// Inertia of the body, that of the subtree, and what is added to it about the parent.
+    inertia: P,
+    total_inertia: P,
+    moved: P,
+    /// `F`.
+    force: Vec3<P>,
+    /// `P`.
+    slope: Vec3<P>,
+    /// `f × g` for the linear part `f` of `F`.
+    weight: P,
+}
+
+/// What a joint passes on to those below it: sine and cosine of the angle of its body, the angular velocity,
+/// and its own velocity.
+#[derive(Clone, Copy, Debug)]
+struct Motion<S> {
+    direction: Vec2<S>,
+    spin: S,
+    velocity: Vec2<S>,
+}
+
+impl<S: Scalar> Motion<S> {
+    const NONE: Self = Self { direction: [S::ZERO, S::ONE], spin: S::ZERO, velocity: [S::ZERO; 2] };
+}
+
+/// What the joint after this one passes on to it: momentum and moment of its subtree, and angular momentum.
+#[derive(Clone, Copy, Debug)]
+struct Below<S> {
+    sums: [S; 4],
+    turning: S,
+}
+
+impl<S: Scalar> Below<S> {
+    const NONE: Self = Self { sums: [S::ZERO; 4], turning: S::ZERO };
+}
+
+/// The joints of a planar tree at a configuration and velocity, block by block.
+#[derive(Clone, Debug)]
+pub(crate) struct Joints<A: Arrangement> {
+    links: Vec<Links<A::Several>>,
+    /// Momentum and first moment of mass, joint by joint, to the end of the last block.
+    sums: Vec<[A::Number; 4]>,
+    /// Sums over children that do not follow their parent in the list; zero but within a pass.
+    branches: Vec<Below<A::Number>>,
+    inertia_of_branches: Vec<A::Number>,
+    /// Where the joints are, from the origin of the tree; set by [`Joints::place`].
+    positions: Vec<Vec2<A::Number>>,
+}
+
+/// A joint at a configuration and velocity.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Link<S> {
+    pub(crate) edge: Vec2<S>,
+    pub(crate) slide: Vec2<S>,
+    pub(crate) rate: Vec2<S>,
+    pub(crate) force: Vec3<S>,
+    pub(crate) slope: Vec3<S>,
+    pub(crate) weight: S,
+}
+
+#[inline(always)]
+pub(crate) fn cross<A, B: Copy>(a: Vec2<A>, b: Vec2<B>) -> A
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    a[0] * b[1] - a[1] * b[0]
+}
+
+#[inline(always)]
+pub(crate) fn dot<A, B: Copy>(a: Vec2<A>, b: Vec2<B>) -> A
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    a[0] * b[0] + a[1] * b[1]
+}
+
+#[inline(always)]
+fn add<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> Vec2<S> {
+    [a[0] + b[0], a[1] + b[1]]
+}
+
+#[inline(always)]
+fn times<A, B: Copy>(a: Vec2<A>, b: B) -> Vec2<A>
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    [a[0] * b, a[1] * b]
+}
+
+/// `ẑ × v`, times `w`.
+#[inline(always)]
+fn spun<A, B: Copy>(v: Vec2<A>, w: B) -> Vec2<A>
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    [-(v[1] * w), v[0] * w]
+}
+
+/// `v` turned by the angle of which sine and cosine are given.
+#[inline(always)]
+fn turned<A, B: Copy>([s, c]: Vec2<A>, v: Vec2<B>) -> Vec2<A>
+where
+    A: Scalar + Mul<B, Output = A>,
+{
+    [c * v[0] - s * v[1], s * v[0] + c * v[1]]
+}
+
+/// One turn after the other.
+#[inline(always)]
+fn combined<S: Scalar>([s, c]: Vec2<S>, [s1, c1]: Vec2<S>) -> Vec2<S> {
+    [s * c1 + c * s1, c * c1 - s * s1]
+}
+
+#[inline(always)]
+fn add4<S: Scalar>(a: [S; 4], b: [S; 4]) -> [S; 4] {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]]
+}
+
+#[inline(always)]
+pub(crate) fn linear<S: Scalar>(v: Vec3<S>) -> Vec2<S> {
+    [v[1], v[2]]
+}
+
+#[inline(always)]
+fn one2<A: Arrangement>(v: &Vec2<A::Several>, lane: usize) -> Vec2<A::Number> {
+    [A::one(&v[0], lane), A::one(&v[1], lane)]
+}
+
+#[inline(always)]
+fn one3<A: Arrangement>(v: &Vec3<A::Several>, lane: usize) -> Vec3<A::Number> {
+    [A::one(&v[0], lane), A::one(&v[1], lane), A::one(&v[2], lane)]
+}
+
+#[inline(always)]
+fn put2<A: Arrangement>(v: Vec2<A::Number>, to: &mut Vec2<A::Several>, lane: usize) {
+    A::put(v[0], &mut to[0], lane);
+    A::put(v[1], &mut to[1], lane);
+}
+
+impl<A: Arrangement> Joints<A> {
+    pub(crate) fn new(joints: &PlanarJoints) -> Self {
+        let n = joints.len();
+        Self {
+            links: vec![Links::default(); n.div_ceil(A::COUNT)],
+            sums: vec![[A::Number::ZERO; 4]; n.next_multiple_of(A::COUNT)],
+            branches: vec![Below::NONE; n],
+            inertia_of_branches: vec![A::Number::ZERO; n],
+            positions: vec![[A::Number::ZERO; 2]; n],
+        }
+    }
+
+    wide! {
+        /// From the roots to the leaves and back, about 60 flops a joint beside a sine and a cosine.
+        #[inline(never)]
+        pub(crate) fn gradient(
+            mut self,
+            joints: &PlanarJoints,
+            q: &[A::Number],
+            velocity: &[A::Number],
+            l_q: &mut [A::Number],
+            l_v: &mut [A::Number],
+        ) = gradient_portable, gradient_avx2;
+
+        /// Computes `F` and `P` of each joint at the last gradient.
+        #[inline(never)]
+        pub(crate) fn differentiate(mut self, joints: &PlanarJoints)
+            = differentiate_portable, differentiate_avx2;
+    }
+
+    #[inline(always)]
+    fn gradient_portable(
+        &mut self,
+        joints: &PlanarJoints,
+        q: &[A::Number],
+        velocity: &[A::Number],
+        l_q: &mut [A::Number],
+        l_v: &mut [A::Number],
+    ) {
+        if joints.have_sliders {
+            self.walk::<true>(joints, q, velocity, l_q, l_v);
+        } else {
+            self.walk::<false>(joints, q, velocity, l_q, l_v);
+        }
+    }
+
+    /// `SLIDES`: some joint is a slider.
+    #[inline(always)]
+    fn walk<const SLIDES: bool>(
+        &mut self,
+        joints: &PlanarJoints,
+        q: &[A::Number],
+        velocity: &[A::Number],
+        l_q: &mut [A::Number],
+        l_v: &mut [A::Number],
+    ) {
+        let blocks = self.links.len();
+        let (parts, part) = if A::ALONE { (blocks, 1) } else { (1, blocks) };
+        let part = |i: usize| part * i..part * (i + 1);
+        let mut last = Motion::NONE;
+        for i in 0..parts {
+            last = self.descend::<SLIDES>(joints, part(i), q, velocity, last);
+        }
+        let mut below = Below::NONE;
+        for i in (0..parts).rev() {
+            below = self.ascend::<SLIDES>(joints, part(i), l_q, l_v, below);
+        }
+    }
+
+    /// Where joints are and how fast, and the momenta of their bodies, for some blocks.
+    #[inline(always)]
+    fn descend<const SLIDES: bool>(
+        &mut self,
+        joints: &PlanarJoints,
+        blocks: Range<usize>,
+        q: &[A::Number],
+        velocity: &[A::Number],
+        mut last: Motion<A::Number>,
+    ) -> Motion<A::Number> {
+        for block in blocks.clone() {
+            let (link, body) = (&mut self.links[block], A::body(joints, block));
+            link.q = A::gather(joints, block, q);
+            link.speed = A::gather(joints, block, velocity);
+            link.own = (link.q * body.turn).sin_cos().into();
+            link.spin = link.speed * body.turn;
+        }
+        self.turn(joints, blocks.clone(), &mut last);
+        for block in blocks.clone() {
+            let (link, body) = (&mut self.links[block], A::body(joints, block));
+            let Links { q, speed, above, spin_above, .. } = *link;
+            let mut edge = turned(above, body.offset);
+            link.faster = if SLIDES {
+                link.slide = turned(above, body.slide);
+                edge = add(edge, times(link.slide, q));
+                add(spun(edge, spin_above), times(link.slide, speed))
+            } else {
+                spun(edge, spin_above)
+            };
+            link.lever = times(edge, body.subtree_mass);
+            link.edge = edge;
+        }
+        self.go_on(joints, blocks.clone(), &mut last);
+        for block in blocks {
+            let (link, body) = (&mut self.links[block], A::body(joints, block));
+            let Links { direction, slide, spin_above, spin, velocity, .. } = *link;
+            let arm = turned(direction, body.center);
+            let f = times(add(velocity, spun(arm, spin)), body.mass);
+            let moment = times(arm, body.mass);
+            let [x, y] = spun(velocity, body.turn);
+            link.rate = [-x, -y];
+            if SLIDES {
+                // A hinge has no slide, and a slider no turn.
+                link.rate = add(link.rate, spun(slide, spin_above));
+            }
+            link.turning = spin * body.inertia + cross(arm, f);
+            link.inertia = dot(arm, arm) * body.mass + A::Several::ONE * body.inertia;
+            let sums = &mut self.sums[A::COUNT * block..];
+            A::spread([f[0], f[1], moment[0], moment[1]], sums);
+        }
+        last
+    }
+
+    /// Angles and angular velocities of bodies.
+    #[inline(always)]
+    fn turn(&mut self, joints: &PlanarJoints, blocks: Range<usize>, last: &mut Motion<A::Number>) {
+        let links = &mut self.links[..];
+        let Motion { mut direction, mut spin, .. } = *last;
+        for block in blocks {
+            let first = A::COUNT * block;
+            for (lane, joint) in joints[first..].iter().take(A::COUNT).enumerate() {
+                match joint.parent {
+                    0 => Motion { direction, spin, .. } = Motion::NONE,
+                    parent if parent == first + lane => {}
+                    parent => {
+                        let (above, lane) =
+                            (&links[(parent - 1) / A::COUNT], (parent - 1) % A::COUNT);
+                        direction = one2::<A>(&above.direction, lane);
+                        spin = A::one(&above.spin, lane);
+                    }
+                }
+                let link = &mut links[block];
+                put2::<A>(direction, &mut link.above, lane);
+                A::put(spin, &mut link.spin_above, lane);
+                direction = combined(direction, one2::<A>(&link.own, lane));
+                spin += A::one(&link.spin, lane);
+                put2::<A>(direction, &mut link.direction, lane);
+                A::put(spin, &mut link.spin, lane);
+            }
+        }
+        (last.direction, last.spin) = (direction, spin);
+    }
+
+    /// Velocities of joints.
+    #[inline(always)]
+    fn go_on(&mut self, joints: &PlanarJoints, blocks: Range<usize>, last: &mut Motion<A::Number>) {
+        let links = &mut self.links[..];
+        let mut velocity = last.velocity;
+        for block in blocks {
+            let first = A::COUNT * block;
+            for (lane, joint) in joints[first..].iter().take(A::COUNT).enumerate() {
+                match joint.parent {
+                    0 => velocity = [A::Number::ZERO; 2],
+                    parent if parent == first + lane => {}
+                    parent => {
+                        let above = &links[(parent - 1) / A::COUNT].velocity;
+                        velocity = one2::<A>(above, (parent - 1) % A::COUNT);
+                    }
+                }
+                let link = &mut links[block];
+                velocity = add(velocity, one2::<A>(&link.faster, lane));
+                put2::<A>(velocity, &mut link.velocity, lane);
+            }
+        }
+        last.velocity = velocity;
+    }
+
+    /// Momenta and moments of subtrees, and the derivatives, for some blocks.
+    #[inline(always)]
+    fn ascend<const SLIDES: bool>(
+        &mut self,
+        joints: &PlanarJoints,
+        blocks: Range<usize>,
+        l_q: &mut [A::Number],
+        l_v: &mut [A::Number],
+        mut below: Below<A::Number>,
+    ) -> Below<A::Number> {
+        let of = |blocks: &Range<usize>| {
+            A::COUNT * blocks.start..joints.len().min(A::COUNT * blocks.end)
+        };
+        for i in of(&blocks).rev() {
+            let joint = &joints[i];
+            let mut sum = self.sums[i];
+            if joint.is_followed {
+                sum = add4(sum, below.sums);
+            }
+            if joint.has_branches {
+                sum = add4(sum, std::mem::replace(&mut self.branches[i].sums, Below::NONE.sums));
+            }
+            if joint.descendants > 0 {
+                self.sums[i] = sum;
+            }
+            let [x, y] = one2::<A>(&self.links[i / A::COUNT].lever, i % A::COUNT);
+            let sum = [sum[0], sum[1], sum[2] + x, sum[3] + y];
+            match joint.parent {
+                0 => {}
+                parent if parent == i => below.sums = sum,
+                parent => {
+                    let others = &mut self.branches[parent - 1].sums;
+                    *others = add4(*others, sum);
+                }
+            }
+        }
+        for block in blocks.clone() {
+            let link = &mut self.links[block];
+            let [fx, fy, x, y] = A::collect(&self.sums[A::COUNT * block..]);
+            (link.momentum, link.moment) = ([fx, fy], [x, y]);
+            link.torque = cross(link.edge, [fx, fy]);
+        }
+        for i in of(&blocks).rev() {
+            let (joint, lane) = (&joints[i], i % A::COUNT);
+            let link = &mut self.links[i / A::COUNT];
+            let mut sum = A::one(&link.turning, lane);
+            if joint.is_followed {
+                sum += below.turning;
+            }
+            if joint.has_branches {
+                sum += std::mem::take(&mut self.branches[i].turning);
+            }
+            A::put(sum, &mut link.turning, lane);
+            sum += A::one(&link.torque, lane);
+            match joint.parent {
+                0 => {}
+                parent if parent == i => below.turning = sum,
+                parent => self.branches[parent - 1].turning += sum,
+            }
+        }
+        for block in blocks {
+            let (link, body) = (&self.links[block], A::body(joints, block));
+            let Links { slide, rate, turning, momentum: f, moment, .. } = *link;
+            let mut by_velocity = turning * body.turn;
+            let mut by_position = dot(rate, f) + cross(moment, body.gravity) * body.turn;
+            if SLIDES {
+                by_velocity += dot(slide, f);
+                by_position += dot(slide, body.gravity) * body.subtree_mass;
+            }
+            A::scatter(joints, block, by_velocity, l_v);
+            A::scatter(joints, block, by_position, l_q);
+        }
+        below
+    }
+
+    #[inline(always)]
+    fn differentiate_portable(&mut self, joints: &PlanarJoints) {
+        for link in &mut self.links {
+            link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
+        }
+        let branches = &mut self.inertia_of_branches[..];
+        let mut below = A::Number::ZERO;
+        for (block, link) in self.links.iter_mut().enumerate().rev() {
+            let first = A::COUNT * block;
+            let count = A::COUNT.min(joints.len() - first);
+            for (lane, joint) in joints[first..][..count].iter().enumerate().rev() {
+                let mut sum = A::one(&link.inertia, lane);
+                if joint.is_followed {
+                    sum += below;
+                }
+                if joint.has_branches {
+                    sum += std::mem::take(&mut branches[first + lane]);
+                }
+                A::put(sum, &mut link.total_inertia, lane);
+                sum += A::one(&link.moved, lane);
+                match joint.parent {
+                    0 => {}
+                    parent if parent == first + lane => below = sum,
+                    parent => branches[parent - 1] += sum,
+                }
+            }
+        }
+        for (block, link) in self.links.iter_mut().enumerate() {
+            let Links { slide, rate, momentum, moment, total_inertia, .. } = *link;
+            let (body, f) = (A::body(joints, block), momentum);
+            let push = add(spun(moment, body.turn), times(slide, body.subtree_mass));
+            let pull = add(spun(f, body.turn), times(rate, body.subtree_mass));
+            link.force = [total_inertia * body.turn + cross(moment, slide), push[0], push[1]];
+            link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
+            link.weight = cross(push, body.gravity);
+        }
+    }
+
+    /// Places the joints, for [`PlanarTree::pair`].
+    #[inline(never)]
+    fn place(&mut self, joints: &[PlanarJoint]) {
+        for (i, joint) in joints.iter().enumerate() {
+            // The root of a tree is its origin, unless that moves on.
+            self.positions[i] = match joint.parent {
+                0 => [A::Number::ZERO; 2],
+                parent => add(self.positions[parent - 1], self.edge(i)),
+            };
+            if joint.anchor {
+                // All joints placed so far in its tree are its ancestors.
+                self.positions[i] = [A::Number::ZERO; 2];
+                let mut below = i;
+                while joints[below].parent > 0 {
+                    let (parent, edge) = (joints[below].parent - 1, self.edge(below));
+                    let position = self.positions[below];
+                    self.positions[parent] = [position[0] - edge[0], position[1] - edge[1]];
+                    below = parent;
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn edge(&self, joint: usize) -> Vec2<A::Number> {
+        one2::<A>(&self.links[joint / A::COUNT].edge, joint % A::COUNT)
+    }
+
+    #[inline(always)]
+    pub(crate) fn link(&self, joint: usize) -> Link<A::Number> {
+        let (links, lane) = (&self.links[joint / A::COUNT], joint % A::COUNT);
+        Link {
+            edge: one2::<A>(&links.edge, lane),
+            slide: one2::<A>(&links.slide, lane),
+            rate: one2::<A>(&links.rate, lane),
+            force: one3::<A>(&links.force, lane),
+            slope: one3::<A>(&links.slope, lane),
+            weight: A::one(&links.weight, lane),
+        }
+    }
+
+    #[inline(always)]
+    fn pair(
+        &self,
+        joints: &[PlanarJoint],
+        ancestor: usize,
+        descendant: usize,
+    ) -> SecondDerivatives<A::Number> {
+        let (above, below) = (self.link(ancestor), self.link(descendant));
+        let ([x0, y0], [x, y]) = (self.positions[ancestor], self.positions[descendant]);
+        let (s, arm) = (joints[ancestor].body.turn, [x - x0, y - y0]);
+        let along = |wrench: Vec3<A::Number>| {
+            let f = linear(wrench);
+            (wrench[0] + cross(arm, f)) * s + dot(above.slide, f)
+        };
+        SecondDerivatives {
+            qq: dot(above.rate, linear(below.slope)) + below.weight * s,
+            v_above_q_below: along(below.slope),
+            q_above_v_below: dot(above.rate, linear(below.force)),
+            vv: along(below.force),
+        }
+    }
+}
+
+impl<A: Arrangement<Number = f64>> Joints<A> {
+    #[inline(never)]
+    fn fill_newton_matrix(
+        &self,
+        joints: &[PlanarJoint],
+        pairs: &[Pair],
+        step: f64,
+        matrix: &mut TreeLu,
+    ) {
+        let (quarter, inverse) = (0.25 * step, 1.0 / step);
+        for pair in pairs {
+            let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
+            let (common, slot) = (quarter * second.qq - inverse * second.vv, pair.slot as usize);
+            let skew = 0.5 * (second.q_above_v_below - second.v_above_q_below);
+            matrix.upper[slot] = common + skew;
+            matrix.lower[slot] = common - skew;
+        }
+    }
+}

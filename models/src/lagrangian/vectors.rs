@@ -1,0 +1,275 @@
+//! Vectors that bodies carry, and their derivatives by the coordinates of the joints: nested axes.
+//!
+//! A joint with axis `w` turns every vector that it carries: `∂u/∂q = w × u`. With joint `i` above
+//! joint `j`, both carrying `u`, `∂²u/∂q_i ∂q_j = w_i × ∂u/∂q_j`; across branches it is zero.
+
+use crate::lagrangian::kinematics::Poses;
+use crate::math::scalar::Scalar;
+use crate::math::spatial::Vec3;
+use crate::model::mechanism::{Carries, PathJoint, PointPair, Product, Vector};
+use crate::model::tree::{Tree, WORLD};
+
+/// `a − b` in world axes, and both points relative to the origins of their trees.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Separation<S = f64> {
+    pub(crate) difference: Vec3<S>,
+    pub(crate) a: Vec3<S>,
+    pub(crate) b: Vec3<S>,
+    /// Magnitude of what was subtracted, for round-off estimates.
+    pub(crate) magnitude: f64,
+}
+
+impl PointPair {
+    /// Whether no joint carries both, and all of them are hinges and sliders.
+    #[inline]
+    pub(crate) fn are_apart(&self, tree: &Tree) -> bool {
+        let root = |joint: usize| tree.joints.get(joint).map(|joint| joint.root);
+        !tree.has_other_joints && (root(self.a.joint) != root(self.b.joint))
+    }
+
+    /// The separation of the points. Origins cancel exactly within one tree.
+    #[inline]
+    pub(crate) fn separation<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>) -> Separation<S> {
+        let (a, origin_a) = poses.point(tree, &self.a);
+        let (b, origin_b) = poses.point(tree, &self.b);
+        let origins = origin_a - origin_b;
+        Separation {
+            difference: (a - b) + origins,
+            a,
+            b,
+            magnitude: size(a) + size(b) + size(origins),
+        }
+    }
+}
+
+/// Length of the real part.
+fn size<S: Scalar>(v: Vec3<S>) -> f64 {
+    Vec3(v.0.map(S::value)).norm()
+}
+
+impl PathJoint {
+    /// Derivative of the difference `a − b` by the joint's coordinate; the joint carries one of them.
+    #[inline(always)]
+    pub(crate) fn gradient<S: Scalar>(
+        &self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        at: &Separation<S>,
+    ) -> Vec3<S> {
+        if self.carries == Carries::A {
+            poses.point_gradient(tree, self.joint, at.a)
+        } else {
+            -poses.point_gradient(tree, self.joint, at.b)
+        }
+    }
+
+    /// Derivative of this joint's `gradient` by the coordinate of another: nested axes on one branch,
+    /// zero across branches.
+    #[inline]
+    pub(crate) fn second<S: Scalar>(
+        &self,
+        gradient: Vec3<S>,
+        tree: &Tree,
+        poses: &Poses<S>,
+        (column, column_gradient): (&PathJoint, Vec3<S>),
+    ) -> Vec3<S> {
+        if self.carries == column.carries {
+            poses.turned_gradient(tree, (self.joint, gradient), (column.joint, column_gradient))
+        } else {
+            Vec3::ZERO
+        }
+    }
+
+    /// [`Self::second`] of the first joint by the second, and of the second by the first. They differ
+    /// within a ball joint only.
+    #[inline]
+    pub(crate) fn seconds<S: Scalar>(
+        [(row, row_gradient), (column, gradient)]: [(&PathJoint, Vec3<S>); 2],
+        tree: &Tree,
+        poses: &Poses<S>,
+    ) -> (Vec3<S>, Vec3<S>) {
+        let second = row.second(row_gradient, tree, poses, (column, gradient));
+        if tree.one_ball(row.joint, column.joint) {
+            (second, column.second(gradient, tree, poses, (row, row_gradient)))
+        } else {
+            (second, second)
+        }
+    }
+
+    /// [`Self::gradient`] where joints that carry both points are on the path, too.
+    #[inline]
+    pub(crate) fn gradient_in_world<S: Scalar>(
+        &self,
+        tree: &Tree,
+        poses: &Poses<S>,
+        at: &Separation<S>,
+    ) -> Vec3<S> {
+        if self.carries == Carries::Both {
+            poses.turned(tree, self.joint, at.difference)
+        } else {
+            self.gradient(tree, poses, at)
+        }
+    }
+
+    /// [`Self::second`] where joints that carry both points are on the path, too: they are above all
+    /// others.
+    pub(crate) fn second_in_world<S: Scalar>(
+        &self,
+        gradient: Vec3<S>,
+        tree: &Tree,
+        poses: &Poses<S>,
+        (column, column_gradient): (&PathJoint, Vec3<S>),
+    ) -> Vec3<S> {
+        let above = |joint: &PathJoint| joint.carries == Carries::Both;
+        if above(self) || above(column) || self.carries == column.carries {
+            poses.turned_gradient(tree, (self.joint, gradient), (column.joint, column_gradient))
+        } else {
+            Vec3::ZERO
+        }
+    }
+}
+
+/// The distance of two points at one configuration.
+///
+/// ```text
+/// l = |d|,  l_i = e·d_i,  l_ij = [d_i·d_j − (e·d_i)(e·d_j)] / l + e·d_ij,  e = d / l
+/// ```
+///
+/// Where the points coincide it has no direction; then the derivatives are zero.
+pub(crate) struct Distance<'a, S> {
+    pair: &'a PointPair,
+    tree: &'a Tree,
+    poses: &'a Poses<S>,
+    at: Separation<S>,
+    direction: Vec3<S>,
+    inverse: S,
+    pub(crate) length: S,
+}
+
+impl<'a, S: Scalar> Distance<'a, S> {
+    pub(crate) fn new(pair: &'a PointPair, tree: &'a Tree, poses: &'a Poses<S>) -> Self {
+        let at = pair.separation(tree, poses);
+        let square = at.difference.dot(at.difference);
+        let (length, inverse) = if square.value() == 0.0 {
+            (S::ZERO, S::ZERO)
+        } else {
+            let length = square.sqrt();
+            (length, length.recip())
+        };
+        Self { pair, tree, poses, direction: at.difference * inverse, at, inverse, length }
+    }
+
+    /// Magnitude of what was subtracted, for round-off estimates.
+    pub(crate) fn magnitude(&self) -> f64 {
+        self.at.magnitude
+    }
+
+    /// Calls `entry(i, l_i)` for each joint between the points.
+    pub(crate) fn for_each_derivative(&self, mut entry: impl FnMut(usize, S)) {
+        for joint in &self.pair.path {
+            let gradient = joint.gradient(self.tree, self.poses, &self.at);
+            entry(joint.coordinate, self.direction.dot(gradient));
+        }
+    }
+
+    /// Calls `entry(i, j, l_ij)` for each ordered pair of joints between the points.
+    pub(crate) fn for_each_second_derivative(&self, mut entry: impl FnMut(usize, usize, S)) {
+        let (tree, poses) = (self.tree, self.poses);
+        for row in &self.pair.path {
+            let row_gradient = row.gradient(tree, poses, &self.at);
+            let row_slope = self.direction.dot(row_gradient);
+            for column in &self.pair.path {
+                let gradient = column.gradient(tree, poses, &self.at);
+                let slope = self.direction.dot(gradient);
+                let turned = row.second(row_gradient, tree, poses, (column, gradient));
+                let across = row_gradient.dot(gradient) - row_slope * slope;
+                let second = across * self.inverse + self.direction.dot(turned);
+                entry(row.coordinate, column.coordinate, second);
+            }
+        }
+    }
+}
+
+/// A product `u·w` at one configuration.
+///
+/// ```text
+/// h = u·w,  h_i = u_i·w + u·w_i,  h_ij = u_ij·w + u_i·w_j + u_j·w_i + u·w_ij
+/// ```
+///
+/// Joints that carry both bodies turn both vectors alike, and change nothing.
+pub(crate) struct ProductAt<'a, S> {
+    product: &'a Product,
+    tree: &'a Tree,
+    poses: &'a Poses<S>,
+    at: Separation<S>,
+    u: Vec3<S>,
+    w: Vec3<S>,
+}
+
+impl<'a, S: Scalar> ProductAt<'a, S> {
+    pub(crate) fn new(product: &'a Product, tree: &'a Tree, poses: &'a Poses<S>) -> Self {
+        let points = &product.points;
+        let at = points.separation(tree, poses);
+        let turned = |joint: usize, direction: Vec3| match joint {
+            WORLD => Vec3::lift(direction),
+            joint => poses.rotation[joint].apply(Vec3::lift(direction)),
+        };
+        let in_world = |vector: Vector| match vector {
+            Vector::Difference => at.difference,
+            Vector::WithA(direction) => turned(points.a.joint, direction),
+            Vector::WithB(direction) => turned(points.b.joint, direction),
+        };
+        let (u, w) = (in_world(product.u), in_world(product.w));
+        Self { product, tree, poses, at, u, w }
+    }
+
+    pub(crate) fn value(&self) -> S {
+        self.u.dot(self.w)
+    }
+
+    /// Magnitude of what was subtracted, for round-off estimates.
+    pub(crate) fn magnitude(&self) -> f64 {
+        let magnitude = |vector, value: Vec3<S>| match vector {
+            Vector::Difference => self.at.magnitude,
+            _ => size(value),
+        };
+        magnitude(self.product.u, self.u) * magnitude(self.product.w, self.w)
+    }
+
+    /// Derivatives of `u` and `w` by the coordinate of a joint on the path.
+    fn gradients(&self, joint: &PathJoint) -> [Vec3<S>; 2] {
+        [(self.product.u, self.u), (self.product.w, self.w)].map(|(vector, value)| {
+            match (vector, joint.carries) {
+                (Vector::Difference, _) => joint.gradient(self.tree, self.poses, &self.at),
+                (Vector::WithA(_), Carries::A) | (Vector::WithB(_), Carries::B) => {
+                    self.poses.turned(self.tree, joint.joint, value)
+                }
+                _ => Vec3::ZERO,
+            }
+        })
+    }
+
+    /// Calls `entry(i, h_i)` for each joint on the path.
+    pub(crate) fn for_each_derivative(&self, mut entry: impl FnMut(usize, S)) {
+        for joint in &self.product.points.path {
+            let [u, w] = self.gradients(joint);
+            entry(joint.coordinate, u.dot(self.w) + self.u.dot(w));
+        }
+    }
+
+    /// Calls `entry(i, j, h_ij)` for each ordered pair of joints on the path.
+    pub(crate) fn for_each_second_derivative(&self, mut entry: impl FnMut(usize, usize, S)) {
+        let (tree, poses) = (self.tree, self.poses);
+        for row in &self.product.points.path {
+            let [row_u, row_w] = self.gradients(row);
+            for column in &self.product.points.path {
+                let [u, w] = self.gradients(column);
+                let u_second = row.second(row_u, tree, poses, (column, u));
+                let w_second = row.second(row_w, tree, poses, (column, w));
+                let mixed = row_u.dot(w) + u.dot(row_w);
+                let value = mixed + u_second.dot(self.w) + self.u.dot(w_second);
+                entry(row.coordinate, column.coordinate, value);
+            }
+        }
+    }
+}

@@ -1,0 +1,155 @@
+//! The exact linearization of a step of collocation, from all stages at once.
+//!
+//! With the residuals `R_i` and impulses `P_i` of the stages, and `θ = (q, p, inputs, k)`,
+//!
+//! ```text
+//! Y' = −(∂R/∂Y)⁻¹ R_θ        x' = Σ Y_i'        p[k+1]' = p' + Σ P_i,θ + (Σ ∂P_i/∂Y) Y'
+//! ```
+//!
+//! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
+
+use crate::integrator::collocation::Collocation;
+use crate::integrator::collocation::system::System;
+use crate::integrator::newton::{At, Workspace};
+use crate::linearization::linearize::Linearization;
+use crate::math::dense_inverse::DenseInverse;
+use crate::math::rows::{Term, add_rows, padded};
+use crate::plant::facade::StepError;
+
+/// The stages of a linearized step: what its second derivatives need.
+#[derive(Clone, Debug)]
+pub(crate) struct StageTangents {
+    pub(crate) time_step_s: f64,
+    pub(crate) nodes: Vec<f64>,
+    pub(crate) weights: Vec<f64>,
+    pub(crate) coupling: Vec<f64>,
+    /// `Q_i`, `V_i` and inputs, stage by stage.
+    pub(crate) q: Vec<f64>,
+    pub(crate) velocity: Vec<f64>,
+    pub(crate) inputs: Vec<f64>,
+    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `n s` padded rows: those of the stages of a
+    /// coordinate side by side.
+    pub(crate) tangent: Vec<f64>,
+    /// `∂P_i/∂θ`, the same way.
+    impulses: Vec<f64>,
+    /// `Σ ∂P_i/∂Y`, row-major, n by `n s`.
+    pub(crate) slopes: Vec<f64>,
+    /// The inverse of `∂R/∂Y`.
+    pub(crate) matrix: DenseInverse,
+    terms: Vec<Term>,
+}
+
+impl Collocation {
+    /// Linearizes at the solution.
+    pub(crate) fn linearize(
+        &mut self,
+        workspace: &mut Workspace,
+        at: At<'_>,
+        out: &mut Linearization,
+    ) -> Result<(), StepError> {
+        let model = at.model;
+        let d = model.dimensions;
+        let (count, n, nd) = (self.tableau.nodes.len(), d.coordinates(), d.dynamic);
+        let h = at.settings.time_step_s;
+        let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
+        let stride = padded((next + d.prescribed).max(1));
+        let system = self.system.get_or_insert_with(|| Box::new(System::new(model, &self.tableau)));
+        let mut tangents = out.take_stages().unwrap_or_else(|| {
+            Box::new(StageTangents {
+                time_step_s: h,
+                nodes: self.tableau.nodes.clone(),
+                weights: self.tableau.weights.clone(),
+                coupling: self.tableau.coupling.clone(),
+                q: vec![0.0; count * n],
+                velocity: vec![0.0; count * n],
+                inputs: vec![0.0; count * d.inputs],
+                tangent: vec![0.0; count * nd * stride],
+                impulses: vec![0.0; count * nd * stride],
+                slopes: vec![0.0; nd * count * nd],
+                matrix: system.matrix.clone(),
+                terms: Vec::new(),
+            })
+        });
+        system.begin(at, &self.motion, &self.inputs, &mut workspace.input_force);
+        system.evaluate(workspace, at, &self.inputs);
+        system.differentiate(workspace, at, &self.inputs);
+        for i in 0..count {
+            system.place(workspace, at.state, i);
+            tangents.q[i * n..][..n].copy_from_slice(&workspace.q_mid);
+            tangents.velocity[i * n..][..n].copy_from_slice(&workspace.velocity);
+        }
+        tangents.inputs.copy_from_slice(&self.inputs);
+        workspace.prepare(at);
+        system.fill_matrix(n);
+        if !system.matrix.invert() {
+            return Err(StepError::NotFinite { iterations: 0 });
+        }
+        let (hessian, width) = system.hessian();
+        let StageTangents { coupling, tangent, impulses, slopes, terms, .. } = &mut *tangents;
+        tangent.fill(0.0);
+        impulses.fill(0.0);
+        slopes.fill(0.0);
+        for j in 0..count {
+            let (weight, node) = (self.tableau.weights[j], self.tableau.nodes[j]);
+            let length = h * weight;
+            for a in 0..nd {
+                let row = &mut impulses[(a * count + j) * stride..][..stride];
+                let own = &mut tangent[(a * count + j) * stride..][..stride];
+                for b in 0..n {
+                    let entry = (a * n + b) * width + j;
+                    let (q, v) = (length * hessian.qq[entry], hessian.qv[entry]);
+                    let (p_q, p_v) = (hessian.vq[entry], hessian.vv[entry]);
+                    if b < nd {
+                        row[b] = q;
+                        own[b] = -p_q;
+                        slopes[a * count * nd + b * count + j] += v;
+                        for k in 0..count {
+                            slopes[a * count * nd + b * count + k] += q * coupling[j * count + k];
+                        }
+                    } else {
+                        row[b] = (1.0 - node) * q - weight * v;
+                        row[next + b - nd] = node * q + weight * v;
+                        own[b] = p_v / h - (1.0 - node) * p_q;
+                        own[next + b - nd] = -p_v / h - node * p_q;
+                    }
+                }
+                for input in 0..d.inputs {
+                    row[inputs + input] = length * hessian.qu[(a * d.inputs + input) * width + j];
+                }
+                own[momentum + a] = 1.0;
+            }
+        }
+        for i in 0..count {
+            for a in 0..nd {
+                terms.clear();
+                terms.extend((0..count).map(|j| (coupling[i * count + j], a * count + j)));
+                let target = &mut tangent[(a * count + i) * stride..][..stride];
+                add_rows(target, impulses, stride, terms);
+            }
+        }
+        system.matrix.solve_rows(tangent, stride);
+        tangent.iter_mut().for_each(|entry| *entry = -*entry);
+
+        out.begin_collocation(h);
+        let [mut increment, mut moved] = [0; 2].map(|_| vec![0.0; stride]);
+        for a in 0..nd {
+            increment.fill(0.0);
+            terms.clear();
+            terms.extend((0..count).map(|i| (1.0, a * count + i)));
+            add_rows(&mut increment, tangent, stride, terms);
+            moved.fill(0.0);
+            moved[momentum + a] = 1.0;
+            add_rows(&mut moved, impulses, stride, terms);
+            terms.clear();
+            let slopes = slopes[a * count * nd..][..count * nd].iter().copied();
+            terms.extend(slopes.zip(0..).filter(|(slope, _)| *slope != 0.0));
+            add_rows(&mut moved, tangent, stride, terms);
+            out.set_rows(a, [&increment, &moved]);
+        }
+
+        tangents.time_step_s = h;
+        tangents.matrix.take_inverse_of(&system.matrix);
+        out.keep_stages(tangents);
+        Ok(())
+    }
+}

@@ -1,0 +1,51 @@
+//! A linearization as the map of a linear-quadratic problem.
+
+use nalgebra::DMatrix;
+
+use crate::linearization::linearize::{InputImpulse, Linearization};
+use crate::math::sparse_map::Map;
+
+impl Linearization {
+    /// Writes `[B A]` without its zeros: rows of dynamic coordinates and momenta are full, those of
+    /// prescribed coordinates have an entry or two.
+    pub(crate) fn write_map(&self, map: &mut Map) {
+        let (nd, nk, ni) = (self.nd, self.nk, self.ni);
+        let (n, next, inputs) = (nd + nk, self.next_columns(), self.ni + self.nk);
+        if !self.turnings.is_empty() {
+            let (mut a, mut b) = (DMatrix::zeros(2 * n, 2 * n), DMatrix::zeros(2 * n, inputs));
+            self.write_a(&mut a);
+            self.write_b(&mut b);
+            map.set(&a, &b);
+            return;
+        }
+        map.begin((2 * n, 2 * n, inputs), 0..next, (0..nd).chain(n..n + nd));
+        for (part, numbers) in [&self.increment, &self.momentum].into_iter().enumerate() {
+            for (i, source) in numbers.chunks_exact(self.stride.max(1)).enumerate() {
+                let target = map.row_mut(part * nd + i);
+                let driven = self.driven(part * (nd + self.constraints()) + i);
+                target[..ni].fill(0.0);
+                target.iter_mut().zip(driven).for_each(|(target, entry)| *target = *entry);
+                for impulse in self.impulses() {
+                    let InputImpulse { input, coordinate, residual, momentum } = *impulse;
+                    target[input] += residual * source[n + coordinate];
+                    if part == 1 && coordinate == i {
+                        target[input] += momentum - residual;
+                    }
+                }
+                target[ni..inputs].copy_from_slice(&source[next..][..nk]);
+                target[inputs..][..next].copy_from_slice(&source[..next]);
+                if part == 0 {
+                    target[inputs + i] += 1.0;
+                }
+                self.replaced.iter().for_each(|column| target[*column] = 0.0);
+            }
+        }
+        for (first, entry) in [(nd, 1.0), (n + nd, 1.0 / self.time_step_s)] {
+            let driven = (0..nk).filter(|k| !self.replaced.contains(&(ni + k)));
+            driven.for_each(|k| map.push(first + k, ni + k, entry));
+        }
+        for k in 0..nk {
+            map.push(n + nd + k, inputs + nd + k, -1.0 / self.time_step_s);
+        }
+    }
+}

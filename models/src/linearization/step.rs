@@ -1,0 +1,375 @@
+//! Linearizes the step that is solved in a workspace.
+
+use crate::integrator::newton::{At, Workspace};
+use crate::kkt::{loops, planar};
+use crate::lagrangian::planar::PlanarTree;
+use crate::lagrangian::potentials;
+use crate::linearization::linearize::{Kind, Linearization};
+use crate::math::rows::{add_rows, add_rows_portable, padded};
+use crate::math::simd::wide;
+use crate::plant::facade::StepError;
+
+impl Workspace {
+    /// Takes the derivatives with ball joints.
+    fn take_turned(&mut self, out: &mut Linearization) {
+        let Some(blocks) = &self.turned else { return };
+        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
+        let (n, next) = (nd + nk, out.next_columns());
+        out.turnings.extend_from_slice(&blocks.turnings);
+        for place in &mut out.inputs {
+            let entry = place.coordinate * out.ni + place.input;
+            place.residual = blocks.residual_inputs[entry];
+            place.momentum = blocks.momentum_inputs[entry];
+        }
+        for i in 0..nd {
+            let row = i * n..(i + 1) * n;
+            let (increment, momentum) = (
+                &mut out.increment[i * stride..][..stride],
+                &mut out.momentum[i * stride..][..stride],
+            );
+            increment[..n].copy_from_slice(&blocks.residual_start[row.clone()]);
+            increment[next..][..nk].copy_from_slice(&blocks.residual_next[row.clone()][nd..]);
+            momentum[nd..n].copy_from_slice(&blocks.momentum_start[row.clone()][nd..]);
+            momentum[next..][..nk].copy_from_slice(&blocks.momentum_next[row.clone()][nd..]);
+            increment[n + i] = 1.0;
+            momentum[n + i] = 1.0;
+            self.stiffness[i * nd..][..nd]
+                .copy_from_slice(&blocks.momentum_start[row.clone()][..nd]);
+            self.end_slopes[i * nd..][..nd].copy_from_slice(&blocks.momentum_next[row][..nd]);
+        }
+    }
+
+    /// Linearizes at the solution in the workspace.
+    pub(crate) fn linearize(
+        &mut self,
+        at: At<'_>,
+        out: &mut Linearization,
+    ) -> Result<(), StepError> {
+        let d = at.model.dimensions;
+        out.kind = Kind::Step;
+        out.time_step_s = at.settings.time_step_s;
+        out.at_start = at.settings.force_split.at_start();
+        if self.factors.planar().is_some() {
+            self.linearize_by_generators(at, out)?;
+            out.solved.remember(self, at);
+            return Ok(());
+        }
+        if self.linearize_loops(at, out) {
+            out.solved.remember(self, at);
+            return Ok(());
+        }
+        self.factor_newton_matrix(at.model, at.settings)?;
+        self.fill_right_hand_sides(at, out);
+        // Without inertia, springs or forces on prescribed joints, the columns of `k` in r1' are zero.
+        let moving = !at.model.mixed_pairs.is_empty()
+            || at.model.potentials.couple_branches
+            || at.model.forces.is_some()
+            || !at.model.orientations.is_empty();
+        let columns = if moving { out.stride } else { padded(out.next_columns()) };
+        self.factors.matrix.solve_rows(
+            &at.model.elimination,
+            &mut out.increment,
+            out.stride,
+            columns,
+        );
+        if d.constraints > 0 {
+            self.prepare_start(at.model, at.state);
+            self.finish_end(at.model, at.state);
+            self.factor_schur(at.model, at.settings)?;
+            self.solve_multipliers(at, out);
+        }
+        self.differentiate_momentum(at, out);
+        out.solved.remember(self, at);
+        Ok(())
+    }
+
+    /// The same in O(n²), for planar trees without constraints and prescribed coordinates.
+    fn linearize_by_generators(
+        &mut self,
+        at: At<'_>,
+        out: &mut Linearization,
+    ) -> Result<(), StepError> {
+        let model = at.model;
+        self.factor_generators(model, at.settings)?;
+        self.fill_inputs(at, out);
+        let tree = self.mechanics.planar.as_deref().and_then(PlanarTree::many);
+        let (Some(tree), Some(joints), Some(generators)) =
+            (tree, &model.planar, self.factors.planar())
+        else {
+            return Ok(());
+        };
+        let [residual, momentum] = &self.diagonals;
+        let diagonal = planar::Diagonal { residual, momentum };
+        let (increment, momentum) = (&mut out.increment, &mut out.momentum);
+        generators.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
+        Ok(())
+    }
+
+    /// Impulses of inputs, and the diagonals of springs and dampers of coordinates.
+    fn fill_inputs(&mut self, at: At<'_>, out: &mut Linearization) {
+        let (model, h) = (at.model, at.settings.time_step_s);
+        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
+            place.momentum = h * input.gain;
+            place.residual = out.at_start * place.momentum;
+        }
+        let [residual, slope] = &mut self.diagonals;
+        if model.potentials.any {
+            residual.fill(0.0);
+            potentials::for_each_second_derivative(
+                &model.potentials,
+                &model.dynamics,
+                &self.mechanics.poses,
+                &self.q_mid,
+                |i, _, value| residual[i] -= 0.5 * h * value,
+            );
+        }
+        for (i, slope) in slope.iter_mut().enumerate() {
+            *slope = residual[i] - model.damping.get(i).copied().unwrap_or_default();
+        }
+    }
+
+    /// The same with loops, where their pivots allow it: O(n²) where their fronts do not grow.
+    fn linearize_loops(&mut self, at: At<'_>, out: &mut Linearization) -> bool {
+        let At { model, settings, state, .. } = at;
+        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
+        self.finish_end(model, state);
+        if !self.factor_loops(model, settings) {
+            return false;
+        }
+        self.start.hessian(model, &state.q, &self.multipliers, &mut self.constraint_hessian);
+        self.fill_inputs(at, out);
+        let tree = self.mechanics.planar.as_deref().and_then(PlanarTree::many);
+        let (Some(tree), Some(start), Some(end), Some(generators)) =
+            (tree, &self.start.in_plane, &self.end.in_plane, self.factors.loops())
+        else {
+            return false;
+        };
+        let [residual, momentum] = &self.diagonals;
+        let diagonal = planar::Diagonal { residual, momentum };
+        let closures =
+            loops::Closures { jacobian: &self.end.jacobian, hessian: &self.constraint_hessian };
+        let derivatives = loops::Derivatives {
+            increment: &mut out.increment,
+            momentum: &mut out.momentum,
+            multipliers: &mut out.multipliers,
+            stride: out.stride,
+        };
+        let mechanism = loops::Mechanism { loops, joints, tree, start, end };
+        generators.linearize(mechanism, &diagonal, &closures, derivatives);
+        true
+    }
+
+    wide! {
+        /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
+        pub(crate) fn fill_right_hand_sides(mut self, at: At<'_>, out: &mut Linearization) = fill_portable, fill_avx2;
+
+        /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
+        /// `out.momentum`.
+        pub(crate) fn differentiate_momentum(mut self, at: At<'_>, out: &mut Linearization)
+            = differentiate_momentum_portable, differentiate_momentum_avx2;
+    }
+
+    #[inline(always)]
+    fn fill_portable(&mut self, at: At<'_>, out: &mut Linearization) {
+        let model = at.model;
+        let h = at.settings.time_step_s;
+        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
+        out.increment.fill(0.0);
+        out.momentum.fill(0.0);
+        out.turnings.clear();
+        if !model.orientations.is_empty() {
+            self.evaluate_turned(model, at.settings, at.state);
+            self.take_turned(out);
+            return;
+        }
+        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
+            place.momentum = h * input.gain;
+            place.residual = out.at_start * place.momentum;
+        }
+        self.stiffness.fill(0.0);
+        self.end_slopes.fill(0.0);
+        for pair in &model.pairs {
+            let (i, j) = (pair.row as usize, pair.column as usize);
+            let second =
+                self.mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
+            let half = 0.5 * h * second.qq;
+            out.increment[i * stride + j] = half - second.v_above_q_below;
+            out.increment[j * stride + i] = half - second.q_above_v_below;
+            self.end_slopes[i * nd + j] = half + second.q_above_v_below;
+            self.end_slopes[j * nd + i] = half + second.v_above_q_below;
+            self.stiffness[i * nd + j] = h * second.qq;
+            self.stiffness[j * nd + i] = h * second.qq;
+        }
+        for pair in &model.mixed_pairs {
+            let second = self.mechanics.pair(model, pair.ancestor, pair.descendant);
+            let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
+            let descendant = model.dynamics.joints[pair.descendant].coordinate;
+            // Row of the dynamic coordinate, column of the prescribed one.
+            let (row, column, vq, qv) = if ancestor < nd {
+                (ancestor, descendant, second.v_above_q_below, second.q_above_v_below)
+            } else {
+                (descendant, ancestor, second.q_above_v_below, second.v_above_q_below)
+            };
+            let c_q = 0.25 * h * second.qq - 0.5 * vq;
+            let c_v = 0.5 * qv - second.vv / h;
+            let next = nd + column + nk;
+            out.increment[row * stride + column] += c_q - c_v;
+            out.increment[row * stride + next] += c_q + c_v;
+            out.momentum[row * stride + column] += 0.5 * h * second.qq - qv;
+            out.momentum[row * stride + next] += 0.5 * h * second.qq + qv;
+        }
+        self.add_springs(at, out);
+        self.add_forces(at, out);
+        self.add_constraint_hessian(at, out);
+        for i in 0..nd {
+            let momentum = i * stride + nd + nk + i;
+            out.increment[momentum] = 1.0;
+            out.momentum[momentum] += 1.0;
+        }
+    }
+
+    /// Springs add `−V_qq` to `L_qq`.
+    fn add_springs(&mut self, at: At<'_>, out: &mut Linearization) {
+        if !at.model.potentials.any {
+            return;
+        }
+        let model = at.model;
+        let h = at.settings.time_step_s;
+        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
+        let (stiffness, slopes) = (&mut self.stiffness, &mut self.end_slopes);
+        let mut add = |row: usize, column: usize, value: f64| {
+            if column < nd {
+                out.increment[row * stride + column] -= 0.5 * h * value;
+                slopes[row * nd + column] -= 0.5 * h * value;
+                stiffness[row * nd + column] -= h * value;
+            } else {
+                for column in [column, nd + column + nk] {
+                    out.increment[row * stride + column] -= 0.25 * h * value;
+                    out.momentum[row * stride + column] -= 0.5 * h * value;
+                }
+            }
+        };
+        potentials::for_each_second_derivative(
+            &model.potentials,
+            &model.dynamics,
+            &self.mechanics.poses,
+            &self.q_mid,
+            |i, j, value| {
+                if i < nd {
+                    add(i, j, value);
+                }
+            },
+        );
+    }
+
+    /// Forces add `a h f_q` to `C_q`, `a h f_v` to `C_v`, and `h (f_q q' + f_v v')` to `p[k+1]'`.
+    fn add_forces(&mut self, at: At<'_>, out: &mut Linearization) {
+        let Some(forces) = &at.model.forces else { return };
+        let h = at.settings.time_step_s;
+        let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
+        let mut slopes = std::mem::take(&mut self.end_slopes);
+        let mut stiffness = std::mem::take(&mut self.stiffness);
+        let instant = self.instant(at.model);
+        forces.for_each_derivative(&instant, |row, column, by_q, by_v| {
+            if row < nd && column < nd {
+                out.increment[row * stride + column] += a * h * by_q;
+                slopes[row * nd + column] += 0.5 * h * by_q + by_v;
+                stiffness[row * nd + column] += h * by_q;
+            } else if row < nd {
+                let half = 0.5 * h * by_q;
+                for (column, slope) in [(column, half - by_v), (nd + column + nk, half + by_v)] {
+                    out.increment[row * stride + column] += a * slope;
+                    out.momentum[row * stride + column] += slope;
+                }
+            }
+        });
+        let mut places = out.inputs[at.model.coordinate_inputs.len()..].iter_mut();
+        forces.for_each_input_derivative(&instant, |row, _, by_u| {
+            let place = if row < nd { places.next() } else { None };
+            if let Some(place) = place {
+                (place.residual, place.momentum) = (a * h * by_u, h * by_u);
+            }
+        });
+        (self.end_slopes, self.stiffness) = (slopes, stiffness);
+    }
+
+    /// The constraints' impulses turn with the start configuration.
+    fn add_constraint_hessian(&mut self, at: At<'_>, out: &mut Linearization) {
+        if at.model.dimensions.constraints == 0 {
+            return;
+        }
+        let model = at.model;
+        self.start.hessian(model, &at.state.q, &self.multipliers, &mut self.constraint_hessian);
+        let n = model.dimensions.coordinates();
+        for i in 0..out.nd {
+            let row = &self.constraint_hessian[i * n..][..n];
+            let range = i * out.stride..i * out.stride + n;
+            for (entry, value) in out.increment[range.clone()].iter_mut().zip(row) {
+                *entry -= value;
+            }
+            for (entry, value) in out.momentum[range].iter_mut().zip(row) {
+                *entry -= value;
+            }
+        }
+    }
+
+    /// From `K⁻¹ r1'` in `out.increment`: solves `S λ' = A1 K⁻¹ r1' − r2'` and subtracts `K⁻¹ A0ᵀ λ'`.
+    fn solve_multipliers(&mut self, at: At<'_>, out: &mut Linearization) {
+        let model = at.model;
+        let d = model.dimensions;
+        let (n, nd, nc, stride) = (d.coordinates(), d.dynamic, d.constraints, out.stride);
+        let next = out.next_columns();
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let jacobian = &self.end.jacobian[c * n..][..n];
+            let by_start = match &self.turned {
+                None => jacobian,
+                Some(blocks) => &blocks.end_jacobians()[0][c * n..][..n],
+            };
+            let target = &mut out.multipliers[c * stride..][..stride];
+            target.fill(0.0);
+            target.iter_mut().zip(&by_start[..nd]).for_each(|(t, entry)| *t = -entry);
+            target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
+            let dynamic = constraint.dynamic_coordinates().iter();
+            self.terms.clear();
+            self.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
+            add_rows(target, &out.increment, stride, &self.terms);
+        }
+        self.schur.solve_rows(&mut out.multipliers, stride);
+        for (i, target) in out.increment.chunks_exact_mut(stride).enumerate() {
+            let responses = self.responses[i * padded(nc)..][..nc].iter().enumerate();
+            self.terms.clear();
+            self.terms.extend(responses.map(|(c, r)| (-r, c)));
+            add_rows(target, &out.multipliers, stride, &self.terms);
+        }
+    }
+
+    #[inline(always)]
+    fn differentiate_momentum_portable(&mut self, at: At<'_>, out: &mut Linearization) {
+        for x in &mut out.increment {
+            *x = -*x;
+        }
+        let model = at.model;
+        let d = model.dimensions;
+        let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
+        if model.orientations.is_empty() {
+            for (i, c) in model.damping.iter().enumerate() {
+                self.end_slopes[i * nd + i] -= c;
+            }
+        }
+        for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
+            let stiffness = &self.stiffness[i * nd..][..nd];
+            target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
+            let slopes = self.end_slopes[i * nd..][..nd].iter().enumerate();
+            self.terms.clear();
+            self.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
+            add_rows_portable(target, &out.increment, stride, &self.terms);
+        }
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            for &i in constraint.dynamic_coordinates() {
+                let entry = self.start.jacobian[c * n + i];
+                let target = &mut out.momentum[i * stride..][..stride];
+                add_rows_portable(target, &out.multipliers, stride, &[(-entry, c)]);
+            }
+        }
+    }
+}

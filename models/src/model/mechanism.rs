@@ -1,0 +1,619 @@
+//! Models: compiled scenes.
+
+use std::fmt::Write as _;
+
+use crate::compile::loops::Loops;
+use crate::integrator::conditioning::Conditioning;
+use crate::math::elimination::Elimination;
+use crate::math::spatial::{Force, Vec3};
+use crate::math::spline::Spline;
+use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
+use crate::model::signal::{Signal, Target};
+use crate::model::tree::{Attachment, JointKind, Tree};
+use crate::scene::{CoordinateKind, Scene};
+
+/// A compiled scene: immutable, shared by all plants made from it.
+#[derive(Debug)]
+pub struct Model {
+    pub(crate) scene: Scene,
+    pub(crate) dimensions: Dimensions,
+    pub(crate) coordinates: Vec<Coordinate>,
+    /// First of the three coordinates of each orientation (ball joint).
+    pub(crate) orientations: Vec<usize>,
+    pub(crate) constraint_names: Vec<String>,
+    pub(crate) operating_points: Vec<OperatingPoint>,
+    pub(crate) digest: u64,
+    /// Joints that carry inertia or springs: what a step walks at the midpoint.
+    pub(crate) dynamics: Tree,
+    /// The same as a planar tree, where it is one and nothing needs its poses in space.
+    pub(crate) planar: Option<PlanarJoints>,
+    /// Its loops, where they are eliminated with it.
+    pub(crate) loops: Option<Loops>,
+    /// How a step solves for corrections.
+    pub(crate) solver: Solver,
+    /// `None` without gravity.
+    pub(crate) gravity: Option<Vec3>,
+    /// Damping of each dynamic coordinate; empty without damping.
+    pub(crate) damping: Vec<f64>,
+    /// Forces of inputs on coordinates.
+    pub(crate) coordinate_inputs: Vec<CoordinateInput>,
+    /// Forces other than those of springs, damping and inputs on coordinates; `None` without any.
+    pub(crate) forces: Option<Forces>,
+    pub(crate) signals: Vec<Signal>,
+    pub(crate) potentials: Potentials,
+    /// Joints that points of constraints depend on: what a step walks at its ends.
+    pub(crate) closure: Tree,
+    pub(crate) constraints: Vec<Constraint>,
+    pub(crate) alignments: Vec<Alignment>,
+    pub(crate) elimination: Elimination,
+    /// Ancestor and descendant pairs of dynamic coordinates, with their place in the factorization.
+    pub(crate) pairs: Vec<Pair>,
+    /// Ancestor and descendant pairs of which exactly one is prescribed.
+    pub(crate) mixed_pairs: Vec<MixedPair>,
+    /// What pivots are compared with.
+    pub(crate) conditioning: Conditioning,
+    pub(crate) initial_violations: Vec<Violation>,
+}
+
+/// An equation of a constraint that a configuration violates.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Violation {
+    /// Name of the equation.
+    pub constraint: String,
+    /// Its value `h(q)`.
+    pub value: f64,
+}
+
+/// How a step solves with its Newton matrix.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Solver {
+    /// Entry by entry along the elimination tree: O(n·depth²) once, O(n·depth) for each correction.
+    Tree,
+    /// By the vectors that generate the entries: O(n). In planes, or in space.
+    Planar,
+    Spatial,
+    /// By generators in planes, together with the constraints, front by front.
+    Loops,
+}
+
+impl Solver {
+    /// Coordinates from which on generators are faster in planes.
+    const MANY: usize = 4;
+    /// Stored entries a row, on average, above which they are in space. A step took so many thousand
+    /// instructions with the elimination tree and with generators:
+    ///
+    /// ```text
+    /// chains of hinges about x and y by turns      8: 36, 33   16: 100, 66   32: 355, 173   128: 8099, 920
+    /// tree-N, of 4, 5 and 6 entries a row          30: 120, 114   63: 270, 236   127: 618, 502
+    /// ```
+    ///
+    /// Generators of joints on one path wait for each other: in time they are even at 5 entries.
+    const DEEP: usize = 6;
+
+    /// The fastest one for a scene; `needs_poses` where springs between points or forces act.
+    pub(crate) fn of(
+        tree: &Tree,
+        elimination: &Elimination,
+        planar: Option<&[PlanarJoint]>,
+        needs_poses: bool,
+        d: Dimensions,
+    ) -> Self {
+        let joints = tree.joints.iter().map(|joint| joint.coordinate);
+        if d.constraints > 0 || d.prescribed > 0 || !joints.eq(0..d.dynamic) {
+            return Self::Tree;
+        }
+        if planar.is_some() {
+            return if d.dynamic >= Self::MANY { Self::Planar } else { Self::Tree };
+        }
+        let is_generated = !needs_poses
+            && tree.joints.iter().all(|joint| !matches!(joint.kind, JointKind::Ball(_)));
+        if is_generated && elimination.entries() > Self::DEEP * d.dynamic {
+            Self::Spatial
+        } else {
+            Self::Tree
+        }
+    }
+}
+
+/// Two dynamic joints on one path to the root, or one joint twice.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pair {
+    /// Joint in `dynamics`.
+    pub(crate) ancestor: u32,
+    /// Joint in `dynamics`.
+    pub(crate) descendant: u32,
+    /// Coordinate of the ancestor.
+    pub(crate) row: u32,
+    /// Coordinate of the descendant.
+    pub(crate) column: u32,
+    /// Place in the factorization.
+    pub(crate) slot: u32,
+}
+
+/// A pair of joints of the dynamics tree of which exactly one is prescribed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct MixedPair {
+    pub(crate) ancestor: usize,
+    pub(crate) descendant: usize,
+}
+
+/// The springs, by kind.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Potentials {
+    pub(crate) coordinate_springs: Vec<CoordinateSpring>,
+    pub(crate) point_springs: Vec<PointSpring>,
+    pub(crate) spline_springs: Vec<SplineSpring>,
+    pub(crate) path_springs: Vec<PathSpring>,
+    /// There is one at all.
+    pub(crate) any: bool,
+    /// Some spring may couple coordinates that are not on one path to the root, or prescribed ones.
+    pub(crate) couple_branches: bool,
+}
+
+impl Potentials {
+    /// Some spring is neither of a coordinate nor of two points.
+    pub(crate) fn has_other_springs(&self) -> bool {
+        !self.spline_springs.is_empty() || !self.path_springs.is_empty()
+    }
+
+    pub(crate) fn count(&self) -> usize {
+        self.coordinate_springs.len()
+            + self.point_springs.len()
+            + self.spline_springs.len()
+            + self.path_springs.len()
+    }
+}
+
+/// `f = gain u` on a coordinate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct CoordinateInput {
+    pub(crate) input: usize,
+    pub(crate) coordinate: usize,
+    pub(crate) gain: f64,
+}
+
+/// Forces that are evaluated at the midpoint of a step.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Forces {
+    pub(crate) wrenches: Vec<Wrench>,
+    pub(crate) point_forces: Vec<PointForce>,
+    pub(crate) coordinate_forces: Vec<CoordinateForce>,
+}
+
+/// A wrench on a joint that carries a body.
+#[derive(Clone, Debug)]
+pub(crate) struct Wrench {
+    pub(crate) kind: WrenchKind,
+    /// The joint and a point of it; for a wrench that moves or turns with the joint, where it acts.
+    pub(crate) at: Attachment,
+    /// The joint and those above it, root first.
+    pub(crate) path: Vec<usize>,
+    /// Constant part; in the joint's axes if it turns with the joint, else in world axes.
+    pub(crate) constant: Force,
+    /// Inputs, and the wrench of a unit of each.
+    pub(crate) inputs: Vec<(usize, Force)>,
+}
+
+/// How a wrench moves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum WrenchKind {
+    /// With the joint, at its point.
+    Body,
+    /// Not at all: about the world's origin.
+    Spatial,
+    /// Its point moves with the joint, its axes are those of the world.
+    Hybrid,
+}
+
+/// A force between two points that follows from their separation and its rate.
+#[derive(Clone, Debug)]
+pub(crate) struct PointForce {
+    pub(crate) ends: PointPair,
+    pub(crate) law: PointLaw,
+}
+
+/// The force on the first point of a pair, `d = a − b`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum PointLaw {
+    /// `F = −c e (e·ḋ)`, `e = d/|d|`.
+    Damper(f64),
+    /// `F = −c |ḋ| ḋ`.
+    Drag(f64),
+}
+
+/// A force on a coordinate that follows from its velocity.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct CoordinateForce {
+    pub(crate) coordinate: usize,
+    pub(crate) law: CoordinateLaw,
+}
+
+/// The force on a coordinate of velocity `v`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum CoordinateLaw {
+    /// `f = −c |v| v`.
+    Drag(f64),
+    /// `f = −force tanh(v / velocity)`.
+    Friction { force: f64, velocity: f64 },
+}
+
+/// `V = ½ k (q − rest)²`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct CoordinateSpring {
+    pub(crate) coordinate: usize,
+    pub(crate) stiffness: f64,
+    pub(crate) rest: f64,
+}
+
+/// `V = ½ k (|a − b| − rest)²`.
+#[derive(Clone, Debug)]
+pub(crate) struct PointSpring {
+    pub(crate) ends: PointPair,
+    pub(crate) stiffness: f64,
+    pub(crate) rest_length: f64,
+}
+
+/// `V = −∫ force dq`.
+#[derive(Clone, Debug)]
+pub(crate) struct SplineSpring {
+    pub(crate) coordinate: usize,
+    pub(crate) force: Spline,
+}
+
+/// `V = ½ k (L − rest)²`, `L` the sum of the lengths of the segments.
+#[derive(Clone, Debug)]
+pub(crate) struct PathSpring {
+    pub(crate) segments: Vec<PointPair>,
+    pub(crate) stiffness: f64,
+    pub(crate) rest_length: f64,
+}
+
+/// Two points and the joints that move one against the other.
+#[derive(Clone, Debug)]
+pub(crate) struct PointPair {
+    pub(crate) a: Attachment,
+    pub(crate) b: Attachment,
+    /// Joints on the path between the points, ancestors before descendants. Joints that carry both
+    /// points change neither their distance nor what else turns with both bodies, and drop out; but
+    /// where a world axis is involved, those of them that turn come first.
+    pub(crate) path: Vec<PathJoint>,
+}
+
+/// A joint on the path between two points.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PathJoint {
+    pub(crate) joint: usize,
+    pub(crate) coordinate: usize,
+    pub(crate) carries: Carries,
+}
+
+/// Which of two points a joint carries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Carries {
+    A,
+    B,
+    Both,
+}
+
+/// One constraint equation.
+#[derive(Clone, Debug)]
+pub(crate) struct Constraint {
+    pub(crate) kind: ConstraintKind,
+    /// Coordinates that it depends on, but for a prescribed length; dynamic ones first.
+    pub(crate) coordinates: Vec<usize>,
+    /// How many of them are dynamic.
+    pub(crate) dynamic: usize,
+}
+
+impl Constraint {
+    /// Dynamic coordinates that the equation depends on.
+    #[inline(always)]
+    pub(crate) fn dynamic_coordinates(&self) -> &[usize] {
+        &self.coordinates[..self.dynamic]
+    }
+}
+
+/// What a constraint equation says.
+#[derive(Clone, Debug)]
+pub(crate) enum ConstraintKind {
+    /// `|d|² − length² = 0`.
+    Distance(PointPair, Length),
+    /// `d · axis = 0`; the axis is a world axis.
+    Axis(PointPair, usize),
+    /// `u · w = 0`.
+    Product(Product),
+    /// `Σ |d_s| − length = 0` over the segments of a path.
+    PathLength(Vec<PointPair>, Length),
+    /// `Σ_j Σ_k c_jk q_j^k + constant = 0`.
+    Coupling(Vec<Polynomial>, f64),
+}
+
+/// A length.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Length {
+    Fixed(f64),
+    /// A prescribed coordinate.
+    Driven(usize),
+}
+
+/// The scalar product of two vectors that belong to two points and the bodies that carry them.
+#[derive(Clone, Debug)]
+pub(crate) struct Product {
+    pub(crate) points: PointPair,
+    pub(crate) u: Vector,
+    pub(crate) w: Vector,
+}
+
+/// A vector that belongs to two points.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Vector {
+    /// `a − b`.
+    Difference,
+    /// Fixed in the frame of the joint that carries `a`.
+    WithA(Vec3),
+    /// Fixed in the frame of the joint that carries `b`.
+    WithB(Vec3),
+}
+
+/// `Σ_k c_k q^k`, powers from 1.
+#[derive(Clone, Debug)]
+pub(crate) struct Polynomial {
+    pub(crate) coordinate: usize,
+    pub(crate) coefficients: Vec<f64>,
+}
+
+/// Two frames that constraints keep aligned.
+#[derive(Clone, Debug)]
+pub(crate) struct Alignment {
+    /// Name of the constraint.
+    pub(crate) name: String,
+    /// `x_a·x_b, y_a·y_b, z_a·z_b`.
+    pub(crate) axes: [Product; 3],
+}
+
+/// Sizes of a model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Dimensions {
+    /// Dynamic coordinates, `nd`.
+    pub dynamic: usize,
+    /// Prescribed coordinates, `nk`.
+    pub prescribed: usize,
+    /// Generalized-force inputs, `ni`.
+    pub inputs: usize,
+    /// Constraint equations, `nc`.
+    pub constraints: usize,
+}
+
+impl Dimensions {
+    /// Coordinates, `nd + nk`.
+    pub fn coordinates(&self) -> usize {
+        self.dynamic + self.prescribed
+    }
+    /// Entries of `x = (q, p, v)`: `2 nd + 2 nk`.
+    pub fn state(&self) -> usize {
+        2 * self.coordinates()
+    }
+    /// Where the momentum stands in `x`.
+    pub fn momentum(&self) -> std::ops::Range<usize> {
+        self.coordinates()..self.coordinates() + self.dynamic
+    }
+    /// Entries of `u = (inputs, next prescribed positions)`: `ni + nk`.
+    pub fn input(&self) -> usize {
+        self.inputs + self.prescribed
+    }
+}
+
+/// A coordinate of a model.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Coordinate {
+    /// Name.
+    pub name: String,
+    /// Dynamic or prescribed.
+    pub kind: CoordinateKind,
+    /// Angle (rad) or length (m).
+    pub is_angle: bool,
+    /// Value in the scene's initial configuration.
+    pub initial: f64,
+}
+
+/// A configuration to hold, with the input that holds it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OperatingPoint {
+    /// Name.
+    pub name: String,
+    /// Configuration, `nd + nk`.
+    pub q: Vec<f64>,
+    /// Input `u`, `ni + nk`: forces, then the prescribed positions of `q`.
+    pub u: Vec<f64>,
+}
+
+impl Model {
+    /// The scene it was compiled from.
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// Sizes.
+    pub fn dimensions(&self) -> Dimensions {
+        self.dimensions
+    }
+
+    /// Coordinates: dynamic ones in depth-first order, then prescribed ones as listed.
+    pub fn coordinates(&self) -> &[Coordinate] {
+        &self.coordinates
+    }
+
+    /// Names of the constraint equations, in the order of the multipliers; for example `elbow.x`.
+    pub fn constraint_names(&self) -> &[String] {
+        &self.constraint_names
+    }
+
+    /// Operating points, first one `initial`: the initial configuration without input forces.
+    pub fn operating_points(&self) -> &[OperatingPoint] {
+        &self.operating_points
+    }
+
+    /// Equations that the scene's initial configuration violates by more than a millionth of the lengths
+    /// involved: with any, that configuration is only a guess, and a plant has to start elsewhere.
+    pub fn initial_violations(&self) -> &[Violation] {
+        &self.initial_violations
+    }
+
+    /// First of the three coordinates of each orientation (ball joint): a rotation vector.
+    pub fn orientations(&self) -> &[usize] {
+        &self.orientations
+    }
+
+    /// Index of a coordinate.
+    pub fn coordinate_index(&self, name: &str) -> Option<usize> {
+        self.coordinates.iter().position(|c| c.name == name)
+    }
+
+    /// A hash of everything that the motion depends on; equal for equal scenes.
+    pub fn digest(&self) -> u64 {
+        self.digest
+    }
+
+    /// Entries of `u` that signals replace.
+    pub(crate) fn replaced_inputs(&self) -> impl Iterator<Item = usize> {
+        self.signals.iter().filter_map(|signal| match signal.target {
+            Target::Input(_) => None,
+            Target::Prescribed(k) => Some(self.dimensions.inputs + k),
+        })
+    }
+
+    /// Dynamic coordinates and the inputs that act on them: inputs on coordinates, then inputs of
+    /// forces, in the order of [`Forces::for_each_input_derivative`]. A ball joint mixes its rows: with
+    /// one, all pairs.
+    pub(crate) fn input_pattern(&self) -> impl Iterator<Item = (usize, usize)> {
+        let d = self.dimensions;
+        let dense = if self.orientations.is_empty() { 0 } else { d.dynamic * d.inputs };
+        let all = (0..dense).map(move |entry| (entry / d.inputs, entry % d.inputs));
+        let sparse = if dense == 0 { usize::MAX } else { 0 };
+        let on_coordinates = self.coordinate_inputs.iter().map(|i| (i.coordinate, i.input));
+        let wrenches = self.forces.iter().flat_map(|forces| &forces.wrenches);
+        let of_forces = wrenches.flat_map(move |wrench| {
+            wrench.inputs.iter().flat_map(move |&(input, _)| {
+                wrench.path.iter().map(move |&j| (self.dynamics.joints[j].coordinate, input))
+            })
+        });
+        let of_forces = of_forces.filter(move |(coordinate, _)| *coordinate < d.dynamic);
+        all.chain(on_coordinates.chain(of_forces).take(sparse))
+    }
+
+    /// What a step evaluates and what it skips, for people to read.
+    pub fn plan(&self) -> String {
+        let d = self.dimensions;
+        let mut plan = String::new();
+        let mut line = |text: String| {
+            let _ = writeln!(plan, "{text}");
+        };
+        line(format!(
+            "coordinates   {} dynamic, {} prescribed; state {}, input {}",
+            d.dynamic,
+            d.prescribed,
+            d.state(),
+            d.input()
+        ));
+        let joints = &self.dynamics.joints;
+        let count = |is: fn(&JointKind) -> bool| joints.iter().filter(|j| is(&j.kind)).count();
+        let kinds = [
+            ("revolute", count(|kind| matches!(kind, JointKind::Revolute))),
+            ("prismatic", count(|kind| matches!(kind, JointKind::Prismatic))),
+            ("screw", count(|kind| matches!(kind, JointKind::Screw(_)))),
+            ("of ball joints", count(|kind| matches!(kind, JointKind::Ball(_)))),
+        ];
+        let kinds = kinds.iter().filter(|(_, n)| *n > 0).map(|(kind, n)| format!("{n} {kind}"));
+        line(format!(
+            "midpoint      {}, {} axes of {} moving frames: {}",
+            if self.planar.is_some() { "in the plane" } else { "in space" },
+            joints.len(),
+            self.scene.frames.iter().filter(|f| !f.motions().is_empty()).count(),
+            kinds.collect::<Vec<_>>().join(", ")
+        ));
+        let islands = self.elimination.islands();
+        let islands = format!("{islands} {}", if islands == 1 { "island" } else { "islands" });
+        line(match self.solver {
+            Solver::Tree => format!(
+                "factorization tree-sparse, {} entries of {} in each triangle, {islands}",
+                self.elimination.entries(),
+                d.dynamic * (d.dynamic + 1) / 2,
+            ),
+            Solver::Loops => {
+                let plan = self.loops.as_ref().map(|loops| &loops.plan);
+                let most = plan.and_then(|plan| plan.fronts.iter().max()).copied().unwrap_or(0);
+                format!(
+                    "factorization by generators with loops, {} joints in fronts of up to {most} rows, {islands}",
+                    joints.len()
+                )
+            }
+            Solver::Planar | Solver::Spatial => {
+                format!("factorization by generators, {} joints, {islands}", joints.len())
+            }
+        });
+        let skipped = |is: bool| if is { "" } else { " (skipped)" };
+        line(format!(
+            "gravity       {}",
+            if self.gravity.is_some() { "uniform" } else { "none (skipped)" }
+        ));
+        let springs = self.potentials.count();
+        line(format!(
+            "springs       {springs}: {} coordinate, {} two-point, {} spline, {} path{}",
+            self.potentials.coordinate_springs.len(),
+            self.potentials.point_springs.len(),
+            self.potentials.spline_springs.len(),
+            self.potentials.path_springs.len(),
+            skipped(springs > 0)
+        ));
+        let damped = self.damping.iter().filter(|c| **c != 0.0).count();
+        line(format!("damping       {damped} coordinates{}", skipped(damped > 0)));
+        line(format!("inputs        {}{}", d.inputs, skipped(d.inputs > 0)));
+        line(match &self.forces {
+            None => "forces        0 (skipped)".to_owned(),
+            Some(forces) => format!(
+                "forces        {} wrenches, {} between points, {} on coordinates",
+                forces.wrenches.len(),
+                forces.point_forces.len(),
+                forces.coordinate_forces.len()
+            ),
+        });
+        let on_inputs = |s: &&Signal| matches!(s.target, Target::Input(_));
+        let on_inputs = self.signals.iter().filter(on_inputs).count();
+        line(match self.signals.len() {
+            0 => "signals       0 (skipped)".to_owned(),
+            n => format!("signals       {on_inputs} on inputs, {} on coordinates", n - on_inputs),
+        });
+        let equations = |is: fn(&ConstraintKind) -> bool| {
+            self.constraints.iter().filter(|constraint| is(&constraint.kind)).count()
+        };
+        line(format!(
+            "constraints   {} equations over {} joints: {} distance, {} axis, {} product, {} path, {} coupling{}",
+            d.constraints,
+            self.closure.joints.len(),
+            equations(|kind| matches!(kind, ConstraintKind::Distance(..))),
+            equations(|kind| matches!(kind, ConstraintKind::Axis(..))),
+            equations(|kind| matches!(kind, ConstraintKind::Product(_))),
+            equations(|kind| matches!(kind, ConstraintKind::PathLength(..))),
+            equations(|kind| matches!(kind, ConstraintKind::Coupling(..))),
+            skipped(d.constraints > 0)
+        ));
+        let stages = self.stage_costs();
+        let step: f64 = stages.iter().map(|stage| stage.times * stage.instructions).sum();
+        line(format!("cost          about {:.1} thousand instructions a step:", step / 1e3));
+        for stage in stages {
+            let (share, thousands) =
+                (stage.times * stage.instructions / step, stage.instructions / 1e3);
+            line(match stage.times {
+                0.0 => format!("  {:<20}and {thousands:.1} more", stage.name),
+                times => {
+                    format!(
+                        "  {:<20}{times:.1} × {thousands:.1}, {:.0} %",
+                        stage.name,
+                        100.0 * share
+                    )
+                }
+            });
+        }
+        plan
+    }
+}

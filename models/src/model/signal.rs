@@ -1,0 +1,221 @@
+//! Signals: functions of time that drive inputs and prescribed coordinates.
+//!
+//! Time is the step index times the time step, so that a motion goes on the same after a snapshot.
+
+use std::f64::consts::TAU;
+
+use crate::math::spline::Spline;
+use crate::math::trigonometry::sin_cos_of;
+use crate::scene;
+use crate::scene::signals::Interpolation;
+
+/// A signal with what it drives.
+#[derive(Clone, Debug)]
+pub(crate) struct Signal {
+    pub(crate) target: Target,
+    shape: Shape,
+}
+
+/// What a signal drives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Target {
+    /// Adds to an input.
+    Input(usize),
+    /// Replaces a prescribed position, counted among the prescribed coordinates.
+    Prescribed(usize),
+}
+
+#[derive(Clone, Debug)]
+enum Shape {
+    Constant(f64),
+    /// Angular frequency in rad/s.
+    Sinusoid {
+        amplitude: f64,
+        frequency: f64,
+        phase: f64,
+        offset: f64,
+    },
+    /// Angular frequency at the start and its rate, until `duration`.
+    Chirp {
+        amplitude: f64,
+        frequency: f64,
+        rate: f64,
+        duration: f64,
+        offset: f64,
+    },
+    /// Stays before `first` and after `last`.
+    Spline {
+        spline: Spline,
+        first: f64,
+        last: f64,
+    },
+    Table {
+        times: Vec<f64>,
+        values: Vec<f64>,
+        linear: bool,
+        repeat: bool,
+    },
+}
+
+impl Signal {
+    /// From a signal of a scene that has been validated.
+    pub(crate) fn new(target: Target, signal: &scene::Signal) -> Self {
+        Self { target, shape: Shape::new(signal) }
+    }
+
+    /// Value at time `t`, s.
+    pub(crate) fn at(&self, t: f64) -> f64 {
+        self.shape.at(t)
+    }
+}
+
+impl scene::Signal {
+    /// Value at `t = 0` of a signal without problems.
+    pub(crate) fn initial(&self) -> f64 {
+        Shape::new(self).at(0.0)
+    }
+}
+
+impl Shape {
+    fn new(signal: &scene::Signal) -> Self {
+        match signal {
+            scene::Signal::Constant { value, .. } => Self::Constant(*value),
+            scene::Signal::Sinusoid { amplitude, frequency_hz, phase_rad, offset, .. } => {
+                Self::Sinusoid {
+                    amplitude: *amplitude,
+                    frequency: TAU * frequency_hz,
+                    phase: *phase_rad,
+                    offset: *offset,
+                }
+            }
+            scene::Signal::Chirp { amplitude, start_hz, end_hz, duration_s, offset, .. } => {
+                Self::Chirp {
+                    amplitude: *amplitude,
+                    frequency: TAU * start_hz,
+                    rate: TAU * (end_hz - start_hz) / duration_s,
+                    duration: *duration_s,
+                    offset: *offset,
+                }
+            }
+            scene::Signal::Spline { knots, .. } => Self::Spline {
+                spline: Spline::new(knots).expect("validation refuses knots that make no spline"),
+                first: knots[0].x,
+                last: knots[knots.len() - 1].x,
+            },
+            scene::Signal::Table { times_s, values, interpolation, repeat, .. } => Self::Table {
+                times: times_s.clone(),
+                values: values.clone(),
+                linear: *interpolation == Interpolation::Linear,
+                repeat: *repeat,
+            },
+        }
+    }
+
+    fn at(&self, t: f64) -> f64 {
+        match self {
+            Self::Constant(value) => *value,
+            Self::Sinusoid { amplitude, frequency, phase, offset } => {
+                offset + amplitude * sin_cos_of(frequency * t + phase).0
+            }
+            Self::Chirp { amplitude, frequency, rate, duration, offset } => {
+                let swept = t.min(*duration);
+                let phase = frequency * t + rate * swept * (t - 0.5 * swept);
+                offset + amplitude * sin_cos_of(phase).0
+            }
+            Self::Spline { spline, first, last } => spline.value(t.clamp(*first, *last)),
+            Self::Table { times, values, linear, repeat } => {
+                let (first, last) = (times[0], times[times.len() - 1]);
+                let t = if *repeat { first + (t - first).rem_euclid(last - first) } else { t };
+                table(times, values, *linear, t)
+            }
+        }
+    }
+}
+
+/// Value of a table at `t`: binary search, then the earlier value or a straight line.
+fn table(times: &[f64], values: &[f64], linear: bool, t: f64) -> f64 {
+    let after = times.partition_point(|time| *time <= t);
+    match (after.checked_sub(1), linear && after < times.len()) {
+        (None, _) => values[0],
+        (Some(before), false) => values[before],
+        (Some(before), true) => {
+            let part = (t - times[before]) / (times[after] - times[before]);
+            values[before] + part * (values[after] - values[before])
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parsed(text: &str) -> Shape {
+        Shape::new(&toml::from_str(&format!("drives = \"u\"\n{text}")).unwrap())
+    }
+
+    #[test]
+    fn sinusoid_has_amplitude_frequency_phase_and_mean() {
+        let signal = parsed(
+            "type = \"sinusoid\"\namplitude = 2.0\nfrequency_hz = 0.5\nphase_rad = 0.3\noffset = 1.0",
+        );
+        for t in [0.0, 0.1, 1.7, 20.0] {
+            let expected = 1.0 + 2.0 * (std::f64::consts::PI * t + 0.3).sin();
+            assert!((signal.at(t) - expected).abs() < 1e-13, "{t}");
+        }
+    }
+
+    /// The frequency between two rising zeros is that of the middle, and constant after the sweep.
+    #[test]
+    fn chirp_sweeps_linearly_and_then_stays() {
+        let signal = parsed(
+            "type = \"chirp\"\namplitude = 1.0\nstart_hz = 1.0\nend_hz = 3.0\nduration_s = 10.0",
+        );
+        let step = 1e-4;
+        let rising: Vec<f64> = (0..150_000)
+            .map(|k| f64::from(k) * step)
+            .filter(|t| signal.at(*t) < 0.0 && signal.at(t + step) >= 0.0)
+            .collect();
+        for pair in rising.windows(2) {
+            let (middle, frequency) = (0.5 * (pair[0] + pair[1]), 1.0 / (pair[1] - pair[0]));
+            let expected = if middle < 10.0 { 1.0 + 0.2 * middle } else { 3.0 };
+            assert!((frequency - expected).abs() < 0.02, "{frequency} Hz at {middle} s");
+        }
+        assert!(rising.len() > 30);
+    }
+
+    #[test]
+    fn spline_goes_through_its_knots_and_stays_at_its_ends() {
+        let signal = parsed(
+            "type = \"spline\"\nknots = [{ x = 1.0, value = 3.0, slope = 0.0 }, { x = 2.0, value = 5.0 }, { x = 4.0, value = 1.0, slope = 7.0 }]",
+        );
+        for (t, value) in [(0.0, 3.0), (1.0, 3.0), (2.0, 5.0), (4.0, 1.0), (9.0, 1.0)] {
+            assert!((signal.at(t) - value).abs() < 1e-12, "{t}");
+        }
+        assert!((signal.at(4.0) - signal.at(4.0 - 1e-6) - 7e-6).abs() < 1e-10);
+    }
+
+    #[test]
+    fn table_holds_or_goes_straight_and_stays_at_its_ends() {
+        let points = "type = \"table\"\ntimes_s = [1.0, 2.0, 4.0]\nvalues = [3.0, 5.0, 1.0]";
+        let cases = [(0.0, 3.0, 3.0), (1.0, 3.0, 3.0), (1.5, 3.0, 4.0), (2.0, 5.0, 5.0)];
+        let (hold, linear) =
+            (parsed(points), parsed(&format!("{points}\ninterpolation = \"linear\"")));
+        for (t, held, straight) in
+            cases.into_iter().chain([(3.0, 5.0, 3.0), (4.0, 1.0, 1.0), (9.0, 1.0, 1.0)])
+        {
+            assert_eq!((hold.at(t), linear.at(t)), (held, straight), "{t}");
+        }
+    }
+
+    #[test]
+    fn repeated_table_starts_again_at_its_last_time() {
+        let points = "type = \"table\"\ntimes_s = [0.5, 1.0, 2.0]\nvalues = [3.0, 5.0, 1.0]";
+        let signal = parsed(&format!("{points}\nrepeat = true\ninterpolation = \"linear\""));
+        for t in [0.5, 0.6, 1.2, 1.9] {
+            for round in [-1.0, 1.0, 7.0] {
+                assert!((signal.at(t + 1.5 * round) - signal.at(t)).abs() < 1e-12, "{t}");
+            }
+        }
+        assert_eq!((signal.at(2.0), signal.at(0.0)), (3.0, 3.0));
+    }
+}

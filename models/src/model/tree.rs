@@ -1,0 +1,149 @@
+//! The joint tree as a step walks it: depth first, fixed joints merged into their parents, every
+//! joint turned so that its axis is its own z axis.
+
+use crate::math::spatial::{Mat3, Sym3, Vec3};
+
+/// "No parent": the joint hangs from the world.
+pub(crate) const WORLD: usize = usize::MAX;
+
+/// Kind of a moving joint.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum JointKind {
+    /// Turns about its z axis.
+    Revolute,
+    /// Slides along its z axis.
+    Prismatic,
+    /// Turns about its z axis and slides along it, by so many metres a radian.
+    Screw(f64),
+    /// Turns about all axes. A ball joint is three entries in a row, numbered 0, 1, 2, with the pose of
+    /// the whole joint, turned so that the z axis of entry `a` is the joint's own axis `a`. Their
+    /// velocities are the components of the angular velocity in the joint's own axes.
+    Ball(usize),
+}
+
+/// A moving joint with everything that is fixed to it.
+#[derive(Clone, Debug)]
+pub(crate) struct Joint {
+    /// Index of the parent joint, smaller than the joint's own, or [`WORLD`].
+    pub(crate) parent: usize,
+    /// Index of the root of the joint's tree.
+    pub(crate) root: usize,
+    pub(crate) kind: JointKind,
+    /// Pose of the joint at zero in the parent joint's frame.
+    pub(crate) rotation: Mat3,
+    pub(crate) translation: Vec3,
+    /// Index of the coordinate.
+    pub(crate) coordinate: usize,
+    /// Index of the orientation of a ball joint; meaningless for others.
+    pub(crate) orientation: usize,
+    /// Bodies fixed to the joint, lumped, in the joint's frame.
+    pub(crate) body: Body,
+    /// Mass of the joint's subtree.
+    pub(crate) subtree_mass: f64,
+    /// The evaluation's origin moves to this joint (see [`Tree`]).
+    pub(crate) anchor: bool,
+}
+
+/// A lumped rigid body in its joint's frame.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Body {
+    pub(crate) mass: f64,
+    pub(crate) center: Vec3,
+    /// About the centre of mass.
+    pub(crate) inertia: Rotational,
+}
+
+/// The rotational inertia of a body, by what its evaluation costs.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) enum Rotational {
+    /// No body at all.
+    #[default]
+    None,
+    /// A point mass.
+    Point,
+    /// The same about every axis.
+    Isotropic(f64),
+    /// Anything else.
+    Full(Sym3),
+}
+
+/// A forest of joints, parents first.
+///
+/// Positions are measured from one origin per tree of the forest: the root joint's frame, or, where
+/// the root is carried by massless joints (a floating base), the first joint with mass. Far from the
+/// world's origin this keeps all digits.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Tree {
+    pub(crate) joints: Vec<Joint>,
+    /// Some joint is neither revolute nor prismatic.
+    pub(crate) has_other_joints: bool,
+}
+
+impl Tree {
+    /// The joints of `all` for which `keep` holds, re-indexed, and the map from old to new indices.
+    /// `keep` must hold for the parent of every kept joint.
+    pub(crate) fn pruned(all: &[Joint], keep: &[bool]) -> (Self, Vec<usize>) {
+        let mut index = vec![WORLD; all.len()];
+        let mut joints: Vec<Joint> = Vec::new();
+        for (old, joint) in all.iter().enumerate().filter(|(old, _)| keep[*old]) {
+            index[old] = joints.len();
+            let parent = if joint.parent == WORLD { WORLD } else { index[joint.parent] };
+            let root = if parent == WORLD { joints.len() } else { joints[parent].root };
+            joints.push(Joint { parent, root, ..joint.clone() });
+        }
+        let simple =
+            |joint: &Joint| matches!(joint.kind, JointKind::Revolute | JointKind::Prismatic);
+        let has_other_joints = !joints.iter().all(simple);
+        let mut tree = Self { joints, has_other_joints };
+        tree.place_anchors();
+        (tree, index)
+    }
+
+    /// Proper ancestors of a joint and the joint itself, root first.
+    pub(crate) fn path(&self, mut joint: usize) -> Vec<usize> {
+        let mut path = Vec::new();
+        while joint != WORLD {
+            path.push(joint);
+            joint = self.joints[joint].parent;
+        }
+        path.reverse();
+        path
+    }
+
+    /// Whether two joints are axes of one ball joint.
+    #[inline]
+    pub(crate) fn one_ball(&self, i: usize, j: usize) -> bool {
+        let first = |joint: usize| match self.joints[joint].kind {
+            JointKind::Ball(axis) => Some(joint - axis),
+            _ => None,
+        };
+        self.has_other_joints && first(i).is_some() && first(i) == first(j)
+    }
+
+    fn place_anchors(&mut self) {
+        for root in 0..self.joints.len() {
+            if self.joints[root].parent != WORLD {
+                continue;
+            }
+            let mut anchor = root;
+            while matches!(self.joints[anchor].body.inertia, Rotational::None) {
+                let mut children =
+                    (anchor + 1..self.joints.len()).filter(|&j| self.joints[j].parent == anchor);
+                match (children.next(), children.next()) {
+                    (Some(only), None) => anchor = only,
+                    _ => break,
+                }
+            }
+            self.joints[anchor].anchor = anchor != root;
+        }
+    }
+}
+
+/// A point fixed to a joint of a tree, or to the world.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Attachment {
+    /// Index of the joint, or [`WORLD`].
+    pub(crate) joint: usize,
+    /// Position in the joint's frame.
+    pub(crate) point: Vec3,
+}
