@@ -3,8 +3,9 @@
 use std::f64::consts::{FRAC_PI_6, PI};
 
 use crate::math::trigonometry::sin_cos_of;
+use crate::scene::point::Point;
 use crate::scene::{
-    Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Point, Scene,
+    Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Scene,
 };
 
 /// Names of the built-in scenes. `chain-N`, `tree-N` and `scissor-N` stand for whole families.

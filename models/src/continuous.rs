@@ -26,14 +26,14 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::integrator::balls::{orientations, three};
 use crate::integrator::blocks::Blocks;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rows::padded;
 use crate::math::scalar::{Dual, Scalar};
-use crate::math::spatial::{Mat3, Vec3};
+use crate::math::spatial::{Mat3, Vec3, three};
 use crate::math::tree_lu::TreeLu;
+use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
 
 /// A pivot of the mass matrix below this fraction of the largest inertia of its coordinate is zero.

@@ -30,6 +30,7 @@ pub(crate) mod modes;
 pub(crate) mod spectrum;
 pub(crate) mod weights;
 
+pub use crate::math::null_space::tangent_basis;
 pub use controllability::{controllability_rank, observability_rank};
 pub use error::{AnalysisError, RiccatiError};
 pub use finite_horizon::{
@@ -41,7 +42,7 @@ pub use kalman::{
     Kalman, KalmanError, KalmanTrajectory, NoiseCovariances, NoiseError, steady_state_kalman,
     steady_state_kalman_on_manifold, time_varying_kalman, time_varying_kalman_on_manifold,
 };
-pub use manifold::{Tangent, tangent_basis};
+pub use manifold::Tangent;
 pub use modes::{Mode, modes};
 pub use spectrum::spectral_radius;
 pub use weights::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};

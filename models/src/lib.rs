@@ -36,19 +36,23 @@ pub use crate::compile::cost::StageCost;
 pub use crate::continuous::{
     Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,
 };
+pub use crate::integrator::report::{StepError, StepReport};
 pub use crate::integrator::settings::{
     ForceSplit, HALVINGS_MAX, Precision, SUBSTEPS_MAX, Settings,
 };
+pub use crate::integrator::state::State;
+pub use crate::lagrangian::energy::Energy;
 pub use crate::linearization::linearize::Linearization;
 pub use crate::linearization::second_order::contraction::Contraction;
 pub use crate::linearization::second_order::tensors::{SecondOrder, TooLarge};
 pub use crate::model::mechanism::{Coordinate, Dimensions, Model, OperatingPoint, Violation};
+pub use crate::model::site::Site;
 pub use crate::plant::choice::{Choice, ChoiceError, ErrorEstimate};
 pub use crate::plant::diagnose::Diagnostics;
-pub use crate::plant::facade::{Energy, Plant, State, StepError, StepReport};
+pub use crate::plant::facade::Plant;
 pub use crate::plant::initial::{Initial, InitialError};
 pub use crate::plant::settle::{Equilibrium, SettleError, SettleRequest};
-pub use crate::plant::site::{Pose, Site};
+pub use crate::plant::site::Pose;
 pub use crate::plant::snapshot::{Snapshot, SnapshotError};
 pub use crate::plant::spare::Spare;
 pub use crate::scene::{Problem, Scene, SceneError};

@@ -119,7 +119,7 @@ mod trajectory;
 use nalgebra::DMatrix;
 
 use crate::control::{Momentum, TrajectoryWeights, Weights};
-use crate::plant::facade::State;
+use crate::integrator::state::State;
 
 pub use error::{BoundFault, BoundState, OptimizeError, Stuck};
 pub use search::Optimizer;

@@ -4,8 +4,9 @@
 //! reports every error of a scene at once, each with its path.
 
 pub(crate) mod forces;
-mod limits;
+pub(crate) mod limits;
 mod number_or_name;
+pub(crate) mod point;
 pub(crate) mod signals;
 mod text;
 mod validate;
@@ -16,12 +17,15 @@ pub use crate::scene::limits::{
     MAX_KNOTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER, MAX_SIGNAL_POINTS,
     MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES,
 };
+pub use crate::scene::point::Point;
 pub use crate::scene::signals::{Interpolation, Signal};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
+pub use crate::math::spline::Knot;
 use crate::scene::number_or_name::{NumberOrName, field, number_or_name};
+use crate::scene::point::{is_zero, is_zero3, one};
 
 /// A mechanism: a tree of frames with joints and bodies, what acts on it, and what constrains it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -72,9 +76,6 @@ pub struct Scene {
 fn default_time_step() -> f64 {
     0.01
 }
-fn is_zero(x: &f64) -> bool {
-    *x == 0.0
-}
 
 /// A frame, placed in its parent; its joint moves it away from there.
 ///
@@ -106,9 +107,6 @@ fn world() -> String {
 }
 fn is_world(name: &str) -> bool {
     name == "world"
-}
-fn is_zero3(v: &[f64; 3]) -> bool {
-    *v == [0.0; 3]
 }
 
 /// An orientation.
@@ -246,17 +244,6 @@ pub enum CoordinateKind {
     Prescribed,
 }
 
-/// A point fixed in a frame.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Point {
-    /// Frame name, or `world`.
-    pub frame: String,
-    /// Position in the frame, m.
-    #[serde(default, skip_serializing_if = "is_zero3")]
-    pub at: [f64; 3],
-}
-
 /// A spring.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
@@ -303,25 +290,6 @@ pub enum Spring {
     },
 }
 
-/// A knot of a spline, which is piecewise quintic with continuous value, slope and curvature.
-///
-/// A slope that is not given is replaced by continuity of the third derivative, a curvature by
-/// continuity of the fourth. Before the first and after the last knot the spline is quadratic.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Knot {
-    /// Position; greater than that of the knot before.
-    pub x: f64,
-    /// Value.
-    pub value: f64,
-    /// First derivative.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub slope: Option<f64>,
-    /// Second derivative.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub curvature: Option<f64>,
-}
-
 /// A number `u` that the driver sends: a generalized force `gain · u` on a dynamic coordinate, a
 /// component of forces that name it, or both.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -335,10 +303,6 @@ pub struct Input {
     /// Factor of the force on the coordinate.
     #[serde(default = "one")]
     pub gain: f64,
-}
-
-fn one() -> f64 {
-    1.0
 }
 
 /// A holonomic constraint `h(q) = 0`.

@@ -11,8 +11,9 @@ use crate::model::mechanism::{
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree, WORLD};
 use crate::scene;
+use crate::scene::Scene;
 use crate::scene::forces::Component;
-use crate::scene::{Point, Scene};
+use crate::scene::point::Point;
 
 /// The forces of a scene over the joints of a tree.
 struct Resolver<'a> {

@@ -8,41 +8,18 @@
 //! An equation is eliminated as soon as as many joints below it as it needs are. In [`Plan::new`], `spare`
 //! joints more are asked for: fronts are larger, pivots too.
 
-use crate::integrator::newton::Workspace;
-use crate::math::spatial::Mat3;
-use crate::model::mechanism::{Constraint, ConstraintKind, Length, Model, PointPair, Solver};
+use crate::integrator::workspace::Workspace;
+use crate::model::loop_plan::{Above, Absorbed, BODY, Equation, Loops, Opened, Plan, Step};
+use crate::model::mechanism::{Constraint, Model};
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 use crate::model::tree::{Tree, WORLD};
 
-/// Rows of a body in a front.
-pub(crate) const BODY: usize = 6;
 /// How many times the work of fronts dense matrices must be to take as long.
 const MARGIN: f64 = 2.0;
 /// Entries of fronts that are always few.
 const ROOM: usize = 1 << 16;
 /// Most joints more than needed that an equation waits for.
 const SPARE_MOST: usize = 2;
-
-/// The loops of a planar mechanism.
-#[derive(Clone, Debug)]
-pub(crate) struct Loops {
-    pub(crate) plan: Plan,
-    pub(crate) equations: Vec<Equation>,
-    /// Axes of the plane in the world, its normal last.
-    pub(crate) plane: Mat3,
-    /// Each joint in the tree of the constraints; [`WORLD`] for those that move none.
-    pub(crate) in_closure: Vec<usize>,
-}
-
-/// An equation that closes a loop.
-#[derive(Clone, Debug)]
-pub(crate) struct Equation {
-    /// Index of the constraint.
-    pub(crate) constraint: usize,
-    pub(crate) bodies: [Option<usize>; 2],
-    /// The last joint that carries both bodies.
-    pub(crate) ancestor: Option<usize>,
-}
 
 impl Loops {
     /// The loops of trees in one plane, of which all joints are dynamic and in the order of their
@@ -74,76 +51,6 @@ impl Loops {
         let plan = Plan::new(joints, &bodies, spare, work)?;
         Some(Self { plan, equations, plane, in_closure })
     }
-}
-
-impl Constraint {
-    /// The points that an equation of loops is about.
-    pub(crate) fn points_in_plane(&self) -> Option<&PointPair> {
-        match &self.kind {
-            ConstraintKind::Distance(points, Length::Fixed(_))
-            | ConstraintKind::Axis(points, _) => Some(points),
-            _ => None,
-        }
-    }
-}
-
-/// The order.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Plan {
-    pub(crate) steps: Vec<Step>,
-    /// Rows of each front.
-    pub(crate) fronts: Vec<usize>,
-}
-
-/// One joint is eliminated, and after it the equations that this closes.
-#[derive(Clone, Debug)]
-pub(crate) struct Step {
-    pub(crate) joint: usize,
-    pub(crate) front: usize,
-    /// Rows in use.
-    pub(crate) rows: usize,
-    /// First row of the joint's body.
-    pub(crate) place: usize,
-    pub(crate) above: Above,
-    /// Fronts that end here.
-    pub(crate) absorbed: Vec<Absorbed>,
-    pub(crate) opened: Vec<Opened>,
-    /// Equations, and their rows.
-    pub(crate) closed: Vec<(usize, usize)>,
-}
-
-impl Step {
-    fn work(&self) -> f64 {
-        (self.rows * (self.rows * (1 + self.closed.len()) + 20)) as f64
-    }
-}
-
-/// Where the body of the parent is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Above {
-    /// Nowhere: it is the world.
-    World,
-    /// It takes the place of the joint.
-    Here,
-    /// In the front already.
-    At(usize),
-}
-
-/// A front becomes part of another one.
-#[derive(Clone, Debug)]
-pub(crate) struct Absorbed {
-    pub(crate) front: usize,
-    /// Rows, from and to.
-    pub(crate) rows: Vec<(usize, usize)>,
-}
-
-/// An equation that a joint of the step is the first to move.
-#[derive(Clone, Debug)]
-pub(crate) struct Opened {
-    pub(crate) equation: usize,
-    pub(crate) place: usize,
-    /// First rows of its two bodies; the world has none.
-    pub(crate) bodies: [Option<usize>; 2],
 }
 
 /// What a front has rows for.
@@ -445,7 +352,7 @@ impl Model {
     /// The loops, in an order that takes no more than some work and of which the pivots are sound at the
     /// configuration that [`Conditioning`] found.
     ///
-    /// [`Conditioning`]: crate::integrator::conditioning::Conditioning
+    /// [`Conditioning`]: crate::model::conditioning::Conditioning
     pub(crate) fn loops_within(&mut self, work: f64) -> Option<Loops> {
         let (d, conditioning) = (self.dimensions, &self.conditioning);
         let are_all = self.dynamics.joints.iter().map(|joint| joint.coordinate).eq(0..d.dynamic);
@@ -463,11 +370,6 @@ impl Model {
         });
         self.solver = solver;
         found
-    }
-
-    pub(crate) fn take_loops(&mut self, loops: Loops) {
-        self.loops = Some(loops);
-        self.solver = Solver::Loops;
     }
 
     /// Multiplications and additions of dense matrices of the constraints.

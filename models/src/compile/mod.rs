@@ -4,3 +4,4 @@ pub(crate) mod cost;
 pub(crate) mod forces;
 pub(crate) mod loops;
 pub(crate) mod scene;
+pub(crate) mod singular;

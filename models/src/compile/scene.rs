@@ -3,22 +3,30 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::integrator::conditioning::Conditioning;
 use crate::math::elimination::Elimination;
+use crate::math::hash::fnv1a;
 use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Sym3, Vec3};
 use crate::math::spline::Spline;
 use crate::math::trigonometry::sin_cos_of;
+use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
     Alignment, Carries, Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions,
     Forces, Length, MixedPair, Model, OperatingPoint, Pair, PathJoint, PathSpring, PointPair,
     PointSpring, Polynomial, Potentials, Product, Solver, SplineSpring, Vector,
 };
 use crate::model::planar_tree::planar;
+use crate::model::site::{Site, SiteJoint};
 use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
-use crate::plant::site::{Site, SiteJoint};
 use crate::scene;
 use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
+
+impl Scene {
+    /// Everything that is wrong with the scene; empty when it will compile.
+    pub fn validate(&self) -> Vec<Problem> {
+        Model::compile(self).map_or_else(|error| error.problems, |_| Vec::new())
+    }
+}
 
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.
@@ -753,11 +761,4 @@ fn digest(scene: &Scene) -> u64 {
         Scene { description: String::new(), operating_points: Vec::new(), ..scene.clone() };
     let text = serde_json::to_string(&essence).unwrap_or_default();
     fnv1a(text.as_bytes())
-}
-
-/// The 64-bit FNV-1a hash.
-pub(crate) fn fnv1a(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
-    })
 }

@@ -3,9 +3,9 @@
 //!
 //! A wrench `(n, f)` is about the joint of its body, as in [`crate::lagrangian::planar`].
 
-use crate::compile::loops::Loops;
 use crate::lagrangian::kinematics::Poses;
 use crate::math::spatial::Vec3;
+use crate::model::loop_plan::Loops;
 use crate::model::mechanism::{ConstraintKind, Model, PointPair};
 use crate::model::planar_tree::PlanarJoint;
 use crate::model::tree::{JointKind, Tree, WORLD};

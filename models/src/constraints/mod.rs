@@ -1,4 +1,5 @@
 //! Constraints.
 
 pub(crate) mod closure;
+pub(crate) mod conditioning;
 pub(crate) mod in_plane;

@@ -5,8 +5,8 @@
 //! first-order linearization itself is [`linearize`](crate::linearization::linearize), which knows the sparsity.
 
 use crate::constraints::closure::Closure;
-use crate::integrator::balls::{Turning, three};
 use crate::integrator::settings::Settings;
+use crate::integrator::turning::Turning;
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
@@ -15,7 +15,7 @@ use crate::lagrangian::potentials;
 use crate::math::rotation;
 use crate::math::rows::Term;
 use crate::math::scalar::{Dual, Scalar};
-use crate::math::spatial::{Mat3, Vec3};
+use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::{CoordinateInput, Forces, Model};
 use crate::model::tree::{JointKind, WORLD};
 

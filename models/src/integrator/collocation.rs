@@ -22,14 +22,13 @@ pub(crate) mod hessian;
 pub(crate) mod sweep;
 pub(crate) mod system;
 
-use crate::integrator::newton::{At, Workspace};
-use crate::integrator::predictor::Past;
-use crate::integrator::scheme::Tableau;
-use crate::model::mechanism::Model;
-use crate::plant::facade::{StepError, StepReport};
-
 use crate::integrator::collocation::sweep::Sweep;
 use crate::integrator::collocation::system::System;
+use crate::integrator::predictor::Past;
+use crate::integrator::report::{StepError, StepReport};
+use crate::integrator::scheme::Tableau;
+use crate::integrator::workspace::{At, Workspace};
+use crate::model::mechanism::Model;
 
 /// Unknowns up to which all stages are corrected at once.
 const AT_ONCE: usize = 48;

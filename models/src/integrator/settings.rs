@@ -1,8 +1,6 @@
 //! How a plant is stepped: what its maker chooses.
 
-use crate::integrator::scheme::Scheme;
 use crate::model::mechanism::Model;
-use crate::plant::initial::InitialError;
 
 /// Most substeps in a control period.
 pub const SUBSTEPS_MAX: u32 = 256;
@@ -48,40 +46,6 @@ impl Settings {
             max_iterations: 40,
             singular_below: 1e-14,
         }
-    }
-
-    /// Checks every setting; finds the method that has the order for the model.
-    pub(crate) fn check(&self, model: &Model) -> Result<Scheme, InitialError> {
-        for (name, value) in [
-            ("time_step_s", self.time_step_s),
-            ("max_iterations", f64::from(self.max_iterations)),
-            ("singular_below", self.singular_below),
-        ] {
-            if !(value.is_finite() && value > 0.0) {
-                return Err(InitialError::Settings { name, value });
-            }
-        }
-        let within = |name, value: u32, least: u32, most: u32| {
-            if (least..=most).contains(&value) {
-                Ok(())
-            } else {
-                Err(InitialError::OutOfRange { name, value, least, most })
-            }
-        };
-        within("substeps", self.substeps, 1, SUBSTEPS_MAX)?;
-        within("halvings", self.halvings, 0, HALVINGS_MAX)?;
-        let scheme = Scheme::of_order(self.order, model)
-            .map_err(|what| InitialError::Order { order: self.order, what })?;
-        let order = |what| Err(InitialError::Order { order: self.order, what });
-        if scheme != Scheme::Midpoint && self.force_split == ForceSplit::Paper {
-            return order("needs the symmetric force split");
-        }
-        if model.turns_prescribed() && (self.substeps > 1 || scheme != Scheme::Midpoint) {
-            return order(
-                "and one substep alone are there for prescribed ball joints; use order 2",
-            );
-        }
-        Ok(scheme)
     }
 }
 

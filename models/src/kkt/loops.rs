@@ -14,13 +14,13 @@
 //! `ψ −= e λ`. What is eliminated is summed in a front, `[φ ψ 0] = A [ξ ω λ]`, with one row for each equation
 //! that is still open; a pivot takes the product of a column and a row away from it.
 
-use crate::compile::loops::{Above, BODY, Loops, Opened, Step};
 use crate::constraints::in_plane::InPlane;
 use crate::kkt::planar::{Diagonal, Elimination, Method, Of, add_to, dot3, product};
 use crate::lagrangian::planar::{Fours, Joints, Vec2, Vec3, cross};
 use crate::math::rows::{Block, LANES, padded};
 use crate::math::simd::wide;
 use crate::math::tree_lu::SmallestPivot;
+use crate::model::loop_plan::{Above, BODY, Loops, Opened, Step};
 use crate::model::planar_tree::PlanarJoint;
 
 /// What a front stands for, and where it is.

@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use crate::integrator::balls::orientations;
 use crate::lagrangian::kinematics::Poses;
 use crate::math::rotation;
 use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3};
+use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
 use crate::model::tree::Tree;
 use crate::scene::Scene;

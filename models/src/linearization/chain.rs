@@ -9,20 +9,12 @@
 //!
 //! O(n²) for each of the parameters and steps.
 
-use crate::linearization::linearize::{InputImpulse, Kind, Linearization};
+use crate::linearization::linearize::{InputImpulse, Kind, Linearization, Part};
 use crate::math::rows::{Term, add_rows, padded};
 use crate::model::mechanism::Model;
 
 /// Numbers that the steps of a period may take: 1 GiB.
 const NUMBERS_MAX: usize = 1 << 27;
-
-/// A step of a period: its own derivatives, and the tangent of where it begins.
-#[derive(Clone, Debug)]
-pub(crate) struct Part {
-    pub(crate) step: Linearization,
-    /// `D`, row-major: rows `(q_d, q_k, p, k)`.
-    pub(crate) tangent: Vec<f64>,
-}
 
 /// The tangent along the steps of a period. Empty until it is used.
 #[derive(Clone, Debug, Default)]

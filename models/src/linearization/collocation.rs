@@ -10,34 +10,10 @@
 
 use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::system::System;
-use crate::integrator::newton::{At, Workspace};
-use crate::linearization::linearize::Linearization;
-use crate::math::dense_inverse::DenseInverse;
-use crate::math::rows::{Term, add_rows, padded};
-use crate::plant::facade::StepError;
-
-/// The stages of a linearized step: what its second derivatives need.
-#[derive(Clone, Debug)]
-pub(crate) struct StageTangents {
-    pub(crate) time_step_s: f64,
-    pub(crate) nodes: Vec<f64>,
-    pub(crate) weights: Vec<f64>,
-    pub(crate) coupling: Vec<f64>,
-    /// `Q_i`, `V_i` and inputs, stage by stage.
-    pub(crate) q: Vec<f64>,
-    pub(crate) velocity: Vec<f64>,
-    pub(crate) inputs: Vec<f64>,
-    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `n s` padded rows: those of the stages of a
-    /// coordinate side by side.
-    pub(crate) tangent: Vec<f64>,
-    /// `∂P_i/∂θ`, the same way.
-    impulses: Vec<f64>,
-    /// `Σ ∂P_i/∂Y`, row-major, n by `n s`.
-    pub(crate) slopes: Vec<f64>,
-    /// The inverse of `∂R/∂Y`.
-    pub(crate) matrix: DenseInverse,
-    terms: Vec<Term>,
-}
+use crate::integrator::report::StepError;
+use crate::integrator::workspace::{At, Workspace};
+use crate::linearization::linearize::{Linearization, StageTangents};
+use crate::math::rows::{add_rows, padded};
 
 impl Collocation {
     /// Linearizes at the solution.

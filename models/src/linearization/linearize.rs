@@ -22,16 +22,15 @@
 
 use nalgebra::DMatrix;
 
-use crate::integrator::balls::Turning;
-use crate::integrator::newton::{At, Workspace};
+use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
-use crate::linearization::chain::Part;
-use crate::linearization::collocation::StageTangents;
+use crate::integrator::turning::Turning;
+use crate::integrator::workspace::{At, Workspace};
+use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
-use crate::math::rows::{padded, spread};
+use crate::math::rows::{Term, padded, spread};
 use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
-use crate::plant::facade::StepError;
 
 /// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.
 #[derive(Clone, Copy, Debug)]
@@ -465,4 +464,35 @@ fn add_block(block: &Mat3, (row, column): (usize, usize), matrix: &mut DMatrix<f
             matrix[(row + a, column + b)] += entries[a];
         }
     }
+}
+
+/// A step of a period: its own derivatives, and the tangent of where it begins.
+#[derive(Clone, Debug)]
+pub(crate) struct Part {
+    pub(crate) step: Linearization,
+    /// `D`, row-major: rows `(q_d, q_k, p, k)`.
+    pub(crate) tangent: Vec<f64>,
+}
+
+/// The stages of a linearized step: what its second derivatives need.
+#[derive(Clone, Debug)]
+pub(crate) struct StageTangents {
+    pub(crate) time_step_s: f64,
+    pub(crate) nodes: Vec<f64>,
+    pub(crate) weights: Vec<f64>,
+    pub(crate) coupling: Vec<f64>,
+    /// `Q_i`, `V_i` and inputs, stage by stage.
+    pub(crate) q: Vec<f64>,
+    pub(crate) velocity: Vec<f64>,
+    pub(crate) inputs: Vec<f64>,
+    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `n s` padded rows: those of the stages of a
+    /// coordinate side by side.
+    pub(crate) tangent: Vec<f64>,
+    /// `∂P_i/∂θ`, the same way.
+    pub(crate) impulses: Vec<f64>,
+    /// `Σ ∂P_i/∂Y`, row-major, n by `n s`.
+    pub(crate) slopes: Vec<f64>,
+    /// The inverse of `∂R/∂Y`.
+    pub(crate) matrix: DenseInverse,
+    pub(crate) terms: Vec<Term>,
 }

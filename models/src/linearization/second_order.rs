@@ -18,8 +18,8 @@ pub(crate) mod tensors;
 
 use nalgebra::DMatrix;
 
-use crate::integrator::balls::Turning;
 use crate::integrator::blocks::StepBlocks;
+use crate::integrator::turning::Turning;
 use crate::linearization::linearize::SolvedStep;
 use crate::math::rotation;
 use crate::math::rows::{Term, padded};
@@ -29,13 +29,13 @@ use crate::model::mechanism::Model;
 
 /// Sizes, and where things stand among the parameters `θ = (q, p, inputs, k)`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Layout {
-    nd: usize,
-    nk: usize,
-    ni: usize,
-    nc: usize,
+pub(crate) struct Layout {
+    pub(crate) nd: usize,
+    pub(crate) nk: usize,
+    pub(crate) ni: usize,
+    pub(crate) nc: usize,
     /// Length of a row over the parameters, padded.
-    stride: usize,
+    pub(crate) stride: usize,
 }
 
 impl Layout {
@@ -46,7 +46,7 @@ impl Layout {
     }
 
     /// Coordinates.
-    fn n(&self) -> usize {
+    pub(crate) fn n(&self) -> usize {
         self.nd + self.nk
     }
 
@@ -65,7 +65,7 @@ impl Layout {
     }
 
     /// Which of the six numbers that turn the ends of a prescribed ball joint a parameter is.
-    fn end_of(&self, coordinate: usize, parameter: usize) -> Option<usize> {
+    pub(crate) fn end_of(&self, coordinate: usize, parameter: usize) -> Option<usize> {
         let ends = [coordinate, self.next() + coordinate.wrapping_sub(self.nd)];
         let first = ends.iter().position(|end| (*end..*end + 3).contains(&parameter))?;
         Some(3 * first + parameter - ends[first])
@@ -74,17 +74,17 @@ impl Layout {
 
 /// What both forms compute with.
 #[derive(Clone, Debug)]
-struct Scratch {
-    layout: Layout,
-    blocks: StepBlocks<Dual>,
+pub(crate) struct Scratch {
+    pub(crate) layout: Layout,
+    pub(crate) blocks: StepBlocks<Dual>,
     /// `x'` and `λ'` by all parameters, row-major, nd + nc rows.
-    tangent: Vec<f64>,
-    terms: Vec<Term>,
+    pub(crate) tangent: Vec<f64>,
+    pub(crate) terms: Vec<Term>,
     /// Entries of `u` that signals replace: they have no effect.
-    replaced: Vec<usize>,
+    pub(crate) replaced: Vec<usize>,
 }
 
-fn assert_layout(model: &Model, scratch: &Scratch) {
+pub(crate) fn assert_layout(model: &Model, scratch: &Scratch) {
     assert!(
         scratch.layout == Layout::new(model),
         "the second-order linearization belongs to another model"
@@ -93,7 +93,7 @@ fn assert_layout(model: &Model, scratch: &Scratch) {
 
 /// How the derivatives of the velocity of a prescribed ball joint by the ends of the step,
 /// `(N⁻ η₁ − N⁺ η₀) / h`, change along the direction of the duals.
-fn spin_change(t: &Turning<Dual>, time_step_s: f64) -> [[f64; 6]; 3] {
+pub(crate) fn spin_change(t: &Turning<Dual>, time_step_s: f64) -> [[f64; 6]; 3] {
     [0, 1, 2].map(|row| {
         [0, 1, 2, 3, 4, 5].map(|column| {
             let entry = if column < 3 {
@@ -130,7 +130,7 @@ impl Scratch {
     }
 
     /// Places the blocks at a solved step, with the tangent of parameter `a`.
-    fn seed(&mut self, a: usize, model: &Model, step: &SolvedStep) {
+    pub(crate) fn seed(&mut self, a: usize, model: &Model, step: &SolvedStep) {
         let Layout { nd, stride, .. } = self.layout;
         let (inputs, next) = (self.layout.inputs(), self.layout.next());
         let unit = |is: bool| if is { 1.0 } else { 0.0 };

@@ -1,13 +1,13 @@
 //! Linearizes the step that is solved in a workspace.
 
-use crate::integrator::newton::{At, Workspace};
+use crate::integrator::report::StepError;
+use crate::integrator::workspace::{At, Workspace};
 use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::potentials;
 use crate::linearization::linearize::{Kind, Linearization};
 use crate::math::rows::{add_rows, add_rows_portable, padded};
 use crate::math::simd::wide;
-use crate::plant::facade::StepError;
 
 impl Workspace {
     /// Takes the derivatives with ball joints.

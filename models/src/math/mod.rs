@@ -3,6 +3,9 @@
 pub(crate) mod dense_inverse;
 pub(crate) mod elimination;
 pub(crate) mod gemm;
+pub(crate) mod hash;
+pub(crate) mod norms;
+pub(crate) mod null_space;
 pub(crate) mod pivoted_lu;
 pub(crate) mod rotation;
 pub(crate) mod rows;
@@ -12,5 +15,6 @@ pub(crate) mod simd;
 pub(crate) mod sparse_map;
 pub(crate) mod spatial;
 pub(crate) mod spline;
+pub(crate) mod sums;
 pub(crate) mod tree_lu;
 pub(crate) mod trigonometry;

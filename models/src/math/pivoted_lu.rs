@@ -4,7 +4,6 @@
 //! all solutions the one of least norm is taken: what a solution has along the null space of the
 //! matrix is removed. A matrix of full rank pays nothing for that.
 
-use crate::integrator::conditioning::DEPENDENT;
 use crate::math::rows::{Term, add_rows};
 use crate::math::simd::wide;
 
@@ -316,6 +315,10 @@ fn subtract_part(x: &mut [f64], n: &[f64]) {
     let part: f64 = x.iter().zip(n).map(|(x, n)| x * n).sum();
     x.iter_mut().zip(n).for_each(|(x, n)| *x -= part * n);
 }
+
+/// Square of the distance from the others, relative to a row of full steepness, below which a row
+/// depends on them.
+pub(crate) const DEPENDENT: f64 = 1e-11;
 
 #[cfg(test)]
 mod tests {

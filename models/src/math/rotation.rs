@@ -7,8 +7,8 @@
 
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Mat3, Vec3};
+use crate::math::sums::two_sum;
 use crate::math::trigonometry::sin_cos_of;
-use crate::plant::facade::two_sum;
 
 /// An orientation, as a unit quaternion `[w, x, y, z]`.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -318,3 +318,8 @@ impl<S: Scalar> Inertia<S> {
         }
     }
 }
+
+/// The three numbers that begin at `i`: those of a ball joint.
+pub(crate) fn three<S: Scalar>(values: &[S], i: usize) -> Vec3<S> {
+    Vec3([values[i], values[i + 1], values[i + 2]])
+}

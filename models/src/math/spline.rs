@@ -13,8 +13,10 @@
 //! f''''(w) = [ 360 m − 168 s0 − 192 s1]/w³ + [−24 c0 + 36 c1]/w²
 //! ```
 
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
 use crate::math::scalar::Scalar;
-use crate::scene::Knot;
 
 /// A pivot below this fraction of its row's largest entry leaves the spline undetermined.
 const SINGULAR: f64 = 1e-12;
@@ -215,6 +217,25 @@ impl Banded {
         }
         Some(self.right)
     }
+}
+
+/// A knot of a spline, which is piecewise quintic with continuous value, slope and curvature.
+///
+/// A slope that is not given is replaced by continuity of the third derivative, a curvature by
+/// continuity of the fourth. Before the first and after the last knot the spline is quadratic.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Knot {
+    /// Position; greater than that of the knot before.
+    pub x: f64,
+    /// Value.
+    pub value: f64,
+    /// First derivative.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub slope: Option<f64>,
+    /// Second derivative.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub curvature: Option<f64>,
 }
 
 #[cfg(test)]

@@ -2,11 +2,11 @@
 
 use std::fmt::Write as _;
 
-use crate::compile::loops::Loops;
-use crate::integrator::conditioning::Conditioning;
 use crate::math::elimination::Elimination;
 use crate::math::spatial::{Force, Vec3};
 use crate::math::spline::Spline;
+use crate::model::conditioning::Conditioning;
+use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, JointKind, Tree};
@@ -615,5 +615,26 @@ impl Model {
             });
         }
         plan
+    }
+
+    /// Equations of constraints that are independent at the scene's initial configuration.
+    pub(crate) fn constraint_rank(&self) -> usize {
+        self.conditioning.independent.len()
+    }
+
+    pub(crate) fn take_loops(&mut self, loops: Loops) {
+        self.loops = Some(loops);
+        self.solver = Solver::Loops;
+    }
+}
+
+impl Constraint {
+    /// The points that an equation of loops is about.
+    pub(crate) fn points_in_plane(&self) -> Option<&PointPair> {
+        match &self.kind {
+            ConstraintKind::Distance(points, Length::Fixed(_))
+            | ConstraintKind::Axis(points, _) => Some(points),
+            _ => None,
+        }
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::InitialError;
 use crate::control::WeightsError;
-use crate::plant::facade::StepError;
+use crate::integrator::report::StepError;
 
 /// Why a problem was refused, or an iteration failed. An optimizer is as it was before.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -10,11 +10,10 @@ use super::{Bounds, FreeInitialState, OptimizeError, TrajectoryCost};
 use crate::control::{
     Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError, symmetrize,
 };
-use crate::integrator::balls::three;
 use crate::math::rotation;
 use crate::math::rotation::Quaternion;
 use crate::math::scalar::Dual;
-use crate::math::spatial::{Mat3, Vec3};
+use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
 use crate::plant::facade::Plant;
 

@@ -18,10 +18,11 @@ use crate::Initial;
 use crate::Snapshot;
 use crate::control::Weights;
 use crate::control::lq::{LqRecursion, Stage};
+use crate::integrator::state::State;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
 use crate::math::sparse_map::Map;
-use crate::plant::facade::{Plant, State};
+use crate::plant::facade::Plant;
 
 /// Penalty with which a search begins.
 const FIRST_PENALTY: f64 = 10.0;

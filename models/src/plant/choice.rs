@@ -9,9 +9,11 @@
 
 use std::sync::Arc;
 
+use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{SUBSTEPS_MAX, Settings};
-use crate::plant::facade::{Plant, State, StepError};
+use crate::integrator::state::State;
+use crate::plant::facade::Plant;
 use crate::plant::initial::{Initial, InitialError};
 
 /// Control periods of the probe.

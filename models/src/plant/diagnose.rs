@@ -2,8 +2,9 @@
 
 use nalgebra::DMatrix;
 
+use crate::lagrangian::energy::Energy;
 use crate::math::spatial::Vec3;
-use crate::plant::facade::{Energy, Plant};
+use crate::plant::facade::Plant;
 
 /// What can be said of a plant at its state. Momenta are those of the velocity that belongs to the
 /// projected momentum; bodies fixed to the world do not count.

@@ -2,19 +2,20 @@
 //! velocity and energy that belong to a state.
 
 use crate::constraints::closure::Closure;
-use crate::integrator::balls::{orientations, three};
-use crate::integrator::matrix::fill_schur;
-use crate::integrator::newton::Workspace;
-use crate::lagrangian::kinematics::Poses;
-use crate::lagrangian::momenta::Momenta;
-use crate::lagrangian::potentials;
+use crate::integrator::scheme::Scheme;
+use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settings};
+use crate::integrator::state::PreciseState;
+use crate::integrator::workspace::Workspace;
+use crate::kkt::schur::fill_schur;
+use crate::lagrangian::energy::{Energy, potential_energy};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rotation::Quaternion;
 use crate::math::rows::padded;
-use crate::math::spatial::Vec3;
+use crate::math::spatial::{Vec3, three};
+use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
-use crate::plant::facade::{Energy, Plant, PreciseState};
+use crate::plant::facade::Plant;
 use crate::plant::settle::{SettleError, SettleRequest};
 
 /// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
@@ -72,106 +73,6 @@ pub enum Initial {
         q: Vec<f64>,
         /// Coordinates that keep their value.
         hold: Vec<String>,
-    },
-}
-
-/// Why a state was refused. The plant is as it was.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum InitialError {
-    /// A vector has the wrong length.
-    #[error("{name} has {actual} entries; {expected} are needed")]
-    Dimension {
-        /// Which vector.
-        name: &'static str,
-        /// Entries it must have.
-        expected: usize,
-        /// Entries it has.
-        actual: usize,
-    },
-    /// A number is NaN or infinite.
-    #[error("{name}[{index}] is {value}")]
-    NotFinite {
-        /// Which vector.
-        name: &'static str,
-        /// Index of the entry.
-        index: usize,
-        /// The entry.
-        value: f64,
-    },
-    /// No operating point or coordinate of that name.
-    #[error("there is no {kind} `{name}`")]
-    Unknown {
-        /// What was looked for.
-        kind: &'static str,
-        /// Its name.
-        name: String,
-    },
-    /// The configuration violates a constraint by more than 1e-6 relative.
-    #[error("constraint `{constraint}` is violated by {violation:e}")]
-    OffConstraint {
-        /// Name of the constraint equation.
-        constraint: String,
-        /// Its value `h(q)`.
-        violation: f64,
-    },
-    /// The scene's initial configuration violates a constraint by more than that.
-    #[error(
-        "the scene's initial configuration is only a guess: it violates constraint `{constraint}` by {violation:e}; start at a configuration that satisfies the constraints, which a projection or settling finds"
-    )]
-    SceneIsGuess {
-        /// Name of the constraint equation.
-        constraint: String,
-        /// Its value `h(q)`.
-        violation: f64,
-    },
-    /// The configuration satisfies a constraint in a way in which it must not be used.
-    #[error("constraint `{constraint}`: {what}")]
-    Degenerate {
-        /// Name of the constraint.
-        constraint: String,
-        /// What is wrong.
-        what: &'static str,
-    },
-    /// The projection found no configuration that satisfies the constraints.
-    #[error(
-        "no configuration found near the guess; constraint `{constraint}` stays violated by {violation:e}"
-    )]
-    Projection {
-        /// Name of the worst constraint equation.
-        constraint: String,
-        /// Its value `h(q)`.
-        violation: f64,
-    },
-    /// No equilibrium was found.
-    #[error(transparent)]
-    Settle(#[from] SettleError),
-    /// A whole number is out of range.
-    #[error("{name} is {value}; it must be from {least} to {most}")]
-    OutOfRange {
-        /// Which setting.
-        name: &'static str,
-        /// Its value.
-        value: u32,
-        /// The least allowed.
-        least: u32,
-        /// The most allowed.
-        most: u32,
-    },
-    /// There is no method of that order for the model and the other settings.
-    #[error("order {order} {what}")]
-    Order {
-        /// The order.
-        order: u32,
-        /// Why there is none.
-        what: &'static str,
-    },
-    /// A time step or an iteration limit is out of range.
-    #[error("{name} is {value}; it must be finite and greater than zero")]
-    Settings {
-        /// Which setting.
-        name: &'static str,
-        /// Its value.
-        value: f64,
     },
 }
 
@@ -449,19 +350,6 @@ impl Plant {
     }
 }
 
-/// Potential energy of gravity and springs, with poses and momenta evaluated at `q`.
-pub(crate) fn potential_energy(model: &Model, poses: &Poses, momenta: &Momenta, q: &[f64]) -> f64 {
-    let tree = &model.dynamics;
-    let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
-    let weight: f64 = roots
-        .map(|(i, root)| {
-            let moment = momenta.moment[i] + poses.origin[i] * root.subtree_mass;
-            model.gravity.map_or(0.0, |g| g.dot(moment))
-        })
-        .sum();
-    potentials::potential(&model.potentials, tree, poses, q) - weight
-}
-
 fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f64>, InitialError> {
     if values.len() != expected {
         return Err(InitialError::Dimension { name, expected, actual: values.len() });
@@ -564,5 +452,141 @@ impl Workspace {
                 *v -= response * weight;
             }
         }
+    }
+}
+
+/// Why a state was refused. The plant is as it was.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum InitialError {
+    /// A vector has the wrong length.
+    #[error("{name} has {actual} entries; {expected} are needed")]
+    Dimension {
+        /// Which vector.
+        name: &'static str,
+        /// Entries it must have.
+        expected: usize,
+        /// Entries it has.
+        actual: usize,
+    },
+    /// A number is NaN or infinite.
+    #[error("{name}[{index}] is {value}")]
+    NotFinite {
+        /// Which vector.
+        name: &'static str,
+        /// Index of the entry.
+        index: usize,
+        /// The entry.
+        value: f64,
+    },
+    /// No operating point or coordinate of that name.
+    #[error("there is no {kind} `{name}`")]
+    Unknown {
+        /// What was looked for.
+        kind: &'static str,
+        /// Its name.
+        name: String,
+    },
+    /// The configuration violates a constraint by more than 1e-6 relative.
+    #[error("constraint `{constraint}` is violated by {violation:e}")]
+    OffConstraint {
+        /// Name of the constraint equation.
+        constraint: String,
+        /// Its value `h(q)`.
+        violation: f64,
+    },
+    /// The scene's initial configuration violates a constraint by more than that.
+    #[error(
+        "the scene's initial configuration is only a guess: it violates constraint `{constraint}` by {violation:e}; start at a configuration that satisfies the constraints, which a projection or settling finds"
+    )]
+    SceneIsGuess {
+        /// Name of the constraint equation.
+        constraint: String,
+        /// Its value `h(q)`.
+        violation: f64,
+    },
+    /// The configuration satisfies a constraint in a way in which it must not be used.
+    #[error("constraint `{constraint}`: {what}")]
+    Degenerate {
+        /// Name of the constraint.
+        constraint: String,
+        /// What is wrong.
+        what: &'static str,
+    },
+    /// The projection found no configuration that satisfies the constraints.
+    #[error(
+        "no configuration found near the guess; constraint `{constraint}` stays violated by {violation:e}"
+    )]
+    Projection {
+        /// Name of the worst constraint equation.
+        constraint: String,
+        /// Its value `h(q)`.
+        violation: f64,
+    },
+    /// No equilibrium was found.
+    #[error(transparent)]
+    Settle(#[from] SettleError),
+    /// A whole number is out of range.
+    #[error("{name} is {value}; it must be from {least} to {most}")]
+    OutOfRange {
+        /// Which setting.
+        name: &'static str,
+        /// Its value.
+        value: u32,
+        /// The least allowed.
+        least: u32,
+        /// The most allowed.
+        most: u32,
+    },
+    /// There is no method of that order for the model and the other settings.
+    #[error("order {order} {what}")]
+    Order {
+        /// The order.
+        order: u32,
+        /// Why there is none.
+        what: &'static str,
+    },
+    /// A time step or an iteration limit is out of range.
+    #[error("{name} is {value}; it must be finite and greater than zero")]
+    Settings {
+        /// Which setting.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+    },
+}
+
+impl Settings {
+    /// Checks every setting; finds the method that has the order for the model.
+    pub(crate) fn check(&self, model: &Model) -> Result<Scheme, InitialError> {
+        for (name, value) in [
+            ("time_step_s", self.time_step_s),
+            ("max_iterations", f64::from(self.max_iterations)),
+            ("singular_below", self.singular_below),
+        ] {
+            if !(value.is_finite() && value > 0.0) {
+                return Err(InitialError::Settings { name, value });
+            }
+        }
+        let within = |name, value: u32, least: u32, most: u32| {
+            if (least..=most).contains(&value) {
+                Ok(())
+            } else {
+                Err(InitialError::OutOfRange { name, value, least, most })
+            }
+        };
+        within("substeps", self.substeps, 1, SUBSTEPS_MAX)?;
+        within("halvings", self.halvings, 0, HALVINGS_MAX)?;
+        let scheme = Scheme::of_order(self.order, model)
+            .map_err(|what| InitialError::Order { order: self.order, what })?;
+        let order = |what| Err(InitialError::Order { order: self.order, what });
+        if scheme != Scheme::Midpoint && self.force_split == ForceSplit::Paper {
+            return order("needs the symmetric force split");
+        }
+        if model.turns_prescribed() && (self.substeps > 1 || scheme != Scheme::Midpoint) {
+            return order(
+                "and one substep alone are there for prescribed ball joints; use order 2",
+            );
+        }
+        Ok(scheme)
     }
 }

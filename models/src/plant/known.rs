@@ -2,11 +2,12 @@
 
 use nalgebra::DMatrix;
 
-use crate::integrator::balls::orientations;
-use crate::integrator::newton::At;
+use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
+use crate::integrator::workspace::At;
 use crate::linearization::linearize::Linearization;
-use crate::plant::facade::{Plant, StepError};
+use crate::model::manifold::orientations;
+use crate::plant::facade::Plant;
 
 /// A step that was taken before, or one that a reference asks for.
 #[derive(Clone, Copy, Debug)]

@@ -16,11 +16,11 @@
 use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::constraints::closure::Closure;
-use crate::control::manifold::tangent_basis;
-use crate::integrator::balls::orientations;
 use crate::integrator::blocks::Blocks;
+use crate::lagrangian::energy::potential_energy;
+use crate::math::null_space::tangent_basis;
+use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
-use crate::plant::initial::potential_energy;
 
 /// Iterations before the search is given up.
 const MAX_ITERATIONS: u32 = 300;

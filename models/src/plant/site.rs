@@ -11,34 +11,15 @@
 //!
 //! with the joint's axis `a_j` through `o_j`, and the point `x`.
 
+use crate::integrator::report::StepError;
 use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Vec3};
+use crate::math::sums::two_sum;
 use crate::math::trigonometry::sin_cos_of;
 use crate::model::mechanism::Model;
+use crate::model::site::{Site, SiteJoint};
 use crate::model::tree::JointKind;
-use crate::plant::facade::{Plant, StepError, two_sum};
-
-/// A frame of a model, with a point of it.
-#[derive(Clone, Debug)]
-pub struct Site {
-    /// The joints that carry it, root first.
-    pub(crate) joints: Vec<SiteJoint>,
-    /// The frame's axes in those of the last joint.
-    pub(crate) rotation: Mat3,
-    /// The point in the frame of the last joint.
-    pub(crate) point: Vec3,
-}
-
-/// A joint above a site.
-#[derive(Clone, Debug)]
-pub(crate) struct SiteJoint {
-    pub(crate) kind: JointKind,
-    pub(crate) coordinate: usize,
-    pub(crate) orientation: usize,
-    /// Pose at zero in the joint above.
-    pub(crate) rotation: Mat3,
-    pub(crate) translation: Vec3,
-}
+use crate::plant::facade::Plant;
 
 /// Where a site is, in world axes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 
-use crate::integrator::newton::Workspace;
 use crate::integrator::settings::Settings;
+use crate::integrator::state::PreciseState;
+use crate::integrator::workspace::Workspace;
 use crate::model::mechanism::Model;
-use crate::plant::facade::{Plant, PreciseState};
+use crate::plant::facade::Plant;
 use crate::plant::initial::{Initial, InitialError};
 use crate::plant::period::Period;
 use crate::plant::snapshot::{Snapshot, SnapshotError};
@@ -66,5 +67,22 @@ impl From<Plant> for Spare {
     /// The plant without its state; the count of its steps stays.
     fn from(plant: Plant) -> Self {
         Self(plant)
+    }
+}
+
+impl Plant {
+    /// A plant in the scene's initial configuration, at rest. Refused where that is only a guess
+    /// ([`Model::initial_violations`]): [`Plant::at`] starts elsewhere.
+    pub fn new(model: Arc<Model>, settings: Settings) -> Result<Self, InitialError> {
+        Self::at(model, settings, &Initial::Scene)
+    }
+
+    /// A plant in a state, step 0.
+    pub fn at(
+        model: Arc<Model>,
+        settings: Settings,
+        initial: &Initial,
+    ) -> Result<Self, InitialError> {
+        Spare::new(model, settings)?.start(initial)
     }
 }

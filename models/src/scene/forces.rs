@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::scene::number_or_name::{NumberOrName, field, number_or_name};
-use crate::scene::{Point, is_zero3, one};
+use crate::scene::point::{Point, is_zero3, one};
 
 /// A force. Forces act on dynamic coordinates; velocities include those of prescribed ones.
 ///

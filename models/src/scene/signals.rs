@@ -3,7 +3,8 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::scene::{Knot, is_zero};
+use crate::math::spline::Knot;
+use crate::scene::point::is_zero;
 
 /// A function of time `t`, seconds since the plant was initialised.
 ///

@@ -19,14 +19,7 @@ use crate::scene::limits::{
 use crate::scene::signals::Signal;
 use crate::scene::{Constraint, CoordinateKind, Motion, Problem, Scene, Spring};
 
-use crate::model::mechanism::Model;
-
 impl Scene {
-    /// Everything that is wrong with the scene; empty when it will compile.
-    pub fn validate(&self) -> Vec<Problem> {
-        Model::compile(self).map_or_else(|error| error.problems, |_| Vec::new())
-    }
-
     /// Everything that is wrong with what the scene says, before it is compiled.
     pub(crate) fn problems(&self) -> Vec<Problem> {
         let mut check = Check::new(self);

@@ -1,6 +1,6 @@
 //! Second derivatives at the stages.
 
-use crate::integrator::newton::Workspace;
+use crate::integrator::workspace::Workspace;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::Planar;
 use crate::lagrangian::potentials;

@@ -1,12 +1,14 @@
 //! One stage corrected after the other, each as a step of the midpoint rule with factors of O(n), until all
 //! residuals are at round-off.
 
-use crate::integrator::matrix::Factors;
-use crate::integrator::newton::{At, CHORD_FLOOR, STALE, Workspace};
+use crate::integrator::newton::{CHORD_FLOOR, STALE};
+use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::{Scheme, Tableau};
 use crate::integrator::settings::Settings;
+use crate::integrator::state::PreciseState;
+use crate::integrator::workspace::{At, Workspace};
+use crate::kkt::factors::Factors;
 use crate::model::mechanism::Model;
-use crate::plant::facade::{PreciseState, StepError, StepReport};
 
 /// A residual that falls by less than this from one sweep to the next falls too slowly.
 const SLOW: f64 = 0.5;

@@ -3,20 +3,21 @@
 //! What belongs to the stages of a coordinate lies side by side, padded to whole [`Lanes`]: number `i` of
 //! coordinate `a` is entry `a·width + i`.
 
-use crate::constraints::closure::{larger, largest};
-use crate::integrator::newton::{At, CHORD_FLOOR, FLOOR, Workspace};
+use crate::integrator::collocation::hessian::Hessian;
+use crate::integrator::newton::{CHORD_FLOOR, FLOOR};
+use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Precision;
+use crate::integrator::state::PreciseState;
+use crate::integrator::workspace::{At, Workspace};
 use crate::lagrangian::forces;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::math::dense_inverse::DenseInverse;
+use crate::math::norms::{larger, largest};
 use crate::math::scalar::{Lanes, Scalar, Side};
 use crate::math::simd::wide;
 use crate::math::trigonometry::without_turns;
 use crate::model::mechanism::Model;
-use crate::plant::facade::{PreciseState, StepError, StepReport};
-
-use crate::integrator::collocation::hessian::Hessian;
 
 /// Rounds of corrections beyond which shorter steps are the better way.
 const ROUNDS: u32 = 16;

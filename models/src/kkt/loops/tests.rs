@@ -5,8 +5,9 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::builtin;
-use crate::integrator::newton::{At, Workspace};
+use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
+use crate::integrator::workspace::{At, Workspace};
 use crate::kkt::loops::{Closures, Derivatives, Mechanism, Scales};
 use crate::kkt::planar::{Diagonal, Of};
 use crate::lagrangian::planar::PlanarTree;
@@ -15,7 +16,7 @@ use crate::linearization::second_order::contraction::Contraction;
 use crate::linearization::second_order::tensors::SecondOrder;
 use crate::math::rows::padded;
 use crate::model::mechanism::{Model, Solver};
-use crate::plant::facade::{Plant, StepError};
+use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
 use crate::scene::Scene;
 

@@ -5,15 +5,16 @@ use std::sync::Arc;
 use nalgebra::{DMatrix, DVector};
 
 use crate::builtin;
-use crate::integrator::matrix::Generators;
-use crate::integrator::newton::Workspace;
+use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
+use crate::integrator::workspace::Workspace;
+use crate::kkt::factors::Generators;
 use crate::kkt::planar::Of;
 use crate::kkt::space::Elimination;
 use crate::linearization::linearize::Linearization;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::{Model, Solver};
-use crate::plant::facade::{Plant, StepError};
+use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
 use crate::scene::Scene;
 

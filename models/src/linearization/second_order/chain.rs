@@ -1,14 +1,12 @@
 //! Weighted second derivatives of collocation, and of periods of several steps.
 
 use crate::integrator::blocks::non_zero;
-use crate::linearization::chain::Part;
-use crate::linearization::collocation::StageTangents;
-use crate::linearization::linearize::Linearization;
+use crate::integrator::report::StepError;
+use crate::linearization::linearize::{Linearization, Part, StageTangents};
 use crate::linearization::second_order::contraction::Contraction;
 use crate::math::rows::add_rows;
 use crate::math::scalar::Dual;
 use crate::model::mechanism::Model;
-use crate::plant::facade::StepError;
 
 impl Contraction {
     /// The sum over the steps of a period: with the tangent `T_j` of the parameters of step `j`, and the

@@ -17,20 +17,19 @@
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::integrator::balls::three;
 use crate::integrator::blocks::{StepBlocks, non_zero};
-use crate::integrator::matrix::fill_schur;
+use crate::integrator::report::StepError;
+use crate::kkt::schur::fill_schur;
 use crate::linearization::linearize::{Linearization, SolvedStep};
+use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
 use crate::math::gemm::{Into, Operand, mirror_head, product};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rows::{Term, add_rows, padded};
 use crate::math::scalar::Dual;
+use crate::math::spatial::three;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Model;
-use crate::plant::facade::{Plant, StepError, StepReport};
-
-use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
 
 /// A weighted sum of second derivatives, `Σ z_i ∂²x_i[k+1] + Σ w_c ∂²λ_c`, preallocated.
 #[derive(Clone, Debug)]
@@ -539,33 +538,11 @@ impl Contraction {
     }
 }
 
-impl Plant {
-    /// [`Plant::linearize`] into `first`, then [`Contraction::contract`] with `weights_x` and
-    /// `weights_multipliers` into `out`.
-    ///
-    /// # Errors
-    ///
-    /// Those of a step, and [`StepError::Dimension`] for weights of the wrong length.
-    ///
-    /// # Panics
-    ///
-    /// If `first` or `out` was made for a model of other dimensions.
-    pub fn contract_second_order(
-        &mut self,
-        u: &[f64],
-        weights_x: &[f64],
-        weights_multipliers: &[f64],
-        first: &mut Linearization,
-        out: &mut Contraction,
-    ) -> Result<StepReport, StepError> {
-        check_weights(&self.model, weights_x, weights_multipliers)?;
-        let report = self.linearize(u, first)?;
-        out.contract(&self.model, first, weights_x, weights_multipliers)?;
-        Ok(report)
-    }
-}
-
-fn check_weights(model: &Model, x: &[f64], multipliers: &[f64]) -> Result<(), StepError> {
+pub(crate) fn check_weights(
+    model: &Model,
+    x: &[f64],
+    multipliers: &[f64],
+) -> Result<(), StepError> {
     let d = model.dimensions;
     for (weights, expected) in [(x, d.state()), (multipliers, d.constraints)] {
         if weights.len() != expected {

@@ -2,17 +2,14 @@
 
 use nalgebra::DMatrix;
 
-use crate::integrator::balls::Turning;
-use crate::integrator::blocks::non_zero;
+use crate::integrator::report::StepError;
+use crate::integrator::turning::Turning;
 use crate::linearization::linearize::Linearization;
-use crate::math::rows::{add_rows, padded};
+use crate::linearization::second_order::contraction::Contraction;
+use crate::linearization::second_order::{Layout, Scratch};
 use crate::math::scalar::Dual;
 use crate::math::spatial::Mat3;
 use crate::model::mechanism::Model;
-use crate::plant::facade::{Plant, StepError, StepReport};
-
-use crate::linearization::second_order::contraction::Contraction;
-use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
 
 /// Full tensors with more numbers than this are refused: 1 GiB.
 const ENTRIES_MAX: usize = 1 << 27;
@@ -35,20 +32,20 @@ pub struct TooLarge {
 /// multiplier; the rows and columns of `v`, and the outputs of prescribed coordinates, are zero.
 #[derive(Clone, Debug)]
 pub struct SecondOrder {
-    scratch: Scratch,
+    pub(crate) scratch: Scratch,
     /// One block for each parameter `a`: rows `x''` (nd), `λ''` (nc), `p''` (nd), columns `b ≤ a`.
-    tensor: Vec<f64>,
+    pub(crate) tensor: Vec<f64>,
     /// Velocities of prescribed ball joints, `ξ/h`, by both ends of the step.
-    spins: Vec<Spin>,
+    pub(crate) spins: Vec<Spin>,
 }
 
 /// Second derivatives of the velocity of a prescribed ball joint.
 #[derive(Clone, Debug)]
-struct Spin {
+pub(crate) struct Spin {
     /// First of its coordinates.
-    coordinate: usize,
+    pub(crate) coordinate: usize,
     /// For each component, by the start and by the end of the step.
-    tensor: [DMatrix<f64>; 3],
+    pub(crate) tensor: [DMatrix<f64>; 3],
 }
 
 /// Where the second derivatives of an output stand.
@@ -137,7 +134,7 @@ impl SecondOrder {
     }
 
     /// Fills the tensor output by output.
-    fn gather(&mut self, model: &Model, first: &Linearization) -> Result<(), StepError> {
+    pub(crate) fn gather(&mut self, model: &Model, first: &Linearization) -> Result<(), StepError> {
         let Layout { nd, nc, stride, .. } = self.scratch.layout;
         let (n, rows) = (self.scratch.layout.n(), 2 * nd + nc);
         let mut contraction = Contraction::new(model);
@@ -228,143 +225,10 @@ impl SecondOrder {
     }
 }
 
-impl Plant {
-    /// Linearizes the map at the current state and `u` to second order, and stays there. `first` gets
-    /// what [`Plant::linearize`] writes.
-    ///
-    /// Costs, for `N` parameters, `N` evaluations of the derivative blocks in dual numbers and
-    /// O(N² nd·depth).
-    ///
-    /// # Panics
-    ///
-    /// If `first` or `second` was made for a model of other dimensions.
-    pub fn linearize_second_order(
-        &mut self,
-        u: &[f64],
-        first: &mut Linearization,
-        second: &mut SecondOrder,
-    ) -> Result<StepReport, StepError> {
-        let report = self.linearize(u, first)?;
-        assert_layout(&self.model, &second.scratch);
-        if !first.is_midpoint_step() {
-            second.gather(&self.model, first)?;
-            return Ok(report);
-        }
-        if self.workspace.factors.planar().is_some() {
-            self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
-        }
-        if self.workspace.in_loops {
-            self.workspace.prepare_start(&self.model, &self.state);
-            self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
-            self.workspace.factor_schur(&self.model, &self.settings)?;
-        }
-        self.differentiate_linearization(first, second);
-        Ok(report)
-    }
-
-    /// Fills the tensor at the solution in the workspace, whose factors `first` left there.
-    fn differentiate_linearization(&mut self, first: &Linearization, second: &mut SecondOrder) {
-        let model = &*self.model;
-        let SecondOrder { scratch, tensor, spins } = second;
-        let Layout { nd, nc, stride, .. } = scratch.layout;
-        let n = scratch.layout.n();
-        let workspace = &mut self.workspace;
-        workspace.schur.reserve(stride);
-        first.write_tangent(stride, &mut scratch.tangent);
-        let rows = (2 * nd + nc) * stride;
-        if rows == 0 {
-            return;
-        }
-        for (a, block) in tensor.chunks_exact_mut(rows).enumerate() {
-            scratch.seed(a, model, first.solved_step());
-            scratch.blocks.evaluate(model, &self.settings);
-            let Scratch { layout, blocks, tangent, terms, .. } = scratch;
-            // Columns beyond `a` follow from symmetry, which ball joints reach only in the end.
-            let columns = if blocks.turnings.is_empty() { padded(a + 1) } else { stride };
-            let (solved, momentum) = block.split_at_mut((nd + nc) * stride);
-            let (residual, closing) = solved.split_at_mut(nd * stride);
-
-            // What the change of the blocks makes of the tangents.
-            for (i, row) in residual.chunks_exact_mut(stride).enumerate() {
-                let row = &mut row[..columns];
-                let by = [&blocks.residual_start[..], &blocks.residual_next[..]];
-                layout.place(row, i, by, &blocks.residual_inputs);
-                blocks.terms(i, &blocks.residual_next, terms);
-                add_rows(row, tangent, stride, terms);
-            }
-            for (i, row) in momentum.chunks_exact_mut(stride).enumerate() {
-                let row = &mut row[..columns];
-                let by = [&blocks.momentum_start[..], &blocks.momentum_next[..]];
-                layout.place(row, i, by, &blocks.momentum_inputs);
-                blocks.terms(i, &blocks.momentum_next, terms);
-                add_rows(row, tangent, stride, terms);
-            }
-            for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
-                let row = &mut row[..columns];
-                let [by_start, by_next] =
-                    blocks.end_jacobians().map(|jacobian| &jacobian[c * n..][..n]);
-                layout.place_end(row, by_start, by_next);
-                terms.clear();
-                terms.extend(non_zero(by_next[..nd].iter().map(|entry| entry.eps)));
-                add_rows(row, tangent, stride, terms);
-            }
-
-            // x'' and λ'' = −E⁻¹ (…).
-            workspace.factors.matrix.solve_rows(&model.elimination, residual, stride, columns);
-            for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
-                let row = &mut row[..columns];
-                row.iter_mut().for_each(|entry| *entry = -*entry);
-                let jacobian = &workspace.end.jacobian[c * n..][..nd];
-                terms.clear();
-                terms.extend(non_zero(jacobian.iter().copied()));
-                add_rows(row, residual, stride, terms);
-            }
-            if nc > 0 {
-                workspace.schur.solve_rows(closing, stride);
-            }
-            for (i, row) in residual.chunks_exact_mut(stride).enumerate() {
-                let row = &mut row[..columns];
-                row.iter_mut().for_each(|entry| *entry = -*entry);
-                let responses = &workspace.responses[i * padded(nc)..][..nc];
-                terms.clear();
-                terms.extend(responses.iter().enumerate().map(|(c, response)| (*response, c)));
-                add_rows(row, closing, stride, terms);
-            }
-
-            // What these make of the momentum.
-            for (i, row) in momentum.chunks_exact_mut(stride).enumerate() {
-                let slopes = blocks.momentum_next[i * n..][..nd].iter().map(|entry| entry.re);
-                let impulses = (0..nc).map(|c| -workspace.start.jacobian[c * n + i]);
-                terms.clear();
-                terms.extend(non_zero(slopes.chain(impulses)));
-                add_rows(&mut row[..columns], solved, stride, terms);
-            }
-            for t in blocks.turnings.iter().filter(|t| t.coordinate < nd) {
-                layout.turn_rows(t, tangent, solved);
-            }
-            let prescribed = blocks.turnings.iter().filter(|t| t.coordinate >= nd);
-            for (spin, t) in spins.iter_mut().zip(prescribed) {
-                if let Some(a) = layout.end_of(t.coordinate, a) {
-                    let change = spin_change(t, self.settings.time_step_s);
-                    for (tensor, row) in spin.tensor.iter_mut().zip(change) {
-                        tensor.row_mut(a).iter_mut().zip(row).for_each(|(to, from)| *to = from);
-                    }
-                }
-            }
-        }
-        if !model.orientations.is_empty() {
-            symmetrise(tensor, rows, stride);
-            for tensor in spins.iter_mut().flat_map(|spin| &mut spin.tensor) {
-                *tensor = (&*tensor + tensor.transpose()) * 0.5;
-            }
-        }
-    }
-}
-
 impl Layout {
     /// Writes the dual parts of row `i` of a block by start, next, and inputs into the columns of the
     /// parameters that these are; the columns of `x` are for the tangents.
-    fn place(&self, row: &mut [f64], i: usize, by: [&[Dual]; 2], by_inputs: &[Dual]) {
+    pub(crate) fn place(&self, row: &mut [f64], i: usize, by: [&[Dual]; 2], by_inputs: &[Dual]) {
         let [start, next] = by.map(|block| &block[i * self.n()..][..self.n()]);
         row.fill(0.0);
         put(row, 0, start);
@@ -373,7 +237,7 @@ impl Layout {
     }
 
     /// The same for a row of the constraint Jacobian at the end: a shift of the start moves both ends.
-    fn place_end(&self, row: &mut [f64], by_start: &[Dual], by_next: &[Dual]) {
+    pub(crate) fn place_end(&self, row: &mut [f64], by_start: &[Dual], by_next: &[Dual]) {
         row.fill(0.0);
         put(row, 0, &by_start[..self.nd]);
         put(row, self.next(), &by_next[self.nd..]);
@@ -381,7 +245,7 @@ impl Layout {
 
     /// From `ξ''` of a ball joint to the second derivative of how its end turns, `dexp₋ξ ξ' + exp(−ξ) η`
     /// once more along the direction of the duals.
-    fn turn_rows(&self, t: &Turning<Dual>, tangent: &[f64], rows: &mut [f64]) {
+    pub(crate) fn turn_rows(&self, t: &Turning<Dual>, tangent: &[f64], rows: &mut [f64]) {
         let (i, stride) = (t.coordinate, self.stride);
         let entry = |m: &Mat3<Dual>, a: usize, b: usize| m.0[b][a];
         for column in 0..stride {
@@ -403,7 +267,7 @@ impl Layout {
 
 /// Replaces the derivative along `a` of the tangent `b` by its mean with that along `b` of the tangent
 /// `a`: the second derivative in the chart `exp` of each ball joint. Their difference is a commutator.
-fn symmetrise(tensor: &mut [f64], rows: usize, stride: usize) {
+pub(crate) fn symmetrise(tensor: &mut [f64], rows: usize, stride: usize) {
     let parameters = tensor.len() / rows;
     for a in 0..parameters {
         for b in 0..a {

@@ -10,13 +10,14 @@ use nalgebra::{DMatrix, DVector};
 use super::{Direction, Go, Optimizer, Scratch, Second, Worker, ask, subtract_product};
 use crate::control::lq::Stage;
 use crate::control::tangent_basis;
+use crate::integrator::report::StepError;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
 use crate::math::sparse_map::Map;
 use crate::optimize::problem::{self, Deviation, Problem, dot};
 use crate::optimize::trajectory::Trajectory;
 use crate::optimize::{Fallback, Method, OptimizeError};
-use crate::plant::facade::{Plant, StepError};
+use crate::plant::facade::Plant;
 use crate::plant::known::KnownStep;
 
 /// Curvature, relative to the largest, that a free initial state is given where projected momenta leave it
@@ -156,8 +157,7 @@ impl Optimizer {
             let mut slope = weight * change;
             for &i in problem.model.orientations() {
                 let map = problem::chart(&scratch.error, i);
-                let turned =
-                    map.apply_transposed(crate::integrator::balls::three(slope.as_slice(), i));
+                let turned = map.apply_transposed(crate::math::spatial::three(slope.as_slice(), i));
                 slope.rows_mut(i, 3).copy_from_slice(&turned.0);
             }
             by_x[0] += slope;

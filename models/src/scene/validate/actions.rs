@@ -3,10 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::scene::limits::MAX_POWER;
+use crate::scene::point::Point;
 use crate::scene::validate::Check;
-use crate::scene::{
-    Axis, Constraint, CoordinateKind, CouplingTerm, Length, Motion, Plane, Point, Spring,
-};
+use crate::scene::{Axis, Constraint, CoordinateKind, CouplingTerm, Length, Motion, Plane, Spring};
 
 /// A frame; the world has no index.
 pub(super) type Carrier = Option<usize>;

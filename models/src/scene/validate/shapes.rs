@@ -2,10 +2,10 @@
 
 use nalgebra::{Matrix3, Vector3, Vector4};
 
-use crate::math::spline::Spline;
+use crate::math::spline::{Knot, Spline};
 use crate::scene::limits::MAX_KNOTS;
 use crate::scene::validate::Check;
-use crate::scene::{Body, Knot, Rotation};
+use crate::scene::{Body, Rotation};
 
 /// How far a quaternion or a rotation matrix may be from orthonormal: what seven digits leave.
 const ORTHONORMAL_TOLERANCE: f64 = 1e-6;

@@ -1,0 +1,28 @@
+//! Kinetic and potential energy.
+
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::momenta::Momenta;
+use crate::lagrangian::potentials;
+use crate::model::mechanism::Model;
+
+/// Potential energy of gravity and springs, with poses and momenta evaluated at `q`.
+pub(crate) fn potential_energy(model: &Model, poses: &Poses, momenta: &Momenta, q: &[f64]) -> f64 {
+    let tree = &model.dynamics;
+    let roots = tree.joints.iter().enumerate().filter(|(i, joint)| joint.root == *i);
+    let weight: f64 = roots
+        .map(|(i, root)| {
+            let moment = momenta.moment[i] + poses.origin[i] * root.subtree_mass;
+            model.gravity.map_or(0.0, |g| g.dot(moment))
+        })
+        .sum();
+    potentials::potential(&model.potentials, tree, poses, q) - weight
+}
+
+/// Kinetic and potential energy, J.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Energy {
+    /// `T(q, v)`.
+    pub kinetic_j: f64,
+    /// Gravity and springs.
+    pub potential_j: f64,
+}
