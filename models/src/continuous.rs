@@ -27,6 +27,7 @@ use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
 use crate::integrator::blocks::Blocks;
+use crate::kkt::schur::room_for_schur;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rows::padded;
@@ -159,7 +160,7 @@ impl Continuous {
             varied: None,
             mass: TreeLu::new(&model.elimination),
             responses: vec![0.0; nd * padded(nc)],
-            schur: PivotedLu::new(&model.conditioning.weight, stride),
+            schur: room_for_schur(&model, stride),
             value: Accelerations { acceleration: vec![0.0; nd], multipliers: vec![0.0; nc] },
             tangent: vec![0.0; (nd + nc) * stride],
             model,

@@ -23,9 +23,10 @@ pub use crate::scene::signals::{Interpolation, Signal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-pub use crate::math::spline::Knot;
 use crate::scene::number_or_name::{NumberOrName, field, number_or_name};
 use crate::scene::point::{is_zero, is_zero3, one};
+
+pub use crate::math::spline::Knot;
 
 /// A mechanism: a tree of frames with joints and bodies, what acts on it, and what constrains it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -8,6 +8,7 @@ use crate::integrator::report::StepReport;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::factors::Factors;
+use crate::kkt::schur::room_for_schur;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rows::{Term, padded, spread};
@@ -155,7 +156,7 @@ impl Workspace {
             end: Closure::new(model),
             end_is_exact: false,
             responses: zeros(nd * padded(nc)),
-            schur: PivotedLu::new(&model.conditioning.weight, spread(padded(2 * n))),
+            schur: room_for_schur(model, spread(padded(2 * n))),
             in_loops: false,
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),

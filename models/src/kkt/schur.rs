@@ -20,3 +20,8 @@ pub(crate) fn fill_schur(model: &Model, closure: &Closure, x: &[f64], schur: &mu
         }
     }
 }
+
+/// Room for `S` of a model, each row with its weight, and for solutions of rows `stride` apart.
+pub(crate) fn room_for_schur(model: &Model, stride: usize) -> PivotedLu {
+    PivotedLu::new(&model.conditioning.weight, stride).with_independent(model.constraint_rank())
+}

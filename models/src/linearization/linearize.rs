@@ -26,6 +26,7 @@ use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
 use crate::integrator::workspace::{At, Workspace};
+use crate::kkt::schur::room_for_schur;
 use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rows::{Term, padded, spread};
@@ -124,7 +125,7 @@ impl SolvedStep {
             inputs: zeros(d.inputs),
             multipliers: zeros(d.constraints),
             responses: zeros(d.dynamic * padded(d.constraints)),
-            schur: PivotedLu::new(&model.conditioning.weight, 1),
+            schur: room_for_schur(model, 1),
             in_loops: false,
         }
     }

@@ -19,7 +19,7 @@ use nalgebra::DMatrix;
 use crate::constraints::closure::Closure;
 use crate::integrator::blocks::{StepBlocks, non_zero};
 use crate::integrator::report::StepError;
-use crate::kkt::schur::fill_schur;
+use crate::kkt::schur::{fill_schur, room_for_schur};
 use crate::linearization::linearize::{Linearization, SolvedStep};
 use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
 use crate::math::gemm::{Into, Operand, mirror_head, product};
@@ -179,7 +179,7 @@ impl Contraction {
             adjoint: vec![0.0; rows],
             impulse: vec![0.0; n],
             quadratic: Quadratic::new(layout),
-            schur: PivotedLu::new(&model.conditioning.weight, 1),
+            schur: room_for_schur(model, 1),
             dense: model.loops.as_ref().map(|_| Dense {
                 matrix: TreeLu::new(&model.elimination),
                 responses: vec![0.0; layout.nd * padded(layout.nc)],
