@@ -26,8 +26,8 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::integrator::blocks::Blocks;
 use crate::kkt::schur::room_for_schur;
+use crate::lagrangian::derivatives::Derivatives;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rows::padded;
@@ -443,7 +443,7 @@ struct Equations<S> {
     acceleration: Vec<S>,
     multipliers: Vec<S>,
     /// Along the motion.
-    blocks: Blocks<Dual<S>>,
+    blocks: Derivatives<Dual<S>>,
     /// At the configuration, for second derivatives.
     closure: Closure<S>,
     /// Along the motion, twice.
@@ -475,7 +475,7 @@ impl<S: Scalar> Equations<S> {
             inputs: zeros(layout.ni),
             acceleration: zeros(n),
             multipliers: zeros(layout.nc),
-            blocks: Blocks::new(model),
+            blocks: Derivatives::new(model),
             closure: Closure::new(model),
             motion: Closure::new(model),
             hessian: zeros(if layout.nc > 0 { n * n } else { 0 }),

@@ -36,6 +36,31 @@ pub(crate) struct SecondDerivatives<S = f64> {
     pub(crate) vv: S,
 }
 
+/// Second derivatives of `L` by two coordinates, in their row and column of the matrices.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Entry<S> {
+    pub(crate) qq: S,
+    pub(crate) qv: S,
+    pub(crate) vq: S,
+    pub(crate) vv: S,
+}
+
+impl<S: Copy> SecondDerivatives<S> {
+    /// What stands at (ancestor, descendant) and at (descendant, ancestor).
+    #[inline(always)]
+    pub(crate) fn entries(
+        self,
+        ancestor: usize,
+        descendant: usize,
+    ) -> [(usize, usize, Entry<S>); 2] {
+        let Self { qq, vv, q_above_v_below: above, v_above_q_below: below } = self;
+        [
+            (ancestor, descendant, Entry { qq, qv: above, vq: below, vv }),
+            (descendant, ancestor, Entry { qq, qv: below, vq: above, vv }),
+        ]
+    }
+}
+
 impl<S: Scalar> Curvature<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();

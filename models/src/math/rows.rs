@@ -103,3 +103,8 @@ fn add_block<const N: usize>(
     }
     *block = sum;
 }
+
+/// The entries that are not zero, with their indices.
+pub(crate) fn non_zero(entries: impl Iterator<Item = f64>) -> impl Iterator<Item = Term> {
+    entries.enumerate().filter(|(_, entry)| *entry != 0.0).map(|(i, entry)| (entry, i))
+}

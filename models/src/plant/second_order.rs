@@ -1,12 +1,11 @@
 //! Second derivatives at the state of a plant.
 
-use crate::integrator::blocks::non_zero;
 use crate::integrator::report::{StepError, StepReport};
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::{Contraction, check_weights};
 use crate::linearization::second_order::tensors::{SecondOrder, symmetrise};
 use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
-use crate::math::rows::{add_rows, padded};
+use crate::math::rows::{add_rows, non_zero, padded};
 use crate::plant::facade::Plant;
 
 impl Plant {

@@ -16,7 +16,7 @@
 use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::constraints::closure::Closure;
-use crate::integrator::blocks::Blocks;
+use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::energy::potential_energy;
 use crate::math::null_space::tangent_basis;
 use crate::model::manifold::orientations;
@@ -153,7 +153,7 @@ fn retract(model: &Model, q: &[f64], increment: &DVector<f64>) -> Vec<f64> {
 /// A search in progress.
 struct Search<'a> {
     model: &'a Model,
-    blocks: Blocks,
+    blocks: Derivatives,
     closure: Closure,
     inputs: Vec<f64>,
     /// Whether each dynamic coordinate may move.
@@ -200,7 +200,7 @@ impl<'a> Search<'a> {
                 *moves = false;
             }
         }
-        let (blocks, closure) = (Blocks::new(model), Closure::new(model));
+        let (blocks, closure) = (Derivatives::new(model), Closure::new(model));
         Ok(Self { model, blocks, closure, inputs, moves, largest: 0.0 })
     }
 

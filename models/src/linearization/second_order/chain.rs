@@ -1,10 +1,9 @@
 //! Weighted second derivatives of collocation, and of periods of several steps.
 
-use crate::integrator::blocks::non_zero;
 use crate::integrator::report::StepError;
 use crate::linearization::linearize::{Linearization, Part, StageTangents};
 use crate::linearization::second_order::contraction::Contraction;
-use crate::math::rows::add_rows;
+use crate::math::rows::{add_rows, non_zero};
 use crate::math::scalar::Dual;
 use crate::model::mechanism::Model;
 

@@ -17,7 +17,7 @@
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::integrator::blocks::{StepBlocks, non_zero};
+use crate::integrator::blocks::StepBlocks;
 use crate::integrator::report::StepError;
 use crate::kkt::schur::{fill_schur, room_for_schur};
 use crate::linearization::linearize::{Linearization, SolvedStep};
@@ -25,7 +25,7 @@ use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_ch
 use crate::math::gemm::{Into, Operand, mirror_head, product};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
-use crate::math::rows::{Term, add_rows, padded};
+use crate::math::rows::{Term, add_rows, non_zero, padded};
 use crate::math::scalar::Dual;
 use crate::math::spatial::three;
 use crate::math::tree_lu::TreeLu;
