@@ -1,6 +1,6 @@
 //! The exact linearization of a step of collocation, from all stages at once.
 //!
-//! With the residuals `R_i` and impulses `P_i` of the stages, and `θ = (q, p, inputs, k)`,
+//! With the residuals `R_i` and impulses `P_i` of the stages, and `θ = (q, p, u, k)`,
 //!
 //! ```text
 //! Y' = −(∂R/∂Y)⁻¹ R_θ        x' = Σ Y_i'        p[k+1]' = p' + Σ P_i,θ + (Σ ∂P_i/∂Y) Y'
@@ -13,7 +13,8 @@ use crate::integrator::collocation::system::System;
 use crate::integrator::report::StepError;
 use crate::integrator::workspace::{At, Workspace};
 use crate::linearization::linearize::{Linearization, StageTangents};
-use crate::math::rows::{add_rows, padded};
+use crate::linearization::parameters::Parameters;
+use crate::math::rows::add_rows;
 
 impl Collocation {
     /// Linearizes at the solution.
@@ -27,8 +28,8 @@ impl Collocation {
         let d = model.dimensions;
         let (count, n, nd) = (self.tableau.nodes.len(), d.coordinates(), d.dynamic);
         let h = at.settings.time_step_s;
-        let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
-        let stride = padded((next + d.prescribed).max(1));
+        let theta = Parameters::new(model);
+        let (momentum, inputs, next, stride) = (n, theta.inputs(), theta.next(), theta.stride);
         let system = self.system.get_or_insert_with(|| Box::new(System::new(model, &self.tableau)));
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {

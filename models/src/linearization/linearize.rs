@@ -1,24 +1,29 @@
-//! The exact first-order linearization of a step, in increment form.
+//! The exact first-order linearization of a step, in increment form (sections IV and V of the paper).
 //!
-//! Unknown `y = (x, λ)`, parameters `θ = (q_d, q_k, p, k, u)`: start configuration (dynamic,
-//! prescribed), momentum, next prescribed positions, inputs. With both ends of the step shifted
-//! together no terms of size `1/h` cancel. At the midpoint, with `a` the weight of `F⁻`,
+//! Unknown `y = (x, λ)`, parameters `θ = (q, p, u, k)` with `q = (q_d, q_k)`: start configuration
+//! (dynamic, prescribed), momentum, inputs, next prescribed positions. With both ends of the step
+//! shifted together no terms of size `1/h` cancel. At the midpoint, with `a` the weight of `F⁻`,
 //!
 //! ```text
-//! C_q = ½h L_qq − L_vq        C_v = ½h L_qv − L_vv + a h f_v        H = Σ λ D²h(q[k])
+//! C_q = ½h L_qq − L_vq + a h f_q      C_v = ½h L_qv − L_vv + a h f_v      H = Σ λ D²h(q[k])
+//! M_q = h (L_qq + f_q)                M_v = h (L_qv + f_v)                S = A1 K⁻¹ A0ᵀ
 //!
-//! column      of r1                       of r2
-//! q_d         (C_q − H)_dd                A1_d
-//! q_k         (½C_q − C_v/h − H)_dk       0
-//! p           1                           0
-//! k           (½C_q + C_v/h)_dk           A1_k
+//! column      of r1                       of r2      of p[k+1], at fixed x and λ
+//! q_d         (C_q − H)_dd                A1_d       (M_q − H)_dd
+//! q_k         (½C_q − C_v/h − H)_dk       0          (½M_q − M_v/h − H)_dk
+//! p           1                           0          1
+//! u           a h f_u                     0          h f_u
+//! k           (½C_q + C_v/h)_dk           A1_k       (½M_q + M_v/h)_dk
+//! x           K = (½C_q + C_v/h)_dd       A1_d       (½M_q + M_v/h)_dd
+//! λ           −A0ᵀ                        0          −A0ᵀ
 //!
 //! x' = K⁻¹ (A0ᵀ λ' − r1')      S λ' = A1 K⁻¹ r1' − r2'      q[k+1]' = q_d' + x'
-//! p[k+1]' = p' + (½h L_qq + L_qv + h f_v/h) x' + h L_qq q_d' + (prescribed) − A0ᵀ λ' − H q'
+//! p[k+1]' = p' + (½M_q + M_v/h) x' + M_q q_d' + (prescribed) − A0ᵀ λ' − H q'
 //! ```
 //!
 //! An input acts like momentum: its column is `Σ_i a h ∂f_i/∂u` times that of `p_i`, plus
-//! `(1 − a) h ∂f_i/∂u` on `p[k+1]_i`. Prescribed positions that signals replace have no effect.
+//! `(1 − a) h ∂f_i/∂u` on `p[k+1]_i`; rows leave the columns of `u` out. Prescribed positions that
+//! signals replace have no effect.
 
 use nalgebra::DMatrix;
 
@@ -27,6 +32,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
 use crate::integrator::workspace::{At, Workspace};
 use crate::kkt::schur::room_for_schur;
+use crate::linearization::parameters::Parameters;
 use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rows::{Term, padded, spread};
@@ -74,7 +80,7 @@ pub struct Linearization {
     /// Prescribed coordinates that signals drive, as columns of `B`.
     pub(crate) replaced: Vec<usize>,
     pub(crate) at_start: f64,
-    /// Length of a row: the columns of the parameters `(q_d, q_k, p, k)`, padded.
+    /// Length of a row: the columns of the parameters `(q, p, k)`, padded.
     pub(crate) stride: usize,
     /// `x'`, row-major, nd rows.
     pub(crate) increment: Vec<f64>,
@@ -247,17 +253,16 @@ impl Linearization {
         self.driven.resize((2 * self.nd + self.constraints()) * self.ni, 0.0);
     }
 
-    /// Sets `x_i'` and `p_i[k+1]'` by the parameters `(q, p, inputs, k)`, for collocation.
+    /// Sets `x_i'` and `p_i[k+1]'` by the parameters `(q, p, u, k)`, for collocation.
     pub(crate) fn set_rows(&mut self, i: usize, by: [&[f64]; 2]) {
-        let (next, nk, ni, nd) = (self.next_columns(), self.nk, self.ni, self.nd);
-        let driven = [i, nd + self.constraints() + i];
+        let theta = self.parameters();
+        let driven = [i, theta.nd + theta.nc + i];
         for ((rows, driven), by) in
             [&mut self.increment, &mut self.momentum].into_iter().zip(driven).zip(by)
         {
-            self.driven[driven * ni..][..ni].copy_from_slice(&by[next..][..ni]);
-            let row = &mut rows[i * self.stride..][..self.stride];
-            row[..next].copy_from_slice(&by[..next]);
-            row[next..][..nk].copy_from_slice(&by[next + ni..][..nk]);
+            let by_inputs = &by[theta.inputs()..theta.next()];
+            self.driven[driven * theta.ni..][..theta.ni].copy_from_slice(by_inputs);
+            theta.drop_inputs(by, &mut rows[i * self.stride..][..self.stride]);
         }
     }
 
@@ -414,18 +419,18 @@ impl Linearization {
         [at_start, at_end]
     }
 
-    /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, inputs, k)`.
+    /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, u, k)`.
     pub(crate) fn write_tangent(&self, stride: usize, out: &mut [f64]) {
-        let (n, next) = (self.nd + self.nk, self.next_columns());
+        let theta = self.parameters();
         let width = self.stride.max(1);
         let rows = self.increment.chunks_exact(width).chain(self.multipliers.chunks_exact(width));
         for (row, out) in rows.zip(out.chunks_exact_mut(stride)) {
-            out[..next].copy_from_slice(&row[..next]);
-            out[next..][..self.ni].fill(0.0);
+            theta.insert_inputs(row, out);
+            let by_inputs = &mut out[theta.inputs()..theta.next()];
+            by_inputs.fill(0.0);
             for &InputImpulse { input, coordinate, residual, .. } in &self.inputs {
-                out[next + input] += residual * row[n + coordinate];
+                by_inputs[input] += residual * row[theta.n() + coordinate];
             }
-            out[next + self.ni..][..self.nk].copy_from_slice(&row[next..][..self.nk]);
         }
     }
 
@@ -439,9 +444,15 @@ impl Linearization {
         if self.kind == Kind::Step { &[] } else { &self.driven[row * self.ni..][..self.ni] }
     }
 
-    /// First column of the next prescribed positions.
+    /// The parameters of the map. Rows leave the columns of the inputs out.
+    pub(crate) fn parameters(&self) -> Parameters {
+        let (nd, nk, ni, nc) = (self.nd, self.nk, self.ni, self.constraints());
+        Parameters { nd, nk, ni, nc, stride: self.stride }
+    }
+
+    /// First column of the next prescribed positions in rows without the inputs.
     pub(crate) fn next_columns(&self) -> usize {
-        2 * self.nd + self.nk
+        self.parameters().inputs()
     }
 
     pub(crate) fn constraints(&self) -> usize {
@@ -471,7 +482,7 @@ fn add_block(block: &Mat3, (row, column): (usize, usize), matrix: &mut DMatrix<f
 #[derive(Clone, Debug)]
 pub(crate) struct Part {
     pub(crate) step: Linearization,
-    /// `D`, row-major: rows `(q_d, q_k, p, k)`.
+    /// `D`, row-major: rows `(q, p, k)`.
     pub(crate) tangent: Vec<f64>,
 }
 
@@ -486,7 +497,7 @@ pub(crate) struct StageTangents {
     pub(crate) q: Vec<f64>,
     pub(crate) velocity: Vec<f64>,
     pub(crate) inputs: Vec<f64>,
-    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `n s` padded rows: those of the stages of a
+    /// `Y'` by the parameters `(q, p, u, k)`, row-major, `n s` padded rows: those of the stages of a
     /// coordinate side by side.
     pub(crate) tangent: Vec<f64>,
     /// `∂P_i/∂θ`, the same way.

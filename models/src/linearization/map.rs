@@ -9,8 +9,9 @@ impl Linearization {
     /// Writes `[B A]` without its zeros: rows of dynamic coordinates and momenta are full, those of
     /// prescribed coordinates have an entry or two.
     pub(crate) fn write_map(&self, map: &mut Map) {
-        let (nd, nk, ni) = (self.nd, self.nk, self.ni);
-        let (n, next, inputs) = (nd + nk, self.next_columns(), self.ni + self.nk);
+        let theta = self.parameters();
+        let (nd, nk, ni) = (theta.nd, theta.nk, theta.ni);
+        let (n, next, inputs) = (theta.n(), theta.inputs(), ni + nk);
         if !self.turnings.is_empty() {
             let (mut a, mut b) = (DMatrix::zeros(2 * n, 2 * n), DMatrix::zeros(2 * n, inputs));
             self.write_a(&mut a);

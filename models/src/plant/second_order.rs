@@ -2,9 +2,10 @@
 
 use crate::integrator::report::{StepError, StepReport};
 use crate::linearization::linearize::Linearization;
+use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::contraction::{Contraction, check_weights};
 use crate::linearization::second_order::tensors::{SecondOrder, symmetrise};
-use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
+use crate::linearization::second_order::{Scratch, assert_layout, spin_change};
 use crate::math::rows::{add_rows, non_zero, padded};
 use crate::plant::facade::Plant;
 
@@ -76,7 +77,7 @@ impl Plant {
     ) {
         let model = &*self.model;
         let SecondOrder { scratch, tensor, spins } = second;
-        let Layout { nd, nc, stride, .. } = scratch.layout;
+        let Parameters { nd, nc, stride, .. } = scratch.layout;
         let n = scratch.layout.n();
         let workspace = &mut self.workspace;
         workspace.schur.reserve(stride);

@@ -22,7 +22,7 @@ impl Contraction {
         weights_multipliers: &[f64],
     ) -> Result<(), StepError> {
         let layout = self.scratch.layout;
-        let (stride, size, n, nd) = (layout.stride, layout.parameters(), layout.n(), layout.nd);
+        let (stride, size, n, nd) = (layout.stride, layout.count(), layout.n(), layout.nd);
         let rows = size * stride;
         let [mut total, mut tangent, mut product] = [0; 3].map(|_| vec![0.0; rows]);
         let mut z = nalgebra::DVector::from_column_slice(weights_x);
@@ -66,7 +66,7 @@ impl Contraction {
     pub(super) fn contract_stages(&mut self, model: &Model, stages: &StageTangents, z: &[f64]) {
         let layout = self.scratch.layout;
         let (nd, n, ni, stride) = (layout.nd, layout.n(), layout.ni, layout.stride);
-        let (size, count) = (layout.parameters(), stages.weights.len());
+        let (size, count) = (layout.count(), stages.weights.len());
         let z_p = &z[n..][..nd];
         let mut adjoint = vec![0.0; count * nd];
         for (k, mu) in adjoint.iter_mut().enumerate() {

@@ -5,8 +5,9 @@ use nalgebra::DMatrix;
 use crate::integrator::report::StepError;
 use crate::integrator::turning::Turning;
 use crate::linearization::linearize::Linearization;
+use crate::linearization::parameters::Parameters;
+use crate::linearization::second_order::Scratch;
 use crate::linearization::second_order::contraction::Contraction;
-use crate::linearization::second_order::{Layout, Scratch};
 use crate::math::scalar::Dual;
 use crate::math::spatial::Mat3;
 use crate::model::mechanism::Model;
@@ -67,8 +68,8 @@ impl SecondOrder {
     ///
     /// If these are more than 2²⁷, which is 1 GiB. [`Contraction`](crate::linearization::second_order::contraction::Contraction) has no such limit.
     pub fn new(model: &Model) -> Result<Self, TooLarge> {
-        let layout = Layout::new(model);
-        let parameters = layout.parameters();
+        let layout = Parameters::new(model);
+        let parameters = layout.count();
         let entries = parameters * layout.stride * (2 * layout.nd + layout.nc);
         if entries > ENTRIES_MAX {
             return Err(TooLarge { parameters, entries });
@@ -135,7 +136,7 @@ impl SecondOrder {
 
     /// Fills the tensor output by output.
     pub(crate) fn gather(&mut self, model: &Model, first: &Linearization) -> Result<(), StepError> {
-        let Layout { nd, nc, stride, .. } = self.scratch.layout;
+        let Parameters { nd, nc, stride, .. } = self.scratch.layout;
         let (n, rows) = (self.scratch.layout.n(), 2 * nd + nc);
         let mut contraction = Contraction::new(model);
         for row in 0..rows {
@@ -156,7 +157,7 @@ impl SecondOrder {
     }
 
     fn output_row(&self, output: usize) -> Output {
-        let Layout { nd, nc, .. } = self.scratch.layout;
+        let Parameters { nd, nc, .. } = self.scratch.layout;
         let n = self.scratch.layout.n();
         assert!(output < 2 * n, "output {output} of {}", 2 * n);
         match output {
@@ -176,14 +177,14 @@ impl SecondOrder {
     }
 
     fn multiplier_row(&self, c: usize) -> Output {
-        let Layout { nd, nc, .. } = self.scratch.layout;
+        let Parameters { nd, nc, .. } = self.scratch.layout;
         assert!(c < nc, "constraint {c} of {nc}");
         Output::Row(nd + c)
     }
 
     fn entry(&self, output: Output, a: usize, b: usize) -> f64 {
         let layout = self.scratch.layout;
-        let Layout { nd, nc, stride, .. } = layout;
+        let Parameters { nd, nc, stride, .. } = layout;
         match output {
             Output::Linear => 0.0,
             Output::Row(row) => self.tensor[((a.max(b)) * (2 * nd + nc) + row) * stride + a.min(b)],
@@ -225,7 +226,7 @@ impl SecondOrder {
     }
 }
 
-impl Layout {
+impl Parameters {
     /// Writes the dual parts of row `i` of a block by start, next, and inputs into the columns of the
     /// parameters that these are; the columns of `x` are for the tangents.
     pub(crate) fn place(&self, row: &mut [f64], i: usize, by: [&[Dual]; 2], by_inputs: &[Dual]) {
