@@ -138,7 +138,7 @@ pub enum ContinuousError {
 pub struct Continuous {
     model: Arc<Model>,
     equations: Equations<f64>,
-    /// The same in dual numbers, from the first second-order linearization on.
+    /// Equations in dual numbers, from the first second-order linearization on.
     varied: Option<Box<Equations<Dual>>>,
     mass: TreeLu,
     /// `M⁻¹ A_dᵀ`, row-major, nd by padded nc.
@@ -184,7 +184,7 @@ impl Continuous {
         Ok(self.value.clone())
     }
 
-    /// The same with first derivatives, exact. Their cost is that of one evaluation of the derivative
+    /// Accelerations and constraint forces with their first derivatives, exact. Their cost is that of one evaluation of the derivative
     /// blocks in dual numbers and O(N nd·depth) for `N` parameters.
     pub fn linearize(
         &mut self,
