@@ -9,7 +9,6 @@ use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
 use crate::lagrangian::derivatives::Derivatives;
 use crate::math::rotation;
-use crate::math::rows::{Term, non_zero};
 use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
@@ -371,13 +370,12 @@ fn turn_columns<S: Scalar>(
 }
 
 impl StepBlocks<Dual> {
-    /// What multiplies `x'` (nd) and `λ'` (nc) in row `i` of the change of a block by what is next: its
-    /// entries that are not zero.
-    pub(crate) fn terms(&self, i: usize, next: &[Dual], terms: &mut Vec<Term>) {
+    /// What multiplies `x'` (nd) and `λ'` (nc) in row `i` of the change of a block by what is next.
+    pub(crate) fn by_unknowns(&self, i: usize, next: &[Dual]) -> impl Iterator<Item = f64> {
         let (n, nd) = (self.q_start.len(), self.mid.l_q.len());
         let by_increment = next[i * n..][..nd].iter().map(|entry| entry.eps);
-        let impulses = (0..self.multipliers.len()).map(|c| -self.start.jacobian[c * n + i].eps);
-        terms.clear();
-        terms.extend(non_zero(by_increment.chain(impulses)));
+        let impulses =
+            (0..self.multipliers.len()).map(move |c| -self.start.jacobian[c * n + i].eps);
+        by_increment.chain(impulses)
     }
 }

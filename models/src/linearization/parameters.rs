@@ -34,6 +34,11 @@ impl Parameters {
         self.nd + self.nk
     }
 
+    /// `nd` and `n`.
+    pub(crate) fn coordinates(&self) -> (usize, usize) {
+        (self.nd, self.n())
+    }
+
     /// First column of the inputs.
     pub(crate) fn inputs(&self) -> usize {
         self.n() + self.nd

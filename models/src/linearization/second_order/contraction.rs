@@ -26,7 +26,7 @@ use crate::linearization::second_order::{Scratch, assert_layout, spin_change};
 use crate::math::gemm::{Into, Operand, mirror_head, product};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
-use crate::math::rows::{Term, add_rows, non_zero, padded};
+use crate::math::rows::{Term, add_product, padded};
 use crate::math::scalar::Dual;
 use crate::math::spatial::three;
 use crate::math::tree_lu::TreeLu;
@@ -148,9 +148,7 @@ impl Quadratic {
         cofactor.copy_from_slice(mixed);
         let by_increment = increments.chunks_exact(nd.max(1));
         for (row, by) in cofactor.chunks_exact_mut(stride).zip(by_increment) {
-            terms.clear();
-            terms.extend(non_zero(by.iter().copied()));
-            add_rows(row, tangent, stride, terms);
+            add_product(row, tangent, stride, by.iter().copied(), terms);
         }
         let operand = |numbers| Operand { numbers, terms: rows, stride: 1 };
         for (left, right) in [(tangent, &cofactor[..]), (&mixed[..], tangent)] {
@@ -245,8 +243,7 @@ impl Contraction {
 
     /// `μ₁`, from the derivatives by the momentum.
     fn find_impulse(&mut self, model: &Model, first: &Linearization, z: &[f64], w: &[f64]) {
-        let Parameters { nd, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let (nd, n) = self.scratch.layout.coordinates();
         let z_p = &z[n..][..nd];
         self.weights.copy_from_slice(&z[..nd]);
         for &i in model.orientations.iter().filter(|i| **i < nd) {
@@ -405,9 +402,7 @@ impl Contraction {
                 let turned = (0..nd).map(|i| impulse[i] * blocks.start.jacobian[c * n + i].eps);
                 by_unknown[nd + c] = -turned.sum::<f64>();
             }
-            terms.clear();
-            terms.extend(non_zero(by_unknown.iter().copied()));
-            add_rows(row, tangent, stride, terms);
+            add_product(row, tangent, stride, by_unknown.iter().copied(), terms);
         }
         // Both orders of derivatives count the same.
         for a in 1..size {
@@ -420,8 +415,7 @@ impl Contraction {
     /// The sum where everything is the gradient of something: the Lagrangian and the constraints.
     fn contract_gradients(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
         let h = step.settings.time_step_s;
-        let Parameters { nd, nc, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let ((nd, n), nc) = (self.scratch.layout.coordinates(), self.scratch.layout.nc);
         let blocks = &mut self.scratch.blocks;
         for i in 0..n {
             let (start, mid, velocity) = if i < nd {
@@ -457,8 +451,7 @@ impl Contraction {
 
     /// The derivative of the Hessian of the Lagrangian along `(α, β)`.
     fn add_lagrangian(&mut self, h: f64) {
-        let Parameters { nd, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let (nd, n) = self.scratch.layout.coordinates();
         let mid = &self.scratch.blocks.mid;
         let at_start = |i: usize| if i < nd { (1.0, 0.0) } else { (0.5, -1.0 / h) };
         let at_next = (0.5, 1.0 / h);
@@ -477,8 +470,7 @@ impl Contraction {
 
     /// What constraints add: their impulses turn with the start, their values with the end.
     fn add_constraints(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
-        let Parameters { nd, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let (nd, n) = self.scratch.layout.coordinates();
         let h = step.settings.time_step_s;
         let blocks = &mut self.scratch.blocks;
         blocks.start.evaluate(model, &blocks.q_start, &[]);

@@ -157,8 +157,7 @@ impl SecondOrder {
     }
 
     fn output_row(&self, output: usize) -> Output {
-        let Parameters { nd, nc, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let ((nd, n), nc) = (self.scratch.layout.coordinates(), self.scratch.layout.nc);
         assert!(output < 2 * n, "output {output} of {}", 2 * n);
         match output {
             i if i < nd => Output::Row(i),
@@ -237,7 +236,7 @@ impl Parameters {
         put(row, self.next(), &next[self.nd..]);
     }
 
-    /// The same for a row of the constraint Jacobian at the end: a shift of the start moves both ends.
+    /// Writes the dual parts of a row of the constraint Jacobian at the end: a shift of the start moves both ends.
     pub(crate) fn place_end(&self, row: &mut [f64], by_start: &[Dual], by_next: &[Dual]) {
         row.fill(0.0);
         put(row, 0, &by_start[..self.nd]);
