@@ -61,6 +61,24 @@ pub(crate) enum Kind {
 
 /// The exact first-order linearization of a control period. Preallocated for one step of the midpoint
 /// rule; for other methods it gets its memory when it is first used.
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use plantd_models::{Linearization, Model, Plant, Settings, builtin};
+///
+/// let scene = builtin::scene("pendulum").expect("a builtin scene");
+/// let model = Arc::new(Model::compile(&scene)?);
+/// let mut plant = Plant::new(model.clone(), Settings::new(&model))?;
+/// let mut first = Linearization::new(&model);
+/// plant.linearize(&[0.5], &mut first)?;
+///
+/// // x = (q, p): the map of a pendulum keeps areas.
+/// let (a, b) = (first.a(), first.b());
+/// assert!((a.determinant() - 1.0).abs() < 1e-12);
+/// assert_eq!(b.shape(), (2, 1));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Linearization {
     pub(crate) kind: Kind,

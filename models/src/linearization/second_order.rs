@@ -1,4 +1,5 @@
-//! The exact second-order linearization of a step, as full tensors or contracted with weights.
+//! The exact second-order linearization of a step (sections IV and V of the paper), as full tensors or
+//! contracted with weights.
 //!
 //! The equations of a step are `R(θ, y) = 0` for the unknowns `y = (x, λ)` with the parameters
 //! `θ = (q, p, u, k)`; `k` are the next prescribed positions, `O(θ, y)` is `p[k+1]`. The tangent

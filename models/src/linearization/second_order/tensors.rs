@@ -31,6 +31,26 @@ pub struct TooLarge {
 ///
 /// One symmetric matrix of second derivatives for each entry of `x[k+1] = (q, p, v)` and for each
 /// multiplier; the rows and columns of `v`, and the outputs of prescribed coordinates, are zero.
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use plantd_models::{Initial, Linearization, Model, Plant, SecondOrder, Settings, builtin};
+///
+/// let scene = builtin::scene("pendulum").expect("a builtin scene");
+/// let model = Arc::new(Model::compile(&scene)?);
+/// let mut plant = Plant::new(model.clone(), Settings::new(&model))?;
+/// let mut first = Linearization::new(&model);
+/// let mut second = SecondOrder::new(&model)?;
+/// plant.linearize_second_order(&[0.0], &mut first, &mut second)?;
+/// let at_an_angle = second.xx(0);
+///
+/// // A pendulum swings to both sides alike: where it hangs, its map has no second derivatives.
+/// plant.initialize(&Initial::OperatingPoint("hanging".into()))?;
+/// plant.linearize_second_order(&[0.0], &mut first, &mut second)?;
+/// assert!(second.xx(0).amax() < 1e-12 && at_an_angle.amax() > 1e-3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct SecondOrder {
     pub(crate) scratch: Scratch,
