@@ -48,6 +48,17 @@ pub(crate) struct InputImpulse {
     pub(crate) momentum: f64,
 }
 
+/// What a row holds the derivatives of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Output {
+    /// `x_i`.
+    Increment(usize),
+    /// `λ_c`.
+    Multiplier(usize),
+    /// `p_i[k+1]`.
+    Momentum(usize),
+}
+
 /// What was linearized.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
@@ -337,29 +348,15 @@ impl Linearization {
     /// Writes `B` over a matrix of its shape.
     pub(crate) fn write_b(&self, b: &mut DMatrix<f64>) {
         let (nd, nk, ni) = (self.nd, self.nk, self.ni);
-        let (n, next) = (nd + nk, self.next_columns());
+        let (n, mut row) = (nd + nk, vec![0.0; ni + nk]);
         b.fill(0.0);
-        for &InputImpulse { input, coordinate, residual, momentum } in self.impulses() {
-            for i in 0..nd {
-                let column = i * self.stride + n + coordinate;
-                b[(i, input)] += residual * self.increment[column];
-                b[(n + i, input)] += residual * self.momentum[column];
-            }
-            b[(n + coordinate, input)] += momentum - residual;
-        }
         for i in 0..nd {
-            for (input, entry) in self.driven(i).iter().enumerate() {
-                b[(i, input)] = *entry;
-            }
-            for (input, entry) in self.driven(nd + self.constraints() + i).iter().enumerate() {
-                b[(n + i, input)] = *entry;
+            for (target, output) in [(i, Output::Increment(i)), (n + i, Output::Momentum(i))] {
+                self.write_by_input(output, &mut row);
+                b.row_mut(target).iter_mut().zip(&row).for_each(|(to, from)| *to = *from);
             }
         }
         for k in 0..nk {
-            for i in 0..nd {
-                b[(i, ni + k)] = self.increment[i * self.stride + next + k];
-                b[(n + i, ni + k)] = self.momentum[i * self.stride + next + k];
-            }
             b[(nd + k, ni + k)] = 1.0;
             b[(n + nd + k, ni + k)] = 1.0 / self.time_step_s;
         }
@@ -394,19 +391,11 @@ impl Linearization {
     /// `∂λ/∂u`, nc by `ni + nk`; see [`Linearization::multipliers_x`]. Zero where a signal replaces the
     /// entry of `u`.
     pub fn multipliers_u(&self) -> DMatrix<f64> {
-        let (n, ni, next) = (self.nd + self.nk, self.ni, self.next_columns());
-        let mut by_u = DMatrix::zeros(self.constraints(), ni + self.nk);
-        for c in 0..self.constraints() {
-            let row = &self.multipliers[c * self.stride..][..self.stride];
-            for &InputImpulse { input, coordinate, residual, .. } in self.impulses() {
-                by_u[(c, input)] += residual * row[n + coordinate];
-            }
-            for (input, entry) in self.driven(self.nd + c).iter().enumerate() {
-                by_u[(c, input)] = *entry;
-            }
-            for k in 0..self.nk {
-                by_u[(c, ni + k)] = row[next + k];
-            }
+        let mut row = vec![0.0; self.ni + self.nk];
+        let mut by_u = DMatrix::zeros(self.constraints(), row.len());
+        for (c, mut target) in by_u.row_iter_mut().enumerate() {
+            self.write_by_input(Output::Multiplier(c), &mut row);
+            target.iter_mut().zip(&row).for_each(|(to, from)| *to = *from);
         }
         for &column in &self.replaced {
             by_u.column_mut(column).fill(0.0);
@@ -440,25 +429,53 @@ impl Linearization {
     /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, u, k)`.
     pub(crate) fn write_tangent(&self, stride: usize, out: &mut [f64]) {
         let theta = self.parameters();
-        let width = self.stride.max(1);
-        let rows = self.increment.chunks_exact(width).chain(self.multipliers.chunks_exact(width));
-        for (row, out) in rows.zip(out.chunks_exact_mut(stride)) {
-            theta.insert_inputs(row, out);
-            let by_inputs = &mut out[theta.inputs()..theta.next()];
-            by_inputs.fill(0.0);
-            for &InputImpulse { input, coordinate, residual, .. } in &self.inputs {
-                by_inputs[input] += residual * row[theta.n() + coordinate];
-            }
+        let outputs = (0..theta.nd).map(Output::Increment);
+        let outputs = outputs.chain((0..theta.nc).map(Output::Multiplier));
+        for (output, out) in outputs.zip(out.chunks_exact_mut(stride)) {
+            let (by_state, by_input) = out[..theta.count()].split_at_mut(theta.inputs());
+            by_state.copy_from_slice(&self.row(output)[..theta.inputs()]);
+            self.write_by_input(output, by_input);
         }
     }
 
+    /// Derivatives of an output by `(q, p, k)`, padded.
+    fn row(&self, output: Output) -> &[f64] {
+        let (rows, i) = match output {
+            Output::Increment(i) => (&self.increment, i),
+            Output::Multiplier(c) => (&self.multipliers, c),
+            Output::Momentum(i) => (&self.momentum, i),
+        };
+        &rows[i * self.stride..][..self.stride]
+    }
+
+    /// Writes the derivatives of an output by the input of the map, `(u, k)`, those that signals replace
+    /// included.
+    pub(crate) fn write_by_input(&self, output: Output, out: &mut [f64]) {
+        let (theta, row) = (self.parameters(), self.row(output));
+        let driven = match output {
+            Output::Increment(i) => i,
+            Output::Multiplier(c) => theta.nd + c,
+            Output::Momentum(i) => theta.nd + theta.nc + i,
+        };
+        let (by_u, by_k) = out.split_at_mut(theta.ni);
+        by_u.fill(0.0);
+        by_u.iter_mut().zip(self.driven(driven)).for_each(|(to, from)| *to = *from);
+        for &InputImpulse { input, coordinate, residual, momentum } in self.impulses() {
+            by_u[input] += residual * row[theta.n() + coordinate];
+            if output == Output::Momentum(coordinate) {
+                by_u[input] += momentum - residual;
+            }
+        }
+        by_k.copy_from_slice(&row[theta.inputs()..][..theta.nk]);
+    }
+
     /// What unit inputs give to a step of the midpoint rule.
-    pub(crate) fn impulses(&self) -> &[InputImpulse] {
+    fn impulses(&self) -> &[InputImpulse] {
         if self.kind == Kind::Step { &self.inputs } else { &[] }
     }
 
     /// A row of derivatives by the inputs of collocation and periods.
-    pub(crate) fn driven(&self, row: usize) -> &[f64] {
+    fn driven(&self, row: usize) -> &[f64] {
         if self.kind == Kind::Step { &[] } else { &self.driven[row * self.ni..][..self.ni] }
     }
 

@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 
-use crate::linearization::linearize::{InputImpulse, Linearization};
+use crate::linearization::linearize::{Linearization, Output};
 use crate::math::sparse_map::Map;
 
 impl Linearization {
@@ -23,17 +23,8 @@ impl Linearization {
         for (part, numbers) in [&self.increment, &self.momentum].into_iter().enumerate() {
             for (i, source) in numbers.chunks_exact(self.stride.max(1)).enumerate() {
                 let target = map.row_mut(part * nd + i);
-                let driven = self.driven(part * (nd + self.constraints()) + i);
-                target[..ni].fill(0.0);
-                target.iter_mut().zip(driven).for_each(|(target, entry)| *target = *entry);
-                for impulse in self.impulses() {
-                    let InputImpulse { input, coordinate, residual, momentum } = *impulse;
-                    target[input] += residual * source[n + coordinate];
-                    if part == 1 && coordinate == i {
-                        target[input] += momentum - residual;
-                    }
-                }
-                target[ni..inputs].copy_from_slice(&source[next..][..nk]);
+                let output = if part == 0 { Output::Increment(i) } else { Output::Momentum(i) };
+                self.write_by_input(output, &mut target[..inputs]);
                 target[inputs..][..next].copy_from_slice(&source[..next]);
                 if part == 0 {
                     target[inputs + i] += 1.0;

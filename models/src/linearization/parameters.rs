@@ -60,12 +60,6 @@ impl Parameters {
         Some(3 * first + parameter - ends[first])
     }
 
-    /// Copies a row without the columns of the inputs into one that has them; these stay.
-    pub(crate) fn insert_inputs(&self, row: &[f64], out: &mut [f64]) {
-        out[..self.inputs()].copy_from_slice(&row[..self.inputs()]);
-        out[self.next()..][..self.nk].copy_from_slice(&row[self.inputs()..][..self.nk]);
-    }
-
     /// Copies a row into one without the columns of the inputs.
     pub(crate) fn drop_inputs(&self, row: &[f64], out: &mut [f64]) {
         out[..self.inputs()].copy_from_slice(&row[..self.inputs()]);
