@@ -128,8 +128,14 @@ impl<S: Scalar> Curvature<S> {
             qq: axis_rate.dot(rate) + weight,
             v_above_q_below: axis.dot(rate),
             q_above_v_below: axis_rate.dot(force),
-            vv: axis.dot(force),
+            vv: self.inertia_between(momenta, ancestor, descendant),
         }
+    }
+
+    /// The entry of the mass matrix `L_vv` for a pair of joints on one path to the root.
+    #[inline(always)]
+    fn inertia_between(&self, momenta: &Momenta<S>, ancestor: usize, descendant: usize) -> S {
+        momenta.axis[ancestor].dot(self.force[descendant])
     }
 
     /// For two axes of one ball joint, `∂τ_row/∂ζ_column` and `∂τ_row/∂v_column = ∂m_column/∂ζ_row`.
@@ -202,8 +208,8 @@ impl Curvature {
     /// Writes the mass matrix `L_vv` of the dynamic coordinates.
     pub(crate) fn fill_mass_matrix(&self, pairs: &[Pair], momenta: &Momenta, matrix: &mut TreeLu) {
         for pair in pairs {
-            let entry =
-                momenta.axis[pair.ancestor as usize].dot(self.force[pair.descendant as usize]);
+            let (ancestor, descendant) = (pair.ancestor as usize, pair.descendant as usize);
+            let entry = self.inertia_between(momenta, ancestor, descendant);
             matrix.upper[pair.slot as usize] = entry;
             matrix.lower[pair.slot as usize] = entry;
         }

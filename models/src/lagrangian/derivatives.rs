@@ -221,3 +221,48 @@ impl<S: Scalar> Derivatives<S> {
         });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::builtin;
+    use crate::lagrangian::mechanics::Mechanics;
+
+    #[test]
+    fn entries_one_by_one_are_those_of_the_matrices() {
+        for name in ["cart-pole", "spherical-pendulum", "tree-7", "marionette"] {
+            let model = Model::compile(&builtin::scene(name).unwrap()).unwrap();
+            let d = model.dimensions;
+            let n = d.coordinates();
+            let [q, v] = [0.3, 0.7]
+                .map(|a| -> Vec<f64> { (0..n).map(|i| (a * (i + 1) as f64).sin()).collect() });
+            let (mut dense, mut sparse) = (Derivatives::new(&model), Mechanics::new(&model));
+            dense.evaluate(&model, (&q, &[]), &v, &vec![0.0; d.inputs]);
+            let [mut l_q, mut l_v] = [0; 2].map(|_| vec![0.0; d.dynamic]);
+            sparse.gradient(&model, &q, &[], &v, [&mut l_q, &mut l_v]);
+            sparse.differentiate(&model);
+
+            let mut rest = dense.clone();
+            sparse.for_each_second_derivative(&model, |i, j, entry| {
+                let (ij, ji) = (i * n + j, j * n + i);
+                let pairs = [
+                    (entry.qq, dense.l_qq[ij]),
+                    (entry.qv, dense.l_qv[ij]),
+                    (entry.vq, dense.l_qv[ji]),
+                    (entry.vv, dense.l_vv[ij]),
+                ];
+                for (sparse, dense) in pairs {
+                    assert!(
+                        (sparse - dense).abs() <= 1e-11 * (1.0 + dense.abs()),
+                        "{name} {i} {j}"
+                    );
+                }
+                (rest.l_qq[ij], rest.l_vv[ij], rest.l_qv[ij], rest.l_qv[ji]) = (0.0, 0.0, 0.0, 0.0);
+            });
+            for row in 0..d.dynamic {
+                let left = |matrix: &[f64]| matrix[row * n..][..n].iter().all(|x| *x == 0.0);
+                assert!(left(&rest.l_qq) && left(&rest.l_qv) && left(&rest.l_vv), "{name} {row}");
+            }
+        }
+    }
+}
