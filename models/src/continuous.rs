@@ -26,8 +26,8 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::integrator::blocks::Blocks;
 use crate::kkt::schur::room_for_schur;
+use crate::lagrangian::derivatives::Derivatives;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rows::padded;
@@ -138,7 +138,7 @@ pub enum ContinuousError {
 pub struct Continuous {
     model: Arc<Model>,
     equations: Equations<f64>,
-    /// The same in dual numbers, from the first second-order linearization on.
+    /// Equations in dual numbers, from the first second-order linearization on.
     varied: Option<Box<Equations<Dual>>>,
     mass: TreeLu,
     /// `M⁻¹ A_dᵀ`, row-major, nd by padded nc.
@@ -184,7 +184,7 @@ impl Continuous {
         Ok(self.value.clone())
     }
 
-    /// The same with first derivatives, exact. Their cost is that of one evaluation of the derivative
+    /// Accelerations and constraint forces with their first derivatives, exact. Their cost is that of one evaluation of the derivative
     /// blocks in dual numbers and O(N nd·depth) for `N` parameters.
     pub fn linearize(
         &mut self,
@@ -443,7 +443,7 @@ struct Equations<S> {
     acceleration: Vec<S>,
     multipliers: Vec<S>,
     /// Along the motion.
-    blocks: Blocks<Dual<S>>,
+    blocks: Derivatives<Dual<S>>,
     /// At the configuration, for second derivatives.
     closure: Closure<S>,
     /// Along the motion, twice.
@@ -475,7 +475,7 @@ impl<S: Scalar> Equations<S> {
             inputs: zeros(layout.ni),
             acceleration: zeros(n),
             multipliers: zeros(layout.nc),
-            blocks: Blocks::new(model),
+            blocks: Derivatives::new(model),
             closure: Closure::new(model),
             motion: Closure::new(model),
             hessian: zeros(if layout.nc > 0 { n * n } else { 0 }),

@@ -22,6 +22,7 @@ use std::f64::consts::TAU;
 use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::constraints::closure::Closure;
+use crate::constraints::projection::{Limits, Reached, project};
 use crate::math::pivoted_lu::DEPENDENT;
 use crate::model::conditioning::Conditioning;
 use crate::model::manifold::orientations;
@@ -38,22 +39,13 @@ pub(crate) const SUSPECT: f64 = 1e-4;
 /// Displacements from the initial configuration that tell whether it is a singular one, m or rad.
 pub(crate) const DISPLACEMENTS: [f64; 3] = [0.02, -0.05, 0.11];
 /// Corrections towards the constraints.
-pub(crate) const CORRECTIONS: usize = 30;
+const CORRECTIONS: usize = 30;
 /// Most equations for which dense decompositions are worth their time.
 pub(crate) const MOST_EQUATIONS: usize = 128;
 /// A correction shorter than this leads nowhere, m or rad.
-pub(crate) const SHORT: f64 = 1e-9;
+const SHORT: f64 = 1e-9;
 /// A constraint violated by more than this, in units of round-off, is violated.
 pub(crate) const VIOLATED: f64 = 1e4;
-
-/// Where corrections towards the constraints lead.
-pub(crate) enum Reached {
-    Satisfied,
-    /// To where no correction reduces the violation.
-    Violated,
-    /// Nowhere.
-    Lost,
-}
 
 impl Conditioning {
     pub(crate) fn new(model: &Model) -> Self {
@@ -111,35 +103,30 @@ impl Conditioning {
         q: &mut Vec<f64>,
         enough: f64,
     ) -> Reached {
-        let d = model.dimensions;
-        for _ in 0..CORRECTIONS {
-            let rows = self.rows(model, closure, q);
-            closure.evaluate(model, q, &orientations(model, q));
-            let value = DVector::from_fn(d.constraints, |c, _| {
+        let limits = Limits {
+            corrections: CORRECTIONS,
+            enough,
+            floor: enough,
+            longest: f64::INFINITY,
+            shortest: SHORT,
+            round_off_is_fresh: true,
+        };
+        let correction = |closure: &Closure| {
+            let rows = self.weigh(model, closure);
+            let value = DVector::from_fn(closure.value.len(), |c, _| {
                 // What nothing moves keeps its size.
                 let weight = self.weight[c];
                 -closure.value[c] * if weight > 0.0 { weight } else { 1.0 }
             });
-            if closure.violation() <= enough {
-                return Reached::Satisfied;
-            }
             let finite = rows.iter().chain(value.iter()).all(|x| x.is_finite());
             if rows.is_empty() || !finite {
-                return Reached::Lost;
+                return None;
             }
-            let Ok(step) = SVD::new(rows, true, true).solve(&value, DEPENDENT.sqrt()) else {
-                return Reached::Lost;
-            };
-            let mut change = vec![0.0; d.coordinates()];
-            for (j, x) in step.iter().enumerate() {
-                change[j] = x / self.inertia_of(j).sqrt();
-            }
-            if change.iter().all(|x| x.abs() < SHORT) {
-                return Reached::Violated;
-            }
-            *q = model.retract(q, &change);
-        }
-        Reached::Lost
+            let step = SVD::new(rows, true, true).solve(&value, DEPENDENT.sqrt()).ok()?;
+            let scaled = step.iter().enumerate().map(|(j, x)| x / self.inertia_of(j).sqrt());
+            Some(scaled.collect())
+        };
+        project(model, closure, q, &limits, correction).0
     }
 
     /// Dynamic columns of `Dh(q)`, each row with its weight and each column by the root of its
@@ -147,6 +134,11 @@ impl Conditioning {
     pub(crate) fn rows(&self, model: &Model, closure: &mut Closure, q: &[f64]) -> DMatrix<f64> {
         closure.evaluate(model, q, &orientations(model, q));
         closure.differentiate(model, q);
+        self.weigh(model, closure)
+    }
+
+    /// What [`Conditioning::rows`] says at the last Jacobian.
+    pub(crate) fn weigh(&self, model: &Model, closure: &Closure) -> DMatrix<f64> {
         let d = model.dimensions;
         DMatrix::from_fn(d.constraints, d.dynamic, |c, j| {
             let weight = self.weight.get(c).copied().unwrap_or(1.0);

@@ -3,3 +3,4 @@
 pub(crate) mod closure;
 pub(crate) mod conditioning;
 pub(crate) mod in_plane;
+pub(crate) mod projection;

@@ -1,218 +1,17 @@
-//! First-order derivative blocks of a step's equations as dense matrices, for any scalar.
+//! First-order derivatives of the equations of a step as dense matrices, for any scalar.
 //!
-//! Evaluated with [`Dual`] numbers they give the second-order linearization: the
-//! blocks are first derivatives, their dual parts are derivatives of these along a direction. The
-//! first-order linearization itself is [`linearize`](crate::linearization::linearize), which knows the sparsity.
+//! Evaluated with [`Dual`] numbers they give the second-order linearization: their dual parts are
+//! derivatives of these along a direction. The first-order linearization itself is
+//! [`linearize`](crate::linearization::linearize), which knows the sparsity.
 
 use crate::constraints::closure::Closure;
 use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
-use crate::lagrangian::curvature::Curvature;
-use crate::lagrangian::forces::Instant;
-use crate::lagrangian::kinematics::Poses;
-use crate::lagrangian::momenta::Momenta;
-use crate::lagrangian::potentials;
+use crate::lagrangian::derivatives::Derivatives;
 use crate::math::rotation;
-use crate::math::rows::Term;
 use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3, three};
-use crate::model::mechanism::{CoordinateInput, Forces, Model};
-use crate::model::tree::{JointKind, WORLD};
-
-/// Gradient and second derivatives of the Lagrangian, springs included, and forces with their first
-/// derivatives, at one configuration and velocity.
-///
-/// Matrices are row-major; `n` coordinates, `nd` of them dynamic, `ni` inputs.
-#[derive(Clone, Debug)]
-pub(crate) struct Blocks<S = f64> {
-    pub(crate) poses: Poses<S>,
-    pub(crate) momenta: Momenta<S>,
-    curvature: Curvature<S>,
-    /// `∂L/∂q`, nd.
-    pub(crate) l_q: Vec<S>,
-    /// `∂L/∂v`, nd.
-    pub(crate) l_v: Vec<S>,
-    /// Generalized force `f`, nd.
-    pub(crate) force: Vec<S>,
-    /// `∂²L/∂q∂q`, n by n.
-    pub(crate) l_qq: Vec<S>,
-    /// `∂²L/∂q∂v`, n by n: rows by `q`, columns by `v`; its transpose is `L_vq`.
-    pub(crate) l_qv: Vec<S>,
-    /// `∂²L/∂v∂v`, n by n.
-    pub(crate) l_vv: Vec<S>,
-    /// `∂f/∂q`, nd by n.
-    pub(crate) f_q: Vec<S>,
-    /// `∂f/∂v`, nd by n.
-    pub(crate) f_v: Vec<S>,
-    /// `∂f/∂u`, nd by ni.
-    pub(crate) f_u: Vec<S>,
-    /// Ancestor and descendant of each pair of joints on one path to the root, a joint with itself
-    /// included, and their coordinates.
-    pairs: Vec<[usize; 4]>,
-    /// First joints of ball joints.
-    balls: Vec<usize>,
-}
-
-impl<S: Scalar> Blocks<S> {
-    pub(crate) fn new(model: &Model) -> Self {
-        let (n, nd, ni) =
-            (model.dimensions.coordinates(), model.dimensions.dynamic, model.dimensions.inputs);
-        let zeros = |len: usize| vec![S::ZERO; len];
-        let joints = &model.dynamics.joints;
-        let mut pairs = Vec::new();
-        for (descendant, joint) in joints.iter().enumerate() {
-            let mut ancestor = descendant;
-            while ancestor != WORLD {
-                let above = &joints[ancestor];
-                pairs.push([ancestor, descendant, above.coordinate, joint.coordinate]);
-                ancestor = above.parent;
-            }
-        }
-        let is_first = |&j: &usize| joints[j].kind == JointKind::Ball(0);
-        Self {
-            balls: (0..joints.len()).filter(is_first).collect(),
-            poses: Poses::new(&model.dynamics),
-            momenta: Momenta::new(&model.dynamics),
-            curvature: Curvature::new(&model.dynamics),
-            l_q: zeros(nd),
-            l_v: zeros(nd),
-            force: zeros(nd),
-            l_qq: zeros(n * n),
-            l_qv: zeros(n * n),
-            l_vv: zeros(n * n),
-            f_q: zeros(nd * n),
-            f_v: zeros(nd * n),
-            f_u: zeros(nd * ni),
-            pairs,
-        }
-    }
-
-    /// Rows and columns of dynamic rows that may differ from zero.
-    fn pattern(&self, model: &Model) -> Vec<(usize, usize)> {
-        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
-        let couple = |forces: &Forces| !forces.point_forces.is_empty();
-        if model.potentials.couple_branches || model.forces.as_ref().is_some_and(couple) {
-            return (0..nd * n).map(|entry| (entry / n, entry % n)).collect();
-        }
-        let on_paths = self.pairs.iter().flat_map(|&[_, _, i, j]| [(i, j), (j, i)]);
-        let mut pattern: Vec<_> =
-            on_paths.chain((0..nd).map(|i| (i, i))).filter(|(i, _)| *i < nd).collect();
-        pattern.sort_unstable();
-        pattern.dedup();
-        pattern
-    }
-
-    /// Pairs of coordinates that the Lagrangian couples, both ways round.
-    pub(crate) fn coupled_coordinates(&self, model: &Model) -> Vec<(usize, usize)> {
-        let n = model.dimensions.coordinates();
-        if model.potentials.couple_branches {
-            return (0..n * n).map(|entry| (entry / n, entry % n)).collect();
-        }
-        let on_paths = self.pairs.iter().flat_map(|&[_, _, i, j]| [(i, j), (j, i)]);
-        let mut coupled: Vec<_> = on_paths.chain((0..n).map(|i| (i, i))).collect();
-        coupled.sort_unstable();
-        coupled.dedup();
-        coupled
-    }
-
-    /// Evaluates everything at a configuration, with the orientations of ball joints, and a velocity.
-    pub(crate) fn evaluate(
-        &mut self,
-        model: &Model,
-        (q, orientations): (&[S], &[Mat3<S>]),
-        velocity: &[S],
-        inputs: &[S],
-    ) {
-        self.poses.evaluate(&model.dynamics, q, orientations);
-        self.momenta.gradient(
-            &model.dynamics,
-            &self.poses,
-            velocity,
-            model.gravity,
-            &mut self.l_q,
-            &mut self.l_v,
-        );
-        if model.potentials.any {
-            potentials::add_gradient(
-                &model.potentials,
-                &model.dynamics,
-                &self.poses,
-                q,
-                &mut self.l_q,
-            );
-        }
-        self.evaluate_forces(model, velocity, inputs);
-        self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
-        let n = model.dimensions.coordinates();
-        self.l_qq.fill(S::ZERO);
-        for &[above, below, i, j] in &self.pairs {
-            let second = self.curvature.pair(&self.momenta, model.gravity, above, below);
-            self.l_qq[i * n + j] = second.qq;
-            self.l_qq[j * n + i] = second.qq;
-            self.l_qv[i * n + j] = second.q_above_v_below;
-            self.l_qv[j * n + i] = second.v_above_q_below;
-            self.l_vv[i * n + j] = second.vv;
-            self.l_vv[j * n + i] = second.vv;
-        }
-        for &first in &self.balls {
-            for (row, column) in (0..9).map(|entry| (first + entry / 3, first + entry % 3)) {
-                let (qq, qv) =
-                    self.curvature.within_ball(&self.momenta, model.gravity, row, column);
-                let at = |joint: usize| model.dynamics.joints[joint].coordinate;
-                self.l_qq[at(row) * n + at(column)] = qq;
-                self.l_qv[at(row) * n + at(column)] = qv;
-            }
-        }
-        if model.potentials.any {
-            potentials::for_each_second_derivative(
-                &model.potentials,
-                &model.dynamics,
-                &self.poses,
-                q,
-                |i, j, value| self.l_qq[i * n + j] -= value,
-            );
-        }
-    }
-
-    /// Forces and their derivatives; poses and momenta are those of the last [`Self::evaluate`].
-    fn evaluate_forces(&mut self, model: &Model, velocity: &[S], inputs: &[S]) {
-        let (n, ni) = (model.dimensions.coordinates(), model.dimensions.inputs);
-        self.force.fill(S::ZERO);
-        if model.forces.is_some() {
-            for derivatives in [&mut self.f_q, &mut self.f_v, &mut self.f_u] {
-                derivatives.fill(S::ZERO);
-            }
-        }
-        for (i, c) in model.damping.iter().enumerate() {
-            self.force[i] -= velocity[i] * *c;
-            self.f_v[i * (n + 1)] = S::constant(-c);
-        }
-        for &CoordinateInput { input, coordinate, gain } in &model.coordinate_inputs {
-            self.force[coordinate] += inputs[input] * gain;
-            self.f_u[coordinate * ni + input] = S::constant(gain);
-        }
-        let (Some(forces), nd) = (&model.forces, model.dimensions.dynamic) else { return };
-        let at = Instant {
-            tree: &model.dynamics,
-            poses: &self.poses,
-            momenta: &self.momenta,
-            velocity,
-            inputs,
-        };
-        forces.add(&at, &mut self.force);
-        forces.for_each_derivative(&at, |i, j, by_q, by_v| {
-            if i < nd {
-                self.f_q[i * n + j] += by_q;
-                self.f_v[i * n + j] += by_v;
-            }
-        });
-        forces.for_each_input_derivative(&at, |i, k, by_u| {
-            if i < nd {
-                self.f_u[i * ni + k] += by_u;
-            }
-        });
-    }
-}
+use crate::model::mechanism::Model;
 
 /// The blocks of one step's equations, row-major.
 ///
@@ -236,7 +35,7 @@ impl<S: Scalar> Blocks<S> {
 #[derive(Clone, Debug)]
 pub(crate) struct StepBlocks<S = f64> {
     /// At the midpoint.
-    pub(crate) mid: Blocks<S>,
+    pub(crate) mid: Derivatives<S>,
     /// Constraints at `q[k]` and at `q[k+1]`, with their Jacobians.
     pub(crate) start: Closure<S>,
     pub(crate) end: Closure<S>,
@@ -291,8 +90,8 @@ impl<S: Scalar> StepBlocks<S> {
         let (n, nd, ni, nc) = (d.coordinates(), d.dynamic, d.inputs, d.constraints);
         let no = model.orientations.len();
         let zeros = |len: usize| vec![S::ZERO; len];
-        let mid = Blocks::new(model);
-        let pattern = mid.pattern(model);
+        let mid = Derivatives::new(model);
+        let pattern = mid.dynamic_pattern(model);
         Self {
             mid,
             start: Closure::new(model),
@@ -533,7 +332,7 @@ impl<S: Scalar> StepBlocks<S> {
 
 /// Derivatives of torque, momentum and force of coordinate `row` by the start and by what is next.
 fn turn_columns<S: Scalar>(
-    mid: &Blocks<S>,
+    mid: &Derivatives<S>,
     turnings: &[Turning<S>],
     nd: usize,
     h: f64,
@@ -571,18 +370,12 @@ fn turn_columns<S: Scalar>(
 }
 
 impl StepBlocks<Dual> {
-    /// What multiplies `x'` (nd) and `λ'` (nc) in row `i` of the change of a block by what is next: its
-    /// entries that are not zero.
-    pub(crate) fn terms(&self, i: usize, next: &[Dual], terms: &mut Vec<Term>) {
+    /// What multiplies `x'` (nd) and `λ'` (nc) in row `i` of the change of a block by what is next.
+    pub(crate) fn by_unknowns(&self, i: usize, next: &[Dual]) -> impl Iterator<Item = f64> {
         let (n, nd) = (self.q_start.len(), self.mid.l_q.len());
         let by_increment = next[i * n..][..nd].iter().map(|entry| entry.eps);
-        let impulses = (0..self.multipliers.len()).map(|c| -self.start.jacobian[c * n + i].eps);
-        terms.clear();
-        terms.extend(non_zero(by_increment.chain(impulses)));
+        let impulses =
+            (0..self.multipliers.len()).map(move |c| -self.start.jacobian[c * n + i].eps);
+        by_increment.chain(impulses)
     }
-}
-
-/// The entries that are not zero, with their indices.
-pub(crate) fn non_zero(entries: impl Iterator<Item = f64>) -> impl Iterator<Item = Term> {
-    entries.enumerate().filter(|(_, entry)| *entry != 0.0).map(|(i, entry)| (entry, i))
 }

@@ -4,8 +4,9 @@ use nalgebra::{DMatrix, SVD};
 
 use crate::constraints::closure::Closure;
 use crate::constraints::conditioning::{
-    MOST_EQUATIONS, Reached, SUSPECT, VIOLATED, gram, reciprocal_condition,
+    MOST_EQUATIONS, SUSPECT, VIOLATED, gram, reciprocal_condition,
 };
+use crate::constraints::projection::Reached;
 use crate::integrator::report::StepError;
 use crate::integrator::state::PreciseState;
 use crate::model::mechanism::Model;

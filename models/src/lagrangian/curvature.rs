@@ -36,6 +36,31 @@ pub(crate) struct SecondDerivatives<S = f64> {
     pub(crate) vv: S,
 }
 
+/// Second derivatives of `L` by two coordinates, in their row and column of the matrices.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Entry<S> {
+    pub(crate) qq: S,
+    pub(crate) qv: S,
+    pub(crate) vq: S,
+    pub(crate) vv: S,
+}
+
+impl<S: Copy> SecondDerivatives<S> {
+    /// What stands at (ancestor, descendant) and at (descendant, ancestor).
+    #[inline(always)]
+    pub(crate) fn entries(
+        self,
+        ancestor: usize,
+        descendant: usize,
+    ) -> [(usize, usize, Entry<S>); 2] {
+        let Self { qq, vv, q_above_v_below: above, v_above_q_below: below } = self;
+        [
+            (ancestor, descendant, Entry { qq, qv: above, vq: below, vv }),
+            (descendant, ancestor, Entry { qq, qv: below, vq: above, vv }),
+        ]
+    }
+}
+
 impl<S: Scalar> Curvature<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();
@@ -103,8 +128,14 @@ impl<S: Scalar> Curvature<S> {
             qq: axis_rate.dot(rate) + weight,
             v_above_q_below: axis.dot(rate),
             q_above_v_below: axis_rate.dot(force),
-            vv: axis.dot(force),
+            vv: self.inertia_between(momenta, ancestor, descendant),
         }
+    }
+
+    /// The entry of the mass matrix `L_vv` for a pair of joints on one path to the root.
+    #[inline(always)]
+    fn inertia_between(&self, momenta: &Momenta<S>, ancestor: usize, descendant: usize) -> S {
+        momenta.axis[ancestor].dot(self.force[descendant])
     }
 
     /// For two axes of one ball joint, `∂τ_row/∂ζ_column` and `∂τ_row/∂v_column = ∂m_column/∂ζ_row`.
@@ -177,8 +208,8 @@ impl Curvature {
     /// Writes the mass matrix `L_vv` of the dynamic coordinates.
     pub(crate) fn fill_mass_matrix(&self, pairs: &[Pair], momenta: &Momenta, matrix: &mut TreeLu) {
         for pair in pairs {
-            let entry =
-                momenta.axis[pair.ancestor as usize].dot(self.force[pair.descendant as usize]);
+            let (ancestor, descendant) = (pair.ancestor as usize, pair.descendant as usize);
+            let entry = self.inertia_between(momenta, ancestor, descendant);
             matrix.upper[pair.slot as usize] = entry;
             matrix.lower[pair.slot as usize] = entry;
         }

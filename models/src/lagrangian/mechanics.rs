@@ -1,7 +1,7 @@
 //! The Lagrangian of joint trees at a configuration and velocity, without springs: in the plane where the
 //! scene allows it, else in space.
 
-use crate::lagrangian::curvature::{Curvature, SecondDerivatives};
+use crate::lagrangian::curvature::{Curvature, Entry, SecondDerivatives};
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::lagrangian::planar::{Planar, PlanarTree};
@@ -66,6 +66,31 @@ impl<S: Planar> Mechanics<S> {
         match (&self.planar, &model.planar) {
             (Some(planar), Some(joints)) => planar.pair(joints, ancestor, descendant),
             _ => self.curvature.pair(&self.momenta, model.gravity, ancestor, descendant),
+        }
+    }
+
+    /// Second derivatives in the rows of the dynamic coordinates, at the last [`Mechanics::differentiate`]:
+    /// row, column, and what stands there. Entries that it does not name are zero; those on the diagonal
+    /// come twice, and the second one counts.
+    #[inline(always)]
+    pub(crate) fn for_each_second_derivative(
+        &self,
+        model: &Model,
+        mut take: impl FnMut(usize, usize, Entry<S>),
+    ) {
+        for pair in &model.pairs {
+            let second = self.pair(model, pair.ancestor as usize, pair.descendant as usize);
+            for (row, column, entry) in second.entries(pair.row as usize, pair.column as usize) {
+                take(row, column, entry);
+            }
+        }
+        let coordinate = |joint: usize| model.dynamics.joints[joint].coordinate;
+        for pair in &model.mixed_pairs {
+            let second = self.pair(model, pair.ancestor, pair.descendant);
+            let entries = second.entries(coordinate(pair.ancestor), coordinate(pair.descendant));
+            let is_below = entries[0].0 >= model.dimensions.dynamic;
+            let (row, column, entry) = entries[usize::from(is_below)];
+            take(row, column, entry);
         }
     }
 }

@@ -1,6 +1,7 @@
 //! The Lagrangian.
 
 pub(crate) mod curvature;
+pub(crate) mod derivatives;
 pub(crate) mod energy;
 pub(crate) mod forces;
 pub(crate) mod kinematics;

@@ -1,6 +1,6 @@
 //! The chain rule over the steps of a control period.
 //!
-//! With the tangent `D = ∂(q, p, k)/∂θ` of where a step begins, by the parameters `θ = (q, p, inputs, k)`
+//! With the tangent `D = ∂(q, p, k)/∂θ` of where a step begins, by the parameters `θ = (q, p, u, k)`
 //! of the period, and the derivatives `[x', p']` of the step by its own parameters,
 //!
 //! ```text
@@ -19,7 +19,7 @@ const NUMBERS_MAX: usize = 1 << 27;
 /// The tangent along the steps of a period. Empty until it is used.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Chain {
-    /// `D`, row-major: rows `(q_d, q_k, p, k)`, columns `(q, p, inputs, k)`, padded.
+    /// `D`, row-major: rows `(q, p, k)`, columns `(q, p, u, k)`, padded.
     tangent: Vec<f64>,
     next: Vec<f64>,
     /// `∂λ/∂θ`, summed over the steps.
@@ -59,7 +59,8 @@ impl Chain {
         // Steps that are too many to be kept share a place.
         let at = if *steps < out.parts_max { *steps } else { 0 };
         *steps += 1;
-        let (nd, nk, last) = (out.nd, out.nk, out.next_columns() + out.ni);
+        let theta = out.parameters();
+        let (nd, nk, last) = (theta.nd, theta.nk, theta.next());
         for k in 0..nk {
             for (row, fraction) in [(nd + k, from), (2 * nd + nk + k, to)] {
                 let row = &mut self.tangent[row * self.stride..][..self.stride];
@@ -82,8 +83,9 @@ impl Chain {
         let Kind::Period { steps } = out.kind else { return };
         let Some(last) = steps.checked_sub(1) else { return };
         let step = &out.parts[if last < out.parts_max { last } else { 0 }].step;
-        let (nd, nk, ni, stride) = (out.nd, out.nk, out.ni, self.stride);
-        let (n, inputs) = (nd + nk, out.next_columns());
+        let (theta, stride) = (out.parameters(), self.stride);
+        let (nd, nk, ni) = (theta.nd, theta.nk, theta.ni);
+        let (n, inputs) = (theta.n(), theta.inputs());
         let Self { tangent, next, multipliers, terms, .. } = self;
         let mut follow = |target: &mut [f64], part: &[f64], i: usize, driven: usize| {
             let row = &part[i * step.stride..][..inputs + nk];
@@ -134,8 +136,8 @@ impl Chain {
 
     /// Hands out the derivatives of the whole period, of length `h`.
     pub(crate) fn finish(&self, h: f64, out: &mut Linearization) {
-        let (nd, nk, ni, stride) = (out.nd, out.nk, out.ni, self.stride);
-        let (n, inputs) = (nd + nk, out.next_columns());
+        let (theta, stride) = (out.parameters(), self.stride);
+        let (nd, ni, n, inputs) = (theta.nd, theta.ni, theta.n(), theta.inputs());
         out.time_step_s = h;
         out.turnings.clear();
         out.driven.clear();
@@ -148,10 +150,8 @@ impl Chain {
         }
         let width = out.stride.max(1);
         let put = |rows: &mut [f64], sources: &mut dyn Iterator<Item = &[f64]>| {
-            for (target, source) in rows.chunks_exact_mut(width).zip(sources) {
-                target[..inputs].copy_from_slice(&source[..inputs]);
-                target[inputs..][..nk].copy_from_slice(&source[inputs + ni..][..nk]);
-            }
+            let rows = rows.chunks_exact_mut(width).zip(sources);
+            rows.for_each(|(target, source)| theta.drop_inputs(source, target));
         };
         put(&mut out.increment, &mut { increments });
         put(&mut out.multipliers, &mut { lambdas });

@@ -1,6 +1,6 @@
 //! The exact linearization of a step of collocation, from all stages at once.
 //!
-//! With the residuals `R_i` and impulses `P_i` of the stages, and `θ = (q, p, inputs, k)`,
+//! With the residuals `R_i` and impulses `P_i` of the stages, and `θ = (q, p, u, k)`,
 //!
 //! ```text
 //! Y' = −(∂R/∂Y)⁻¹ R_θ        x' = Σ Y_i'        p[k+1]' = p' + Σ P_i,θ + (Σ ∂P_i/∂Y) Y'
@@ -11,9 +11,11 @@
 use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::system::System;
 use crate::integrator::report::StepError;
+use crate::integrator::scheme::Tableau;
 use crate::integrator::workspace::{At, Workspace};
 use crate::linearization::linearize::{Linearization, StageTangents};
-use crate::math::rows::{add_rows, padded};
+use crate::linearization::parameters::Parameters;
+use crate::math::rows::{add_product, add_rows};
 
 impl Collocation {
     /// Linearizes at the solution.
@@ -27,8 +29,8 @@ impl Collocation {
         let d = model.dimensions;
         let (count, n, nd) = (self.tableau.nodes.len(), d.coordinates(), d.dynamic);
         let h = at.settings.time_step_s;
-        let (momentum, inputs, next) = (n, n + nd, n + nd + d.inputs);
-        let stride = padded((next + d.prescribed).max(1));
+        let theta = Parameters::new(model);
+        let stride = theta.stride;
         let system = self.system.get_or_insert_with(|| Box::new(System::new(model, &self.tableau)));
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {
@@ -60,49 +62,8 @@ impl Collocation {
         if !system.matrix.invert() {
             return Err(StepError::NotFinite { iterations: 0 });
         }
-        let (hessian, width) = system.hessian();
-        let StageTangents { coupling, tangent, impulses, slopes, terms, .. } = &mut *tangents;
-        tangent.fill(0.0);
-        impulses.fill(0.0);
-        slopes.fill(0.0);
-        for j in 0..count {
-            let (weight, node) = (self.tableau.weights[j], self.tableau.nodes[j]);
-            let length = h * weight;
-            for a in 0..nd {
-                let row = &mut impulses[(a * count + j) * stride..][..stride];
-                let own = &mut tangent[(a * count + j) * stride..][..stride];
-                for b in 0..n {
-                    let entry = (a * n + b) * width + j;
-                    let (q, v) = (length * hessian.qq[entry], hessian.qv[entry]);
-                    let (p_q, p_v) = (hessian.vq[entry], hessian.vv[entry]);
-                    if b < nd {
-                        row[b] = q;
-                        own[b] = -p_q;
-                        slopes[a * count * nd + b * count + j] += v;
-                        for k in 0..count {
-                            slopes[a * count * nd + b * count + k] += q * coupling[j * count + k];
-                        }
-                    } else {
-                        row[b] = (1.0 - node) * q - weight * v;
-                        row[next + b - nd] = node * q + weight * v;
-                        own[b] = p_v / h - (1.0 - node) * p_q;
-                        own[next + b - nd] = -p_v / h - node * p_q;
-                    }
-                }
-                for input in 0..d.inputs {
-                    row[inputs + input] = length * hessian.qu[(a * d.inputs + input) * width + j];
-                }
-                own[momentum + a] = 1.0;
-            }
-        }
-        for i in 0..count {
-            for a in 0..nd {
-                terms.clear();
-                terms.extend((0..count).map(|j| (coupling[i * count + j], a * count + j)));
-                let target = &mut tangent[(a * count + i) * stride..][..stride];
-                add_rows(target, impulses, stride, terms);
-            }
-        }
+        tangents.fill(system, &self.tableau, &theta, h);
+        let StageTangents { tangent, impulses, slopes, terms, .. } = &mut *tangents;
         system.matrix.solve_rows(tangent, stride);
         tangent.iter_mut().for_each(|entry| *entry = -*entry);
 
@@ -114,12 +75,10 @@ impl Collocation {
             terms.extend((0..count).map(|i| (1.0, a * count + i)));
             add_rows(&mut increment, tangent, stride, terms);
             moved.fill(0.0);
-            moved[momentum + a] = 1.0;
+            moved[n + a] = 1.0;
             add_rows(&mut moved, impulses, stride, terms);
-            terms.clear();
             let slopes = slopes[a * count * nd..][..count * nd].iter().copied();
-            terms.extend(slopes.zip(0..).filter(|(slope, _)| *slope != 0.0));
-            add_rows(&mut moved, tangent, stride, terms);
+            add_product(&mut moved, tangent, stride, slopes, terms);
             out.set_rows(a, [&increment, &moved]);
         }
 
@@ -127,5 +86,57 @@ impl Collocation {
         tangents.matrix.take_inverse_of(&system.matrix);
         out.keep_stages(tangents);
         Ok(())
+    }
+}
+
+impl StageTangents {
+    /// Writes `∂P_j/∂θ`, `Σ ∂P_j/∂Y`, and into `tangent` the derivatives `R_θ` of the residuals.
+    fn fill(&mut self, system: &System, tableau: &Tableau, theta: &Parameters, h: f64) {
+        let &Parameters { nd, ni, stride, .. } = theta;
+        let (n, inputs, next, count) =
+            (theta.n(), theta.inputs(), theta.next(), tableau.nodes.len());
+        let (hessian, width) = system.hessian();
+        let Self { coupling, tangent, impulses, slopes, terms, .. } = self;
+        tangent.fill(0.0);
+        impulses.fill(0.0);
+        slopes.fill(0.0);
+        for (j, (node, weight)) in tableau.nodes.iter().zip(&tableau.weights).enumerate() {
+            let length = h * weight;
+            for a in 0..nd {
+                let row = &mut impulses[(a * count + j) * stride..][..stride];
+                let own = &mut tangent[(a * count + j) * stride..][..stride];
+                for b in 0..n {
+                    let entry = (a * n + b) * width + j;
+                    let (q, v) = (length * hessian.qq[entry], hessian.qv[entry]);
+                    let (p_q, p_v) = (hessian.vq[entry], hessian.vv[entry]);
+                    if b < nd {
+                        row[b] = q;
+                        own[b] = -p_q;
+                        let slopes = &mut slopes[(a * nd + b) * count..][..count];
+                        slopes[j] += v;
+                        for (slope, coupling) in slopes.iter_mut().zip(&coupling[j * count..]) {
+                            *slope += q * coupling;
+                        }
+                    } else {
+                        row[b] = (1.0 - node) * q - weight * v;
+                        row[next + b - nd] = node * q + weight * v;
+                        own[b] = p_v / h - (1.0 - node) * p_q;
+                        own[next + b - nd] = -p_v / h - node * p_q;
+                    }
+                }
+                for (input, entry) in row[inputs..next].iter_mut().enumerate() {
+                    *entry = length * hessian.qu[(a * ni + input) * width + j];
+                }
+                own[n + a] = 1.0;
+            }
+        }
+        for i in 0..count {
+            for a in 0..nd {
+                terms.clear();
+                terms.extend((0..count).map(|j| (coupling[i * count + j], a * count + j)));
+                let target = &mut tangent[(a * count + i) * stride..][..stride];
+                add_rows(target, impulses, stride, terms);
+            }
+        }
     }
 }

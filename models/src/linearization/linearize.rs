@@ -1,24 +1,29 @@
-//! The exact first-order linearization of a step, in increment form.
+//! The exact first-order linearization of a step, in increment form (sections IV and V of the paper).
 //!
-//! Unknown `y = (x, λ)`, parameters `θ = (q_d, q_k, p, k, u)`: start configuration (dynamic,
-//! prescribed), momentum, next prescribed positions, inputs. With both ends of the step shifted
-//! together no terms of size `1/h` cancel. At the midpoint, with `a` the weight of `F⁻`,
+//! Unknown `y = (x, λ)`, parameters `θ = (q, p, u, k)` with `q = (q_d, q_k)`: start configuration
+//! (dynamic, prescribed), momentum, inputs, next prescribed positions. With both ends of the step
+//! shifted together no terms of size `1/h` cancel. At the midpoint, with `a` the weight of `F⁻`,
 //!
 //! ```text
-//! C_q = ½h L_qq − L_vq        C_v = ½h L_qv − L_vv + a h f_v        H = Σ λ D²h(q[k])
+//! C_q = ½h L_qq − L_vq + a h f_q      C_v = ½h L_qv − L_vv + a h f_v      H = Σ λ D²h(q[k])
+//! M_q = h (L_qq + f_q)                M_v = h (L_qv + f_v)                S = A1 K⁻¹ A0ᵀ
 //!
-//! column      of r1                       of r2
-//! q_d         (C_q − H)_dd                A1_d
-//! q_k         (½C_q − C_v/h − H)_dk       0
-//! p           1                           0
-//! k           (½C_q + C_v/h)_dk           A1_k
+//! column      of r1                       of r2      of p[k+1], at fixed x and λ
+//! q_d         (C_q − H)_dd                A1_d       (M_q − H)_dd
+//! q_k         (½C_q − C_v/h − H)_dk       0          (½M_q − M_v/h − H)_dk
+//! p           1                           0          1
+//! u           a h f_u                     0          h f_u
+//! k           (½C_q + C_v/h)_dk           A1_k       (½M_q + M_v/h)_dk
+//! x           K = (½C_q + C_v/h)_dd       A1_d       (½M_q + M_v/h)_dd
+//! λ           −A0ᵀ                        0          −A0ᵀ
 //!
 //! x' = K⁻¹ (A0ᵀ λ' − r1')      S λ' = A1 K⁻¹ r1' − r2'      q[k+1]' = q_d' + x'
-//! p[k+1]' = p' + (½h L_qq + L_qv + h f_v/h) x' + h L_qq q_d' + (prescribed) − A0ᵀ λ' − H q'
+//! p[k+1]' = p' + (½M_q + M_v/h) x' + M_q q_d' + (prescribed) − A0ᵀ λ' − H q'
 //! ```
 //!
 //! An input acts like momentum: its column is `Σ_i a h ∂f_i/∂u` times that of `p_i`, plus
-//! `(1 − a) h ∂f_i/∂u` on `p[k+1]_i`. Prescribed positions that signals replace have no effect.
+//! `(1 − a) h ∂f_i/∂u` on `p[k+1]_i`; rows leave the columns of `u` out. Prescribed positions that
+//! signals replace have no effect.
 
 use nalgebra::DMatrix;
 
@@ -27,6 +32,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
 use crate::integrator::workspace::{At, Workspace};
 use crate::kkt::schur::room_for_schur;
+use crate::linearization::parameters::Parameters;
 use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rows::{Term, padded, spread};
@@ -42,6 +48,17 @@ pub(crate) struct InputImpulse {
     pub(crate) momentum: f64,
 }
 
+/// What a row holds the derivatives of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Output {
+    /// `x_i`.
+    Increment(usize),
+    /// `λ_c`.
+    Multiplier(usize),
+    /// `p_i[k+1]`.
+    Momentum(usize),
+}
+
 /// What was linearized.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
@@ -55,6 +72,24 @@ pub(crate) enum Kind {
 
 /// The exact first-order linearization of a control period. Preallocated for one step of the midpoint
 /// rule; for other methods it gets its memory when it is first used.
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use plantd_models::{Linearization, Model, Plant, Settings, builtin};
+///
+/// let scene = builtin::scene("pendulum").expect("a builtin scene");
+/// let model = Arc::new(Model::compile(&scene)?);
+/// let mut plant = Plant::new(model.clone(), Settings::new(&model))?;
+/// let mut first = Linearization::new(&model);
+/// plant.linearize(&[0.5], &mut first)?;
+///
+/// // x = (q, p): the map of a pendulum keeps areas.
+/// let (a, b) = (first.a(), first.b());
+/// assert!((a.determinant() - 1.0).abs() < 1e-12);
+/// assert_eq!(b.shape(), (2, 1));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Linearization {
     pub(crate) kind: Kind,
@@ -74,7 +109,7 @@ pub struct Linearization {
     /// Prescribed coordinates that signals drive, as columns of `B`.
     pub(crate) replaced: Vec<usize>,
     pub(crate) at_start: f64,
-    /// Length of a row: the columns of the parameters `(q_d, q_k, p, k)`, padded.
+    /// Length of a row: the columns of the parameters `(q, p, k)`, padded.
     pub(crate) stride: usize,
     /// `x'`, row-major, nd rows.
     pub(crate) increment: Vec<f64>,
@@ -247,17 +282,16 @@ impl Linearization {
         self.driven.resize((2 * self.nd + self.constraints()) * self.ni, 0.0);
     }
 
-    /// Sets `x_i'` and `p_i[k+1]'` by the parameters `(q, p, inputs, k)`, for collocation.
+    /// Sets `x_i'` and `p_i[k+1]'` by the parameters `(q, p, u, k)`, for collocation.
     pub(crate) fn set_rows(&mut self, i: usize, by: [&[f64]; 2]) {
-        let (next, nk, ni, nd) = (self.next_columns(), self.nk, self.ni, self.nd);
-        let driven = [i, nd + self.constraints() + i];
+        let theta = self.parameters();
+        let driven = [i, theta.nd + theta.nc + i];
         for ((rows, driven), by) in
             [&mut self.increment, &mut self.momentum].into_iter().zip(driven).zip(by)
         {
-            self.driven[driven * ni..][..ni].copy_from_slice(&by[next..][..ni]);
-            let row = &mut rows[i * self.stride..][..self.stride];
-            row[..next].copy_from_slice(&by[..next]);
-            row[next..][..nk].copy_from_slice(&by[next + ni..][..nk]);
+            let by_inputs = &by[theta.inputs()..theta.next()];
+            self.driven[driven * theta.ni..][..theta.ni].copy_from_slice(by_inputs);
+            theta.drop_inputs(by, &mut rows[i * self.stride..][..self.stride]);
         }
     }
 
@@ -314,29 +348,15 @@ impl Linearization {
     /// Writes `B` over a matrix of its shape.
     pub(crate) fn write_b(&self, b: &mut DMatrix<f64>) {
         let (nd, nk, ni) = (self.nd, self.nk, self.ni);
-        let (n, next) = (nd + nk, self.next_columns());
+        let (n, mut row) = (nd + nk, vec![0.0; ni + nk]);
         b.fill(0.0);
-        for &InputImpulse { input, coordinate, residual, momentum } in self.impulses() {
-            for i in 0..nd {
-                let column = i * self.stride + n + coordinate;
-                b[(i, input)] += residual * self.increment[column];
-                b[(n + i, input)] += residual * self.momentum[column];
-            }
-            b[(n + coordinate, input)] += momentum - residual;
-        }
         for i in 0..nd {
-            for (input, entry) in self.driven(i).iter().enumerate() {
-                b[(i, input)] = *entry;
-            }
-            for (input, entry) in self.driven(nd + self.constraints() + i).iter().enumerate() {
-                b[(n + i, input)] = *entry;
+            for (target, output) in [(i, Output::Increment(i)), (n + i, Output::Momentum(i))] {
+                self.write_by_input(output, &mut row);
+                b.row_mut(target).iter_mut().zip(&row).for_each(|(to, from)| *to = *from);
             }
         }
         for k in 0..nk {
-            for i in 0..nd {
-                b[(i, ni + k)] = self.increment[i * self.stride + next + k];
-                b[(n + i, ni + k)] = self.momentum[i * self.stride + next + k];
-            }
             b[(nd + k, ni + k)] = 1.0;
             b[(n + nd + k, ni + k)] = 1.0 / self.time_step_s;
         }
@@ -371,19 +391,11 @@ impl Linearization {
     /// `∂λ/∂u`, nc by `ni + nk`; see [`Linearization::multipliers_x`]. Zero where a signal replaces the
     /// entry of `u`.
     pub fn multipliers_u(&self) -> DMatrix<f64> {
-        let (n, ni, next) = (self.nd + self.nk, self.ni, self.next_columns());
-        let mut by_u = DMatrix::zeros(self.constraints(), ni + self.nk);
-        for c in 0..self.constraints() {
-            let row = &self.multipliers[c * self.stride..][..self.stride];
-            for &InputImpulse { input, coordinate, residual, .. } in self.impulses() {
-                by_u[(c, input)] += residual * row[n + coordinate];
-            }
-            for (input, entry) in self.driven(self.nd + c).iter().enumerate() {
-                by_u[(c, input)] = *entry;
-            }
-            for k in 0..self.nk {
-                by_u[(c, ni + k)] = row[next + k];
-            }
+        let mut row = vec![0.0; self.ni + self.nk];
+        let mut by_u = DMatrix::zeros(self.constraints(), row.len());
+        for (c, mut target) in by_u.row_iter_mut().enumerate() {
+            self.write_by_input(Output::Multiplier(c), &mut row);
+            target.iter_mut().zip(&row).for_each(|(to, from)| *to = *from);
         }
         for &column in &self.replaced {
             by_u.column_mut(column).fill(0.0);
@@ -414,34 +426,68 @@ impl Linearization {
         [at_start, at_end]
     }
 
-    /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, inputs, k)`.
+    /// Writes `x'` (nd rows) and `λ'` (nc rows) by the parameters `(q, p, u, k)`.
     pub(crate) fn write_tangent(&self, stride: usize, out: &mut [f64]) {
-        let (n, next) = (self.nd + self.nk, self.next_columns());
-        let width = self.stride.max(1);
-        let rows = self.increment.chunks_exact(width).chain(self.multipliers.chunks_exact(width));
-        for (row, out) in rows.zip(out.chunks_exact_mut(stride)) {
-            out[..next].copy_from_slice(&row[..next]);
-            out[next..][..self.ni].fill(0.0);
-            for &InputImpulse { input, coordinate, residual, .. } in &self.inputs {
-                out[next + input] += residual * row[n + coordinate];
-            }
-            out[next + self.ni..][..self.nk].copy_from_slice(&row[next..][..self.nk]);
+        let theta = self.parameters();
+        let outputs = (0..theta.nd).map(Output::Increment);
+        let outputs = outputs.chain((0..theta.nc).map(Output::Multiplier));
+        for (output, out) in outputs.zip(out.chunks_exact_mut(stride)) {
+            let (by_state, by_input) = out[..theta.count()].split_at_mut(theta.inputs());
+            by_state.copy_from_slice(&self.row(output)[..theta.inputs()]);
+            self.write_by_input(output, by_input);
         }
     }
 
+    /// Derivatives of an output by `(q, p, k)`, padded.
+    fn row(&self, output: Output) -> &[f64] {
+        let (rows, i) = match output {
+            Output::Increment(i) => (&self.increment, i),
+            Output::Multiplier(c) => (&self.multipliers, c),
+            Output::Momentum(i) => (&self.momentum, i),
+        };
+        &rows[i * self.stride..][..self.stride]
+    }
+
+    /// Writes the derivatives of an output by the input of the map, `(u, k)`, those that signals replace
+    /// included.
+    pub(crate) fn write_by_input(&self, output: Output, out: &mut [f64]) {
+        let (theta, row) = (self.parameters(), self.row(output));
+        let driven = match output {
+            Output::Increment(i) => i,
+            Output::Multiplier(c) => theta.nd + c,
+            Output::Momentum(i) => theta.nd + theta.nc + i,
+        };
+        let (by_u, by_k) = out.split_at_mut(theta.ni);
+        by_u.fill(0.0);
+        by_u.iter_mut().zip(self.driven(driven)).for_each(|(to, from)| *to = *from);
+        for &InputImpulse { input, coordinate, residual, momentum } in self.impulses() {
+            by_u[input] += residual * row[theta.n() + coordinate];
+            if output == Output::Momentum(coordinate) {
+                by_u[input] += momentum - residual;
+            }
+        }
+        by_k.copy_from_slice(&row[theta.inputs()..][..theta.nk]);
+    }
+
     /// What unit inputs give to a step of the midpoint rule.
-    pub(crate) fn impulses(&self) -> &[InputImpulse] {
+    fn impulses(&self) -> &[InputImpulse] {
         if self.kind == Kind::Step { &self.inputs } else { &[] }
     }
 
     /// A row of derivatives by the inputs of collocation and periods.
-    pub(crate) fn driven(&self, row: usize) -> &[f64] {
+    fn driven(&self, row: usize) -> &[f64] {
         if self.kind == Kind::Step { &[] } else { &self.driven[row * self.ni..][..self.ni] }
     }
 
-    /// First column of the next prescribed positions.
+    /// The parameters of the map. Rows leave the columns of the inputs out.
+    pub(crate) fn parameters(&self) -> Parameters {
+        let (nd, nk, ni, nc) = (self.nd, self.nk, self.ni, self.constraints());
+        Parameters { nd, nk, ni, nc, stride: self.stride }
+    }
+
+    /// First column of the next prescribed positions in rows without the inputs.
     pub(crate) fn next_columns(&self) -> usize {
-        2 * self.nd + self.nk
+        self.parameters().inputs()
     }
 
     pub(crate) fn constraints(&self) -> usize {
@@ -471,7 +517,7 @@ fn add_block(block: &Mat3, (row, column): (usize, usize), matrix: &mut DMatrix<f
 #[derive(Clone, Debug)]
 pub(crate) struct Part {
     pub(crate) step: Linearization,
-    /// `D`, row-major: rows `(q_d, q_k, p, k)`.
+    /// `D`, row-major: rows `(q, p, k)`.
     pub(crate) tangent: Vec<f64>,
 }
 
@@ -486,7 +532,7 @@ pub(crate) struct StageTangents {
     pub(crate) q: Vec<f64>,
     pub(crate) velocity: Vec<f64>,
     pub(crate) inputs: Vec<f64>,
-    /// `Y'` by the parameters `(q, p, inputs, k)`, row-major, `n s` padded rows: those of the stages of a
+    /// `Y'` by the parameters `(q, p, u, k)`, row-major, `n s` padded rows: those of the stages of a
     /// coordinate side by side.
     pub(crate) tangent: Vec<f64>,
     /// `∂P_i/∂θ`, the same way.

@@ -2,15 +2,16 @@
 
 use nalgebra::DMatrix;
 
-use crate::linearization::linearize::{InputImpulse, Linearization};
+use crate::linearization::linearize::{Linearization, Output};
 use crate::math::sparse_map::Map;
 
 impl Linearization {
     /// Writes `[B A]` without its zeros: rows of dynamic coordinates and momenta are full, those of
     /// prescribed coordinates have an entry or two.
     pub(crate) fn write_map(&self, map: &mut Map) {
-        let (nd, nk, ni) = (self.nd, self.nk, self.ni);
-        let (n, next, inputs) = (nd + nk, self.next_columns(), self.ni + self.nk);
+        let theta = self.parameters();
+        let (nd, nk, ni) = (theta.nd, theta.nk, theta.ni);
+        let (n, next, inputs) = (theta.n(), theta.inputs(), ni + nk);
         if !self.turnings.is_empty() {
             let (mut a, mut b) = (DMatrix::zeros(2 * n, 2 * n), DMatrix::zeros(2 * n, inputs));
             self.write_a(&mut a);
@@ -22,17 +23,8 @@ impl Linearization {
         for (part, numbers) in [&self.increment, &self.momentum].into_iter().enumerate() {
             for (i, source) in numbers.chunks_exact(self.stride.max(1)).enumerate() {
                 let target = map.row_mut(part * nd + i);
-                let driven = self.driven(part * (nd + self.constraints()) + i);
-                target[..ni].fill(0.0);
-                target.iter_mut().zip(driven).for_each(|(target, entry)| *target = *entry);
-                for impulse in self.impulses() {
-                    let InputImpulse { input, coordinate, residual, momentum } = *impulse;
-                    target[input] += residual * source[n + coordinate];
-                    if part == 1 && coordinate == i {
-                        target[input] += momentum - residual;
-                    }
-                }
-                target[ni..inputs].copy_from_slice(&source[next..][..nk]);
+                let output = if part == 0 { Output::Increment(i) } else { Output::Momentum(i) };
+                self.write_by_input(output, &mut target[..inputs]);
                 target[inputs..][..next].copy_from_slice(&source[..next]);
                 if part == 0 {
                     target[inputs + i] += 1.0;

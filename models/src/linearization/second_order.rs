@@ -1,7 +1,8 @@
-//! The exact second-order linearization of a step, as full tensors or contracted with weights.
+//! The exact second-order linearization of a step (sections IV and V of the paper), as full tensors or
+//! contracted with weights.
 //!
 //! The equations of a step are `R(θ, y) = 0` for the unknowns `y = (x, λ)` with the parameters
-//! `θ = (q, p, inputs, k)`; `k` are the next prescribed positions, `O(θ, y)` is `p[k+1]`. The tangent
+//! `θ = (q, p, u, k)`; `k` are the next prescribed positions, `O(θ, y)` is `p[k+1]`. The tangent
 //! of parameter `a` is `W_a = (e_a, y'_a)`, from the first-order linearization. One more derivative:
 //!
 //! ```text
@@ -21,61 +22,17 @@ use nalgebra::DMatrix;
 use crate::integrator::blocks::StepBlocks;
 use crate::integrator::turning::Turning;
 use crate::linearization::linearize::SolvedStep;
+use crate::linearization::parameters::Parameters;
 use crate::math::rotation;
-use crate::math::rows::{Term, padded};
+use crate::math::rows::Term;
 use crate::math::scalar::Dual;
 use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 
-/// Sizes, and where things stand among the parameters `θ = (q, p, inputs, k)`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Layout {
-    pub(crate) nd: usize,
-    pub(crate) nk: usize,
-    pub(crate) ni: usize,
-    pub(crate) nc: usize,
-    /// Length of a row over the parameters, padded.
-    pub(crate) stride: usize,
-}
-
-impl Layout {
-    fn new(model: &Model) -> Self {
-        let d = model.dimensions;
-        let (nd, nk, ni, nc) = (d.dynamic, d.prescribed, d.inputs, d.constraints);
-        Self { nd, nk, ni, nc, stride: padded((2 * (nd + nk) + ni).max(1)) }
-    }
-
-    /// Coordinates.
-    pub(crate) fn n(&self) -> usize {
-        self.nd + self.nk
-    }
-
-    /// First column of the inputs.
-    fn inputs(&self) -> usize {
-        self.n() + self.nd
-    }
-
-    /// First column of the next prescribed positions.
-    fn next(&self) -> usize {
-        self.inputs() + self.ni
-    }
-
-    fn parameters(&self) -> usize {
-        self.next() + self.nk
-    }
-
-    /// Which of the six numbers that turn the ends of a prescribed ball joint a parameter is.
-    pub(crate) fn end_of(&self, coordinate: usize, parameter: usize) -> Option<usize> {
-        let ends = [coordinate, self.next() + coordinate.wrapping_sub(self.nd)];
-        let first = ends.iter().position(|end| (*end..*end + 3).contains(&parameter))?;
-        Some(3 * first + parameter - ends[first])
-    }
-}
-
 /// What both forms compute with.
 #[derive(Clone, Debug)]
 pub(crate) struct Scratch {
-    pub(crate) layout: Layout,
+    pub(crate) layout: Parameters,
     pub(crate) blocks: StepBlocks<Dual>,
     /// `x'` and `λ'` by all parameters, row-major, nd + nc rows.
     pub(crate) tangent: Vec<f64>,
@@ -86,7 +43,7 @@ pub(crate) struct Scratch {
 
 pub(crate) fn assert_layout(model: &Model, scratch: &Scratch) {
     assert!(
-        scratch.layout == Layout::new(model),
+        scratch.layout == Parameters::new(model),
         "the second-order linearization belongs to another model"
     );
 }
@@ -108,7 +65,7 @@ pub(crate) fn spin_change(t: &Turning<Dual>, time_step_s: f64) -> [[f64; 6]; 3] 
 
 impl Scratch {
     fn new(model: &Model) -> Self {
-        let layout = Layout::new(model);
+        let layout = Parameters::new(model);
         let rows = layout.nd + layout.nc;
         Self {
             layout,
@@ -131,7 +88,7 @@ impl Scratch {
 
     /// Places the blocks at a solved step, with the tangent of parameter `a`.
     pub(crate) fn seed(&mut self, a: usize, model: &Model, step: &SolvedStep) {
-        let Layout { nd, stride, .. } = self.layout;
+        let Parameters { nd, stride, .. } = self.layout;
         let (inputs, next) = (self.layout.inputs(), self.layout.next());
         let unit = |is: bool| if is { 1.0 } else { 0.0 };
         let tangent = |row: usize| self.tangent[row * stride + a];

@@ -103,3 +103,21 @@ fn add_block<const N: usize>(
     }
     *block = sum;
 }
+
+/// `target += Σ factors[row] · source[row]` for the factors that are not zero; `terms` is room for them.
+pub(crate) fn add_product(
+    target: &mut [f64],
+    source: &[f64],
+    stride: usize,
+    factors: impl Iterator<Item = f64>,
+    terms: &mut Vec<Term>,
+) {
+    terms.clear();
+    terms.extend(non_zero(factors));
+    add_rows(target, source, stride, terms);
+}
+
+/// The entries that are not zero, with their indices.
+pub(crate) fn non_zero(entries: impl Iterator<Item = f64>) -> impl Iterator<Item = Term> {
+    entries.enumerate().filter(|(_, entry)| *entry != 0.0).map(|(i, entry)| (entry, i))
+}

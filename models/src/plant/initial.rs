@@ -2,6 +2,7 @@
 //! velocity and energy that belong to a state.
 
 use crate::constraints::closure::Closure;
+use crate::constraints::projection::{Limits, Reached, project};
 use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settings};
 use crate::integrator::state::PreciseState;
@@ -21,10 +22,15 @@ use crate::plant::settle::{SettleError, SettleRequest};
 /// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
 /// half turns about an axis and for cyclic exchanges of the axes, it is −1 or 0.
 const ALIGNED: f64 = 2.0;
-/// Corrections before a projection onto the constraints is given up.
-const PROJECTION_ITERATIONS: usize = 100;
-/// A projection moves no coordinate by more than this in one correction, m or rad.
-const PROJECTION_STEP: f64 = 0.5;
+/// How a guess is projected onto the constraints.
+const PROJECTION: Limits = Limits {
+    corrections: 100,
+    enough: 1.0,
+    floor: 1e3,
+    longest: 0.5,
+    shortest: 0.0,
+    round_off_is_fresh: false,
+};
 
 /// How a state is given.
 #[derive(Clone, Debug, PartialEq)]
@@ -245,7 +251,8 @@ impl Plant {
         Ok(())
     }
 
-    /// Newton's method with the shortest correction, `dq = −Aᵀ (A Aᵀ)⁻¹ h`, `A` the columns that move.
+    /// The nearest configuration on the constraints, with the shortest corrections
+    /// `dq = −Aᵀ (A Aᵀ)⁻¹ h`, `A` the columns that move.
     pub(crate) fn project(
         &self,
         mut q: Vec<f64>,
@@ -255,15 +262,7 @@ impl Plant {
         let (n, nc) = (q.len(), model.dimensions.constraints);
         let mut closure = Closure::new(model);
         let mut normal = PivotedLu::new(&model.conditioning.weight, 0);
-        let mut best = f64::INFINITY;
-        for _ in 0..PROJECTION_ITERATIONS {
-            closure.evaluate(model, &q, &orientations(model, &q));
-            closure.differentiate(model, &q);
-            let violation = closure.violation();
-            if violation <= 1.0 || (violation <= 1e3 && violation >= 0.5 * best) {
-                return Ok(q);
-            }
-            best = best.min(violation);
+        let correction = |closure: &Closure| {
             let rows: Vec<&[f64]> = closure.jacobian.chunks(n).collect();
             for i in 0..nc {
                 for j in 0..nc {
@@ -274,22 +273,16 @@ impl Plant {
             normal.factor();
             let mut weights = closure.value.clone();
             normal.solve(&mut weights);
-            let correction: Vec<f64> = (0..n)
-                .map(
-                    |k| if moves[k] { (0..nc).map(|c| rows[c][k] * weights[c]).sum() } else { 0.0 },
-                )
-                .collect();
-            let longest = correction.iter().fold(0.0, |m: f64, c| m.max(c.abs()));
-            let scale = if longest > PROJECTION_STEP { PROJECTION_STEP / longest } else { 1.0 };
-            let change: Vec<f64> = correction.iter().map(|c| -scale * c).collect();
-            q = model.retract(&q, &change);
+            let along = |k: usize| (0..nc).map(|c| rows[c][k] * weights[c]).sum::<f64>();
+            Some((0..n).map(|k| -if moves[k] { along(k) } else { 0.0 }).collect())
+        };
+        match project(model, &mut closure, &mut q, &PROJECTION, correction) {
+            (Reached::Satisfied, _) => Ok(q),
+            _ => {
+                let (constraint, violation) = model.worst_equation(&closure);
+                Err(InitialError::Projection { constraint, violation })
+            }
         }
-        let relative = |c: &usize| (closure.value[*c] / closure.round_off[*c]).abs();
-        let worst = (0..nc).max_by(|a, b| relative(a).total_cmp(&relative(b))).unwrap_or_default();
-        Err(InitialError::Projection {
-            constraint: model.constraint_names[worst].clone(),
-            violation: closure.value[worst],
-        })
     }
 
     /// Velocity `q̇` (nd + nk) that belongs to the projected momentum (allocates).
@@ -301,7 +294,7 @@ impl Plant {
         velocity
     }
 
-    /// The same into `out`, nd + nk entries; allocates nothing.
+    /// Writes the velocity that belongs to the projected momentum, nd + nk entries; allocates nothing.
     pub fn write_velocity(&mut self, out: &mut [f64]) {
         self.workspace.find_velocity(&self.model, &self.state);
         let (dynamic, prescribed) = out.split_at_mut(self.workspace.residual.len());

@@ -16,7 +16,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use crate::integrator::blocks::Blocks;
+use crate::lagrangian::derivatives::Derivatives;
 use crate::plant::facade::Plant;
 
 /// Eigenvalues of `Dh M⁻¹ Dhᵀ` below this, relative to the largest, belong to redundant equations.
@@ -66,7 +66,7 @@ impl Plant {
             nd,
             self.state.p.iter().zip(&self.workspace.l_v).map(|(p, m)| p - m),
         );
-        let mut blocks = Blocks::<f64>::new(&model);
+        let mut blocks = Derivatives::<f64>::new(&model);
         let orientations = &self.workspace.orientations_start;
         blocks.evaluate(&model, (&self.state.q, orientations), &velocity, &vec![0.0; d.inputs]);
         let mut by_state = DMatrix::zeros(nd, 2 * n);

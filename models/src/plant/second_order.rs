@@ -1,12 +1,12 @@
 //! Second derivatives at the state of a plant.
 
-use crate::integrator::blocks::non_zero;
 use crate::integrator::report::{StepError, StepReport};
 use crate::linearization::linearize::Linearization;
+use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::contraction::{Contraction, check_weights};
 use crate::linearization::second_order::tensors::{SecondOrder, symmetrise};
-use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
-use crate::math::rows::{add_rows, padded};
+use crate::linearization::second_order::{Scratch, assert_layout, spin_change};
+use crate::math::rows::{add_product, add_rows, padded};
 use crate::plant::facade::Plant;
 
 impl Plant {
@@ -77,7 +77,7 @@ impl Plant {
     ) {
         let model = &*self.model;
         let SecondOrder { scratch, tensor, spins } = second;
-        let Layout { nd, nc, stride, .. } = scratch.layout;
+        let Parameters { nd, nc, stride, .. } = scratch.layout;
         let n = scratch.layout.n();
         let workspace = &mut self.workspace;
         workspace.schur.reserve(stride);
@@ -96,28 +96,26 @@ impl Plant {
             let (residual, closing) = solved.split_at_mut(nd * stride);
 
             // What the change of the blocks makes of the tangents.
-            for (i, row) in residual.chunks_exact_mut(stride).enumerate() {
-                let row = &mut row[..columns];
-                let by = [&blocks.residual_start[..], &blocks.residual_next[..]];
-                layout.place(row, i, by, &blocks.residual_inputs);
-                blocks.terms(i, &blocks.residual_next, terms);
-                add_rows(row, tangent, stride, terms);
-            }
-            for (i, row) in momentum.chunks_exact_mut(stride).enumerate() {
-                let row = &mut row[..columns];
-                let by = [&blocks.momentum_start[..], &blocks.momentum_next[..]];
-                layout.place(row, i, by, &blocks.momentum_inputs);
-                blocks.terms(i, &blocks.momentum_next, terms);
-                add_rows(row, tangent, stride, terms);
+            let residual_by =
+                [&blocks.residual_start, &blocks.residual_next, &blocks.residual_inputs];
+            let momentum_by =
+                [&blocks.momentum_start, &blocks.momentum_next, &blocks.momentum_inputs];
+            for (rows, [start, next, inputs]) in
+                [(&mut *residual, residual_by), (&mut *momentum, momentum_by)]
+            {
+                for (i, row) in rows.chunks_exact_mut(stride).enumerate() {
+                    let row = &mut row[..columns];
+                    layout.place(row, i, [start, next], inputs);
+                    add_product(row, tangent, stride, blocks.by_unknowns(i, next), terms);
+                }
             }
             for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
                 let row = &mut row[..columns];
                 let [by_start, by_next] =
                     blocks.end_jacobians().map(|jacobian| &jacobian[c * n..][..n]);
                 layout.place_end(row, by_start, by_next);
-                terms.clear();
-                terms.extend(non_zero(by_next[..nd].iter().map(|entry| entry.eps)));
-                add_rows(row, tangent, stride, terms);
+                let by_increment = by_next[..nd].iter().map(|entry| entry.eps);
+                add_product(row, tangent, stride, by_increment, terms);
             }
 
             // x'' and λ'' = −E⁻¹ (…).
@@ -126,9 +124,7 @@ impl Plant {
                 let row = &mut row[..columns];
                 row.iter_mut().for_each(|entry| *entry = -*entry);
                 let jacobian = &workspace.end.jacobian[c * n..][..nd];
-                terms.clear();
-                terms.extend(non_zero(jacobian.iter().copied()));
-                add_rows(row, residual, stride, terms);
+                add_product(row, residual, stride, jacobian.iter().copied(), terms);
             }
             if nc > 0 {
                 workspace.schur.solve_rows(closing, stride);
@@ -146,9 +142,7 @@ impl Plant {
             for (i, row) in momentum.chunks_exact_mut(stride).enumerate() {
                 let slopes = blocks.momentum_next[i * n..][..nd].iter().map(|entry| entry.re);
                 let impulses = (0..nc).map(|c| -workspace.start.jacobian[c * n + i]);
-                terms.clear();
-                terms.extend(non_zero(slopes.chain(impulses)));
-                add_rows(&mut row[..columns], solved, stride, terms);
+                add_product(&mut row[..columns], solved, stride, slopes.chain(impulses), terms);
             }
             for t in blocks.turnings.iter().filter(|t| t.coordinate < nd) {
                 layout.turn_rows(t, tangent, solved);

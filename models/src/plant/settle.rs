@@ -16,25 +16,32 @@
 use nalgebra::{DMatrix, DVector, SVD};
 
 use crate::constraints::closure::Closure;
-use crate::integrator::blocks::Blocks;
+use crate::constraints::projection::{Limits, Reached, project};
+use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::energy::potential_energy;
 use crate::math::null_space::tangent_basis;
+use crate::model::conditioning::Conditioning;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
 
 /// Iterations before the search is given up.
 const MAX_ITERATIONS: u32 = 300;
-/// Corrections that bring a configuration onto the constraints.
-const MAX_CORRECTIONS: usize = 60;
 /// Halvings of a step.
 const MAX_HALVINGS: u32 = 40;
 /// No iteration turns a joint by more than this, rad.
 const LONGEST_TURN: f64 = 1.0;
-/// A correction onto the constraints moves no coordinate by more than this, m or rad.
-const LONGEST_CORRECTION: f64 = 0.5;
+/// How configurations are brought onto the constraints.
+const PROJECTION: Limits = Limits {
+    corrections: 60,
+    enough: 1.0,
+    floor: 1e4,
+    longest: 0.5,
+    shortest: 0.0,
+    round_off_is_fresh: true,
+};
 /// The energy has no lower bound if a coordinate descends this far, m.
 const FAR_M: f64 = 1e6;
-/// The same for an angle, at the iteration limit, rad.
+/// It has none either if an angle is that far at the iteration limit, rad.
 const FAR_RAD: f64 = 50.0;
 /// Singular values of the constraints below this fraction of the largest are zero.
 const RANK_CUT: f64 = 1e-9;
@@ -153,7 +160,7 @@ fn retract(model: &Model, q: &[f64], increment: &DVector<f64>) -> Vec<f64> {
 /// A search in progress.
 struct Search<'a> {
     model: &'a Model,
-    blocks: Blocks,
+    blocks: Derivatives,
     closure: Closure,
     inputs: Vec<f64>,
     /// Whether each dynamic coordinate may move.
@@ -200,14 +207,15 @@ impl<'a> Search<'a> {
                 *moves = false;
             }
         }
-        let (blocks, closure) = (Blocks::new(model), Closure::new(model));
+        let (blocks, closure) = (Derivatives::new(model), Closure::new(model));
         Ok(Self { model, blocks, closure, inputs, moves, largest: 0.0 })
     }
 
     fn run(&mut self, guess: &[f64]) -> Result<Equilibrium, SettleError> {
         let mut q = guess.to_vec();
         if self.project(&mut q).is_none() {
-            return Err(self.off_constraints());
+            let (constraint, violation) = self.model.worst_equation(&self.closure);
+            return Err(SettleError::Constraints { constraint, violation });
         }
         let mut point = self.point(q);
         let mut radius = 1.0;
@@ -234,7 +242,9 @@ impl<'a> Search<'a> {
                 let softest = modes.eigenvalues.imin();
                 if modes.eigenvalues[softest] < -FLAT * stiffest {
                     let away = &basis * modes.eigenvectors.column(softest);
-                    if let Some(lower) = self.leave(&point, &self.unscaled(&away)) {
+                    if let Some(lower) =
+                        self.leave(&point, &unscaled(&self.model.conditioning, &away))
+                    {
                         point = lower;
                         continue;
                     }
@@ -246,7 +256,8 @@ impl<'a> Search<'a> {
             let step = DVector::from_fn(along.len(), |i, _| {
                 -along[i] / modes.eigenvalues[i].abs().max(floor)
             });
-            let mut step = self.unscaled(&(&basis * (&modes.eigenvectors * step)));
+            let mut step =
+                unscaled(&self.model.conditioning, &(&basis * (&modes.eigenvectors * step)));
             let limited = self.limit(&mut step, radius);
             match self.descend(&point, &step, round_off) {
                 Some((next, fraction)) => {
@@ -284,9 +295,7 @@ impl<'a> Search<'a> {
         });
         let potential = potential_energy(model, &blocks.poses, &blocks.momenta, &q);
         let mut rows = model.conditioning.rows(model, &mut self.closure, &q);
-        for (j, _) in self.moves.iter().enumerate().filter(|(_, moves)| !**moves) {
-            rows.column_mut(j).fill(0.0);
-        }
+        without_columns(&mut rows, &self.moves);
         let scaled = self.scaled_vector(&gradient);
         let weighted = pseudo_solve(rows.transpose(), &-&scaled);
         let unbalanced = scaled + rows.transpose() * &weighted;
@@ -327,39 +336,21 @@ impl<'a> Search<'a> {
 
     /// Newton's method with the shortest correction; the total increment if it arrives.
     fn project(&mut self, q: &mut Vec<f64>) -> Option<DVector<f64>> {
-        let model = self.model;
-        let d = model.dimensions;
-        let mut total = DVector::zeros(d.dynamic);
-        let mut best = f64::INFINITY;
-        for _ in 0..MAX_CORRECTIONS {
-            let mut rows = model.conditioning.rows(model, &mut self.closure, q);
-            if d.constraints == 0 {
-                return Some(total);
-            }
-            self.closure.evaluate(model, q, &orientations(model, q));
-            let violation = self.closure.violation();
-            if violation <= 1.0 || (violation <= 1e4 && violation >= 0.5 * best) {
-                return Some(total);
-            }
-            best = best.min(violation);
-            for (j, _) in self.moves.iter().enumerate().filter(|(_, moves)| !**moves) {
-                rows.column_mut(j).fill(0.0);
-            }
-            let value = DVector::from_fn(d.constraints, |c, _| {
-                -self.closure.value[c] * model.conditioning.weight[c]
+        let (model, conditioning) = (self.model, &self.model.conditioning);
+        let correction = |closure: &Closure| {
+            let mut rows = conditioning.weigh(model, closure);
+            without_columns(&mut rows, &self.moves);
+            let value = DVector::from_fn(closure.value.len(), |c, _| {
+                -closure.value[c] * conditioning.weight[c]
             });
-            let mut step = self.unscaled(&pseudo_solve(rows, &value));
-            let longest = step.amax();
-            if !longest.is_finite() {
-                return None;
+            Some(unscaled(conditioning, &pseudo_solve(rows, &value)).as_slice().to_vec())
+        };
+        match project(model, &mut self.closure, q, &PROJECTION, correction) {
+            (Reached::Satisfied, total) => {
+                Some(DVector::from_column_slice(&total[..self.moves.len()]))
             }
-            if longest > LONGEST_CORRECTION {
-                step *= LONGEST_CORRECTION / longest;
-            }
-            *q = retract(model, q, &step);
-            total += step;
+            _ => None,
         }
-        None
     }
 
     /// The point at the first fraction of a step that is low enough, and the fraction.
@@ -488,18 +479,6 @@ impl<'a> Search<'a> {
         })
     }
 
-    fn off_constraints(&self) -> SettleError {
-        let closure = &self.closure;
-        let relative = |c: &usize| (closure.value[*c] / closure.round_off[*c]).abs();
-        let worst = (0..closure.value.len())
-            .max_by(|a, b| relative(a).total_cmp(&relative(b)))
-            .unwrap_or_default();
-        SettleError::Constraints {
-            constraint: self.model.constraint_names[worst].clone(),
-            violation: closure.value[worst],
-        }
-    }
-
     /// The columns of a basis that have no part in held coordinates.
     fn without_held(&self, basis: DMatrix<f64>) -> DMatrix<f64> {
         let held: Vec<usize> = (0..self.moves.len()).filter(|j| !self.moves[*j]).collect();
@@ -523,10 +502,17 @@ impl<'a> Search<'a> {
     fn scaled_vector(&self, gradient: &DVector<f64>) -> DVector<f64> {
         gradient.map_with_location(|i, _, g| g / self.model.conditioning.inertia_of(i).sqrt())
     }
+}
 
-    /// An increment in the coordinates' own units.
-    fn unscaled(&self, increment: &DVector<f64>) -> DVector<f64> {
-        increment.map_with_location(|i, _, x| x / self.model.conditioning.inertia_of(i).sqrt())
+/// An increment in the coordinates' own units.
+fn unscaled(conditioning: &Conditioning, increment: &DVector<f64>) -> DVector<f64> {
+    increment.map_with_location(|i, _, x| x / conditioning.inertia_of(i).sqrt())
+}
+
+/// Zeroes the columns of what does not move.
+fn without_columns(rows: &mut DMatrix<f64>, moves: &[bool]) {
+    for (j, _) in moves.iter().enumerate().filter(|(_, moves)| !**moves) {
+        rows.column_mut(j).fill(0.0);
     }
 }
 

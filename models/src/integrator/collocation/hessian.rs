@@ -41,38 +41,17 @@ impl Hessian {
         stage: usize,
     ) {
         let d = model.dimensions;
-        let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
+        let (n, width) = (d.coordinates(), self.width);
         mechanics.differentiate(model);
         let Self { qq, qv, vq, vv, qu, .. } = self;
         let place = |row: usize, column: usize| (row * n + column) * width + stage;
-        for pair in &model.pairs {
-            let (i, j) = (pair.row as usize, pair.column as usize);
-            let second = mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
-            let (above, below) = (second.q_above_v_below, second.v_above_q_below);
-            for (at, by_velocity, by_position) in
-                [(place(i, j), above, below), (place(j, i), below, above)]
-            {
-                second.qq.store(&mut qq[at..]);
-                second.vv.store(&mut vv[at..]);
-                by_velocity.store(&mut qv[at..]);
-                by_position.store(&mut vq[at..]);
-            }
-        }
-        for pair in &model.mixed_pairs {
-            let second = mechanics.pair(model, pair.ancestor, pair.descendant);
-            let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
-            let descendant = model.dynamics.joints[pair.descendant].coordinate;
-            let (above, below) = (second.q_above_v_below, second.v_above_q_below);
-            let (at, by_velocity, by_position) = if ancestor < nd {
-                (place(ancestor, descendant), above, below)
-            } else {
-                (place(descendant, ancestor), below, above)
-            };
-            second.qq.store(&mut qq[at..]);
-            second.vv.store(&mut vv[at..]);
-            by_velocity.store(&mut qv[at..]);
-            by_position.store(&mut vq[at..]);
-        }
+        mechanics.for_each_second_derivative(model, |row, column, entry| {
+            let at = place(row, column);
+            entry.qq.store(&mut qq[at..]);
+            entry.qv.store(&mut qv[at..]);
+            entry.vq.store(&mut vq[at..]);
+            entry.vv.store(&mut vv[at..]);
+        });
         for (i, c) in model.damping.iter().enumerate() {
             let entry = &mut qv[place(i, i)..];
             (S::load(entry) - *c).store(entry);

@@ -36,7 +36,7 @@ pub(crate) struct System {
     mechanics: Vec<Mechanics<Lanes>>,
     /// `μ_ij`, row after row, padded both ways.
     rows: Vec<Lanes>,
-    /// The same, column after column.
+    /// `μ_ij`, column after column.
     columns: Vec<Lanes>,
     weights: Vec<f64>,
     nodes: Vec<f64>,

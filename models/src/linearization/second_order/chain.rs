@@ -1,12 +1,25 @@
 //! Weighted second derivatives of collocation, and of periods of several steps.
 
-use crate::integrator::blocks::non_zero;
 use crate::integrator::report::StepError;
 use crate::linearization::linearize::{Linearization, Part, StageTangents};
 use crate::linearization::second_order::contraction::Contraction;
-use crate::math::rows::add_rows;
+use crate::math::rows::{Term, add_product, add_rows};
 use crate::math::scalar::Dual;
 use crate::model::mechanism::Model;
+
+/// `sum += leftᵀ right`, all with rows of `stride` numbers.
+fn add_transposed_product(
+    sum: &mut [f64],
+    left: &[f64],
+    right: &[f64],
+    stride: usize,
+    terms: &mut Vec<Term>,
+) {
+    for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
+        let column = left.iter().skip(a).step_by(stride).copied();
+        add_product(row, right, stride, column, terms);
+    }
+}
 
 impl Contraction {
     /// The sum over the steps of a period: with the tangent `T_j` of the parameters of step `j`, and the
@@ -23,7 +36,7 @@ impl Contraction {
         weights_multipliers: &[f64],
     ) -> Result<(), StepError> {
         let layout = self.scratch.layout;
-        let (stride, size, n, nd) = (layout.stride, layout.parameters(), layout.n(), layout.nd);
+        let (stride, size, n, nd) = (layout.stride, layout.count(), layout.n(), layout.nd);
         let rows = size * stride;
         let [mut total, mut tangent, mut product] = [0; 3].map(|_| vec![0.0; rows]);
         let mut z = nalgebra::DVector::from_column_slice(weights_x);
@@ -46,15 +59,9 @@ impl Contraction {
             for (source, row) in
                 self.quadratic.sum.chunks_exact(stride).zip(product.chunks_exact_mut(stride))
             {
-                terms.clear();
-                terms.extend(non_zero(source[..size].iter().copied()));
-                add_rows(row, &tangent, stride, terms);
+                add_product(row, &tangent, stride, source[..size].iter().copied(), terms);
             }
-            for (a, row) in total.chunks_exact_mut(stride).enumerate() {
-                terms.clear();
-                terms.extend(non_zero(tangent.iter().skip(a).step_by(stride).copied()));
-                add_rows(row, &product, stride, terms);
-            }
+            add_transposed_product(&mut total, &tangent, &product, stride, terms);
             z = part.step.a().tr_mul(&z) + part.step.multipliers_x().tr_mul(&w);
         }
         self.quadratic.sum[..rows].copy_from_slice(&total);
@@ -67,7 +74,7 @@ impl Contraction {
     pub(super) fn contract_stages(&mut self, model: &Model, stages: &StageTangents, z: &[f64]) {
         let layout = self.scratch.layout;
         let (nd, n, ni, stride) = (layout.nd, layout.n(), layout.ni, layout.stride);
-        let (size, count) = (layout.parameters(), stages.weights.len());
+        let (size, count) = (layout.count(), stages.weights.len());
         let z_p = &z[n..][..nd];
         let mut adjoint = vec![0.0; count * nd];
         for (k, mu) in adjoint.iter_mut().enumerate() {
@@ -108,15 +115,10 @@ impl Contraction {
                     (false, true) => mid.l_qv[c * n + row - n].eps,
                     (false, false) => mid.l_vv[(row - n) * n + c - n].eps,
                 };
-                terms.clear();
-                terms.extend(non_zero((0..2 * n).map(hessian)));
-                add_rows(target, &tangent, stride, terms);
+                add_product(target, &tangent, stride, (0..2 * n).map(hessian), terms);
             }
-            for (a, row) in self.quadratic.sum.chunks_exact_mut(stride).enumerate().take(size) {
-                terms.clear();
-                terms.extend(non_zero(tangent.iter().skip(a).step_by(stride).copied()));
-                add_rows(row, &product, stride, terms);
-            }
+            let sum = &mut self.quadratic.sum[..size * stride];
+            add_transposed_product(sum, &tangent, &product, stride, terms);
             if model.forces.is_none() {
                 continue;
             }
@@ -137,19 +139,14 @@ impl Contraction {
                 let of = |entries: &[Dual], width: usize, c: usize| -> f64 {
                     weights.iter().enumerate().map(|(i, w)| w * entries[i * width + c].eps).sum()
                 };
-                scratch.terms.clear();
-                scratch.terms.extend(non_zero(
-                    (0..2 * n).map(
-                        |c| {
-                            if c < n { of(&mid.f_q, n, c) } else { of(&mid.f_v, n, c - n) }
-                        },
-                    ),
-                ));
+                let by_midpoint =
+                    |c| if c < n { of(&mid.f_q, n, c) } else { of(&mid.f_v, n, c - n) };
                 let row = &mut quadratic.sum[a * stride..][..stride];
                 for i in 0..ni {
                     row[layout.inputs() + i] += of(&mid.f_u, ni, i);
                 }
-                add_rows(row, &tangent, stride, &scratch.terms);
+                let factors = (0..2 * n).map(by_midpoint);
+                add_product(row, &tangent, stride, factors, &mut scratch.terms);
             }
         }
     }

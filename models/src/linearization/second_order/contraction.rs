@@ -17,15 +17,16 @@
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::integrator::blocks::{StepBlocks, non_zero};
+use crate::integrator::blocks::StepBlocks;
 use crate::integrator::report::StepError;
 use crate::kkt::schur::{fill_schur, room_for_schur};
 use crate::linearization::linearize::{Linearization, SolvedStep};
-use crate::linearization::second_order::{Layout, Scratch, assert_layout, spin_change};
+use crate::linearization::parameters::Parameters;
+use crate::linearization::second_order::{Scratch, assert_layout, spin_change};
 use crate::math::gemm::{Into, Operand, mirror_head, product};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
-use crate::math::rows::{Term, add_rows, padded};
+use crate::math::rows::{Term, add_product, padded};
 use crate::math::scalar::Dual;
 use crate::math::spatial::three;
 use crate::math::tree_lu::TreeLu;
@@ -75,7 +76,7 @@ struct Dense {
 /// which is symmetric: in the order of rows the upper triangle is computed. `Y` has few entries.
 #[derive(Clone, Debug)]
 pub(super) struct Quadratic {
-    layout: Layout,
+    layout: Parameters,
     /// Row-major over all parameters, square with the padding; the upper triangle counts.
     pub(super) sum: Vec<f64>,
     /// `C`, row-major, nd + nc rows.
@@ -89,7 +90,7 @@ pub(super) struct Quadratic {
 }
 
 impl Quadratic {
-    fn new(layout: Layout) -> Self {
+    fn new(layout: Parameters) -> Self {
         let rows = layout.nd + layout.nc;
         Self {
             layout,
@@ -119,7 +120,7 @@ impl Quadratic {
 
     /// At the start of `i` and what is next of `j`, and the other way round.
     fn add_start_next(&mut self, i: usize, j: usize, value: f64) {
-        let Layout { nd, .. } = self.layout;
+        let Parameters { nd, .. } = self.layout;
         if j < nd {
             self.add_mixed(j, i, value);
         } else {
@@ -130,7 +131,7 @@ impl Quadratic {
 
     /// At what is next of `i` and of `j`; comes for `(j, i)` again.
     fn add_nexts(&mut self, i: usize, j: usize, value: f64) {
-        let (Layout { nd, .. }, next) = (self.layout, self.layout.next());
+        let (Parameters { nd, .. }, next) = (self.layout, self.layout.next());
         match (i < nd, j < nd) {
             (true, true) => self.increments[i * nd + j] += value,
             (true, false) => self.add_mixed(i, next + j - nd, value),
@@ -141,15 +142,13 @@ impl Quadratic {
 
     /// Puts the Hessian into the upper triangle of `sum`; `tangent` is `W`, row-major.
     fn substitute(&mut self, tangent: &[f64], terms: &mut Vec<Term>) {
-        let Layout { nd, stride, .. } = self.layout;
-        let size = self.layout.parameters();
+        let Parameters { nd, stride, .. } = self.layout;
+        let size = self.layout.count();
         let Self { sum, mixed, cofactor, increments, rows, .. } = self;
         cofactor.copy_from_slice(mixed);
         let by_increment = increments.chunks_exact(nd.max(1));
         for (row, by) in cofactor.chunks_exact_mut(stride).zip(by_increment) {
-            terms.clear();
-            terms.extend(non_zero(by.iter().copied()));
-            add_rows(row, tangent, stride, terms);
+            add_product(row, tangent, stride, by.iter().copied(), terms);
         }
         let operand = |numbers| Operand { numbers, terms: rows, stride: 1 };
         for (left, right) in [(tangent, &cofactor[..]), (&mixed[..], tangent)] {
@@ -160,14 +159,14 @@ impl Quadratic {
 
     /// Fills the lower triangle of `sum` with the upper one.
     pub(super) fn mirror(&mut self) {
-        mirror_head(&mut self.sum, self.layout.stride, self.layout.parameters());
+        mirror_head(&mut self.sum, self.layout.stride, self.layout.count());
     }
 }
 
 impl Contraction {
     /// Room for the contraction of a model: `O((2 nd + 2 nk + ni)²)` numbers.
     pub fn new(model: &Model) -> Self {
-        let layout = Layout::new(model);
+        let layout = Parameters::new(model);
         let (n, rows) = (layout.n(), layout.nd + layout.nc);
         let inputs = layout.ni + layout.nk;
         let scratch = Scratch::new(model);
@@ -244,8 +243,7 @@ impl Contraction {
 
     /// `μ₁`, from the derivatives by the momentum.
     fn find_impulse(&mut self, model: &Model, first: &Linearization, z: &[f64], w: &[f64]) {
-        let Layout { nd, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let (nd, n) = self.scratch.layout.coordinates();
         let z_p = &z[n..][..nd];
         self.weights.copy_from_slice(&z[..nd]);
         for &i in model.orientations.iter().filter(|i| **i < nd) {
@@ -262,7 +260,7 @@ impl Contraction {
     /// `K⁻¹ A0ᵀ` and the factors of `S`, where loops were eliminated without them.
     fn find_responses(&mut self, model: &Model, step: &SolvedStep) {
         let Some(Dense { matrix, responses }) = &mut self.dense else { return };
-        let Layout { nd, nc, .. } = self.scratch.layout;
+        let Parameters { nd, nc, .. } = self.scratch.layout;
         let (n, stride) = (self.scratch.layout.n(), padded(nc));
         let (h, a) = (step.settings.time_step_s, step.settings.force_split.at_start());
         let StepBlocks { mid, start, .. } = &self.scratch.blocks;
@@ -302,7 +300,7 @@ impl Contraction {
         z: &[f64],
         slope: impl Fn(&StepBlocks<Dual>, usize, usize) -> f64,
     ) {
-        let Layout { nd, nc, .. } = self.scratch.layout;
+        let Parameters { nd, nc, .. } = self.scratch.layout;
         let (n, stride) = (self.scratch.layout.n(), padded(nc));
         let blocks = &self.scratch.blocks;
         let z_p = &z[n..][..nd];
@@ -330,8 +328,8 @@ impl Contraction {
     /// all blocks for each parameter.
     fn contract_directions(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
         let layout = self.scratch.layout;
-        let Layout { nd, nc, ni, stride, .. } = layout;
-        let (n, size) = (layout.n(), layout.parameters());
+        let Parameters { nd, nc, ni, stride, .. } = layout;
+        let (n, size) = (layout.n(), layout.count());
         let (inputs, next) = (layout.inputs(), layout.next());
         if nc > 0 {
             self.scratch.seed(0, model, step);
@@ -404,9 +402,7 @@ impl Contraction {
                 let turned = (0..nd).map(|i| impulse[i] * blocks.start.jacobian[c * n + i].eps);
                 by_unknown[nd + c] = -turned.sum::<f64>();
             }
-            terms.clear();
-            terms.extend(non_zero(by_unknown.iter().copied()));
-            add_rows(row, tangent, stride, terms);
+            add_product(row, tangent, stride, by_unknown.iter().copied(), terms);
         }
         // Both orders of derivatives count the same.
         for a in 1..size {
@@ -419,8 +415,7 @@ impl Contraction {
     /// The sum where everything is the gradient of something: the Lagrangian and the constraints.
     fn contract_gradients(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
         let h = step.settings.time_step_s;
-        let Layout { nd, nc, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let ((nd, n), nc) = (self.scratch.layout.coordinates(), self.scratch.layout.nc);
         let blocks = &mut self.scratch.blocks;
         for i in 0..n {
             let (start, mid, velocity) = if i < nd {
@@ -456,8 +451,7 @@ impl Contraction {
 
     /// The derivative of the Hessian of the Lagrangian along `(α, β)`.
     fn add_lagrangian(&mut self, h: f64) {
-        let Layout { nd, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let (nd, n) = self.scratch.layout.coordinates();
         let mid = &self.scratch.blocks.mid;
         let at_start = |i: usize| if i < nd { (1.0, 0.0) } else { (0.5, -1.0 / h) };
         let at_next = (0.5, 1.0 / h);
@@ -476,8 +470,7 @@ impl Contraction {
 
     /// What constraints add: their impulses turn with the start, their values with the end.
     fn add_constraints(&mut self, model: &Model, step: &SolvedStep, z: &[f64]) {
-        let Layout { nd, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let (nd, n) = self.scratch.layout.coordinates();
         let h = step.settings.time_step_s;
         let blocks = &mut self.scratch.blocks;
         blocks.start.evaluate(model, &blocks.q_start, &[]);
@@ -520,7 +513,7 @@ impl Contraction {
     /// Hands the sum out.
     fn finish(&mut self) {
         let layout = self.scratch.layout;
-        let (moving, stride, size) = (layout.inputs(), layout.stride, layout.parameters());
+        let (moving, stride, size) = (layout.inputs(), layout.stride, layout.count());
         self.quadratic.mirror();
         let sum = &self.quadratic.sum;
         let row = |a: usize| &sum[a * stride..][..size];

@@ -5,8 +5,9 @@ use nalgebra::DMatrix;
 use crate::integrator::report::StepError;
 use crate::integrator::turning::Turning;
 use crate::linearization::linearize::Linearization;
+use crate::linearization::parameters::Parameters;
+use crate::linearization::second_order::Scratch;
 use crate::linearization::second_order::contraction::Contraction;
-use crate::linearization::second_order::{Layout, Scratch};
 use crate::math::scalar::Dual;
 use crate::math::spatial::Mat3;
 use crate::model::mechanism::Model;
@@ -30,6 +31,26 @@ pub struct TooLarge {
 ///
 /// One symmetric matrix of second derivatives for each entry of `x[k+1] = (q, p, v)` and for each
 /// multiplier; the rows and columns of `v`, and the outputs of prescribed coordinates, are zero.
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use plantd_models::{Initial, Linearization, Model, Plant, SecondOrder, Settings, builtin};
+///
+/// let scene = builtin::scene("pendulum").expect("a builtin scene");
+/// let model = Arc::new(Model::compile(&scene)?);
+/// let mut plant = Plant::new(model.clone(), Settings::new(&model))?;
+/// let mut first = Linearization::new(&model);
+/// let mut second = SecondOrder::new(&model)?;
+/// plant.linearize_second_order(&[0.0], &mut first, &mut second)?;
+/// let at_an_angle = second.xx(0);
+///
+/// // A pendulum swings to both sides alike: where it hangs, its map has no second derivatives.
+/// plant.initialize(&Initial::OperatingPoint("hanging".into()))?;
+/// plant.linearize_second_order(&[0.0], &mut first, &mut second)?;
+/// assert!(second.xx(0).amax() < 1e-12 && at_an_angle.amax() > 1e-3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct SecondOrder {
     pub(crate) scratch: Scratch,
@@ -67,8 +88,8 @@ impl SecondOrder {
     ///
     /// If these are more than 2²⁷, which is 1 GiB. [`Contraction`](crate::linearization::second_order::contraction::Contraction) has no such limit.
     pub fn new(model: &Model) -> Result<Self, TooLarge> {
-        let layout = Layout::new(model);
-        let parameters = layout.parameters();
+        let layout = Parameters::new(model);
+        let parameters = layout.count();
         let entries = parameters * layout.stride * (2 * layout.nd + layout.nc);
         if entries > ENTRIES_MAX {
             return Err(TooLarge { parameters, entries });
@@ -135,7 +156,7 @@ impl SecondOrder {
 
     /// Fills the tensor output by output.
     pub(crate) fn gather(&mut self, model: &Model, first: &Linearization) -> Result<(), StepError> {
-        let Layout { nd, nc, stride, .. } = self.scratch.layout;
+        let Parameters { nd, nc, stride, .. } = self.scratch.layout;
         let (n, rows) = (self.scratch.layout.n(), 2 * nd + nc);
         let mut contraction = Contraction::new(model);
         for row in 0..rows {
@@ -156,8 +177,7 @@ impl SecondOrder {
     }
 
     fn output_row(&self, output: usize) -> Output {
-        let Layout { nd, nc, .. } = self.scratch.layout;
-        let n = self.scratch.layout.n();
+        let ((nd, n), nc) = (self.scratch.layout.coordinates(), self.scratch.layout.nc);
         assert!(output < 2 * n, "output {output} of {}", 2 * n);
         match output {
             i if i < nd => Output::Row(i),
@@ -176,14 +196,14 @@ impl SecondOrder {
     }
 
     fn multiplier_row(&self, c: usize) -> Output {
-        let Layout { nd, nc, .. } = self.scratch.layout;
+        let Parameters { nd, nc, .. } = self.scratch.layout;
         assert!(c < nc, "constraint {c} of {nc}");
         Output::Row(nd + c)
     }
 
     fn entry(&self, output: Output, a: usize, b: usize) -> f64 {
         let layout = self.scratch.layout;
-        let Layout { nd, nc, stride, .. } = layout;
+        let Parameters { nd, nc, stride, .. } = layout;
         match output {
             Output::Linear => 0.0,
             Output::Row(row) => self.tensor[((a.max(b)) * (2 * nd + nc) + row) * stride + a.min(b)],
@@ -225,7 +245,7 @@ impl SecondOrder {
     }
 }
 
-impl Layout {
+impl Parameters {
     /// Writes the dual parts of row `i` of a block by start, next, and inputs into the columns of the
     /// parameters that these are; the columns of `x` are for the tangents.
     pub(crate) fn place(&self, row: &mut [f64], i: usize, by: [&[Dual]; 2], by_inputs: &[Dual]) {
@@ -236,7 +256,7 @@ impl Layout {
         put(row, self.next(), &next[self.nd..]);
     }
 
-    /// The same for a row of the constraint Jacobian at the end: a shift of the start moves both ends.
+    /// Writes the dual parts of a row of the constraint Jacobian at the end: a shift of the start moves both ends.
     pub(crate) fn place_end(&self, row: &mut [f64], by_start: &[Dual], by_next: &[Dual]) {
         row.fill(0.0);
         put(row, 0, &by_start[..self.nd]);
