@@ -291,6 +291,17 @@ pub enum Spring {
     },
 }
 
+impl Spring {
+    /// Points of frames between which it acts.
+    pub(crate) fn points(&self) -> Vec<&Point> {
+        match self {
+            Self::TwoPoint { a, b, .. } => vec![a, b],
+            Self::Path { points, .. } => points.iter().collect(),
+            Self::Coordinate { .. } | Self::Spline { .. } => Vec::new(),
+        }
+    }
+}
+
 /// A number `u` that the driver sends: a generalized force `gain · u` on a dynamic coordinate, a
 /// component of forces that name it, or both.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -34,7 +34,7 @@ impl Model {
         } else {
             (in_space(&self.dynamics), 340.0)
         };
-        let others = self.potentials.count() as f64
+        let others = self.potentials.springs.len() as f64
             + self.forces.as_ref().map_or(0, |f| f.wrenches.len() + f.point_forces.len()) as f64;
         let joints = self.dynamics.joints.len() as f64;
         // Of loops.

@@ -90,7 +90,7 @@ impl<S: Scalar> Blocks<S> {
     /// Rows and columns of dynamic rows that may differ from zero.
     fn pattern(&self, model: &Model) -> Vec<(usize, usize)> {
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
-        let couple = |forces: &Forces| !forces.point_forces.is_empty();
+        let couple = Forces::couple_branches;
         if model.potentials.couple_branches || model.forces.as_ref().is_some_and(couple) {
             return (0..nd * n).map(|entry| (entry / n, entry % n)).collect();
         }

@@ -137,30 +137,47 @@ pub(crate) struct MixedPair {
     pub(crate) descendant: usize,
 }
 
-/// The springs, by kind.
+/// The springs.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Potentials {
-    pub(crate) coordinate_springs: Vec<CoordinateSpring>,
-    pub(crate) point_springs: Vec<PointSpring>,
-    pub(crate) spline_springs: Vec<SplineSpring>,
-    pub(crate) path_springs: Vec<PathSpring>,
+    /// Ordered by kind.
+    pub(crate) springs: Vec<Spring>,
     /// There is one at all.
     pub(crate) any: bool,
     /// Some spring may couple coordinates that are not on one path to the root, or prescribed ones.
     pub(crate) couple_branches: bool,
 }
 
-impl Potentials {
-    /// Some spring is neither of a coordinate nor of two points.
-    pub(crate) fn has_other_springs(&self) -> bool {
-        !self.spline_springs.is_empty() || !self.path_springs.is_empty()
-    }
+/// A spring.
+#[derive(Clone, Debug)]
+pub(crate) enum Spring {
+    Coordinate(CoordinateSpring),
+    Point(PointSpring),
+    Spline(SplineSpring),
+    Path(PathSpring),
+}
 
-    pub(crate) fn count(&self) -> usize {
-        self.coordinate_springs.len()
-            + self.point_springs.len()
-            + self.spline_springs.len()
-            + self.path_springs.len()
+impl Spring {
+    /// What kinds are called, in the order in which they are evaluated.
+    const KINDS: [&'static str; 4] = ["coordinate", "two-point", "spline", "path"];
+
+    /// Place of its kind among [`Self::KINDS`].
+    pub(crate) fn kind(&self) -> usize {
+        match self {
+            Self::Coordinate(_) => 0,
+            Self::Point(_) => 1,
+            Self::Spline(_) => 2,
+            Self::Path(_) => 3,
+        }
+    }
+}
+
+impl Potentials {
+    /// How many there are of each kind.
+    fn counts(&self) -> String {
+        let count = |kind: usize| self.springs.iter().filter(|s| s.kind() == kind).count();
+        let counts = Spring::KINDS.iter().enumerate();
+        counts.map(|(kind, name)| format!("{} {name}", count(kind))).collect::<Vec<_>>().join(", ")
     }
 }
 
@@ -277,6 +294,13 @@ pub(crate) struct PointPair {
     /// points change neither their distance nor what else turns with both bodies, and drop out; but
     /// where a world axis is involved, those of them that turn come first.
     pub(crate) path: Vec<PathJoint>,
+}
+
+impl PointPair {
+    /// Coordinates of the joints between the points.
+    pub(crate) fn coordinates(&self) -> impl Iterator<Item = usize> {
+        self.path.iter().map(|joint| joint.coordinate)
+    }
 }
 
 /// A joint on the path between two points.
@@ -556,15 +580,9 @@ impl Model {
             "gravity       {}",
             if self.gravity.is_some() { "uniform" } else { "none (skipped)" }
         ));
-        let springs = self.potentials.count();
-        line(format!(
-            "springs       {springs}: {} coordinate, {} two-point, {} spline, {} path{}",
-            self.potentials.coordinate_springs.len(),
-            self.potentials.point_springs.len(),
-            self.potentials.spline_springs.len(),
-            self.potentials.path_springs.len(),
-            skipped(springs > 0)
-        ));
+        let springs = self.potentials.springs.len();
+        let counts = self.potentials.counts();
+        line(format!("springs       {springs}: {counts}{}", skipped(springs > 0)));
         let damped = self.damping.iter().filter(|c| **c != 0.0).count();
         line(format!("damping       {damped} coordinates{}", skipped(damped > 0)));
         line(format!("inputs        {}{}", d.inputs, skipped(d.inputs > 0)));

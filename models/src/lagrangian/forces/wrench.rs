@@ -11,10 +11,11 @@
 //! Two axes of one ball joint: they turn with the joint, so the second line holds for both orders,
 //! and the first for none.
 
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Force, Vec3};
 use crate::model::mechanism::{Wrench, WrenchKind};
+use crate::model::tree::Tree;
 
 impl Wrench {
     /// About the origin of the joint's tree, in world axes.
@@ -38,8 +39,16 @@ impl Wrench {
         }
         self.in_world(at, total)
     }
+}
 
-    pub(super) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+impl GeneralizedForce for Wrench {
+    const COUPLES_BRANCHES: bool = false;
+
+    fn couples(&self, tree: &Tree) -> Vec<usize> {
+        self.path.iter().map(|&joint| tree.joints[joint].coordinate).collect()
+    }
+
+    fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
         let wrench = self.total(at);
         for &joint in &self.path {
             if let Some(entry) = force.get_mut(at.tree.joints[joint].coordinate) {
@@ -48,7 +57,7 @@ impl Wrench {
         }
     }
 
-    pub(super) fn for_each_derivative<S: Scalar>(
+    fn for_each_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S, S),
@@ -78,7 +87,7 @@ impl Wrench {
         }
     }
 
-    pub(super) fn for_each_input_derivative<S: Scalar>(
+    fn for_each_input_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S),
