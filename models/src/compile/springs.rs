@@ -3,11 +3,12 @@
 use crate::compile::scene::{Layout, Places};
 use crate::math::spline::Spline;
 use crate::model::mechanism::{
-    CoordinateSpring, PathSpring, PointSpring, Potentials, SplineSpring, Spring,
+    CoordinateSpring, LinearSpring, PathSpring, PointSpring, Potentials, SplineSpring, Spring,
 };
 use crate::model::tree::Tree;
 use crate::scene;
 use crate::scene::Scene;
+use crate::scene::linear_term::LinearTerm;
 
 impl Layout {
     pub(super) fn potentials(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Potentials {
@@ -48,6 +49,18 @@ impl Layout {
                 stiffness: *stiffness,
                 rest_length: *rest_length,
             }),
+            scene::Spring::LinearSpring { terms, stiffness, rest } => {
+                Spring::Linear(LinearSpring {
+                    terms: self.linear(terms),
+                    stiffness: *stiffness,
+                    rest: *rest,
+                })
+            }
         })
+    }
+
+    /// Coordinates and factors of a sum.
+    pub(super) fn linear(&self, terms: &[LinearTerm]) -> Vec<(usize, f64)> {
+        terms.iter().map(|term| (self.index[&term.coordinate], term.coefficient)).collect()
     }
 }

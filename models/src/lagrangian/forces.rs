@@ -4,6 +4,7 @@
 //! `f(q, v, u)` of points, joints and coordinates, with their derivatives.
 
 pub(crate) mod coordinate;
+pub(crate) mod linear_damper;
 pub(crate) mod point;
 #[cfg(test)]
 mod tests;
@@ -77,10 +78,11 @@ pub(crate) trait GeneralizedForce {
 impl Forces {
     /// For each force, the coordinates that it couples with each other.
     pub(crate) fn couples(&self, tree: &Tree) -> Vec<Vec<usize>> {
-        let Self { wrenches, point_forces, coordinate_forces } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
         let mut all: Vec<_> = wrenches.iter().map(|force| force.couples(tree)).collect();
         all.extend(point_forces.iter().map(|force| force.couples(tree)));
         all.extend(coordinate_forces.iter().map(|force| force.couples(tree)));
+        all.extend(linear_dampers.iter().map(|force| force.couples(tree)));
         all
     }
 
@@ -89,17 +91,18 @@ impl Forces {
         fn any<F: GeneralizedForce>(forces: &[F]) -> bool {
             F::COUPLES_BRANCHES && !forces.is_empty()
         }
-        let Self { wrenches, point_forces, coordinate_forces } = self;
-        any(wrenches) || any(point_forces) || any(coordinate_forces)
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        any(wrenches) || any(point_forces) || any(coordinate_forces) || any(linear_dampers)
     }
 
     /// Adds the generalized force to `force` (dynamic coordinates).
     #[inline(never)]
     pub(crate) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
-        let Self { wrenches, point_forces, coordinate_forces } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
         wrenches.iter().for_each(|element| element.add(at, force));
         point_forces.iter().for_each(|element| element.add(at, force));
         coordinate_forces.iter().for_each(|element| element.add(at, force));
+        linear_dampers.iter().for_each(|element| element.add(at, force));
     }
 
     /// [`GeneralizedForce::for_each_derivative`] of each force.
@@ -109,10 +112,11 @@ impl Forces {
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S, S),
     ) {
-        let Self { wrenches, point_forces, coordinate_forces } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
         wrenches.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
         point_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
         coordinate_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
+        linear_dampers.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
     }
 
     /// [`GeneralizedForce::for_each_input_derivative`] of each force.
@@ -122,9 +126,10 @@ impl Forces {
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S),
     ) {
-        let Self { wrenches, point_forces, coordinate_forces } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
         wrenches.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
         point_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
         coordinate_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
+        linear_dampers.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
     }
 }

@@ -5,6 +5,7 @@
 //! coupled stops the first model that has one.
 
 pub(crate) mod coordinate_spring;
+pub(crate) mod linear_spring;
 pub(crate) mod path_spring;
 pub(crate) mod point_spring;
 pub(crate) mod spline_spring;
@@ -61,6 +62,7 @@ impl Spring {
             Self::Point(spring) => spring.couples_branches(),
             Self::Spline(spring) => spring.couples_branches(),
             Self::Path(spring) => spring.couples_branches(),
+            Self::Linear(spring) => spring.couples_branches(),
         }
     }
 
@@ -71,6 +73,7 @@ impl Spring {
             Self::Point(spring) => spring.couples(),
             Self::Spline(spring) => spring.couples(),
             Self::Path(spring) => spring.couples(),
+            Self::Linear(spring) => spring.couples(),
         }
     }
 
@@ -80,6 +83,7 @@ impl Spring {
             Self::Point(spring) => spring.energy(at),
             Self::Spline(spring) => spring.energy(at),
             Self::Path(spring) => spring.energy(at),
+            Self::Linear(spring) => spring.energy(at),
         }
     }
 
@@ -90,6 +94,7 @@ impl Spring {
             Self::Point(spring) => spring.add_gradient(at, l_q),
             Self::Spline(spring) => spring.add_gradient(at, l_q),
             Self::Path(spring) => spring.add_gradient(at, l_q),
+            Self::Linear(spring) => spring.add_gradient(at, l_q),
         }
     }
 
@@ -104,6 +109,7 @@ impl Spring {
             Self::Point(spring) => spring.for_each_second_derivative(at, entry),
             Self::Spline(spring) => spring.for_each_second_derivative(at, entry),
             Self::Path(spring) => spring.for_each_second_derivative(at, entry),
+            Self::Linear(spring) => spring.for_each_second_derivative(at, entry),
         }
     }
 }

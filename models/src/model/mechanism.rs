@@ -155,11 +155,12 @@ pub(crate) enum Spring {
     Point(PointSpring),
     Spline(SplineSpring),
     Path(PathSpring),
+    Linear(LinearSpring),
 }
 
 impl Spring {
     /// What kinds are called, in the order in which they are evaluated.
-    const KINDS: [&'static str; 4] = ["coordinate", "two-point", "spline", "path"];
+    const KINDS: [&'static str; 5] = ["coordinate", "two-point", "spline", "path", "linear"];
 
     /// Place of its kind among [`Self::KINDS`].
     pub(crate) fn kind(&self) -> usize {
@@ -168,6 +169,7 @@ impl Spring {
             Self::Point(_) => 1,
             Self::Spline(_) => 2,
             Self::Path(_) => 3,
+            Self::Linear(_) => 4,
         }
     }
 }
@@ -195,6 +197,7 @@ pub(crate) struct Forces {
     pub(crate) wrenches: Vec<Wrench>,
     pub(crate) point_forces: Vec<PointForce>,
     pub(crate) coordinate_forces: Vec<CoordinateForce>,
+    pub(crate) linear_dampers: Vec<LinearDamper>,
 }
 
 /// A wrench on a joint that carries a body.
@@ -283,6 +286,23 @@ pub(crate) struct PathSpring {
     pub(crate) segments: Vec<PointPair>,
     pub(crate) stiffness: f64,
     pub(crate) rest_length: f64,
+}
+
+/// `V = ½ k (Σ c_i q_i − rest)²`.
+#[derive(Clone, Debug)]
+pub(crate) struct LinearSpring {
+    /// Coordinates `i` and their `c_i`.
+    pub(crate) terms: Vec<(usize, f64)>,
+    pub(crate) stiffness: f64,
+    pub(crate) rest: f64,
+}
+
+/// `f_i = −d c_i Σ c_j v_j`.
+#[derive(Clone, Debug)]
+pub(crate) struct LinearDamper {
+    /// Coordinates `i` and their `c_i`.
+    pub(crate) terms: Vec<(usize, f64)>,
+    pub(crate) damping: f64,
 }
 
 /// Two points and the joints that move one against the other.
@@ -589,10 +609,11 @@ impl Model {
         line(match &self.forces {
             None => "forces        0 (skipped)".to_owned(),
             Some(forces) => format!(
-                "forces        {} wrenches, {} between points, {} on coordinates",
+                "forces        {} wrenches, {} between points, {} on coordinates, {} linear",
                 forces.wrenches.len(),
                 forces.point_forces.len(),
-                forces.coordinate_forces.len()
+                forces.coordinate_forces.len(),
+                forces.linear_dampers.len()
             ),
         });
         let on_inputs = |s: &&Signal| matches!(s.target, Target::Input(_));
