@@ -1,6 +1,7 @@
 //! From scene to model.
 
 pub(crate) mod cost;
+mod explain;
 pub(crate) mod forces;
 pub(crate) mod loops;
 mod pattern;

@@ -81,7 +81,7 @@ fn check(from: &str, to: &str, expected: &[&str]) -> Option<String> {
     check_in(GOOD, from, to, expected)
 }
 
-/// The same in another good scene.
+/// Replaces `from` by `to` in any good scene, as [`check`] does in one.
 fn check_in(good: &str, from: &str, to: &str, expected: &[&str]) -> Option<String> {
     assert_eq!(good.matches(from).count(), 1, "`{from}` must occur once");
     let scene = Scene::from_toml(&good.replace(from, to)).unwrap_or_else(|e| panic!("`{to}`: {e}"));
