@@ -31,7 +31,7 @@ pub(super) fn couplings(
         }
     }
     let of_springs = potentials.springs.iter().map(Spring::couples);
-    let of_forces = forces.into_iter().flat_map(|forces| forces.couples(tree));
+    let of_forces = forces.into_iter().flat_map(Forces::couples);
     for coordinates in of_springs.chain(of_forces) {
         for (k, &later) in coordinates.iter().enumerate() {
             coordinates[..k].iter().for_each(|&earlier| couple(earlier, later));

@@ -47,11 +47,9 @@ pub(crate) struct Instant<'a, S = f64> {
 
 /// A generalized force `f(q, v, u)`.
 pub(crate) trait GeneralizedForce {
-    /// Whether it may couple coordinates that are not on one path to the root.
-    const COUPLES_BRANCHES: bool;
-
-    /// The coordinates that its derivatives couple with each other.
-    fn couples(&self, tree: &Tree) -> Vec<usize>;
+    /// The coordinates that its derivatives couple with each other; those of joints on one path to the root
+    /// are coupled anyway, and may be left out.
+    fn couples(&self) -> Vec<usize>;
 
     /// Adds it to `force` (dynamic coordinates).
     fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]);
@@ -77,22 +75,18 @@ pub(crate) trait GeneralizedForce {
 
 impl Forces {
     /// For each force, the coordinates that it couples with each other.
-    pub(crate) fn couples(&self, tree: &Tree) -> Vec<Vec<usize>> {
+    pub(crate) fn couples(&self) -> Vec<Vec<usize>> {
         let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
-        let mut all: Vec<_> = wrenches.iter().map(|force| force.couples(tree)).collect();
-        all.extend(point_forces.iter().map(|force| force.couples(tree)));
-        all.extend(coordinate_forces.iter().map(|force| force.couples(tree)));
-        all.extend(linear_dampers.iter().map(|force| force.couples(tree)));
+        let mut all: Vec<_> = wrenches.iter().map(GeneralizedForce::couples).collect();
+        all.extend(point_forces.iter().map(GeneralizedForce::couples));
+        all.extend(coordinate_forces.iter().map(GeneralizedForce::couples));
+        all.extend(linear_dampers.iter().map(GeneralizedForce::couples));
         all
     }
 
     /// Whether some may couple coordinates that are not on one path to the root.
     pub(crate) fn couple_branches(&self) -> bool {
-        fn any<F: GeneralizedForce>(forces: &[F]) -> bool {
-            F::COUPLES_BRANCHES && !forces.is_empty()
-        }
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
-        any(wrenches) || any(point_forces) || any(coordinate_forces) || any(linear_dampers)
+        self.couples().iter().any(|coordinates| coordinates.len() > 1)
     }
 
     /// Adds the generalized force to `force` (dynamic coordinates).

@@ -3,12 +3,9 @@
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::{CoordinateForce, CoordinateLaw};
-use crate::model::tree::Tree;
 
 impl GeneralizedForce for CoordinateForce {
-    const COUPLES_BRANCHES: bool = false;
-
-    fn couples(&self, _: &Tree) -> Vec<usize> {
+    fn couples(&self) -> Vec<usize> {
         vec![self.coordinate]
     }
 

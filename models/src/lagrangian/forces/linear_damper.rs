@@ -3,12 +3,9 @@
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::LinearDamper;
-use crate::model::tree::Tree;
 
 impl GeneralizedForce for LinearDamper {
-    const COUPLES_BRANCHES: bool = true;
-
-    fn couples(&self, _: &Tree) -> Vec<usize> {
+    fn couples(&self) -> Vec<usize> {
         self.terms.iter().map(|&(i, _)| i).collect()
     }
 

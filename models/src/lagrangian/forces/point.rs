@@ -13,7 +13,7 @@ use crate::lagrangian::vectors::Separation;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Motion, Vec3};
 use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw};
-use crate::model::tree::{Attachment, JointKind, Tree, WORLD};
+use crate::model::tree::{Attachment, JointKind, WORLD};
 
 /// Points whose squared distance (m²) or speed (m²/s²) is below this coincide or rest: there is no
 /// force, and no derivative. Above it three derivatives of a root stay within the range of numbers.
@@ -69,9 +69,7 @@ impl<S: Scalar> Acting<S> {
 }
 
 impl GeneralizedForce for PointForce {
-    const COUPLES_BRANCHES: bool = true;
-
-    fn couples(&self, _: &Tree) -> Vec<usize> {
+    fn couples(&self) -> Vec<usize> {
         self.ends.coordinates().collect()
     }
 

@@ -15,7 +15,6 @@ use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Force, Vec3};
 use crate::model::mechanism::{Wrench, WrenchKind};
-use crate::model::tree::Tree;
 
 impl Wrench {
     /// About the origin of the joint's tree, in world axes.
@@ -42,10 +41,8 @@ impl Wrench {
 }
 
 impl GeneralizedForce for Wrench {
-    const COUPLES_BRANCHES: bool = false;
-
-    fn couples(&self, tree: &Tree) -> Vec<usize> {
-        self.path.iter().map(|&joint| tree.joints[joint].coordinate).collect()
+    fn couples(&self) -> Vec<usize> {
+        Vec::new()
     }
 
     fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
