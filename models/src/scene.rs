@@ -5,6 +5,7 @@
 
 pub(crate) mod forces;
 pub(crate) mod limits;
+pub(crate) mod linear_term;
 mod number_or_name;
 pub(crate) mod point;
 pub(crate) mod signals;
@@ -14,9 +15,10 @@ mod validate;
 pub use crate::scene::forces::{Component, Force};
 pub use crate::scene::limits::{
     MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES, MAX_FRAMES, MAX_INPUTS,
-    MAX_KNOTS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER, MAX_SIGNAL_POINTS,
-    MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES,
+    MAX_KNOTS, MAX_LINEAR_TERMS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER,
+    MAX_SIGNAL_POINTS, MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES,
 };
+pub use crate::scene::linear_term::LinearTerm;
 pub use crate::scene::point::Point;
 pub use crate::scene::signals::{Interpolation, Signal};
 
@@ -289,6 +291,27 @@ pub enum Spring {
         #[serde(default)]
         rest_length: f64,
     },
+    /// `V = ½ stiffness (Σ coefficient_i q_i − rest)²` with a sum of coordinates.
+    LinearSpring {
+        /// One or more terms, each of another coordinate.
+        terms: Vec<LinearTerm>,
+        /// N/m or N·m/rad, as the coefficients make it.
+        stiffness: f64,
+        /// m or rad, as the coefficients make it.
+        #[serde(default)]
+        rest: f64,
+    },
+}
+
+impl Spring {
+    /// Points of frames between which it acts.
+    pub(crate) fn points(&self) -> Vec<&Point> {
+        match self {
+            Self::TwoPoint { a, b, .. } => vec![a, b],
+            Self::Path { points, .. } => points.iter().collect(),
+            Self::Coordinate { .. } | Self::Spline { .. } | Self::LinearSpring { .. } => Vec::new(),
+        }
+    }
 }
 
 /// A number `u` that the driver sends: a generalized force `gain · u` on a dynamic coordinate, a

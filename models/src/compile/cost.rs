@@ -34,8 +34,12 @@ impl Model {
         } else {
             (in_space(&self.dynamics), 340.0)
         };
-        let others = self.potentials.count() as f64
-            + self.forces.as_ref().map_or(0, |f| f.wrenches.len() + f.point_forces.len()) as f64;
+        let others = self.potentials.springs.len() as f64
+            + self
+                .forces
+                .as_ref()
+                .map_or(0, |f| f.wrenches.len() + f.point_forces.len() + f.linear_dampers.len())
+                as f64;
         let joints = self.dynamics.joints.len() as f64;
         // Of loops.
         let plan = self.loops.as_ref().map(|loops| &loops.plan);

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use crate::compile::scene::{Layout, Places};
 use crate::math::spatial::{Force, Mat3, Vec3};
 use crate::model::mechanism::{
-    CoordinateForce, CoordinateInput, CoordinateLaw, Forces, PointForce, PointLaw, Wrench,
-    WrenchKind,
+    CoordinateForce, CoordinateInput, CoordinateLaw, Forces, LinearDamper, PointForce, PointLaw,
+    Wrench, WrenchKind,
 };
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree, WORLD};
@@ -39,8 +39,11 @@ impl Layout {
         for force in &scene.forces {
             resolver.add(force, &mut forces);
         }
-        let Forces { wrenches, point_forces, coordinate_forces } = &forces;
-        let none = wrenches.is_empty() && point_forces.is_empty() && coordinate_forces.is_empty();
+        let Forces { wrenches, point_forces, coordinate_forces, linear_dampers } = &forces;
+        let none = wrenches.is_empty()
+            && point_forces.is_empty()
+            && coordinate_forces.is_empty()
+            && linear_dampers.is_empty();
         (!none).then_some(forces)
     }
 
@@ -98,6 +101,12 @@ impl Resolver<'_> {
                 if *coefficient != 0.0 {
                     let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
                     forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+                }
+            }
+            scene::Force::LinearDamper { terms, damping } => {
+                if *damping != 0.0 {
+                    let terms = layout.linear(terms);
+                    forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
                 }
             }
             scene::Force::Friction { coordinate, force, velocity } => {

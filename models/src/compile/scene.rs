@@ -3,23 +3,23 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use crate::compile::pattern;
+use crate::compile::pattern::{couplings, joint_pairs};
 use crate::math::elimination::Elimination;
 use crate::math::hash::fnv1a;
 use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Sym3, Vec3};
-use crate::math::spline::Spline;
 use crate::math::trigonometry::sin_cos_of;
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
-    Alignment, Carries, Constraint, ConstraintKind, Coordinate, CoordinateSpring, Dimensions,
-    Forces, Length, MixedPair, Model, OperatingPoint, Pair, PathJoint, PathSpring, PointPair,
-    PointSpring, Polynomial, Potentials, Product, Solver, SplineSpring, Vector,
+    Alignment, Carries, Constraint, ConstraintKind, Coordinate, Dimensions, Length, Model,
+    OperatingPoint, PathJoint, PointPair, Polynomial, Product, Solver, Vector,
 };
 use crate::model::planar_tree::planar;
 use crate::model::site::{Site, SiteJoint};
 use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 use crate::scene;
-use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError, Spring};
+use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError};
 
 impl Scene {
     /// Everything that is wrong with the scene; empty when it will compile.
@@ -75,9 +75,7 @@ fn compile(scene: &Scene) -> Model {
         .collect();
     let gravity = Vec3(scene.gravity);
     let gravity = (gravity != Vec3::ZERO).then_some(gravity);
-    let needs_poses = forces.is_some()
-        || !potentials.point_springs.is_empty()
-        || !potentials.path_springs.is_empty();
+    let needs_poses = forces.is_some() || potentials.couple_branches;
     let planar = if needs_poses { None } else { planar(&dynamics, gravity) };
     let dimensions = Dimensions {
         dynamic,
@@ -115,6 +113,7 @@ fn compile(scene: &Scene) -> Model {
     model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);
     model.find_loops();
+    pattern::check(&model);
     model
 }
 
@@ -325,17 +324,8 @@ impl Layout {
                 needed[joint] = true;
             }
         };
-        for spring in &scene.springs {
-            match spring {
-                Spring::TwoPoint { a, b, .. } => {
-                    mark(&mut needs.dynamics, &a.frame);
-                    mark(&mut needs.dynamics, &b.frame);
-                }
-                Spring::Path { points, .. } => {
-                    points.iter().for_each(|point| mark(&mut needs.dynamics, &point.frame));
-                }
-                Spring::Coordinate { .. } | Spring::Spline { .. } => {}
-            }
+        for point in scene.springs.iter().flat_map(scene::Spring::points) {
+            mark(&mut needs.dynamics, &point.frame);
         }
         for force in &scene.forces {
             force.points().for_each(|point| mark(&mut needs.dynamics, &point.frame));
@@ -352,49 +342,6 @@ impl Layout {
             }
         }
         needs
-    }
-
-    fn potentials(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Potentials {
-        let places = Places { layout: self, tree, index };
-        let mut potentials = Potentials::default();
-        for spring in &scene.springs {
-            match spring {
-                Spring::TwoPoint { a, b, stiffness, rest_length } => {
-                    potentials.point_springs.push(PointSpring {
-                        ends: places.between(self.attachment(a), self.attachment(b)),
-                        stiffness: *stiffness,
-                        rest_length: *rest_length,
-                    });
-                }
-                Spring::Coordinate { coordinate, stiffness, rest } => {
-                    potentials.coordinate_springs.push(CoordinateSpring {
-                        coordinate: self.index[coordinate],
-                        stiffness: *stiffness,
-                        rest: *rest,
-                    });
-                }
-                Spring::Spline { coordinate, knots } => {
-                    // Validation has found that the knots determine a spline.
-                    potentials.spline_springs.extend(
-                        Spline::new(knots).map(|force| SplineSpring {
-                            coordinate: self.index[coordinate],
-                            force,
-                        }),
-                    );
-                }
-                Spring::Path { points, stiffness, rest_length } => {
-                    potentials.path_springs.push(PathSpring {
-                        segments: places.segments(points),
-                        stiffness: *stiffness,
-                        rest_length: *rest_length,
-                    });
-                }
-            }
-        }
-        potentials.any = potentials.count() > 0;
-        potentials.couple_branches =
-            !potentials.point_springs.is_empty() || !potentials.path_springs.is_empty();
-        potentials
     }
 
     fn equations(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Equations {
@@ -529,7 +476,7 @@ impl Places<'_> {
     }
 
     /// The segments of a path from point to point.
-    fn segments(&self, points: &[scene::Point]) -> Vec<PointPair> {
+    pub(crate) fn segments(&self, points: &[scene::Point]) -> Vec<PointPair> {
         let ends = points.windows(2);
         ends.map(|ends| {
             self.between(self.layout.attachment(&ends[0]), self.layout.attachment(&ends[1]))
@@ -551,11 +498,11 @@ impl Equations {
     fn push(&mut self, name: String, kind: ConstraintKind) {
         let all: Vec<usize> = match &kind {
             ConstraintKind::Distance(points, _) | ConstraintKind::Axis(points, _) => {
-                coordinates_of(points).collect()
+                points.coordinates().collect()
             }
-            ConstraintKind::Product(product) => coordinates_of(&product.points).collect(),
+            ConstraintKind::Product(product) => product.points.coordinates().collect(),
             ConstraintKind::PathLength(segments, _) => {
-                segments.iter().flat_map(coordinates_of).collect()
+                segments.iter().flat_map(PointPair::coordinates).collect()
             }
             ConstraintKind::Coupling(terms, _) => terms.iter().map(|t| t.coordinate).collect(),
         };
@@ -589,10 +536,6 @@ impl From<Product> for ConstraintKind {
     fn from(product: Product) -> Self {
         Self::Product(product)
     }
-}
-
-fn coordinates_of(points: &PointPair) -> impl Iterator<Item = usize> {
-    points.path.iter().map(|joint| joint.coordinate)
 }
 
 /// The joint of one motion, and the rotation that takes its axis to z.
@@ -687,72 +630,6 @@ fn classified(mass: f64, tensor: Sym3) -> Rotational {
     } else {
         Rotational::Full(tensor)
     }
-}
-
-/// Which dynamic coordinates each one is coupled with, among those before it.
-fn couplings(
-    dynamic: usize,
-    tree: &Tree,
-    potentials: &Potentials,
-    forces: Option<&Forces>,
-) -> Vec<BTreeSet<usize>> {
-    let mut couplings = vec![BTreeSet::new(); dynamic];
-    let mut couple = |coordinates: &[usize]| {
-        for (k, &later) in coordinates.iter().enumerate() {
-            for &earlier in &coordinates[..k] {
-                couplings[later.max(earlier)].insert(later.min(earlier));
-            }
-        }
-    };
-    let dynamic_only = |c: &usize| *c < dynamic;
-    for joint in 0..tree.joints.len() {
-        // Those above are coupled when it is their turn.
-        for above in tree.path(joint) {
-            let pair = [tree.joints[above].coordinate, tree.joints[joint].coordinate];
-            if above != joint && pair.iter().all(dynamic_only) {
-                couple(&pair);
-            }
-        }
-    }
-    for spring in &potentials.point_springs {
-        couple(&coordinates_of(&spring.ends).filter(dynamic_only).collect::<Vec<_>>());
-    }
-    for spring in &potentials.path_springs {
-        let path: BTreeSet<_> = spring.segments.iter().flat_map(coordinates_of).collect();
-        couple(&path.into_iter().filter(dynamic_only).collect::<Vec<_>>());
-    }
-    for force in forces.into_iter().flat_map(|forces| &forces.point_forces) {
-        couple(&coordinates_of(&force.ends).filter(dynamic_only).collect::<Vec<_>>());
-    }
-    couplings
-}
-
-fn joint_pairs(
-    dynamic: usize,
-    tree: &Tree,
-    elimination: &Elimination,
-) -> (Vec<Pair>, Vec<MixedPair>) {
-    let (mut pairs, mut mixed) = (Vec::new(), Vec::new());
-    for (joint, descendant) in tree.joints.iter().enumerate() {
-        for above in tree.path(joint) {
-            let ancestor = &tree.joints[above];
-            match (ancestor.coordinate < dynamic, descendant.coordinate < dynamic) {
-                (true, true) => {
-                    let slot = elimination.slot(descendant.coordinate, ancestor.coordinate);
-                    pairs.push(Pair {
-                        ancestor: above as u32,
-                        descendant: joint as u32,
-                        row: ancestor.coordinate as u32,
-                        column: descendant.coordinate as u32,
-                        slot: slot.expect("coupled coordinates share an elimination path") as u32,
-                    });
-                }
-                (false, false) => {}
-                _ => mixed.push(MixedPair { ancestor: above, descendant: joint }),
-            }
-        }
-    }
-    (pairs, mixed)
 }
 
 /// FNV-1a over the scene without what does not move it.

@@ -26,7 +26,7 @@ use crate::lagrangian::momenta::Momenta;
 use crate::lagrangian::potentials;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::Mat3;
-use crate::model::mechanism::{CoordinateInput, Model};
+use crate::model::mechanism::{CoordinateInput, Forces, Model};
 use crate::model::tree::{JointKind, WORLD};
 
 /// Gradient and second derivatives of the Lagrangian, springs included, and forces with their first
@@ -102,8 +102,8 @@ impl<S: Scalar> Derivatives<S> {
 
     /// Rows and columns at which derivatives of torques, momenta and forces may differ from zero.
     pub(crate) fn dynamic_pattern(&self, model: &Model) -> Vec<(usize, usize)> {
-        let of_points = model.forces.as_ref().is_some_and(|f| !f.point_forces.is_empty());
-        self.pattern(model.dimensions.dynamic, model.potentials.couple_branches || of_points)
+        let forces_couple = model.forces.as_ref().is_some_and(Forces::couple_branches);
+        self.pattern(model.dimensions.dynamic, model.potentials.couple_branches || forces_couple)
     }
 
     /// Pairs of coordinates that the Lagrangian couples, both ways round.

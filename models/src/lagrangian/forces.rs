@@ -4,6 +4,7 @@
 //! `f(q, v, u)` of points, joints and coordinates, with their derivatives.
 
 pub(crate) mod coordinate;
+pub(crate) mod linear_damper;
 pub(crate) mod point;
 #[cfg(test)]
 mod tests;
@@ -44,50 +45,85 @@ pub(crate) struct Instant<'a, S = f64> {
     pub(crate) inputs: &'a [S],
 }
 
-impl Forces {
-    /// Adds the generalized force to `force` (dynamic coordinates).
-    #[inline(never)]
-    pub(crate) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
-        for wrench in &self.wrenches {
-            wrench.add(at, force);
-        }
-        for point_force in &self.point_forces {
-            point_force.add(at, force);
-        }
-        for coordinate_force in &self.coordinate_forces {
-            coordinate_force.add(at, force);
-        }
-    }
+/// A generalized force `f(q, v, u)`.
+pub(crate) trait GeneralizedForce {
+    /// The coordinates that its derivatives couple with each other; those of joints on one path to the root
+    /// are coupled anyway, and may be left out.
+    fn couples(&self) -> Vec<usize>;
+
+    /// Adds it to `force` (dynamic coordinates).
+    fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]);
 
     /// Calls `entry(i, j, ∂f_i/∂q_j, ∂f_i/∂v_j)` for ordered pairs of coordinates, some of them more
     /// than once; the derivatives add up.
+    fn for_each_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S, S),
+    );
+
+    /// Calls `entry(i, k, ∂f_i/∂u_k)` for coordinates and inputs, in the same order for every
+    /// configuration; the derivatives add up. Most forces follow no input.
+    fn for_each_input_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S),
+    ) {
+        let _ = (at, entry);
+    }
+}
+
+impl Forces {
+    /// For each force, the coordinates that it couples with each other.
+    pub(crate) fn couples(&self) -> Vec<Vec<usize>> {
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        let mut all: Vec<_> = wrenches.iter().map(GeneralizedForce::couples).collect();
+        all.extend(point_forces.iter().map(GeneralizedForce::couples));
+        all.extend(coordinate_forces.iter().map(GeneralizedForce::couples));
+        all.extend(linear_dampers.iter().map(GeneralizedForce::couples));
+        all
+    }
+
+    /// Whether some may couple coordinates that are not on one path to the root.
+    pub(crate) fn couple_branches(&self) -> bool {
+        self.couples().iter().any(|coordinates| coordinates.len() > 1)
+    }
+
+    /// Adds the generalized force to `force` (dynamic coordinates).
+    #[inline(never)]
+    pub(crate) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        wrenches.iter().for_each(|element| element.add(at, force));
+        point_forces.iter().for_each(|element| element.add(at, force));
+        coordinate_forces.iter().for_each(|element| element.add(at, force));
+        linear_dampers.iter().for_each(|element| element.add(at, force));
+    }
+
+    /// [`GeneralizedForce::for_each_derivative`] of each force.
     #[inline(never)]
     pub(crate) fn for_each_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S, S),
     ) {
-        for wrench in &self.wrenches {
-            wrench.for_each_derivative(at, &mut entry);
-        }
-        for point_force in &self.point_forces {
-            point_force.for_each_derivative(at, &mut entry);
-        }
-        for coordinate_force in &self.coordinate_forces {
-            coordinate_force.derivative(at, &mut entry);
-        }
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        wrenches.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
+        point_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
+        coordinate_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
+        linear_dampers.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
     }
 
-    /// Calls `entry(i, k, ∂f_i/∂u_k)` for coordinates and inputs, in the same order for every
-    /// configuration; the derivatives add up.
+    /// [`GeneralizedForce::for_each_input_derivative`] of each force.
     #[inline(never)]
     pub(crate) fn for_each_input_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S),
     ) {
-        for wrench in &self.wrenches {
-            wrench.for_each_input_derivative(at, &mut entry);
-        }
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        wrenches.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
+        point_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
+        coordinate_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
+        linear_dampers.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
     }
 }

@@ -1,65 +1,116 @@
 //! Springs: potentials `V` that add `−V_q` to `L_q` and `−V_qq` to `L_qq`.
 //!
-//! ```text
-//! coordinate  V = ½ k (q − rest)²       V_i = k (q − rest)         V_ii = k
-//! spline      V = −∫ f dq               V_i = −f                   V_ii = −f'
-//! two points  V = ½ k (|d| − rest)²     V_i = t d·d_i              V_ij = t (d_i·d_j + d·d_ij) + c (d·d_i)(d·d_j)
-//! path        V = ½ k (L − rest)²       V_i = k (L − rest) L_i     V_ij = k L_i L_j + k (L − rest) L_ij
-//! ```
-//!
-//! with `d` from point to point, `t = k (|d| − rest)/|d|`, `c = k rest/|d|³`, and `L` the sum of the
-//! lengths of a path's segments. Where two points coincide, a spring with a rest length pulls nowhere;
-//! its stiffness there is taken as `k` in all directions.
+//! One file each, with its formulas. A new one is such a file, a variant of [`Spring`], and a variant of
+//! the scene's springs; what it leaves out does not compile, and a coordinate that it does not name as
+//! coupled stops the first model that has one.
+
+pub(crate) mod coordinate_spring;
+pub(crate) mod linear_spring;
+pub(crate) mod path_spring;
+pub(crate) mod point_spring;
+pub(crate) mod spline_spring;
 
 use crate::lagrangian::kinematics::Poses;
-use crate::lagrangian::vectors::{Distance, Separation};
 use crate::math::elimination::Elimination;
 use crate::math::scalar::Scalar;
-use crate::math::spatial::Vec3;
 use crate::math::tree_lu::TreeLu;
-use crate::model::mechanism::{PathJoint, PathSpring, PointSpring, Potentials};
+use crate::model::mechanism::{Potentials, Spring};
 use crate::model::tree::Tree;
 
-/// A two-point spring at one configuration.
-struct Stretched<S> {
-    at: Separation<S>,
-    /// `t = V_l / l`.
-    tension: S,
-    /// `c`.
-    bend: S,
+/// A configuration, as far as potentials depend on it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Place<'a, S = f64> {
+    pub(crate) tree: &'a Tree,
+    pub(crate) poses: &'a Poses<S>,
+    /// All coordinates.
+    pub(crate) q: &'a [S],
 }
 
-/// Without rest length nothing is divided by the length, so that all derivatives hold at zero too.
-fn stretched<S: Scalar>(spring: &PointSpring, tree: &Tree, poses: &Poses<S>) -> Stretched<S> {
-    let at = spring.ends.separation(tree, poses);
-    let square = at.difference.dot(at.difference);
-    if spring.rest_length == 0.0 || square.value() == 0.0 {
-        return Stretched { at, tension: S::constant(spring.stiffness), bend: S::ZERO };
+/// A potential `V(q)`.
+pub(crate) trait Potential {
+    /// Whether it reads poses: then planar models have to evaluate them.
+    const NEEDS_POSES: bool;
+
+    /// The coordinates that it couples with each other; a coordinate may come more than once.
+    fn couples(&self) -> Vec<usize>;
+
+    /// `V`, J.
+    fn energy<S: Scalar>(&self, at: Place<'_, S>) -> S;
+
+    /// Adds `−V_q` to `l_q` (dynamic coordinates).
+    fn add_gradient<S: Scalar>(&self, at: Place<'_, S>, l_q: &mut [S]);
+
+    /// Calls `entry(i, j, V_ij)` for ordered pairs of coordinates, dynamic and prescribed; a pair may
+    /// come more than once, and its values add.
+    fn for_each_second_derivative<S: Scalar>(
+        &self,
+        at: Place<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S),
+    );
+
+    /// Whether it may couple coordinates that are not on one path to the root, or prescribed ones.
+    fn couples_branches(&self) -> bool {
+        Self::NEEDS_POSES || self.couples().len() > 1
     }
-    let length = square.sqrt();
-    let inverse = length.recip();
-    let tension = (length - spring.rest_length) * inverse * spring.stiffness;
-    let bend = inverse * inverse * inverse * (spring.stiffness * spring.rest_length);
-    Stretched { at, tension, bend }
 }
 
-impl PathSpring {
-    /// Its segments at a configuration.
-    fn segments<'a, S: Scalar>(
-        &'a self,
-        tree: &'a Tree,
-        poses: &'a Poses<S>,
-    ) -> impl Iterator<Item = Distance<'a, S>> {
-        self.segments.iter().map(move |ends| Distance::new(ends, tree, poses))
-    }
-
-    /// `L − rest`.
-    fn stretch<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>) -> S {
-        let mut length = S::ZERO;
-        for segment in self.segments(tree, poses) {
-            length += segment.length;
+impl Spring {
+    /// Whether it may couple coordinates that are not on one path to the root, or prescribed ones.
+    pub(crate) fn couples_branches(&self) -> bool {
+        match self {
+            Self::Coordinate(spring) => spring.couples_branches(),
+            Self::Point(spring) => spring.couples_branches(),
+            Self::Spline(spring) => spring.couples_branches(),
+            Self::Path(spring) => spring.couples_branches(),
+            Self::Linear(spring) => spring.couples_branches(),
         }
-        length - self.rest_length
+    }
+
+    /// The coordinates that it couples with each other.
+    pub(crate) fn couples(&self) -> Vec<usize> {
+        match self {
+            Self::Coordinate(spring) => spring.couples(),
+            Self::Point(spring) => spring.couples(),
+            Self::Spline(spring) => spring.couples(),
+            Self::Path(spring) => spring.couples(),
+            Self::Linear(spring) => spring.couples(),
+        }
+    }
+
+    fn energy<S: Scalar>(&self, at: Place<'_, S>) -> S {
+        match self {
+            Self::Coordinate(spring) => spring.energy(at),
+            Self::Point(spring) => spring.energy(at),
+            Self::Spline(spring) => spring.energy(at),
+            Self::Path(spring) => spring.energy(at),
+            Self::Linear(spring) => spring.energy(at),
+        }
+    }
+
+    #[inline(always)]
+    fn add_gradient<S: Scalar>(&self, at: Place<'_, S>, l_q: &mut [S]) {
+        match self {
+            Self::Coordinate(spring) => spring.add_gradient(at, l_q),
+            Self::Point(spring) => spring.add_gradient(at, l_q),
+            Self::Spline(spring) => spring.add_gradient(at, l_q),
+            Self::Path(spring) => spring.add_gradient(at, l_q),
+            Self::Linear(spring) => spring.add_gradient(at, l_q),
+        }
+    }
+
+    #[inline(always)]
+    fn for_each_second_derivative<S: Scalar>(
+        &self,
+        at: Place<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S),
+    ) {
+        match self {
+            Self::Coordinate(spring) => spring.for_each_second_derivative(at, entry),
+            Self::Point(spring) => spring.for_each_second_derivative(at, entry),
+            Self::Spline(spring) => spring.for_each_second_derivative(at, entry),
+            Self::Path(spring) => spring.for_each_second_derivative(at, entry),
+            Self::Linear(spring) => spring.for_each_second_derivative(at, entry),
+        }
     }
 }
 
@@ -72,44 +123,8 @@ pub(crate) fn add_gradient<S: Scalar>(
     q: &[S],
     l_q: &mut [S],
 ) {
-    for spring in &potentials.coordinate_springs {
-        l_q[spring.coordinate] -= (q[spring.coordinate] - spring.rest) * spring.stiffness;
-    }
-    for spring in &potentials.point_springs {
-        let s = stretched(spring, tree, poses);
-        let pull = s.at.difference * s.tension;
-        for joint in &spring.ends.path {
-            if let Some(entry) = l_q.get_mut(joint.coordinate) {
-                *entry -= pull.dot(joint.gradient(tree, poses, &s.at));
-            }
-        }
-    }
-    if potentials.has_other_springs() {
-        add_other_gradients(potentials, tree, poses, q, l_q);
-    }
-}
-
-#[inline(never)]
-fn add_other_gradients<S: Scalar>(
-    potentials: &Potentials,
-    tree: &Tree,
-    poses: &Poses<S>,
-    q: &[S],
-    l_q: &mut [S],
-) {
-    for spring in &potentials.spline_springs {
-        l_q[spring.coordinate] += spring.force.value(q[spring.coordinate]);
-    }
-    for spring in &potentials.path_springs {
-        let tension = spring.stretch(tree, poses) * spring.stiffness;
-        for segment in spring.segments(tree, poses) {
-            segment.for_each_derivative(|i, slope| {
-                if let Some(entry) = l_q.get_mut(i) {
-                    *entry -= tension * slope;
-                }
-            });
-        }
-    }
+    let at = Place { tree, poses, q };
+    potentials.springs.iter().for_each(|spring| spring.add_gradient(at, l_q));
 }
 
 /// Potential energy of all springs, J.
@@ -119,33 +134,12 @@ pub(crate) fn potential<S: Scalar>(
     poses: &Poses<S>,
     q: &[S],
 ) -> S {
-    let energy = |stiffness: f64, stretch: S| stretch * stretch * (0.5 * stiffness);
-    let mut sum = S::ZERO;
-    for spring in &potentials.coordinate_springs {
-        sum += energy(spring.stiffness, q[spring.coordinate] - spring.rest);
-    }
-    for spring in &potentials.spline_springs {
-        sum -= spring.force.integral(q[spring.coordinate]);
-    }
-    for spring in &potentials.point_springs {
-        let at = spring.ends.separation(tree, poses);
-        let square = at.difference.dot(at.difference);
-        sum += if spring.rest_length == 0.0 {
-            square * (0.5 * spring.stiffness)
-        } else if square.value() == 0.0 {
-            energy(spring.stiffness, S::constant(spring.rest_length))
-        } else {
-            energy(spring.stiffness, square.sqrt() - spring.rest_length)
-        };
-    }
-    for spring in &potentials.path_springs {
-        sum += energy(spring.stiffness, spring.stretch(tree, poses));
-    }
-    sum
+    let at = Place { tree, poses, q };
+    potentials.springs.iter().fold(S::ZERO, |sum, spring| sum + spring.energy(at))
 }
 
-/// Calls `entry(i, j, V_ij)` for ordered pairs of coordinates, dynamic and prescribed, of each spring;
-/// a pair may come more than once, and its values add.
+/// Calls `entry(i, j, V_ij)` for ordered pairs of coordinates of each spring, as
+/// [`Potential::for_each_second_derivative`] does.
 pub(crate) fn for_each_second_derivative<S: Scalar>(
     potentials: &Potentials,
     tree: &Tree,
@@ -153,57 +147,9 @@ pub(crate) fn for_each_second_derivative<S: Scalar>(
     q: &[S],
     mut entry: impl FnMut(usize, usize, S),
 ) {
-    for spring in &potentials.coordinate_springs {
-        entry(spring.coordinate, spring.coordinate, S::constant(spring.stiffness));
-    }
-    for spring in &potentials.point_springs {
-        let s = stretched(spring, tree, poses);
-        for (k, row) in spring.ends.path.iter().enumerate() {
-            let row_gradient = row.gradient(tree, poses, &s.at);
-            let bend = s.bend * s.at.difference.dot(row_gradient);
-            for column in &spring.ends.path[..=k] {
-                let gradient = column.gradient(tree, poses, &s.at);
-                let both = [(row, row_gradient), (column, gradient)];
-                let (second, mirrored) = PathJoint::seconds(both, tree, poses);
-                let product = gradient.dot(row_gradient);
-                let along = bend * s.at.difference.dot(gradient);
-                let value =
-                    |second: Vec3<S>| s.tension * (product + s.at.difference.dot(second)) + along;
-                entry(row.coordinate, column.coordinate, value(second));
-                if row.joint != column.joint {
-                    entry(column.coordinate, row.coordinate, value(mirrored));
-                }
-            }
-        }
-    }
-    if potentials.has_other_springs() {
-        for_each_other_second_derivative(potentials, tree, poses, q, entry);
-    }
-}
-
-fn for_each_other_second_derivative<S: Scalar>(
-    potentials: &Potentials,
-    tree: &Tree,
-    poses: &Poses<S>,
-    q: &[S],
-    mut entry: impl FnMut(usize, usize, S),
-) {
-    for spring in &potentials.spline_springs {
-        let stiffness = -spring.force.slope(q[spring.coordinate]);
-        entry(spring.coordinate, spring.coordinate, stiffness);
-    }
-    for spring in &potentials.path_springs {
-        let tension = spring.stretch(tree, poses) * spring.stiffness;
-        for segment in spring.segments(tree, poses) {
-            segment.for_each_second_derivative(|i, j, second| entry(i, j, tension * second));
-            segment.for_each_derivative(|i, row_slope| {
-                for other in spring.segments(tree, poses) {
-                    other.for_each_derivative(|j, slope| {
-                        entry(i, j, row_slope * slope * spring.stiffness);
-                    });
-                }
-            });
-        }
+    let at = Place { tree, poses, q };
+    for spring in &potentials.springs {
+        spring.for_each_second_derivative(at, &mut entry);
     }
 }
 

@@ -66,11 +66,9 @@ impl TreeLu {
     #[inline]
     pub(crate) fn add(&mut self, elimination: &Elimination, row: usize, column: usize, value: f64) {
         let slot = elimination.slot(row.max(column), row.min(column));
-        debug_assert!(slot.is_some(), "{row} and {column} are not coupled");
-        if let Some(slot) = slot {
-            let triangle = if row <= column { &mut self.upper } else { &mut self.lower };
-            triangle[slot] += value;
-        }
+        let slot = slot.expect("what a model adds to its matrix is coupled");
+        let triangle = if row <= column { &mut self.upper } else { &mut self.lower };
+        triangle[slot] += value;
     }
 
     wide! {

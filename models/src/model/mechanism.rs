@@ -1,7 +1,5 @@
 //! Models: compiled scenes.
 
-use std::fmt::Write as _;
-
 use crate::math::elimination::Elimination;
 use crate::math::spatial::{Force, Vec3};
 use crate::math::spline::Spline;
@@ -25,7 +23,7 @@ pub struct Model {
     pub(crate) digest: u64,
     /// Joints that carry inertia or springs: what a step walks at the midpoint.
     pub(crate) dynamics: Tree,
-    /// The same as a planar tree, where it is one and nothing needs its poses in space.
+    /// [`Self::dynamics`] as a planar tree, where it is one and nothing needs its poses in space.
     pub(crate) planar: Option<PlanarJoints>,
     /// Its loops, where they are eliminated with it.
     pub(crate) loops: Option<Loops>,
@@ -137,30 +135,49 @@ pub(crate) struct MixedPair {
     pub(crate) descendant: usize,
 }
 
-/// The springs, by kind.
+/// The springs.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Potentials {
-    pub(crate) coordinate_springs: Vec<CoordinateSpring>,
-    pub(crate) point_springs: Vec<PointSpring>,
-    pub(crate) spline_springs: Vec<SplineSpring>,
-    pub(crate) path_springs: Vec<PathSpring>,
+    /// Ordered by kind.
+    pub(crate) springs: Vec<Spring>,
     /// There is one at all.
     pub(crate) any: bool,
     /// Some spring may couple coordinates that are not on one path to the root, or prescribed ones.
     pub(crate) couple_branches: bool,
 }
 
-impl Potentials {
-    /// Some spring is neither of a coordinate nor of two points.
-    pub(crate) fn has_other_springs(&self) -> bool {
-        !self.spline_springs.is_empty() || !self.path_springs.is_empty()
-    }
+/// A spring.
+#[derive(Clone, Debug)]
+pub(crate) enum Spring {
+    Coordinate(CoordinateSpring),
+    Point(PointSpring),
+    Spline(SplineSpring),
+    Path(PathSpring),
+    Linear(LinearSpring),
+}
 
-    pub(crate) fn count(&self) -> usize {
-        self.coordinate_springs.len()
-            + self.point_springs.len()
-            + self.spline_springs.len()
-            + self.path_springs.len()
+impl Spring {
+    /// What kinds are called, in the order in which they are evaluated.
+    const KINDS: [&'static str; 5] = ["coordinate", "two-point", "spline", "path", "linear"];
+
+    /// Place of its kind among [`Self::KINDS`].
+    pub(crate) fn kind(&self) -> usize {
+        match self {
+            Self::Coordinate(_) => 0,
+            Self::Point(_) => 1,
+            Self::Spline(_) => 2,
+            Self::Path(_) => 3,
+            Self::Linear(_) => 4,
+        }
+    }
+}
+
+impl Potentials {
+    /// How many there are of each kind.
+    pub(crate) fn counts(&self) -> String {
+        let count = |kind: usize| self.springs.iter().filter(|s| s.kind() == kind).count();
+        let counts = Spring::KINDS.iter().enumerate();
+        counts.map(|(kind, name)| format!("{} {name}", count(kind))).collect::<Vec<_>>().join(", ")
     }
 }
 
@@ -178,6 +195,7 @@ pub(crate) struct Forces {
     pub(crate) wrenches: Vec<Wrench>,
     pub(crate) point_forces: Vec<PointForce>,
     pub(crate) coordinate_forces: Vec<CoordinateForce>,
+    pub(crate) linear_dampers: Vec<LinearDamper>,
 }
 
 /// A wrench on a joint that carries a body.
@@ -268,6 +286,23 @@ pub(crate) struct PathSpring {
     pub(crate) rest_length: f64,
 }
 
+/// `V = ½ k (Σ c_i q_i − rest)²`.
+#[derive(Clone, Debug)]
+pub(crate) struct LinearSpring {
+    /// Coordinates `i` and their `c_i`.
+    pub(crate) terms: Vec<(usize, f64)>,
+    pub(crate) stiffness: f64,
+    pub(crate) rest: f64,
+}
+
+/// `f_i = −d c_i Σ c_j v_j`.
+#[derive(Clone, Debug)]
+pub(crate) struct LinearDamper {
+    /// Coordinates `i` and their `c_i`.
+    pub(crate) terms: Vec<(usize, f64)>,
+    pub(crate) damping: f64,
+}
+
 /// Two points and the joints that move one against the other.
 #[derive(Clone, Debug)]
 pub(crate) struct PointPair {
@@ -277,6 +312,13 @@ pub(crate) struct PointPair {
     /// points change neither their distance nor what else turns with both bodies, and drop out; but
     /// where a world axis is involved, those of them that turn come first.
     pub(crate) path: Vec<PathJoint>,
+}
+
+impl PointPair {
+    /// Coordinates of the joints between the points.
+    pub(crate) fn coordinates(&self) -> impl Iterator<Item = usize> {
+        self.path.iter().map(|joint| joint.coordinate)
+    }
 }
 
 /// A joint on the path between two points.
@@ -499,122 +541,6 @@ impl Model {
         });
         let of_forces = of_forces.filter(move |(coordinate, _)| *coordinate < d.dynamic);
         all.chain(on_coordinates.chain(of_forces).take(sparse))
-    }
-
-    /// What a step evaluates and what it skips, for people to read.
-    pub fn plan(&self) -> String {
-        let d = self.dimensions;
-        let mut plan = String::new();
-        let mut line = |text: String| {
-            let _ = writeln!(plan, "{text}");
-        };
-        line(format!(
-            "coordinates   {} dynamic, {} prescribed; state {}, input {}",
-            d.dynamic,
-            d.prescribed,
-            d.state(),
-            d.input()
-        ));
-        let joints = &self.dynamics.joints;
-        let count = |is: fn(&JointKind) -> bool| joints.iter().filter(|j| is(&j.kind)).count();
-        let kinds = [
-            ("revolute", count(|kind| matches!(kind, JointKind::Revolute))),
-            ("prismatic", count(|kind| matches!(kind, JointKind::Prismatic))),
-            ("screw", count(|kind| matches!(kind, JointKind::Screw(_)))),
-            ("of ball joints", count(|kind| matches!(kind, JointKind::Ball(_)))),
-        ];
-        let kinds = kinds.iter().filter(|(_, n)| *n > 0).map(|(kind, n)| format!("{n} {kind}"));
-        line(format!(
-            "midpoint      {}, {} axes of {} moving frames: {}",
-            if self.planar.is_some() { "in the plane" } else { "in space" },
-            joints.len(),
-            self.scene.frames.iter().filter(|f| !f.motions().is_empty()).count(),
-            kinds.collect::<Vec<_>>().join(", ")
-        ));
-        let islands = self.elimination.islands();
-        let islands = format!("{islands} {}", if islands == 1 { "island" } else { "islands" });
-        line(match self.solver {
-            Solver::Tree => format!(
-                "factorization tree-sparse, {} entries of {} in each triangle, {islands}",
-                self.elimination.entries(),
-                d.dynamic * (d.dynamic + 1) / 2,
-            ),
-            Solver::Loops => {
-                let plan = self.loops.as_ref().map(|loops| &loops.plan);
-                let most = plan.and_then(|plan| plan.fronts.iter().max()).copied().unwrap_or(0);
-                format!(
-                    "factorization by generators with loops, {} joints in fronts of up to {most} rows, {islands}",
-                    joints.len()
-                )
-            }
-            Solver::Planar | Solver::Spatial => {
-                format!("factorization by generators, {} joints, {islands}", joints.len())
-            }
-        });
-        let skipped = |is: bool| if is { "" } else { " (skipped)" };
-        line(format!(
-            "gravity       {}",
-            if self.gravity.is_some() { "uniform" } else { "none (skipped)" }
-        ));
-        let springs = self.potentials.count();
-        line(format!(
-            "springs       {springs}: {} coordinate, {} two-point, {} spline, {} path{}",
-            self.potentials.coordinate_springs.len(),
-            self.potentials.point_springs.len(),
-            self.potentials.spline_springs.len(),
-            self.potentials.path_springs.len(),
-            skipped(springs > 0)
-        ));
-        let damped = self.damping.iter().filter(|c| **c != 0.0).count();
-        line(format!("damping       {damped} coordinates{}", skipped(damped > 0)));
-        line(format!("inputs        {}{}", d.inputs, skipped(d.inputs > 0)));
-        line(match &self.forces {
-            None => "forces        0 (skipped)".to_owned(),
-            Some(forces) => format!(
-                "forces        {} wrenches, {} between points, {} on coordinates",
-                forces.wrenches.len(),
-                forces.point_forces.len(),
-                forces.coordinate_forces.len()
-            ),
-        });
-        let on_inputs = |s: &&Signal| matches!(s.target, Target::Input(_));
-        let on_inputs = self.signals.iter().filter(on_inputs).count();
-        line(match self.signals.len() {
-            0 => "signals       0 (skipped)".to_owned(),
-            n => format!("signals       {on_inputs} on inputs, {} on coordinates", n - on_inputs),
-        });
-        let equations = |is: fn(&ConstraintKind) -> bool| {
-            self.constraints.iter().filter(|constraint| is(&constraint.kind)).count()
-        };
-        line(format!(
-            "constraints   {} equations over {} joints: {} distance, {} axis, {} product, {} path, {} coupling{}",
-            d.constraints,
-            self.closure.joints.len(),
-            equations(|kind| matches!(kind, ConstraintKind::Distance(..))),
-            equations(|kind| matches!(kind, ConstraintKind::Axis(..))),
-            equations(|kind| matches!(kind, ConstraintKind::Product(_))),
-            equations(|kind| matches!(kind, ConstraintKind::PathLength(..))),
-            equations(|kind| matches!(kind, ConstraintKind::Coupling(..))),
-            skipped(d.constraints > 0)
-        ));
-        let stages = self.stage_costs();
-        let step: f64 = stages.iter().map(|stage| stage.times * stage.instructions).sum();
-        line(format!("cost          about {:.1} thousand instructions a step:", step / 1e3));
-        for stage in stages {
-            let (share, thousands) =
-                (stage.times * stage.instructions / step, stage.instructions / 1e3);
-            line(match stage.times {
-                0.0 => format!("  {:<20}and {thousands:.1} more", stage.name),
-                times => {
-                    format!(
-                        "  {:<20}{times:.1} × {thousands:.1}, {:.0} %",
-                        stage.name,
-                        100.0 * share
-                    )
-                }
-            });
-        }
-        plan
     }
 
     /// Equations of constraints that are independent at the scene's initial configuration.

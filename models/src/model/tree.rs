@@ -61,7 +61,7 @@ pub(crate) enum Rotational {
     None,
     /// A point mass.
     Point,
-    /// The same about every axis.
+    /// One moment of inertia about every axis.
     Isotropic(f64),
     /// Anything else.
     Full(Sym3),

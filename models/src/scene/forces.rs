@@ -3,6 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
+use crate::scene::linear_term::LinearTerm;
 use crate::scene::number_or_name::{NumberOrName, field, number_or_name};
 use crate::scene::point::{Point, is_zero3, one};
 
@@ -86,6 +87,13 @@ pub enum Force {
         /// N·s²/m² or N·m·s²/rad².
         coefficient: f64,
     },
+    /// `f_i = −damping · coefficient_i · Σ coefficient_j v_j` on the coordinates of a sum.
+    LinearDamper {
+        /// One or more terms, each of another coordinate.
+        terms: Vec<LinearTerm>,
+        /// N·s/m or N·m·s/rad, as the coefficients make it.
+        damping: f64,
+    },
     /// `f = −force · tanh(v / velocity)` on a coordinate of velocity `v`: dry friction without a jump.
     Friction {
         /// Coordinate.
@@ -159,7 +167,9 @@ impl Force {
                 [of(frame, *at), None]
             }
             Self::TwoPointDamper { a, b, .. } => [Some(a.clone()), Some(b.clone())],
-            Self::CoordinateDrag { .. } | Self::Friction { .. } => [None, None],
+            Self::CoordinateDrag { .. } | Self::Friction { .. } | Self::LinearDamper { .. } => {
+                [None, None]
+            }
         };
         points.into_iter().flatten()
     }

@@ -26,6 +26,8 @@ pub const MAX_KNOTS: usize = 4096;
 pub const MAX_PATH_POINTS: usize = 4096;
 /// Most terms of all couplings together.
 pub const MAX_COUPLING_TERMS: usize = 4096;
+/// Most terms of all springs on sums together, and of all dampers on sums together.
+pub const MAX_LINEAR_TERMS: usize = 4096;
 /// Highest power of a coupling.
 pub const MAX_POWER: usize = 16;
 /// Most operating points.

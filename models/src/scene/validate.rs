@@ -11,10 +11,11 @@ mod tests;
 
 use std::collections::BTreeMap;
 
+use crate::scene::forces::Force;
 use crate::scene::limits::{
     MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES, MAX_FRAMES, MAX_INPUTS,
-    MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_SIGNAL_POINTS, MAX_SIGNALS,
-    MAX_SPRINGS,
+    MAX_LINEAR_TERMS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_SIGNAL_POINTS,
+    MAX_SIGNALS, MAX_SPRINGS,
 };
 use crate::scene::signals::Signal;
 use crate::scene::{Constraint, CoordinateKind, Motion, Problem, Scene, Spring};
@@ -83,6 +84,14 @@ impl<'a> Check<'a> {
             Spring::Path { points, .. } => points.len(),
             _ => 0,
         });
+        let spring_terms = scene.springs.iter().map(|spring| match spring {
+            Spring::LinearSpring { terms, .. } => terms.len(),
+            _ => 0,
+        });
+        let force_terms = scene.forces.iter().map(|force| match force {
+            Force::LinearDamper { terms, .. } => terms.len(),
+            _ => 0,
+        });
         let constraint_points = scene.constraints.iter().map(|constraint| match constraint {
             Constraint::PathLength { points, .. } => points.len(),
             _ => 0,
@@ -98,6 +107,8 @@ impl<'a> Check<'a> {
             ("coordinates", "coordinates", scene.coordinates.len(), MAX_COORDINATES),
             ("springs", "springs", scene.springs.len(), MAX_SPRINGS),
             ("springs", "points of paths", spring_points.sum(), MAX_PATH_POINTS),
+            ("springs", "terms of sums", spring_terms.sum(), MAX_LINEAR_TERMS),
+            ("forces", "terms of sums", force_terms.sum(), MAX_LINEAR_TERMS),
             ("inputs", "inputs", scene.inputs.len(), MAX_INPUTS),
             ("forces", "forces", scene.forces.len(), MAX_FORCES),
             ("signals", "signals", scene.signals.len(), MAX_SIGNALS),

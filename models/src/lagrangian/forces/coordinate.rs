@@ -1,11 +1,15 @@
 //! Forces on coordinates that follow from their velocities.
 
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::{CoordinateForce, CoordinateLaw};
 
-impl CoordinateForce {
-    pub(super) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+impl GeneralizedForce for CoordinateForce {
+    fn couples(&self) -> Vec<usize> {
+        vec![self.coordinate]
+    }
+
+    fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
         let v = at.velocity[self.coordinate];
         force[self.coordinate] += match self.law {
             CoordinateLaw::Drag(c) => magnitude(v) * v * -c,
@@ -13,7 +17,7 @@ impl CoordinateForce {
         };
     }
 
-    pub(super) fn derivative<S: Scalar>(
+    fn for_each_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S, S),

@@ -8,7 +8,7 @@
 //! The rate of a point `x` carried with twist `V` changes with a joint `j` above it by
 //! `J_j × (V − V_before)` taken at `x`, plus `w × ∂x/∂q_j`, where `V_before` is the twist before `j`.
 
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::lagrangian::vectors::Separation;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Motion, Vec3};
@@ -68,8 +68,12 @@ impl<S: Scalar> Acting<S> {
     }
 }
 
-impl PointForce {
-    pub(super) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+impl GeneralizedForce for PointForce {
+    fn couples(&self) -> Vec<usize> {
+        self.ends.coordinates().collect()
+    }
+
+    fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
         let acting = Acting::new(self, at);
         for joint in &self.ends.path {
             if let Some(entry) = force.get_mut(joint.coordinate) {
@@ -78,7 +82,7 @@ impl PointForce {
         }
     }
 
-    pub(super) fn for_each_derivative<S: Scalar>(
+    fn for_each_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S, S),
@@ -101,7 +105,9 @@ impl PointForce {
             }
         }
     }
+}
 
+impl PointForce {
     /// `∂ḋ/∂q` of a joint on the path.
     fn rate_by_position<S: Scalar>(
         &self,

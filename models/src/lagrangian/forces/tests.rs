@@ -103,6 +103,10 @@ type = "coordinate_drag"
 coordinate = "d"
 coefficient = 0.5
 [[forces]]
+type = "linear_damper"
+damping = 0.6
+terms = [{ coordinate = "shaken", coefficient = 0.4 }, { coordinate = "d", coefficient = -2 }, { coordinate = "c", coefficient = 1.5 }]
+[[forces]]
 type = "friction"
 coordinate = "b"
 force = 0.5

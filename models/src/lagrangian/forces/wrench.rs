@@ -11,7 +11,7 @@
 //! Two axes of one ball joint: they turn with the joint, so the second line holds for both orders,
 //! and the first for none.
 
-use crate::lagrangian::forces::Instant;
+use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Force, Vec3};
 use crate::model::mechanism::{Wrench, WrenchKind};
@@ -38,8 +38,14 @@ impl Wrench {
         }
         self.in_world(at, total)
     }
+}
 
-    pub(super) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+impl GeneralizedForce for Wrench {
+    fn couples(&self) -> Vec<usize> {
+        Vec::new()
+    }
+
+    fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
         let wrench = self.total(at);
         for &joint in &self.path {
             if let Some(entry) = force.get_mut(at.tree.joints[joint].coordinate) {
@@ -48,7 +54,7 @@ impl Wrench {
         }
     }
 
-    pub(super) fn for_each_derivative<S: Scalar>(
+    fn for_each_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S, S),
@@ -78,7 +84,7 @@ impl Wrench {
         }
     }
 
-    pub(super) fn for_each_input_derivative<S: Scalar>(
+    fn for_each_input_derivative<S: Scalar>(
         &self,
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S),

@@ -41,6 +41,11 @@ impl Check<'_> {
                     self.not_of_an_orientation(format!("{path}.coordinate"), coordinate);
                     self.knots(format!("{path}.knots"), knots);
                 }
+                Spring::LinearSpring { terms, stiffness, rest } => {
+                    self.linear_terms(&path, terms);
+                    self.not_negative(format!("{path}.stiffness"), *stiffness);
+                    self.finite(format!("{path}.rest"), *rest);
+                }
                 Spring::Path { points, stiffness, rest_length } => {
                     self.not_negative(format!("{path}.stiffness"), *stiffness);
                     self.not_negative(format!("{path}.rest_length"), *rest_length);

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::scene::forces::Force;
+use crate::scene::linear_term::LinearTerm;
 use crate::scene::signals::Signal;
 use crate::scene::validate::Check;
 use crate::scene::{Constraint, CoordinateKind, Motion};
@@ -92,6 +93,36 @@ impl<'a> Check<'a> {
                 );
             }
             Some(CoordinateKind::Dynamic) => {}
+        }
+    }
+
+    /// That the terms of a spring or force on a sum name different coordinates, one of them dynamic.
+    pub(super) fn linear_terms(&mut self, path: &str, terms: &[LinearTerm]) {
+        let mut seen = BTreeSet::new();
+        let mut can_move = terms.is_empty();
+        if terms.is_empty() {
+            self.report(format!("{path}.terms"), "is empty; must have a term or more");
+        }
+        for (i, term) in terms.iter().enumerate() {
+            let (path, name) = (format!("{path}.terms[{i}]"), term.coordinate.as_str());
+            let kind = self.kinds.get(name);
+            can_move |= kind != Some(&CoordinateKind::Prescribed);
+            if kind.is_none() {
+                let message = format!("there is no coordinate `{name}`");
+                self.report(format!("{path}.coordinate"), message);
+            } else if !seen.insert(name) {
+                let message = format!("coordinate `{name}` has a term already");
+                self.report(format!("{path}.coordinate"), message);
+            }
+            self.not_of_an_orientation(format!("{path}.coordinate"), name);
+            let path = format!("{path}.coefficient");
+            if self.finite(path.clone(), term.coefficient) && term.coefficient == 0.0 {
+                self.report(path, "is zero; the term would have no effect");
+            }
+        }
+        if !can_move {
+            let message = "are of prescribed coordinates alone; one must be dynamic";
+            self.report(format!("{path}.terms"), message);
         }
     }
 

@@ -44,6 +44,10 @@ impl Check<'_> {
                     self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
                     self.not_negative(format!("{path}.coefficient"), *coefficient);
                 }
+                Force::LinearDamper { terms, damping } => {
+                    self.linear_terms(&path, terms);
+                    self.not_negative(format!("{path}.damping"), *damping);
+                }
                 Force::Friction { coordinate, force, velocity } => {
                     self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
                     self.not_negative(format!("{path}.force"), *force);

@@ -81,7 +81,7 @@ fn check(from: &str, to: &str, expected: &[&str]) -> Option<String> {
     check_in(GOOD, from, to, expected)
 }
 
-/// The same in another good scene.
+/// Replaces `from` by `to` in any good scene, as [`check`] does in one.
 fn check_in(good: &str, from: &str, to: &str, expected: &[&str]) -> Option<String> {
     assert_eq!(good.matches(from).count(), 1, "`{from}` must occur once");
     let scene = Scene::from_toml(&good.replace(from, to)).unwrap_or_else(|e| panic!("`{to}`: {e}"));
@@ -374,6 +374,40 @@ fn faults_of_elements_are_found_where_they_are() {
             "{ coordinate = \"wheel\", coefficients = [3.0] }",
             "{ coordinate = \"well\", coefficients = [nan] }",
             &["constraints[0].terms[1].coordinate", "constraints[0].terms[1].coefficients[0]"],
+        ),
+        // Sums of coordinates.
+        (
+            "linear-spring",
+            "coefficient = -1.0",
+            "coefficient = 0.0",
+            &["springs[0].terms[1].coefficient"],
+        ),
+        (
+            "linear-spring",
+            "coefficient = -1.0",
+            "coefficient = nan",
+            &["springs[0].terms[1].coefficient"],
+        ),
+        ("linear-spring", "stiffness = 8.0", "stiffness = -8.0", &["springs[0].stiffness"]),
+        ("linear-spring", "rest = 0.1", "rest = inf", &["springs[0].rest"]),
+        (
+            "linear-spring",
+            "coordinate = \"right\", coeff",
+            "coordinate = \"left\", coeff",
+            &["springs[0].terms[1].coordinate"],
+        ),
+        (
+            "linear-damper",
+            "coordinate = \"right\", coeff",
+            "coordinate = \"wing\", coeff",
+            &["forces[0].terms[1].coordinate"],
+        ),
+        ("linear-damper", "damping = 0.7", "damping = nan", &["forces[0].damping"]),
+        (
+            "linear-damper",
+            "terms = [{ coordinate = \"left\", coefficient = 1.0 }, { coordinate = \"right\", coefficient = 0.5 }]",
+            "terms = []",
+            &["forces[0].terms"],
         ),
         ("coupling", "constant = -0.1", "constant = inf", &["constraints[1].constant"]),
         ("hoist", "{ coordinate = \"fan\", coefficients = [1.0, 0.1] },", "", &["constraints[1]"]),

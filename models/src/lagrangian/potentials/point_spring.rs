@@ -1,0 +1,94 @@
+//! A spring between two points.
+//!
+//! ```text
+//! V = ½ k (|d| − rest)²    V_i = t d·d_i    V_ij = t (d_i·d_j + d·d_ij) + c (d·d_i)(d·d_j)
+//! ```
+//!
+//! with `d` from point to point, `t = k (|d| − rest)/|d|`, `c = k rest/|d|³`. Where the points coincide, a
+//! spring with a rest length pulls nowhere; its stiffness there is taken as `k` in all directions.
+
+use crate::lagrangian::potentials::{Place, Potential};
+use crate::lagrangian::vectors::Separation;
+use crate::math::scalar::Scalar;
+use crate::math::spatial::Vec3;
+use crate::model::mechanism::{PathJoint, PointSpring};
+
+/// A two-point spring at one configuration.
+struct Stretched<S> {
+    at: Separation<S>,
+    /// `t = V_l / l`.
+    tension: S,
+    /// `c`.
+    bend: S,
+}
+
+/// Without rest length nothing is divided by the length, so that all derivatives hold at zero too.
+fn stretched<S: Scalar>(spring: &PointSpring, place: Place<'_, S>) -> Stretched<S> {
+    let at = spring.ends.separation(place.tree, place.poses);
+    let square = at.difference.dot(at.difference);
+    if spring.rest_length == 0.0 || square.value() == 0.0 {
+        return Stretched { at, tension: S::constant(spring.stiffness), bend: S::ZERO };
+    }
+    let length = square.sqrt();
+    let inverse = length.recip();
+    let tension = (length - spring.rest_length) * inverse * spring.stiffness;
+    let bend = inverse * inverse * inverse * (spring.stiffness * spring.rest_length);
+    Stretched { at, tension, bend }
+}
+
+impl Potential for PointSpring {
+    const NEEDS_POSES: bool = true;
+
+    fn couples(&self) -> Vec<usize> {
+        self.ends.coordinates().collect()
+    }
+
+    fn energy<S: Scalar>(&self, at: Place<'_, S>) -> S {
+        let d = self.ends.separation(at.tree, at.poses).difference;
+        let square = d.dot(d);
+        if self.rest_length == 0.0 {
+            return square * (0.5 * self.stiffness);
+        }
+        let length = if square.value() == 0.0 { S::ZERO } else { square.sqrt() };
+        let stretch = length - self.rest_length;
+        stretch * stretch * (0.5 * self.stiffness)
+    }
+
+    #[inline]
+    fn add_gradient<S: Scalar>(&self, at: Place<'_, S>, l_q: &mut [S]) {
+        let s = stretched(self, at);
+        let pull = s.at.difference * s.tension;
+        for joint in &self.ends.path {
+            if let Some(entry) = l_q.get_mut(joint.coordinate) {
+                *entry -= pull.dot(joint.gradient(at.tree, at.poses, &s.at));
+            }
+        }
+    }
+
+    #[inline]
+    fn for_each_second_derivative<S: Scalar>(
+        &self,
+        at: Place<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S),
+    ) {
+        let (tree, poses) = (at.tree, at.poses);
+        let s = stretched(self, at);
+        for (k, row) in self.ends.path.iter().enumerate() {
+            let row_gradient = row.gradient(tree, poses, &s.at);
+            let bend = s.bend * s.at.difference.dot(row_gradient);
+            for column in &self.ends.path[..=k] {
+                let gradient = column.gradient(tree, poses, &s.at);
+                let both = [(row, row_gradient), (column, gradient)];
+                let (second, mirrored) = PathJoint::seconds(both, tree, poses);
+                let product = gradient.dot(row_gradient);
+                let along = bend * s.at.difference.dot(gradient);
+                let value =
+                    |second: Vec3<S>| s.tension * (product + s.at.difference.dot(second)) + along;
+                entry(row.coordinate, column.coordinate, value(second));
+                if row.joint != column.joint {
+                    entry(column.coordinate, row.coordinate, value(mirrored));
+                }
+            }
+        }
+    }
+}
