@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::math::hash::fnv1a;
 use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Sym3, Vec3};
@@ -66,7 +66,7 @@ fn compile(scene: &Scene) -> Model {
 
     let forces = layout.forces(scene, &dynamics, &in_dynamics);
     let couplings = couplings(dynamic, &dynamics, &potentials, forces.as_ref());
-    let elimination = Elimination::new(&couplings);
+    let elimination = SymbolicElimination::new(&couplings);
     let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
 
     let damping: Vec<f64> = layout.coordinates[..dynamic]
@@ -730,7 +730,7 @@ fn couplings(
 fn joint_pairs(
     dynamic: usize,
     tree: &Tree,
-    elimination: &Elimination,
+    elimination: &SymbolicElimination,
 ) -> (Vec<Pair>, Vec<MixedPair>) {
     let (mut pairs, mut mixed) = (Vec::new(), Vec::new());
     for (joint, descendant) in tree.joints.iter().enumerate() {

@@ -27,7 +27,7 @@ use crate::integrator::collocation::system::System;
 use crate::integrator::predictor::Past;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::model::mechanism::Model;
 
 /// Unknowns up to which all stages are corrected at once.
@@ -69,7 +69,7 @@ impl Collocation {
     pub(crate) fn solve(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         start_s: f64,
     ) -> Result<StepReport, StepError> {
         self.guess(workspace, at, start_s)?;
@@ -98,10 +98,10 @@ impl Collocation {
     fn guess(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         start_s: f64,
     ) -> Result<(), StepError> {
-        let At { model, settings, state, u } = at;
+        let StepContext { model, settings, state, u } = at;
         let d = model.dimensions;
         let h = settings.time_step_s;
         let is_guessed = match &state.past {

@@ -6,7 +6,7 @@ use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::factors::Generators;
 use crate::kkt::loops;
-use crate::kkt::planar::Of;
+use crate::kkt::planar::MatrixKind;
 use crate::kkt::schur::fill_schur;
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::potentials;
@@ -64,13 +64,18 @@ impl Workspace {
     /// Factors `K` and the constraints of loops, which are in the plane; whether the pivots allow it.
     pub(crate) fn factor_loops(&mut self, model: &Model, settings: &Settings) -> bool {
         self.fill_diagonal(model, settings);
-        self.factor_loops_of(model, settings, Of::Motion)
+        self.factor_loops_of(model, settings, MatrixKind::Newton)
     }
 
     /// The same with what is in `diagonal`. With masses alone, constraints are those at the start.
-    pub(super) fn factor_loops_of(&mut self, model: &Model, settings: &Settings, of: Of) -> bool {
+    pub(super) fn factor_loops_of(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        kind: MatrixKind,
+    ) -> bool {
         self.in_loops = false;
-        let end = if of == Of::Masses { &self.start } else { &self.end };
+        let end = if kind == MatrixKind::Mass { &self.start } else { &self.end };
         let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
         let (Some(start), Some(end)) = (&self.start.in_plane, &end.in_plane) else {
             return false;
@@ -85,7 +90,7 @@ impl Workspace {
         let at = loops::Mechanism { loops, joints, tree, start, end };
         let conditioning = &model.conditioning;
         let scales = loops::Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
-        let pivots = generators.factor(at, &self.diagonal, scales, settings.time_step_s, of);
+        let pivots = generators.factor(at, &self.diagonal, scales, settings.time_step_s, kind);
         if pivots.joints.relative < SAFE
             || pivots.equations < SAFE
             || pivots.steepness < settings.singular_below
@@ -168,7 +173,7 @@ impl Workspace {
         }
         self.fill_diagonal(model, settings);
         let (h, diagonal) = (settings.time_step_s, &self.diagonal);
-        match self.factors.generate(model, &mut self.mechanics, diagonal, h, Of::Motion) {
+        match self.factors.generate(model, &mut self.mechanics, diagonal, h, MatrixKind::Newton) {
             Some(pivot) => self.accept_pivot(model, settings, pivot),
             None => self.factor_newton_matrix(model, settings),
         }

@@ -9,13 +9,13 @@
 //!
 //! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
 //! measured in units of its own round-off; the solver stops where arithmetic does. Loops in planes are
-//! factored with `K` in place of `S` ([`crate::kkt::loops::LoopElimination`]).
+//! factored with `K` in place of `S` ([`crate::kkt::loops::Multifrontal`]).
 
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{At, Workspace};
-use crate::kkt::planar::Of;
+use crate::integrator::workspace::{StepContext, Workspace};
+use crate::kkt::planar::MatrixKind;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::{forces, potentials};
 use crate::math::norms::{larger, largest};
@@ -47,8 +47,8 @@ impl Precision {
 
 impl Workspace {
     /// Solves one step; the solution stays in the workspace.
-    pub(crate) fn solve(&mut self, at: At<'_>) -> Result<StepReport, StepError> {
-        let At { model, settings, state, .. } = at;
+    pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<StepReport, StepError> {
+        let StepContext { model, settings, state, .. } = at;
         self.prepare(at);
         if state.past.predict(settings.time_step_s, &mut self.increment) {
             // The equations are linear in the multipliers: any guess is as good.
@@ -64,8 +64,8 @@ impl Workspace {
     }
 
     /// What does not change within a step: prescribed motion, input forces, constraints at the start.
-    pub(crate) fn prepare(&mut self, at: At<'_>) {
-        let At { model, settings, state, u } = at;
+    pub(crate) fn prepare(&mut self, at: StepContext<'_>) {
+        let StepContext { model, settings, state, u } = at;
         let d = model.dimensions;
         let (inputs, next) = u.split_at(d.inputs);
         for (k, next) in next.iter().enumerate() {
@@ -164,8 +164,8 @@ impl Workspace {
         self.diagonal.fill(0.0);
         if model.loops.is_none() {
             let (mechanics, h) = (&mut self.mechanics, settings.time_step_s);
-            self.factors.generate(model, mechanics, &self.diagonal, h, Of::Masses);
-        } else if !self.factor_loops_of(model, settings, Of::Masses) {
+            self.factors.generate(model, mechanics, &self.diagonal, h, MatrixKind::Mass);
+        } else if !self.factor_loops_of(model, settings, MatrixKind::Mass) {
             return false;
         }
         for (x, p) in self.increment.iter_mut().zip(&state.p) {

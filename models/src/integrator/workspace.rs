@@ -18,7 +18,7 @@ use crate::model::tree::JointKind;
 
 /// What a step is taken of.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct At<'a> {
+pub(crate) struct StepContext<'a> {
     pub(crate) model: &'a Model,
     /// Of this step: its time step may be a part of the control period, or negative.
     pub(crate) settings: &'a Settings,

@@ -1,6 +1,6 @@
 //! The Newton matrix of a step, factored: entry by entry, or by its generators.
 
-use crate::kkt::planar::Of;
+use crate::kkt::planar::MatrixKind;
 use crate::kkt::{loops, planar, space};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::PlanarTree;
@@ -19,10 +19,10 @@ pub(crate) struct Factors {
 /// The Newton matrix of a tree in planes or in space.
 #[derive(Clone, Debug)]
 pub(crate) enum Generators {
-    Planar(planar::Elimination),
+    Planar(planar::PlanarRecursion),
     /// With the constraints.
-    Loops(Box<loops::LoopElimination>),
-    Spatial(space::Elimination),
+    Loops(Box<loops::Multifrontal>),
+    Spatial(space::SpatialRecursion),
 }
 
 impl Factors {
@@ -30,20 +30,21 @@ impl Factors {
         let joints = model.dimensions.dynamic;
         let generators = match model.solver {
             Solver::Tree => None,
-            Solver::Planar => Some(Generators::Planar(planar::Elimination::new(joints))),
+            Solver::Planar => Some(Generators::Planar(planar::PlanarRecursion::new(joints))),
             Solver::Loops => {
                 let loops = model.loops.as_ref();
-                loops.map(|loops| Generators::Loops(Box::new(loops::LoopElimination::new(loops))))
+                loops.map(|loops| Generators::Loops(Box::new(loops::Multifrontal::new(loops))))
             }
-            Solver::Spatial => {
-                Some(Generators::Spatial(space::Elimination::new(&model.dynamics, model.gravity)))
-            }
+            Solver::Spatial => Some(Generators::Spatial(space::SpatialRecursion::new(
+                &model.dynamics,
+                model.gravity,
+            ))),
         };
         Self { matrix: TreeLu::new(&model.elimination), generators: generators.map(Box::new) }
     }
 
     /// The generators of a planar tree.
-    pub(crate) fn planar(&mut self) -> Option<&mut planar::Elimination> {
+    pub(crate) fn planar(&mut self) -> Option<&mut planar::PlanarRecursion> {
         match self.generators.as_deref_mut() {
             Some(Generators::Planar(generators)) => Some(generators),
             _ => None,
@@ -57,25 +58,25 @@ impl Factors {
         mechanics: &mut Mechanics,
         diagonal: &[f64],
         step: f64,
-        of: Of,
+        kind: MatrixKind,
     ) -> Option<SmallestPivot> {
         let inertia = &model.conditioning.inertia;
         match (self.generators.as_deref_mut()?, &mut mechanics.planar, &model.planar) {
             (Generators::Planar(generators), Some(planar), Some(joints)) => {
                 let PlanarTree::Many(tree) = &mut **planar else { return None };
                 tree.differentiate(joints);
-                Some(generators.factor(tree, joints, diagonal, inertia, step, of))
+                Some(generators.factor(tree, joints, diagonal, inertia, step, kind))
             }
             (Generators::Spatial(generators), ..) => {
                 mechanics.differentiate(model);
-                Some(generators.factor(&model.dynamics, mechanics, diagonal, inertia, step, of))
+                Some(generators.factor(&model.dynamics, mechanics, diagonal, inertia, step, kind))
             }
             _ => None,
         }
     }
 
     /// Those of a mechanism with loops.
-    pub(crate) fn loops(&mut self) -> Option<&mut loops::LoopElimination> {
+    pub(crate) fn loops(&mut self) -> Option<&mut loops::Multifrontal> {
         match self.generators.as_deref_mut() {
             Some(Generators::Loops(generators)) => Some(generators),
             _ => None,

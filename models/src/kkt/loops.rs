@@ -10,12 +10,12 @@
 //! ```
 //!
 //! joint `j` adds `plus_j x_j` to `ξ` and `s_j x_j` to `ω` of what it carries; it feels `minus_j·φ + s_j·ψ`
-//! ([`Elimination`] is the same without loops). A closure measures `e·ω` of its two bodies and pushes them by
+//! ([`PlanarRecursion`] is the same without loops). A closure measures `e·ω` of its two bodies and pushes them by
 //! `ψ −= e λ`. What is eliminated is summed in a front, `[φ ψ 0] = A [ξ ω λ]`, with one row for each equation
 //! that is still open; a pivot takes the product of a column and a row away from it.
 
 use crate::constraints::in_plane::InPlane;
-use crate::kkt::planar::{Diagonal, Elimination, Method, Of, add_to, dot3, product};
+use crate::kkt::planar::{Diagonal, MatrixKind, Method, PlanarRecursion, add_to, dot3, product};
 use crate::lagrangian::planar::{Fours, Joints, Vec2, Vec3, cross};
 use crate::math::rows::{Block, LANES, padded};
 use crate::math::simd::wide;
@@ -116,8 +116,8 @@ impl Side for Block {
 
 /// The matrix.
 #[derive(Clone, Debug)]
-pub(crate) struct LoopElimination {
-    tree: Elimination,
+pub(crate) struct Multifrontal {
+    tree: PlanarRecursion,
     shapes: Vec<Shape>,
     fronts: Vec<f64>,
     pivots: Vec<Pivot>,
@@ -286,7 +286,7 @@ impl Front<'_> {
     }
 }
 
-impl LoopElimination {
+impl Multifrontal {
     pub(crate) fn new(loops: &Loops) -> Self {
         let (joints, equations) = (loops.in_closure.len(), loops.equations.len());
         let (mut shapes, mut entry, mut row) = (Vec::new(), 0, 0);
@@ -299,7 +299,7 @@ impl LoopElimination {
         let factors = loops.plan.steps.iter();
         let factors = factors.map(|s| 2 * shapes[s.front].stride * (1 + s.closed.len())).sum();
         Self {
-            tree: Elimination::new(joints),
+            tree: PlanarRecursion::new(joints),
             shapes,
             fronts: vec![0.0; entry],
             pivots: vec![Pivot::default(); joints],
@@ -325,7 +325,7 @@ impl LoopElimination {
             diagonal: &[f64],
             scales: Scales<'_>,
             time_step_s: f64,
-            of: Of,
+            kind: MatrixKind,
         ) -> Pivots = factor_portable, factor_avx2, factor_avx512;
 
         /// Solves for `x` and `λ` in place; `constraints` are all that the model has.
@@ -337,7 +337,7 @@ impl LoopElimination {
             constraints: &mut [f64],
         ) = solve_portable, solve_avx2, solve_avx512;
 
-        /// As [`Elimination::linearize`], with multipliers. About `8 m` flops for each joint or equation
+        /// As [`PlanarRecursion::linearize`], with multipliers. About `8 m` flops for each joint or equation
         /// and column beside those of a tree.
         #[inline(never)]
         pub(crate) fn linearize(
@@ -356,10 +356,10 @@ impl LoopElimination {
         diagonal: &[f64],
         scales: Scales<'_>,
         time_step_s: f64,
-        of: Of,
+        kind: MatrixKind,
     ) -> Pivots {
         let Mechanism { loops, joints, tree, start, end } = at;
-        let method = Method::new(time_step_s, of);
+        let method = Method::new(time_step_s, kind);
         self.tree.step = time_step_s;
         self.fronts.fill(0.0);
         let mut pivots = Pivots { joints: SmallestPivot::NONE, equations: 1.0, steepness: 1.0 };
@@ -387,10 +387,10 @@ impl LoopElimination {
             for (k, factor) in minus.iter().enumerate() {
                 add_row(row, *factor, front.row(place + k));
             }
-            let own = dot3(generator.minus, upper) + diagonal[i];
-            let pushed = column[place..].iter().zip(minus).map(|(pushed, minus)| pushed * minus);
-            let pivot = own + pushed.sum::<f64>();
-            pivots.joints.see(i, pivot, own.abs().max(scales.inertia[i] * method.inverse.abs()));
+            let k_jj = dot3(generator.minus, upper) + diagonal[i];
+            let a_plus = column[place..].iter().zip(minus).map(|(a_plus, minus)| a_plus * minus);
+            let pivot = k_jj + a_plus.sum::<f64>();
+            pivots.joints.see(i, pivot, k_jj.abs().max(scales.inertia[i] * method.inverse.abs()));
             let inverse = 1.0 / pivot;
             for k in 0..3 {
                 column[place + k] += upper[k];
@@ -560,7 +560,7 @@ impl LoopElimination {
         for first in (0..stride).step_by(LANES) {
             self.tree.start_columns(tree, joints, diagonal, first);
             let columns = first..n.min(first + LANES);
-            let Elimination { increment, momentum, .. } = &mut self.tree;
+            let PlanarRecursion { increment, momentum, .. } = &mut self.tree;
             for (i, (x, p)) in increment.iter_mut().zip(momentum).enumerate() {
                 if first < n {
                     let row = &closures.hessian[i * n..][columns.clone()];

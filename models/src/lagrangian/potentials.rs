@@ -13,7 +13,7 @@
 
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::vectors::{Distance, Separation};
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::Vec3;
 use crate::math::tree_lu::TreeLu;
@@ -215,7 +215,7 @@ pub(crate) fn add_to_newton_matrix(
     poses: &Poses,
     q: &[f64],
     step: f64,
-    elimination: &Elimination,
+    elimination: &SymbolicElimination,
     matrix: &mut TreeLu,
 ) {
     for_each_second_derivative(potentials, tree, poses, q, |i, j, value| {

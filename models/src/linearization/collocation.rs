@@ -11,7 +11,7 @@
 use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::system::System;
 use crate::integrator::report::StepError;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::linearization::linearize::{Linearization, StageTangents};
 use crate::math::rows::{add_rows, padded};
 
@@ -20,7 +20,7 @@ impl Collocation {
     pub(crate) fn linearize(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<(), StepError> {
         let model = at.model;

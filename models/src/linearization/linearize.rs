@@ -25,7 +25,7 @@ use nalgebra::DMatrix;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
 use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
@@ -131,7 +131,7 @@ impl SolvedStep {
     }
 
     /// Remembers the solution in the workspace.
-    pub(crate) fn remember(&mut self, workspace: &Workspace, at: At<'_>) {
+    pub(crate) fn remember(&mut self, workspace: &Workspace, at: StepContext<'_>) {
         let (inputs, next) = at.u.split_at(self.inputs.len());
         self.settings = *at.settings;
         for (to, from) in [

@@ -1,7 +1,7 @@
 //! Linearizes the step that is solved in a workspace.
 
 use crate::integrator::report::StepError;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::potentials;
@@ -42,7 +42,7 @@ impl Workspace {
     /// Linearizes at the solution in the workspace.
     pub(crate) fn linearize(
         &mut self,
-        at: At<'_>,
+        at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<(), StepError> {
         let d = at.model.dimensions;
@@ -86,7 +86,7 @@ impl Workspace {
     /// The same in O(n²), for planar trees without constraints and prescribed coordinates.
     fn linearize_by_generators(
         &mut self,
-        at: At<'_>,
+        at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<(), StepError> {
         let model = at.model;
@@ -106,7 +106,7 @@ impl Workspace {
     }
 
     /// Impulses of inputs, and the diagonals of springs and dampers of coordinates.
-    fn fill_inputs(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn fill_inputs(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let (model, h) = (at.model, at.settings.time_step_s);
         for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
             place.momentum = h * input.gain;
@@ -129,8 +129,8 @@ impl Workspace {
     }
 
     /// The same with loops, where their pivots allow it: O(n²) where their fronts do not grow.
-    fn linearize_loops(&mut self, at: At<'_>, out: &mut Linearization) -> bool {
-        let At { model, settings, state, .. } = at;
+    fn linearize_loops(&mut self, at: StepContext<'_>, out: &mut Linearization) -> bool {
+        let StepContext { model, settings, state, .. } = at;
         let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
         self.finish_end(model, state);
         if !self.factor_loops(model, settings) {
@@ -161,16 +161,16 @@ impl Workspace {
 
     wide! {
         /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
-        pub(crate) fn fill_right_hand_sides(mut self, at: At<'_>, out: &mut Linearization) = fill_portable, fill_avx2;
+        pub(crate) fn fill_right_hand_sides(mut self, at: StepContext<'_>, out: &mut Linearization) = fill_portable, fill_avx2;
 
         /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
         /// `out.momentum`.
-        pub(crate) fn differentiate_momentum(mut self, at: At<'_>, out: &mut Linearization)
+        pub(crate) fn differentiate_momentum(mut self, at: StepContext<'_>, out: &mut Linearization)
             = differentiate_momentum_portable, differentiate_momentum_avx2;
     }
 
     #[inline(always)]
-    fn fill_portable(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn fill_portable(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let model = at.model;
         let h = at.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
@@ -229,7 +229,7 @@ impl Workspace {
     }
 
     /// Springs add `−V_qq` to `L_qq`.
-    fn add_springs(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn add_springs(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         if !at.model.potentials.any {
             return;
         }
@@ -263,7 +263,7 @@ impl Workspace {
     }
 
     /// Forces add `a h f_q` to `C_q`, `a h f_v` to `C_v`, and `h (f_q q' + f_v v')` to `p[k+1]'`.
-    fn add_forces(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn add_forces(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let Some(forces) = &at.model.forces else { return };
         let h = at.settings.time_step_s;
         let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
@@ -294,7 +294,7 @@ impl Workspace {
     }
 
     /// The constraints' impulses turn with the start configuration.
-    fn add_constraint_hessian(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn add_constraint_hessian(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         if at.model.dimensions.constraints == 0 {
             return;
         }
@@ -314,7 +314,7 @@ impl Workspace {
     }
 
     /// From `K⁻¹ r1'` in `out.increment`: solves `S λ' = A1 K⁻¹ r1' − r2'` and subtracts `K⁻¹ A0ᵀ λ'`.
-    fn solve_multipliers(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn solve_multipliers(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let model = at.model;
         let d = model.dimensions;
         let (n, nd, nc, stride) = (d.coordinates(), d.dynamic, d.constraints, out.stride);
@@ -344,7 +344,7 @@ impl Workspace {
     }
 
     #[inline(always)]
-    fn differentiate_momentum_portable(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn differentiate_momentum_portable(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         for x in &mut out.increment {
             *x = -*x;
         }

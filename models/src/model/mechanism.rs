@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::math::spatial::{Force, Vec3};
 use crate::math::spline::Spline;
 use crate::model::conditioning::Conditioning;
@@ -45,7 +45,7 @@ pub struct Model {
     pub(crate) closure: Tree,
     pub(crate) constraints: Vec<Constraint>,
     pub(crate) alignments: Vec<Alignment>,
-    pub(crate) elimination: Elimination,
+    pub(crate) elimination: SymbolicElimination,
     /// Ancestor and descendant pairs of dynamic coordinates, with their place in the factorization.
     pub(crate) pairs: Vec<Pair>,
     /// Ancestor and descendant pairs of which exactly one is prescribed.
@@ -93,7 +93,7 @@ impl Solver {
     /// The fastest one for a scene; `needs_poses` where springs between points or forces act.
     pub(crate) fn of(
         tree: &Tree,
-        elimination: &Elimination,
+        elimination: &SymbolicElimination,
         planar: Option<&[PlanarJoint]>,
         needs_poses: bool,
         d: Dimensions,

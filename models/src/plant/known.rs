@@ -4,7 +4,7 @@ use nalgebra::DMatrix;
 
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
-use crate::integrator::workspace::At;
+use crate::integrator::workspace::StepContext;
 use crate::linearization::linearize::Linearization;
 use crate::model::manifold::orientations;
 use crate::plant::facade::Plant;
@@ -46,7 +46,7 @@ impl Plant {
         self.place_known(step)?;
         let Self { model, settings, state, workspace, period } = self;
         let u = period.input.of_step(model, state, settings.time_step_s, step.u, [0.0, 1.0])?;
-        workspace.linearize(At { model, settings, state, u }, out)
+        workspace.linearize(StepContext { model, settings, state, u }, out)
     }
 
     /// Whether the period is one step of the midpoint rule.
@@ -130,7 +130,7 @@ impl Plant {
         self.place_start(step);
         let Self { model, settings, state, workspace, period } = self;
         let u = period.input.of_step(model, state, settings.time_step_s, step.u, [0.0, 1.0])?;
-        workspace.prepare(At { model, settings, state, u });
+        workspace.prepare(StepContext { model, settings, state, u });
         let nd = self.model.dimensions.dynamic;
         let increment = &mut self.workspace.increment;
         for (x, (q1, q0)) in increment.iter_mut().zip(step.q1.iter().zip(step.q0)) {

@@ -6,7 +6,7 @@ use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::{Scheme, Tableau};
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::factors::Factors;
 use crate::model::mechanism::Model;
 
@@ -51,12 +51,12 @@ impl Sweep {
     pub(super) fn correct(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         tableau: &Tableau,
         inputs: &[f64],
         motion: &mut [f64],
     ) -> Result<Option<StepReport>, StepError> {
-        let At { model, settings, state, u } = at;
+        let StepContext { model, settings, state, u } = at;
         let (ni, nd) = (model.dimensions.inputs, model.dimensions.dynamic);
         let count = self.stages.len();
         for (i, stage) in self.stages.iter_mut().enumerate() {
@@ -121,12 +121,12 @@ impl Sweep {
     fn evaluate(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         tableau: &Tableau,
         inputs: &[f64],
         i: usize,
     ) -> f64 {
-        let At { model, state, u, .. } = at;
+        let StepContext { model, state, u, .. } = at;
         let d = model.dimensions;
         let Self { stages, base, input } = self;
         base.q_low.copy_from_slice(&state.q_low);
@@ -147,7 +147,7 @@ impl Sweep {
         let settings = stage_settings(at.settings, tableau.weights[i]);
         if d.prescribed > 0 || !model.signals.is_empty() {
             input[..d.inputs].copy_from_slice(&inputs[i * d.inputs..][..d.inputs]);
-            workspace.prepare(At { model, settings: &settings, state: base, u: input });
+            workspace.prepare(StepContext { model, settings: &settings, state: base, u: input });
         }
         workspace.increment.copy_from_slice(&stages[i].increment);
         let residual = workspace.evaluate(model, &settings, base);
@@ -162,7 +162,7 @@ impl Sweep {
     fn finish(
         &self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         tableau: &Tableau,
         motion: &mut [f64],
     ) -> Result<(), StepError> {

@@ -9,7 +9,7 @@ use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Precision;
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::forces;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::math::dense_inverse::DenseInverse;
@@ -138,8 +138,14 @@ impl System {
     }
 
     /// Takes velocities and forces, stage by stage, and what does not change within the step.
-    pub(crate) fn begin(&mut self, at: At<'_>, motion: &[f64], inputs: &[f64], force: &mut [f64]) {
-        let At { model, settings, state, u } = at;
+    pub(crate) fn begin(
+        &mut self,
+        at: StepContext<'_>,
+        motion: &[f64],
+        inputs: &[f64],
+        force: &mut [f64],
+    ) {
+        let StepContext { model, settings, state, u } = at;
         let (d, h) = (model.dimensions, settings.time_step_s);
         let (nd, n, width) = (d.dynamic, d.coordinates(), self.width);
         for i in 0..self.count {
@@ -172,10 +178,10 @@ impl System {
     pub(crate) fn evaluate(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         inputs: &[f64],
     ) -> f64 {
-        let At { model, state, .. } = at;
+        let StepContext { model, state, .. } = at;
         let n = model.dimensions.coordinates();
         let mut magnitude = f64::MIN_POSITIVE;
         for g in 0..self.groups() {
@@ -242,11 +248,11 @@ impl System {
     fn evaluate_alone(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         inputs: &[f64],
         stage: usize,
     ) {
-        let At { model, state, .. } = at;
+        let StepContext { model, state, .. } = at;
         let d = model.dimensions;
         if d.inputs > 0 {
             workspace.set_inputs(model, &inputs[stage * d.inputs..][..d.inputs]);
@@ -315,10 +321,10 @@ impl System {
     pub(super) fn correct(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         inputs: &[f64],
     ) -> Result<StepReport, StepError> {
-        let At { model, settings, state, .. } = at;
+        let StepContext { model, settings, state, .. } = at;
         let n = model.dimensions.coordinates();
         let enough = settings.precision.residual();
         let mut report = StepReport::default();
@@ -364,7 +370,12 @@ impl System {
     }
 
     /// Takes second derivatives at the last evaluation.
-    pub(crate) fn differentiate(&mut self, workspace: &mut Workspace, at: At<'_>, inputs: &[f64]) {
+    pub(crate) fn differentiate(
+        &mut self,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        inputs: &[f64],
+    ) {
         let model = at.model;
         self.hessian.clear(model);
         if self.mechanics.is_empty() {

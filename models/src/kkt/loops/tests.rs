@@ -7,9 +7,9 @@ use nalgebra::DMatrix;
 use crate::builtin;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::loops::{Closures, Derivatives, Mechanism, Scales};
-use crate::kkt::planar::{Diagonal, Of};
+use crate::kkt::planar::{Diagonal, MatrixKind};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
@@ -303,7 +303,7 @@ fn the_first_guess_is_that_of_dense_matrices() {
                 plant.step(&u).unwrap();
             }
             let Plant { settings, state, workspace, .. } = &mut plant;
-            workspace.prepare(At { model: &model, settings, state, u: &u });
+            workspace.prepare(StepContext { model: &model, settings, state, u: &u });
             workspace.ballistic(&model, settings, state);
             assert_eq!(workspace.in_loops, model.loops.is_some());
             workspace.increment.clone()
@@ -358,8 +358,8 @@ fn wider_registers_give_the_same_bits() {
         let scales = Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
         let mut wide = factors.loops().unwrap().clone();
         let mut narrow = wide.clone();
-        wide.factor(at, &numbers, scales, 0.01, Of::Motion);
-        narrow.factor_portable(at, &numbers, scales, 0.01, Of::Motion);
+        wide.factor(at, &numbers, scales, 0.01, MatrixKind::Newton);
+        narrow.factor_portable(at, &numbers, scales, 0.01, MatrixKind::Newton);
         assert_eq!(wide.factors, narrow.factors);
         let [mut x, mut narrow_x] = [0; 2].map(|_| numbers.clone());
         let [mut lambda, mut narrow_lambda] = [0; 2].map(|_| vec![0.3; d.constraints]);

@@ -9,8 +9,8 @@ use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::factors::Generators;
-use crate::kkt::planar::Of;
-use crate::kkt::space::Elimination;
+use crate::kkt::planar::MatrixKind;
+use crate::kkt::space::SpatialRecursion;
 use crate::linearization::linearize::Linearization;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::{Model, Solver};
@@ -121,7 +121,7 @@ fn a_solution_satisfies_the_dense_system() {
         let n = model.dimensions.dynamic;
         let settings = Settings { time_step_s: 0.02, ..Settings::new(&model) };
         let mut workspace = Workspace::new(&model);
-        let generators = Elimination::new(&model.dynamics, model.gravity);
+        let generators = SpatialRecursion::new(&model.dynamics, model.gravity);
         workspace.factors.generators = Some(Box::new(Generators::Spatial(generators)));
         for trial in 0..5 {
             for i in 0..n {
@@ -145,7 +145,7 @@ fn a_solution_satisfies_the_dense_system() {
             let masses = dense(&model, &factors.matrix) * (-1.0 / settings.time_step_s);
             let diagonal = vec![0.0; n];
             factors
-                .generate(&model, mechanics, &diagonal, settings.time_step_s, Of::Masses)
+                .generate(&model, mechanics, &diagonal, settings.time_step_s, MatrixKind::Mass)
                 .unwrap();
             assert_solves(&mut workspace, &model, &masses);
         }
@@ -166,7 +166,7 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     let settings = Settings { order, ..Settings::new(model) };
     let mut fast = Plant::new(Arc::clone(model), settings).unwrap();
     assert!(order == 2 || model.solver == Solver::Spatial);
-    let generators = Elimination::new(&model.dynamics, model.gravity);
+    let generators = SpatialRecursion::new(&model.dynamics, model.gravity);
     fast.workspace.factors.generators = Some(Box::new(Generators::Spatial(generators)));
     let n = model.dimensions.dynamic;
     let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
