@@ -114,8 +114,8 @@ impl Workspace {
         for row in 0..model.dimensions.dynamic {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let ancestor = elimination.ancestors[slot];
-                self.factors.matrix.upper[slot] = blocks.residual_next[ancestor * n + row];
-                self.factors.matrix.lower[slot] = blocks.residual_next[row * n + ancestor];
+                self.kkt.tree.upper[slot] = blocks.residual_next[ancestor * n + row];
+                self.kkt.tree.lower[slot] = blocks.residual_next[row * n + ancestor];
             }
         }
     }

@@ -90,7 +90,7 @@ impl Collocation {
             }
         };
         workspace.prepare(at);
-        workspace.estimates.write(&mut report);
+        workspace.kkt.estimates.write(&mut report);
         Ok(report)
     }
 

@@ -1,28 +1,19 @@
 //! The solver of a step: chord Newton on the increment, from an extrapolated guess, to round-off.
 //!
-//! With `A0 = Dh(q[k])` and `A1 = Dh(q[k+1])` a correction solves
-//!
-//! ```text
-//! [ K   −A0ᵀ ] [dx]     [r1]       S = A1 K⁻¹ A0ᵀ,   S dλ = A1 K⁻¹ r1 − r2
-//! [ A1    0  ] [dλ] = − [r2],      dx = K⁻¹ (A0ᵀ dλ − r1)
-//! ```
-//!
+//! Corrections solve the KKT system of [`crate::kkt::system`] with `A0 = Dh(q[k])` and `A1 = Dh(q[k+1])`.
 //! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
-//! measured in units of its own round-off; the solver stops where arithmetic does. Loops in planes are
-//! factored with `K` in place of `S` ([`crate::kkt::loops::Multifrontal`]).
+//! measured in units of its own round-off; the solver stops where arithmetic does.
 
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
-use crate::kkt::planar::MatrixKind;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::{forces, potentials};
 use crate::math::norms::{larger, largest};
-use crate::math::rows::padded;
 use crate::math::scalar::{Side, side_by_side};
 use crate::math::simd::wide;
-use crate::model::mechanism::{Model, Solver};
+use crate::model::mechanism::Model;
 
 /// A residual this small, in units of round-off, is as good as zero.
 const CONVERGED: f64 = 4.0;
@@ -100,7 +91,7 @@ impl Workspace {
     /// Constraints at the start of the step, kept from the end of the last one where possible; of loops
     /// without a Jacobian.
     fn place_start(&mut self, model: &Model, state: &PreciseState) {
-        if model.loops.is_none() {
+        if self.start.in_plane.is_none() {
             self.prepare_start(model, state);
         } else if !self.start_is_valid {
             self.start.evaluate(model, &state.q, &self.orientations_start);
@@ -152,32 +143,25 @@ impl Workspace {
         }
     }
 
-    /// The same by generators, where there are some and loops allow it.
+    /// Guesses by the recursion, where there is one and its pivots are sound.
     fn coast(&mut self, model: &Model, settings: &Settings, state: &PreciseState) -> bool {
-        if self.factors.generators.is_none() {
+        if !self.kkt.has_recursion() {
             return false;
         }
         self.velocity.fill(0.0);
         let (orientations, derivatives) =
             (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
         self.mechanics.gradient(model, &state.q, orientations, &self.velocity, derivatives);
-        self.diagonal.fill(0.0);
-        if model.loops.is_none() {
-            let (mechanics, h) = (&mut self.mechanics, settings.time_step_s);
-            self.factors.generate(model, mechanics, &self.diagonal, h, MatrixKind::Mass);
-        } else if !self.factor_loops_of(model, settings, MatrixKind::Mass) {
+        if !self.factor_masses(model, settings) {
             return false;
         }
         for (x, p) in self.increment.iter_mut().zip(&state.p) {
             *x = -p;
         }
-        if model.loops.is_none() {
-            self.factors.solve(model, &mut self.increment);
-        } else {
-            self.constraint_residual.fill(0.0);
-            self.factors.solve_loops(model, &mut self.increment, &mut self.constraint_residual);
-            self.multipliers.copy_from_slice(&state.multipliers);
-        }
+        self.constraint_residual.fill(0.0);
+        let x = &mut self.increment;
+        self.kkt.solve(model, &self.start, x, &mut self.constraint_residual);
+        self.multipliers.copy_from_slice(&state.multipliers);
         // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
         for x in self.increment.iter_mut().filter(|x| !x.is_finite()) {
             *x = 0.0;
@@ -194,11 +178,7 @@ impl Workspace {
         always_factor: bool,
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
-        // What a factorization costs, in corrections.
-        let patience = match model.solver {
-            Solver::Tree => 3,
-            Solver::Planar | Solver::Spatial | Solver::Loops => 2,
-        };
+        let patience = self.kkt.corrections();
         let enough = settings.precision.residual();
         let mut previous = f64::INFINITY;
         let (mut fresh, mut idle) = (false, false);
@@ -332,21 +312,14 @@ impl Workspace {
             if model.damping.is_empty() {
                 self.force.copy_from_slice(&self.input_force);
             }
-            let mut force = std::mem::take(&mut self.force);
-            forces.add(&self.instant(model), &mut force);
-            self.force = force;
+            let instant = self.mechanics.instant(model, &self.velocity, &self.inputs);
+            forces.add(&instant, &mut self.force);
         }
     }
 
     /// What forces depend on, at the last evaluation.
     pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a> {
-        Instant {
-            tree: &model.dynamics,
-            poses: &self.mechanics.poses,
-            momenta: &self.mechanics.momenta,
-            velocity: &self.velocity,
-            inputs: &self.inputs,
-        }
+        self.mechanics.instant(model, &self.velocity, &self.inputs)
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.
@@ -371,40 +344,11 @@ impl Workspace {
 
     /// One correction with the factors at hand.
     fn correct(&mut self, model: &Model) {
-        if self.in_loops {
-            self.constraint_residual.copy_from_slice(&self.end.value);
-            self.factors.solve_loops(model, &mut self.residual, &mut self.constraint_residual);
-            for (lambda, change) in self.multipliers.iter_mut().zip(&self.constraint_residual) {
-                *lambda -= change;
-            }
-            for (x, r) in self.increment.iter_mut().zip(&self.residual) {
-                *x -= r;
-            }
-            return;
-        }
-        self.factors.solve(model, &mut self.residual);
-        if model.dimensions.constraints > 0 {
-            let n = model.dimensions.coordinates();
-            let stride = padded(model.dimensions.constraints);
-            for (c, constraint) in model.constraints.iter().enumerate() {
-                let row = &self.end.jacobian[c * n..][..n];
-                let mut value = -self.end.value[c];
-                for &i in constraint.dynamic_coordinates() {
-                    value += row[i] * self.residual[i];
-                }
-                self.constraint_residual[c] = value;
-            }
-            self.schur.solve(&mut self.constraint_residual);
-            for (lambda, change) in self.multipliers.iter_mut().zip(&self.constraint_residual) {
-                *lambda += change;
-            }
-            for (i, r) in self.residual.iter_mut().enumerate() {
-                for (response, change) in
-                    self.responses[i * stride..].iter().zip(&self.constraint_residual)
-                {
-                    *r -= response * change;
-                }
-            }
+        self.constraint_residual.copy_from_slice(&self.end.value);
+        let [r1, r2] = [&mut self.residual, &mut self.constraint_residual];
+        self.kkt.solve(model, &self.end, r1, r2);
+        for (lambda, change) in self.multipliers.iter_mut().zip(&self.constraint_residual) {
+            *lambda += change;
         }
         for (x, r) in self.increment.iter_mut().zip(&self.residual) {
             *x -= r;
@@ -435,13 +379,11 @@ impl Workspace {
             self.turn_impulse(model, settings);
         }
         if model.dimensions.constraints > 0 {
-            if !self.in_loops {
-                // The extrapolated guess has the least norm of other configurations.
-                self.schur.remove_null(&mut self.multipliers);
-            }
+            // The extrapolated guess has the least norm of other configurations.
+            self.kkt.remove_null(&mut self.multipliers);
             self.start.subtract_pushes(model, &self.multipliers, &mut self.impulse);
         }
-        self.estimates.write(&mut report);
+        self.kkt.estimates.write(&mut report);
         Ok(report)
     }
 

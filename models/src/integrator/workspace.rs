@@ -4,13 +4,10 @@ use std::f64::consts::TAU;
 
 use crate::constraints::closure::Closure;
 use crate::integrator::blocks::StepBlocks;
-use crate::integrator::report::StepReport;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
-use crate::kkt::factors::Factors;
-use crate::kkt::schur::room_for_schur;
+use crate::kkt::system::KktSystem;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rows::{Term, padded, spread};
 use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
@@ -66,10 +63,8 @@ pub(crate) struct Workspace {
     pub(crate) constraint_residual: Vec<f64>,
     /// At the midpoint.
     pub(crate) mechanics: Mechanics,
-    pub(crate) factors: Factors,
-    /// What springs and dampers of coordinates add to its diagonal.
-    pub(crate) diagonal: Vec<f64>,
-    /// The same for the linearization: of the residual by the start, of the momentum by the increment.
+    pub(crate) kkt: KktSystem,
+    /// What springs and dampers of coordinates add to the linearization: of the residual by the start, of the momentum by the increment.
     pub(crate) diagonals: [Vec<f64>; 2],
     /// Constraints at `q[k]`.
     pub(crate) start: Closure,
@@ -79,11 +74,6 @@ pub(crate) struct Workspace {
     pub(crate) end: Closure,
     /// `end` holds the constraints, Jacobian included, at the solution.
     pub(crate) end_is_exact: bool,
-    /// `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
-    pub(crate) responses: Vec<f64>,
-    pub(crate) schur: PivotedLu,
-    /// The last factorization was one of loops, not of `K` and `S`.
-    pub(crate) in_loops: bool,
     /// `Σ λ D²h`, for the linearization.
     pub(crate) constraint_hessian: Vec<f64>,
     /// `½h L_qq + L_qv`, for the linearization, row-major.
@@ -91,25 +81,6 @@ pub(crate) struct Workspace {
     /// `h L_qq`, for the linearization, row-major.
     pub(crate) stiffness: Vec<f64>,
     pub(crate) terms: Vec<Term>,
-    pub(crate) estimates: Estimates,
-}
-
-/// Reciprocal condition estimates of the last factorization.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Estimates {
-    pub(crate) matrix: f64,
-    pub(crate) constraints: f64,
-    pub(crate) redundant: u32,
-}
-
-impl Estimates {
-    pub(crate) const NONE: Self = Self { matrix: 1.0, constraints: 1.0, redundant: 0 };
-
-    pub(crate) fn write(&self, report: &mut StepReport) {
-        report.reciprocal_condition = self.matrix;
-        report.constraint_reciprocal_condition = self.constraints;
-        report.redundant_constraints = self.redundant;
-    }
 }
 
 impl Workspace {
@@ -148,21 +119,16 @@ impl Workspace {
             round_off: 0.0,
             constraint_residual: zeros(nc),
             mechanics: Mechanics::new(model),
-            factors: Factors::new(model),
-            diagonal: zeros(nd),
+            kkt: KktSystem::new(model, spread(padded(2 * n))),
             diagonals: [zeros(nd), zeros(nd)],
             start: Closure::new(model),
             start_is_valid: false,
             end: Closure::new(model),
             end_is_exact: false,
-            responses: zeros(nd * padded(nc)),
-            schur: room_for_schur(model, spread(padded(2 * n))),
-            in_loops: false,
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),
             stiffness: zeros(nd * nd),
             terms: Vec::with_capacity(nd.max(nc)),
-            estimates: Estimates::NONE,
         }
     }
 }

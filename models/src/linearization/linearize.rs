@@ -27,6 +27,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
+use crate::kkt::system::Factors;
 use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rows::{Term, padded, spread};
@@ -148,10 +149,10 @@ impl SolvedStep {
         }
         if !self.multipliers.is_empty() {
             self.multipliers.copy_from_slice(&workspace.multipliers);
-            self.in_loops = workspace.in_loops;
+            self.in_loops = workspace.kkt.valid == Factors::Recursion;
             if !self.in_loops {
-                self.responses.copy_from_slice(&workspace.responses);
-                self.schur.take_factors_of(&workspace.schur);
+                self.responses.copy_from_slice(&workspace.kkt.schur.responses);
+                self.schur.take_factors_of(&workspace.kkt.schur.lu);
             }
         }
     }

@@ -2,6 +2,7 @@
 
 use crate::integrator::report::StepError;
 use crate::integrator::workspace::{StepContext, Workspace};
+use crate::kkt::system::Recursion;
 use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::potentials;
@@ -49,12 +50,12 @@ impl Workspace {
         out.kind = Kind::Step;
         out.time_step_s = at.settings.time_step_s;
         out.at_start = at.settings.force_split.at_start();
-        if self.factors.planar().is_some() {
-            self.linearize_by_generators(at, out)?;
-            out.solved.remember(self, at);
-            return Ok(());
-        }
-        if self.linearize_loops(at, out) {
+        let is_done = match self.kkt.recursion {
+            Recursion::Planar(_) => self.linearize_planar(at, out)?,
+            Recursion::Loops(_) => self.linearize_loops(at, out)?,
+            Recursion::None | Recursion::Spatial(_) => false,
+        };
+        if is_done {
             out.solved.remember(self, at);
             return Ok(());
         }
@@ -66,12 +67,7 @@ impl Workspace {
             || at.model.forces.is_some()
             || !at.model.orientations.is_empty();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
-        self.factors.matrix.solve_rows(
-            &at.model.elimination,
-            &mut out.increment,
-            out.stride,
-            columns,
-        );
+        self.kkt.tree.solve_rows(&at.model.elimination, &mut out.increment, out.stride, columns);
         if d.constraints > 0 {
             self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
@@ -83,26 +79,28 @@ impl Workspace {
         Ok(())
     }
 
-    /// The same in O(n²), for planar trees without constraints and prescribed coordinates.
-    fn linearize_by_generators(
+    /// Linearizes in O(n²), for planar trees without constraints and prescribed coordinates.
+    fn linearize_planar(
         &mut self,
         at: StepContext<'_>,
         out: &mut Linearization,
-    ) -> Result<(), StepError> {
+    ) -> Result<bool, StepError> {
         let model = at.model;
-        self.factor_generators(model, at.settings)?;
+        if !self.factor_recursion(model, at.settings)? {
+            return Ok(false);
+        }
         self.fill_inputs(at, out);
         let tree = self.mechanics.planar.as_deref().and_then(PlanarTree::many);
-        let (Some(tree), Some(joints), Some(generators)) =
-            (tree, &model.planar, self.factors.planar())
+        let (Some(tree), Some(joints), Recursion::Planar(recursion)) =
+            (tree, &model.planar, &mut self.kkt.recursion)
         else {
-            return Ok(());
+            return Ok(false);
         };
         let [residual, momentum] = &self.diagonals;
         let diagonal = planar::Diagonal { residual, momentum };
         let (increment, momentum) = (&mut out.increment, &mut out.momentum);
-        generators.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
-        Ok(())
+        recursion.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
+        Ok(true)
     }
 
     /// Impulses of inputs, and the diagonals of springs and dampers of coordinates.
@@ -128,21 +126,25 @@ impl Workspace {
         }
     }
 
-    /// The same with loops, where their pivots allow it: O(n²) where their fronts do not grow.
-    fn linearize_loops(&mut self, at: StepContext<'_>, out: &mut Linearization) -> bool {
+    /// Linearizes with loops, where their pivots allow it: O(n²) where their fronts do not grow.
+    fn linearize_loops(
+        &mut self,
+        at: StepContext<'_>,
+        out: &mut Linearization,
+    ) -> Result<bool, StepError> {
         let StepContext { model, settings, state, .. } = at;
-        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
+        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return Ok(false) };
         self.finish_end(model, state);
-        if !self.factor_loops(model, settings) {
-            return false;
+        if !self.factor_recursion(model, settings)? {
+            return Ok(false);
         }
         self.start.hessian(model, &state.q, &self.multipliers, &mut self.constraint_hessian);
         self.fill_inputs(at, out);
         let tree = self.mechanics.planar.as_deref().and_then(PlanarTree::many);
-        let (Some(tree), Some(start), Some(end), Some(generators)) =
-            (tree, &self.start.in_plane, &self.end.in_plane, self.factors.loops())
+        let (Some(tree), Some(start), Some(end), Recursion::Loops(fronts)) =
+            (tree, &self.start.in_plane, &self.end.in_plane, &mut self.kkt.recursion)
         else {
-            return false;
+            return Ok(false);
         };
         let [residual, momentum] = &self.diagonals;
         let diagonal = planar::Diagonal { residual, momentum };
@@ -155,8 +157,8 @@ impl Workspace {
             stride: out.stride,
         };
         let mechanism = loops::Mechanism { loops, joints, tree, start, end };
-        generators.linearize(mechanism, &diagonal, &closures, derivatives);
-        true
+        fronts.linearize(mechanism, &diagonal, &closures, derivatives);
+        Ok(true)
     }
 
     wide! {
@@ -267,9 +269,8 @@ impl Workspace {
         let Some(forces) = &at.model.forces else { return };
         let h = at.settings.time_step_s;
         let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
-        let mut slopes = std::mem::take(&mut self.end_slopes);
-        let mut stiffness = std::mem::take(&mut self.stiffness);
-        let instant = self.instant(at.model);
+        let Self { mechanics, velocity, inputs, end_slopes: slopes, stiffness, .. } = self;
+        let instant = mechanics.instant(at.model, velocity, inputs);
         forces.for_each_derivative(&instant, |row, column, by_q, by_v| {
             if row < nd && column < nd {
                 out.increment[row * stride + column] += a * h * by_q;
@@ -290,7 +291,6 @@ impl Workspace {
                 (place.residual, place.momentum) = (a * h * by_u, h * by_u);
             }
         });
-        (self.end_slopes, self.stiffness) = (slopes, stiffness);
     }
 
     /// The constraints' impulses turn with the start configuration.
@@ -334,9 +334,9 @@ impl Workspace {
             self.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
             add_rows(target, &out.increment, stride, &self.terms);
         }
-        self.schur.solve_rows(&mut out.multipliers, stride);
+        self.kkt.schur.lu.solve_rows(&mut out.multipliers, stride);
         for (i, target) in out.increment.chunks_exact_mut(stride).enumerate() {
-            let responses = self.responses[i * padded(nc)..][..nc].iter().enumerate();
+            let responses = self.kkt.schur.responses[i * padded(nc)..][..nc].iter().enumerate();
             self.terms.clear();
             self.terms.extend(responses.map(|(c, r)| (-r, c)));
             add_rows(target, &out.multipliers, stride, &self.terms);

@@ -6,12 +6,11 @@ use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settings};
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::schur::fill_schur;
+use crate::kkt::system::KktSystem;
 use crate::lagrangian::energy::{Energy, potential_energy};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rotation::Quaternion;
-use crate::math::rows::padded;
 use crate::math::spatial::{Vec3, three};
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
@@ -413,18 +412,17 @@ impl Workspace {
             &self.mechanics.poses,
             &self.mechanics.momenta,
         );
-        self.factors.matrix.clear();
+        self.kkt.tree.clear();
         self.mechanics.curvature.fill_mass_matrix(
             &model.pairs,
             &self.mechanics.momenta,
-            &mut self.factors.matrix,
+            &mut self.kkt.tree,
         );
-        let pivot =
-            self.factors.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
+        let pivot = self.kkt.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.iter_mut().enumerate() {
             *r = state.p[i] - self.l_v[i];
         }
-        self.factors.matrix.solve(&model.elimination, &mut self.residual);
+        self.kkt.tree.solve(&model.elimination, &mut self.residual);
         if d.constraints > 0 {
             self.project_velocity(model, state);
         }
@@ -434,24 +432,16 @@ impl Workspace {
     /// Takes the part of the velocity away that violates `Dh q̇ = 0`.
     fn project_velocity(&mut self, model: &Model, state: &PreciseState) {
         let n = model.dimensions.coordinates();
-        let stride = padded(model.dimensions.constraints);
         self.prepare_start(model, state);
-        self.find_responses(model);
-        fill_schur(model, &self.start, &self.responses, &mut self.schur);
-        self.schur.factor();
+        let KktSystem { tree, schur, .. } = &mut self.kkt;
+        schur.factor(model, tree, [&self.start; 2]);
         let rows = self.start.jacobian.chunks(n);
         for (rate, row) in self.constraint_residual.iter_mut().zip(rows) {
             let velocity = self.residual.iter().chain(&state.v);
             *rate = row.iter().zip(velocity).map(|(entry, v)| entry * v).sum();
         }
-        self.schur.solve(&mut self.constraint_residual);
-        for (i, v) in self.residual.iter_mut().enumerate() {
-            for (response, weight) in
-                self.responses[i * stride..].iter().zip(&self.constraint_residual)
-            {
-                *v -= response * weight;
-            }
-        }
+        schur.lu.solve(&mut self.constraint_residual);
+        schur.subtract_responses(&self.constraint_residual, &mut self.residual);
     }
 }
 

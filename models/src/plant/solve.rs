@@ -151,7 +151,7 @@ pub(crate) fn take(
         let mut report = workspace.solve(at)?;
         if let Some(out) = out {
             workspace.linearize(at, out)?;
-            workspace.estimates.write(&mut report);
+            workspace.kkt.estimates.write(&mut report);
         }
         return Ok(report);
     };

@@ -7,7 +7,7 @@ use crate::integrator::scheme::{Scheme, Tableau};
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
-use crate::kkt::factors::Factors;
+use crate::kkt::system::KktSystem;
 use crate::model::mechanism::Model;
 
 /// A residual that falls by less than this from one sweep to the next falls too slowly.
@@ -28,7 +28,7 @@ struct Stage {
     /// `Y_i` and `P_i`.
     increment: Vec<f64>,
     impulse: Vec<f64>,
-    factors: Factors,
+    kkt: KktSystem,
 }
 
 impl Sweep {
@@ -37,7 +37,7 @@ impl Sweep {
         let stage = || Stage {
             increment: vec![0.0; d.dynamic],
             impulse: vec![0.0; d.dynamic],
-            factors: Factors::new(model),
+            kkt: KktSystem::new(model, 0),
         };
         Self {
             stages: (0..stages).map(|_| stage()).collect(),
@@ -86,12 +86,13 @@ impl Sweep {
                 size = size.max(residual);
                 if report.iterations == 1 {
                     let settings = stage_settings(settings, tableau.weights[i]);
-                    workspace.factor_generators(model, &settings)?;
-                    std::mem::swap(&mut workspace.factors, &mut self.stages[i].factors);
+                    workspace.factor(model, &settings, state)?;
+                    std::mem::swap(&mut workspace.kkt, &mut self.stages[i].kkt);
+                    workspace.kkt.estimates = self.stages[i].kkt.estimates;
                     report.factorizations += 1;
                 }
                 let stage = &mut self.stages[i];
-                stage.factors.solve(model, &mut workspace.residual);
+                stage.kkt.solve(model, &workspace.end, &mut workspace.residual, &mut []);
                 for (y, correction) in stage.increment.iter_mut().zip(&workspace.residual) {
                     *y -= correction;
                 }

@@ -10,6 +10,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::loops::{Closures, Derivatives, Mechanism, Scales};
 use crate::kkt::planar::{Diagonal, MatrixKind};
+use crate::kkt::system::{Factors, Recursion};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
@@ -211,7 +212,10 @@ fn loops_move_and_linearize_as_with_dense_matrices() {
         for _ in 0..20 {
             slow.restore(&fast.snapshot()).unwrap();
             let report = fast.step_and_linearize(&u, &mut a).unwrap();
-            assert!(fast.workspace.in_loops && !slow.workspace.in_loops);
+            assert!(
+                [&fast, &slow].map(|p| p.workspace.kkt.valid)
+                    == [Factors::Recursion, Factors::Tree]
+            );
             assert!(report.constraint_reciprocal_condition > 1e-9);
             slow.step_and_linearize(&u, &mut b).unwrap();
             let name = &scene.name;
@@ -239,7 +243,7 @@ fn dense_matrices_stand_in_for_loops() {
         for _ in 0..10 {
             refused.step(&u).unwrap();
             slow.step(&u).unwrap();
-            assert!(!refused.workspace.in_loops);
+            assert_eq!(refused.workspace.kkt.valid, Factors::Tree);
             assert_near(refused.q(), slow.q(), 1e-9, &scene.name);
         }
         refused.linearize(&u, &mut a).unwrap();
@@ -305,7 +309,7 @@ fn the_first_guess_is_that_of_dense_matrices() {
             let Plant { settings, state, workspace, .. } = &mut plant;
             workspace.prepare(StepContext { model: &model, settings, state, u: &u });
             workspace.ballistic(&model, settings, state);
-            assert_eq!(workspace.in_loops, model.loops.is_some());
+            assert_eq!(workspace.kkt.valid == Factors::Recursion, model.loops.is_some());
             workspace.increment.clone()
         });
         assert_near(&fast, &slow, 1e-9, &scene.name);
@@ -339,8 +343,7 @@ fn wider_registers_give_the_same_bits() {
         let mut out = Linearization::new(&model);
         plant.step(&vec![0.2; model.dimensions().input()]).unwrap();
         plant.linearize(&vec![0.2; model.dimensions().input()], &mut out).unwrap();
-        let Workspace { mechanics, start, end, factors, constraint_hessian, .. } =
-            &mut plant.workspace;
+        let Workspace { mechanics, start, end, kkt, constraint_hessian, .. } = &mut plant.workspace;
         let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
         let (loops, joints) = (model.loops.as_ref().unwrap(), model.planar.as_ref().unwrap());
         let at = Mechanism {
@@ -356,7 +359,8 @@ fn wider_registers_give_the_same_bits() {
         let closures = Closures { jacobian: &end.jacobian, hessian: constraint_hessian };
         let conditioning = &model.conditioning;
         let scales = Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
-        let mut wide = factors.loops().unwrap().clone();
+        let Recursion::Loops(fronts) = &kkt.recursion else { panic!("no fronts") };
+        let mut wide = fronts.clone();
         let mut narrow = wide.clone();
         wide.factor(at, &numbers, scales, 0.01, MatrixKind::Newton);
         narrow.factor_portable(at, &numbers, scales, 0.01, MatrixKind::Newton);

@@ -7,6 +7,7 @@ use nalgebra::DMatrix;
 use crate::builtin;
 use crate::integrator::settings::Settings;
 use crate::kkt::planar::Diagonal;
+use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
 use crate::math::rows::padded;
@@ -158,13 +159,13 @@ fn generators_stand_for_the_newton_matrix() {
     for model in [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3")] {
         let model = Arc::new(model);
         let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
-        assert!(fast.workspace.factors.generators.is_some(), "{}", model.scene.name);
+        assert!(fast.workspace.kkt.has_recursion(), "{}", model.scene.name);
         let n = model.dimensions.dynamic;
         let q = (0..n).map(|i| 0.3 * wave(i)).collect();
         let v = (0..n).map(|i| 0.1 * wave(i + 50)).collect();
         fast.initialize(&Initial::Velocity { q, v }).unwrap();
         let mut slow = fast.clone();
-        slow.workspace.factors.generators = None;
+        slow.workspace.kkt.recursion = Recursion::None;
         let mut by_generators = Linearization::new(&model);
         let mut by_entries = Linearization::new(&model);
         let u: Vec<f64> = (0..model.dimensions.input()).map(wave).collect();
@@ -200,7 +201,8 @@ fn linearizations_have_the_same_bits_in_any_register() {
         let (joints, stride) = (model.planar.as_ref().unwrap(), padded(2 * n));
         let numbers: Vec<f64> = (0..n).map(wave).collect();
         let diagonal = Diagonal { residual: &numbers, momentum: &numbers };
-        let mut wide = plant.workspace.factors.planar().unwrap().clone();
+        let Recursion::Planar(recursion) = &plant.workspace.kkt.recursion else { panic!() };
+        let mut wide = recursion.clone();
         let mut narrow = wide.clone();
         let [mut x, mut p, mut narrow_x, mut narrow_p] = [0; 4].map(|_| vec![0.0; n * stride]);
         wide.linearize(tree, joints, &diagonal, &mut x, &mut p, stride);
