@@ -82,9 +82,9 @@ impl Collocation {
             Some(report) => report,
             None => {
                 let system = system.get_or_insert_with(|| Box::new(System::new(at.model, tableau)));
-                system.begin(at, motion, inputs, &mut workspace.input_force);
+                system.begin(at, motion, inputs, &mut workspace.mid.input_force);
                 let report = system.correct(workspace, at, inputs)?;
-                let sums = [&mut *workspace.increment, &mut *workspace.impulse];
+                let sums = [&mut *workspace.step.increment, &mut *workspace.step.impulse];
                 system.finish(at.model, motion, sums)?;
                 report
             }
@@ -114,7 +114,7 @@ impl Collocation {
             let half = self.motion.len() / 2;
             let (velocities, forces) = self.motion.split_at_mut(half);
             for velocities in velocities.chunks_exact_mut(d.dynamic.max(1)) {
-                let pairs = velocities.iter_mut().zip(&workspace.increment);
+                let pairs = velocities.iter_mut().zip(&workspace.step.increment);
                 pairs.for_each(|(v, x)| *v = x / h);
             }
             forces.fill(0.0);

@@ -21,18 +21,18 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) -> Result<(), StepError> {
-        self.end.place_in_plane(model, &self.q_end);
+        self.constraints.end.place_in_plane(model, &self.step.q_end);
         if self.factor_recursion(model, settings)? {
             return Ok(());
         }
-        if self.start.in_plane.is_some() {
+        if self.constraints.start.in_plane.is_some() {
             // By all joints together what is singular may not be, and if it is it gets its name.
-            self.start.differentiate(model, &state.q);
-            self.start.place_in_plane(model, &state.q);
+            self.constraints.start.differentiate(model, &state.q);
+            self.constraints.start.place_in_plane(model, &state.q);
         }
         self.factor_newton_matrix(model, settings)?;
         if model.dimensions.constraints > 0 {
-            self.end.differentiate(model, &self.q_end);
+            self.constraints.end.differentiate(model, &self.step.q_end);
             if !model.orientations.is_empty() {
                 self.turn_end_jacobian(model);
             }
@@ -44,15 +44,16 @@ impl Workspace {
     /// Whether the pivots of loops are sound at rest, where the constraints are known to be regular.
     pub(crate) fn can_eliminate_loops(&mut self, model: &Model) -> bool {
         let q = &model.conditioning.regular;
-        for (closure, q_there) in
-            [(&mut self.start, &mut self.q_mid), (&mut self.end, &mut self.q_end)]
-        {
+        for (closure, q_there) in [
+            (&mut self.constraints.start, &mut self.mid.q),
+            (&mut self.constraints.end, &mut self.step.q_end),
+        ] {
             q_there.copy_from_slice(q);
             closure.evaluate(model, q, &[]);
             closure.place_in_plane(model, q);
         }
-        self.angles.copy_from_slice(q);
-        self.evaluate_lagrangian(model);
+        self.mid.angles.copy_from_slice(q);
+        self.mid.evaluate(model);
         matches!(self.factor_recursion(model, &Settings::new(model)), Ok(true))
     }
 
@@ -67,8 +68,8 @@ impl Workspace {
             return Ok(false);
         }
         self.fill_diagonal(model, settings);
-        let constraints = [&self.start, &self.end];
-        let at = linearized(model, settings, &mut self.mechanics, constraints);
+        let constraints = [&self.constraints.start, &self.constraints.end];
+        let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
         self.kkt
             .factor_recursion(at, MatrixKind::Newton)
             .map_err(|pivot| model.singular_matrix(pivot))
@@ -77,8 +78,8 @@ impl Workspace {
     /// Factors the mass matrix by the recursion, with the constraints at the start; whether that went well.
     pub(super) fn factor_masses(&mut self, model: &Model, settings: &Settings) -> bool {
         self.kkt.diagonal.fill(0.0);
-        let constraints = [&self.start, &self.start];
-        let at = linearized(model, settings, &mut self.mechanics, constraints);
+        let constraints = [&self.constraints.start, &self.constraints.start];
+        let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
         matches!(self.kkt.factor_recursion(at, MatrixKind::Mass), Ok(true))
     }
 
@@ -92,13 +93,13 @@ impl Workspace {
         if model.potentials.couple_branches || model.forces.is_some() {
             self.kkt.tree.clear();
         }
-        self.mechanics.differentiate(model);
-        if let (Some(planar), Some(joints)) = (&mut self.mechanics.planar, &model.planar) {
+        self.mid.mechanics.differentiate(model);
+        if let (Some(planar), Some(joints)) = (&mut self.mid.mechanics.planar, &model.planar) {
             planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.kkt.tree);
         } else {
-            self.mechanics.curvature.fill_newton_matrix(
+            self.mid.mechanics.curvature.fill_newton_matrix(
                 &model.pairs,
-                &self.mechanics.momenta,
+                &self.mid.mechanics.momenta,
                 model.gravity,
                 h,
                 &mut self.kkt.tree,
@@ -108,8 +109,8 @@ impl Workspace {
             potentials::add_to_newton_matrix(
                 &model.potentials,
                 &model.dynamics,
-                &self.mechanics.poses,
-                &self.q_mid,
+                &self.mid.mechanics.poses,
+                &self.mid.q,
                 h,
                 &model.elimination,
                 &mut self.kkt.tree,
@@ -145,8 +146,8 @@ impl Workspace {
             potentials::for_each_second_derivative(
                 &model.potentials,
                 &model.dynamics,
-                &self.mechanics.poses,
-                &self.q_mid,
+                &self.mid.mechanics.poses,
+                &self.mid.q,
                 |i, _, value| diagonal[i] -= 0.25 * h * value,
             );
         }
@@ -160,7 +161,7 @@ impl Workspace {
     fn add_forces_to_newton_matrix(&mut self, model: &Model, forces: &Forces, settings: &Settings) {
         let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
         let dynamic = model.dimensions.dynamic;
-        let instant = self.mechanics.instant(model, &self.velocity, &self.inputs);
+        let instant = self.mid.mechanics.instant(model, &self.mid.velocity, &self.mid.inputs);
         let matrix = &mut self.kkt.tree;
         forces.for_each_derivative(&instant, |i, j, by_q, by_v| {
             if i < dynamic && j < dynamic {
@@ -194,12 +195,12 @@ impl Workspace {
         settings: &Settings,
     ) -> Result<(), StepError> {
         let Settings { time_step_s, singular_below, .. } = *settings;
-        let constraints = [&self.start, &self.end];
+        let constraints = [&self.constraints.start, &self.constraints.end];
         if self.kkt.factor_schur(model, constraints, time_step_s, singular_below) {
             return Ok(());
         }
         let SchurComplement { responses, lu } = &mut self.kkt.schur;
-        fill_schur(model, &self.end, responses, lu);
+        fill_schur(model, &self.constraints.end, responses, lu);
         Err(model.singular_constraints(&lu.matrix, self.kkt.estimates.constraints))
     }
 }

@@ -46,13 +46,13 @@ impl Collocation {
                 terms: Vec::new(),
             })
         });
-        system.begin(at, &self.motion, &self.inputs, &mut workspace.input_force);
+        system.begin(at, &self.motion, &self.inputs, &mut workspace.mid.input_force);
         system.evaluate(workspace, at, &self.inputs);
         system.differentiate(workspace, at, &self.inputs);
         for i in 0..count {
             system.place(workspace, at.state, i);
-            tangents.q[i * n..][..n].copy_from_slice(&workspace.q_mid);
-            tangents.velocity[i * n..][..n].copy_from_slice(&workspace.velocity);
+            tangents.q[i * n..][..n].copy_from_slice(&workspace.mid.q);
+            tangents.velocity[i * n..][..n].copy_from_slice(&workspace.mid.velocity);
         }
         tangents.inputs.copy_from_slice(&self.inputs);
         workspace.prepare(at);

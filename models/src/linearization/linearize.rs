@@ -137,18 +137,18 @@ impl SolvedStep {
         self.settings = *at.settings;
         for (to, from) in [
             (&mut self.q, &at.state.q[..]),
-            (&mut self.increment, &workspace.increment),
+            (&mut self.increment, &workspace.step.increment),
             (&mut self.next, next),
             (&mut self.inputs, inputs),
         ] {
             to.copy_from_slice(from);
         }
         if !self.orientations.is_empty() {
-            self.orientations.copy_from_slice(&workspace.orientations_start);
-            self.turns.copy_from_slice(&workspace.turns);
+            self.orientations.copy_from_slice(&workspace.balls.start);
+            self.turns.copy_from_slice(&workspace.balls.turns);
         }
         if !self.multipliers.is_empty() {
-            self.multipliers.copy_from_slice(&workspace.multipliers);
+            self.multipliers.copy_from_slice(&workspace.step.multipliers);
             self.in_loops = workspace.kkt.valid == Factors::Recursion;
             if !self.in_loops {
                 self.responses.copy_from_slice(&workspace.kkt.schur.responses);

@@ -48,7 +48,8 @@ impl Plant {
         let constraint_rank = d.constraints - redundant_constraints.len();
         // Leaves poses and momenta at the velocity.
         let energy = self.energy();
-        let (poses, momenta) = (&self.workspace.mechanics.poses, &self.workspace.mechanics.momenta);
+        let (poses, momenta) =
+            (&self.workspace.mid.mechanics.poses, &self.workspace.mid.mechanics.momenta);
         let (mut linear, mut angular) = (Vec3::ZERO, Vec3::ZERO);
         let (mut moment, mut mass) = (Vec3::ZERO, 0.0);
         for (i, joint) in model.dynamics.joints.iter().enumerate().filter(|(i, j)| j.root == *i) {

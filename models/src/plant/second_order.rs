@@ -118,7 +118,7 @@ impl Plant {
             for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
                 let row = &mut row[..columns];
                 row.iter_mut().for_each(|entry| *entry = -*entry);
-                let jacobian = &workspace.end.jacobian[c * n..][..nd];
+                let jacobian = &workspace.constraints.end.jacobian[c * n..][..nd];
                 terms.clear();
                 terms.extend(non_zero(jacobian.iter().copied()));
                 add_rows(row, residual, stride, terms);
@@ -138,7 +138,7 @@ impl Plant {
             // What these make of the momentum.
             for (i, row) in momentum.chunks_exact_mut(stride).enumerate() {
                 let slopes = blocks.momentum_next[i * n..][..nd].iter().map(|entry| entry.re);
-                let impulses = (0..nc).map(|c| -workspace.start.jacobian[c * n + i]);
+                let impulses = (0..nc).map(|c| -workspace.constraints.start.jacobian[c * n + i]);
                 terms.clear();
                 terms.extend(non_zero(slopes.chain(impulses)));
                 add_rows(&mut row[..columns], solved, stride, terms);

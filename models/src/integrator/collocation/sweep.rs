@@ -69,7 +69,7 @@ impl Sweep {
         self.base.q.copy_from_slice(&state.q);
         self.base.p.copy_from_slice(&state.p);
         if ni > 0 {
-            workspace.set_inputs(model, &u[..ni]);
+            workspace.mid.set_inputs(model, &u[..ni]);
         }
         let enough = settings.precision.residual();
         let mut report = StepReport::default();
@@ -92,8 +92,14 @@ impl Sweep {
                     report.factorizations += 1;
                 }
                 let stage = &mut self.stages[i];
-                stage.kkt.solve(model, &workspace.end, &mut workspace.residual, &mut []);
-                for (y, correction) in stage.increment.iter_mut().zip(&workspace.residual) {
+                stage.kkt.solve(
+                    model,
+                    &workspace.constraints.end,
+                    &mut workspace.residual.dynamics,
+                    &mut [],
+                );
+                for (y, correction) in stage.increment.iter_mut().zip(&workspace.residual.dynamics)
+                {
                     *y -= correction;
                 }
             }
@@ -150,9 +156,9 @@ impl Sweep {
             input[..d.inputs].copy_from_slice(&inputs[i * d.inputs..][..d.inputs]);
             workspace.prepare(StepContext { model, settings: &settings, state: base, u: input });
         }
-        workspace.increment.copy_from_slice(&stages[i].increment);
+        workspace.step.increment.copy_from_slice(&stages[i].increment);
         let residual = workspace.evaluate(model, &settings, base);
-        let forces = workspace.l_q.iter().zip(&workspace.force);
+        let forces = workspace.mid.l_q.iter().zip(&workspace.mid.force);
         for (impulse, (l_q, force)) in stages[i].impulse.iter_mut().zip(forces) {
             *impulse = settings.time_step_s * (l_q + force);
         }
@@ -171,13 +177,13 @@ impl Sweep {
         for stage in &self.stages {
             at.model.check_turns(&stage.increment)?;
         }
-        workspace.increment.fill(0.0);
-        workspace.impulse.fill(0.0);
+        workspace.step.increment.fill(0.0);
+        workspace.step.impulse.fill(0.0);
         for (i, stage) in self.stages.iter().enumerate() {
             let rate = 1.0 / (at.settings.time_step_s * tableau.weights[i]);
             for k in 0..nd {
-                workspace.increment[k] += stage.increment[k];
-                workspace.impulse[k] += stage.impulse[k];
+                workspace.step.increment[k] += stage.increment[k];
+                workspace.step.impulse[k] += stage.impulse[k];
                 motion[i * nd + k] = rate * stage.increment[k];
                 motion[(count + i) * nd + k] = rate * stage.impulse[k];
             }

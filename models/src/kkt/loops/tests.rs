@@ -310,7 +310,7 @@ fn the_first_guess_is_that_of_dense_matrices() {
             workspace.prepare(StepContext { model: &model, settings, state, u: &u });
             workspace.ballistic(&model, settings, state);
             assert_eq!(workspace.kkt.valid == Factors::Recursion, model.loops.is_some());
-            workspace.increment.clone()
+            workspace.step.increment.clone()
         });
         assert_near(&fast, &slow, 1e-9, &scene.name);
     }
@@ -329,8 +329,8 @@ fn impulses_are_those_of_the_jacobian() {
         let d = model.dimensions();
         let multipliers: Vec<f64> = (0..d.constraints).map(|i| (i as f64 + 0.5).cos()).collect();
         let [mut by_wrenches, mut by_entries] = [0; 2].map(|_| vec![0.0; d.dynamic]);
-        workspace.start.subtract_pushes(&model, &multipliers, &mut by_wrenches);
-        workspace.start.subtract_impulses(&model, &multipliers, &mut by_entries);
+        workspace.constraints.start.subtract_pushes(&model, &multipliers, &mut by_wrenches);
+        workspace.constraints.start.subtract_impulses(&model, &multipliers, &mut by_entries);
         assert_near(&by_wrenches, &by_entries, 1e-13, &scene.name);
     }
 }
@@ -343,7 +343,9 @@ fn wider_registers_give_the_same_bits() {
         let mut out = Linearization::new(&model);
         plant.step(&vec![0.2; model.dimensions().input()]).unwrap();
         plant.linearize(&vec![0.2; model.dimensions().input()], &mut out).unwrap();
-        let Workspace { mechanics, start, end, kkt, constraint_hessian, .. } = &mut plant.workspace;
+        let Workspace { mid, constraints, kkt, tangents, .. } = &mut plant.workspace;
+        let (mechanics, start, end) = (&mid.mechanics, &constraints.start, &constraints.end);
+        let constraint_hessian = &tangents.constraint_hessian;
         let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
         let (loops, joints) = (model.loops.as_ref().unwrap(), model.planar.as_ref().unwrap());
         let at = Mechanism {
@@ -432,7 +434,7 @@ fn singular_loops_are_named() {
     let d = model.dimensions();
     let q = vec![0.0; d.coordinates()];
     let workspace = &mut plant.workspace;
-    for closure in [&mut workspace.start, &mut workspace.end] {
+    for closure in [&mut workspace.constraints.start, &mut workspace.constraints.end] {
         closure.evaluate(&model, &q, &[]);
         closure.differentiate(&model, &q);
         closure.place_in_plane(&model, &q);

@@ -80,20 +80,20 @@ fn gradients_and_second_derivatives_are_those_in_space() {
             planar.differentiate(joints);
         }
         let workspace = &mut spatial.workspace;
-        workspace.mechanics.poses.evaluate(&model.dynamics, &q, &[]);
+        workspace.mid.mechanics.poses.evaluate(&model.dynamics, &q, &[]);
         let (mut in_space_q, mut in_space_v) = (vec![0.0; nd], vec![0.0; nd]);
-        workspace.mechanics.momenta.gradient(
+        workspace.mid.mechanics.momenta.gradient(
             &model.dynamics,
-            &workspace.mechanics.poses,
+            &workspace.mid.mechanics.poses,
             &v,
             model.gravity,
             &mut in_space_q,
             &mut in_space_v,
         );
-        workspace.mechanics.curvature.evaluate(
+        workspace.mid.mechanics.curvature.evaluate(
             &model.dynamics,
-            &workspace.mechanics.poses,
-            &workspace.mechanics.momenta,
+            &workspace.mid.mechanics.poses,
+            &workspace.mid.mechanics.momenta,
         );
         let size = |x: &[f64]| 1.0 + x.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
         for i in 0..nd {
@@ -103,8 +103,8 @@ fn gradients_and_second_derivatives_are_those_in_space() {
         for descendant in 0..joints.len() {
             for ancestor in model.dynamics.path(descendant) {
                 let a = planar.pair(joints, ancestor, descendant);
-                let b = workspace.mechanics.curvature.pair(
-                    &workspace.mechanics.momenta,
+                let b = workspace.mid.mechanics.curvature.pair(
+                    &workspace.mid.mechanics.momenta,
                     model.gravity,
                     ancestor,
                     descendant,
@@ -196,7 +196,7 @@ fn linearizations_have_the_same_bits_in_any_register() {
         let n = model.dimensions.dynamic;
         let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
         plant.step(&vec![0.0; model.dimensions.input()]).unwrap();
-        let mechanics = &plant.workspace.mechanics;
+        let mechanics = &plant.workspace.mid.mechanics;
         let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
         let (joints, stride) = (model.planar.as_ref().unwrap(), padded(2 * n));
         let numbers: Vec<f64> = (0..n).map(wave).collect();

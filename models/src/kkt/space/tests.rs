@@ -125,17 +125,18 @@ fn a_solution_satisfies_the_dense_system() {
         workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
         for trial in 0..5 {
             for i in 0..n {
-                workspace.q_mid[i] = wave(100 * trial + i);
-                workspace.angles[i] = workspace.q_mid[i];
-                workspace.velocity[i] = 3.0 * wave(1000 + 100 * trial + i);
+                workspace.mid.q[i] = wave(100 * trial + i);
+                workspace.mid.angles[i] = workspace.mid.q[i];
+                workspace.mid.velocity[i] = 3.0 * wave(1000 + 100 * trial + i);
             }
-            workspace.evaluate_lagrangian(&model);
+            workspace.mid.evaluate(&model);
             workspace.fill_newton_matrix(&model, &settings);
             let matrix = dense(&model, &workspace.kkt.tree);
             assert!(workspace.factor_recursion(&model, &settings).unwrap());
             assert_solves(&mut workspace, &model, &matrix);
 
-            let Workspace { mechanics, kkt, start, .. } = &mut workspace;
+            let Workspace { mid, kkt, constraints, .. } = &mut workspace;
+            let (mechanics, start) = (&mut mid.mechanics, &constraints.start);
             kkt.tree.clear();
             mechanics.curvature.fill_mass_matrix(&model.pairs, &mechanics.momenta, &mut kkt.tree);
             let masses = dense(&model, &kkt.tree) * (-1.0 / settings.time_step_s);
@@ -156,7 +157,7 @@ fn a_solution_satisfies_the_dense_system() {
 fn assert_solves(workspace: &mut Workspace, model: &Model, matrix: &DMatrix<f64>) {
     let b = DVector::from_fn(matrix.nrows(), |i, _| wave(i + 7));
     let mut x = b.clone();
-    workspace.kkt.solve(model, &workspace.end, x.as_mut_slice(), &mut []);
+    workspace.kkt.solve(model, &workspace.constraints.end, x.as_mut_slice(), &mut []);
     let exact = matrix.clone().lu().solve(&b).unwrap();
     let error = (&x - &exact).amax() / exact.amax();
     assert!(error < 1e-9, "{} rows: {error:e}", matrix.nrows());
