@@ -21,30 +21,6 @@ use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
 
-/// The ball joints of a step.
-#[derive(Clone, Debug)]
-pub(crate) struct BallJoints {
-    /// Orientations at the start and at the end.
-    pub(crate) start: Vec<Mat3>,
-    pub(crate) end: Vec<Mat3>,
-    /// How they turn over the step, in their own axes.
-    pub(crate) turns: Vec<Vec3>,
-    /// Derivatives of the step, which are found with all coordinates in one; none without ball joints.
-    pub(crate) blocks: Option<Box<StepBlocks>>,
-}
-
-impl BallJoints {
-    pub(crate) fn new(model: &Model) -> Self {
-        let count = model.orientations.len();
-        Self {
-            start: vec![Mat3::IDENTITY; count],
-            end: vec![Mat3::IDENTITY; count],
-            turns: vec![Vec3::ZERO; count],
-            blocks: (count > 0).then(|| Box::new(StepBlocks::new(model))),
-        }
-    }
-}
-
 /// Writes where a step starts and what is next.
 fn place(
     blocks: &mut StepBlocks,

@@ -21,36 +21,15 @@
 use crate::integrator::midpoint::Midpoint;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::Workspace;
+use crate::integrator::workspace::{Residual, Workspace};
 use crate::math::norms::largest;
 use crate::math::rotation;
 use crate::math::scalar::side_by_side;
 use crate::math::simd::wide;
 use crate::math::spatial::three;
-use crate::model::mechanism::{Dimensions, Model};
-
-/// What a step's equations leave over; a correction takes its place.
-#[derive(Clone, Debug)]
-pub(crate) struct Residual {
-    /// `r1`, of the discrete Euler-Lagrange equations.
-    pub(crate) dynamics: Vec<f64>,
-    /// `r2 = h(q1)`.
-    pub(crate) constraints: Vec<f64>,
-    /// Magnitudes of what `r1` is the sum of, and the largest.
-    pub(crate) magnitudes: Vec<f64>,
-    pub(crate) round_off: f64,
-}
+use crate::model::mechanism::Model;
 
 impl Residual {
-    pub(crate) fn new(d: Dimensions) -> Self {
-        Self {
-            dynamics: vec![0.0; d.dynamic],
-            constraints: vec![0.0; d.constraints],
-            magnitudes: vec![0.0; d.dynamic],
-            round_off: 0.0,
-        }
-    }
-
     wide! {
         /// Sums up `r1 = p0 + D1Ld + F⁻`, without constraints, and the magnitudes; `half` is `½h`, `weight`
         /// is `a h`.

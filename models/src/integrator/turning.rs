@@ -23,7 +23,7 @@ pub(crate) struct Turning<S = f64> {
     /// How the midpoint turns, and the velocity changes, with the start: of a dynamic joint at fixed
     /// `ξ`, of a prescribed one at a fixed end.
     pub(crate) by_start: (Mat3<S>, Mat3<S>),
-    /// The same with what is next: `ξ` of a dynamic joint, the end of a prescribed one.
+    /// These maps with what is next: `ξ` of a dynamic joint, the end of a prescribed one.
     pub(crate) by_next: (Mat3<S>, Mat3<S>),
 }
 

@@ -1,13 +1,13 @@
 //! The memory of a step.
 
 use crate::constraints::closure::Closure;
-use crate::integrator::balls::BallJoints;
+use crate::integrator::blocks::StepBlocks;
 use crate::integrator::midpoint::Midpoint;
-use crate::integrator::residual::Residual;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::system::KktSystem;
 use crate::math::rows::{Term, padded, spread};
+use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 
 /// What a step is taken of.
@@ -44,6 +44,30 @@ pub(crate) struct StepIncrement {
     pub(crate) impulse: Vec<f64>,
     /// `q[k+1]`.
     pub(crate) q_end: Vec<f64>,
+}
+
+/// The ball joints of a step.
+#[derive(Clone, Debug)]
+pub(crate) struct BallJoints {
+    /// Orientations at the start and at the end.
+    pub(crate) start: Vec<Mat3>,
+    pub(crate) end: Vec<Mat3>,
+    /// How they turn over the step, in their own axes.
+    pub(crate) turns: Vec<Vec3>,
+    /// Derivatives of the step, which are found with all coordinates in one; none without ball joints.
+    pub(crate) blocks: Option<Box<StepBlocks>>,
+}
+
+/// What a step's equations leave over; a correction takes its place.
+#[derive(Clone, Debug)]
+pub(crate) struct Residual {
+    /// `r1`, of the discrete Euler-Lagrange equations.
+    pub(crate) dynamics: Vec<f64>,
+    /// `r2 = h(q1)`.
+    pub(crate) constraints: Vec<f64>,
+    /// Magnitudes of what `r1` is the sum of, and the largest.
+    pub(crate) magnitudes: Vec<f64>,
+    pub(crate) round_off: f64,
 }
 
 /// The constraints at both ends of a step.
@@ -91,6 +115,7 @@ impl Workspace {
     pub(crate) fn new(model: &Model) -> Self {
         let d = model.dimensions;
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
+        let no = model.orientations.len();
         let zeros = |len: usize| vec![0.0; len];
         Self {
             step: StepIncrement {
@@ -100,8 +125,18 @@ impl Workspace {
                 q_end: zeros(n),
             },
             mid: Midpoint::new(model),
-            balls: BallJoints::new(model),
-            residual: Residual::new(d),
+            balls: BallJoints {
+                start: vec![Mat3::IDENTITY; no],
+                end: vec![Mat3::IDENTITY; no],
+                turns: vec![Vec3::ZERO; no],
+                blocks: (no > 0).then(|| Box::new(StepBlocks::new(model))),
+            },
+            residual: Residual {
+                dynamics: zeros(nd),
+                constraints: zeros(nc),
+                magnitudes: zeros(nd),
+                round_off: 0.0,
+            },
             constraints: ConstraintPair { start: Closure::new(model), end: Closure::new(model) },
             kkt: KktSystem::new(model, spread(padded(2 * n))),
             tangents: Tangents {

@@ -14,6 +14,10 @@
 //! `ψ −= e λ`. What is eliminated is summed in a front, `[φ ψ 0] = A [ξ ω λ]`, with one row for each equation
 //! that is still open; a pivot takes the product of a column and a row away from it.
 
+mod column;
+
+use column::Column;
+
 use crate::constraints::in_plane::InPlane;
 use crate::kkt::planar::{Diagonal, MatrixKind, Method, PlanarRecursion, add_to, dot3, product};
 use crate::lagrangian::planar::{Fours, Joints, Vec2, Vec3, cross};
@@ -53,68 +57,7 @@ struct Closed {
     inverse: f64,
 }
 
-/// What a right-hand side is made of: a number, or several side by side.
-trait Side: Copy {
-    const ZERO: Self;
-    fn plus(self, other: Self) -> Self;
-    fn times(self, factor: f64) -> Self;
-    /// `Σ row_k x_k`; both lengths are whole blocks.
-    fn sum(row: &[f64], x: &[Self]) -> Self;
-}
-
-impl Side for f64 {
-    const ZERO: Self = 0.0;
-
-    #[inline(always)]
-    fn plus(self, other: Self) -> Self {
-        self + other
-    }
-
-    #[inline(always)]
-    fn times(self, factor: f64) -> Self {
-        self * factor
-    }
-
-    #[inline(always)]
-    fn sum(row: &[f64], x: &[f64]) -> f64 {
-        let mut sums = [0.0; LANES];
-        for (row, x) in row.as_chunks::<LANES>().0.iter().zip(x.as_chunks::<LANES>().0) {
-            for ((sum, row), x) in sums.iter_mut().zip(row).zip(x) {
-                *sum += row * x;
-            }
-        }
-        let [a, b, c, d, e, f, g, h] = sums;
-        ((a + e) + (b + f)) + ((c + g) + (d + h))
-    }
-}
-
-impl Side for Block {
-    const ZERO: Self = Block::ZERO;
-
-    #[inline(always)]
-    fn plus(self, other: Self) -> Self {
-        Block::plus(self, other)
-    }
-
-    #[inline(always)]
-    fn times(self, factor: f64) -> Self {
-        Block::times(self, factor)
-    }
-
-    #[inline(always)]
-    fn sum(row: &[f64], x: &[Block]) -> Block {
-        let mut sums = [Block::ZERO; 4];
-        for (row, x) in row.as_chunks::<LANES>().0.iter().zip(x.as_chunks::<LANES>().0) {
-            for (k, (row, x)) in row.iter().zip(x).enumerate() {
-                sums[k % 4] = sums[k % 4].plus(x.times(*row));
-            }
-        }
-        let [a, b, c, d] = sums;
-        a.plus(b).plus(c.plus(d))
-    }
-}
-
-/// The matrix.
+/// The KKT matrix of a mechanism with loops, factored front by front.
 #[derive(Clone, Debug)]
 pub(crate) struct Multifrontal {
     tree: PlanarRecursion,
@@ -128,7 +71,7 @@ pub(crate) struct Multifrontal {
     flows: Vec<f64>,
     sides: Vec<f64>,
     multipliers: Vec<f64>,
-    /// The same of a block of them.
+    /// Flows, sides and multipliers of a block of right-hand sides.
     block_flows: Vec<Block>,
     block_sides: Vec<Block>,
     block_multipliers: Vec<Block>,
@@ -375,6 +318,7 @@ impl Multifrontal {
                     .open(opened, [start, end].map(|closures| &closures.wrenches[opened.equation]));
             }
 
+            // D = K_jj + minusᵀ A plus,  U = upper + A plus,  W = lower + Aᵀ minus.
             let joint = &joints[i];
             let link = tree.link(i);
             let ([upper, lower], generator) = method.generator(&link, joint);
@@ -396,8 +340,10 @@ impl Multifrontal {
                 column[place + k] += upper[k];
                 row[place + k] += lower[k];
             }
+            // A −= U Wᵀ / D.
             front.eliminate(column, row, inverse);
 
+            // Equations that are closed here, the steepest first.
             let closing = take_first(&mut closed, step.closed.len());
             for (closed, &(equation, row)) in closing.iter_mut().zip(&step.closed) {
                 let weight = scales.weight[loops.equations[equation].constraint];
@@ -445,7 +391,7 @@ impl Multifrontal {
 
     /// From the leaves to the root.
     #[inline(always)]
-    fn eliminate<S: Side>(
+    fn eliminate<S: Column>(
         &self,
         loops: &Loops,
         x: &mut [S],
@@ -500,7 +446,7 @@ impl Multifrontal {
 
     /// From the root to the leaves.
     #[inline(always)]
-    fn substitute<S: Side>(
+    fn substitute<S: Column>(
         &self,
         loops: &Loops,
         x: &mut [S],
@@ -648,7 +594,7 @@ fn add_row(to: &mut [f64], factor: f64, from: &[f64]) {
 
 /// `to += factor · column`, over whole blocks.
 #[inline(always)]
-fn add_column<S: Side>(to: &mut [S], factor: S, column: &[f64]) {
+fn add_column<S: Column>(to: &mut [S], factor: S, column: &[f64]) {
     let column = column.as_chunks::<LANES>().0;
     for (to, column) in to.as_chunks_mut::<LANES>().0.iter_mut().zip(column) {
         for (to, column) in to.iter_mut().zip(column) {

@@ -112,7 +112,7 @@ impl Method {
     }
 }
 
-/// The matrix.
+/// The Newton matrix of a planar tree, factored.
 #[derive(Clone, Debug)]
 pub(crate) struct PlanarRecursion {
     generators: Vec<Generator>,
@@ -121,7 +121,7 @@ pub(crate) struct PlanarRecursion {
     pub(super) step: f64,
     /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
     branches: Vec<[Vec3; 3]>,
-    /// The same for a right-hand side, and what joints with several children pass down to them.
+    /// What branches pass of a right-hand side, and what joints with several children pass down to them.
     flows_of_branches: Vec<Vec3>,
     flow: Vec<Vec3>,
     /// Both for a block of right-hand sides; the first is that of the world. What goes up is zero but within a

@@ -43,7 +43,7 @@ struct Generator {
     w_over_d: Block,
 }
 
-/// The matrix.
+/// The Newton matrix of a tree in space, factored.
 #[derive(Clone, Debug)]
 pub(crate) struct SpatialRecursion {
     generators: Vec<Generator>,
@@ -52,7 +52,7 @@ pub(crate) struct SpatialRecursion {
     places: Vec<usize>,
     /// `A` by rows; zero but for joints whose elimination has begun.
     sums: Vec<[Block; 8]>,
-    /// The same for right-hand sides, and twists that belong to solutions.
+    /// Flows of right-hand sides, and twists that belong to solutions.
     flows: Vec<Block>,
     /// `e1` and `e2`.
     horizontal: [Vec3; 2],
