@@ -26,7 +26,7 @@ use crate::math::norms::largest;
 use crate::math::rotation;
 use crate::math::scalar::side_by_side;
 use crate::math::simd::wide;
-use crate::math::spatial::three;
+use crate::math::spatial::{Vec3, three};
 use crate::model::mechanism::Model;
 
 impl Residual {
@@ -98,6 +98,24 @@ impl Workspace {
         if !model.orientations.is_empty() {
             self.turn_impulse(model, settings);
         }
+    }
+
+    /// `p1 = D2Ld + F⁺ = L_v + ½h L_q + (1 − a) h f` at the last evaluation; allocates.
+    pub(crate) fn momentum_at_end(&self, model: &Model, settings: &Settings) -> Vec<f64> {
+        let (h, mid) = (settings.time_step_s, &self.mid);
+        let at_end = (1.0 - settings.force_split.at_start()) * h;
+        let torque = |i: usize| 0.5 * h * mid.l_q[i] + at_end * mid.force[i];
+        let mut momentum: Vec<f64> = (0..mid.l_v.len()).map(|i| mid.l_v[i] + torque(i)).collect();
+        for (turn, &i) in self.balls.turns.iter().zip(&model.orientations) {
+            if let Some(momentum) = momentum.get_mut(i..i + 3) {
+                let carried =
+                    rotation::momentum_at_start(*turn).apply_transposed(three(&mid.l_v, i));
+                let torque = Vec3([torque(i), torque(i + 1), torque(i + 2)]);
+                let torque = rotation::torque_at_start(*turn).apply_transposed(torque);
+                momentum.copy_from_slice(&(carried + torque).0);
+            }
+        }
+        momentum
     }
 
     /// The residual of ball joints, `p − N⁻ m + T⁻ (½h τ + a h f)`.

@@ -11,7 +11,7 @@ use crate::lagrangian::energy::{Energy, potential_energy};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rotation::Quaternion;
-use crate::math::spatial::{Vec3, three};
+use crate::math::spatial::three;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
 use crate::plant::facade::Plant;
@@ -193,24 +193,8 @@ impl Plant {
     /// `D2 Ld(q0, q1) + F⁺ = L_v + ½h L_q + (1 − a) h f`.
     fn momentum_between(&mut self, q0: &[f64], q1: &[f64], inputs: &[f64]) -> Vec<f64> {
         self.evaluate_between(q0, q1, inputs);
-        let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
-        let at_end = (1.0 - self.settings.force_split.at_start()) * h;
-        let torque = |i: usize| 0.5 * h * workspace.mid.l_q[i] + at_end * workspace.mid.force[i];
-        let mut momentum: Vec<f64> =
-            (0..workspace.mid.l_v.len()).map(|i| workspace.mid.l_v[i] + torque(i)).collect();
-        for (o, &i) in self.model.orientations.iter().enumerate() {
-            if let Some(momentum) = momentum.get_mut(i..i + 3) {
-                let turn = workspace.balls.turns[o];
-                let carried = rotation::momentum_at_start(turn)
-                    .apply_transposed(three(&workspace.mid.l_v, i));
-                let torque = rotation::torque_at_start(turn).apply_transposed(Vec3([
-                    torque(i),
-                    torque(i + 1),
-                    torque(i + 2),
-                ]));
-                momentum.copy_from_slice(&(carried + torque).0);
-            }
-        }
+        let workspace = &mut self.workspace;
+        let momentum = workspace.momentum_at_end(&self.model, &self.settings);
         workspace.mid.input_force.fill(0.0);
         workspace.mid.force.fill(0.0);
         momentum

@@ -158,10 +158,7 @@ impl Sweep {
         }
         workspace.step.increment.copy_from_slice(&stages[i].increment);
         let residual = workspace.evaluate(model, &settings, base);
-        let forces = workspace.mid.l_q.iter().zip(&workspace.mid.force);
-        for (impulse, (l_q, force)) in stages[i].impulse.iter_mut().zip(forces) {
-            *impulse = settings.time_step_s * (l_q + force);
-        }
+        workspace.mid.write_impulse(settings.time_step_s, &mut stages[i].impulse);
         residual
     }
 
