@@ -21,11 +21,14 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) -> Result<(), StepError> {
-        self.constraints.end.place_in_plane(model, &self.step.q_end);
+        let has_loops = self.constraints.end.in_plane.is_some();
+        if has_loops {
+            self.constraints.end.place_in_plane(model, &self.step.q_end);
+        }
         if self.factor_recursion(model, settings)? {
             return Ok(());
         }
-        if self.constraints.start.in_plane.is_some() {
+        if has_loops {
             // By all joints together what is singular may not be, and if it is it gets its name.
             self.constraints.start.differentiate(model, &state.q);
             self.constraints.start.place_in_plane(model, &state.q);
