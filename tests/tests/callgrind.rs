@@ -27,14 +27,14 @@ impl Profile {
 
 /// The stages that a plan leaves out, by the functions that do their work.
 const CONSTRAINTS: &[&str] =
-    &["plant::closure::", "plant::pivoted_lu::", "matrix::fill_schur", "Workspace::find_responses"];
-const SPRINGS: &[&str] = &["plant::potentials::"];
-const DAMPING: &[&str] = &["plant::forces::add_damping"];
-const INPUTS: &[&str] = &["plant::forces::input_forces"];
+    &["constraints::closure::", "math::pivoted_lu::", "kkt::schur::", "SchurComplement::"];
+const SPRINGS: &[&str] = &["lagrangian::potentials::"];
+const DAMPING: &[&str] = &["lagrangian::forces::add_damping"];
+const INPUTS: &[&str] = &["lagrangian::forces::input_forces"];
 const FORCES: &[&str] =
     &["Forces::", "forces::wrench::", "forces::point::", "forces::coordinate::"];
-const SIGNALS: &[&str] = &["plantd_models::signal::"];
-const BALLS: &[&str] = &["plant::balls::", "plantd_models::rotation::", "plant::blocks::"];
+const SIGNALS: &[&str] = &["model::signal::"];
+const BALLS: &[&str] = &["integrator::balls::", "math::rotation::", "integrator::blocks::"];
 
 /// A pendulum without anything else.
 const BARE: &str = r#"

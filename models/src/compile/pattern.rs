@@ -6,7 +6,7 @@ use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::lagrangian::potentials;
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Forces, MixedPair, Model, Pair, Potentials, Spring};
 use crate::model::tree::Tree;
@@ -44,7 +44,7 @@ pub(super) fn couplings(
 pub(super) fn joint_pairs(
     dynamic: usize,
     tree: &Tree,
-    elimination: &Elimination,
+    elimination: &SymbolicElimination,
 ) -> (Vec<Pair>, Vec<MixedPair>) {
     let (mut pairs, mut mixed) = (Vec::new(), Vec::new());
     for (joint, descendant) in tree.joints.iter().enumerate() {
@@ -120,7 +120,8 @@ mod tests {
     /// Its elimination without what springs and forces couple.
     fn without_couplings(mut model: Model) -> Model {
         let (nd, tree) = (model.dimensions.dynamic, &model.dynamics);
-        model.elimination = Elimination::new(&couplings(nd, tree, &Potentials::default(), None));
+        model.elimination =
+            SymbolicElimination::new(&couplings(nd, tree, &Potentials::default(), None));
         model
     }
 

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::compile::pattern;
 use crate::compile::pattern::{couplings, joint_pairs};
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::math::hash::fnv1a;
 use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Sym3, Vec3};
@@ -66,7 +66,7 @@ fn compile(scene: &Scene) -> Model {
 
     let forces = layout.forces(scene, &dynamics, &in_dynamics);
     let couplings = couplings(dynamic, &dynamics, &potentials, forces.as_ref());
-    let elimination = Elimination::new(&couplings);
+    let elimination = SymbolicElimination::new(&couplings);
     let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
 
     let damping: Vec<f64> = layout.coordinates[..dynamic]

@@ -16,10 +16,10 @@ impl Model {
         let mut culprit = None;
         // Configurations where something is singular by chance are rare.
         for k in (0..=SAMPLES).rev() {
-            workspace.q_mid = sample(self, k, 1.0);
-            workspace.angles.copy_from_slice(&workspace.q_mid);
-            workspace.orientations_mid = orientations(self, &workspace.q_mid);
-            workspace.evaluate_lagrangian(self);
+            workspace.mid.q = sample(self, k, 1.0);
+            workspace.mid.angles.copy_from_slice(&workspace.mid.q);
+            workspace.mid.orientations = orientations(self, &workspace.mid.q);
+            workspace.mid.evaluate(self);
             match workspace.factor_newton_matrix(self, &settings) {
                 Err(StepError::Singular { coordinate, .. }) => culprit = Some(coordinate),
                 _ => return None,

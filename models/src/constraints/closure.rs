@@ -41,6 +41,8 @@ pub(crate) struct Closure<S = f64> {
     pulls: Vec<Pull<S>>,
     /// Of a distance, by the coordinates on the path between its ends.
     gradients: Vec<(usize, Vec3<S>)>,
+    /// Values and Jacobian, and wrenches of loops, are at one configuration.
+    pub(crate) is_complete: bool,
     /// In place of the Jacobian, where loops are eliminated in the plane.
     pub(crate) in_plane: Option<Box<InPlane>>,
 }
@@ -99,6 +101,7 @@ impl<S: Scalar> Closure<S> {
             coordinate_round_off: vec![0.0; nc],
             pulls: vec![Pull::NONE; model.closure.joints.len()],
             gradients: Vec::with_capacity(model.closure.joints.len()),
+            is_complete: false,
             in_plane: model.loops.as_ref().map(|loops| Box::new(InPlane::new(loops))),
         }
     }
@@ -106,6 +109,7 @@ impl<S: Scalar> Closure<S> {
     /// Values at `q`, with the orientations of ball joints.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, model: &Model, q: &[S], orientations: &[Mat3<S>]) {
+        self.is_complete = false;
         self.poses.evaluate(&model.closure, q, orientations);
         for (c, constraint) in model.constraints.iter().enumerate() {
             let (value, magnitude) = constraint.value(&model.closure, &self.poses, q);
@@ -276,6 +280,14 @@ impl<S: Scalar> Closure<S> {
 }
 
 impl Closure {
+    /// Evaluates all there is at a configuration.
+    pub(crate) fn complete(&mut self, model: &Model, q: &[f64], orientations: &[Mat3]) {
+        self.evaluate(model, q, orientations);
+        self.differentiate(model, q);
+        self.place_in_plane(model, q);
+        self.is_complete = true;
+    }
+
     /// Wrenches of loops at the configuration of the last [`Closure::evaluate`], where there are some.
     pub(crate) fn place_in_plane(&mut self, model: &Model, q: &[f64]) {
         if let (Some(in_plane), Some(loops), Some(joints)) =

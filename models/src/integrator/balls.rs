@@ -49,16 +49,15 @@ impl Workspace {
         state: &PreciseState,
     ) {
         for (o, &i) in model.orientations.iter().enumerate() {
-            self.orientations_start[o] = state.orientations[o].matrix();
+            self.balls.start[o] = state.orientations[o].matrix();
             if i >= model.dimensions.dynamic {
-                let end = Quaternion::exp(three(&self.q_end, i));
+                let end = Quaternion::exp(three(&self.step.q_end, i));
                 let turn = state.orientations[o].inverse().times(end).log();
-                self.turns[o] = turn;
-                self.orientations_mid[o] =
-                    self.orientations_start[o].times(&rotation::exp(turn * 0.5));
-                self.orientations_end[o] = end.matrix();
+                self.balls.turns[o] = turn;
+                self.mid.orientations[o] = self.balls.start[o].times(&rotation::exp(turn * 0.5));
+                self.balls.end[o] = end.matrix();
                 let velocity = turn * (1.0 / settings.time_step_s);
-                self.velocity[i..i + 3].copy_from_slice(&velocity.0);
+                self.mid.velocity[i..i + 3].copy_from_slice(&velocity.0);
             }
         }
     }
@@ -67,10 +66,9 @@ impl Workspace {
     pub(crate) fn turn_to_midpoint(&mut self, model: &Model) {
         for (o, &i) in model.orientations.iter().enumerate() {
             if i < model.dimensions.dynamic {
-                let turn = three(&self.increment, i);
-                self.turns[o] = turn;
-                self.orientations_mid[o] =
-                    self.orientations_start[o].times(&rotation::exp(turn * 0.5));
+                let turn = three(&self.step.increment, i);
+                self.balls.turns[o] = turn;
+                self.mid.orientations[o] = self.balls.start[o].times(&rotation::exp(turn * 0.5));
             }
         }
     }
@@ -79,8 +77,8 @@ impl Workspace {
     pub(crate) fn turn_to_end(&mut self, model: &Model) {
         for (o, &i) in model.orientations.iter().enumerate() {
             if i < model.dimensions.dynamic {
-                let turn = three(&self.increment, i);
-                self.orientations_end[o] = self.orientations_start[o].times(&rotation::exp(turn));
+                let turn = three(&self.step.increment, i);
+                self.balls.end[o] = self.balls.start[o].times(&rotation::exp(turn));
             }
         }
     }
@@ -92,30 +90,42 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) {
-        let Some(blocks) = &mut self.turned else { return };
+        let Some(blocks) = &mut self.balls.blocks else { return };
         blocks.q_start.copy_from_slice(&state.q);
-        blocks.multipliers.copy_from_slice(&self.multipliers);
-        place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
-        blocks.inputs.copy_from_slice(&self.inputs);
+        blocks.multipliers.copy_from_slice(&self.step.multipliers);
+        place(
+            blocks,
+            model,
+            &self.step.increment,
+            &self.step.q_end,
+            (&self.balls.start, &self.balls.turns),
+        );
+        blocks.inputs.copy_from_slice(&self.mid.inputs);
         blocks.evaluate(model, settings);
     }
 
     /// Writes the Jacobian of the residual by the increment.
     pub(crate) fn fill_turned_newton_matrix(&mut self, model: &Model, settings: &Settings) {
-        let Some(blocks) = &mut self.turned else { return };
-        place(blocks, model, &self.increment, &self.q_end, (&self.orientations_start, &self.turns));
-        blocks.inputs.copy_from_slice(&self.inputs);
+        let Some(blocks) = &mut self.balls.blocks else { return };
+        place(
+            blocks,
+            model,
+            &self.step.increment,
+            &self.step.q_end,
+            (&self.balls.start, &self.balls.turns),
+        );
+        blocks.inputs.copy_from_slice(&self.mid.inputs);
         blocks.place_midpoint(model, settings.time_step_s);
-        blocks.q_mid.copy_from_slice(&self.q_mid);
-        blocks.velocity.copy_from_slice(&self.velocity);
+        blocks.q_mid.copy_from_slice(&self.mid.q);
+        blocks.velocity.copy_from_slice(&self.mid.velocity);
         blocks.evaluate_mid(model);
         blocks.assemble(model, settings);
         let (n, elimination) = (model.dimensions.coordinates(), &model.elimination);
         for row in 0..model.dimensions.dynamic {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let ancestor = elimination.ancestors[slot];
-                self.factors.matrix.upper[slot] = blocks.residual_next[ancestor * n + row];
-                self.factors.matrix.lower[slot] = blocks.residual_next[row * n + ancestor];
+                self.kkt.tree.upper[slot] = blocks.residual_next[ancestor * n + row];
+                self.kkt.tree.lower[slot] = blocks.residual_next[row * n + ancestor];
             }
         }
     }
@@ -124,53 +134,10 @@ impl Workspace {
     pub(crate) fn turn_end_jacobian(&mut self, model: &Model) {
         let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
         for &i in model.orientations.iter().filter(|i| **i < nd) {
-            let to_end = rotation::dexp(three(&self.increment, i));
-            for row in self.end.jacobian.chunks_exact_mut(n) {
+            let to_end = rotation::dexp(three(&self.step.increment, i));
+            for row in self.constraints.end.jacobian.chunks_exact_mut(n) {
                 let turned = to_end.apply_transposed(three(row, i));
                 row[i..i + 3].copy_from_slice(&turned.0);
-            }
-        }
-    }
-
-    /// The residual of ball joints, `p − N⁻ m + T⁻ (½h τ + a h f)`.
-    pub(crate) fn turn_residual(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-        state: &PreciseState,
-    ) {
-        let h = settings.time_step_s;
-        let weight = settings.force_split.at_start() * h;
-        for (o, &i) in model.orientations.iter().enumerate() {
-            if i >= model.dimensions.dynamic {
-                continue;
-            }
-            let turn = self.turns[o];
-            let momentum = three(&self.l_v, i);
-            let torque = three(&self.l_q, i) * (0.5 * h) + three(&self.force, i) * weight;
-            let momentum = rotation::momentum_at_start(turn).apply(momentum);
-            let torque = rotation::torque_at_start(turn).apply(torque);
-            for a in 0..3 {
-                self.residual[i + a] =
-                    ((state.p[i + a] - momentum[a]) + torque[a]) + state.p_low[i + a];
-            }
-        }
-    }
-
-    /// The change of the momentum of ball joints beyond `h (τ + f)`: `−ξ × m + (2a − 1) h (T⁻ − 1) f`.
-    pub(crate) fn turn_impulse(&mut self, model: &Model, settings: &Settings) {
-        let h = settings.time_step_s;
-        let skew = (2.0 * settings.force_split.at_start() - 1.0) * h;
-        for (o, &i) in model.orientations.iter().enumerate() {
-            if i >= model.dimensions.dynamic {
-                continue;
-            }
-            let turn = self.turns[o];
-            let carried = three(&self.l_v, i).cross(turn);
-            let force = three(&self.force, i);
-            let split = (rotation::torque_at_start(turn).apply(force) - force) * skew;
-            for a in 0..3 {
-                self.impulse[i + a] += carried[a] + split[a];
             }
         }
     }
@@ -181,11 +148,11 @@ impl Workspace {
             let orientation = &mut state.orientations[o];
             if i < model.dimensions.dynamic {
                 let low = &mut state.orientations_low[o];
-                (*orientation, *low) = orientation.turned(*low, three(&self.increment, i));
+                (*orientation, *low) = orientation.turned(*low, three(&self.step.increment, i));
                 state.q[i..i + 3].copy_from_slice(&orientation.log().0);
                 state.q_low[i..i + 3].fill(0.0);
             } else {
-                *orientation = Quaternion::exp(three(&self.q_end, i));
+                *orientation = Quaternion::exp(three(&self.step.q_end, i));
             }
         }
     }

@@ -27,7 +27,7 @@ use crate::integrator::collocation::system::System;
 use crate::integrator::predictor::Past;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::model::mechanism::Model;
 
 /// Unknowns up to which all stages are corrected at once.
@@ -69,7 +69,7 @@ impl Collocation {
     pub(crate) fn solve(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         start_s: f64,
     ) -> Result<StepReport, StepError> {
         self.guess(workspace, at, start_s)?;
@@ -82,15 +82,15 @@ impl Collocation {
             Some(report) => report,
             None => {
                 let system = system.get_or_insert_with(|| Box::new(System::new(at.model, tableau)));
-                system.begin(at, motion, inputs, &mut workspace.input_force);
+                system.begin(at, motion, inputs, &mut workspace.mid.input_force);
                 let report = system.correct(workspace, at, inputs)?;
-                let sums = [&mut *workspace.increment, &mut *workspace.impulse];
+                let sums = [&mut *workspace.step.increment, &mut *workspace.step.impulse];
                 system.finish(at.model, motion, sums)?;
                 report
             }
         };
         workspace.prepare(at);
-        workspace.estimates.write(&mut report);
+        workspace.kkt.estimates.write(&mut report);
         Ok(report)
     }
 
@@ -98,10 +98,10 @@ impl Collocation {
     fn guess(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         start_s: f64,
     ) -> Result<(), StepError> {
-        let At { model, settings, state, u } = at;
+        let StepContext { model, settings, state, u } = at;
         let d = model.dimensions;
         let h = settings.time_step_s;
         let is_guessed = match &state.past {
@@ -114,7 +114,7 @@ impl Collocation {
             let half = self.motion.len() / 2;
             let (velocities, forces) = self.motion.split_at_mut(half);
             for velocities in velocities.chunks_exact_mut(d.dynamic.max(1)) {
-                let pairs = velocities.iter_mut().zip(&workspace.increment);
+                let pairs = velocities.iter_mut().zip(&workspace.step.increment);
                 pairs.for_each(|(v, x)| *v = x / h);
             }
             forces.fill(0.0);

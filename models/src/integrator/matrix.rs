@@ -1,43 +1,41 @@
 //! The Newton matrices `K` and `S`: filled and factored.
 
+use crate::constraints::closure::Closure;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::factors::Generators;
-use crate::kkt::loops;
-use crate::kkt::planar::Of;
-use crate::kkt::schur::fill_schur;
-use crate::lagrangian::planar::PlanarTree;
+use crate::kkt::planar::MatrixKind;
+use crate::kkt::schur::{SchurComplement, fill_schur};
+use crate::kkt::system::{Factors, Linearized};
+use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::potentials;
-use crate::math::rows::padded;
-use crate::math::tree_lu::SmallestPivot;
 use crate::model::mechanism::{Forces, Model};
 
-/// Pivots of loops, relative to what they are compared with, from which on they are taken.
-const SAFE: f64 = 1e-6;
-
 impl Workspace {
-    /// Factors `K` and `S` at the last evaluation.
+    /// Factors the KKT system at the last evaluation: by a recursion where that is sound, else by the tree LU of
+    /// `K` with the Schur complement `S`.
     pub(crate) fn factor(
         &mut self,
         model: &Model,
         settings: &Settings,
         state: &PreciseState,
     ) -> Result<(), StepError> {
-        self.in_loops = false;
-        if model.loops.is_some() {
-            self.end.place_in_plane(model, &self.q_end);
-            if self.factor_loops(model, settings) {
-                return Ok(());
-            }
-            // By all joints together what is singular may not be, and if it is it gets its name.
-            self.start.differentiate(model, &state.q);
-            self.start.place_in_plane(model, &state.q);
+        let has_loops = self.constraints.end.in_plane.is_some();
+        if has_loops {
+            self.constraints.end.place_in_plane(model, &self.step.q_end);
         }
-        self.factor_generators(model, settings)?;
+        if self.factor_recursion(model, settings)? {
+            return Ok(());
+        }
+        if has_loops {
+            // By all joints together what is singular may not be, and if it is it gets its name.
+            self.constraints.start.differentiate(model, &state.q);
+            self.constraints.start.place_in_plane(model, &state.q);
+        }
+        self.factor_newton_matrix(model, settings)?;
         if model.dimensions.constraints > 0 {
-            self.end.differentiate(model, &self.q_end);
+            self.constraints.end.differentiate(model, &self.step.q_end);
             if !model.orientations.is_empty() {
                 self.turn_end_jacobian(model);
             }
@@ -49,54 +47,43 @@ impl Workspace {
     /// Whether the pivots of loops are sound at rest, where the constraints are known to be regular.
     pub(crate) fn can_eliminate_loops(&mut self, model: &Model) -> bool {
         let q = &model.conditioning.regular;
-        for (closure, q_there) in
-            [(&mut self.start, &mut self.q_mid), (&mut self.end, &mut self.q_end)]
-        {
+        for (closure, q_there) in [
+            (&mut self.constraints.start, &mut self.mid.q),
+            (&mut self.constraints.end, &mut self.step.q_end),
+        ] {
             q_there.copy_from_slice(q);
             closure.evaluate(model, q, &[]);
             closure.place_in_plane(model, q);
         }
-        self.angles.copy_from_slice(q);
-        self.evaluate_lagrangian(model);
-        self.factor_loops(model, &Settings::new(model))
+        self.mid.angles.copy_from_slice(q);
+        self.mid.evaluate(model);
+        matches!(self.factor_recursion(model, &Settings::new(model)), Ok(true))
     }
 
-    /// Factors `K` and the constraints of loops, which are in the plane; whether the pivots allow it.
-    pub(crate) fn factor_loops(&mut self, model: &Model, settings: &Settings) -> bool {
-        self.fill_diagonal(model, settings);
-        self.factor_loops_of(model, settings, Of::Motion)
-    }
-
-    /// The same with what is in `diagonal`. With masses alone, constraints are those at the start.
-    pub(super) fn factor_loops_of(&mut self, model: &Model, settings: &Settings, of: Of) -> bool {
-        self.in_loops = false;
-        let end = if of == Of::Masses { &self.start } else { &self.end };
-        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
-        let (Some(start), Some(end)) = (&self.start.in_plane, &end.in_plane) else {
-            return false;
-        };
-        let Some(PlanarTree::Many(tree)) = self.mechanics.planar.as_deref_mut() else {
-            return false;
-        };
-        let Some(Generators::Loops(generators)) = self.factors.generators.as_deref_mut() else {
-            return false;
-        };
-        tree.differentiate(joints);
-        let at = loops::Mechanism { loops, joints, tree, start, end };
-        let conditioning = &model.conditioning;
-        let scales = loops::Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
-        let pivots = generators.factor(at, &self.diagonal, scales, settings.time_step_s, of);
-        if pivots.joints.relative < SAFE
-            || pivots.equations < SAFE
-            || pivots.steepness < settings.singular_below
-        {
-            return false;
+    /// Factors `K`, and the constraints of loops, by the recursion at the last evaluation; whether there is one
+    /// and its pivots are sound.
+    pub(crate) fn factor_recursion(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+    ) -> Result<bool, StepError> {
+        if !self.kkt.has_recursion() {
+            return Ok(false);
         }
-        self.in_loops = true;
-        self.estimates.matrix = pivots.joints.relative;
-        self.estimates.constraints = pivots.equations.min(pivots.steepness);
-        self.estimates.redundant = (model.constraints.len() - loops.equations.len()) as u32;
-        true
+        self.fill_diagonal(model, settings);
+        let constraints = [&self.constraints.start, &self.constraints.end];
+        let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
+        self.kkt
+            .factor_recursion(at, MatrixKind::Newton)
+            .map_err(|pivot| model.singular_matrix(pivot))
+    }
+
+    /// Factors the mass matrix by the recursion, with the constraints at the start; whether that went well.
+    pub(super) fn factor_masses(&mut self, model: &Model, settings: &Settings) -> bool {
+        self.kkt.diagonal.fill(0.0);
+        let constraints = [&self.constraints.start, &self.constraints.start];
+        let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
+        matches!(self.kkt.factor_recursion(at, MatrixKind::Mass), Ok(true))
     }
 
     /// Fills `K` at the last evaluation.
@@ -107,34 +94,34 @@ impl Workspace {
         }
         let h = settings.time_step_s;
         if model.potentials.couple_branches || model.forces.is_some() {
-            self.factors.matrix.clear();
+            self.kkt.tree.clear();
         }
-        self.mechanics.differentiate(model);
-        if let (Some(planar), Some(joints)) = (&mut self.mechanics.planar, &model.planar) {
-            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.factors.matrix);
+        self.mid.mechanics.differentiate(model);
+        if let (Some(planar), Some(joints)) = (&mut self.mid.mechanics.planar, &model.planar) {
+            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.kkt.tree);
         } else {
-            self.mechanics.curvature.fill_newton_matrix(
+            self.mid.mechanics.curvature.fill_newton_matrix(
                 &model.pairs,
-                &self.mechanics.momenta,
+                &self.mid.mechanics.momenta,
                 model.gravity,
                 h,
-                &mut self.factors.matrix,
+                &mut self.kkt.tree,
             );
         }
         if model.potentials.any {
             potentials::add_to_newton_matrix(
                 &model.potentials,
                 &model.dynamics,
-                &self.mechanics.poses,
-                &self.q_mid,
+                &self.mid.mechanics.poses,
+                &self.mid.q,
                 h,
                 &model.elimination,
-                &mut self.factors.matrix,
+                &mut self.kkt.tree,
             );
         }
         for (i, c) in model.damping.iter().enumerate() {
             let slot = model.elimination.offsets[i + 1] - 1;
-            self.factors.matrix.add_to_diagonal(slot, -settings.force_split.at_start() * c);
+            self.kkt.tree.add_to_diagonal(slot, -settings.force_split.at_start() * c);
         }
         if let Some(forces) = &model.forces {
             self.add_forces_to_newton_matrix(model, forces, settings);
@@ -148,43 +135,22 @@ impl Workspace {
         settings: &Settings,
     ) -> Result<(), StepError> {
         self.fill_newton_matrix(model, settings);
-        let inertia = &model.conditioning.inertia;
-        let pivot = self.factors.matrix.factor(
-            &model.elimination,
-            inertia,
-            1.0 / settings.time_step_s.abs(),
-        );
-        self.accept_pivot(model, settings, pivot)
-    }
-
-    /// Factors the generators of `K` at the last evaluation.
-    pub(crate) fn factor_generators(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-    ) -> Result<(), StepError> {
-        if self.factors.generators.is_none() {
-            return self.factor_newton_matrix(model, settings);
-        }
-        self.fill_diagonal(model, settings);
-        let (h, diagonal) = (settings.time_step_s, &self.diagonal);
-        match self.factors.generate(model, &mut self.mechanics, diagonal, h, Of::Motion) {
-            Some(pivot) => self.accept_pivot(model, settings, pivot),
-            None => self.factor_newton_matrix(model, settings),
-        }
+        self.kkt
+            .factor_tree(model, settings.time_step_s, settings.singular_below)
+            .map_err(|pivot| model.singular_matrix(pivot))
     }
 
     /// What springs and dampers of coordinates add to the diagonal of `K`.
     fn fill_diagonal(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
-        let diagonal = &mut self.diagonal;
+        let diagonal = &mut self.kkt.diagonal;
         diagonal.fill(0.0);
         if model.potentials.any {
             potentials::for_each_second_derivative(
                 &model.potentials,
                 &model.dynamics,
-                &self.mechanics.poses,
-                &self.q_mid,
+                &self.mid.mechanics.poses,
+                &self.mid.q,
                 |i, _, value| diagonal[i] -= 0.25 * h * value,
             );
         }
@@ -194,32 +160,35 @@ impl Workspace {
         }
     }
 
-    /// Takes note of the smallest pivot; refuses one that is too small.
-    fn accept_pivot(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-        pivot: SmallestPivot,
-    ) -> Result<(), StepError> {
-        self.estimates.matrix = pivot.relative;
-        if pivot.relative >= settings.singular_below {
-            return Ok(());
-        }
-        let coordinate = model.coordinates[pivot.row].name.clone();
-        Err(StepError::Singular { coordinate, pivot: pivot.relative })
-    }
-
     /// Adds the part `a (½h f_q + f_v)` of forces to the Newton matrix.
     fn add_forces_to_newton_matrix(&mut self, model: &Model, forces: &Forces, settings: &Settings) {
         let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
         let dynamic = model.dimensions.dynamic;
-        let mut matrix = std::mem::take(&mut self.factors.matrix);
-        forces.for_each_derivative(&self.instant(model), |i, j, by_q, by_v| {
+        let instant = self.mid.mechanics.instant(model, &self.mid.velocity, &self.mid.inputs);
+        let matrix = &mut self.kkt.tree;
+        forces.for_each_derivative(&instant, |i, j, by_q, by_v| {
             if i < dynamic && j < dynamic {
                 matrix.add(&model.elimination, i, j, a * (half * by_q + by_v));
             }
         });
-        self.factors.matrix = matrix;
+    }
+
+    /// Factors by the tree what a recursion has factored last, for those that need `K⁻¹` and `S` apart.
+    pub(crate) fn factor_tree(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) -> Result<(), StepError> {
+        if self.kkt.valid == Factors::Tree {
+            return Ok(());
+        }
+        self.prepare_start(model, state);
+        self.factor_newton_matrix(model, settings)?;
+        if model.dimensions.constraints > 0 {
+            self.factor_schur(model, settings)?;
+        }
+        Ok(())
     }
 
     /// Factors `S = A1 K⁻¹ A0ᵀ` with the Jacobians in `start` and `end`.
@@ -228,29 +197,24 @@ impl Workspace {
         model: &Model,
         settings: &Settings,
     ) -> Result<(), StepError> {
-        self.find_responses(model);
-        fill_schur(model, &self.end, &self.responses, &mut self.schur);
-        self.schur.factor();
-        let rank = model.constraint_rank();
-        self.estimates.constraints =
-            self.schur.reciprocal_condition(rank, settings.time_step_s.abs());
-        self.estimates.redundant = self.schur.deficiency() as u32;
-        if self.estimates.constraints >= settings.singular_below {
+        let Settings { time_step_s, singular_below, .. } = *settings;
+        let constraints = [&self.constraints.start, &self.constraints.end];
+        if self.kkt.factor_schur(model, constraints, time_step_s, singular_below) {
             return Ok(());
         }
-        fill_schur(model, &self.end, &self.responses, &mut self.schur);
-        Err(model.singular_constraints(&self.schur.matrix, self.estimates.constraints))
+        let SchurComplement { responses, lu } = &mut self.kkt.schur;
+        fill_schur(model, &self.constraints.end, responses, lu);
+        Err(model.singular_constraints(&lu.matrix, self.kkt.estimates.constraints))
     }
+}
 
-    /// Solves for the responses `K⁻¹ A0ᵀ` with the matrix that is factored.
-    pub(crate) fn find_responses(&mut self, model: &Model) {
-        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
-        let stride = padded(nc);
-        for i in 0..model.dimensions.dynamic {
-            for c in 0..nc {
-                self.responses[i * stride + c] = self.start.jacobian[c * n + i];
-            }
-        }
-        self.factors.matrix.solve_rows(&model.elimination, &mut self.responses, stride, stride);
-    }
+/// Where the KKT system is factored.
+fn linearized<'a>(
+    model: &'a Model,
+    settings: &Settings,
+    mechanics: &'a mut Mechanics,
+    constraints: [&'a Closure; 2],
+) -> Linearized<'a> {
+    let Settings { time_step_s, singular_below, .. } = *settings;
+    Linearized { model, mechanics, constraints, time_step_s, singular_below }
 }

@@ -1,28 +1,15 @@
 //! The solver of a step: chord Newton on the increment, from an extrapolated guess, to round-off.
 //!
-//! With `A0 = Dh(q[k])` and `A1 = Dh(q[k+1])` a correction solves
-//!
-//! ```text
-//! [ K   −A0ᵀ ] [dx]     [r1]       S = A1 K⁻¹ A0ᵀ,   S dλ = A1 K⁻¹ r1 − r2
-//! [ A1    0  ] [dλ] = − [r2],      dx = K⁻¹ (A0ᵀ dλ − r1)
-//! ```
-//!
+//! Corrections solve the KKT system of [`crate::kkt::system`] with `A0 = Dh(q[k])` and `A1 = Dh(q[k+1])`.
 //! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
-//! measured in units of its own round-off; the solver stops where arithmetic does. Loops in planes are
-//! factored with `K` in place of `S` ([`crate::kkt::loops::LoopElimination`]).
+//! measured in units of its own round-off; the solver stops where arithmetic does.
 
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{At, Workspace};
-use crate::kkt::planar::Of;
-use crate::lagrangian::forces::Instant;
-use crate::lagrangian::{forces, potentials};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::math::norms::{larger, largest};
-use crate::math::rows::padded;
-use crate::math::scalar::{Side, side_by_side};
-use crate::math::simd::wide;
-use crate::model::mechanism::{Model, Solver};
+use crate::model::mechanism::Model;
 
 /// A residual this small, in units of round-off, is as good as zero.
 const CONVERGED: f64 = 4.0;
@@ -30,7 +17,7 @@ const CONVERGED: f64 = 4.0;
 const NEARLY: f64 = 1e5;
 /// A residual that no longer falls, with a fresh Jacobian, is at its floor if it is below this.
 pub(crate) const FLOOR: f64 = 1e4;
-/// The same for a Jacobian that was kept.
+/// [`FLOOR`] for a Jacobian that was kept.
 pub(crate) const CHORD_FLOOR: f64 = 1e2;
 /// Corrections of larger residuals must be seen by the impulse, or energy drifts by a part of them.
 pub(crate) const STALE: f64 = 2.0;
@@ -45,14 +32,55 @@ impl Precision {
     }
 }
 
+/// How far an iteration with kept factors has come.
+struct Chord {
+    /// A residual after which one more correction is the last.
+    enough: f64,
+    /// What a factorization costs, in corrections.
+    patience: u32,
+    always_factor: bool,
+    previous: f64,
+    /// The Jacobian is that of this residual.
+    is_fresh: bool,
+    /// The last correction was no more than round-off of the coordinates.
+    is_idle: bool,
+}
+
+impl Chord {
+    fn new(settings: &Settings, patience: u32, always_factor: bool) -> Self {
+        let enough = settings.precision.residual();
+        let previous = f64::INFINITY;
+        Self { enough, patience, always_factor, previous, is_fresh: false, is_idle: false }
+    }
+
+    /// Whether the correction of a residual is the last; `is_fresh` says whether it takes a new Jacobian.
+    fn judge(&mut self, size: f64, constraint_residual: f64) -> bool {
+        let floor = if self.is_fresh { FLOOR } else { CHORD_FLOOR };
+        let stagnates = size > 0.5 * self.previous;
+        // Where forces balance, a unit of round-off of a coordinate outweighs the residual's own.
+        let is_idle = self.is_idle && constraint_residual <= FLOOR;
+        let at_floor = stagnates && (size <= floor || is_idle);
+        let converged = size <= self.enough || at_floor;
+        // A new Jacobian squares the rate: it pays where the old one needs many corrections more.
+        let rate = size / self.previous;
+        let later = (0..self.patience).fold(size, |size, _| size * rate);
+        // The first correction is one with this step's Jacobian, also where it is the last: factors of
+        // another step would be memory beside the state.
+        self.is_fresh = self.previous.is_infinite()
+            || (!converged && (self.always_factor || later > self.enough));
+        self.previous = size;
+        converged
+    }
+}
+
 impl Workspace {
     /// Solves one step; the solution stays in the workspace.
-    pub(crate) fn solve(&mut self, at: At<'_>) -> Result<StepReport, StepError> {
-        let At { model, settings, state, .. } = at;
+    pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<StepReport, StepError> {
+        let StepContext { model, settings, state, .. } = at;
         self.prepare(at);
-        if state.past.predict(settings.time_step_s, &mut self.increment) {
+        if state.past.predict(settings.time_step_s, &mut self.step.increment) {
             // The equations are linear in the multipliers: any guess is as good.
-            self.multipliers.copy_from_slice(&state.multipliers);
+            self.step.multipliers.copy_from_slice(&state.multipliers);
             let report = self.iterate(model, settings, state, false);
             if report.is_ok() {
                 return report;
@@ -60,76 +88,53 @@ impl Workspace {
         }
         self.ballistic(model, settings, state);
         self.iterate(model, settings, state, true)
-            .map_err(|error| model.explain(error, state, &self.q_end))
+            .map_err(|error| model.explain(error, state, &self.step.q_end))
     }
 
     /// What does not change within a step: prescribed motion, input forces, constraints at the start.
-    pub(crate) fn prepare(&mut self, at: At<'_>) {
-        let At { model, settings, state, u } = at;
+    pub(crate) fn prepare(&mut self, at: StepContext<'_>) {
+        let StepContext { model, settings, state, u } = at;
         let d = model.dimensions;
         let (inputs, next) = u.split_at(d.inputs);
         for (k, next) in next.iter().enumerate() {
             let i = d.dynamic + k;
-            self.q_mid[i] = 0.5 * (state.q[i] + next);
-            self.angles[i] = self.q_mid[i];
-            self.velocity[i] = (next - state.q[i]) / settings.time_step_s;
-            self.q_end[i] = *next;
+            self.mid.q[i] = 0.5 * (state.q[i] + next);
+            self.mid.angles[i] = self.mid.q[i];
+            self.mid.velocity[i] = (next - state.q[i]) / settings.time_step_s;
+            self.step.q_end[i] = *next;
         }
         if !model.orientations.is_empty() {
             self.prepare_orientations(model, settings, state);
         }
         if d.inputs > 0 {
-            self.set_inputs(model, inputs);
+            self.mid.set_inputs(model, inputs);
         }
         if d.constraints > 0 {
             self.place_start(model, state);
             // Until the end has a Jacobian of this step: nothing of the last may decide on this one.
-            self.end.expect_round_off_of(&self.start);
-        }
-    }
-
-    /// Inputs, and their forces on coordinates.
-    pub(crate) fn set_inputs(&mut self, model: &Model, inputs: &[f64]) {
-        forces::input_forces(&model.coordinate_inputs, inputs, &mut self.input_force);
-        self.force.copy_from_slice(&self.input_force);
-        if !self.inputs.is_empty() {
-            self.inputs.copy_from_slice(inputs);
+            self.constraints.end.expect_round_off_of(&self.constraints.start);
         }
     }
 
     /// Constraints at the start of the step, kept from the end of the last one where possible; of loops
     /// without a Jacobian.
     fn place_start(&mut self, model: &Model, state: &PreciseState) {
-        if model.loops.is_none() {
+        if self.constraints.start.in_plane.is_none() {
             self.prepare_start(model, state);
-        } else if !self.start_is_valid {
-            self.start.evaluate(model, &state.q, &self.orientations_start);
-            self.start.place_in_plane(model, &state.q);
+        } else if !self.constraints.start.is_complete {
+            self.constraints.start.evaluate(model, &state.q, &self.balls.start);
+            self.constraints.start.place_in_plane(model, &state.q);
         }
     }
 
-    /// The same with a Jacobian.
+    /// Constraints at the start of the step, with their Jacobian.
     pub(crate) fn prepare_start(&mut self, model: &Model, state: &PreciseState) {
-        if model.dimensions.constraints > 0 && !self.start_is_valid {
-            for (matrix, q) in self.orientations_start.iter_mut().zip(&state.orientations) {
+        if model.dimensions.constraints > 0 && !self.constraints.start.is_complete {
+            for (matrix, q) in self.balls.start.iter_mut().zip(&state.orientations) {
                 *matrix = q.matrix();
             }
-            self.start.evaluate(model, &state.q, &self.orientations_start);
-            self.start.differentiate(model, &state.q);
-            self.start.place_in_plane(model, &state.q);
-            self.start_is_valid = true;
+            self.constraints.start.complete(model, &state.q, &self.balls.start);
         }
-    }
-
-    /// The end of this step is the start of the next.
-    pub(crate) fn move_on(&mut self) {
-        // With ball joints the Jacobian at the end is one by the increment.
-        self.end_is_exact &= self.turns.is_empty();
-        if self.end_is_exact {
-            std::mem::swap(&mut self.start, &mut self.end);
-        }
-        self.start_is_valid = self.end_is_exact;
-        self.end_is_exact = false;
     }
 
     /// Guess: the velocity that belongs to the momentum goes on.
@@ -138,48 +143,41 @@ impl Workspace {
             return;
         }
         let is_singular = self.find_velocity(model, state) < settings.singular_below;
-        for (x, v) in self.increment.iter_mut().zip(&self.residual) {
+        for (x, v) in self.step.increment.iter_mut().zip(&self.residual.dynamics) {
             // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
             *x = if v.is_finite() && !is_singular { settings.time_step_s * v } else { 0.0 };
         }
-        self.multipliers.copy_from_slice(&state.multipliers);
+        self.step.multipliers.copy_from_slice(&state.multipliers);
         // The velocity was found with the prescribed velocities of the last step, not of this one.
-        for i in model.dimensions.dynamic..self.velocity.len() {
-            self.velocity[i] = (self.q_end[i] - state.q[i]) / settings.time_step_s;
+        for i in model.dimensions.dynamic..self.mid.velocity.len() {
+            self.mid.velocity[i] = (self.step.q_end[i] - state.q[i]) / settings.time_step_s;
         }
         if !model.orientations.is_empty() {
             self.prepare_orientations(model, settings, state);
         }
     }
 
-    /// The same by generators, where there are some and loops allow it.
+    /// Guesses by the recursion, where there is one and its pivots are sound.
     fn coast(&mut self, model: &Model, settings: &Settings, state: &PreciseState) -> bool {
-        if self.factors.generators.is_none() {
+        if !self.kkt.has_recursion() {
             return false;
         }
-        self.velocity.fill(0.0);
+        self.mid.velocity.fill(0.0);
         let (orientations, derivatives) =
-            (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
-        self.mechanics.gradient(model, &state.q, orientations, &self.velocity, derivatives);
-        self.diagonal.fill(0.0);
-        if model.loops.is_none() {
-            let (mechanics, h) = (&mut self.mechanics, settings.time_step_s);
-            self.factors.generate(model, mechanics, &self.diagonal, h, Of::Masses);
-        } else if !self.factor_loops_of(model, settings, Of::Masses) {
+            (&self.mid.orientations, [&mut *self.mid.l_q, &mut *self.mid.l_v]);
+        self.mid.mechanics.gradient(model, &state.q, orientations, &self.mid.velocity, derivatives);
+        if !self.factor_masses(model, settings) {
             return false;
         }
-        for (x, p) in self.increment.iter_mut().zip(&state.p) {
+        for (x, p) in self.step.increment.iter_mut().zip(&state.p) {
             *x = -p;
         }
-        if model.loops.is_none() {
-            self.factors.solve(model, &mut self.increment);
-        } else {
-            self.constraint_residual.fill(0.0);
-            self.factors.solve_loops(model, &mut self.increment, &mut self.constraint_residual);
-            self.multipliers.copy_from_slice(&state.multipliers);
-        }
+        self.residual.constraints.fill(0.0);
+        let x = &mut self.step.increment;
+        self.kkt.solve(model, &self.constraints.start, x, &mut self.residual.constraints);
+        self.step.multipliers.copy_from_slice(&state.multipliers);
         // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
-        for x in self.increment.iter_mut().filter(|x| !x.is_finite()) {
+        for x in self.step.increment.iter_mut().filter(|x| !x.is_finite()) {
             *x = 0.0;
         }
         true
@@ -194,159 +192,39 @@ impl Workspace {
         always_factor: bool,
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
-        // What a factorization costs, in corrections.
-        let patience = match model.solver {
-            Solver::Tree => 3,
-            Solver::Planar | Solver::Spatial | Solver::Loops => 2,
-        };
-        let enough = settings.precision.residual();
-        let mut previous = f64::INFINITY;
-        let (mut fresh, mut idle) = (false, false);
+        let mut chord = Chord::new(settings, self.kkt.corrections(), always_factor);
         while report.iterations < settings.max_iterations {
             report.iterations += 1;
+            // Residual: r1 = p0 + D1Ld + F⁻ − Dh(q0)ᵀ λ, r2 = h(q1).
             report.residual = self.evaluate(model, settings, state);
             report.constraint_residual = self.evaluate_end(model, state);
             let size = larger(report.residual, report.constraint_residual);
             if !size.is_finite() {
                 return Err(StepError::NotFinite { iterations: report.iterations });
             }
-            if report.iterations == 1 && size <= CONVERGED {
-                // Nothing to correct, but what is singular shall not pass for solved.
+            // Factor: K = D2D1Ld + D2F⁻ and S = A1 K⁻¹ A0ᵀ.
+            let converged = chord.judge(size, report.constraint_residual);
+            if chord.is_fresh {
                 self.factor(model, settings, state)?;
                 report.factorizations += 1;
+            }
+            if report.iterations == 1 && size <= CONVERGED {
+                // Nothing to correct, but what is singular has not passed for solved.
                 return self.accept(model, settings, report);
             }
-            let floor = if fresh { FLOOR } else { CHORD_FLOOR };
-            let stagnates = size > 0.5 * previous;
-            // Where forces balance, a unit of round-off of a coordinate outweighs the residual's own.
-            let is_idle = idle && report.constraint_residual <= FLOOR;
-            let at_floor = stagnates && (size <= floor || is_idle);
-            let converged = size <= enough || at_floor;
-            // A new Jacobian squares the rate: it pays where the old one needs many corrections more.
-            let rate = size / previous;
-            let later = (0..patience).fold(size, |size, _| size * rate);
-            // The first correction is one with this step's Jacobian, also where it is the last: factors of
-            // another step would be memory beside the state.
-            fresh = previous.is_infinite() || (!converged && (always_factor || later > enough));
-            if fresh {
-                self.factor(model, settings, state)?;
-                report.factorizations += 1;
-            }
+            // Correct: x += dx, λ += dλ.
             self.correct(model);
+            // Accept: p1 = D2Ld + F⁺.
             if converged {
                 if size > STALE {
                     self.evaluate(model, settings, state);
                 }
                 return self.accept(model, settings, report);
             }
-            idle = self.is_round_off_of_coordinates();
-            previous = size;
+            chord.is_idle = self.is_round_off_of_coordinates();
         }
-        Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
-    }
-
-    /// Residual `r1` at the current increment; returns its size in units of round-off.
-    pub(crate) fn evaluate(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-        state: &PreciseState,
-    ) -> f64 {
-        let h = settings.time_step_s;
-        self.go_to_middle(state, 1.0 / h);
-        if !model.orientations.is_empty() {
-            self.turn_to_midpoint(model);
-        }
-        self.evaluate_lagrangian(model);
-        self.sum_up(state, 0.5 * h, settings.force_split.at_start() * h);
-        self.round_off = largest(&self.magnitudes).max(f64::MIN_POSITIVE);
-        if !model.orientations.is_empty() {
-            self.turn_residual(model, settings, state);
-        }
-        if model.dimensions.constraints > 0 {
-            self.start.subtract_pushes(model, &self.multipliers, &mut self.residual);
-        }
-        largest(&self.residual) / (f64::EPSILON * self.round_off)
-    }
-
-    wide! {
-        /// Configuration and velocity at the midpoint.
-        pub(crate) fn go_to_middle(mut self, state: &PreciseState, inverse: f64)
-            = go_to_middle_portable, go_to_middle_avx2;
-
-        /// The residual, and what it is the sum of.
-        pub(crate) fn sum_up(mut self, state: &PreciseState, half: f64, weight: f64)
-            = sum_up_portable, sum_up_avx2;
-    }
-
-    #[inline(always)]
-    fn go_to_middle_portable(&mut self, state: &PreciseState, inverse: f64) {
-        let nd = self.increment.len();
-        side_by_side!(for (
-            x in &self.increment[..nd],
-            q in &state.q[..nd],
-            q_low in &state.q_low[..nd],
-            per_radian in &self.turns_per_radian[..nd],
-        ) let more = x * 0.5 + q_low; {
-            middle(&mut self.q_mid[..nd]) = q + more;
-            velocity(&mut self.velocity[..nd]) = x * inverse;
-            angle(&mut self.angles[..nd]) = Side::unwound(q, more, per_radian);
-        });
-    }
-
-    #[inline(always)]
-    fn sum_up_portable(&mut self, state: &PreciseState, half: f64, weight: f64) {
-        let nd = self.increment.len();
-        side_by_side!(for (
-            p in &state.p[..nd],
-            p_low in &state.p_low[..nd],
-            l_q in &self.l_q[..nd],
-            l_v in &self.l_v[..nd],
-            force in &self.force[..nd],
-            angle in &self.angles[..nd],
-        ) let (half_q, force) = (l_q * half, force * weight); {
-            residual(&mut self.residual[..nd]) = ((p - l_v) + (half_q + force)) + p_low;
-            magnitude(&mut self.magnitudes[..nd]) =
-                p.abs() + l_v.abs() + half_q.abs() * (angle.abs() + 1.0) + force.abs();
-        });
-    }
-
-    /// Gradient of the Lagrangian and forces at the midpoint.
-    pub(crate) fn evaluate_lagrangian(&mut self, model: &Model) {
-        let (orientations, derivatives) =
-            (&self.orientations_mid, [&mut *self.l_q, &mut *self.l_v]);
-        self.mechanics.gradient(model, &self.angles, orientations, &self.velocity, derivatives);
-        if model.potentials.any {
-            potentials::add_gradient(
-                &model.potentials,
-                &model.dynamics,
-                &self.mechanics.poses,
-                &self.q_mid,
-                &mut self.l_q,
-            );
-        }
-        if !model.damping.is_empty() {
-            forces::add_damping(&model.damping, &self.velocity, &self.input_force, &mut self.force);
-        }
-        if let Some(forces) = &model.forces {
-            if model.damping.is_empty() {
-                self.force.copy_from_slice(&self.input_force);
-            }
-            let mut force = std::mem::take(&mut self.force);
-            forces.add(&self.instant(model), &mut force);
-            self.force = force;
-        }
-    }
-
-    /// What forces depend on, at the last evaluation.
-    pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a> {
-        Instant {
-            tree: &model.dynamics,
-            poses: &self.mechanics.poses,
-            momenta: &self.mechanics.momenta,
-            velocity: &self.velocity,
-            inputs: &self.inputs,
-        }
+        let residual = chord.previous;
+        Err(StepError::NotConverged { iterations: report.iterations, residual })
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.
@@ -355,14 +233,13 @@ impl Workspace {
             return 0.0;
         }
         self.place_end(model, state);
-        self.end_is_exact = false;
-        self.end.evaluate(model, &self.q_end, &self.orientations_end);
-        self.end.violation()
+        self.constraints.end.evaluate(model, &self.step.q_end, &self.balls.end);
+        self.constraints.end.violation()
     }
 
     fn place_end(&mut self, model: &Model, state: &PreciseState) {
-        for (i, x) in self.increment.iter().enumerate() {
-            self.q_end[i] = state.q[i] + (state.q_low[i] + x);
+        for (i, x) in self.step.increment.iter().enumerate() {
+            self.step.q_end[i] = state.q[i] + (state.q_low[i] + x);
         }
         if !model.orientations.is_empty() {
             self.turn_to_end(model);
@@ -371,42 +248,13 @@ impl Workspace {
 
     /// One correction with the factors at hand.
     fn correct(&mut self, model: &Model) {
-        if self.in_loops {
-            self.constraint_residual.copy_from_slice(&self.end.value);
-            self.factors.solve_loops(model, &mut self.residual, &mut self.constraint_residual);
-            for (lambda, change) in self.multipliers.iter_mut().zip(&self.constraint_residual) {
-                *lambda -= change;
-            }
-            for (x, r) in self.increment.iter_mut().zip(&self.residual) {
-                *x -= r;
-            }
-            return;
+        self.residual.constraints.copy_from_slice(&self.constraints.end.value);
+        let [r1, r2] = [&mut self.residual.dynamics, &mut self.residual.constraints];
+        self.kkt.solve(model, &self.constraints.end, r1, r2);
+        for (lambda, change) in self.step.multipliers.iter_mut().zip(&self.residual.constraints) {
+            *lambda += change;
         }
-        self.factors.solve(model, &mut self.residual);
-        if model.dimensions.constraints > 0 {
-            let n = model.dimensions.coordinates();
-            let stride = padded(model.dimensions.constraints);
-            for (c, constraint) in model.constraints.iter().enumerate() {
-                let row = &self.end.jacobian[c * n..][..n];
-                let mut value = -self.end.value[c];
-                for &i in constraint.dynamic_coordinates() {
-                    value += row[i] * self.residual[i];
-                }
-                self.constraint_residual[c] = value;
-            }
-            self.schur.solve(&mut self.constraint_residual);
-            for (lambda, change) in self.multipliers.iter_mut().zip(&self.constraint_residual) {
-                *lambda += change;
-            }
-            for (i, r) in self.residual.iter_mut().enumerate() {
-                for (response, change) in
-                    self.responses[i * stride..].iter().zip(&self.constraint_residual)
-                {
-                    *r -= response * change;
-                }
-            }
-        }
-        for (x, r) in self.increment.iter_mut().zip(&self.residual) {
+        for (x, r) in self.step.increment.iter_mut().zip(&self.residual.dynamics) {
             *x -= r;
         }
     }
@@ -414,8 +262,8 @@ impl Workspace {
     /// Whether the last correction is no more than the round-off of the coordinates.
     fn is_round_off_of_coordinates(&self) -> bool {
         // The midpoint may be next to zero where start and end are not.
-        let size = |i: usize| self.angles[i].abs() + self.increment[i].abs();
-        let mut corrections = self.residual.iter().enumerate();
+        let size = |i: usize| self.mid.angles[i].abs() + self.step.increment[i].abs();
+        let mut corrections = self.residual.dynamics.iter().enumerate();
         corrections.all(|(i, x)| x.abs() <= 2.0 * f64::EPSILON * size(i))
     }
 
@@ -426,36 +274,29 @@ impl Workspace {
         settings: &Settings,
         mut report: StepReport,
     ) -> Result<StepReport, StepError> {
-        model.check_turns(&self.increment)?;
-        let pairs = self.l_q.iter().zip(&self.force);
-        for (impulse, (l_q, force)) in self.impulse.iter_mut().zip(pairs) {
-            *impulse = settings.time_step_s * (l_q + force);
-        }
-        if !model.orientations.is_empty() {
-            self.turn_impulse(model, settings);
-        }
+        model.check_turns(&self.step.increment)?;
+        self.find_impulse(model, settings);
         if model.dimensions.constraints > 0 {
-            if !self.in_loops {
-                // The extrapolated guess has the least norm of other configurations.
-                self.schur.remove_null(&mut self.multipliers);
-            }
-            self.start.subtract_pushes(model, &self.multipliers, &mut self.impulse);
+            // The extrapolated guess has the least norm of other configurations.
+            self.kkt.remove_null(&mut self.step.multipliers);
+            self.constraints.start.subtract_pushes(
+                model,
+                &self.step.multipliers,
+                &mut self.step.impulse,
+            );
         }
-        self.estimates.write(&mut report);
+        self.kkt.estimates.write(&mut report);
         Ok(report)
     }
 
     /// Constraints with Jacobian at the solution, for the linearization and the next step.
     pub(crate) fn finish_end(&mut self, model: &Model, state: &PreciseState) {
-        if model.dimensions.constraints > 0 && !self.end_is_exact {
+        if model.dimensions.constraints > 0 && !self.constraints.end.is_complete {
             self.place_end(model, state);
-            self.end.evaluate(model, &self.q_end, &self.orientations_end);
-            self.end.differentiate(model, &self.q_end);
-            self.end.place_in_plane(model, &self.q_end);
+            self.constraints.end.complete(model, &self.step.q_end, &self.balls.end);
             if !model.orientations.is_empty() {
                 self.turn_end_jacobian(model);
             }
-            self.end_is_exact = true;
         }
     }
 }

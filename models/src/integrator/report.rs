@@ -1,5 +1,7 @@
 //! What the solver of a step did, and why it failed.
 
+use crate::kkt::system::Estimates;
+use crate::math::tree_lu::SmallestPivot;
 use crate::model::mechanism::Model;
 
 /// What the solver did.
@@ -149,6 +151,14 @@ impl StepError {
     }
 }
 
+impl Estimates {
+    pub(crate) fn write(&self, report: &mut StepReport) {
+        report.reciprocal_condition = self.matrix;
+        report.constraint_reciprocal_condition = self.constraints;
+        report.redundant_constraints = self.redundant;
+    }
+}
+
 impl StepReport {
     /// Adds a step of a period.
     pub(crate) fn add(&mut self, step: &Self) {
@@ -165,6 +175,12 @@ impl StepReport {
 }
 
 impl Model {
+    /// The error of a Newton matrix with a pivot that is too small.
+    pub(crate) fn singular_matrix(&self, pivot: SmallestPivot) -> StepError {
+        let coordinate = self.coordinates[pivot.row].name.clone();
+        StepError::Singular { coordinate, pivot: pivot.relative }
+    }
+
     /// Refuses an input of the wrong length, or with a number that is not finite.
     pub fn check_input(&self, u: &[f64]) -> Result<(), StepError> {
         let d = self.dimensions;

@@ -1,24 +1,18 @@
 //! The memory of a step.
 
-use std::f64::consts::TAU;
-
 use crate::constraints::closure::Closure;
 use crate::integrator::blocks::StepBlocks;
-use crate::integrator::report::StepReport;
+use crate::integrator::midpoint::Midpoint;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
-use crate::kkt::factors::Factors;
-use crate::kkt::schur::room_for_schur;
-use crate::lagrangian::mechanics::Mechanics;
-use crate::math::pivoted_lu::PivotedLu;
+use crate::kkt::system::KktSystem;
 use crate::math::rows::{Term, padded, spread};
 use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
-use crate::model::tree::JointKind;
 
 /// What a step is taken of.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct At<'a> {
+pub(crate) struct StepContext<'a> {
     pub(crate) model: &'a Model,
     /// Of this step: its time step may be a part of the control period, or negative.
     pub(crate) settings: &'a Settings,
@@ -30,86 +24,91 @@ pub(crate) struct At<'a> {
 /// All memory that a step and its linearization need.
 #[derive(Clone, Debug)]
 pub(crate) struct Workspace {
+    pub(crate) step: StepIncrement,
+    pub(crate) mid: Midpoint,
+    pub(crate) balls: BallJoints,
+    pub(crate) residual: Residual,
+    pub(crate) constraints: ConstraintPair,
+    pub(crate) kkt: KktSystem,
+    pub(crate) tangents: Tangents,
+}
+
+/// The unknowns of a step, and where they lead.
+#[derive(Clone, Debug)]
+pub(crate) struct StepIncrement {
+    /// `x = q[k+1] − q[k]` of the dynamic coordinates.
     pub(crate) increment: Vec<f64>,
+    /// `λ`.
     pub(crate) multipliers: Vec<f64>,
-    /// Change of the momentum over the step.
+    /// `p[k+1] − p[k]`.
     pub(crate) impulse: Vec<f64>,
-    /// Configuration at the midpoint.
-    pub(crate) q_mid: Vec<f64>,
-    /// The same with angles of hinges less their whole turns, in which they keep all digits.
-    pub(crate) angles: Vec<f64>,
-    /// `1/2π` for the coordinates of hinges, else zero.
-    pub(crate) turns_per_radian: Vec<f64>,
-    /// Configuration at the end.
+    /// `q[k+1]`.
     pub(crate) q_end: Vec<f64>,
-    /// Orientations of ball joints at the start, the midpoint and the end.
-    pub(crate) orientations_start: Vec<Mat3>,
-    pub(crate) orientations_mid: Vec<Mat3>,
-    pub(crate) orientations_end: Vec<Mat3>,
-    /// How ball joints turn over the step, in their own axes.
+}
+
+/// The ball joints of a step.
+#[derive(Clone, Debug)]
+pub(crate) struct BallJoints {
+    /// Orientations at the start and at the end.
+    pub(crate) start: Vec<Mat3>,
+    pub(crate) end: Vec<Mat3>,
+    /// How they turn over the step, in their own axes.
     pub(crate) turns: Vec<Vec3>,
-    /// Derivatives with ball joints; none without.
-    pub(crate) turned: Option<Box<StepBlocks>>,
-    /// Velocity over the step.
-    pub(crate) velocity: Vec<f64>,
-    pub(crate) l_q: Vec<f64>,
-    pub(crate) l_v: Vec<f64>,
-    /// The inputs, where forces or ball joints need them; else empty.
-    pub(crate) inputs: Vec<f64>,
-    pub(crate) input_force: Vec<f64>,
-    /// Inputs, damping and forces at the midpoint.
-    pub(crate) force: Vec<f64>,
-    pub(crate) residual: Vec<f64>,
-    /// Magnitudes of what the residuals are the sums of, and the largest.
+    /// Derivatives of the step, which are found with all coordinates in one; none without ball joints.
+    pub(crate) blocks: Option<Box<StepBlocks>>,
+}
+
+/// What a step's equations leave over; a correction takes its place.
+#[derive(Clone, Debug)]
+pub(crate) struct Residual {
+    /// `r1`, of the discrete Euler-Lagrange equations.
+    pub(crate) dynamics: Vec<f64>,
+    /// `r2 = h(q1)`.
+    pub(crate) constraints: Vec<f64>,
+    /// Magnitudes of what `r1` is the sum of, and the largest.
     pub(crate) magnitudes: Vec<f64>,
     pub(crate) round_off: f64,
-    pub(crate) constraint_residual: Vec<f64>,
-    /// At the midpoint.
-    pub(crate) mechanics: Mechanics,
-    pub(crate) factors: Factors,
-    /// What springs and dampers of coordinates add to its diagonal.
-    pub(crate) diagonal: Vec<f64>,
-    /// The same for the linearization: of the residual by the start, of the momentum by the increment.
-    pub(crate) diagonals: [Vec<f64>; 2],
-    /// Constraints at `q[k]`.
+}
+
+/// The constraints at both ends of a step.
+#[derive(Clone, Debug)]
+pub(crate) struct ConstraintPair {
+    /// At `q[k]`; complete where it is known to be at the state's configuration.
     pub(crate) start: Closure,
-    /// `start` holds the constraints at the state's configuration.
-    pub(crate) start_is_valid: bool,
-    /// Constraints at `q[k+1]`.
+    /// At `q[k+1]`; complete at the solution.
     pub(crate) end: Closure,
-    /// `end` holds the constraints, Jacobian included, at the solution.
-    pub(crate) end_is_exact: bool,
-    /// `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
-    pub(crate) responses: Vec<f64>,
-    pub(crate) schur: PivotedLu,
-    /// The last factorization was one of loops, not of `K` and `S`.
-    pub(crate) in_loops: bool,
-    /// `Σ λ D²h`, for the linearization.
+}
+
+impl ConstraintPair {
+    /// The end of this step is the start of the next; a Jacobian by the increments of ball joints is not.
+    pub(crate) fn move_on(&mut self, has_balls: bool) {
+        if self.end.is_complete && !has_balls {
+            std::mem::swap(&mut self.start, &mut self.end);
+            self.end.is_complete = false;
+        } else {
+            self.forget();
+        }
+    }
+
+    /// The state has changed: nothing of the last step holds.
+    pub(crate) fn forget(&mut self) {
+        self.start.is_complete = false;
+        self.end.is_complete = false;
+    }
+}
+
+/// What a linearization is made of, row-major.
+#[derive(Clone, Debug)]
+pub(crate) struct Tangents {
+    /// Springs and dampers of coordinates: of the residual by the start, of the momentum by the increment.
+    pub(crate) diagonals: [Vec<f64>; 2],
+    /// `Σ λ D²h`.
     pub(crate) constraint_hessian: Vec<f64>,
-    /// `½h L_qq + L_qv`, for the linearization, row-major.
+    /// `½h L_qq + L_qv`.
     pub(crate) end_slopes: Vec<f64>,
-    /// `h L_qq`, for the linearization, row-major.
+    /// `h L_qq`.
     pub(crate) stiffness: Vec<f64>,
     pub(crate) terms: Vec<Term>,
-    pub(crate) estimates: Estimates,
-}
-
-/// Reciprocal condition estimates of the last factorization.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Estimates {
-    pub(crate) matrix: f64,
-    pub(crate) constraints: f64,
-    pub(crate) redundant: u32,
-}
-
-impl Estimates {
-    pub(crate) const NONE: Self = Self { matrix: 1.0, constraints: 1.0, redundant: 0 };
-
-    pub(crate) fn write(&self, report: &mut StepReport) {
-        report.reciprocal_condition = self.matrix;
-        report.constraint_reciprocal_condition = self.constraints;
-        report.redundant_constraints = self.redundant;
-    }
 }
 
 impl Workspace {
@@ -118,51 +117,45 @@ impl Workspace {
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
         let no = model.orientations.len();
         let zeros = |len: usize| vec![0.0; len];
-        let mut turns_per_radian = zeros(nd);
-        for joint in model.dynamics.joints.iter().filter(|j| j.kind == JointKind::Revolute) {
-            if let Some(turns) = turns_per_radian.get_mut(joint.coordinate) {
-                *turns = 1.0 / TAU;
-            }
-        }
         Self {
-            increment: zeros(nd),
-            multipliers: zeros(nc),
-            impulse: zeros(nd),
-            q_mid: zeros(n),
-            angles: zeros(n),
-            turns_per_radian,
-            q_end: zeros(n),
-            orientations_start: vec![Mat3::IDENTITY; no],
-            orientations_mid: vec![Mat3::IDENTITY; no],
-            orientations_end: vec![Mat3::IDENTITY; no],
-            turns: vec![Vec3::ZERO; no],
-            turned: (no > 0).then(|| Box::new(StepBlocks::new(model))),
-            velocity: zeros(n),
-            l_q: zeros(nd),
-            l_v: zeros(nd),
-            inputs: zeros(if model.forces.is_some() || no > 0 { d.inputs } else { 0 }),
-            input_force: zeros(nd),
-            force: zeros(nd),
-            residual: zeros(nd),
-            magnitudes: zeros(nd),
-            round_off: 0.0,
-            constraint_residual: zeros(nc),
-            mechanics: Mechanics::new(model),
-            factors: Factors::new(model),
-            diagonal: zeros(nd),
-            diagonals: [zeros(nd), zeros(nd)],
-            start: Closure::new(model),
-            start_is_valid: false,
-            end: Closure::new(model),
-            end_is_exact: false,
-            responses: zeros(nd * padded(nc)),
-            schur: room_for_schur(model, spread(padded(2 * n))),
-            in_loops: false,
-            constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
-            end_slopes: zeros(nd * nd),
-            stiffness: zeros(nd * nd),
-            terms: Vec::with_capacity(nd.max(nc)),
-            estimates: Estimates::NONE,
+            step: StepIncrement {
+                increment: zeros(nd),
+                multipliers: zeros(nc),
+                impulse: zeros(nd),
+                q_end: zeros(n),
+            },
+            mid: Midpoint::new(model),
+            balls: BallJoints {
+                start: vec![Mat3::IDENTITY; no],
+                end: vec![Mat3::IDENTITY; no],
+                turns: vec![Vec3::ZERO; no],
+                blocks: (no > 0).then(|| Box::new(StepBlocks::new(model))),
+            },
+            residual: Residual {
+                dynamics: zeros(nd),
+                constraints: zeros(nc),
+                magnitudes: zeros(nd),
+                round_off: 0.0,
+            },
+            constraints: ConstraintPair { start: Closure::new(model), end: Closure::new(model) },
+            kkt: KktSystem::new(model, spread(padded(2 * n))),
+            tangents: Tangents {
+                diagonals: [zeros(nd), zeros(nd)],
+                constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
+                end_slopes: zeros(nd * nd),
+                stiffness: zeros(nd * nd),
+                terms: Vec::with_capacity(nd.max(nc)),
+            },
         }
+    }
+
+    /// The state has changed: nothing of the last step holds.
+    pub(crate) fn forget(&mut self) {
+        self.constraints.forget();
+    }
+
+    /// The end of this step is the start of the next.
+    pub(crate) fn move_on(&mut self) {
+        self.constraints.move_on(!self.balls.turns.is_empty());
     }
 }

@@ -10,12 +10,16 @@
 //! ```
 //!
 //! joint `j` adds `plus_j x_j` to `ξ` and `s_j x_j` to `ω` of what it carries; it feels `minus_j·φ + s_j·ψ`
-//! ([`Elimination`] is the same without loops). A closure measures `e·ω` of its two bodies and pushes them by
+//! ([`PlanarRecursion`] is the same without loops). A closure measures `e·ω` of its two bodies and pushes them by
 //! `ψ −= e λ`. What is eliminated is summed in a front, `[φ ψ 0] = A [ξ ω λ]`, with one row for each equation
 //! that is still open; a pivot takes the product of a column and a row away from it.
 
+mod column;
+
+use column::Column;
+
 use crate::constraints::in_plane::InPlane;
-use crate::kkt::planar::{Diagonal, Elimination, Method, Of, add_to, dot3, product};
+use crate::kkt::planar::{Diagonal, MatrixKind, Method, PlanarRecursion, add_to, dot3, product};
 use crate::lagrangian::planar::{Fours, Joints, Vec2, Vec3, cross};
 use crate::math::rows::{Block, LANES, padded};
 use crate::math::simd::wide;
@@ -53,71 +57,10 @@ struct Closed {
     inverse: f64,
 }
 
-/// What a right-hand side is made of: a number, or several side by side.
-trait Side: Copy {
-    const ZERO: Self;
-    fn plus(self, other: Self) -> Self;
-    fn times(self, factor: f64) -> Self;
-    /// `Σ row_k x_k`; both lengths are whole blocks.
-    fn sum(row: &[f64], x: &[Self]) -> Self;
-}
-
-impl Side for f64 {
-    const ZERO: Self = 0.0;
-
-    #[inline(always)]
-    fn plus(self, other: Self) -> Self {
-        self + other
-    }
-
-    #[inline(always)]
-    fn times(self, factor: f64) -> Self {
-        self * factor
-    }
-
-    #[inline(always)]
-    fn sum(row: &[f64], x: &[f64]) -> f64 {
-        let mut sums = [0.0; LANES];
-        for (row, x) in row.as_chunks::<LANES>().0.iter().zip(x.as_chunks::<LANES>().0) {
-            for ((sum, row), x) in sums.iter_mut().zip(row).zip(x) {
-                *sum += row * x;
-            }
-        }
-        let [a, b, c, d, e, f, g, h] = sums;
-        ((a + e) + (b + f)) + ((c + g) + (d + h))
-    }
-}
-
-impl Side for Block {
-    const ZERO: Self = Block::ZERO;
-
-    #[inline(always)]
-    fn plus(self, other: Self) -> Self {
-        Block::plus(self, other)
-    }
-
-    #[inline(always)]
-    fn times(self, factor: f64) -> Self {
-        Block::times(self, factor)
-    }
-
-    #[inline(always)]
-    fn sum(row: &[f64], x: &[Block]) -> Block {
-        let mut sums = [Block::ZERO; 4];
-        for (row, x) in row.as_chunks::<LANES>().0.iter().zip(x.as_chunks::<LANES>().0) {
-            for (k, (row, x)) in row.iter().zip(x).enumerate() {
-                sums[k % 4] = sums[k % 4].plus(x.times(*row));
-            }
-        }
-        let [a, b, c, d] = sums;
-        a.plus(b).plus(c.plus(d))
-    }
-}
-
-/// The matrix.
+/// The KKT matrix of a mechanism with loops, factored front by front.
 #[derive(Clone, Debug)]
-pub(crate) struct LoopElimination {
-    tree: Elimination,
+pub(crate) struct Multifrontal {
+    tree: PlanarRecursion,
     shapes: Vec<Shape>,
     fronts: Vec<f64>,
     pivots: Vec<Pivot>,
@@ -128,7 +71,7 @@ pub(crate) struct LoopElimination {
     flows: Vec<f64>,
     sides: Vec<f64>,
     multipliers: Vec<f64>,
-    /// The same of a block of them.
+    /// Flows, sides and multipliers of a block of right-hand sides.
     block_flows: Vec<Block>,
     block_sides: Vec<Block>,
     block_multipliers: Vec<Block>,
@@ -286,7 +229,7 @@ impl Front<'_> {
     }
 }
 
-impl LoopElimination {
+impl Multifrontal {
     pub(crate) fn new(loops: &Loops) -> Self {
         let (joints, equations) = (loops.in_closure.len(), loops.equations.len());
         let (mut shapes, mut entry, mut row) = (Vec::new(), 0, 0);
@@ -299,7 +242,7 @@ impl LoopElimination {
         let factors = loops.plan.steps.iter();
         let factors = factors.map(|s| 2 * shapes[s.front].stride * (1 + s.closed.len())).sum();
         Self {
-            tree: Elimination::new(joints),
+            tree: PlanarRecursion::new(joints),
             shapes,
             fronts: vec![0.0; entry],
             pivots: vec![Pivot::default(); joints],
@@ -325,7 +268,7 @@ impl LoopElimination {
             diagonal: &[f64],
             scales: Scales<'_>,
             time_step_s: f64,
-            of: Of,
+            kind: MatrixKind,
         ) -> Pivots = factor_portable, factor_avx2, factor_avx512;
 
         /// Solves for `x` and `λ` in place; `constraints` are all that the model has.
@@ -337,7 +280,7 @@ impl LoopElimination {
             constraints: &mut [f64],
         ) = solve_portable, solve_avx2, solve_avx512;
 
-        /// As [`Elimination::linearize`], with multipliers. About `8 m` flops for each joint or equation
+        /// As [`PlanarRecursion::linearize`], with multipliers. About `8 m` flops for each joint or equation
         /// and column beside those of a tree.
         #[inline(never)]
         pub(crate) fn linearize(
@@ -356,10 +299,10 @@ impl LoopElimination {
         diagonal: &[f64],
         scales: Scales<'_>,
         time_step_s: f64,
-        of: Of,
+        kind: MatrixKind,
     ) -> Pivots {
         let Mechanism { loops, joints, tree, start, end } = at;
-        let method = Method::new(time_step_s, of);
+        let method = Method::new(time_step_s, kind);
         self.tree.step = time_step_s;
         self.fronts.fill(0.0);
         let mut pivots = Pivots { joints: SmallestPivot::NONE, equations: 1.0, steepness: 1.0 };
@@ -375,6 +318,7 @@ impl LoopElimination {
                     .open(opened, [start, end].map(|closures| &closures.wrenches[opened.equation]));
             }
 
+            // D = K_jj + minusᵀ A plus,  U = upper + A plus,  W = lower + Aᵀ minus.
             let joint = &joints[i];
             let link = tree.link(i);
             let ([upper, lower], generator) = method.generator(&link, joint);
@@ -387,17 +331,19 @@ impl LoopElimination {
             for (k, factor) in minus.iter().enumerate() {
                 add_row(row, *factor, front.row(place + k));
             }
-            let own = dot3(generator.minus, upper) + diagonal[i];
-            let pushed = column[place..].iter().zip(minus).map(|(pushed, minus)| pushed * minus);
-            let pivot = own + pushed.sum::<f64>();
-            pivots.joints.see(i, pivot, own.abs().max(scales.inertia[i] * method.inverse.abs()));
+            let k_jj = dot3(generator.minus, upper) + diagonal[i];
+            let a_plus = column[place..].iter().zip(minus).map(|(a_plus, minus)| a_plus * minus);
+            let pivot = k_jj + a_plus.sum::<f64>();
+            pivots.joints.see(i, pivot, k_jj.abs().max(scales.inertia[i] * method.inverse.abs()));
             let inverse = 1.0 / pivot;
             for k in 0..3 {
                 column[place + k] += upper[k];
                 row[place + k] += lower[k];
             }
+            // A −= U Wᵀ / D.
             front.eliminate(column, row, inverse);
 
+            // Equations that are closed here, the steepest first.
             let closing = take_first(&mut closed, step.closed.len());
             for (closed, &(equation, row)) in closing.iter_mut().zip(&step.closed) {
                 let weight = scales.weight[loops.equations[equation].constraint];
@@ -445,7 +391,7 @@ impl LoopElimination {
 
     /// From the leaves to the root.
     #[inline(always)]
-    fn eliminate<S: Side>(
+    fn eliminate<S: Column>(
         &self,
         loops: &Loops,
         x: &mut [S],
@@ -500,7 +446,7 @@ impl LoopElimination {
 
     /// From the root to the leaves.
     #[inline(always)]
-    fn substitute<S: Side>(
+    fn substitute<S: Column>(
         &self,
         loops: &Loops,
         x: &mut [S],
@@ -560,7 +506,7 @@ impl LoopElimination {
         for first in (0..stride).step_by(LANES) {
             self.tree.start_columns(tree, joints, diagonal, first);
             let columns = first..n.min(first + LANES);
-            let Elimination { increment, momentum, .. } = &mut self.tree;
+            let PlanarRecursion { increment, momentum, .. } = &mut self.tree;
             for (i, (x, p)) in increment.iter_mut().zip(momentum).enumerate() {
                 if first < n {
                     let row = &closures.hessian[i * n..][columns.clone()];
@@ -648,7 +594,7 @@ fn add_row(to: &mut [f64], factor: f64, from: &[f64]) {
 
 /// `to += factor · column`, over whole blocks.
 #[inline(always)]
-fn add_column<S: Side>(to: &mut [S], factor: S, column: &[f64]) {
+fn add_column<S: Column>(to: &mut [S], factor: S, column: &[f64]) {
     let column = column.as_chunks::<LANES>().0;
     for (to, column) in to.as_chunks_mut::<LANES>().0.iter_mut().zip(column) {
         for (to, column) in to.iter_mut().zip(column) {

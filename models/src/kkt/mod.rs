@@ -1,7 +1,7 @@
 //! The linear system of a step.
 
-pub(crate) mod factors;
 pub(crate) mod loops;
 pub(crate) mod planar;
 pub(crate) mod schur;
 pub(crate) mod space;
+pub(crate) mod system;

@@ -12,11 +12,13 @@
 //! joint is summed in a 3 by 3 matrix `A`,
 //!
 //! ```text
-//! d_j = K_jj + minus_jᵀ A_j plus_j      above_j = upper_j + A_j plus_j      across_j = lower_j + A_jᵀ minus_j
-//! A_parent += A_j − above_j across_jᵀ / d_j
+//! D_j = K_jj + minus_jᵀ A_j plus_j      U_j = upper_j + A_j plus_j      W_j = lower_j + A_jᵀ minus_j
+//! A_parent += A_j − U_j W_jᵀ / D_j
 //! ```
 //!
-//! and `d_j` are the pivots of an elimination from the leaves to the root. As each sum is about its own
+//! This is the articulated recursion: `A` stands for the articulated inertia, and for masses alone, where
+//! `K` is symmetric, `W` is the `U` of the literature with another sign. The pivots of an elimination from
+//! the leaves to the root are `D_j`. As each sum is about its own
 //! joint, long chains lose no digits.
 
 use crate::lagrangian::planar::{Fours, Joints, Link, Vec2, Vec3, cross, dot, linear};
@@ -30,7 +32,7 @@ use crate::model::planar_tree::PlanarJoint;
 pub(super) struct Generator {
     pub(super) minus: Vec3,
     pub(super) plus: Vec3,
-    inverse_pivot: f64,
+    inverse_d: f64,
 }
 
 /// What a joint gives to the derivative of the momentum.
@@ -45,15 +47,15 @@ struct Slope {
 }
 
 /// How right-hand sides pass a joint when it has been eliminated: what is below reaches the parent as
-/// `up · flow + drive · b`, and what is above the children as `down · flow + plus · x`. These wait for one
+/// `up · flow + U/D · b`, and what is above the children as `down · flow + plus · x`. These wait for one
 /// product each, not for the solution.
 #[derive(Clone, Copy, Debug, Default)]
 struct Passage {
     up: [Vec3; 3],
-    drive: Vec3,
+    u_over_d: Vec3,
     down: [Vec3; 3],
-    /// What the flow from the parent takes from the solution.
-    taken: Vec3,
+    /// `W/D`: what the flow from the parent takes from the solution.
+    w_over_d: Vec3,
 }
 
 /// What springs and dampers of coordinates add: `−½h V_ii` to the derivative of the residual by the
@@ -63,13 +65,13 @@ pub(crate) struct Diagonal<'a> {
     pub(crate) momentum: &'a [f64],
 }
 
-/// What a matrix is made of.
+/// Which matrix of the second derivatives of the Lagrangian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Of {
-    /// Second derivatives by positions and velocities: the Newton matrix.
-    Motion,
-    /// Those by velocities.
-    Masses,
+pub(crate) enum MatrixKind {
+    /// The Newton matrix `K`.
+    Newton,
+    /// The mass matrix, as `−M/h`.
+    Mass,
 }
 
 /// The matrix of a step.
@@ -83,8 +85,8 @@ pub(super) struct Method {
 
 impl Method {
     #[inline(always)]
-    pub(super) fn new(step: f64, of: Of) -> Self {
-        let motion = if of == Of::Masses { 0.0 } else { 1.0 };
+    pub(super) fn new(step: f64, kind: MatrixKind) -> Self {
+        let motion = if kind == MatrixKind::Mass { 0.0 } else { 1.0 };
         Self { motion, half: 0.5 * step * motion, inverse: 1.0 / step }
     }
 
@@ -105,21 +107,21 @@ impl Method {
         let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
         upper[0] -= 0.5 * weight;
         lower[0] += 0.5 * weight;
-        let generator = Generator { minus, plus, inverse_pivot: 0.0 };
+        let generator = Generator { minus, plus, inverse_d: 0.0 };
         ([upper, lower], generator)
     }
 }
 
-/// The matrix.
+/// The Newton matrix of a planar tree, factored.
 #[derive(Clone, Debug)]
-pub(crate) struct Elimination {
+pub(crate) struct PlanarRecursion {
     generators: Vec<Generator>,
     slopes: Vec<Slope>,
     passages: Vec<Passage>,
     pub(super) step: f64,
     /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
     branches: Vec<[Vec3; 3]>,
-    /// The same for a right-hand side, and what joints with several children pass down to them.
+    /// What branches pass of a right-hand side, and what joints with several children pass down to them.
     flows_of_branches: Vec<Vec3>,
     flow: Vec<Vec3>,
     /// Both for a block of right-hand sides; the first is that of the world. What goes up is zero but within a
@@ -166,7 +168,7 @@ fn add_scaled(a: Vec3, s: f64, b: Vec3) -> Vec3 {
     [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]]
 }
 
-impl Elimination {
+impl PlanarRecursion {
     pub(crate) fn new(joints: usize) -> Self {
         Self {
             generators: vec![Generator::default(); joints],
@@ -195,7 +197,7 @@ impl Elimination {
             diagonal: &[f64],
             inertia: &[f64],
             step: f64,
-            of: Of,
+            kind: MatrixKind,
         ) -> SmallestPivot = factor_portable, factor_avx2;
 
         /// Solves `K x = b` in place, about 55 flops a joint.
@@ -228,9 +230,9 @@ impl Elimination {
         diagonal: &[f64],
         inertia: &[f64],
         step: f64,
-        of: Of,
+        kind: MatrixKind,
     ) -> SmallestPivot {
-        let method = Method::new(step, of);
+        let method = Method::new(step, kind);
         self.step = step;
         let mut smallest = SmallestPivot::NONE;
         // `A` of the joint that follows, about its parent.
@@ -245,23 +247,25 @@ impl Elimination {
             let ([upper, lower], mut generator) = method.generator(&link, joint);
             let Generator { minus, plus, .. } = generator;
 
-            let pushed = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
-            let own = dot3(minus, upper) + diagonal[row];
-            let pivot = own + dot3(minus, pushed);
-            smallest.see(row, pivot, own.abs().max(inertia[row] * method.inverse));
-            let inverse_pivot = 1.0 / pivot;
-            let pulled = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
-            let (above, across) = (plus3(upper, pushed), plus3(lower, pulled));
-            // About the parent: all that can be done before the pivot is known.
+            // D = K_jj + minusᵀ A plus,  U = upper + A plus,  W = lower + Aᵀ minus.
+            let a_plus = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
+            let k_jj = dot3(minus, upper) + diagonal[row];
+            let d = k_jj + dot3(minus, a_plus);
+            smallest.see(row, d, k_jj.abs().max(inertia[row] * method.inverse));
+            let inverse_d = 1.0 / d;
+            let a_minus = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
+            let (u, w) = (plus3(upper, a_plus), plus3(lower, a_minus));
+            // A, U and W / D about the parent: all that can be done before D is known.
             let edge = link.edge;
             let [ex, ey] = edge;
             let moved = |v: Vec3| [v[0] + cross(edge, linear(v)), v[1], v[2]];
             let (a, b, c) = (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
-            let (above_there, taken) = (moved(above), scaled(inverse_pivot, moved(across)));
+            let (u, w_over_d) = (moved(u), scaled(inverse_d, moved(w)));
+            // A − U Wᵀ / D, for the parent.
             let sum = [
-                add_scaled(a, -above_there[0], taken),
-                add_scaled(b, -above_there[1], taken),
-                add_scaled(c, -above_there[2], taken),
+                add_scaled(a, -u[0], w_over_d),
+                add_scaled(b, -u[1], w_over_d),
+                add_scaled(c, -u[2], w_over_d),
             ];
             match joint.parent {
                 0 => {}
@@ -270,23 +274,24 @@ impl Elimination {
                     self.branches[parent - 1] = plus33(self.branches[parent - 1], sum);
                 }
             }
-            let (drive, wrench) = (scaled(inverse_pivot, above_there), [1.0, -ey, ex]);
+            // Right-hand sides pass by 1 − U minusᵀ / D up, and by 1 − plus Wᵀ / D down.
+            let (u_over_d, wrench) = (scaled(inverse_d, u), [1.0, -ey, ex]);
             let unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
             self.passages[row] = Passage {
                 up: [
-                    add_scaled(wrench, -drive[0], minus),
-                    add_scaled(unit[1], -drive[1], minus),
-                    add_scaled(unit[2], -drive[2], minus),
+                    add_scaled(wrench, -u_over_d[0], minus),
+                    add_scaled(unit[1], -u_over_d[1], minus),
+                    add_scaled(unit[2], -u_over_d[2], minus),
                 ],
-                drive,
+                u_over_d,
                 down: [
-                    add_scaled(unit[0], -plus[0], taken),
-                    add_scaled([-ey, 1.0, 0.0], -plus[1], taken),
-                    add_scaled([ex, 0.0, 1.0], -plus[2], taken),
+                    add_scaled(unit[0], -plus[0], w_over_d),
+                    add_scaled([-ey, 1.0, 0.0], -plus[1], w_over_d),
+                    add_scaled([ex, 0.0, 1.0], -plus[2], w_over_d),
                 ],
-                taken,
+                w_over_d,
             };
-            generator.inverse_pivot = inverse_pivot;
+            generator.inverse_d = inverse_d;
             self.generators[row] = generator;
         }
         smallest
@@ -297,14 +302,14 @@ impl Elimination {
         let Self { generators, passages, flows_of_branches: branches, flow: flows, .. } = self;
         let mut below = [0.0; 3];
         for (i, joint) in joints.iter().enumerate().rev() {
-            let (Generator { minus, inverse_pivot, .. }, passage) = (&generators[i], &passages[i]);
+            let (Generator { minus, inverse_d, .. }, passage) = (&generators[i], &passages[i]);
             let mut flow = if joint.is_followed { below } else { [0.0; 3] };
             if joint.has_branches {
                 flow = plus3(flow, std::mem::take(&mut branches[i]));
             }
             let b = x[i];
-            x[i] = (b - dot3(*minus, flow)) * inverse_pivot;
-            let up = passed(&passage.up, flow, b, passage.drive);
+            x[i] = (b - dot3(*minus, flow)) * inverse_d;
+            let up = passed(&passage.up, flow, b, passage.u_over_d);
             match joint.parent {
                 0 => {}
                 parent if parent == i => below = up,
@@ -319,7 +324,7 @@ impl Elimination {
                 parent => flows[parent - 1],
             };
             let (own, passage) = (x[i], &passages[i]);
-            x[i] = own - dot3(passage.taken, flow);
+            x[i] = own - dot3(passage.w_over_d, flow);
             above = passed(&passage.down, flow, own, generators[i].plus);
             if joint.has_branches {
                 flows[i] = above;
@@ -450,9 +455,9 @@ impl Elimination {
             let flow = std::mem::replace(&mut self.flows[i + 1], [Block::ZERO; 3]);
             let right = row.times(-1.0);
             let pulled = product(generator.minus, flow);
-            *row = row.plus(pulled).times(-generator.inverse_pivot);
+            *row = row.plus(pulled).times(-generator.inverse_d);
             if joint.parent > 0 {
-                let up = passed_by_all(&passage.up, flow, right, passage.drive);
+                let up = passed_by_all(&passage.up, flow, right, passage.u_over_d);
                 add_to(&mut self.flows[joint.parent], up);
             }
         }
@@ -469,7 +474,7 @@ impl Elimination {
             let Slope { edge, plus, slope, .. } = *slope;
             let (flow, right) = (self.motions[joint.parent], *row);
             let slope = [slope[0] + cross(edge, linear(slope)), slope[1], slope[2]];
-            let x = right.plus(product(passage.taken, flow).times(-1.0));
+            let x = right.plus(product(passage.w_over_d, flow).times(-1.0));
             *row = x;
             *momentum = momentum.plus(product(slope, flow)).plus(x.times(*own));
             self.motions[i + 1] = passed_by_all(&passage.down, flow, right, plus);

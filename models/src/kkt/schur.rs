@@ -1,9 +1,71 @@
-//! The matrix of the constraints: S = A1 K⁻¹ A0ᵀ.
+//! The Schur complement of `K` in the KKT system: `S = A1 K⁻¹ A0ᵀ`.
 
 use crate::constraints::closure::Closure;
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rows::padded;
+use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Model;
+
+/// `S`, factored, with what it is made of.
+#[derive(Clone, Debug)]
+pub(crate) struct SchurComplement {
+    /// `K⁻¹ A0ᵀ`, row-major, nd by padded nc.
+    pub(crate) responses: Vec<f64>,
+    pub(crate) lu: PivotedLu,
+}
+
+impl SchurComplement {
+    pub(crate) fn new(model: &Model, stride: usize) -> Self {
+        let d = model.dimensions;
+        let responses = vec![0.0; d.dynamic * padded(d.constraints)];
+        Self { responses, lu: room_for_schur(model, stride) }
+    }
+
+    /// Factors `S` with the `K` that is factored, and the Jacobians at the start and the end.
+    pub(crate) fn factor(&mut self, model: &Model, tree: &mut TreeLu, [start, end]: [&Closure; 2]) {
+        let (n, nc) = (model.dimensions.coordinates(), model.dimensions.constraints);
+        let stride = padded(nc);
+        for i in 0..model.dimensions.dynamic {
+            for c in 0..nc {
+                self.responses[i * stride + c] = start.jacobian[c * n + i];
+            }
+        }
+        tree.solve_rows(&model.elimination, &mut self.responses, stride, stride);
+        fill_schur(model, end, &self.responses, &mut self.lu);
+        self.lu.factor();
+    }
+
+    /// From `K⁻¹ r1` in `x` and `r2` in `lambda`: `dλ = S⁻¹ (A1 K⁻¹ r1 − r2)` and `K⁻¹ (r1 − A0ᵀ dλ)`.
+    pub(crate) fn close(
+        &mut self,
+        model: &Model,
+        end: &Closure,
+        x: &mut [f64],
+        lambda: &mut [f64],
+    ) {
+        let n = model.dimensions.coordinates();
+        for (c, constraint) in model.constraints.iter().enumerate() {
+            let row = &end.jacobian[c * n..][..n];
+            let mut value = -lambda[c];
+            for &i in constraint.dynamic_coordinates() {
+                value += row[i] * x[i];
+            }
+            lambda[c] = value;
+        }
+        self.lu.solve(lambda);
+        self.subtract_responses(lambda, x);
+    }
+
+    /// `x −= K⁻¹ A0ᵀ λ`.
+    pub(crate) fn subtract_responses(&self, lambda: &[f64], x: &mut [f64]) {
+        let stride = padded(lambda.len());
+        for (i, x) in x.iter_mut().enumerate() {
+            for (response, lambda) in self.responses[i * stride..].iter().zip(lambda) {
+                *x -= response * lambda;
+            }
+        }
+    }
+}
 
 /// Writes `A X` for the constraint Jacobian `A` of `closure` and `X`, row-major, nd by padded nc.
 pub(crate) fn fill_schur(model: &Model, closure: &Closure, x: &[f64], schur: &mut PivotedLu) {

@@ -15,18 +15,18 @@
 //! the same form: what is eliminated below a joint is summed in an 8 by 8 matrix `A`,
 //!
 //! ```text
-//! d_j = K_jj + minus_jᵀ A_j plus_j      above_j = upper_j + A_j plus_j      across_j = lower_j + A_jᵀ minus_j
-//! A_parent += A_j − above_j across_jᵀ / d_j
+//! D_j = K_jj + minus_jᵀ A_j plus_j      U_j = upper_j + A_j plus_j      W_j = lower_j + A_jᵀ minus_j
+//! A_parent += A_j − U_j W_jᵀ / D_j
 //! ```
 //!
-//! and `d_j` are the pivots of an elimination from the leaves to the root. As all sums are about one origin,
+//! as in [`planar`](crate::kkt::planar), and `D_j` are the pivots of an elimination from the leaves to the root. As all sums are about one origin,
 //! the solution loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction
 //! makes good.
 
 #[cfg(test)]
 mod tests;
 
-use crate::kkt::planar::Of;
+use crate::kkt::planar::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::math::rows::Block;
 use crate::math::simd::wide;
@@ -39,21 +39,20 @@ use crate::model::tree::Tree;
 struct Generator {
     minus: Block,
     plus: Block,
-    above: Block,
-    /// Divided by the pivot.
-    across: Block,
+    u: Block,
+    w_over_d: Block,
 }
 
-/// The matrix.
+/// The Newton matrix of a tree in space, factored.
 #[derive(Clone, Debug)]
-pub(crate) struct Elimination {
+pub(crate) struct SpatialRecursion {
     generators: Vec<Generator>,
-    inverse_pivot: Vec<f64>,
+    inverse_d: Vec<f64>,
     /// Where the sums of each joint are.
     places: Vec<usize>,
     /// `A` by rows; zero but for joints whose elimination has begun.
     sums: Vec<[Block; 8]>,
-    /// The same for right-hand sides, and twists that belong to solutions.
+    /// Flows of right-hand sides, and twists that belong to solutions.
     flows: Vec<Block>,
     /// `e1` and `e2`.
     horizontal: [Vec3; 2],
@@ -93,7 +92,7 @@ fn lanes(a: Vec3, b: Vec3, [c, d]: [f64; 2]) -> Block {
     Block([a[0], a[1], a[2], b[0], b[1], b[2], c, d])
 }
 
-impl Elimination {
+impl SpatialRecursion {
     pub(crate) fn new(tree: &Tree, gravity: Option<Vec3>) -> Self {
         let joints = tree.joints.len();
         let places = places(tree);
@@ -105,7 +104,7 @@ impl Elimination {
         };
         Self {
             generators: vec![Generator::default(); joints],
-            inverse_pivot: vec![0.0; joints],
+            inverse_d: vec![0.0; joints],
             places,
             sums: vec![[Block::ZERO; 8]; most],
             flows: vec![Block::ZERO; most],
@@ -126,7 +125,7 @@ impl Elimination {
             diagonal: &[f64],
             inertia: &[f64],
             step: f64,
-            of: Of,
+            kind: MatrixKind,
         ) -> SmallestPivot = factor_portable, factor_avx2;
 
         /// Solves `K x = b` in place, about 65 flops a joint.
@@ -142,10 +141,10 @@ impl Elimination {
         diagonal: &[f64],
         inertia: &[f64],
         step: f64,
-        of: Of,
+        kind: MatrixKind,
     ) -> SmallestPivot {
         let Mechanics { momenta, curvature, .. } = mechanics;
-        let motion = if of == Of::Masses { 0.0 } else { 0.5 };
+        let motion = if kind == MatrixKind::Mass { 0.0 } else { 0.5 };
         let (half, inverse) = (step * motion, 1.0 / step);
         let [e1, e2] = self.horizontal;
         let weight = 0.5 * half * self.gravity;
@@ -165,23 +164,24 @@ impl Elimination {
             let place = self.places[row];
             let (sums, own) = self.sums.split_at_mut(place);
             let own = &mut own[0];
-            let mut pushed = Block::ZERO;
-            for (pushed, line) in pushed.0.iter_mut().zip(&*own) {
-                *pushed = dot(line, &plus);
+            // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
+            let mut a_plus = Block::ZERO;
+            for (a_plus, line) in a_plus.0.iter_mut().zip(&*own) {
+                *a_plus = dot(line, &plus);
             }
-            let above = upper.plus(pushed);
-            let mut across = lower;
+            let u = upper.plus(a_plus);
+            let mut w = lower;
             for (two, lines) in minus.0.as_chunks::<2>().0.iter().zip(own.as_chunks::<2>().0) {
-                let pulled = lines[0].times(two[0]).plus(lines[1].times(two[1]));
-                across = across.plus(pulled);
+                w = w.plus(lines[0].times(two[0]).plus(lines[1].times(two[1])));
             }
-            let entry = dot(&minus, &upper) + diagonal[row];
-            let pivot = entry + dot(&minus, &pushed);
-            smallest.see(row, pivot, entry.abs().max(inertia[row] * inverse.abs()));
-            let inverse_pivot = 1.0 / pivot;
-            let across = across.times(inverse_pivot);
-            for (line, above) in own.iter_mut().zip(above.0) {
-                *line = line.plus(across.times(-above));
+            let k_jj = dot(&minus, &upper) + diagonal[row];
+            let d = k_jj + dot(&minus, &a_plus);
+            smallest.see(row, d, k_jj.abs().max(inertia[row] * inverse.abs()));
+            let inverse_d = 1.0 / d;
+            let w_over_d = w.times(inverse_d);
+            // A −= U Wᵀ / D, and on to the parent.
+            for (line, u) in own.iter_mut().zip(u.0) {
+                *line = line.plus(w_over_d.times(-u));
             }
             match self.places.get(joint.parent) {
                 Some(&to) if to == place => {}
@@ -194,21 +194,21 @@ impl Elimination {
                     *own = [Block::ZERO; 8];
                 }
             }
-            self.generators[row] = Generator { minus, plus, above, across };
-            self.inverse_pivot[row] = inverse_pivot;
+            self.generators[row] = Generator { minus, plus, u, w_over_d };
+            self.inverse_d[row] = inverse_d;
         }
         smallest
     }
 
     #[inline(always)]
     fn solve_portable(&mut self, tree: &Tree, x: &mut [f64]) {
-        let Self { generators, inverse_pivot, places, flows, .. } = self;
+        let Self { generators, inverse_d, places, flows, .. } = self;
         flows.fill(Block::ZERO);
         for (i, joint) in tree.joints.iter().enumerate().rev() {
             let (generator, place) = (&generators[i], places[i]);
             let flow = flows[place];
-            x[i] = (x[i] - dot(&generator.minus, &flow)) * inverse_pivot[i];
-            let flow = flow.plus(generator.above.times(x[i]));
+            x[i] = (x[i] - dot(&generator.minus, &flow)) * inverse_d[i];
+            let flow = flow.plus(generator.u.times(x[i]));
             match places.get(joint.parent) {
                 Some(&to) if to == place => flows[to] = flow,
                 to => {
@@ -221,7 +221,7 @@ impl Elimination {
         }
         for (i, joint) in tree.joints.iter().enumerate() {
             let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
-            x[i] -= dot(&generators[i].across, &flow);
+            x[i] -= dot(&generators[i].w_over_d, &flow);
             flows[places[i]] = flow.plus(generators[i].plus.times(x[i]));
         }
     }

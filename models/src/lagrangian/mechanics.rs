@@ -2,6 +2,8 @@
 //! scene allows it, else in space.
 
 use crate::lagrangian::curvature::{Curvature, Entry, SecondDerivatives};
+
+use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::lagrangian::planar::{Planar, PlanarTree};
@@ -53,6 +55,17 @@ impl<S: Planar> Mechanics<S> {
             (Some(planar), Some(joints)) => planar.differentiate(joints),
             _ => self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta),
         }
+    }
+
+    /// What forces depend on, at the last gradient.
+    pub(crate) fn instant<'a>(
+        &'a self,
+        model: &'a Model,
+        velocity: &'a [S],
+        inputs: &'a [S],
+    ) -> Instant<'a, S> {
+        let (poses, momenta) = (&self.poses, &self.momenta);
+        Instant { tree: &model.dynamics, poses, momenta, velocity, inputs }
     }
 
     /// Second derivatives for a pair of joints on one path to the root.

@@ -11,7 +11,7 @@ pub(crate) mod point_spring;
 pub(crate) mod spline_spring;
 
 use crate::lagrangian::kinematics::Poses;
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::math::scalar::Scalar;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::{Potentials, Spring};
@@ -161,7 +161,7 @@ pub(crate) fn add_to_newton_matrix(
     poses: &Poses,
     q: &[f64],
     step: f64,
-    elimination: &Elimination,
+    elimination: &SymbolicElimination,
     matrix: &mut TreeLu,
 ) {
     for_each_second_derivative(potentials, tree, poses, q, |i, j, value| {

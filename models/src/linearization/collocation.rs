@@ -12,7 +12,8 @@ use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::system::System;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
-use crate::integrator::workspace::{At, Workspace};
+
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::linearization::linearize::{Linearization, StageTangents};
 use crate::linearization::parameters::Parameters;
 use crate::math::rows::{add_product, add_rows};
@@ -22,7 +23,7 @@ impl Collocation {
     pub(crate) fn linearize(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<(), StepError> {
         let model = at.model;
@@ -48,13 +49,13 @@ impl Collocation {
                 terms: Vec::new(),
             })
         });
-        system.begin(at, &self.motion, &self.inputs, &mut workspace.input_force);
+        system.begin(at, &self.motion, &self.inputs, &mut workspace.mid.input_force);
         system.evaluate(workspace, at, &self.inputs);
         system.differentiate(workspace, at, &self.inputs);
         for i in 0..count {
             system.place(workspace, at.state, i);
-            tangents.q[i * n..][..n].copy_from_slice(&workspace.q_mid);
-            tangents.velocity[i * n..][..n].copy_from_slice(&workspace.velocity);
+            tangents.q[i * n..][..n].copy_from_slice(&workspace.mid.q);
+            tangents.velocity[i * n..][..n].copy_from_slice(&workspace.mid.velocity);
         }
         tangents.inputs.copy_from_slice(&self.inputs);
         workspace.prepare(at);

@@ -30,8 +30,9 @@ use nalgebra::DMatrix;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::turning::Turning;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
+use crate::kkt::system::Factors;
 use crate::linearization::parameters::Parameters;
 use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
@@ -166,27 +167,27 @@ impl SolvedStep {
     }
 
     /// Remembers the solution in the workspace.
-    pub(crate) fn remember(&mut self, workspace: &Workspace, at: At<'_>) {
+    pub(crate) fn remember(&mut self, workspace: &Workspace, at: StepContext<'_>) {
         let (inputs, next) = at.u.split_at(self.inputs.len());
         self.settings = *at.settings;
         for (to, from) in [
             (&mut self.q, &at.state.q[..]),
-            (&mut self.increment, &workspace.increment),
+            (&mut self.increment, &workspace.step.increment),
             (&mut self.next, next),
             (&mut self.inputs, inputs),
         ] {
             to.copy_from_slice(from);
         }
         if !self.orientations.is_empty() {
-            self.orientations.copy_from_slice(&workspace.orientations_start);
-            self.turns.copy_from_slice(&workspace.turns);
+            self.orientations.copy_from_slice(&workspace.balls.start);
+            self.turns.copy_from_slice(&workspace.balls.turns);
         }
         if !self.multipliers.is_empty() {
-            self.multipliers.copy_from_slice(&workspace.multipliers);
-            self.in_loops = workspace.in_loops;
+            self.multipliers.copy_from_slice(&workspace.step.multipliers);
+            self.in_loops = workspace.kkt.valid == Factors::Recursion;
             if !self.in_loops {
-                self.responses.copy_from_slice(&workspace.responses);
-                self.schur.take_factors_of(&workspace.schur);
+                self.responses.copy_from_slice(&workspace.kkt.schur.responses);
+                self.schur.take_factors_of(&workspace.kkt.schur.lu);
             }
         }
     }

@@ -1,7 +1,8 @@
 //! Linearizes the step that is solved in a workspace.
 
 use crate::integrator::report::StepError;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Tangents, Workspace};
+use crate::kkt::system::Recursion;
 use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::potentials;
@@ -12,7 +13,7 @@ use crate::math::simd::wide;
 impl Workspace {
     /// Takes the derivatives with ball joints.
     fn take_turned(&mut self, out: &mut Linearization) {
-        let Some(blocks) = &self.turned else { return };
+        let Some(blocks) = &self.balls.blocks else { return };
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
         let (n, next) = (nd + nk, out.next_columns());
         out.turnings.extend_from_slice(&blocks.turnings);
@@ -33,28 +34,29 @@ impl Workspace {
             momentum[next..][..nk].copy_from_slice(&blocks.momentum_next[row.clone()][nd..]);
             increment[n + i] = 1.0;
             momentum[n + i] = 1.0;
-            self.stiffness[i * nd..][..nd]
+            self.tangents.stiffness[i * nd..][..nd]
                 .copy_from_slice(&blocks.momentum_start[row.clone()][..nd]);
-            self.end_slopes[i * nd..][..nd].copy_from_slice(&blocks.momentum_next[row][..nd]);
+            self.tangents.end_slopes[i * nd..][..nd]
+                .copy_from_slice(&blocks.momentum_next[row][..nd]);
         }
     }
 
     /// Linearizes at the solution in the workspace.
     pub(crate) fn linearize(
         &mut self,
-        at: At<'_>,
+        at: StepContext<'_>,
         out: &mut Linearization,
     ) -> Result<(), StepError> {
         let d = at.model.dimensions;
         out.kind = Kind::Step;
         out.time_step_s = at.settings.time_step_s;
         out.at_start = at.settings.force_split.at_start();
-        if self.factors.planar().is_some() {
-            self.linearize_by_generators(at, out)?;
-            out.solved.remember(self, at);
-            return Ok(());
-        }
-        if self.linearize_loops(at, out) {
+        let is_done = match self.kkt.recursion {
+            Recursion::Planar(_) => self.linearize_planar(at, out)?,
+            Recursion::Loops(_) => self.linearize_loops(at, out)?,
+            Recursion::None | Recursion::Spatial(_) => false,
+        };
+        if is_done {
             out.solved.remember(self, at);
             return Ok(());
         }
@@ -66,12 +68,7 @@ impl Workspace {
             || at.model.forces.is_some()
             || !at.model.orientations.is_empty();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
-        self.factors.matrix.solve_rows(
-            &at.model.elimination,
-            &mut out.increment,
-            out.stride,
-            columns,
-        );
+        self.kkt.tree.solve_rows(&at.model.elimination, &mut out.increment, out.stride, columns);
         if d.constraints > 0 {
             self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
@@ -83,43 +80,45 @@ impl Workspace {
         Ok(())
     }
 
-    /// The same in O(n²), for planar trees without constraints and prescribed coordinates.
-    fn linearize_by_generators(
+    /// Linearizes in O(n²), for planar trees without constraints and prescribed coordinates.
+    fn linearize_planar(
         &mut self,
-        at: At<'_>,
+        at: StepContext<'_>,
         out: &mut Linearization,
-    ) -> Result<(), StepError> {
+    ) -> Result<bool, StepError> {
         let model = at.model;
-        self.factor_generators(model, at.settings)?;
+        if !self.factor_recursion(model, at.settings)? {
+            return Ok(false);
+        }
         self.fill_inputs(at, out);
-        let tree = self.mechanics.planar.as_deref().and_then(PlanarTree::many);
-        let (Some(tree), Some(joints), Some(generators)) =
-            (tree, &model.planar, self.factors.planar())
+        let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
+        let (Some(tree), Some(joints), Recursion::Planar(recursion)) =
+            (tree, &model.planar, &mut self.kkt.recursion)
         else {
-            return Ok(());
+            return Ok(false);
         };
-        let [residual, momentum] = &self.diagonals;
+        let [residual, momentum] = &self.tangents.diagonals;
         let diagonal = planar::Diagonal { residual, momentum };
         let (increment, momentum) = (&mut out.increment, &mut out.momentum);
-        generators.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
-        Ok(())
+        recursion.linearize(tree, joints, &diagonal, increment, momentum, out.stride);
+        Ok(true)
     }
 
     /// Impulses of inputs, and the diagonals of springs and dampers of coordinates.
-    fn fill_inputs(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn fill_inputs(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let (model, h) = (at.model, at.settings.time_step_s);
         for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
             place.momentum = h * input.gain;
             place.residual = out.at_start * place.momentum;
         }
-        let [residual, slope] = &mut self.diagonals;
+        let [residual, slope] = &mut self.tangents.diagonals;
         if model.potentials.any {
             residual.fill(0.0);
             potentials::for_each_second_derivative(
                 &model.potentials,
                 &model.dynamics,
-                &self.mechanics.poses,
-                &self.q_mid,
+                &self.mid.mechanics.poses,
+                &self.mid.q,
                 |i, _, value| residual[i] -= 0.5 * h * value,
             );
         }
@@ -128,26 +127,40 @@ impl Workspace {
         }
     }
 
-    /// The same with loops, where their pivots allow it: O(n²) where their fronts do not grow.
-    fn linearize_loops(&mut self, at: At<'_>, out: &mut Linearization) -> bool {
-        let At { model, settings, state, .. } = at;
-        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return false };
+    /// Linearizes with loops, where their pivots allow it: O(n²) where their fronts do not grow.
+    fn linearize_loops(
+        &mut self,
+        at: StepContext<'_>,
+        out: &mut Linearization,
+    ) -> Result<bool, StepError> {
+        let StepContext { model, settings, state, .. } = at;
+        let (Some(loops), Some(joints)) = (&model.loops, &model.planar) else { return Ok(false) };
         self.finish_end(model, state);
-        if !self.factor_loops(model, settings) {
-            return false;
+        if !self.factor_recursion(model, settings)? {
+            return Ok(false);
         }
-        self.start.hessian(model, &state.q, &self.multipliers, &mut self.constraint_hessian);
+        self.constraints.start.hessian(
+            model,
+            &state.q,
+            &self.step.multipliers,
+            &mut self.tangents.constraint_hessian,
+        );
         self.fill_inputs(at, out);
-        let tree = self.mechanics.planar.as_deref().and_then(PlanarTree::many);
-        let (Some(tree), Some(start), Some(end), Some(generators)) =
-            (tree, &self.start.in_plane, &self.end.in_plane, self.factors.loops())
-        else {
-            return false;
+        let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
+        let (Some(tree), Some(start), Some(end), Recursion::Loops(fronts)) = (
+            tree,
+            &self.constraints.start.in_plane,
+            &self.constraints.end.in_plane,
+            &mut self.kkt.recursion,
+        ) else {
+            return Ok(false);
         };
-        let [residual, momentum] = &self.diagonals;
+        let [residual, momentum] = &self.tangents.diagonals;
         let diagonal = planar::Diagonal { residual, momentum };
-        let closures =
-            loops::Closures { jacobian: &self.end.jacobian, hessian: &self.constraint_hessian };
+        let closures = loops::Closures {
+            jacobian: &self.constraints.end.jacobian,
+            hessian: &self.tangents.constraint_hessian,
+        };
         let derivatives = loops::Derivatives {
             increment: &mut out.increment,
             momentum: &mut out.momentum,
@@ -155,22 +168,22 @@ impl Workspace {
             stride: out.stride,
         };
         let mechanism = loops::Mechanism { loops, joints, tree, start, end };
-        generators.linearize(mechanism, &diagonal, &closures, derivatives);
-        true
+        fronts.linearize(mechanism, &diagonal, &closures, derivatives);
+        Ok(true)
     }
 
     wide! {
         /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
-        pub(crate) fn fill_right_hand_sides(mut self, at: At<'_>, out: &mut Linearization) = fill_portable, fill_avx2;
+        pub(crate) fn fill_right_hand_sides(mut self, at: StepContext<'_>, out: &mut Linearization) = fill_portable, fill_avx2;
 
         /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
         /// `out.momentum`.
-        pub(crate) fn differentiate_momentum(mut self, at: At<'_>, out: &mut Linearization)
+        pub(crate) fn differentiate_momentum(mut self, at: StepContext<'_>, out: &mut Linearization)
             = differentiate_momentum_portable, differentiate_momentum_avx2;
     }
 
     #[inline(always)]
-    fn fill_portable(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn fill_portable(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let model = at.model;
         let h = at.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
@@ -186,22 +199,22 @@ impl Workspace {
             place.momentum = h * input.gain;
             place.residual = out.at_start * place.momentum;
         }
-        self.stiffness.fill(0.0);
-        self.end_slopes.fill(0.0);
+        self.tangents.stiffness.fill(0.0);
+        self.tangents.end_slopes.fill(0.0);
         for pair in &model.pairs {
             let (i, j) = (pair.row as usize, pair.column as usize);
             let second =
-                self.mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
+                self.mid.mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
             let half = 0.5 * h * second.qq;
             out.increment[i * stride + j] = half - second.v_above_q_below;
             out.increment[j * stride + i] = half - second.q_above_v_below;
-            self.end_slopes[i * nd + j] = half + second.q_above_v_below;
-            self.end_slopes[j * nd + i] = half + second.v_above_q_below;
-            self.stiffness[i * nd + j] = h * second.qq;
-            self.stiffness[j * nd + i] = h * second.qq;
+            self.tangents.end_slopes[i * nd + j] = half + second.q_above_v_below;
+            self.tangents.end_slopes[j * nd + i] = half + second.v_above_q_below;
+            self.tangents.stiffness[i * nd + j] = h * second.qq;
+            self.tangents.stiffness[j * nd + i] = h * second.qq;
         }
         for pair in &model.mixed_pairs {
-            let second = self.mechanics.pair(model, pair.ancestor, pair.descendant);
+            let second = self.mid.mechanics.pair(model, pair.ancestor, pair.descendant);
             let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
             let descendant = model.dynamics.joints[pair.descendant].coordinate;
             // Row of the dynamic coordinate, column of the prescribed one.
@@ -229,14 +242,14 @@ impl Workspace {
     }
 
     /// Springs add `−V_qq` to `L_qq`.
-    fn add_springs(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn add_springs(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         if !at.model.potentials.any {
             return;
         }
         let model = at.model;
         let h = at.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
-        let (stiffness, slopes) = (&mut self.stiffness, &mut self.end_slopes);
+        let (stiffness, slopes) = (&mut self.tangents.stiffness, &mut self.tangents.end_slopes);
         let mut add = |row: usize, column: usize, value: f64| {
             if column < nd {
                 out.increment[row * stride + column] -= 0.5 * h * value;
@@ -252,8 +265,8 @@ impl Workspace {
         potentials::for_each_second_derivative(
             &model.potentials,
             &model.dynamics,
-            &self.mechanics.poses,
-            &self.q_mid,
+            &self.mid.mechanics.poses,
+            &self.mid.q,
             |i, j, value| {
                 if i < nd {
                     add(i, j, value);
@@ -263,13 +276,12 @@ impl Workspace {
     }
 
     /// Forces add `a h f_q` to `C_q`, `a h f_v` to `C_v`, and `h (f_q q' + f_v v')` to `p[k+1]'`.
-    fn add_forces(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn add_forces(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let Some(forces) = &at.model.forces else { return };
         let h = at.settings.time_step_s;
         let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
-        let mut slopes = std::mem::take(&mut self.end_slopes);
-        let mut stiffness = std::mem::take(&mut self.stiffness);
-        let instant = self.instant(at.model);
+        let Tangents { end_slopes: slopes, stiffness, .. } = &mut self.tangents;
+        let instant = self.mid.instant(at.model);
         forces.for_each_derivative(&instant, |row, column, by_q, by_v| {
             if row < nd && column < nd {
                 out.increment[row * stride + column] += a * h * by_q;
@@ -290,19 +302,23 @@ impl Workspace {
                 (place.residual, place.momentum) = (a * h * by_u, h * by_u);
             }
         });
-        (self.end_slopes, self.stiffness) = (slopes, stiffness);
     }
 
     /// The constraints' impulses turn with the start configuration.
-    fn add_constraint_hessian(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn add_constraint_hessian(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         if at.model.dimensions.constraints == 0 {
             return;
         }
         let model = at.model;
-        self.start.hessian(model, &at.state.q, &self.multipliers, &mut self.constraint_hessian);
+        self.constraints.start.hessian(
+            model,
+            &at.state.q,
+            &self.step.multipliers,
+            &mut self.tangents.constraint_hessian,
+        );
         let n = model.dimensions.coordinates();
         for i in 0..out.nd {
-            let row = &self.constraint_hessian[i * n..][..n];
+            let row = &self.tangents.constraint_hessian[i * n..][..n];
             let range = i * out.stride..i * out.stride + n;
             for (entry, value) in out.increment[range.clone()].iter_mut().zip(row) {
                 *entry -= value;
@@ -314,14 +330,14 @@ impl Workspace {
     }
 
     /// From `K⁻¹ r1'` in `out.increment`: solves `S λ' = A1 K⁻¹ r1' − r2'` and subtracts `K⁻¹ A0ᵀ λ'`.
-    fn solve_multipliers(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn solve_multipliers(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         let model = at.model;
         let d = model.dimensions;
         let (n, nd, nc, stride) = (d.coordinates(), d.dynamic, d.constraints, out.stride);
         let next = out.next_columns();
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let jacobian = &self.end.jacobian[c * n..][..n];
-            let by_start = match &self.turned {
+            let jacobian = &self.constraints.end.jacobian[c * n..][..n];
+            let by_start = match &self.balls.blocks {
                 None => jacobian,
                 Some(blocks) => &blocks.end_jacobians()[0][c * n..][..n],
             };
@@ -330,21 +346,21 @@ impl Workspace {
             target.iter_mut().zip(&by_start[..nd]).for_each(|(t, entry)| *t = -entry);
             target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
             let dynamic = constraint.dynamic_coordinates().iter();
-            self.terms.clear();
-            self.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
-            add_rows(target, &out.increment, stride, &self.terms);
+            self.tangents.terms.clear();
+            self.tangents.terms.extend(dynamic.map(|&i| (jacobian[i], i)));
+            add_rows(target, &out.increment, stride, &self.tangents.terms);
         }
-        self.schur.solve_rows(&mut out.multipliers, stride);
+        self.kkt.schur.lu.solve_rows(&mut out.multipliers, stride);
         for (i, target) in out.increment.chunks_exact_mut(stride).enumerate() {
-            let responses = self.responses[i * padded(nc)..][..nc].iter().enumerate();
-            self.terms.clear();
-            self.terms.extend(responses.map(|(c, r)| (-r, c)));
-            add_rows(target, &out.multipliers, stride, &self.terms);
+            let responses = self.kkt.schur.responses[i * padded(nc)..][..nc].iter().enumerate();
+            self.tangents.terms.clear();
+            self.tangents.terms.extend(responses.map(|(c, r)| (-r, c)));
+            add_rows(target, &out.multipliers, stride, &self.tangents.terms);
         }
     }
 
     #[inline(always)]
-    fn differentiate_momentum_portable(&mut self, at: At<'_>, out: &mut Linearization) {
+    fn differentiate_momentum_portable(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         for x in &mut out.increment {
             *x = -*x;
         }
@@ -353,20 +369,20 @@ impl Workspace {
         let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
         if model.orientations.is_empty() {
             for (i, c) in model.damping.iter().enumerate() {
-                self.end_slopes[i * nd + i] -= c;
+                self.tangents.end_slopes[i * nd + i] -= c;
             }
         }
         for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
-            let stiffness = &self.stiffness[i * nd..][..nd];
+            let stiffness = &self.tangents.stiffness[i * nd..][..nd];
             target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
-            let slopes = self.end_slopes[i * nd..][..nd].iter().enumerate();
-            self.terms.clear();
-            self.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
-            add_rows_portable(target, &out.increment, stride, &self.terms);
+            let slopes = self.tangents.end_slopes[i * nd..][..nd].iter().enumerate();
+            self.tangents.terms.clear();
+            self.tangents.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
+            add_rows_portable(target, &out.increment, stride, &self.tangents.terms);
         }
         for (c, constraint) in model.constraints.iter().enumerate() {
             for &i in constraint.dynamic_coordinates() {
-                let entry = self.start.jacobian[c * n + i];
+                let entry = self.constraints.start.jacobian[c * n + i];
                 let target = &mut out.momentum[i * stride..][..stride];
                 add_rows_portable(target, &out.multipliers, stride, &[(-entry, c)]);
             }

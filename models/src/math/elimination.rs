@@ -9,7 +9,7 @@ use std::collections::BTreeSet;
 
 /// The elimination tree.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Elimination {
+pub(crate) struct SymbolicElimination {
     /// Row `j` owns `ancestors[offsets[j]..offsets[j + 1]]`.
     pub(crate) offsets: Vec<usize>,
     /// Ancestors of each row, root first, the row itself last.
@@ -20,7 +20,7 @@ pub(crate) struct Elimination {
     descendants: Vec<(usize, usize)>,
 }
 
-impl Elimination {
+impl SymbolicElimination {
     /// Symbolic elimination of the pattern `couplings[j]` (indices below `j`), from the last row to
     /// the first.
     pub(crate) fn new(couplings: &[BTreeSet<usize>]) -> Self {

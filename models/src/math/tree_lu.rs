@@ -1,7 +1,7 @@
 //! LU factorization without pivoting along the elimination tree: the non-symmetric twin of
 //! Featherstone's LTL, without fill-in. O(n·depth²) to factor, O(n·depth) to solve.
 
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::math::rows::{Term, add_rows_portable};
 use crate::math::simd::wide;
 
@@ -41,7 +41,7 @@ impl SmallestPivot {
 }
 
 impl TreeLu {
-    pub(crate) fn new(elimination: &Elimination) -> Self {
+    pub(crate) fn new(elimination: &SymbolicElimination) -> Self {
         Self {
             upper: vec![0.0; elimination.entries()],
             lower: vec![0.0; elimination.entries()],
@@ -64,7 +64,13 @@ impl TreeLu {
 
     /// Adds to the entry of two coupled rows, which may be one.
     #[inline]
-    pub(crate) fn add(&mut self, elimination: &Elimination, row: usize, column: usize, value: f64) {
+    pub(crate) fn add(
+        &mut self,
+        elimination: &SymbolicElimination,
+        row: usize,
+        column: usize,
+        value: f64,
+    ) {
         let slot = elimination.slot(row.max(column), row.min(column));
         let slot = slot.expect("what a model adds to its matrix is coupled");
         let triangle = if row <= column { &mut self.upper } else { &mut self.lower };
@@ -77,7 +83,7 @@ impl TreeLu {
         #[inline(never)]
         pub(crate) fn factor(
             mut self,
-            elimination: &Elimination,
+            elimination: &SymbolicElimination,
             scale: &[f64],
             factor: f64,
         ) -> SmallestPivot = factor_portable, factor_avx2;
@@ -87,7 +93,7 @@ impl TreeLu {
         #[inline(never)]
         pub(crate) fn solve_rows(
             mut self,
-            elimination: &Elimination,
+            elimination: &SymbolicElimination,
             x: &mut [f64],
             stride: usize,
             columns: usize,
@@ -97,7 +103,7 @@ impl TreeLu {
     #[inline(always)]
     fn factor_portable(
         &mut self,
-        elimination: &Elimination,
+        elimination: &SymbolicElimination,
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot {
@@ -138,7 +144,7 @@ impl TreeLu {
 
     /// Solves `K x = b` in place.
     #[inline(never)]
-    pub(crate) fn solve(&self, elimination: &Elimination, x: &mut [f64]) {
+    pub(crate) fn solve(&self, elimination: &SymbolicElimination, x: &mut [f64]) {
         for k in (0..elimination.len()).rev() {
             let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
             let value = x[k];
@@ -163,7 +169,7 @@ impl TreeLu {
     #[inline(always)]
     fn solve_rows_portable(
         &mut self,
-        elimination: &Elimination,
+        elimination: &SymbolicElimination,
         x: &mut [f64],
         stride: usize,
         columns: usize,
@@ -199,13 +205,13 @@ mod tests {
     use super::*;
 
     /// A forest with a coupling between two branches: rows 3 and 5 share no path without it.
-    fn elimination() -> Elimination {
+    fn elimination() -> SymbolicElimination {
         let couplings = [&[][..], &[0], &[0, 1], &[0, 1, 2], &[0], &[0, 3, 4], &[], &[6]];
-        Elimination::new(&couplings.map(|c| c.iter().copied().collect::<BTreeSet<_>>()))
+        SymbolicElimination::new(&couplings.map(|c| c.iter().copied().collect::<BTreeSet<_>>()))
     }
 
     /// A diagonally dominant matrix on the pattern, with the dense one that it stands for.
-    fn matrix(elimination: &Elimination) -> (TreeLu, DMatrix<f64>) {
+    fn matrix(elimination: &SymbolicElimination) -> (TreeLu, DMatrix<f64>) {
         let n = elimination.len();
         let (mut lu, mut dense) = (TreeLu::new(elimination), DMatrix::zeros(n, n));
         for row in 0..n {

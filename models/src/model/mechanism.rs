@@ -1,6 +1,6 @@
 //! Models: compiled scenes.
 
-use crate::math::elimination::Elimination;
+use crate::math::elimination::SymbolicElimination;
 use crate::math::spatial::{Force, Vec3};
 use crate::math::spline::Spline;
 use crate::model::conditioning::Conditioning;
@@ -43,7 +43,7 @@ pub struct Model {
     pub(crate) closure: Tree,
     pub(crate) constraints: Vec<Constraint>,
     pub(crate) alignments: Vec<Alignment>,
-    pub(crate) elimination: Elimination,
+    pub(crate) elimination: SymbolicElimination,
     /// Ancestor and descendant pairs of dynamic coordinates, with their place in the factorization.
     pub(crate) pairs: Vec<Pair>,
     /// Ancestor and descendant pairs of which exactly one is prescribed.
@@ -91,7 +91,7 @@ impl Solver {
     /// The fastest one for a scene; `needs_poses` where springs between points or forces act.
     pub(crate) fn of(
         tree: &Tree,
-        elimination: &Elimination,
+        elimination: &SymbolicElimination,
         planar: Option<&[PlanarJoint]>,
         needs_poses: bool,
         d: Dimensions,

@@ -43,12 +43,13 @@ impl Plant {
         let d = model.dimensions;
         let mass_matrix_reciprocal_condition = self.workspace.find_velocity(&model, &self.state);
         let constraint_reciprocal_condition =
-            self.workspace.schur.reciprocal_condition(model.constraint_rank(), 1.0);
+            self.workspace.kkt.schur.lu.reciprocal_condition(model.constraint_rank(), 1.0);
         let redundant_constraints = model.redundant_equations(&self.state.q);
         let constraint_rank = d.constraints - redundant_constraints.len();
         // Leaves poses and momenta at the velocity.
         let energy = self.energy();
-        let (poses, momenta) = (&self.workspace.mechanics.poses, &self.workspace.mechanics.momenta);
+        let (poses, momenta) =
+            (&self.workspace.mid.mechanics.poses, &self.workspace.mid.mechanics.momenta);
         let (mut linear, mut angular) = (Vec3::ZERO, Vec3::ZERO);
         let (mut moment, mut mass) = (Vec3::ZERO, 0.0);
         for (i, joint) in model.dynamics.joints.iter().enumerate().filter(|(i, j)| j.root == *i) {
@@ -93,9 +94,9 @@ impl Plant {
         for row in 0..nd {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let ancestor = elimination.ancestors[slot];
-                matrix[(row, ancestor)] = workspace.factors.matrix.lower[slot];
+                matrix[(row, ancestor)] = workspace.kkt.tree.lower[slot];
                 // The diagonal is kept in the upper triangle alone.
-                matrix[(ancestor, row)] = workspace.factors.matrix.upper[slot];
+                matrix[(ancestor, row)] = workspace.kkt.tree.upper[slot];
             }
         }
         matrix

@@ -181,6 +181,10 @@ impl Plant {
     pub fn constraint_jacobian(&mut self) -> DMatrix<f64> {
         self.workspace.prepare_start(&self.model, &self.state);
         let d = self.model.dimensions;
-        DMatrix::from_row_slice(d.constraints, d.coordinates(), &self.workspace.start.jacobian)
+        DMatrix::from_row_slice(
+            d.constraints,
+            d.coordinates(),
+            &self.workspace.constraints.start.jacobian,
+        )
     }
 }

@@ -7,13 +7,12 @@ use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settings};
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::schur::fill_schur;
+use crate::kkt::system::KktSystem;
 use crate::lagrangian::energy::{Energy, potential_energy};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rotation::Quaternion;
-use crate::math::rows::padded;
-use crate::math::spatial::{Vec3, three};
+use crate::math::spatial::three;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
 use crate::plant::facade::Plant;
@@ -154,7 +153,7 @@ impl Plant {
                 let q0 = checked("q0", q0, n)?;
                 state.q = checked("q1", q1, n)?;
                 state.p = self.momentum_between(&q0, &state.q, &vec![0.0; d.inputs]);
-                state.v.copy_from_slice(&self.workspace.velocity[nd..]);
+                state.v.copy_from_slice(&self.workspace.mid.velocity[nd..]);
             }
             Initial::Equilibrium { q, hold, inputs } => {
                 let (q, hold, inputs) = (q.clone(), hold.clone(), inputs.clone());
@@ -183,49 +182,33 @@ impl Plant {
         let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
         let change = self.model.difference(q0, q1);
         for i in 0..q0.len() {
-            workspace.q_mid[i] = q0[i] + 0.5 * change[i];
-            workspace.angles[i] = workspace.q_mid[i];
-            workspace.velocity[i] = change[i] / h;
+            workspace.mid.q[i] = q0[i] + 0.5 * change[i];
+            workspace.mid.angles[i] = workspace.mid.q[i];
+            workspace.mid.velocity[i] = change[i] / h;
         }
         let turns = self.model.orientations.iter().map(|&i| three(&change, i));
         let orientations = orientations(&self.model, q0);
         for (o, turn) in turns.enumerate() {
-            workspace.turns[o] = turn;
-            workspace.orientations_mid[o] = orientations[o].times(&rotation::exp(turn * 0.5));
+            workspace.balls.turns[o] = turn;
+            workspace.mid.orientations[o] = orientations[o].times(&rotation::exp(turn * 0.5));
         }
-        workspace.set_inputs(&self.model, inputs);
-        workspace.evaluate_lagrangian(&self.model);
+        workspace.mid.set_inputs(&self.model, inputs);
+        workspace.mid.evaluate(&self.model);
     }
 
     /// `D2 Ld(q0, q1) + F⁺ = L_v + ½h L_q + (1 − a) h f`.
     fn momentum_between(&mut self, q0: &[f64], q1: &[f64], inputs: &[f64]) -> Vec<f64> {
         self.evaluate_between(q0, q1, inputs);
-        let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
-        let at_end = (1.0 - self.settings.force_split.at_start()) * h;
-        let torque = |i: usize| 0.5 * h * workspace.l_q[i] + at_end * workspace.force[i];
-        let mut momentum: Vec<f64> =
-            (0..workspace.l_v.len()).map(|i| workspace.l_v[i] + torque(i)).collect();
-        for (o, &i) in self.model.orientations.iter().enumerate() {
-            if let Some(momentum) = momentum.get_mut(i..i + 3) {
-                let turn = workspace.turns[o];
-                let carried =
-                    rotation::momentum_at_start(turn).apply_transposed(three(&workspace.l_v, i));
-                let torque = rotation::torque_at_start(turn).apply_transposed(Vec3([
-                    torque(i),
-                    torque(i + 1),
-                    torque(i + 2),
-                ]));
-                momentum.copy_from_slice(&(carried + torque).0);
-            }
-        }
-        workspace.input_force.fill(0.0);
-        workspace.force.fill(0.0);
+        let workspace = &mut self.workspace;
+        let momentum = workspace.momentum_at_end(&self.model, &self.settings);
+        workspace.mid.input_force.fill(0.0);
+        workspace.mid.force.fill(0.0);
         momentum
     }
 
     fn check_constraints(&mut self, q: &[f64]) -> Result<(), InitialError> {
-        self.workspace.end_is_exact = false;
-        let Workspace { end: closure, orientations_end: orientations, .. } = &mut self.workspace;
+        let Workspace { constraints, balls, .. } = &mut self.workspace;
+        let (closure, orientations) = (&mut constraints.end, &mut balls.end);
         for (orientation, &i) in orientations.iter_mut().zip(&self.model.orientations) {
             *orientation = Quaternion::exp(three(q, i)).matrix();
         }
@@ -297,8 +280,8 @@ impl Plant {
     /// Writes the velocity that belongs to the projected momentum, nd + nk entries; allocates nothing.
     pub fn write_velocity(&mut self, out: &mut [f64]) {
         self.workspace.find_velocity(&self.model, &self.state);
-        let (dynamic, prescribed) = out.split_at_mut(self.workspace.residual.len());
-        dynamic.copy_from_slice(&self.workspace.residual);
+        let (dynamic, prescribed) = out.split_at_mut(self.workspace.residual.dynamics.len());
+        dynamic.copy_from_slice(&self.workspace.residual.dynamics);
         prescribed.copy_from_slice(&self.state.v);
     }
 
@@ -306,12 +289,12 @@ impl Plant {
     /// allocates nothing.
     pub fn energy(&mut self) -> Energy {
         self.workspace.find_velocity(&self.model, &self.state);
-        let mut velocity = std::mem::take(&mut self.workspace.velocity);
-        let (dynamic, prescribed) = velocity.split_at_mut(self.workspace.residual.len());
-        dynamic.copy_from_slice(&self.workspace.residual);
+        let mut velocity = std::mem::take(&mut self.workspace.mid.velocity);
+        let (dynamic, prescribed) = velocity.split_at_mut(self.workspace.residual.dynamics.len());
+        dynamic.copy_from_slice(&self.workspace.residual.dynamics);
         prescribed.copy_from_slice(&self.state.v);
         let energy = self.workspace.energy_of(&self.model, &self.state, &velocity);
-        self.workspace.velocity = velocity;
+        self.workspace.mid.velocity = velocity;
         energy
     }
 
@@ -356,39 +339,33 @@ fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f6
 impl Workspace {
     fn energy_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Energy {
         self.gradient_at(model, state, velocity);
-        let (poses, momenta) = (&self.mechanics.poses, &self.mechanics.momenta);
+        let (poses, momenta) = (&self.mid.mechanics.poses, &self.mid.mechanics.momenta);
         Energy {
             kinetic_j: 0.5 * momenta.twice_kinetic_energy(&model.dynamics, velocity),
             potential_j: potential_energy(model, poses, momenta, &state.q),
         }
     }
 
-    /// The state has changed: nothing of the last step holds.
-    pub(crate) fn forget(&mut self) {
-        self.start_is_valid = false;
-        self.end_is_exact = false;
-    }
-
     /// Gradient of the Lagrangian without springs at any configuration and velocity.
     pub(crate) fn gradient_at(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) {
-        for (matrix, orientation) in self.orientations_start.iter_mut().zip(&state.orientations) {
+        for (matrix, orientation) in self.balls.start.iter_mut().zip(&state.orientations) {
             *matrix = orientation.matrix();
         }
-        self.mechanics.poses.evaluate(&model.dynamics, &state.q, &self.orientations_start);
-        self.mechanics.momenta.gradient(
+        self.mid.mechanics.poses.evaluate(&model.dynamics, &state.q, &self.balls.start);
+        self.mid.mechanics.momenta.gradient(
             &model.dynamics,
-            &self.mechanics.poses,
+            &self.mid.mechanics.poses,
             velocity,
             model.gravity,
-            &mut self.l_q,
-            &mut self.l_v,
+            &mut self.mid.l_q,
+            &mut self.mid.l_v,
         );
     }
 
     /// `p = M(q) q̇` on the dynamic rows.
     fn momentum_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Vec<f64> {
         self.gradient_at(model, state, velocity);
-        self.l_v.clone()
+        self.mid.l_v.clone()
     }
 
     /// Finds the velocity of the dynamic coordinates that belongs to a state, into `residual`; returns
@@ -396,28 +373,27 @@ impl Workspace {
     pub(crate) fn find_velocity(&mut self, model: &Model, state: &PreciseState) -> f64 {
         let d = model.dimensions;
         // With only the prescribed coordinates moving, `L_v` is their share of the momentum.
-        self.velocity[..d.dynamic].fill(0.0);
-        self.velocity[d.dynamic..].copy_from_slice(&state.v);
-        let velocity = std::mem::take(&mut self.velocity);
+        self.mid.velocity[..d.dynamic].fill(0.0);
+        self.mid.velocity[d.dynamic..].copy_from_slice(&state.v);
+        let velocity = std::mem::take(&mut self.mid.velocity);
         self.gradient_at(model, state, &velocity);
-        self.velocity = velocity;
-        self.mechanics.curvature.evaluate(
+        self.mid.velocity = velocity;
+        self.mid.mechanics.curvature.evaluate(
             &model.dynamics,
-            &self.mechanics.poses,
-            &self.mechanics.momenta,
+            &self.mid.mechanics.poses,
+            &self.mid.mechanics.momenta,
         );
-        self.factors.matrix.clear();
-        self.mechanics.curvature.fill_mass_matrix(
+        self.kkt.tree.clear();
+        self.mid.mechanics.curvature.fill_mass_matrix(
             &model.pairs,
-            &self.mechanics.momenta,
-            &mut self.factors.matrix,
+            &self.mid.mechanics.momenta,
+            &mut self.kkt.tree,
         );
-        let pivot =
-            self.factors.matrix.factor(&model.elimination, &model.conditioning.inertia, 1.0);
-        for (i, r) in self.residual.iter_mut().enumerate() {
-            *r = state.p[i] - self.l_v[i];
+        let pivot = self.kkt.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
+        for (i, r) in self.residual.dynamics.iter_mut().enumerate() {
+            *r = state.p[i] - self.mid.l_v[i];
         }
-        self.factors.matrix.solve(&model.elimination, &mut self.residual);
+        self.kkt.tree.solve(&model.elimination, &mut self.residual.dynamics);
         if d.constraints > 0 {
             self.project_velocity(model, state);
         }
@@ -427,24 +403,16 @@ impl Workspace {
     /// Takes the part of the velocity away that violates `Dh q̇ = 0`.
     fn project_velocity(&mut self, model: &Model, state: &PreciseState) {
         let n = model.dimensions.coordinates();
-        let stride = padded(model.dimensions.constraints);
         self.prepare_start(model, state);
-        self.find_responses(model);
-        fill_schur(model, &self.start, &self.responses, &mut self.schur);
-        self.schur.factor();
-        let rows = self.start.jacobian.chunks(n);
-        for (rate, row) in self.constraint_residual.iter_mut().zip(rows) {
-            let velocity = self.residual.iter().chain(&state.v);
+        let KktSystem { tree, schur, .. } = &mut self.kkt;
+        schur.factor(model, tree, [&self.constraints.start; 2]);
+        let rows = self.constraints.start.jacobian.chunks(n);
+        for (rate, row) in self.residual.constraints.iter_mut().zip(rows) {
+            let velocity = self.residual.dynamics.iter().chain(&state.v);
             *rate = row.iter().zip(velocity).map(|(entry, v)| entry * v).sum();
         }
-        self.schur.solve(&mut self.constraint_residual);
-        for (i, v) in self.residual.iter_mut().enumerate() {
-            for (response, weight) in
-                self.responses[i * stride..].iter().zip(&self.constraint_residual)
-            {
-                *v -= response * weight;
-            }
-        }
+        schur.lu.solve(&mut self.residual.constraints);
+        schur.subtract_responses(&self.residual.constraints, &mut self.residual.dynamics);
     }
 }
 

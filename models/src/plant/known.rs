@@ -4,7 +4,7 @@ use nalgebra::DMatrix;
 
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
-use crate::integrator::workspace::At;
+use crate::integrator::workspace::StepContext;
 use crate::linearization::linearize::Linearization;
 use crate::model::manifold::orientations;
 use crate::plant::facade::Plant;
@@ -46,7 +46,7 @@ impl Plant {
         self.place_known(step)?;
         let Self { model, settings, state, workspace, period } = self;
         let u = period.input.of_step(model, state, settings.time_step_s, step.u, [0.0, 1.0])?;
-        workspace.linearize(At { model, settings, state, u }, out)
+        workspace.linearize(StepContext { model, settings, state, u }, out)
     }
 
     /// Whether the period is one step of the midpoint rule.
@@ -79,16 +79,11 @@ impl Plant {
         self.state.p_low.fill(0.0);
         let multipliers = &vec![0.0; self.model.dimensions.constraints];
         self.place_known(&KnownStep { multipliers, ..*step })?;
-        let (h, workspace) = (self.settings.time_step_s, &mut self.workspace);
-        for (i, impulse) in workspace.impulse.iter_mut().enumerate() {
-            *impulse = h * (workspace.l_q[i] + workspace.force[i]);
-        }
-        if !self.model.orientations.is_empty() {
-            workspace.turn_impulse(&self.model, &self.settings);
-        }
+        self.workspace.find_impulse(&self.model, &self.settings);
+        let workspace = &self.workspace;
         let momenta = at_start.iter_mut().zip(at_end);
         for ((start, end), (residual, impulse)) in
-            momenta.zip(workspace.residual.iter().zip(&workspace.impulse))
+            momenta.zip(workspace.residual.dynamics.iter().zip(&workspace.step.impulse))
         {
             *start = -residual;
             *end = impulse - residual;
@@ -107,7 +102,7 @@ impl Plant {
         for j in 0..nd {
             velocity[j] = 1.0;
             self.workspace.gradient_at(&self.model, &self.state, &velocity);
-            mass.column_mut(j).copy_from_slice(&self.workspace.l_v);
+            mass.column_mut(j).copy_from_slice(&self.workspace.mid.l_v);
             velocity[j] = 0.0;
         }
         mass
@@ -116,8 +111,7 @@ impl Plant {
     /// Values `h(q)` of the constraints and their Jacobian, nc by nd + nk (allocates).
     pub(crate) fn constraints_at(&mut self, q: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
         let d = self.model.dimensions;
-        let closure = &mut self.workspace.end;
-        self.workspace.end_is_exact = false;
+        let closure = &mut self.workspace.constraints.end;
         closure.evaluate(&self.model, q, &orientations(&self.model, q));
         closure.differentiate(&self.model, q);
         let jacobian = DMatrix::from_row_slice(d.constraints, d.coordinates(), &closure.jacobian);
@@ -130,17 +124,17 @@ impl Plant {
         self.place_start(step);
         let Self { model, settings, state, workspace, period } = self;
         let u = period.input.of_step(model, state, settings.time_step_s, step.u, [0.0, 1.0])?;
-        workspace.prepare(At { model, settings, state, u });
+        workspace.prepare(StepContext { model, settings, state, u });
         let nd = self.model.dimensions.dynamic;
-        let increment = &mut self.workspace.increment;
+        let increment = &mut self.workspace.step.increment;
         for (x, (q1, q0)) in increment.iter_mut().zip(step.q1.iter().zip(step.q0)) {
             *x = q1 - q0;
         }
-        self.workspace.multipliers.copy_from_slice(step.multipliers);
+        self.workspace.step.multipliers.copy_from_slice(step.multipliers);
         if self.model.orientations.iter().any(|&i| i < nd) {
             let change = self.model.difference(step.q0, step.q1);
             for &i in self.model.orientations.iter().filter(|i| **i < nd) {
-                self.workspace.increment[i..i + 3].copy_from_slice(&change[i..i + 3]);
+                self.workspace.step.increment[i..i + 3].copy_from_slice(&change[i..i + 3]);
             }
         }
         let residual = self.workspace.evaluate(&self.model, &self.settings, &self.state);

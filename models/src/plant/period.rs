@@ -111,7 +111,7 @@ impl Period {
     /// Moves on to the solution of a step of length `h`.
     pub(crate) fn advance(&mut self, model: &Model, workspace: &mut Workspace, h: f64) {
         self.reached.move_on(model, workspace, self.collocation.as_deref(), h);
-        for (sum, impulse) in self.multipliers.iter_mut().zip(&workspace.multipliers) {
+        for (sum, impulse) in self.multipliers.iter_mut().zip(&workspace.step.multipliers) {
             *sum += impulse;
         }
         workspace.move_on();
@@ -153,17 +153,17 @@ impl PreciseState {
         h: f64,
     ) {
         let nd = model.dimensions.dynamic;
-        add(&mut self.q[..nd], &mut self.q_low, &workspace.increment);
-        add(&mut self.p, &mut self.p_low, &workspace.impulse);
-        self.q[nd..].copy_from_slice(&workspace.q_end[nd..]);
+        add(&mut self.q[..nd], &mut self.q_low, &workspace.step.increment);
+        add(&mut self.p, &mut self.p_low, &workspace.step.impulse);
+        self.q[nd..].copy_from_slice(&workspace.step.q_end[nd..]);
         if !model.orientations.is_empty() {
             workspace.turn(model, self);
         }
-        self.v.copy_from_slice(&workspace.velocity[nd..]);
-        self.multipliers.copy_from_slice(&workspace.multipliers);
+        self.v.copy_from_slice(&workspace.mid.velocity[nd..]);
+        self.multipliers.copy_from_slice(&workspace.step.multipliers);
         match (&mut self.past, collocation) {
             (Past::Stages(past), Some(collocation)) => past.record(collocation.motion()),
-            (past, _) => past.record(h, &workspace.increment, &model.conditioning.inertia),
+            (past, _) => past.record(h, &workspace.step.increment, &model.conditioning.inertia),
         }
     }
 }

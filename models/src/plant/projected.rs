@@ -51,7 +51,7 @@ impl Plant {
     pub fn projected_momentum(&mut self) -> Vec<f64> {
         let velocity = self.velocity();
         self.workspace.gradient_at(&self.model, &self.state, &velocity);
-        self.workspace.l_v.clone()
+        self.workspace.mid.l_v.clone()
     }
 
     /// The derivative of the projected momentum by `x = (q, p, v)`, nd by `2 nd + 2 nk`: for energies and
@@ -64,10 +64,10 @@ impl Plant {
         self.workspace.gradient_at(&model, &self.state, &velocity);
         let excess = DVector::from_iterator(
             nd,
-            self.state.p.iter().zip(&self.workspace.l_v).map(|(p, m)| p - m),
+            self.state.p.iter().zip(&self.workspace.mid.l_v).map(|(p, m)| p - m),
         );
         let mut blocks = Derivatives::<f64>::new(&model);
-        let orientations = &self.workspace.orientations_start;
+        let orientations = &self.workspace.balls.start;
         blocks.evaluate(&model, (&self.state.q, orientations), &velocity, &vec![0.0; d.inputs]);
         let mut by_state = DMatrix::zeros(nd, 2 * n);
         by_state.view_mut((0, n), (nd, nd)).fill_with_identity();
@@ -99,7 +99,7 @@ impl Plant {
 
         // Right-hand sides by q, p, v.
         let (mut hessian, mut rate) = (DMatrix::zeros(n, n), DMatrix::zeros(nc, n));
-        let closure = &self.workspace.start;
+        let closure = &self.workspace.constraints.start;
         for (c, constraint) in model.constraints.iter().enumerate() {
             let (tree, q) = (&model.closure, &self.state.q[..]);
             constraint.for_each_second_derivative(tree, &closure.poses, q, |i, j, value| {

@@ -57,14 +57,7 @@ impl Plant {
             second.gather(&self.model, first)?;
             return Ok(report);
         }
-        if self.workspace.factors.planar().is_some() {
-            self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
-        }
-        if self.workspace.in_loops {
-            self.workspace.prepare_start(&self.model, &self.state);
-            self.workspace.factor_newton_matrix(&self.model, &self.settings)?;
-            self.workspace.factor_schur(&self.model, &self.settings)?;
-        }
+        self.workspace.factor_tree(&self.model, &self.settings, &self.state)?;
         self.differentiate_linearization(first, second);
         Ok(report)
     }
@@ -80,7 +73,7 @@ impl Plant {
         let Parameters { nd, nc, stride, .. } = scratch.layout;
         let n = scratch.layout.n();
         let workspace = &mut self.workspace;
-        workspace.schur.reserve(stride);
+        workspace.kkt.schur.lu.reserve(stride);
         first.write_tangent(stride, &mut scratch.tangent);
         let rows = (2 * nd + nc) * stride;
         if rows == 0 {
@@ -119,20 +112,20 @@ impl Plant {
             }
 
             // x'' and λ'' = −E⁻¹ (…).
-            workspace.factors.matrix.solve_rows(&model.elimination, residual, stride, columns);
+            workspace.kkt.tree.solve_rows(&model.elimination, residual, stride, columns);
             for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
                 let row = &mut row[..columns];
                 row.iter_mut().for_each(|entry| *entry = -*entry);
-                let jacobian = &workspace.end.jacobian[c * n..][..nd];
+                let jacobian = &workspace.constraints.end.jacobian[c * n..][..nd];
                 add_product(row, residual, stride, jacobian.iter().copied(), terms);
             }
             if nc > 0 {
-                workspace.schur.solve_rows(closing, stride);
+                workspace.kkt.schur.lu.solve_rows(closing, stride);
             }
             for (i, row) in residual.chunks_exact_mut(stride).enumerate() {
                 let row = &mut row[..columns];
                 row.iter_mut().for_each(|entry| *entry = -*entry);
-                let responses = &workspace.responses[i * padded(nc)..][..nc];
+                let responses = &workspace.kkt.schur.responses[i * padded(nc)..][..nc];
                 terms.clear();
                 terms.extend(responses.iter().enumerate().map(|(c, response)| (*response, c)));
                 add_rows(row, closing, stride, terms);
@@ -141,7 +134,7 @@ impl Plant {
             // What these make of the momentum.
             for (i, row) in momentum.chunks_exact_mut(stride).enumerate() {
                 let slopes = blocks.momentum_next[i * n..][..nd].iter().map(|entry| entry.re);
-                let impulses = (0..nc).map(|c| -workspace.start.jacobian[c * n + i]);
+                let impulses = (0..nc).map(|c| -workspace.constraints.start.jacobian[c * n + i]);
                 add_product(&mut row[..columns], solved, stride, slopes.chain(impulses), terms);
             }
             for t in blocks.turnings.iter().filter(|t| t.coordinate < nd) {

@@ -4,7 +4,7 @@ use crate::integrator::collocation::Collocation;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{STEPS_MAX, Settings};
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::linearization::linearize::Linearization;
 use crate::plant::facade::Plant;
 use crate::plant::period::Period;
@@ -70,7 +70,7 @@ impl Plant {
         period.is_reached = count * scheme.steps() > 1 || halvings != state.halvings;
         if !period.is_reached {
             let u = period.input.of_step(model, state, h, u, [0.0, 1.0])?;
-            let at = At { model, settings, state, u };
+            let at = StepContext { model, settings, state, u };
             return take(workspace, &mut period.collocation, at, state.time_after_s(0.0, h), out);
         }
         workspace.forget();
@@ -98,7 +98,7 @@ impl Plant {
                 let settings = Settings { time_step_s: length * h, ..*settings };
                 let Period { reached, collocation, input, chain, .. } = &mut *period;
                 let u = input.of_step(model, state, h, u, [fraction, end])?;
-                let at = At { model, settings: &settings, state: reached, u };
+                let at = StepContext { model, settings: &settings, state: reached, u };
                 let start_s = state.time_after_s(fraction, h);
                 let part_report = match out.as_deref_mut() {
                     None => take(workspace, collocation, at, start_s, None)?,
@@ -143,7 +143,7 @@ impl Plant {
 pub(crate) fn take(
     workspace: &mut Workspace,
     collocation: &mut Option<Box<Collocation>>,
-    at: At<'_>,
+    at: StepContext<'_>,
     start_s: f64,
     out: Option<&mut Linearization>,
 ) -> Result<StepReport, StepError> {
@@ -151,7 +151,7 @@ pub(crate) fn take(
         let mut report = workspace.solve(at)?;
         if let Some(out) = out {
             workspace.linearize(at, out)?;
-            workspace.estimates.write(&mut report);
+            workspace.kkt.estimates.write(&mut report);
         }
         return Ok(report);
     };

@@ -72,8 +72,8 @@ impl Hessian {
         let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
         let Self { qq, qv, qu, .. } = self;
         if model.potentials.any {
-            let (tree, poses) = (&model.dynamics, &workspace.mechanics.poses);
-            let q = &workspace.q_mid;
+            let (tree, poses) = (&model.dynamics, &workspace.mid.mechanics.poses);
+            let q = &workspace.mid.q;
             potentials::for_each_second_derivative(&model.potentials, tree, poses, q, |i, j, k| {
                 if i < nd {
                     qq[(i * n + j) * width + stage] -= k;
@@ -81,7 +81,7 @@ impl Hessian {
             });
         }
         if let Some(forces) = &model.forces {
-            let instant = workspace.instant(model);
+            let instant = workspace.mid.instant(model);
             forces.for_each_derivative(&instant, |i, j, by_q, by_v| {
                 if i < nd {
                     qq[(i * n + j) * width + stage] += by_q;

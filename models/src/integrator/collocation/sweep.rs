@@ -6,8 +6,8 @@ use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::{Scheme, Tableau};
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{At, Workspace};
-use crate::kkt::factors::Factors;
+use crate::integrator::workspace::{StepContext, Workspace};
+use crate::kkt::system::KktSystem;
 use crate::model::mechanism::Model;
 
 /// A residual that falls by less than this from one sweep to the next falls too slowly.
@@ -28,7 +28,7 @@ struct Stage {
     /// `Y_i` and `P_i`.
     increment: Vec<f64>,
     impulse: Vec<f64>,
-    factors: Factors,
+    kkt: KktSystem,
 }
 
 impl Sweep {
@@ -37,7 +37,7 @@ impl Sweep {
         let stage = || Stage {
             increment: vec![0.0; d.dynamic],
             impulse: vec![0.0; d.dynamic],
-            factors: Factors::new(model),
+            kkt: KktSystem::new(model, 0),
         };
         Self {
             stages: (0..stages).map(|_| stage()).collect(),
@@ -51,12 +51,12 @@ impl Sweep {
     pub(super) fn correct(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         tableau: &Tableau,
         inputs: &[f64],
         motion: &mut [f64],
     ) -> Result<Option<StepReport>, StepError> {
-        let At { model, settings, state, u } = at;
+        let StepContext { model, settings, state, u } = at;
         let (ni, nd) = (model.dimensions.inputs, model.dimensions.dynamic);
         let count = self.stages.len();
         for (i, stage) in self.stages.iter_mut().enumerate() {
@@ -69,7 +69,7 @@ impl Sweep {
         self.base.q.copy_from_slice(&state.q);
         self.base.p.copy_from_slice(&state.p);
         if ni > 0 {
-            workspace.set_inputs(model, &u[..ni]);
+            workspace.mid.set_inputs(model, &u[..ni]);
         }
         let enough = settings.precision.residual();
         let mut report = StepReport::default();
@@ -86,13 +86,20 @@ impl Sweep {
                 size = size.max(residual);
                 if report.iterations == 1 {
                     let settings = stage_settings(settings, tableau.weights[i]);
-                    workspace.factor_generators(model, &settings)?;
-                    std::mem::swap(&mut workspace.factors, &mut self.stages[i].factors);
+                    workspace.factor(model, &settings, state)?;
+                    std::mem::swap(&mut workspace.kkt, &mut self.stages[i].kkt);
+                    workspace.kkt.estimates = self.stages[i].kkt.estimates;
                     report.factorizations += 1;
                 }
                 let stage = &mut self.stages[i];
-                stage.factors.solve(model, &mut workspace.residual);
-                for (y, correction) in stage.increment.iter_mut().zip(&workspace.residual) {
+                stage.kkt.solve(
+                    model,
+                    &workspace.constraints.end,
+                    &mut workspace.residual.dynamics,
+                    &mut [],
+                );
+                for (y, correction) in stage.increment.iter_mut().zip(&workspace.residual.dynamics)
+                {
                     *y -= correction;
                 }
             }
@@ -121,12 +128,12 @@ impl Sweep {
     fn evaluate(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         tableau: &Tableau,
         inputs: &[f64],
         i: usize,
     ) -> f64 {
-        let At { model, state, u, .. } = at;
+        let StepContext { model, state, u, .. } = at;
         let d = model.dimensions;
         let Self { stages, base, input } = self;
         base.q_low.copy_from_slice(&state.q_low);
@@ -147,14 +154,11 @@ impl Sweep {
         let settings = stage_settings(at.settings, tableau.weights[i]);
         if d.prescribed > 0 || !model.signals.is_empty() {
             input[..d.inputs].copy_from_slice(&inputs[i * d.inputs..][..d.inputs]);
-            workspace.prepare(At { model, settings: &settings, state: base, u: input });
+            workspace.prepare(StepContext { model, settings: &settings, state: base, u: input });
         }
-        workspace.increment.copy_from_slice(&stages[i].increment);
+        workspace.step.increment.copy_from_slice(&stages[i].increment);
         let residual = workspace.evaluate(model, &settings, base);
-        let forces = workspace.l_q.iter().zip(&workspace.force);
-        for (impulse, (l_q, force)) in stages[i].impulse.iter_mut().zip(forces) {
-            *impulse = settings.time_step_s * (l_q + force);
-        }
+        workspace.mid.write_impulse(settings.time_step_s, &mut stages[i].impulse);
         residual
     }
 
@@ -162,7 +166,7 @@ impl Sweep {
     fn finish(
         &self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         tableau: &Tableau,
         motion: &mut [f64],
     ) -> Result<(), StepError> {
@@ -170,13 +174,13 @@ impl Sweep {
         for stage in &self.stages {
             at.model.check_turns(&stage.increment)?;
         }
-        workspace.increment.fill(0.0);
-        workspace.impulse.fill(0.0);
+        workspace.step.increment.fill(0.0);
+        workspace.step.impulse.fill(0.0);
         for (i, stage) in self.stages.iter().enumerate() {
             let rate = 1.0 / (at.settings.time_step_s * tableau.weights[i]);
             for k in 0..nd {
-                workspace.increment[k] += stage.increment[k];
-                workspace.impulse[k] += stage.impulse[k];
+                workspace.step.increment[k] += stage.increment[k];
+                workspace.step.impulse[k] += stage.impulse[k];
                 motion[i * nd + k] = rate * stage.increment[k];
                 motion[(count + i) * nd + k] = rate * stage.impulse[k];
             }

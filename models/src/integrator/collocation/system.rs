@@ -9,7 +9,7 @@ use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Precision;
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::forces;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::math::dense_inverse::DenseInverse;
@@ -129,17 +129,23 @@ impl System {
         let (n, lane) = (state.q.len(), stage % Lanes::COUNT);
         let at = stage / Lanes::COUNT * n;
         for (a, (q, v)) in self.q[at..].iter().zip(&self.velocity[at..]).take(n).enumerate() {
-            let per_radian = workspace.turns_per_radian.get(a).copied().unwrap_or_default();
+            let per_radian = workspace.mid.turns_per_radian.get(a).copied().unwrap_or_default();
             let turns = state.q[a] - without_turns(state.q[a], per_radian)[0];
-            workspace.angles[a] = q.0[lane];
-            workspace.q_mid[a] = q.0[lane] + turns;
-            workspace.velocity[a] = v.0[lane];
+            workspace.mid.angles[a] = q.0[lane];
+            workspace.mid.q[a] = q.0[lane] + turns;
+            workspace.mid.velocity[a] = v.0[lane];
         }
     }
 
     /// Takes velocities and forces, stage by stage, and what does not change within the step.
-    pub(crate) fn begin(&mut self, at: At<'_>, motion: &[f64], inputs: &[f64], force: &mut [f64]) {
-        let At { model, settings, state, u } = at;
+    pub(crate) fn begin(
+        &mut self,
+        at: StepContext<'_>,
+        motion: &[f64],
+        inputs: &[f64],
+        force: &mut [f64],
+    ) {
+        let StepContext { model, settings, state, u } = at;
         let (d, h) = (model.dimensions, settings.time_step_s);
         let (nd, n, width) = (d.dynamic, d.coordinates(), self.width);
         for i in 0..self.count {
@@ -172,14 +178,14 @@ impl System {
     pub(crate) fn evaluate(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         inputs: &[f64],
     ) -> f64 {
-        let At { model, state, .. } = at;
+        let StepContext { model, state, .. } = at;
         let n = model.dimensions.coordinates();
         let mut magnitude = f64::MIN_POSITIVE;
         for g in 0..self.groups() {
-            self.move_to(state, &workspace.turns_per_radian, n, g);
+            self.move_to(state, &workspace.mid.turns_per_radian, n, g);
             if self.mechanics.is_empty() {
                 for lane in 0..Lanes::COUNT.min(self.count - g * Lanes::COUNT) {
                     self.evaluate_alone(workspace, at, inputs, g * Lanes::COUNT + lane);
@@ -242,24 +248,24 @@ impl System {
     fn evaluate_alone(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         inputs: &[f64],
         stage: usize,
     ) {
-        let At { model, state, .. } = at;
+        let StepContext { model, state, .. } = at;
         let d = model.dimensions;
         if d.inputs > 0 {
-            workspace.set_inputs(model, &inputs[stage * d.inputs..][..d.inputs]);
+            workspace.mid.set_inputs(model, &inputs[stage * d.inputs..][..d.inputs]);
         }
         self.place(workspace, state, stage);
-        workspace.evaluate_lagrangian(model);
+        workspace.mid.evaluate(model);
         let lane = stage % Lanes::COUNT;
         for a in 0..d.dynamic {
             // Forces count as a part of `L_q`; those of inputs and dampers are added to all stages.
-            let damping = model.damping.get(a).map_or(0.0, |c| c * workspace.velocity[a]);
-            let others = workspace.force[a] - (self.held[a * self.width + stage] - damping);
-            self.l_q[a].0[lane] = workspace.l_q[a] + others;
-            self.l_v[a].0[lane] = workspace.l_v[a];
+            let damping = model.damping.get(a).map_or(0.0, |c| c * workspace.mid.velocity[a]);
+            let others = workspace.mid.force[a] - (self.held[a * self.width + stage] - damping);
+            self.l_q[a].0[lane] = workspace.mid.l_q[a] + others;
+            self.l_v[a].0[lane] = workspace.mid.l_v[a];
         }
     }
 
@@ -315,10 +321,10 @@ impl System {
     pub(super) fn correct(
         &mut self,
         workspace: &mut Workspace,
-        at: At<'_>,
+        at: StepContext<'_>,
         inputs: &[f64],
     ) -> Result<StepReport, StepError> {
-        let At { model, settings, state, .. } = at;
+        let StepContext { model, settings, state, .. } = at;
         let n = model.dimensions.coordinates();
         let enough = settings.precision.residual();
         let mut report = StepReport::default();
@@ -364,13 +370,18 @@ impl System {
     }
 
     /// Takes second derivatives at the last evaluation.
-    pub(crate) fn differentiate(&mut self, workspace: &mut Workspace, at: At<'_>, inputs: &[f64]) {
+    pub(crate) fn differentiate(
+        &mut self,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        inputs: &[f64],
+    ) {
         let model = at.model;
         self.hessian.clear(model);
         if self.mechanics.is_empty() {
             for stage in 0..self.count {
                 self.evaluate_alone(workspace, at, inputs, stage);
-                self.hessian.take(model, &mut workspace.mechanics, stage);
+                self.hessian.take(model, &mut workspace.mid.mechanics, stage);
                 self.hessian.add_forces(model, workspace, stage);
             }
         }

@@ -7,9 +7,10 @@ use nalgebra::DMatrix;
 use crate::builtin;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
-use crate::integrator::workspace::{At, Workspace};
+use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::loops::{Closures, Derivatives, Mechanism, Scales};
-use crate::kkt::planar::{Diagonal, Of};
+use crate::kkt::planar::{Diagonal, MatrixKind};
+use crate::kkt::system::{Factors, Recursion};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
@@ -211,7 +212,10 @@ fn loops_move_and_linearize_as_with_dense_matrices() {
         for _ in 0..20 {
             slow.restore(&fast.snapshot()).unwrap();
             let report = fast.step_and_linearize(&u, &mut a).unwrap();
-            assert!(fast.workspace.in_loops && !slow.workspace.in_loops);
+            assert!(
+                [&fast, &slow].map(|p| p.workspace.kkt.valid)
+                    == [Factors::Recursion, Factors::Tree]
+            );
             assert!(report.constraint_reciprocal_condition > 1e-9);
             slow.step_and_linearize(&u, &mut b).unwrap();
             let name = &scene.name;
@@ -239,7 +243,7 @@ fn dense_matrices_stand_in_for_loops() {
         for _ in 0..10 {
             refused.step(&u).unwrap();
             slow.step(&u).unwrap();
-            assert!(!refused.workspace.in_loops);
+            assert_eq!(refused.workspace.kkt.valid, Factors::Tree);
             assert_near(refused.q(), slow.q(), 1e-9, &scene.name);
         }
         refused.linearize(&u, &mut a).unwrap();
@@ -303,10 +307,10 @@ fn the_first_guess_is_that_of_dense_matrices() {
                 plant.step(&u).unwrap();
             }
             let Plant { settings, state, workspace, .. } = &mut plant;
-            workspace.prepare(At { model: &model, settings, state, u: &u });
+            workspace.prepare(StepContext { model: &model, settings, state, u: &u });
             workspace.ballistic(&model, settings, state);
-            assert_eq!(workspace.in_loops, model.loops.is_some());
-            workspace.increment.clone()
+            assert_eq!(workspace.kkt.valid == Factors::Recursion, model.loops.is_some());
+            workspace.step.increment.clone()
         });
         assert_near(&fast, &slow, 1e-9, &scene.name);
     }
@@ -325,8 +329,8 @@ fn impulses_are_those_of_the_jacobian() {
         let d = model.dimensions();
         let multipliers: Vec<f64> = (0..d.constraints).map(|i| (i as f64 + 0.5).cos()).collect();
         let [mut by_wrenches, mut by_entries] = [0; 2].map(|_| vec![0.0; d.dynamic]);
-        workspace.start.subtract_pushes(&model, &multipliers, &mut by_wrenches);
-        workspace.start.subtract_impulses(&model, &multipliers, &mut by_entries);
+        workspace.constraints.start.subtract_pushes(&model, &multipliers, &mut by_wrenches);
+        workspace.constraints.start.subtract_impulses(&model, &multipliers, &mut by_entries);
         assert_near(&by_wrenches, &by_entries, 1e-13, &scene.name);
     }
 }
@@ -339,8 +343,9 @@ fn wider_registers_give_the_same_bits() {
         let mut out = Linearization::new(&model);
         plant.step(&vec![0.2; model.dimensions().input()]).unwrap();
         plant.linearize(&vec![0.2; model.dimensions().input()], &mut out).unwrap();
-        let Workspace { mechanics, start, end, factors, constraint_hessian, .. } =
-            &mut plant.workspace;
+        let Workspace { mid, constraints, kkt, tangents, .. } = &mut plant.workspace;
+        let (mechanics, start, end) = (&mid.mechanics, &constraints.start, &constraints.end);
+        let constraint_hessian = &tangents.constraint_hessian;
         let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
         let (loops, joints) = (model.loops.as_ref().unwrap(), model.planar.as_ref().unwrap());
         let at = Mechanism {
@@ -356,10 +361,11 @@ fn wider_registers_give_the_same_bits() {
         let closures = Closures { jacobian: &end.jacobian, hessian: constraint_hessian };
         let conditioning = &model.conditioning;
         let scales = Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
-        let mut wide = factors.loops().unwrap().clone();
+        let Recursion::Loops(fronts) = &kkt.recursion else { panic!("no fronts") };
+        let mut wide = fronts.clone();
         let mut narrow = wide.clone();
-        wide.factor(at, &numbers, scales, 0.01, Of::Motion);
-        narrow.factor_portable(at, &numbers, scales, 0.01, Of::Motion);
+        wide.factor(at, &numbers, scales, 0.01, MatrixKind::Newton);
+        narrow.factor_portable(at, &numbers, scales, 0.01, MatrixKind::Newton);
         assert_eq!(wide.factors, narrow.factors);
         let [mut x, mut narrow_x] = [0; 2].map(|_| numbers.clone());
         let [mut lambda, mut narrow_lambda] = [0; 2].map(|_| vec![0.3; d.constraints]);
@@ -428,7 +434,7 @@ fn singular_loops_are_named() {
     let d = model.dimensions();
     let q = vec![0.0; d.coordinates()];
     let workspace = &mut plant.workspace;
-    for closure in [&mut workspace.start, &mut workspace.end] {
+    for closure in [&mut workspace.constraints.start, &mut workspace.constraints.end] {
         closure.evaluate(&model, &q, &[]);
         closure.differentiate(&model, &q);
         closure.place_in_plane(&model, &q);

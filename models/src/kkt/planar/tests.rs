@@ -7,6 +7,7 @@ use nalgebra::DMatrix;
 use crate::builtin;
 use crate::integrator::settings::Settings;
 use crate::kkt::planar::Diagonal;
+use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
 use crate::math::rows::padded;
@@ -79,20 +80,20 @@ fn gradients_and_second_derivatives_are_those_in_space() {
             planar.differentiate(joints);
         }
         let workspace = &mut spatial.workspace;
-        workspace.mechanics.poses.evaluate(&model.dynamics, &q, &[]);
+        workspace.mid.mechanics.poses.evaluate(&model.dynamics, &q, &[]);
         let (mut in_space_q, mut in_space_v) = (vec![0.0; nd], vec![0.0; nd]);
-        workspace.mechanics.momenta.gradient(
+        workspace.mid.mechanics.momenta.gradient(
             &model.dynamics,
-            &workspace.mechanics.poses,
+            &workspace.mid.mechanics.poses,
             &v,
             model.gravity,
             &mut in_space_q,
             &mut in_space_v,
         );
-        workspace.mechanics.curvature.evaluate(
+        workspace.mid.mechanics.curvature.evaluate(
             &model.dynamics,
-            &workspace.mechanics.poses,
-            &workspace.mechanics.momenta,
+            &workspace.mid.mechanics.poses,
+            &workspace.mid.mechanics.momenta,
         );
         let size = |x: &[f64]| 1.0 + x.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
         for i in 0..nd {
@@ -102,8 +103,8 @@ fn gradients_and_second_derivatives_are_those_in_space() {
         for descendant in 0..joints.len() {
             for ancestor in model.dynamics.path(descendant) {
                 let a = planar.pair(joints, ancestor, descendant);
-                let b = workspace.mechanics.curvature.pair(
-                    &workspace.mechanics.momenta,
+                let b = workspace.mid.mechanics.curvature.pair(
+                    &workspace.mid.mechanics.momenta,
                     model.gravity,
                     ancestor,
                     descendant,
@@ -158,13 +159,13 @@ fn generators_stand_for_the_newton_matrix() {
     for model in [chain(7), chain(64), oblique(12, ""), oblique(13, "damping = 0.3")] {
         let model = Arc::new(model);
         let mut fast = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
-        assert!(fast.workspace.factors.generators.is_some(), "{}", model.scene.name);
+        assert!(fast.workspace.kkt.has_recursion(), "{}", model.scene.name);
         let n = model.dimensions.dynamic;
         let q = (0..n).map(|i| 0.3 * wave(i)).collect();
         let v = (0..n).map(|i| 0.1 * wave(i + 50)).collect();
         fast.initialize(&Initial::Velocity { q, v }).unwrap();
         let mut slow = fast.clone();
-        slow.workspace.factors.generators = None;
+        slow.workspace.kkt.recursion = Recursion::None;
         let mut by_generators = Linearization::new(&model);
         let mut by_entries = Linearization::new(&model);
         let u: Vec<f64> = (0..model.dimensions.input()).map(wave).collect();
@@ -195,12 +196,13 @@ fn linearizations_have_the_same_bits_in_any_register() {
         let n = model.dimensions.dynamic;
         let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
         plant.step(&vec![0.0; model.dimensions.input()]).unwrap();
-        let mechanics = &plant.workspace.mechanics;
+        let mechanics = &plant.workspace.mid.mechanics;
         let tree = mechanics.planar.as_deref().and_then(PlanarTree::many).unwrap();
         let (joints, stride) = (model.planar.as_ref().unwrap(), padded(2 * n));
         let numbers: Vec<f64> = (0..n).map(wave).collect();
         let diagonal = Diagonal { residual: &numbers, momentum: &numbers };
-        let mut wide = plant.workspace.factors.planar().unwrap().clone();
+        let Recursion::Planar(recursion) = &plant.workspace.kkt.recursion else { panic!() };
+        let mut wide = recursion.clone();
         let mut narrow = wide.clone();
         let [mut x, mut p, mut narrow_x, mut narrow_p] = [0; 4].map(|_| vec![0.0; n * stride]);
         wide.linearize(tree, joints, &diagonal, &mut x, &mut p, stride);

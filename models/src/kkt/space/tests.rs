@@ -8,9 +8,9 @@ use crate::builtin;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::factors::Generators;
-use crate::kkt::planar::Of;
-use crate::kkt::space::Elimination;
+use crate::kkt::planar::MatrixKind;
+use crate::kkt::space::SpatialRecursion;
+use crate::kkt::system::{Linearized, Recursion};
 use crate::linearization::linearize::Linearization;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::{Model, Solver};
@@ -121,32 +121,34 @@ fn a_solution_satisfies_the_dense_system() {
         let n = model.dimensions.dynamic;
         let settings = Settings { time_step_s: 0.02, ..Settings::new(&model) };
         let mut workspace = Workspace::new(&model);
-        let generators = Elimination::new(&model.dynamics, model.gravity);
-        workspace.factors.generators = Some(Box::new(Generators::Spatial(generators)));
+        let generators = SpatialRecursion::new(&model.dynamics, model.gravity);
+        workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
         for trial in 0..5 {
             for i in 0..n {
-                workspace.q_mid[i] = wave(100 * trial + i);
-                workspace.angles[i] = workspace.q_mid[i];
-                workspace.velocity[i] = 3.0 * wave(1000 + 100 * trial + i);
+                workspace.mid.q[i] = wave(100 * trial + i);
+                workspace.mid.angles[i] = workspace.mid.q[i];
+                workspace.mid.velocity[i] = 3.0 * wave(1000 + 100 * trial + i);
             }
-            workspace.evaluate_lagrangian(&model);
+            workspace.mid.evaluate(&model);
             workspace.fill_newton_matrix(&model, &settings);
-            let matrix = dense(&model, &workspace.factors.matrix);
-            workspace.factor_generators(&model, &settings).unwrap();
+            let matrix = dense(&model, &workspace.kkt.tree);
+            assert!(workspace.factor_recursion(&model, &settings).unwrap());
             assert_solves(&mut workspace, &model, &matrix);
 
-            let Workspace { mechanics, factors, .. } = &mut workspace;
-            factors.matrix.clear();
-            mechanics.curvature.fill_mass_matrix(
-                &model.pairs,
-                &mechanics.momenta,
-                &mut factors.matrix,
-            );
-            let masses = dense(&model, &factors.matrix) * (-1.0 / settings.time_step_s);
-            let diagonal = vec![0.0; n];
-            factors
-                .generate(&model, mechanics, &diagonal, settings.time_step_s, Of::Masses)
-                .unwrap();
+            let Workspace { mid, kkt, constraints, .. } = &mut workspace;
+            let (mechanics, start) = (&mut mid.mechanics, &constraints.start);
+            kkt.tree.clear();
+            mechanics.curvature.fill_mass_matrix(&model.pairs, &mechanics.momenta, &mut kkt.tree);
+            let masses = dense(&model, &kkt.tree) * (-1.0 / settings.time_step_s);
+            kkt.diagonal.fill(0.0);
+            let at = Linearized {
+                model: &model,
+                mechanics,
+                constraints: [start, start],
+                time_step_s: settings.time_step_s,
+                singular_below: settings.singular_below,
+            };
+            assert!(kkt.factor_recursion(at, MatrixKind::Mass).unwrap());
             assert_solves(&mut workspace, &model, &masses);
         }
     }
@@ -155,7 +157,7 @@ fn a_solution_satisfies_the_dense_system() {
 fn assert_solves(workspace: &mut Workspace, model: &Model, matrix: &DMatrix<f64>) {
     let b = DVector::from_fn(matrix.nrows(), |i, _| wave(i + 7));
     let mut x = b.clone();
-    workspace.factors.solve(model, x.as_mut_slice());
+    workspace.kkt.solve(model, &workspace.constraints.end, x.as_mut_slice(), &mut []);
     let exact = matrix.clone().lu().solve(&b).unwrap();
     let error = (&x - &exact).amax() / exact.amax();
     assert!(error < 1e-9, "{} rows: {error:e}", matrix.nrows());
@@ -166,15 +168,15 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     let settings = Settings { order, ..Settings::new(model) };
     let mut fast = Plant::new(Arc::clone(model), settings).unwrap();
     assert!(order == 2 || model.solver == Solver::Spatial);
-    let generators = Elimination::new(&model.dynamics, model.gravity);
-    fast.workspace.factors.generators = Some(Box::new(Generators::Spatial(generators)));
+    let generators = SpatialRecursion::new(&model.dynamics, model.gravity);
+    fast.workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
     let n = model.dimensions.dynamic;
     let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
     let q = (0..n).map(turned).collect();
     let v = (0..n).map(|i| 0.1 * (0.3 * i as f64).cos()).collect();
     fast.initialize(&Initial::Velocity { q, v }).unwrap();
     let mut slow = fast.clone();
-    slow.workspace.factors.generators = None;
+    slow.workspace.kkt.recursion = Recursion::None;
     [fast, slow]
 }
 

@@ -1,0 +1,231 @@
+//! The linear system of a step, factored and solved: the KKT system
+//!
+//! ```text
+//! [ K   −A0ᵀ ] [dx]     [r1]       S = A1 K⁻¹ A0ᵀ,   S dλ = A1 K⁻¹ r1 − r2
+//! [ A1    0  ] [dλ] = − [r2],      dx = K⁻¹ (A0ᵀ dλ − r1)
+//! ```
+//!
+//! The tree LU of `K` with the Schur complement `S` serves every scene. Where a recursion is faster, it takes
+//! its place; what it cannot do sound falls back on the tree.
+
+use crate::constraints::closure::Closure;
+use crate::kkt::loops::{Mechanism, Multifrontal, Scales};
+use crate::kkt::planar::{MatrixKind, PlanarRecursion};
+use crate::kkt::schur::SchurComplement;
+use crate::kkt::space::SpatialRecursion;
+use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::planar::PlanarTree;
+use crate::math::tree_lu::{SmallestPivot, TreeLu};
+use crate::model::mechanism::{Model, Solver};
+
+/// Pivots of loops, relative to what they are compared with, from which on they are taken.
+const SAFE: f64 = 1e-6;
+
+/// The KKT system of a step, with all factors that its model may need.
+#[derive(Clone, Debug)]
+pub(crate) struct KktSystem {
+    /// `K` entry by entry.
+    pub(crate) tree: TreeLu,
+    pub(crate) schur: SchurComplement,
+    pub(crate) recursion: Recursion,
+    /// Which of them were factored last.
+    pub(crate) valid: Factors,
+    /// What springs and dampers of coordinates add to the diagonal of `K`, for recursions.
+    pub(crate) diagonal: Vec<f64>,
+    pub(crate) estimates: Estimates,
+}
+
+/// Factors in O(n), in place of the tree LU.
+#[derive(Clone, Debug)]
+pub(crate) enum Recursion {
+    None,
+    Planar(Box<PlanarRecursion>),
+    /// With the constraints.
+    Loops(Box<Multifrontal>),
+    Spatial(Box<SpatialRecursion>),
+}
+
+/// Which factors are valid.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Factors {
+    /// The tree LU, with the Schur complement where there are constraints.
+    Tree,
+    Recursion,
+}
+
+/// Reciprocal condition estimates of the last factorization.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Estimates {
+    pub(crate) matrix: f64,
+    pub(crate) constraints: f64,
+    pub(crate) redundant: u32,
+}
+
+/// Where a system is factored: at the last gradient of the mechanics.
+pub(crate) struct Linearized<'a> {
+    pub(crate) model: &'a Model,
+    pub(crate) mechanics: &'a mut Mechanics,
+    /// Constraints at the start and at the end of the step.
+    pub(crate) constraints: [&'a Closure; 2],
+    pub(crate) time_step_s: f64,
+    pub(crate) singular_below: f64,
+}
+
+impl KktSystem {
+    /// Room for the factors, by what suits the model; columns of the Schur complement are `stride` apart.
+    pub(crate) fn new(model: &Model, stride: usize) -> Self {
+        let nd = model.dimensions.dynamic;
+        let recursion = match (model.solver, &model.loops) {
+            (Solver::Planar, _) => Recursion::Planar(Box::new(PlanarRecursion::new(nd))),
+            (Solver::Loops, Some(loops)) => Recursion::Loops(Box::new(Multifrontal::new(loops))),
+            (Solver::Spatial, _) => {
+                let recursion = SpatialRecursion::new(&model.dynamics, model.gravity);
+                Recursion::Spatial(Box::new(recursion))
+            }
+            (Solver::Tree | Solver::Loops, _) => Recursion::None,
+        };
+        Self {
+            tree: TreeLu::new(&model.elimination),
+            schur: SchurComplement::new(model, stride),
+            recursion,
+            valid: Factors::Tree,
+            diagonal: vec![0.0; nd],
+            estimates: Estimates { matrix: 1.0, constraints: 1.0, redundant: 0 },
+        }
+    }
+
+    /// What a factorization costs, in corrections.
+    pub(crate) fn corrections(&self) -> u32 {
+        if self.has_recursion() { 2 } else { 3 }
+    }
+
+    pub(crate) fn has_recursion(&self) -> bool {
+        !matches!(self.recursion, Recursion::None)
+    }
+
+    /// Factors by the recursion: false where there is none or its pivots are not sound, and the tree has to
+    /// do. The error is a pivot that is too small. Of masses alone all pivots of trees are taken.
+    pub(crate) fn factor_recursion(
+        &mut self,
+        at: Linearized<'_>,
+        kind: MatrixKind,
+    ) -> Result<bool, SmallestPivot> {
+        let Linearized { model, mechanics, constraints, time_step_s, singular_below } = at;
+        let (conditioning, diagonal) = (&model.conditioning, &self.diagonal);
+        let inertia = &conditioning.inertia;
+        self.valid = Factors::Tree;
+        let pivot = match (&mut self.recursion, mechanics.planar.as_deref_mut(), &model.planar) {
+            (Recursion::Planar(recursion), Some(PlanarTree::Many(tree)), Some(joints)) => {
+                tree.differentiate(joints);
+                recursion.factor(tree, joints, diagonal, inertia, time_step_s, kind)
+            }
+            (Recursion::Loops(fronts), Some(PlanarTree::Many(tree)), Some(joints)) => {
+                let [start, end] = constraints.map(|closure| closure.in_plane.as_deref());
+                let (Some(loops), Some(start), Some(end)) = (&model.loops, start, end) else {
+                    return Ok(false);
+                };
+                tree.differentiate(joints);
+                let at = Mechanism { loops, joints, tree, start, end };
+                let scales = Scales { inertia, weight: &conditioning.weight };
+                let pivots = fronts.factor(at, diagonal, scales, time_step_s, kind);
+                if pivots.joints.relative < SAFE
+                    || pivots.equations < SAFE
+                    || pivots.steepness < singular_below
+                {
+                    return Ok(false);
+                }
+                self.valid = Factors::Recursion;
+                self.estimates = Estimates {
+                    matrix: pivots.joints.relative,
+                    constraints: pivots.equations.min(pivots.steepness),
+                    redundant: (model.constraints.len() - loops.equations.len()) as u32,
+                };
+                return Ok(true);
+            }
+            (Recursion::Spatial(recursion), ..) => {
+                mechanics.differentiate(model);
+                let tree = &model.dynamics;
+                recursion.factor(tree, mechanics, diagonal, inertia, time_step_s, kind)
+            }
+            (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => return Ok(false),
+        };
+        self.valid = Factors::Recursion;
+        if kind == MatrixKind::Mass {
+            Ok(true)
+        } else {
+            self.judge(pivot, singular_below).map(|()| true)
+        }
+    }
+
+    /// Factors `K`, which is filled, by the tree LU. The error is a pivot that is too small.
+    pub(crate) fn factor_tree(
+        &mut self,
+        model: &Model,
+        time_step_s: f64,
+        singular_below: f64,
+    ) -> Result<(), SmallestPivot> {
+        self.valid = Factors::Tree;
+        let inertia = &model.conditioning.inertia;
+        let pivot = self.tree.factor(&model.elimination, inertia, 1.0 / time_step_s.abs());
+        self.judge(pivot, singular_below)
+    }
+
+    /// Takes note of the smallest pivot; refuses one that is too small.
+    fn judge(&mut self, pivot: SmallestPivot, singular_below: f64) -> Result<(), SmallestPivot> {
+        self.estimates.matrix = pivot.relative;
+        if pivot.relative >= singular_below { Ok(()) } else { Err(pivot) }
+    }
+
+    /// Factors `S` by the tree LU and the Jacobians at the start and the end; false if it is singular.
+    pub(crate) fn factor_schur(
+        &mut self,
+        model: &Model,
+        constraints: [&Closure; 2],
+        time_step_s: f64,
+        singular_below: f64,
+    ) -> bool {
+        self.schur.factor(model, &mut self.tree, constraints);
+        let lu = &self.schur.lu;
+        self.estimates.constraints =
+            lu.reciprocal_condition(model.constraint_rank(), time_step_s.abs());
+        self.estimates.redundant = lu.deficiency() as u32;
+        self.estimates.constraints >= singular_below
+    }
+
+    /// Solves in place with the valid factors: from `r1` and `r2` come `−dx` and `dλ`.
+    pub(crate) fn solve(
+        &mut self,
+        model: &Model,
+        end: &Closure,
+        x: &mut [f64],
+        lambda: &mut [f64],
+    ) {
+        match (&mut self.recursion, self.valid, &model.planar) {
+            (Recursion::Planar(recursion), Factors::Recursion, Some(joints)) => {
+                recursion.solve(joints, x);
+            }
+            (Recursion::Loops(fronts), Factors::Recursion, _) => {
+                if let Some(loops) = &model.loops {
+                    fronts.solve(loops, x, lambda);
+                    lambda.iter_mut().for_each(|change| *change = -*change);
+                }
+            }
+            (Recursion::Spatial(recursion), Factors::Recursion, _) => {
+                recursion.solve(&model.dynamics, x);
+            }
+            _ => {
+                self.tree.solve(&model.elimination, x);
+                if !lambda.is_empty() {
+                    self.schur.close(model, end, x, lambda);
+                }
+            }
+        }
+    }
+
+    /// Takes away from multipliers what redundant equations leave open; recursions leave nothing open.
+    pub(crate) fn remove_null(&self, multipliers: &mut [f64]) {
+        if self.valid == Factors::Tree {
+            self.schur.lu.remove_null(multipliers);
+        }
+    }
+}
