@@ -19,6 +19,7 @@
 
 pub(crate) mod blocked;
 mod controllability;
+mod coordinates;
 mod doubling;
 mod error;
 mod finite_horizon;
@@ -27,9 +28,11 @@ mod infinite_horizon;
 mod kalman;
 pub(crate) mod lq;
 mod manifold;
+pub(crate) mod matrix;
 mod modes;
+mod noise;
 mod spectrum;
-mod weights;
+pub(crate) mod weights;
 
 pub use controllability::{controllability_rank, observability_rank};
 pub use error::{AnalysisError, RiccatiError};
@@ -39,49 +42,12 @@ pub use finite_horizon::{
 pub use frequency::TransferFunction;
 pub use infinite_horizon::{Regulator, infinite_horizon, infinite_horizon_on_manifold};
 pub use kalman::{
-    Kalman, KalmanError, KalmanTrajectory, NoiseCovariances, NoiseError, steady_state_kalman,
-    steady_state_kalman_on_manifold, time_varying_kalman, time_varying_kalman_on_manifold,
+    Kalman, KalmanTrajectory, steady_state_kalman, steady_state_kalman_on_manifold,
+    time_varying_kalman, time_varying_kalman_on_manifold,
 };
 pub use manifold::{Tangent, tangent_basis};
 pub use modes::{Mode, modes};
+pub use noise::{KalmanError, NoiseCovariances, NoiseError};
 pub use spectrum::spectral_radius;
-pub use weights::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
-
-use nalgebra::DMatrix;
-
-/// Replaces a matrix that is symmetric but for round-off by its symmetric part.
-pub(crate) fn symmetrize(m: &mut DMatrix<f64>) {
-    for column in 0..m.ncols() {
-        for row in 0..column {
-            let mean = 0.5 * (m[(row, column)] + m[(column, row)]);
-            m[(row, column)] = mean;
-            m[(column, row)] = mean;
-        }
-    }
-}
-
-/// `m ≥ 0` up to round-off: `m` shifted by `1e-12` of its largest diagonal entry has a Cholesky
-/// factor.
-fn is_positive_semidefinite(m: &DMatrix<f64>) -> bool {
-    let largest = m.diagonal().amax();
-    if largest == 0.0 {
-        return m.iter().all(|&entry| entry == 0.0);
-    }
-    let mut shifted = m / largest;
-    for i in 0..m.nrows() {
-        shifted[(i, i)] += 1e-12;
-    }
-    shifted.cholesky().is_some()
-}
-
-fn all_finite(m: &DMatrix<f64>) -> bool {
-    // Without a branch per entry: products with zero are zero, or NaN.
-    let (blocks, rest) = m.as_slice().as_chunks::<8>();
-    let mut sums = [0.0; 8];
-    for block in blocks {
-        for (sum, entry) in sums.iter_mut().zip(block) {
-            *sum += 0.0 * entry;
-        }
-    }
-    sums.iter().all(|&sum| sum == 0.0) && rest.iter().all(|entry| entry.is_finite())
-}
+pub use weights::error::WeightsError;
+pub use weights::{Momentum, StageWeights, TrajectoryWeights, Weights};

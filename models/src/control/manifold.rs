@@ -23,7 +23,8 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::RiccatiError;
+use super::error::RiccatiError;
+use super::matrix::{congruent, symmetrize};
 
 /// Pivot of the row-normalised constraint Jacobian below which a constraint is redundant.
 const REDUNDANT: f64 = 1e-10;
@@ -79,8 +80,8 @@ impl Tangent {
         Self { transpose: basis.transpose(), basis }
     }
 
-    /// The same without the motion of the prescribed coordinates: `T = diag([Z; 0], Z, 0)`. What moves
-    /// by itself while they are held; the modes of a map are those of `Tᵀ A T`.
+    /// What moves by itself while the prescribed coordinates are held: `T = diag([Z; 0], Z, 0)`. The modes
+    /// of a map are those of `Tᵀ A T`.
     ///
     /// # Panics
     /// If `dh` has fewer than `dynamic` columns.
@@ -113,7 +114,7 @@ impl Tangent {
     /// `Tᵀ q T`: a weight on the tangent space.
     pub(super) fn restrict(&self, q: &DMatrix<f64>) -> DMatrix<f64> {
         let mut restricted = self.reduce(q) * &self.basis;
-        super::symmetrize(&mut restricted);
+        symmetrize(&mut restricted);
         restricted
     }
     /// `Tᵀ v`.
@@ -130,24 +131,11 @@ impl Tangent {
     }
     /// `T P Tᵀ`: a cost to go of the full state.
     pub(super) fn extend_value(&self, value: &DMatrix<f64>) -> DMatrix<f64> {
-        let mut extended = &self.basis * (value * &self.transpose);
-        super::symmetrize(&mut extended);
-        extended
+        congruent(&self.transpose, value)
     }
 
     pub(super) fn check(&self, sample: usize, states: usize) -> Result<(), RiccatiError> {
-        let (rows, cols) = self.basis.shape();
-        if rows == states {
-            return Ok(());
-        }
-        Err(RiccatiError::Dimension {
-            matrix: "T",
-            sample,
-            rows,
-            cols,
-            expected_rows: states,
-            expected_cols: cols,
-        })
+        RiccatiError::check_shape("T", sample, &self.basis, (states, self.basis.ncols()))
     }
 }
 

@@ -7,9 +7,9 @@ use nalgebra::{DMatrix, DVector};
 use super::bounds::{Ends, Of};
 use super::trajectory::rows;
 use super::{Bounds, FreeInitialState, OptimizeError, TrajectoryCost};
-use crate::control::{
-    Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError, symmetrize,
-};
+use crate::control::matrix::symmetrize;
+use crate::control::weights::error::WeightsError;
+use crate::control::weights::{Momentum, StageWeights, TrajectoryWeights, Weights};
 use crate::plant::balls::three;
 use crate::rotation::{self, Quaternion};
 use crate::scalar::Dual;

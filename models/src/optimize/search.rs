@@ -15,7 +15,9 @@ use super::{
     Status, Stuck, TrajectoryCost,
 };
 use crate::control::Weights;
-use crate::control::lq::{LqRecursion, Map, Stage};
+use crate::control::lq::Map;
+use crate::control::lq::recursion::LqRecursion;
+use crate::control::lq::stage::Stage;
 use crate::{Contraction, Initial, Linearization, Plant, Snapshot, State};
 
 /// Penalty with which a search begins.

@@ -1,4 +1,8 @@
-use super::*;
+use nalgebra::{DMatrix, DVector};
+
+use super::map::Map;
+use super::recursion::LqRecursion;
+use super::stage::{NotConvex, Stage};
 
 /// Numbers in (-1, 1) that follow no pattern.
 fn noise(rows: usize, cols: usize, seed: f64) -> DMatrix<f64> {

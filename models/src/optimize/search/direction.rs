@@ -8,7 +8,8 @@ use std::sync::mpsc;
 use nalgebra::{DMatrix, DVector};
 
 use super::{Direction, Go, Optimizer, Scratch, Second, Worker, ask, subtract_product};
-use crate::control::lq::{Map, Stage};
+use crate::control::lq::Map;
+use crate::control::lq::stage::Stage;
 use crate::control::tangent_basis;
 use crate::optimize::problem::{self, Deviation, Problem, dot};
 use crate::optimize::trajectory::Trajectory;
