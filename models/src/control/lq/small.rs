@@ -27,18 +27,9 @@ pub(super) fn step<const N: usize>(
 ) -> Result<(), NotConvex> {
     let (a, b) = columns::<N>(map, m);
     let value = &cost.numbers()[..LANES * next];
-    let (q, r) = (&stage.q.as_slice()[..n * n], &stage.r.as_slice()[..m * m]);
-    // Pᵀx, which is Px.
-    let times_value = |x: &[f64]| {
-        let mut y = [0.0; N];
-        for k in 0..next {
-            for i in 0..next {
-                y[i] += value[LANES * k + i] * x[k];
-            }
-        }
-        y
-    };
-    let dot = |x: &[f64], y: &[f64]| (0..next).map(|k| x[k] * y[k]).sum::<f64>();
+    let r = &stage.r.as_slice()[..m * m];
+    let times_value = |x: &[f64; N]| times_value(value, next, x);
+    let dot = |x: &[f64; N], y: &[f64]| dot(next, x, y);
 
     // Γ = R + BᵀPB, its lower triangle by rows, and X = AᵀPB + S.
     let mut bracket = [[0.0; N]; N];
@@ -106,30 +97,7 @@ pub(super) fn step<const N: usize>(
     }
     offset.as_mut_slice()[..m].copy_from_slice(&input[..m]);
 
-    // P ← Q + AᵀPA − Y Yᵀ.
-    let mut new_value = [[0.0; N]; N];
-    let mut has_cancelled = false;
-    for j in 0..n {
-        let value_a = times_value(&a[j]);
-        for i in 0..=j {
-            let whole = q[n * j + i] + dot(&a[i], &value_a);
-            let gained: f64 = (0..m).map(|k| cross[k][i] * cross[k][j]).sum();
-            new_value[j][i] = whole - gained;
-            if i == j {
-                has_cancelled |= new_value[j][j].abs() < CANCELLED * whole.abs();
-            }
-        }
-    }
-    if has_cancelled {
-        let closed_loop = closed_loop((&a, &b), &law, (next, n, m));
-        for j in 0..n {
-            let pushed = times_value(&closed_loop[j]);
-            for i in 0..=j {
-                let kept = q[n * j + i] + dot(&closed_loop[i], &pushed);
-                new_value[j][i] = add_price(kept, stage, &law, (i, j));
-            }
-        }
-    }
+    let new_value = value_before((&a, &b), value, (&cross, &law), stage, (next, n, m));
     cost.set_states(n);
     cost.linear.as_mut_slice()[..n].copy_from_slice(&new_linear[..n]);
     let value = &mut cost.numbers_mut()[..LANES * n];
@@ -165,6 +133,23 @@ fn columns<const N: usize>(map: &Map, m: usize) -> (Columns<N>, Columns<N>) {
     (a, b)
 }
 
+/// `P x`, by columns of `P`.
+#[inline(always)]
+fn times_value<const N: usize>(value: &[f64], next: usize, x: &[f64; N]) -> [f64; N] {
+    let mut y = [0.0; N];
+    for k in 0..next {
+        for i in 0..next {
+            y[i] += value[LANES * k + i] * x[k];
+        }
+    }
+    y
+}
+
+#[inline(always)]
+fn dot(next: usize, x: &[f64], y: &[f64]) -> f64 {
+    (0..next).map(|k| x[k] * y[k]).sum()
+}
+
 /// Makes `L` of `Γ = L Lᵀ`; row j is `bracket[j]`.
 #[inline(always)]
 fn factorize<const N: usize>(bracket: &mut Columns<N>, m: usize) -> Result<(), NotConvex> {
@@ -182,6 +167,43 @@ fn factorize<const N: usize>(bracket: &mut Columns<N>, m: usize) -> Result<(), N
         }
     }
     Ok(())
+}
+
+/// `P ← Q + AᵀPA − Y Yᵀ`, its lower triangle by rows.
+#[inline(always)]
+#[allow(clippy::needless_range_loop, reason = "the indices are those of the formulas")]
+fn value_before<const N: usize>(
+    (a, b): (&Columns<N>, &Columns<N>),
+    value: &[f64],
+    (cross, law): (&Columns<N>, &Columns<N>),
+    stage: Stage<'_>,
+    (next, n, m): (usize, usize, usize),
+) -> Columns<N> {
+    let q = stage.q.as_slice();
+    let mut new_value = [[0.0; N]; N];
+    let mut has_cancelled = false;
+    for j in 0..n {
+        let value_a = times_value(value, next, &a[j]);
+        for i in 0..=j {
+            let whole = q[n * j + i] + dot(next, &a[i], &value_a);
+            let gained: f64 = (0..m).map(|k| cross[k][i] * cross[k][j]).sum();
+            new_value[j][i] = whole - gained;
+            if i == j {
+                has_cancelled |= new_value[j][j].abs() < CANCELLED * whole.abs();
+            }
+        }
+    }
+    if has_cancelled {
+        let closed_loop = closed_loop((a, b), law, (next, n, m));
+        for j in 0..n {
+            let pushed = times_value(value, next, &closed_loop[j]);
+            for i in 0..=j {
+                let kept = q[n * j + i] + dot(next, &closed_loop[i], &pushed);
+                new_value[j][i] = add_price(kept, stage, law, (i, j));
+            }
+        }
+    }
+    new_value
 }
 
 /// `A − BK`.
