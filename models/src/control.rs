@@ -27,7 +27,7 @@ mod frequency;
 mod infinite_horizon;
 mod kalman;
 pub(crate) mod lq;
-mod manifold;
+pub(crate) mod manifold;
 pub(crate) mod matrix;
 mod modes;
 mod noise;

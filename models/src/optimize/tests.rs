@@ -2,9 +2,10 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use super::options::{Method, Options};
 use super::search::Optimizer;
-use super::{Bound, Bounds, FreeInitialState, Method, Options, TrajectoryCost};
-use crate::control::{Momentum, StageWeights, TrajectoryWeights, Weights};
+use super::specification::{Bound, Bounds, FreeInitialState, TrajectoryCost};
+use crate::control::weights::{Momentum, StageWeights, TrajectoryWeights, Weights};
 use crate::plant::samples;
 use crate::{ForceSplit, Model, Plant, Settings, builtin};
 use std::sync::Arc;
