@@ -56,6 +56,27 @@ pub struct FiniteHorizon {
 ///
 /// Weights that are not convex step by step are good as long as each `Γ` is positive definite.
 /// Costs at most `3n³ + 6n²m` flops per sample.
+///
+/// ```
+/// use std::sync::Arc;
+/// use plantd_models::control::{Sample, Values, Weights, finite_horizon};
+/// use plantd_models::{Linearization, Model, Plant, Settings, builtin};
+///
+/// // Gains along a motion of the pendulum.
+/// let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap())?);
+/// let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model))?;
+/// let mut linearization = Linearization::new(&model);
+/// let mut samples = Vec::new();
+/// for _ in 0..50 {
+///     plant.step_and_linearize(&[0.1], &mut linearization)?;
+///     samples.push(Sample { a: linearization.a(), b: linearization.b() });
+/// }
+/// let weights = Weights::diagonal(&[10.0, 1.0], &[0.5])?;
+/// let regulator = finite_horizon(&samples, &weights.into(), Values::Drop)?;
+/// assert_eq!(regulator.gains.len(), 50);
+/// assert!(regulator.value.cholesky().is_some());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn finite_horizon(
     samples: &[Sample],
     weights: &TrajectoryWeights,

@@ -55,6 +55,25 @@ pub struct Regulator {
 /// which leaves `P` and `A − BK` as they are; `R` is well invertible then. What comes out has passed three
 /// checks: it solves the equation, it is positive semidefinite, and it stabilises. When a check
 /// fails, the modes of `A` tell why.
+///
+/// ```
+/// use std::f64::consts::PI;
+/// use std::sync::Arc;
+/// use plantd_models::control::{Weights, infinite_horizon};
+/// use plantd_models::{Initial, Linearization, Model, Plant, Settings, builtin};
+///
+/// // Balance the pole of a cart upright.
+/// let model = Arc::new(Model::compile(&builtin::scene("cart-pole").unwrap())?);
+/// let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model))?;
+/// plant.initialize(&Initial::Momentum { q: vec![0.0, PI], p: vec![0.0; 2], v: vec![] })?;
+/// let mut linearization = Linearization::new(&model);
+/// plant.linearize(&[0.0], &mut linearization)?;
+/// let weights = Weights::diagonal(&[1.0; 4], &[0.1])?;
+/// let regulator = infinite_horizon(&linearization.a(), &linearization.b(), &weights)?;
+/// assert_eq!(regulator.gain.shape(), (1, 4));
+/// assert!(regulator.spectral_radius < 1.0 && regulator.residual < 1e-9);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn infinite_horizon(
     a: &DMatrix<f64>,
     b: &DMatrix<f64>,

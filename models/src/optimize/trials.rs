@@ -90,7 +90,7 @@ impl Trials {
         let (mut cost, mut penalties) = (problem.initial_cost(trial.x(0)), 0.0);
         let may_stop_early = problem.is_nonnegative && bounds.is_empty();
         linearizer.roll_out(&mut |behind: &mut dyn FnMut(usize, &Trajectory)| {
-            for k in 0..steps {
+            for (k, gain) in gains.iter().enumerate() {
                 ask_at(k, go_on)?;
                 // u = ū + s du − K (x ⊖ (x̄ + s dx)).
                 let dx = &direction.dx[k * states..][..states];
@@ -101,7 +101,7 @@ impl Trials {
                 {
                     *u = nominal + length * change;
                 }
-                subtract_product(&gains[k], error, input);
+                subtract_product(gain, error, input);
                 cost += problem.evaluate(k, trial.x(k), input, deviation);
                 penalties += bounds.value(k, (trial.x(k), input));
                 // What is still to come costs nothing at least.
