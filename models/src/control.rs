@@ -18,6 +18,7 @@
 //! on a control path. Costs are given in flops of `n` states and `m` inputs.
 
 pub(crate) mod controllability;
+pub(crate) mod coordinates;
 pub(crate) mod doubling;
 pub(crate) mod error;
 pub(crate) mod finite_horizon;
@@ -26,62 +27,29 @@ pub(crate) mod infinite_horizon;
 pub(crate) mod kalman;
 pub(crate) mod lq;
 pub(crate) mod manifold;
+pub(crate) mod matrix;
 pub(crate) mod modes;
+pub(crate) mod noise;
 pub(crate) mod spectrum;
 pub(crate) mod weights;
 
-pub use crate::math::null_space::tangent_basis;
-pub use controllability::{controllability_rank, observability_rank};
-pub use error::{AnalysisError, RiccatiError};
-pub use finite_horizon::{
+pub use crate::control::controllability::{controllability_rank, observability_rank};
+pub use crate::control::error::{AnalysisError, RiccatiError};
+pub use crate::control::finite_horizon::{
     FiniteHorizon, Sample, Values, finite_horizon, finite_horizon_on_manifold,
 };
-pub use frequency::TransferFunction;
-pub use infinite_horizon::{Regulator, infinite_horizon, infinite_horizon_on_manifold};
-pub use kalman::{
-    Kalman, KalmanError, KalmanTrajectory, NoiseCovariances, NoiseError, steady_state_kalman,
-    steady_state_kalman_on_manifold, time_varying_kalman, time_varying_kalman_on_manifold,
+pub use crate::control::frequency::TransferFunction;
+pub use crate::control::infinite_horizon::{
+    Regulator, infinite_horizon, infinite_horizon_on_manifold,
 };
-pub use manifold::Tangent;
-pub use modes::{Mode, modes};
-pub use spectrum::spectral_radius;
-pub use weights::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
-
-use nalgebra::DMatrix;
-
-/// Replaces a matrix that is symmetric but for round-off by its symmetric part.
-pub(crate) fn symmetrize(m: &mut DMatrix<f64>) {
-    for column in 0..m.ncols() {
-        for row in 0..column {
-            let mean = 0.5 * (m[(row, column)] + m[(column, row)]);
-            m[(row, column)] = mean;
-            m[(column, row)] = mean;
-        }
-    }
-}
-
-/// `m ≥ 0` up to round-off: `m` shifted by `1e-12` of its largest diagonal entry has a Cholesky
-/// factor.
-fn is_positive_semidefinite(m: &DMatrix<f64>) -> bool {
-    let largest = m.diagonal().amax();
-    if largest == 0.0 {
-        return m.iter().all(|&entry| entry == 0.0);
-    }
-    let mut shifted = m / largest;
-    for i in 0..m.nrows() {
-        shifted[(i, i)] += 1e-12;
-    }
-    shifted.cholesky().is_some()
-}
-
-fn all_finite(m: &DMatrix<f64>) -> bool {
-    // Without a branch per entry: products with zero are zero, or NaN.
-    let (blocks, rest) = m.as_slice().as_chunks::<8>();
-    let mut sums = [0.0; 8];
-    for block in blocks {
-        for (sum, entry) in sums.iter_mut().zip(block) {
-            *sum += 0.0 * entry;
-        }
-    }
-    sums.iter().all(|&sum| sum == 0.0) && rest.iter().all(|entry| entry.is_finite())
-}
+pub use crate::control::kalman::{
+    Kalman, KalmanTrajectory, steady_state_kalman, steady_state_kalman_on_manifold,
+    time_varying_kalman, time_varying_kalman_on_manifold,
+};
+pub use crate::control::manifold::Tangent;
+pub use crate::control::modes::{Mode, modes};
+pub use crate::control::noise::{KalmanError, NoiseCovariances, NoiseError};
+pub use crate::control::spectrum::spectral_radius;
+pub use crate::control::weights::error::WeightsError;
+pub use crate::control::weights::{Momentum, StageWeights, TrajectoryWeights, Weights};
+pub use crate::math::null_space::tangent_basis;

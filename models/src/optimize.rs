@@ -109,204 +109,26 @@
 //! ```
 
 mod bounds;
+mod chart;
+mod derivatives;
+mod direction;
 mod error;
+mod linearizer;
+mod options;
 mod problem;
+mod products;
+mod progress;
+mod projection;
+mod question;
 mod search;
+mod specification;
 #[cfg(test)]
 mod tests;
 mod trajectory;
+mod trials;
 
-use nalgebra::DMatrix;
-
-use crate::control::{Momentum, TrajectoryWeights, Weights};
-use crate::integrator::state::State;
-
-pub use error::{BoundFault, BoundState, OptimizeError, Stuck};
-pub use search::Optimizer;
-
-/// What a trajectory costs; see the [module](self).
-#[derive(Clone, Debug, PartialEq)]
-pub struct TrajectoryCost {
-    /// Row k is the desired `x[k]`: n + 1 rows of `2 nd + 2 nk`. It need not be a motion of the plant.
-    pub x: DMatrix<f64>,
-    /// Row k is the desired `u[k]`: n rows of `ni + nk`.
-    pub u: DMatrix<f64>,
-    /// Weights, constant or one set per step. They need only be convex together with the map.
-    pub weights: TrajectoryWeights,
-    /// Which momentum they weigh.
-    pub momentum: Momentum,
-}
-
-/// Bounds of single entries.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Bounds {
-    /// Of entries of `x` at steps 1 to n.
-    pub states: Vec<Bound>,
-    /// Of entries of `u` at steps 0 to n − 1.
-    pub inputs: Vec<Bound>,
-    /// Of entries of `x[n]`.
-    pub final_state: Vec<Bound>,
-}
-
-/// Bounds of one entry; at least one end is given, and equal ends fix it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Bound {
-    /// Index of the entry in `x` or `u`.
-    pub index: usize,
-    /// Smallest value.
-    pub min: Option<f64>,
-    /// Largest value.
-    pub max: Option<f64>,
-}
-
-/// An initial state that is free to move on the constraints.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct FreeInitialState {
-    /// Indices of the entries of `x` that may change; empty means all.
-    pub entries: Vec<usize>,
-    /// Weight `W` of `½ dxᵀ W dx`, `dx = x[0] ⊖` the initial state of the guess; symmetric positive
-    /// semidefinite, square of `2 nd + 2 nk`. None means zero.
-    pub weight: Option<DMatrix<f64>>,
-}
-
-/// Which quadratic model of the cost gives the direction of descent; see the [module](self).
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Method {
-    /// Identity in place of second derivatives, but for those of bounds.
-    Steepest,
-    /// Second derivatives of the cost, first derivatives of the map.
-    QuasiNewton,
-    /// Second derivatives of the cost and of the map.
-    #[default]
-    Newton,
-}
-
-/// How to search.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Options {
-    /// Method.
-    pub method: Method,
-    /// Method of the first iterations; none means `method`.
-    pub first_method: Option<Method>,
-    /// How many iterations use it.
-    pub first_iterations: u32,
-    /// Iterations at most; 200.
-    pub max_iterations: u32,
-    /// Directional derivative at which the search has converged; none means 1e-9 times the cost with
-    /// which it began.
-    pub tolerance: Option<f64>,
-    /// `α` of Armijo's rule, between 0 and 1; 1e-5.
-    pub alpha: f64,
-    /// `β` of Armijo's rule, between 0 and 1; 0.7.
-    pub beta: f64,
-    /// Shortenings of a step at most; 30.
-    pub max_backtracks: u32,
-    /// Looks for a step from the one of the iteration before: fewer trials where steps are short again
-    /// and again. Misses a longer one beyond steps that fail. False.
-    pub near_last_step: bool,
-    /// Weights of a regulator to project with, of its own; none means the law of the descent.
-    pub projection: Option<Weights>,
-    /// Error of a bound, in the unit of its entry, that counts as none; 1e-6.
-    pub bound_tolerance: f64,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            method: Method::default(),
-            first_method: None,
-            first_iterations: 0,
-            max_iterations: 200,
-            tolerance: None,
-            alpha: 1e-5,
-            beta: 0.7,
-            max_backtracks: 30,
-            near_last_step: false,
-            projection: None,
-            bound_tolerance: 1e-6,
-        }
-    }
-}
-
-/// Where a search stands: what it goes on from, bit for bit, given the same problem.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Checkpoint {
-    /// Initial state of the trajectory.
-    pub initial: State,
-    /// Row k is `u[k]`.
-    pub inputs: DMatrix<f64>,
-    /// Iterations so far.
-    pub iterations: u32,
-    /// Cost of the trajectory with which the search began.
-    pub first_cost: f64,
-    /// Multipliers of the bounds: those of `states`, `inputs` and `final_state` in this order, for each
-    /// bound the lower before the upper end, for each end its steps. Equal ends have one.
-    pub bound_multipliers: Vec<f64>,
-    /// Penalty of the bounds.
-    pub penalty: f64,
-    /// Error of the bounds when the multipliers were last renewed.
-    pub bound_violation: f64,
-    /// Initial state that [`FreeInitialState::weight`] refers to.
-    pub initial_reference: State,
-    /// Shortenings of the last step that was taken.
-    pub backtracks: u32,
-    /// Directional derivative of the last step since the multipliers were renewed; 0 before the first.
-    pub last_derivative: f64,
-}
-
-/// What an iteration did.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Progress {
-    /// Number of the iteration, from 0.
-    pub iteration: u32,
-    /// Cost before it, with the penalties of bounds.
-    pub cost_before: f64,
-    /// Cost after it, with the penalties of bounds.
-    pub cost: f64,
-    /// Directional derivative of the cost along the direction.
-    pub directional_derivative: f64,
-    /// Method that gave the direction.
-    pub method: Method,
-    /// Why it was not the one asked for, when it was not.
-    pub fallback: Option<Fallback>,
-    /// Length of the step; 0 when none was taken: the search has ended, or multipliers were renewed.
-    pub step_length: f64,
-    /// Shortenings before it was accepted.
-    pub backtracks: u32,
-    /// Largest violation of a bound.
-    pub bound_violation: f64,
-}
-
-/// Why an iteration did not use the method that it was asked to.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum Fallback {
-    /// The quadratic model has no minimum.
-    #[error("the quadratic model has no minimum at step {step}")]
-    NotConvex {
-        /// The step.
-        step: usize,
-    },
-    /// The direction does not descend.
-    #[error("the direction does not descend: its derivative is {derivative:e}")]
-    Ascent {
-        /// Directional derivative.
-        derivative: f64,
-    },
-    /// No step along the direction lowers the cost enough.
-    #[error("no step along a direction with derivative {derivative:e} lowers the cost")]
-    NoStep {
-        /// Directional derivative.
-        derivative: f64,
-    },
-}
-
-/// Whether a search goes on.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Status {
-    /// It does.
-    Running,
-    /// The directional derivative and the bounds are within their tolerances.
-    Converged,
-    /// It ended without; the trajectory is the best that was found.
-    Stuck(Stuck),
-}
+pub use crate::optimize::error::{BoundFault, BoundState, OptimizeError, Stuck};
+pub use crate::optimize::options::{Method, Options};
+pub use crate::optimize::progress::{Checkpoint, Fallback, Progress, Status};
+pub use crate::optimize::search::Optimizer;
+pub use crate::optimize::specification::{Bound, Bounds, FreeInitialState, TrajectoryCost};

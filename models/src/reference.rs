@@ -24,10 +24,11 @@
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 use crate::control::error::RiccatiError;
-use crate::control::finite_horizon;
-use crate::control::finite_horizon::{Sample, Values, finite_horizon_on_manifold};
+use crate::control::finite_horizon::{Sample, Values, finite_horizon, finite_horizon_on_manifold};
 use crate::control::manifold::Tangent;
-use crate::control::weights::{Weights, WeightsError};
+use crate::control::matrix::not_finite;
+use crate::control::weights::Weights;
+use crate::control::weights::error::WeightsError;
 use crate::integrator::report::StepError;
 use crate::integrator::state::State;
 use crate::linearization::linearize::Linearization;
@@ -182,11 +183,9 @@ fn check(
     if (rows, cols) != (expected_rows, expected_cols) {
         return Err(ReferenceError::Dimension { what, rows, cols, expected_rows, expected_cols });
     }
-    match matrix.iter().position(|entry| !entry.is_finite()) {
+    match not_finite(matrix.as_slice(), rows) {
         None => Ok(()),
-        Some(index) => {
-            Err(ReferenceError::NotFinite { what, row: index % rows, col: index / rows })
-        }
+        Some((row, col)) => Err(ReferenceError::NotFinite { what, row, col }),
     }
 }
 
@@ -337,17 +336,12 @@ impl<'a> Assess<'a> {
         let model = self.plant.model().clone();
         let d = model.dimensions();
         let (n, nd, steps) = (d.coordinates(), d.dynamic, self.steps);
-        let h = self.plant.settings().time_step_s;
         let mut out = Linearization::new(&model);
         let mut terms = Vec::with_capacity(steps);
         for k in 0..steps {
             terms.push(self.terms(k, &mut out)?);
         }
-        let mut nodes = Vec::with_capacity(steps);
-        for k in 1..steps {
-            let node = self.node(k, &terms[k - 1], &terms[k]);
-            nodes.push(node);
-        }
+        let nodes: Vec<_> = (1..steps).map(|k| self.node(k, &terms[k - 1], &terms[k])).collect();
         if !self.is_given && d.inputs > 0 {
             let found = fit(&nodes, steps, d.inputs);
             for (k, found) in found.iter().enumerate() {
@@ -356,10 +350,6 @@ impl<'a> Assess<'a> {
                 }
                 // With the inputs in place what is left is known to all digits.
                 terms[k] = self.terms(k, &mut out)?;
-            }
-        } else if self.is_given {
-            for (k, terms) in terms.iter_mut().enumerate() {
-                *terms = self.terms(k, &mut out)?;
             }
         }
         let mut assessment = Assessment {
@@ -376,18 +366,31 @@ impl<'a> Assess<'a> {
             states: DMatrix::zeros(steps + 1, d.state()),
             multipliers: DMatrix::zeros(steps, d.constraints),
         };
-        for (k, node) in (1..steps).zip(&nodes) {
+        self.explain(&terms, &nodes, &mut assessment);
+        self.find_states(&terms, &mut assessment);
+        for k in 0..steps {
+            for (j, coordinate) in model.coordinates()[nd..n].iter().enumerate() {
+                let gap = self.inputs[(k, d.inputs + j)] - self.q[(k + 1, nd + j)];
+                assessment.violate(gap.abs(), k + 1, &coordinate.name);
+            }
+        }
+        Ok(assessment)
+    }
+
+    /// Multipliers of the inner rows, and what is left as a force and as the acceleration that it makes.
+    fn explain(&self, terms: &[StepTerms], nodes: &[Node], assessment: &mut Assessment) {
+        let (model, h) = (self.plant.model(), self.plant.settings().time_step_s);
+        for (k, node) in (1..).zip(nodes) {
             let mut gap = &terms[k - 1].arrives - &terms[k].leaves;
             let multipliers = node.explain(&gap);
             assessment.multipliers.row_mut(k).copy_from(&multipliers.transpose());
-            // What is left, as a force and as the acceleration that it makes.
             let l = node.factor.l_dirty();
             l.solve_lower_triangular_mut(&mut gap);
             let white = &node.free * node.free.tr_mul(&gap);
             let mut acceleration = white.clone();
             l.tr_solve_lower_triangular_mut(&mut acceleration);
             let force = node.factor.l() * white;
-            for i in 0..nd {
+            for i in 0..force.len() {
                 let (force, acceleration) = (force[i].abs() / h, acceleration[i].abs() / h);
                 if force > assessment.unexplained_force {
                     assessment.unexplained_force = force;
@@ -401,10 +404,17 @@ impl<'a> Assess<'a> {
                 }
             }
         }
-        if steps > 1 {
+        if self.steps > 1 {
             let first = assessment.multipliers.row(1).into_owned();
             assessment.multipliers.row_mut(0).copy_from(&first);
         }
+    }
+
+    /// The states, each with the momentum that it leaves with, and the violations there.
+    fn find_states(&mut self, terms: &[StepTerms], assessment: &mut Assessment) {
+        let model = self.plant.model().clone();
+        let (nd, steps) = (model.dimensions().dynamic, self.steps);
+        let h = self.plant.settings().time_step_s;
         for k in 0..=steps {
             let q = row(self.q, k);
             let (values, jacobian) = self.plant.constraints_at(&q);
@@ -424,13 +434,6 @@ impl<'a> Assess<'a> {
             state.extend(change[nd..].iter().map(|change| change / h));
             assessment.states.row_mut(k).copy_from_slice(&state);
         }
-        for k in 0..steps {
-            for (j, coordinate) in model.coordinates()[nd..n].iter().enumerate() {
-                let gap = self.inputs[(k, d.inputs + j)] - self.q[(k + 1, nd + j)];
-                assessment.violate(gap.abs(), k + 1, &coordinate.name);
-            }
-        }
-        Ok(assessment)
     }
 }
 

@@ -1,7 +1,10 @@
 //! What the inputs reach, and what the outputs show.
 
 use nalgebra::DMatrix;
-use nalgebra::linalg::{SVD, balancing};
+use nalgebra::linalg::SVD;
+
+use crate::control::matrix::all_finite;
+use crate::control::spectrum::balance;
 
 /// Singular value, relative to the block's own scale, below which a direction is not reached.
 const REACHED: f64 = 1e-10;
@@ -15,15 +18,11 @@ const REACHED: f64 = 1e-10;
 /// not fit together. About `4n²r` flops for rank `r`, plus small singular value decompositions.
 pub fn controllability_rank(a: &DMatrix<f64>, b: &DMatrix<f64>) -> usize {
     let n = a.nrows();
-    if a.ncols() != n || b.nrows() != n || !super::all_finite(a) || !super::all_finite(b) {
+    if a.ncols() != n || b.nrows() != n || !all_finite(a) || !all_finite(b) {
         return 0;
     }
-    let mut a = a.clone();
-    let scales = balancing::balance_parlett_reinsch(&mut a);
-    let mut fresh = b.clone();
-    for (mut row, scale) in fresh.row_iter_mut().zip(scales.iter()) {
-        row /= *scale;
-    }
+    let (mut a, mut fresh) = (a.clone(), b.clone());
+    balance(&mut a, &mut fresh);
     normalize_columns(&mut fresh);
     let a_norm = a.norm();
     if a_norm > 0.0 {

@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 
-use super::{all_finite, symmetrize};
+use crate::control::matrix::{all_finite, congruent, symmetrize};
 
 /// More than enough for every closed loop that double precision tells from the unit circle.
 const DOUBLINGS_MAX: u32 = 50;
@@ -11,23 +11,16 @@ const CHANGE_CONVERGED: f64 = 1e-14;
 /// Relative change below which growing again means that round-off rules.
 const CHANGE_STAGNATING: f64 = 1e-10;
 
-/// What structure-preserving doubling arrived at.
-pub(super) struct Doubled {
-    /// The fixed point, symmetric; it still has to pass the caller's checks.
-    pub(super) value: DMatrix<f64>,
-    /// Doublings.
-    pub(super) iterations: u32,
-}
-
 /// Structure-preserving doubling for `P = Q + AᵀP (I + G P)⁻¹ A` with `G = B R⁻¹ Bᵀ`
 /// (Chu, Fan, Lin, Wang 2004). `A` may be singular. About `15n³` flops per doubling.
 ///
-/// Fails, with the number of doublings, when it overflows or does not come to rest.
+/// Gives the fixed point, symmetric, which still has to pass the caller's checks, and the number of
+/// doublings; fails, with the number of doublings, when it overflows or does not come to rest.
 pub(super) fn riccati(
     a: &DMatrix<f64>,
     g: &DMatrix<f64>,
     q: &DMatrix<f64>,
-) -> Result<Doubled, u32> {
+) -> Result<(DMatrix<f64>, u32), u32> {
     let (mut a, mut g, mut h) = (a.clone(), g.clone(), q.clone());
     let mut last_change = f64::INFINITY;
     for iterations in 1..=DOUBLINGS_MAX {
@@ -52,7 +45,7 @@ pub(super) fn riccati(
         }
         let stagnating = change < CHANGE_STAGNATING && change >= last_change;
         if change < CHANGE_CONVERGED || stagnating {
-            return Ok(Doubled { value: h, iterations });
+            return Ok((h, iterations));
         }
         last_change = change;
     }
@@ -63,8 +56,7 @@ pub(super) fn riccati(
 pub(super) fn lyapunov(f: &DMatrix<f64>, c: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let (mut f, mut x) = (f.clone(), c.clone());
     for _ in 0..DOUBLINGS_MAX {
-        let mut increase = f.transpose() * (&x * &f);
-        symmetrize(&mut increase);
+        let increase = congruent(&f, &x);
         x += &increase;
         if !all_finite(&x) {
             return None;

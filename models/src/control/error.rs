@@ -2,6 +2,8 @@
 
 use nalgebra::DMatrix;
 
+use crate::control::matrix::all_finite;
+
 /// Why there is no regulator.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RiccatiError {
@@ -156,6 +158,43 @@ pub enum AnalysisError {
     },
 }
 
+impl RiccatiError {
+    /// Refuses a matrix that is not of the shape (rows, columns).
+    pub(super) fn check_shape(
+        matrix: &'static str,
+        sample: usize,
+        m: &DMatrix<f64>,
+        (expected_rows, expected_cols): (usize, usize),
+    ) -> Result<(), Self> {
+        let (rows, cols) = m.shape();
+        if (rows, cols) == (expected_rows, expected_cols) {
+            return Ok(());
+        }
+        Err(Self::Dimension { matrix, sample, rows, cols, expected_rows, expected_cols })
+    }
+
+    /// Refuses a matrix that is not of the shape (rows, columns), or not finite.
+    pub(super) fn check(
+        matrix: &'static str,
+        sample: usize,
+        m: &DMatrix<f64>,
+        shape: (usize, usize),
+    ) -> Result<(), Self> {
+        Self::check_shape(matrix, sample, m, shape)?;
+        if all_finite(m) { Ok(()) } else { Err(Self::NotFinite { matrix, sample }) }
+    }
+
+    /// Refuses a map that is not of `n` states and `m` inputs, or not finite.
+    pub(super) fn check_map(
+        sample: usize,
+        (a, b): (&DMatrix<f64>, &DMatrix<f64>),
+        (n, m): (usize, usize),
+    ) -> Result<(), Self> {
+        Self::check("A", sample, a, (n, n))?;
+        Self::check("B", sample, b, (n, m))
+    }
+}
+
 impl AnalysisError {
     /// Refuses a matrix that is not of the shape (rows, columns), or not finite.
     pub(super) fn check(
@@ -167,6 +206,6 @@ impl AnalysisError {
         if (rows, cols) != (expected_rows, expected_cols) {
             return Err(Self::Dimension { matrix, rows, cols, expected_rows, expected_cols });
         }
-        if super::all_finite(m) { Ok(()) } else { Err(Self::NotFinite { matrix }) }
+        if all_finite(m) { Ok(()) } else { Err(Self::NotFinite { matrix }) }
     }
 }

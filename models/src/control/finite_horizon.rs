@@ -2,10 +2,13 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::lq::LqRecursion;
-use super::lq::NotConvex;
-use super::lq::Stage;
-use super::{RiccatiError, StageWeights, Tangent, TrajectoryWeights, all_finite};
+use crate::control::coordinates::Coordinates;
+use crate::control::error::RiccatiError;
+use crate::control::lq::recursion::LqRecursion;
+use crate::control::lq::stage::{NotConvex, Stage};
+use crate::control::manifold::Tangent;
+use crate::control::matrix::all_finite;
+use crate::control::weights::TrajectoryWeights;
 use crate::math::sparse_map::Map;
 
 /// The linearized map of one step, `dx[k+1] = A dx[k] + B du[k]`.
@@ -53,133 +56,122 @@ pub struct FiniteHorizon {
 ///
 /// Weights that are not convex step by step are good as long as each `Γ` is positive definite.
 /// Costs at most `3n³ + 6n²m` flops per sample.
+///
+/// ```
+/// use std::sync::Arc;
+/// use plantd_models::control::{Sample, Values, Weights, finite_horizon};
+/// use plantd_models::{Linearization, Model, Plant, Settings, builtin};
+///
+/// // Gains along a motion of the pendulum.
+/// let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap())?);
+/// let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model))?;
+/// let mut linearization = Linearization::new(&model);
+/// let mut samples = Vec::new();
+/// for _ in 0..50 {
+///     plant.step_and_linearize(&[0.1], &mut linearization)?;
+///     samples.push(Sample { a: linearization.a(), b: linearization.b() });
+/// }
+/// let weights = Weights::diagonal(&[10.0, 1.0], &[0.5])?;
+/// let regulator = finite_horizon(&samples, &weights.into(), Values::Drop)?;
+/// assert_eq!(regulator.gains.len(), 50);
+/// assert!(regulator.value.cholesky().is_some());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn finite_horizon(
     samples: &[Sample],
     weights: &TrajectoryWeights,
     values: Values,
 ) -> Result<FiniteHorizon, RiccatiError> {
-    let (n, m) = (weights.states(), weights.inputs());
-    check_steps(samples, weights)?;
-    let mut recursion = LqRecursion::new(n, m);
-    recursion.begin(weights.q_final(), None);
-    let mut backwards = Backwards::new(m, n, samples.len(), values);
-    backwards.keep(&recursion, |value| value.clone(), |linear| linear.clone());
-    for (index, sample) in samples.iter().enumerate().rev() {
-        check(index, sample, n, m)?;
-        let stage = weights.stage(index);
-        backwards.step(index, &mut recursion, &sample.a, &sample.b, stage.stage(), stage)?;
-        backwards.gains.push(backwards.gain.clone());
-        backwards.keep(&recursion, |value| value.clone(), |linear| linear.clone());
-    }
-    Ok(backwards.finish(recursion.value()))
+    solve(samples, weights, values, |_| Coordinates(None))
 }
 
-/// The same on the constraint manifold: sample `k` maps from `tangents[k]` to `tangents[k + 1]`,
-/// the cost counts only what the tangent space holds, and the gains act on the full state.
+/// The time-varying regulator on the constraint manifold: sample `k` maps from `tangents[k]` to
+/// `tangents[k + 1]`, the cost counts only what the tangent space holds, and the gains act on the full
+/// state.
 pub fn finite_horizon_on_manifold(
     samples: &[Sample],
     tangents: &[Tangent],
     weights: &TrajectoryWeights,
     values: Values,
 ) -> Result<FiniteHorizon, RiccatiError> {
-    let Some((last, starts)) = tangents.split_last().filter(|(_, s)| s.len() == samples.len())
-    else {
+    if tangents.len() != samples.len() + 1 {
         let (samples, actual) = (samples.len(), tangents.len());
         return Err(RiccatiError::TangentCount { samples, actual });
-    };
-    check_steps(samples, weights)?;
-    let (n, m) = (weights.states(), weights.inputs());
-    last.check(samples.len(), n)?;
-    let mut end = last;
-    let mut recursion = LqRecursion::new(end.dimension(), m);
+    }
+    solve(samples, weights, values, |k| Coordinates(tangents.get(k)))
+}
+
+/// The recursion in coordinates of each state.
+fn solve<'a>(
+    samples: &[Sample],
+    weights: &TrajectoryWeights,
+    values: Values,
+    coordinates: impl Fn(usize) -> Coordinates<'a>,
+) -> Result<FiniteHorizon, RiccatiError> {
+    let (n, m, count) = (weights.states(), weights.inputs(), samples.len());
+    if let Some(stages) = weights.steps().filter(|stages| *stages != count) {
+        return Err(RiccatiError::StageCount { samples: count, stages });
+    }
+    let mut end = coordinates(count);
+    end.check(count, n)?;
+    let mut recursion = LqRecursion::new(end.dimension(n), m);
     recursion.begin(&end.restrict(weights.q_final()), None);
-    let mut backwards = Backwards::new(m, end.dimension(), samples.len(), values);
-    backwards.keep(&recursion, |p| end.extend_value(p), |b| end.extend_vector(b));
-    for (index, (sample, start)) in samples.iter().zip(starts).enumerate().rev() {
-        check(index, sample, n, m)?;
+    let (mut map, mut offset) = (Map::default(), DVector::zeros(m));
+    let mut gain = DMatrix::zeros(m, end.dimension(n));
+    // Gathered as it is found: the end of the horizon first.
+    let mut found = FiniteHorizon {
+        gains: Vec::with_capacity(count),
+        feedforward: Vec::with_capacity(count),
+        values: (values == Values::Keep).then(|| Vec::with_capacity(count + 1)),
+        value: DMatrix::zeros(0, 0),
+        reciprocal_conditions: Vec::with_capacity(count),
+    };
+    found.keep(&recursion, end);
+    for (index, sample) in samples.iter().enumerate().rev() {
+        RiccatiError::check_map(index, (&sample.a, &sample.b), (n, m))?;
+        let start = coordinates(index);
         start.check(index, n)?;
-        if start.dimension() != end.dimension() {
-            backwards.gain = DMatrix::zeros(m, start.dimension());
+        if start.dimension(n) != gain.ncols() {
+            gain = DMatrix::zeros(m, start.dimension(n));
         }
-        let a = end.reduce(&sample.a) * start.basis();
-        let b = end.reduce(&sample.b);
+        map.set(&start.map(end, &sample.a), &end.reduce(&sample.b));
         let weights = weights.stage(index);
-        let q = start.restrict(weights.q());
-        let s = weights.s().map(|s| start.reduce(s));
+        let (q, s) = (start.restrict(weights.q()), weights.s().map(|s| start.reduce(s)));
         let x_linear = weights.x_linear().map(|linear| start.reduce_vector(linear));
-        let stage = Stage { q: &q, s: s.as_ref(), x_linear: x_linear.as_ref(), ..weights.stage() };
-        backwards.step(index, &mut recursion, &a, &b, stage, weights)?;
-        backwards.gains.push(start.extend_gain(&backwards.gain));
-        backwards.keep(&recursion, |p| start.extend_value(p), |b| start.extend_vector(b));
-        end = start;
-    }
-    Ok(backwards.finish(end.extend_value(&recursion.value())))
-}
-
-/// What a solution gathers, in the order in which it is found: the end of the horizon first.
-struct Backwards {
-    map: Map,
-    gain: DMatrix<f64>,
-    offset: DVector<f64>,
-    gains: Vec<DMatrix<f64>>,
-    feedforward: Vec<DVector<f64>>,
-    values: Option<Vec<(DMatrix<f64>, DVector<f64>)>>,
-    reciprocal_conditions: Vec<f64>,
-}
-
-impl Backwards {
-    fn new(m: usize, n: usize, samples: usize, values: Values) -> Self {
-        Self {
-            map: Map::default(),
-            gain: DMatrix::zeros(m, n),
-            offset: DVector::zeros(m),
-            gains: Vec::with_capacity(samples),
-            feedforward: Vec::with_capacity(samples),
-            values: (values == Values::Keep).then(|| Vec::with_capacity(samples + 1)),
-            reciprocal_conditions: Vec::with_capacity(samples),
-        }
-    }
-
-    /// One sample back.
-    fn step(
-        &mut self,
-        sample: usize,
-        recursion: &mut LqRecursion,
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
-        stage: Stage<'_>,
-        weights: &StageWeights,
-    ) -> Result<(), RiccatiError> {
-        self.map.set(a, b);
-        let Self { map, gain, offset, .. } = self;
-        recursion.step(map, stage, gain, offset).map_err(|NotConvex| {
+        let stage =
+            Stage { q: &q, s: s.as_deref(), x_linear: x_linear.as_deref(), ..weights.stage() };
+        recursion.step(&map, stage, &mut gain, &mut offset).map_err(|NotConvex| {
             // Convex stages lose definiteness to overflow or round-off alone.
             if weights.is_convex() || !recursion.is_finite() {
-                RiccatiError::Overflow { sample }
+                RiccatiError::Overflow { sample: index }
             } else {
-                RiccatiError::NotConvex { sample }
+                RiccatiError::NotConvex { sample: index }
             }
         })?;
-        if !recursion.is_finite() || !all_finite(&self.gain) {
-            return Err(RiccatiError::Overflow { sample });
+        if !recursion.is_finite() || !all_finite(&gain) {
+            return Err(RiccatiError::Overflow { sample: index });
         }
-        self.feedforward.push(-&self.offset);
-        self.reciprocal_conditions.push(recursion.reciprocal_condition());
-        Ok(())
+        found.gains.push(start.extend_gain(&gain));
+        found.feedforward.push(-&offset);
+        found.reciprocal_conditions.push(recursion.reciprocal_condition());
+        found.keep(&recursion, start);
+        end = start;
     }
+    found.value = end.extend_value(&recursion.value());
+    found.reverse();
+    Ok(found)
+}
 
-    fn keep(
-        &mut self,
-        recursion: &LqRecursion,
-        value: impl FnOnce(&DMatrix<f64>) -> DMatrix<f64>,
-        linear: impl FnOnce(&DVector<f64>) -> DVector<f64>,
-    ) {
+impl FiniteHorizon {
+    fn keep(&mut self, recursion: &LqRecursion, at: Coordinates<'_>) {
         if let Some(values) = &mut self.values {
-            values.push((value(&recursion.value()), linear(recursion.linear())));
+            let value = at.extend_value(&recursion.value());
+            values.push((value, at.extend_vector(recursion.linear())));
         }
     }
 
-    fn finish(mut self, value: DMatrix<f64>) -> FiniteHorizon {
+    /// From the start of the horizon to its end.
+    fn reverse(&mut self) {
         self.gains.reverse();
         self.feedforward.reverse();
         self.reciprocal_conditions.reverse();
@@ -189,40 +181,5 @@ impl Backwards {
         if self.feedforward.iter().all(|u| u.iter().all(|&u| u == 0.0)) {
             self.feedforward = Vec::new();
         }
-        FiniteHorizon {
-            gains: self.gains,
-            feedforward: self.feedforward,
-            values: self.values,
-            value,
-            reciprocal_conditions: self.reciprocal_conditions,
-        }
     }
-}
-
-fn check_steps(samples: &[Sample], weights: &TrajectoryWeights) -> Result<(), RiccatiError> {
-    match weights.steps() {
-        Some(stages) if stages != samples.len() => {
-            Err(RiccatiError::StageCount { samples: samples.len(), stages })
-        }
-        _ => Ok(()),
-    }
-}
-
-pub(super) fn check(index: usize, sample: &Sample, n: usize, m: usize) -> Result<(), RiccatiError> {
-    for (matrix, name, cols) in [(&sample.a, "A", n), (&sample.b, "B", m)] {
-        if matrix.shape() != (n, cols) {
-            return Err(RiccatiError::Dimension {
-                matrix: name,
-                sample: index,
-                rows: matrix.nrows(),
-                cols: matrix.ncols(),
-                expected_rows: n,
-                expected_cols: cols,
-            });
-        }
-        if !all_finite(matrix) {
-            return Err(RiccatiError::NotFinite { matrix: name, sample: index });
-        }
-    }
-    Ok(())
 }

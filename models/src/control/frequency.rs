@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use nalgebra::linalg::{Hessenberg, balancing};
 use nalgebra::{Complex, DMatrix};
 
-use super::AnalysisError;
+use crate::control::error::AnalysisError;
 
 /// Pivot of `zI − A`, relative to its largest entry, below which `z` counts as an eigenvalue.
 const POLE: f64 = 1e-13;

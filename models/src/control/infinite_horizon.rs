@@ -1,14 +1,14 @@
 //! Regulator about an equilibrium: the discrete algebraic Riccati equation.
 
-use nalgebra::linalg::balancing;
-use nalgebra::{Complex, DMatrix, DVector};
+use nalgebra::{Complex, DMatrix};
 
-use super::finite_horizon::{Sample, check};
-use super::lq::reciprocal_condition;
-use super::spectrum::eigenvalues;
-use super::{
-    RiccatiError, Tangent, Weights, all_finite, doubling, is_positive_semidefinite, symmetrize,
-};
+use crate::control::coordinates::Coordinates;
+use crate::control::doubling;
+use crate::control::error::RiccatiError;
+use crate::control::manifold::Tangent;
+use crate::control::matrix::{is_positive_semidefinite, solve_definite, symmetrize};
+use crate::control::spectrum::{balance, eigenvalues, sorted};
+use crate::control::weights::Weights;
 
 /// Residual above which Newton's method polishes the solution.
 const RESIDUAL_POLISH: f64 = 1e-12;
@@ -55,17 +55,34 @@ pub struct Regulator {
 /// which leaves `P` and `A − BK` as they are; `R` is well invertible then. What comes out has passed three
 /// checks: it solves the equation, it is positive semidefinite, and it stabilises. When a check
 /// fails, the modes of `A` tell why.
+///
+/// ```
+/// use std::f64::consts::PI;
+/// use std::sync::Arc;
+/// use plantd_models::control::{Weights, infinite_horizon};
+/// use plantd_models::{Initial, Linearization, Model, Plant, Settings, builtin};
+///
+/// // Balance the pole of a cart upright.
+/// let model = Arc::new(Model::compile(&builtin::scene("cart-pole").unwrap())?);
+/// let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model))?;
+/// plant.initialize(&Initial::Momentum { q: vec![0.0, PI], p: vec![0.0; 2], v: vec![] })?;
+/// let mut linearization = Linearization::new(&model);
+/// plant.linearize(&[0.0], &mut linearization)?;
+/// let weights = Weights::diagonal(&[1.0; 4], &[0.1])?;
+/// let regulator = infinite_horizon(&linearization.a(), &linearization.b(), &weights)?;
+/// assert_eq!(regulator.gain.shape(), (1, 4));
+/// assert!(regulator.spectral_radius < 1.0 && regulator.residual < 1e-9);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn infinite_horizon(
     a: &DMatrix<f64>,
     b: &DMatrix<f64>,
     weights: &Weights,
 ) -> Result<Regulator, RiccatiError> {
-    let sample = Sample { a: a.clone(), b: b.clone() };
-    check(0, &sample, weights.states(), weights.inputs())?;
-    solve(a, b, weights.q(), weights.r(), weights.s())
+    regulate(a, b, Coordinates(None), weights)
 }
 
-/// The same on the constraint manifold, at an equilibrium with that tangent space: the cost counts
+/// The regulator on the constraint manifold, at an equilibrium with that tangent space: the cost counts
 /// only what the tangent space holds, the gain acts on the full state, and the spectral radius
 /// leaves out directions off the manifold.
 pub fn infinite_horizon_on_manifold(
@@ -74,16 +91,25 @@ pub fn infinite_horizon_on_manifold(
     tangent: &Tangent,
     weights: &Weights,
 ) -> Result<Regulator, RiccatiError> {
-    let sample = Sample { a: a.clone(), b: b.clone() };
-    check(0, &sample, weights.states(), weights.inputs())?;
-    tangent.check(0, weights.states())?;
-    let a = tangent.reduce(a) * tangent.basis();
-    let s = weights.s().map(|s| tangent.reduce(s));
-    let q = tangent.restrict(weights.q());
-    let reduced = solve(&a, &tangent.reduce(b), &q, weights.r(), s.as_ref())?;
+    regulate(a, b, Coordinates(Some(tangent)), weights)
+}
+
+/// The regulator in coordinates of the state.
+fn regulate(
+    a: &DMatrix<f64>,
+    b: &DMatrix<f64>,
+    space: Coordinates<'_>,
+    weights: &Weights,
+) -> Result<Regulator, RiccatiError> {
+    let n = weights.states();
+    RiccatiError::check_map(0, (a, b), (n, weights.inputs()))?;
+    space.check(0, n)?;
+    let (a, b, q) = (space.map(space, a), space.reduce(b), space.restrict(weights.q()));
+    let s = weights.s().map(|s| space.reduce(s));
+    let reduced = solve(&a, &b, &q, weights.r(), s.as_deref())?;
     Ok(Regulator {
-        gain: tangent.extend_gain(&reduced.gain),
-        value: tangent.extend_value(&reduced.value),
+        gain: space.extend_gain(&reduced.gain),
+        value: space.extend_value(&reduced.value),
         ..reduced
     })
 }
@@ -115,15 +141,15 @@ pub(super) fn solve_without_cross(
     q: &DMatrix<f64>,
     r: &DMatrix<f64>,
 ) -> Result<Regulator, RiccatiError> {
-    let problem = Problem { a, b, q, r };
-    let (regulator, iterations) = problem.attempt(q);
+    let equation = RiccatiEquation { a, b, q, r };
+    let (regulator, iterations) = equation.attempt(q);
     let regulator = regulator.filter(Regulator::is_good);
     let regulator = match regulator {
         Some(regulator) if regulator.spectral_radius < MODULUS_MARGINAL => return Ok(regulator),
         marginal => marginal,
     };
     // A closed loop within round-off of the unit circle may be a mode that nothing moves.
-    if let Some(reason) = problem.diagnose()? {
+    if let Some(reason) = equation.diagnose()? {
         return Err(reason);
     }
     if let Some(regulator) = regulator {
@@ -137,7 +163,7 @@ pub(super) fn solve_without_cross(
     for i in 0..visible.nrows() {
         visible[(i, i)] += weight;
     }
-    let (regulator, more_iterations) = problem.attempt(&visible);
+    let (regulator, more_iterations) = equation.attempt(&visible);
     let iterations = iterations + more_iterations;
     match regulator {
         Some(regulator) if regulator.is_good() => Ok(Regulator { iterations, ..regulator }),
@@ -162,15 +188,15 @@ impl Regulator {
 }
 
 /// The equation `P = Q + AᵀPA − AᵀPB (R + BᵀPB)⁻¹ BᵀPA`.
-struct Problem<'a> {
+struct RiccatiEquation<'a> {
     a: &'a DMatrix<f64>,
     b: &'a DMatrix<f64>,
     q: &'a DMatrix<f64>,
     r: &'a DMatrix<f64>,
 }
 
-impl Problem<'_> {
-    /// Doubling with state weight `q`, polished for the weight of the problem; with the number of
+impl RiccatiEquation<'_> {
+    /// Doubling with state weight `q`, polished for the weight of the equation; with the number of
     /// doublings. The caller judges the result.
     fn attempt(&self, q: &DMatrix<f64>) -> (Option<Regulator>, u32) {
         let Some(r) = self.r.clone().cholesky() else {
@@ -180,9 +206,9 @@ impl Problem<'_> {
         symmetrize(&mut g);
         match doubling::riccati(self.a, &g, q) {
             Err(iterations) => (None, iterations),
-            Ok(doubled) => {
-                let rough = self.evaluate(doubled.value, doubled.iterations);
-                (rough.map(|rough| self.polish(rough)), doubled.iterations)
+            Ok((value, iterations)) => {
+                let rough = self.evaluate(value, iterations);
+                (rough.map(|rough| self.polish(rough)), iterations)
             }
         }
     }
@@ -259,7 +285,7 @@ impl Reach {
     /// How inputs reach the modes of `A`.
     fn of_inputs(a: &DMatrix<f64>, b: &DMatrix<f64>) -> Self {
         let mut reach = Self { a: a.clone(), b: b.clone() };
-        reach.balance();
+        balance(&mut reach.a, &mut reach.b);
         let size = reach.a.norm();
         for mut column in reach.b.column_iter_mut() {
             let norm = column.norm();
@@ -273,7 +299,7 @@ impl Reach {
     /// How a weight sees the modes of `A`, whose units it shares.
     fn of_weight(a: &DMatrix<f64>, q: &DMatrix<f64>) -> Self {
         let mut reach = Self { a: a.transpose(), b: q.clone() };
-        let scales = reach.balance();
+        let scales = balance(&mut reach.a, &mut reach.b);
         for (mut column, scale) in reach.b.column_iter_mut().zip(scales.iter()) {
             column /= *scale;
         }
@@ -282,18 +308,6 @@ impl Reach {
             reach.b *= reach.a.norm() / norm;
         }
         reach
-    }
-
-    /// Balances the map and takes `B` along; the units of the new states.
-    fn balance(&mut self) -> DVector<f64> {
-        if self.a.is_empty() {
-            return DVector::zeros(0);
-        }
-        let scales = balancing::balance_parlett_reinsch(&mut self.a);
-        for (mut row, scale) in self.b.row_iter_mut().zip(scales.iter()) {
-            row /= *scale;
-        }
-        scales
     }
 
     /// Of the modes, the one that `B` moves least, if that is not at all: `[A − zI, B]` loses rank.
@@ -331,18 +345,5 @@ fn gain(
     p: &DMatrix<f64>,
 ) -> Option<(DMatrix<f64>, f64)> {
     let bt_p = (p * b).transpose();
-    let mut bracket = &bt_p * b + r;
-    symmetrize(&mut bracket);
-    let factor = bracket.cholesky()?;
-    let gain = factor.solve(&(bt_p * a));
-    all_finite(&gain).then(|| (gain, reciprocal_condition(&factor.l())))
-}
-
-/// Largest modulus first, conjugate ones side by side.
-fn sorted(mut modes: Vec<Complex<f64>>) -> Vec<Complex<f64>> {
-    modes.sort_by(|a, b| {
-        let larger = b.norm().total_cmp(&a.norm());
-        larger.then(a.re.total_cmp(&b.re)).then(b.im.total_cmp(&a.im))
-    });
-    modes
+    solve_definite(&bt_p * b + r, &(bt_p * a))
 }

@@ -11,185 +11,17 @@
 //! `A x⁺ + B u`. A part of the output that the input sets at once, `D u`, is subtracted from `y`
 //! beforehand and changes nothing here.
 
+use std::borrow::Cow;
+
 use nalgebra::{Complex, DMatrix};
 
-use super::infinite_horizon::solve_without_cross;
-use super::lq::reciprocal_condition;
-use super::weights::check_symmetric;
-use super::{
-    RiccatiError, Sample, Tangent, Values, WeightsError, all_finite, finite_horizon,
-    is_positive_semidefinite, symmetrize,
-};
-
-/// Covariances of white noise, per step.
-#[derive(Clone, Debug, PartialEq)]
-pub struct NoiseCovariances {
-    process: Option<DMatrix<f64>>,
-    input: Option<DMatrix<f64>>,
-    measurement: DMatrix<f64>,
-}
-
-impl NoiseCovariances {
-    /// `process` of the state, n × n, and `input` of the inputs, m × m, are symmetric positive
-    /// semidefinite and zero when not given; `measurement`, r × r, is symmetric positive definite.
-    pub fn new(
-        process: Option<DMatrix<f64>>,
-        input: Option<DMatrix<f64>>,
-        mut measurement: DMatrix<f64>,
-    ) -> Result<Self, NoiseError> {
-        let process = process.map(|m| semidefinite("process", m)).transpose()?;
-        let input = input.map(|m| semidefinite("input", m)).transpose()?;
-        check("measurement", &mut measurement)?;
-        if !measurement.is_empty() && measurement.clone().cholesky().is_none() {
-            return Err(NoiseError::NotPositiveDefinite);
-        }
-        Ok(Self { process, input, measurement })
-    }
-
-    /// Of the state.
-    pub fn process(&self) -> Option<&DMatrix<f64>> {
-        self.process.as_ref()
-    }
-    /// Of the inputs.
-    pub fn input(&self) -> Option<&DMatrix<f64>> {
-        self.input.as_ref()
-    }
-    /// Of what is measured.
-    pub fn measurement(&self) -> &DMatrix<f64> {
-        &self.measurement
-    }
-
-    /// Refuses covariances of other numbers of states, inputs and outputs.
-    fn check(&self, states: usize, inputs: usize, outputs: usize) -> Result<(), KalmanError> {
-        let covariances = [
-            ("process", self.process.as_ref(), states),
-            ("input", self.input.as_ref(), inputs),
-            ("measurement", Some(&self.measurement), outputs),
-        ];
-        for (covariance, given, expected) in covariances {
-            if let Some(size) = given.map(DMatrix::nrows).filter(|&size| size != expected) {
-                return Err(NoiseError::Dimension { covariance, size, expected }.into());
-            }
-        }
-        Ok(())
-    }
-
-    /// `process + B input Bᵀ`.
-    fn of_step(&self, b: &DMatrix<f64>) -> DMatrix<f64> {
-        let n = b.nrows();
-        let mut sum = self.process.clone().unwrap_or_else(|| DMatrix::zeros(n, n));
-        if let Some(input) = &self.input {
-            sum += b * (input * b.transpose());
-        }
-        symmetrize(&mut sum);
-        sum
-    }
-}
-
-/// Why covariances were refused.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum NoiseError {
-    /// A covariance is of another size than needed.
-    #[error("covariance {covariance} is {size} x {size}; {expected} x {expected} is needed")]
-    Dimension {
-        /// `process`, `input`, `measurement` or `initial_covariance`.
-        covariance: &'static str,
-        /// Rows and columns.
-        size: usize,
-        /// Rows and columns that are needed.
-        expected: usize,
-    },
-    /// A covariance is not square, not finite or not symmetric.
-    #[error("covariance {covariance}: {problem}")]
-    Malformed {
-        /// As above.
-        covariance: &'static str,
-        /// What is wrong with it, and where.
-        problem: String,
-    },
-    /// A covariance has a negative eigenvalue.
-    #[error("covariance {covariance} has a negative eigenvalue")]
-    Negative {
-        /// As above.
-        covariance: &'static str,
-    },
-    /// `measurement` has an eigenvalue that is not greater than zero.
-    #[error(
-        "covariance measurement is not positive definite; each output needs some noise, and no two \
-         outputs the same"
-    )]
-    NotPositiveDefinite,
-}
-
-impl NoiseError {
-    /// The covariance at fault: `process`, `input`, `measurement` or `initial_covariance`.
-    pub fn covariance(&self) -> &'static str {
-        match self {
-            Self::Dimension { covariance, .. }
-            | Self::Malformed { covariance, .. }
-            | Self::Negative { covariance } => covariance,
-            Self::NotPositiveDefinite => "measurement",
-        }
-    }
-}
-
-/// Why there is no filter.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum KalmanError {
-    /// A covariance does not fit.
-    #[error(transparent)]
-    Noise(#[from] NoiseError),
-    /// A mode that does not decay by itself does not show in the outputs.
-    #[error(
-        "not detectable: no output shows the mode with eigenvalue {real:+.6} {imaginary:+.6}i (modulus {modulus:.6}); measure something that moves with it"
-    )]
-    NotDetectable {
-        /// Real part of the eigenvalue of `A`.
-        real: f64,
-        /// Imaginary part.
-        imaginary: f64,
-        /// Modulus, about 1 or greater.
-        modulus: f64,
-    },
-    /// A mode on the unit circle gets no noise, so that the best filter stops listening to it.
-    #[error(
-        "no process noise reaches the mode with eigenvalue {real:+.6} {imaginary:+.6}i on the unit circle: the filter would stop correcting it; give process or input noise that moves it"
-    )]
-    NotExcited {
-        /// Real part of the eigenvalue of `A`.
-        real: f64,
-        /// Imaginary part.
-        imaginary: f64,
-    },
-    /// Lists along a trajectory have other lengths than needed.
-    #[error("{list} has {actual} entries for {samples} steps; {expected} are needed")]
-    Count {
-        /// `outputs`, `noise` or `tangents`.
-        list: &'static str,
-        /// Steps.
-        samples: usize,
-        /// Entries.
-        actual: usize,
-        /// Entries that are needed: `1 or ` the number of states, or the number of states.
-        expected: String,
-    },
-    /// The matrices, or the numerical solution.
-    #[error(transparent)]
-    Riccati(RiccatiError),
-}
-
-impl From<RiccatiError> for KalmanError {
-    /// In the words of filters: the dual problem's inputs are the outputs.
-    fn from(error: RiccatiError) -> Self {
-        match error {
-            RiccatiError::NotStabilisable { real, imaginary, modulus } => {
-                Self::NotDetectable { real, imaginary, modulus }
-            }
-            RiccatiError::NotDetectable { real, imaginary } => Self::NotExcited { real, imaginary },
-            other => Self::Riccati(other),
-        }
-    }
-}
+use crate::control::coordinates::Coordinates;
+use crate::control::error::RiccatiError;
+use crate::control::finite_horizon::{Sample, Values};
+use crate::control::infinite_horizon::solve_without_cross;
+use crate::control::manifold::Tangent;
+use crate::control::matrix::{all_finite, solve_definite, symmetrize};
+use crate::control::noise::{KalmanError, NoiseCovariances, semidefinite};
 
 /// A steady-state filter.
 #[derive(Clone, Debug, PartialEq)]
@@ -203,7 +35,7 @@ pub struct Kalman {
     /// Eigenvalues of the error's map `A (I − L C)`, largest modulus first, conjugate ones side by
     /// side.
     pub error_modes: Vec<Complex<f64>>,
-    /// Relative residual of the Riccati equation, as in [`Regulator`](super::Regulator).
+    /// Relative residual of the Riccati equation, as in [`Regulator`](crate::control::infinite_horizon::Regulator).
     pub residual: f64,
     /// Doublings.
     pub iterations: u32,
@@ -229,20 +61,19 @@ pub struct KalmanTrajectory {
 /// ```
 ///
 /// The regulator problem of `(Aᵀ, Cᵀ, W, V)`; costs and checks are those of
-/// [`infinite_horizon`](super::infinite_horizon).
+/// [`infinite_horizon`](crate::control::infinite_horizon).
 pub fn steady_state_kalman(
     a: &DMatrix<f64>,
     b: &DMatrix<f64>,
     c: &DMatrix<f64>,
     noise: &NoiseCovariances,
 ) -> Result<Kalman, KalmanError> {
-    check_map(a, b, c, noise)?;
-    solve(a, c, &noise.of_step(b), noise.measurement())
+    steady_state((a, b, c), Coordinates(None), noise)
 }
 
-/// The same on the constraint manifold, at an equilibrium with that tangent space: noise counts only
-/// as far as the tangent space holds it, corrections keep to the manifold, and the error's modes leave
-/// out directions off it.
+/// The steady-state filter on the constraint manifold, at an equilibrium with that tangent space: noise
+/// counts only as far as the tangent space holds it, corrections keep to the manifold, and the error's
+/// modes leave out directions off it.
 pub fn steady_state_kalman_on_manifold(
     a: &DMatrix<f64>,
     b: &DMatrix<f64>,
@@ -250,33 +81,30 @@ pub fn steady_state_kalman_on_manifold(
     tangent: &Tangent,
     noise: &NoiseCovariances,
 ) -> Result<Kalman, KalmanError> {
-    check_map(a, b, c, noise)?;
-    tangent.check(0, a.nrows())?;
-    let process = tangent.restrict(&noise.of_step(b));
-    let (a, c) = (tangent.restrict_map(a), c * tangent.basis());
-    let reduced = solve(&a, &c, &process, noise.measurement())?;
-    Ok(Kalman {
-        gain: tangent.basis() * &reduced.gain,
-        predicted: tangent.extend_value(&reduced.predicted),
-        filtered: tangent.extend_value(&reduced.filtered),
-        ..reduced
-    })
+    steady_state((a, b, c), Coordinates(Some(tangent)), noise)
 }
 
-fn solve(
-    a: &DMatrix<f64>,
-    c: &DMatrix<f64>,
-    process: &DMatrix<f64>,
-    measurement: &DMatrix<f64>,
+/// The steady-state filter in coordinates of the state, as the dual regulator.
+fn steady_state(
+    (a, b, c): (&DMatrix<f64>, &DMatrix<f64>, &DMatrix<f64>),
+    space: Coordinates<'_>,
+    noise: &NoiseCovariances,
 ) -> Result<Kalman, KalmanError> {
-    let dual = solve_without_cross(&a.transpose(), &c.transpose(), process, measurement)?;
-    let (gain, reciprocal_condition) =
-        correction(c, &dual.value, measurement).ok_or(RiccatiError::Overflow { sample: 0 })?;
-    let filtered = correct(c, &gain, &dual.value, measurement);
+    let (n, m) = (a.nrows(), b.ncols());
+    RiccatiError::check_map(0, (a, b), (n, m))?;
+    RiccatiError::check("C", 0, c, (c.nrows(), n))?;
+    noise.check(n, m, c.nrows())?;
+    space.check(0, n)?;
+    let (process, measurement) = (noise.state_noise(b), noise.measurement());
+    let (a, c) = (space.map(space, a), space.columns(Cow::Borrowed(c)));
+    let process = space.restrict(&process);
+    let dual = solve_without_cross(&a.transpose(), &c.transpose(), &process, measurement)?;
+    let (gain, reciprocal_condition) = gain(0, &c, &dual.value, measurement)?;
+    let filtered = correct(&c, &gain, &dual.value, measurement);
     Ok(Kalman {
-        gain,
-        predicted: dual.value,
-        filtered,
+        gain: space.extend(&gain),
+        predicted: space.extend_value(&dual.value),
+        filtered: space.extend_value(&filtered),
         error_modes: dual.closed_loop,
         residual: dual.residual,
         iterations: dual.iterations,
@@ -301,22 +129,12 @@ pub fn time_varying_kalman(
     initial: &DMatrix<f64>,
     covariances: Values,
 ) -> Result<KalmanTrajectory, KalmanError> {
-    let problem = Problem::new(samples, outputs, noise, initial)?;
-    let mut forwards = Forwards::new(samples.len() + 1, covariances);
-    let mut predicted = problem.initial.clone();
-    for state in 0..=samples.len() {
-        let (c, noise) = (problem.output(state)?, problem.noise(state));
-        let step = forwards.correct(state, c, &predicted, noise)?;
-        forwards.keep(&predicted, &step.filtered, DMatrix::clone);
-        forwards.gains.push(step.gain);
-        if let Some(sample) = problem.sample(state)? {
-            predicted = predict(state, &sample.a, &step.filtered, &noise.of_step(&sample.b))?;
-        }
-    }
-    Ok(forwards.finish())
+    let data = FilterData::new(samples, outputs, noise, initial)?;
+    time_varying(&data, covariances, |_| Coordinates(None))
 }
 
-/// The same on the constraint manifold: `tangents` has the tangent space of each state.
+/// The filters along the samples on the constraint manifold: `tangents` has the tangent space of each
+/// state.
 pub fn time_varying_kalman_on_manifold(
     samples: &[Sample],
     outputs: &[DMatrix<f64>],
@@ -325,41 +143,62 @@ pub fn time_varying_kalman_on_manifold(
     initial: &DMatrix<f64>,
     covariances: Values,
 ) -> Result<KalmanTrajectory, KalmanError> {
-    let problem = Problem::new(samples, outputs, noise, initial)?;
-    let states = samples.len() + 1;
-    if tangents.len() != states {
+    let data = FilterData::new(samples, outputs, noise, initial)?;
+    if tangents.len() != samples.len() + 1 {
         let (samples, actual) = (samples.len(), tangents.len());
         return Err(RiccatiError::TangentCount { samples, actual }.into());
     }
     for (state, tangent) in tangents.iter().enumerate() {
         tangent.check(state, initial.nrows())?;
     }
-    let mut forwards = Forwards::new(states, covariances);
-    let mut predicted = tangents[0].restrict(&problem.initial);
-    for (state, tangent) in tangents.iter().enumerate() {
-        let (c, noise) = (problem.output(state)? * tangent.basis(), problem.noise(state));
-        let step = forwards.correct(state, &c, &predicted, noise)?;
-        forwards.keep(&predicted, &step.filtered, |p| tangent.extend_value(p));
-        forwards.gains.push(tangent.basis() * step.gain);
-        if let Some(sample) = problem.sample(state)? {
-            let next = &tangents[state + 1];
-            let a = next.reduce(&sample.a) * tangent.basis();
-            let process = next.restrict(&noise.of_step(&sample.b));
-            predicted = predict(state, &a, &step.filtered, &process)?;
-        }
-    }
-    Ok(forwards.finish())
+    time_varying(&data, covariances, |state| Coordinates(tangents.get(state)))
 }
 
-/// A problem along a trajectory, with lists of the right lengths.
-struct Problem<'a> {
+/// The filters in coordinates of each state.
+fn time_varying<'a>(
+    data: &FilterData<'_>,
+    covariances: Values,
+    coordinates: impl Fn(usize) -> Coordinates<'a>,
+) -> Result<KalmanTrajectory, KalmanError> {
+    let states = data.samples.len() + 1;
+    let mut found = KalmanTrajectory {
+        gains: Vec::with_capacity(states),
+        covariances: (covariances == Values::Keep).then(|| Vec::with_capacity(states)),
+        reciprocal_conditions: Vec::with_capacity(states),
+    };
+    let mut predicted = coordinates(0).restrict(&data.initial).into_owned();
+    for state in 0..states {
+        // L = P Cᵀ (C P Cᵀ + V)⁻¹ and P⁺ = (I − L C) P (I − L C)ᵀ + L V Lᵀ.
+        let space = coordinates(state);
+        let c = space.columns(Cow::Borrowed(data.output(state)?));
+        let noise = data.noise(state);
+        let (gain, condition) = gain(state, &c, &predicted, noise.measurement())?;
+        let filtered = correct(&c, &gain, &predicted, noise.measurement());
+        found.reciprocal_conditions.push(condition);
+        if let Some(covariances) = &mut found.covariances {
+            covariances.push((space.extend_value(&predicted), space.extend_value(&filtered)));
+        }
+        found.gains.push(space.extend(&gain));
+        // P ← A P⁺ Aᵀ + W.
+        if let Some(sample) = data.sample(state)? {
+            let next = coordinates(state + 1);
+            let process = noise.state_noise(&sample.b);
+            let (a, process) = (space.map(next, &sample.a), next.restrict(&process));
+            predicted = predict(state, &a, &filtered, &process)?;
+        }
+    }
+    Ok(found)
+}
+
+/// What filters along a trajectory are made of, with lists of the right lengths.
+struct FilterData<'a> {
     samples: &'a [Sample],
     outputs: &'a [DMatrix<f64>],
     noise: &'a [NoiseCovariances],
     initial: DMatrix<f64>,
 }
 
-impl<'a> Problem<'a> {
+impl<'a> FilterData<'a> {
     fn new(
         samples: &'a [Sample],
         outputs: &'a [DMatrix<f64>],
@@ -385,9 +224,9 @@ impl<'a> Problem<'a> {
     fn output(&self, state: usize) -> Result<&'a DMatrix<f64>, KalmanError> {
         let c = &self.outputs[if self.outputs.len() == 1 { 0 } else { state }];
         let (noise, n) = (self.noise(state), self.initial.nrows());
-        check_output(state, c, n)?;
+        RiccatiError::check("C", state, c, (c.nrows(), n))?;
         let nearest = self.samples.get(state).or(self.samples.last());
-        let any = noise.input.as_ref().map_or(0, DMatrix::nrows);
+        let any = noise.input().map_or(0, DMatrix::nrows);
         let inputs = nearest.map_or(any, |sample| sample.b.ncols());
         noise.check(n, inputs, c.nrows())?;
         Ok(c)
@@ -396,76 +235,24 @@ impl<'a> Problem<'a> {
     /// The map from a state to the next.
     fn sample(&self, state: usize) -> Result<Option<&'a Sample>, KalmanError> {
         let Some(sample) = self.samples.get(state) else { return Ok(None) };
-        finite_horizon::check(state, sample, self.initial.nrows(), sample.b.ncols())?;
+        let sizes = (self.initial.nrows(), sample.b.ncols());
+        RiccatiError::check_map(state, (&sample.a, &sample.b), sizes)?;
         Ok(Some(sample))
     }
 }
 
-/// What a solution gathers.
-struct Forwards {
-    gains: Vec<DMatrix<f64>>,
-    covariances: Option<Vec<(DMatrix<f64>, DMatrix<f64>)>>,
-    reciprocal_conditions: Vec<f64>,
-}
-
-struct Correction {
-    gain: DMatrix<f64>,
-    filtered: DMatrix<f64>,
-}
-
-impl Forwards {
-    fn new(states: usize, covariances: Values) -> Self {
-        Self {
-            gains: Vec::with_capacity(states),
-            covariances: (covariances == Values::Keep).then(|| Vec::with_capacity(states)),
-            reciprocal_conditions: Vec::with_capacity(states),
-        }
-    }
-
-    fn correct(
-        &mut self,
-        state: usize,
-        c: &DMatrix<f64>,
-        predicted: &DMatrix<f64>,
-        noise: &NoiseCovariances,
-    ) -> Result<Correction, KalmanError> {
-        let (gain, reciprocal_condition) = correction(c, predicted, noise.measurement())
-            .ok_or(RiccatiError::Overflow { sample: state })?;
-        self.reciprocal_conditions.push(reciprocal_condition);
-        let filtered = correct(c, &gain, predicted, noise.measurement());
-        Ok(Correction { gain, filtered })
-    }
-
-    fn keep(
-        &mut self,
-        predicted: &DMatrix<f64>,
-        filtered: &DMatrix<f64>,
-        full: impl Fn(&DMatrix<f64>) -> DMatrix<f64>,
-    ) {
-        if let Some(covariances) = &mut self.covariances {
-            covariances.push((full(predicted), full(filtered)));
-        }
-    }
-
-    fn finish(self) -> KalmanTrajectory {
-        let Self { gains, covariances, reciprocal_conditions } = self;
-        KalmanTrajectory { gains, covariances, reciprocal_conditions }
-    }
-}
-
-/// `P Cᵀ (C P Cᵀ + V)⁻¹` and the reciprocal condition of the bracket, or nothing if that is not
-/// positive definite in floating point.
-fn correction(
+/// `P Cᵀ (C P Cᵀ + V)⁻¹` and the reciprocal condition of the bracket, which has to be positive definite
+/// in floating point.
+fn gain(
+    sample: usize,
     c: &DMatrix<f64>,
     predicted: &DMatrix<f64>,
     measurement: &DMatrix<f64>,
-) -> Option<(DMatrix<f64>, f64)> {
+) -> Result<(DMatrix<f64>, f64), RiccatiError> {
     let seen = c * predicted;
-    let mut innovation = &seen * c.transpose() + measurement;
-    symmetrize(&mut innovation);
-    let factor = innovation.cholesky()?;
-    let gain = factor.solve(&seen).transpose();
-    all_finite(&gain).then(|| (gain, reciprocal_condition(&factor.l())))
+    let (transposed, condition) = solve_definite(&seen * c.transpose() + measurement, &seen)
+        .ok_or(RiccatiError::Overflow { sample })?;
+    Ok((transposed.transpose(), condition))
 }
 
 /// `(I − L C) P (I − L C)ᵀ + L V Lᵀ`.
@@ -499,56 +286,4 @@ fn predict(
     } else {
         Err(RiccatiError::Overflow { sample: state }.into())
     }
-}
-
-fn check_map(
-    a: &DMatrix<f64>,
-    b: &DMatrix<f64>,
-    c: &DMatrix<f64>,
-    noise: &NoiseCovariances,
-) -> Result<(), KalmanError> {
-    let sample = Sample { a: a.clone(), b: b.clone() };
-    finite_horizon::check(0, &sample, a.nrows(), b.ncols())?;
-    check_output(0, c, a.nrows())?;
-    noise.check(a.nrows(), b.ncols(), c.nrows())
-}
-
-fn check_output(sample: usize, c: &DMatrix<f64>, n: usize) -> Result<(), KalmanError> {
-    let (rows, cols) = c.shape();
-    if cols != n {
-        let (expected_rows, expected_cols) = (rows, n);
-        let matrix = "C";
-        return Err(RiccatiError::Dimension {
-            matrix,
-            sample,
-            rows,
-            cols,
-            expected_rows,
-            expected_cols,
-        }
-        .into());
-    }
-    if all_finite(c) { Ok(()) } else { Err(RiccatiError::NotFinite { matrix: "C", sample }.into()) }
-}
-
-fn check(covariance: &'static str, m: &mut DMatrix<f64>) -> Result<(), NoiseError> {
-    let size = m.nrows();
-    check_symmetric(covariance, m, size).map_err(|error| {
-        let problem = match error {
-            WeightsError::Dimension { rows, cols, .. } => format!("is {rows} x {cols}, not square"),
-            WeightsError::NotFinite { row, col, .. } => {
-                format!("the number in row {row}, column {col} is not finite")
-            }
-            WeightsError::NotSymmetric { row, col, .. } => {
-                format!("is not symmetric in row {row}, column {col}")
-            }
-            other => other.to_string(),
-        };
-        NoiseError::Malformed { covariance, problem }
-    })
-}
-
-fn semidefinite(covariance: &'static str, mut m: DMatrix<f64>) -> Result<DMatrix<f64>, NoiseError> {
-    check(covariance, &mut m)?;
-    if is_positive_semidefinite(&m) { Ok(m) } else { Err(NoiseError::Negative { covariance }) }
 }

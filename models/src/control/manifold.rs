@@ -21,10 +21,11 @@
 //! ignores: `A = A T₀T₀ᵀ` on everything that can occur. A gain for `ξ` acts on the full state as
 //! `K = K_ξ Tᵀ`, blind to gauge and to errors off the manifold.
 
-use crate::math::null_space::tangent_basis;
 use nalgebra::{DMatrix, DVector};
 
-use super::RiccatiError;
+use crate::control::error::RiccatiError;
+use crate::control::matrix::{congruent, symmetrize};
+use crate::math::null_space::tangent_basis;
 
 /// The tangent space of the constraint manifold at a state, modulo momentum gauge.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,8 +55,8 @@ impl Tangent {
         Self { transpose: basis.transpose(), basis }
     }
 
-    /// The same without the motion of the prescribed coordinates: `T = diag([Z; 0], Z, 0)`. What moves
-    /// by itself while they are held; the modes of a map are those of `Tᵀ A T`.
+    /// What moves by itself while the prescribed coordinates are held: `T = diag([Z; 0], Z, 0)`. The modes
+    /// of a map are those of `Tᵀ A T`.
     ///
     /// # Panics
     /// If `dh` has fewer than `dynamic` columns.
@@ -88,7 +89,7 @@ impl Tangent {
     /// `Tᵀ q T`: a weight on the tangent space.
     pub(super) fn restrict(&self, q: &DMatrix<f64>) -> DMatrix<f64> {
         let mut restricted = self.reduce(q) * &self.basis;
-        super::symmetrize(&mut restricted);
+        symmetrize(&mut restricted);
         restricted
     }
     /// `Tᵀ v`.
@@ -105,24 +106,11 @@ impl Tangent {
     }
     /// `T P Tᵀ`: a cost to go of the full state.
     pub(super) fn extend_value(&self, value: &DMatrix<f64>) -> DMatrix<f64> {
-        let mut extended = &self.basis * (value * &self.transpose);
-        super::symmetrize(&mut extended);
-        extended
+        congruent(&self.transpose, value)
     }
 
     pub(super) fn check(&self, sample: usize, states: usize) -> Result<(), RiccatiError> {
-        let (rows, cols) = self.basis.shape();
-        if rows == states {
-            return Ok(());
-        }
-        Err(RiccatiError::Dimension {
-            matrix: "T",
-            sample,
-            rows,
-            cols,
-            expected_rows: states,
-            expected_cols: cols,
-        })
+        RiccatiError::check_shape("T", sample, &self.basis, (states, self.basis.ncols()))
     }
 }
 

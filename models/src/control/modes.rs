@@ -4,7 +4,8 @@ use std::f64::consts::TAU;
 
 use nalgebra::{Complex, DMatrix};
 
-use super::{AnalysisError, spectrum};
+use crate::control::error::AnalysisError;
+use crate::control::spectrum::{eigenvalues, sorted};
 
 /// An eigenvalue `z` of `A`, read as a mode of continuous time: `z = exp(s h)` with the principal
 /// value `s = ln(z) / h`, so that frequencies go up to the Nyquist frequency `1 / 2h`.
@@ -55,18 +56,12 @@ impl Mode {
 /// eigenvalues, the slowest to decay first, conjugate ones side by side. About `25n³` flops.
 ///
 /// For a map with constraints or prescribed coordinates give its restriction to
-/// [`Tangent::held`](super::Tangent::held): momentum gauge, errors
+/// [`Tangent::held`](crate::control::manifold::Tangent::held): momentum gauge, errors
 /// off the manifold and prescribed coordinates are no modes.
 pub fn modes(a: &DMatrix<f64>, time_step_s: f64) -> Result<Vec<Mode>, AnalysisError> {
     AnalysisError::check("A", a, (a.nrows(), a.nrows()))?;
-    let eigenvalues =
-        spectrum::eigenvalues(a).map_err(|_| AnalysisError::Eigenvalues { size: a.nrows() })?;
-    let mut modes: Vec<Mode> = eigenvalues.into_iter().map(|z| Mode::new(z, time_step_s)).collect();
-    modes.sort_by(|a, b| {
-        let slower = b.modulus.total_cmp(&a.modulus);
-        slower.then(a.real.total_cmp(&b.real)).then(b.imaginary.total_cmp(&a.imaginary))
-    });
-    Ok(modes)
+    let eigenvalues = eigenvalues(a).map_err(|_| AnalysisError::Eigenvalues { size: a.nrows() })?;
+    Ok(sorted(eigenvalues).into_iter().map(|z| Mode::new(z, time_step_s)).collect())
 }
 
 #[cfg(test)]

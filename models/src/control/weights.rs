@@ -1,9 +1,14 @@
 //! Weights of the cost.
 
+pub(crate) mod error;
+#[cfg(test)]
+mod tests;
+
 use nalgebra::{DMatrix, DVector};
 
-use super::lq::Stage;
-use super::{is_positive_semidefinite, symmetrize};
+use crate::control::lq::stage::Stage;
+use crate::control::matrix::{congruent, is_positive_semidefinite, not_finite, symmetrize};
+use crate::control::weights::error::WeightsError;
 
 /// Asymmetry, relative to the largest entry, that counts as round-off of whoever made the matrix.
 const ASYMMETRY: f64 = 1e-9;
@@ -39,7 +44,7 @@ pub struct Weights {
     q_final: DMatrix<f64>,
 }
 
-/// Weights along a trajectory: the same at each step or each step its own, with `½ xᵀ Q_f x` at the
+/// Weights along a trajectory: constant or each step its own, with `½ xᵀ Q_f x` at the
 /// end.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectoryWeights {
@@ -62,104 +67,6 @@ pub enum Momentum {
     /// The projected one, [`Plant::projected_momentum`](crate::Plant::projected_momentum). Without
     /// constraints it is the state's own.
     Projected,
-}
-
-/// Why weights were refused.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum WeightsError {
-    /// A weight is of another shape than needed.
-    #[error("weight {weight} is {rows} x {cols}; {expected_rows} x {expected_cols} is needed")]
-    Dimension {
-        /// `q`, `r`, `s`, `q_final`, `x_linear` or `u_linear`; those two count as columns.
-        weight: &'static str,
-        /// Rows.
-        rows: usize,
-        /// Columns.
-        cols: usize,
-        /// Rows that are needed.
-        expected_rows: usize,
-        /// Columns that are needed.
-        expected_cols: usize,
-    },
-    /// An entry is NaN or infinite.
-    #[error("weight {weight} holds a number that is not finite in row {row}, column {col}")]
-    NotFinite {
-        /// As in [`WeightsError::Dimension`].
-        weight: &'static str,
-        /// Row, from 0.
-        row: usize,
-        /// Column, from 0.
-        col: usize,
-    },
-    /// Entries that mirror each other differ.
-    #[error("weight {weight} is not symmetric in row {row}, column {col}")]
-    NotSymmetric {
-        /// `q`, `r` or `q_final`.
-        weight: &'static str,
-        /// Row, from 0.
-        row: usize,
-        /// Column, from 0.
-        col: usize,
-    },
-    /// `r` has an eigenvalue that is not greater than zero.
-    #[error("weight r is not positive definite")]
-    NotPositiveDefinite,
-    /// `q` or `q_final` has a negative eigenvalue.
-    #[error("weight {weight} has a negative eigenvalue")]
-    Negative {
-        /// `q` or `q_final`.
-        weight: &'static str,
-    },
-    /// The cross term outweighs `q` and `r`: some state and input together cost less than nothing.
-    #[error(
-        "weight s is too large beside q and r: q - s inverse(r) s' has a negative eigenvalue; give \
-         less of s or more of q or r"
-    )]
-    CrossTooLarge,
-    /// The weights of one step were refused.
-    #[error("step {step}: {error}")]
-    Step {
-        /// The step, from 0.
-        step: usize,
-        /// What is wrong with them; never another `Step`.
-        error: Box<WeightsError>,
-    },
-    /// Weights per step without a step.
-    #[error("weights per step need at least one step")]
-    NoSteps,
-    /// Weights of another number of steps than they are pulled back along.
-    #[error("there are weights for {weights} steps; they are pulled back along {steps}")]
-    Steps {
-        /// Steps that have weights.
-        weights: usize,
-        /// Steps that have a `T`.
-        steps: usize,
-    },
-}
-
-impl WeightsError {
-    /// The weight at fault: `q`, `r`, `s`, `q_final`, `x_linear` or `u_linear`; of weights per step,
-    /// within that step. Empty when none was given at all.
-    pub fn weight(&self) -> &'static str {
-        match self {
-            Self::Dimension { weight, .. }
-            | Self::NotFinite { weight, .. }
-            | Self::NotSymmetric { weight, .. }
-            | Self::Negative { weight } => weight,
-            Self::NotPositiveDefinite => "r",
-            Self::CrossTooLarge => "s",
-            Self::Step { error, .. } => error.weight(),
-            Self::NoSteps | Self::Steps { .. } => "",
-        }
-    }
-
-    /// The step whose weights are at fault; none when the weights are not of one step.
-    pub fn step(&self) -> Option<usize> {
-        match self {
-            Self::Step { step, .. } => Some(*step),
-            _ => None,
-        }
-    }
 }
 
 impl StageWeights {
@@ -300,7 +207,7 @@ impl Weights {
         Self::new(matrix(q), matrix(r), None)
     }
 
-    /// The same with the cross term `xᵀSu`, `S` states × inputs.
+    /// These weights with the cross term `xᵀSu`, `S` states × inputs.
     pub fn with_cross(self, s: DMatrix<f64>) -> Result<Self, WeightsError> {
         let StageWeights { q, r, .. } = self.stage;
         let stage = StageWeights::new(q, r, Some(s), None, None)?;
@@ -367,18 +274,16 @@ impl StageWeights {
         })
     }
 
-    fn check_system(&self, states: usize, inputs: usize) -> Result<(), WeightsError> {
+    pub(crate) fn check_system(&self, states: usize, inputs: usize) -> Result<(), WeightsError> {
         for (weight, size, expected) in [("q", self.states(), states), ("r", self.inputs(), inputs)]
         {
             if size != expected {
-                let (rows, cols) = (size, size);
-                let (expected_rows, expected_cols) = (expected, expected);
                 return Err(WeightsError::Dimension {
                     weight,
-                    rows,
-                    cols,
-                    expected_rows,
-                    expected_cols,
+                    rows: size,
+                    cols: size,
+                    expected_rows: expected,
+                    expected_cols: expected,
                 });
             }
         }
@@ -387,16 +292,14 @@ impl StageWeights {
 }
 
 impl TrajectoryWeights {
-    /// The same weights at each step; `q_final` is `stage.q` when not given, and positive
+    /// Constant weights; `q_final` is `stage.q` when not given, and positive
     /// semidefinite either way.
     pub fn constant(
         stage: StageWeights,
         q_final: Option<DMatrix<f64>>,
     ) -> Result<Self, WeightsError> {
-        let q_final = match q_final {
-            None => check_final(stage.q.clone(), stage.states())?,
-            Some(q_final) => check_final(q_final, stage.states())?,
-        };
+        let q_final = q_final.unwrap_or_else(|| stage.q.clone());
+        let q_final = check_final(q_final, stage.states())?;
         Ok(Self { stages: Stages::Constant(stage), q_final })
     }
 
@@ -477,14 +380,6 @@ impl From<&Weights> for TrajectoryWeights {
     }
 }
 
-/// `tᵀ q t` of a symmetric `q`.
-fn congruent(t: &DMatrix<f64>, q: &DMatrix<f64>) -> DMatrix<f64> {
-    // Not `tr_mul`, which takes no blocks.
-    let mut congruent = t.transpose() * (q * t);
-    symmetrize(&mut congruent);
-    congruent
-}
-
 fn check_final(mut q_final: DMatrix<f64>, states: usize) -> Result<DMatrix<f64>, WeightsError> {
     check_symmetric("q_final", &mut q_final, states)?;
     if !is_positive_semidefinite(&q_final) {
@@ -503,10 +398,8 @@ fn check_entries(
     if (rows, cols) != (expected_rows, expected_cols) {
         return Err(WeightsError::Dimension { weight, rows, cols, expected_rows, expected_cols });
     }
-    match entries.iter().position(|entry| !entry.is_finite()) {
-        Some(index) => {
-            Err(WeightsError::NotFinite { weight, row: index % rows, col: index / rows })
-        }
+    match not_finite(entries, rows) {
+        Some((row, col)) => Err(WeightsError::NotFinite { weight, row, col }),
         None => Ok(()),
     }
 }
@@ -528,138 +421,4 @@ pub(super) fn check_symmetric(
     }
     symmetrize(m);
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_fault_is_named() {
-        let identity = DMatrix::<f64>::identity(2, 2);
-        let with = |row: usize, col: usize, value: f64| {
-            let mut m = identity.clone();
-            m[(row, col)] = value;
-            m
-        };
-        let refused = |q: &DMatrix<f64>, r: &DMatrix<f64>, f: Option<&DMatrix<f64>>| {
-            Weights::new(q.clone(), r.clone(), f.cloned()).unwrap_err()
-        };
-        assert_eq!(
-            refused(&DMatrix::zeros(2, 3), &identity, None),
-            WeightsError::Dimension {
-                weight: "q",
-                rows: 2,
-                cols: 3,
-                expected_rows: 2,
-                expected_cols: 2
-            }
-        );
-        assert_eq!(
-            refused(&identity, &identity, Some(&DMatrix::zeros(3, 3))),
-            WeightsError::Dimension {
-                weight: "q_final",
-                rows: 3,
-                cols: 3,
-                expected_rows: 2,
-                expected_cols: 2
-            }
-        );
-        assert_eq!(
-            refused(&identity, &with(1, 0, f64::NAN), None),
-            WeightsError::NotFinite { weight: "r", row: 1, col: 0 }
-        );
-        assert_eq!(
-            refused(&with(0, 1, 0.5), &identity, None),
-            WeightsError::NotSymmetric { weight: "q", row: 0, col: 1 }
-        );
-        assert_eq!(refused(&identity, &with(1, 1, 0.0), None), WeightsError::NotPositiveDefinite);
-        assert_eq!(
-            refused(&with(1, 1, -1e-3), &identity, None),
-            WeightsError::Negative { weight: "q" }
-        );
-        assert_eq!(
-            refused(&identity, &identity, Some(&(-&identity))),
-            WeightsError::Negative { weight: "q_final" }
-        );
-    }
-
-    #[test]
-    fn a_singular_state_weight_is_good() {
-        let weights = Weights::diagonal(&[1.0, 0.0], &[2.0]).unwrap();
-        assert_eq!((weights.states(), weights.inputs()), (2, 1));
-        assert_eq!(weights.q_final(), weights.q());
-        assert!(Weights::diagonal(&[0.0, 0.0], &[2.0]).is_ok());
-    }
-
-    #[test]
-    fn sizes_are_compared_with_the_system() {
-        let weights = Weights::diagonal(&[1.0, 0.0], &[2.0]).unwrap();
-        assert!(weights.clone().for_system(2, 1).is_ok());
-        assert_eq!(
-            weights.for_system(2, 3),
-            Err(WeightsError::Dimension {
-                weight: "r",
-                rows: 1,
-                cols: 1,
-                expected_rows: 3,
-                expected_cols: 3
-            })
-        );
-    }
-
-    #[test]
-    fn a_cross_term_is_judged_together_with_the_others() {
-        let weights = Weights::diagonal(&[1.0, 1e-8], &[4.0]).unwrap();
-        let cross = |a: f64, b: f64| DMatrix::from_column_slice(2, 1, &[a, b]);
-        // (q1 s1; s1 r) and the like lose definiteness at s1² = q1 r.
-        assert!(weights.clone().with_cross(cross(1.9999, 0.0)).is_ok());
-        assert!(weights.clone().with_cross(cross(0.0, 1.9999e-4)).is_ok());
-        for s in [cross(2.0001, 0.0), cross(0.0, 2.0001e-4)] {
-            assert_eq!(weights.clone().with_cross(s), Err(WeightsError::CrossTooLarge));
-        }
-        let blind = Weights::diagonal(&[1.0, 0.0], &[4.0]).unwrap();
-        assert_eq!(blind.with_cross(cross(0.0, 1e-9)), Err(WeightsError::CrossTooLarge));
-        let error = weights.clone().with_cross(DMatrix::zeros(1, 2)).unwrap_err();
-        assert_eq!(error.weight(), "s");
-        assert!(matches!(
-            error,
-            WeightsError::Dimension { expected_rows: 2, expected_cols: 1, .. }
-        ));
-    }
-
-    #[test]
-    fn weights_per_step_name_the_step() {
-        let stage = |n: usize| {
-            StageWeights::new(DMatrix::identity(n, n), DMatrix::identity(1, 1), None, None, None)
-                .unwrap()
-        };
-        let error = TrajectoryWeights::per_step(vec![stage(2), stage(3)], DMatrix::zeros(2, 2))
-            .unwrap_err();
-        assert_eq!((error.step(), error.weight()), (Some(1), "q"));
-        let error = TrajectoryWeights::per_step(vec![stage(2)], DMatrix::zeros(3, 3)).unwrap_err();
-        assert_eq!((error.step(), error.weight()), (None, "q_final"));
-        assert_eq!(
-            TrajectoryWeights::per_step(Vec::new(), DMatrix::zeros(2, 2)),
-            Err(WeightsError::NoSteps)
-        );
-    }
-
-    #[test]
-    fn a_step_of_an_optimisation_need_not_be_convex() {
-        let (q, r) = (-DMatrix::identity(2, 2), DMatrix::identity(1, 1));
-        let linear = DVector::from_element(2, 1.0);
-        assert!(
-            !StageWeights::symmetric(q.clone(), r.clone(), None, None, None).unwrap().is_convex()
-        );
-        assert_eq!(
-            StageWeights::new(q.clone(), r.clone(), None, None, None),
-            Err(WeightsError::Negative { weight: "q" })
-        );
-        let error = StageWeights::symmetric(q.clone(), r.clone(), None, None, Some(linear.clone()))
-            .unwrap_err();
-        assert_eq!(error.weight(), "u_linear");
-        let error = StageWeights::symmetric(q, r, None, Some(linear * f64::NAN), None).unwrap_err();
-        assert_eq!(error, WeightsError::NotFinite { weight: "x_linear", row: 0, col: 0 });
-    }
 }

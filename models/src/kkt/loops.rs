@@ -16,9 +16,8 @@
 
 mod column;
 
-use column::Column;
-
 use crate::constraints::in_plane::InPlane;
+use crate::kkt::loops::column::Column;
 use crate::kkt::planar::{Diagonal, MatrixKind, Method, PlanarRecursion, add_to, dot3, product};
 use crate::lagrangian::planar::{Fours, Joints, Vec2, Vec3, cross};
 use crate::math::rows::{Block, LANES, padded};

@@ -2,7 +2,6 @@
 //! scene allows it, else in space.
 
 use crate::lagrangian::curvature::{Curvature, Entry, SecondDerivatives};
-
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;

@@ -12,7 +12,6 @@ use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::system::System;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
-
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::linearization::linearize::{Linearization, StageTangents};
 use crate::linearization::parameters::Parameters;

@@ -1,8 +1,11 @@
 //! Why a problem is refused, and why a search ends without having converged.
 
-use crate::InitialError;
-use crate::control::WeightsError;
+use nalgebra::DMatrix;
+
+use crate::control::matrix::not_finite;
+use crate::control::weights::error::WeightsError;
 use crate::integrator::report::StepError;
+use crate::plant::initial::InitialError;
 
 /// Why a problem was refused, or an iteration failed. An optimizer is as it was before.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -122,6 +125,24 @@ pub enum OptimizeError {
     Finished,
 }
 
+impl OptimizeError {
+    /// Refuses a matrix of another shape, or with numbers that are not finite.
+    pub(super) fn check(
+        what: &'static str,
+        matrix: &DMatrix<f64>,
+        (expected_rows, expected_cols): (usize, usize),
+    ) -> Result<(), Self> {
+        let (rows, cols) = matrix.shape();
+        if (rows, cols) != (expected_rows, expected_cols) {
+            return Err(Self::Dimension { what, rows, cols, expected_rows, expected_cols });
+        }
+        match not_finite(matrix.as_slice(), rows) {
+            None => Ok(()),
+            Some((row, col)) => Err(Self::NotFinite { what, row, col }),
+        }
+    }
+}
+
 /// What is wrong with a bound.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum BoundFault {
@@ -215,7 +236,7 @@ pub enum Stuck {
 pub struct BoundState {
     /// Largest violation, in the unit of the entry.
     pub violation: f64,
-    /// The same, and where a bound holds, the distance from it, or, if that is less, of its multiplier
+    /// Largest violation, or where a bound holds, distance from it, or, if that is less, of its multiplier
     /// from zero, in units of the penalty.
     pub error: f64,
     /// Error that counts as none.

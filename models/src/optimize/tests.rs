@@ -1,16 +1,18 @@
 //! Directions against differences of the projected cost.
 
+use std::sync::Arc;
+
 use nalgebra::{DMatrix, DVector};
 
-use super::search::Optimizer;
-use super::{Bound, Bounds, FreeInitialState, Method, Options, TrajectoryCost};
 use crate::builtin;
-use crate::control::{Momentum, StageWeights, TrajectoryWeights, Weights};
+use crate::control::weights::{Momentum, StageWeights, TrajectoryWeights, Weights};
 use crate::integrator::settings::{ForceSplit, Settings};
 use crate::lagrangian::samples;
 use crate::model::mechanism::Model;
+use crate::optimize::options::{Method, Options};
+use crate::optimize::search::Optimizer;
+use crate::optimize::specification::{Bound, Bounds, FreeInitialState, TrajectoryCost};
 use crate::plant::facade::Plant;
-use std::sync::Arc;
 
 const STEPS: usize = 12;
 

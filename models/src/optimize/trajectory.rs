@@ -4,11 +4,15 @@ use std::ops::Range;
 
 use nalgebra::DMatrix;
 
+use crate::integrator::state::State;
 use crate::model::mechanism::Dimensions;
+use crate::plant::known::KnownStep;
 
 /// States, inputs and constraint impulses of a motion, row-major.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Trajectory {
+    /// Index of the first step.
+    pub(super) first_step: u64,
     pub(super) coordinates: usize,
     pub(super) states: usize,
     pub(super) inputs: usize,
@@ -23,9 +27,10 @@ pub(super) struct Trajectory {
 }
 
 impl Trajectory {
-    pub(super) fn new(d: Dimensions, steps: usize) -> Self {
+    pub(super) fn new(d: Dimensions, first_step: u64, steps: usize) -> Self {
         let (states, inputs, constraints) = (d.state(), d.input(), d.constraints);
         Self {
+            first_step,
             coordinates: d.coordinates(),
             states,
             inputs,
@@ -40,23 +45,46 @@ impl Trajectory {
 
     /// A copy of some steps.
     pub(super) fn part(&self, steps: Range<usize>) -> Self {
-        let of = |numbers: &[f64], width: usize, rows: usize| {
+        let part = |numbers: &[f64], width: usize, rows: usize| {
             numbers[steps.start * width..][..rows * width].to_vec()
         };
         Self {
-            x: of(&self.x, self.states, steps.len() + 1),
-            u: of(&self.u, self.inputs, steps.len()),
-            multipliers: of(&self.multipliers, self.constraints, steps.len()),
+            first_step: self.first_step.saturating_add(steps.start as u64),
+            x: part(&self.x, self.states, steps.len() + 1),
+            u: part(&self.u, self.inputs, steps.len()),
+            multipliers: part(&self.multipliers, self.constraints, steps.len()),
             ..*self
         }
+    }
+
+    /// Step `k`.
+    pub(super) fn known(&self, k: usize) -> KnownStep<'_> {
+        let n = self.coordinates;
+        KnownStep {
+            index: self.first_step.saturating_add(k as u64),
+            q0: &self.x(k)[..n],
+            p0: Some(&self.x(k)[n..]),
+            q1: &self.x(k + 1)[..n],
+            multipliers: self.multipliers(k),
+            u: self.u(k),
+        }
+    }
+
+    /// The state that it begins with.
+    pub(super) fn initial(&self, d: Dimensions) -> State {
+        let (q, rest) = self.x(0).split_at(self.coordinates);
+        let (p, v) = rest.split_at(d.dynamic);
+        let [q, p, v] = [q, p, v].map(<[f64]>::to_vec);
+        State { step: self.first_step, q, p, v, multipliers: vec![0.0; self.constraints] }
     }
 
     pub(super) fn x(&self, k: usize) -> &[f64] {
         &self.x[k * self.states..][..self.states]
     }
 
+    /// `u[k]`; nothing after the last step.
     pub(super) fn u(&self, k: usize) -> &[f64] {
-        &self.u[k * self.inputs..][..self.inputs]
+        self.u.get(k * self.inputs..(k + 1) * self.inputs).unwrap_or_default()
     }
 
     pub(super) fn multipliers(&self, k: usize) -> &[f64] {

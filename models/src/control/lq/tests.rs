@@ -1,4 +1,8 @@
-use super::*;
+use nalgebra::{DMatrix, DVector};
+
+use crate::control::lq::recursion::LqRecursion;
+use crate::control::lq::stage::{NotConvex, Stage};
+use crate::math::sparse_map::Map;
 
 /// Numbers in (-1, 1) that follow no pattern.
 fn noise(rows: usize, cols: usize, seed: f64) -> DMatrix<f64> {

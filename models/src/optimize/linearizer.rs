@@ -1,0 +1,336 @@
+//! The linearized map along a motion, made block by block, shared among threads where that pays.
+
+use std::ops::{ControlFlow, Range};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+
+use crate::integrator::report::StepError;
+use crate::linearization::linearize::Linearization;
+use crate::linearization::second_order::contraction::Contraction;
+use crate::math::sparse_map::Map;
+use crate::optimize::error::OptimizeError;
+use crate::optimize::question::{Question, ask, ask_at};
+use crate::optimize::trajectory::Trajectory;
+use crate::plant::facade::Plant;
+use crate::plant::known::KnownStep;
+
+/// A step of fewer states is differentiated sooner than a thread starts.
+const STATES_FOR_THREADS: usize = 12;
+
+/// What a thread needs of its own to differentiate steps.
+#[derive(Debug)]
+pub(super) struct Worker {
+    plant: Plant,
+    linearization: Linearization,
+    pub(super) contraction: Contraction,
+}
+
+impl Worker {
+    fn new(plant: &Plant) -> Self {
+        Self {
+            linearization: Linearization::new(plant.model()),
+            contraction: Contraction::new(plant.model()),
+            plant: plant.clone(),
+        }
+    }
+
+    /// Linearizes a step; where room is given, into that.
+    fn linearize(
+        &mut self,
+        step: &KnownStep<'_>,
+        map: &mut Map,
+        kept: Option<&mut Linearization>,
+    ) -> Result<(), StepError> {
+        let out = kept.unwrap_or(&mut self.linearization);
+        self.plant.linearize_known(step, out)?;
+        out.write_map(map);
+        Ok(())
+    }
+}
+
+/// The maps of the steps of a motion, and who makes them.
+#[derive(Debug)]
+pub(super) struct Linearizer {
+    states: usize,
+    pub(super) maps: Vec<Map>,
+    /// One per step where Newton's method contracts them, else none.
+    pub(super) linearizations: Vec<Linearization>,
+    /// Block by block, whether the maps belong to the current motion, or else to the last trial.
+    is_current: Vec<bool>,
+    is_trial: Vec<bool>,
+    /// One per thread; at least one.
+    pub(super) workers: Vec<Worker>,
+}
+
+/// A roll-out that says after each step how many it took, and shows the motion.
+type RollOut<'a> =
+    &'a mut dyn FnMut(&mut dyn FnMut(usize, &Trajectory)) -> Result<bool, OptimizeError>;
+
+/// The map to write, and the linearization to keep.
+type Job<'a> = (&'a mut Map, Option<&'a mut Linearization>);
+
+/// Whether a recursion goes on after a step.
+type Verdict = Result<ControlFlow<()>, OptimizeError>;
+
+impl Linearizer {
+    /// `keeps` the linearizations.
+    pub(super) fn new(plant: &Plant, steps: usize, keeps: bool) -> Self {
+        let model = plant.model();
+        let states = model.dimensions().state();
+        let blocks = steps.div_ceil(block_length(states));
+        Self {
+            states,
+            maps: (0..steps).map(|_| Map::default()).collect(),
+            linearizations: vec![Linearization::new(model); if keeps { steps } else { 0 }],
+            is_current: vec![false; blocks],
+            is_trial: vec![false; blocks],
+            workers: vec![Worker::new(plant)],
+        }
+    }
+
+    /// Lets threads share the work, where the model is large enough to gain from it.
+    pub(super) fn set_threads(&mut self, threads: usize, plant: &Plant) {
+        let useful = if self.states < STATES_FOR_THREADS { 1 } else { threads.max(1) };
+        self.workers.resize_with(useful, || Worker::new(plant));
+    }
+
+    /// Whether trials are linearized behind, in the place of the current motion.
+    pub(super) fn looks_ahead(&self) -> bool {
+        self.workers.len() > 1
+    }
+
+    /// The last trial is the current motion.
+    pub(super) fn accept_trial(&mut self) {
+        std::mem::swap(&mut self.is_current, &mut self.is_trial);
+    }
+
+    /// The last trial comes to nothing.
+    pub(super) fn forget_trial(&mut self) {
+        self.is_trial.fill(false);
+    }
+
+    /// Visits the maps of the steps from the last to the first; the step at which the visitor breaks off.
+    /// Linearizes where that was not done yet: the block before the one that is visited.
+    pub(super) fn visit_backwards(
+        &mut self,
+        motion: &Trajectory,
+        go_on: Question<'_>,
+        mut visit: impl FnMut(usize, &Map, Option<&Linearization>) -> Verdict,
+    ) -> Result<Option<usize>, OptimizeError> {
+        let Self { states, maps, linearizations, is_current, workers, .. } = self;
+        let keeps = !linearizations.is_empty();
+        let mut stopped = None;
+        for (made, used) in blocks(maps.len(), *states) {
+            ask(go_on)?;
+            let block = made.start / block_length(*states);
+            let made = if is_current[block] { made.start..made.start } else { made };
+            let (head, tail) = maps.split_at_mut(used.start);
+            let split = if keeps { used.start } else { 0 };
+            let (linearized_head, linearized) = linearizations.split_at_mut(split);
+            let mut kept = linearized_head[if keeps { made.clone() } else { 0..0 }].iter_mut();
+            let jobs = made.clone().zip(&mut head[made]).map(|(k, map)| (k, (map, kept.next())));
+            let job = |worker: &mut Worker, k, (map, kept): Job<'_>| {
+                worker.linearize(&motion.known(k), map, kept)
+            };
+            let consume = || {
+                for k in used.clone().rev() {
+                    ask_at(k, go_on)?;
+                    if k > used.start {
+                        tail[k - used.start - 1].prefetch();
+                    }
+                    let place = k - used.start;
+                    if visit(k, &tail[place], linearized.get(place))?.is_break() {
+                        stopped = Some(k);
+                        break;
+                    }
+                }
+                Ok(())
+            };
+            share_work(workers, jobs.collect(), job, consume)?;
+            is_current[block] = true;
+            if stopped.is_some() {
+                break;
+            }
+        }
+        Ok(stopped)
+    }
+
+    /// Visits the maps of the steps from the last to the first, each with what a job has made of its
+    /// linearization; the step at which the visitor breaks off. `made_now` and `made_before` are room for
+    /// blocks. All steps are linearized.
+    pub(super) fn visit_contracted<T: Send>(
+        &mut self,
+        rooms: &mut [Vec<T>; 2],
+        go_on: Question<'_>,
+        contract: impl Fn(&mut Contraction, usize, &Linearization, &mut T) -> Result<(), StepError>
+        + Sync,
+        mut visit: impl FnMut(usize, &Map, &mut T) -> Verdict,
+    ) -> Result<Option<usize>, OptimizeError> {
+        let Self { states, maps, linearizations, workers, .. } = self;
+        let [mut made_now, mut made_before] = rooms.each_mut();
+        let mut stopped = None;
+        for (made, used) in blocks(maps.len(), *states) {
+            ask(go_on)?;
+            let jobs = made.zip(&mut *made_now).collect();
+            let job = |worker: &mut Worker, k: usize, room: &mut T| {
+                contract(&mut worker.contraction, k, &linearizations[k], room)
+            };
+            let consume = || {
+                for k in used.clone().rev() {
+                    ask_at(k, go_on)?;
+                    if visit(k, &maps[k], &mut made_before[k - used.start])?.is_break() {
+                        stopped = Some(k);
+                        break;
+                    }
+                }
+                Ok(())
+            };
+            share_work(workers, jobs, job, consume)?;
+            if stopped.is_some() {
+                break;
+            }
+            std::mem::swap(&mut made_now, &mut made_before);
+        }
+        Ok(stopped)
+    }
+
+    /// Rolls a trial out, and has helpers linearize the blocks behind it meanwhile, the last first.
+    pub(super) fn roll_out(&mut self, roll_out: RollOut<'_>) -> Result<bool, OptimizeError> {
+        self.is_trial.fill(false);
+        let helpers = &mut self.workers[1..];
+        if helpers.is_empty() {
+            return roll_out(&mut |_, _| {});
+        }
+        // The maps of the trial take the place of those of the current motion.
+        self.is_current.fill(false);
+        let length = block_length(self.states);
+        let is_over = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            let mut queues = Vec::with_capacity(helpers.len());
+            let mut threads = Vec::with_capacity(helpers.len());
+            for worker in helpers {
+                let (queue, blocks) = mpsc::channel::<Block<'_>>();
+                let is_over = &is_over;
+                queues.push(queue);
+                threads.push(scope.spawn(move || linearize_blocks(worker, &blocks, is_over)));
+            }
+            let mut maps = self.maps.chunks_mut(length).enumerate();
+            let mut kept = self.linearizations.chunks_mut(length);
+            let (mut first, mut next) = (0, maps.next());
+            let rolled_out = roll_out(&mut |steps, trial| {
+                let Some((number, maps_of_block)) =
+                    next.take_if(|(_, maps)| first + maps.len() == steps)
+                else {
+                    return;
+                };
+                let motion = trial.part(first..steps);
+                let kept = kept.next().unwrap_or_default();
+                // A helper that is gone leaves its blocks to the next iteration.
+                let block = Block { number, motion, maps: maps_of_block, kept };
+                let _ = queues[number % queues.len()].send(block);
+                (first, next) = (steps, maps.next());
+            });
+            is_over.store(true, Ordering::Relaxed);
+            drop(queues);
+            for thread in threads {
+                match thread.join() {
+                    Ok(done) => done.into_iter().for_each(|number| self.is_trial[number] = true),
+                    Err(panic) => std::panic::resume_unwind(panic),
+                }
+            }
+            rolled_out
+        })
+    }
+}
+
+/// A block of a trial.
+struct Block<'a> {
+    number: usize,
+    motion: Trajectory,
+    maps: &'a mut [Map],
+    kept: &'a mut [Linearization],
+}
+
+/// Linearizes the blocks that come, the last first, until the roll-out is over; the numbers of those that
+/// are done.
+fn linearize_blocks(
+    worker: &mut Worker,
+    blocks: &mpsc::Receiver<Block<'_>>,
+    is_over: &AtomicBool,
+) -> Vec<usize> {
+    let (mut waiting, mut done) = (Vec::new(), Vec::new());
+    while !is_over.load(Ordering::Relaxed) {
+        if waiting.is_empty() {
+            match blocks.recv() {
+                Ok(block) => waiting.push(block),
+                Err(_) => break,
+            }
+        }
+        waiting.extend(blocks.try_iter());
+        let Some(Block { number, motion, maps, kept }) = waiting.pop() else { break };
+        let mut kept = kept.iter_mut();
+        let linearized = maps
+            .iter_mut()
+            .enumerate()
+            .all(|(k, map)| worker.linearize(&motion.known(k), map, kept.next()).is_ok());
+        if linearized {
+            done.push(number);
+        }
+    }
+    done
+}
+
+/// Steps of a block: enough for threads to share, few enough for caches and for questions.
+pub(super) fn block_length(states: usize) -> usize {
+    (2048 / states.max(1)).clamp(4, 64)
+}
+
+/// Blocks of steps from the last to the first: the one to be made, and the one made before, which is used
+/// meanwhile.
+fn blocks(steps: usize, states: usize) -> impl Iterator<Item = (Range<usize>, Range<usize>)> {
+    let length = block_length(states);
+    let count = steps.div_ceil(length);
+    let block = move |i: usize| (i * length).min(steps)..((i + 1) * length).min(steps);
+    (0..=count).rev().map(move |i| (if i == 0 { 0..0 } else { block(i - 1) }, block(i)))
+}
+
+/// Does the jobs of steps: helpers do while this thread does `consume`, or this one before if there are none.
+fn share_work<J: Send>(
+    workers: &mut [Worker],
+    jobs: Vec<(usize, J)>,
+    job: impl Fn(&mut Worker, usize, J) -> Result<(), StepError> + Sync,
+    consume: impl FnOnce() -> Result<(), OptimizeError>,
+) -> Result<(), OptimizeError> {
+    let do_all = |worker: &mut Worker, jobs: Vec<(usize, J)>| {
+        jobs.into_iter().try_for_each(|(step, what)| {
+            job(worker, step, what).map_err(|error| OptimizeError::Linearization { step, error })
+        })
+    };
+    let Some((own, helpers)) = workers.split_first_mut() else { return consume() };
+    if helpers.is_empty() {
+        do_all(own, jobs)?;
+        return consume();
+    }
+    let share = jobs.len().div_ceil(helpers.len()).max(1);
+    let mut jobs = jobs.into_iter();
+    std::thread::scope(|scope| {
+        let mut threads = Vec::with_capacity(helpers.len());
+        for worker in helpers {
+            let part: Vec<_> = jobs.by_ref().take(share).collect();
+            if !part.is_empty() {
+                threads.push(scope.spawn(|| do_all(worker, part)));
+            }
+        }
+        let consumed = consume();
+        // All are joined, and the first failure counts, whichever thread was faster.
+        let mut made = Ok(());
+        for thread in threads {
+            match thread.join() {
+                Ok(result) => made = made.and(result),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
+        }
+        made?;
+        consumed
+    })
+}
