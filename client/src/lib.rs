@@ -49,30 +49,32 @@
 //! # }
 //! ```
 
-mod channel;
 mod client;
+mod connection;
 mod driver;
 mod error;
 mod estimator;
 mod follower;
 pub mod link;
-mod matrix;
+mod messages;
 mod recording;
 mod rotation;
+mod schedule;
 mod stream;
 
-pub use channel::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use client::Client;
+pub use connection::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use driver::Driver;
 pub use error::{ConnectProblem, Error, Refusal, Result, Violation};
 pub use estimator::Estimator;
-pub use follower::{Follower, GainSchedule, LawState};
-pub use matrix::{
+pub use follower::Follower;
+pub use messages::{
     GainExt, MatrixExt, RolloutExt, StateExt, WeightsExt, diagonal, full, operating_point,
     present_state, weights,
 };
 pub use recording::{RecordingEntry, RecordingReader};
 pub use rotation::{compose, difference, rotations};
+pub use schedule::{GainSchedule, LawState};
 pub use stream::Answers;
 
 /// The messages and stubs of the contract, `plantd.v1`.

@@ -10,7 +10,7 @@ use mcap::sans_io::LinearReaderOptions;
 use plantd_proto::v1;
 use prost::Message as _;
 
-use crate::{Error, Result};
+use crate::error::{Error, Result};
 
 /// Longest record that is read, bytes.
 const RECORD_BYTES_MAX: usize = 1 << 30;

@@ -8,8 +8,7 @@ use std::time::Duration;
 use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::{Channel, Endpoint};
 
-use crate::error::{ConnectProblem, root_cause};
-use crate::{Error, Result};
+use crate::error::{ConnectProblem, Error, Result, root_cause};
 
 /// Where a server listens unless it is told otherwise.
 pub const DEFAULT_ADDRESS: &str = "http://127.0.0.1:50051";

@@ -1,31 +1,15 @@
-//! A synchronous driver over shared memory, for processes on the server's machine.
-//!
-//! ```no_run
-//! use plantd_client::link::{LinkDriver, LinkOptions};
-//!
-//! # fn main() -> Result<(), plantd_client::link::LinkError> {
-//! let mut plant = LinkDriver::connect("pendulum", LinkOptions::default())?;
-//! for _ in 0..1000 {
-//!     let torque = -3.0 * plant.state().q[0] - plant.state().p[0];
-//!     plant.step(&[torque])?;
-//! }
-//! # Ok(())
-//! # }
-//! ```
-
-mod error;
+//! The driver: attaches to a plant, sends inputs, waits for states.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use iceoryx2::identifiers::UniquePublisherId;
 use plantd_proto::link::{
-    Code, Domain, DomainError, Endpoint, Header, Kind, LIVE, LinkNode, Message, default_root,
+    Code, Domain, DomainError, Endpoint, Header, Kind, LIVE, LinkNode, Message, Wait, default_root,
     monotonic_ns, random_instance,
 };
 
-pub use error::{Guarded, LeaseHolder, LinkError, StepFailure};
-pub use plantd_proto::link::Wait;
+use crate::link::error::{LinkError, from_failure};
 
 /// How often a driver that waits looks whether the server lives, ns.
 const CHECK_PERIOD_NS: u64 = 100_000_000;
@@ -109,7 +93,8 @@ pub struct StateView<'a> {
     pub constraint_residual: f64,
     /// Estimate of the reciprocal condition of the Newton matrix, at most 1.
     pub reciprocal_condition: f64,
-    /// The same for the constraints, without redundant ones; 1 without constraints.
+    /// Estimate of the reciprocal condition of the constraints, without redundant ones; 1 without
+    /// constraints.
     pub constraint_reciprocal_condition: f64,
     /// Constraint equations that follow from others.
     pub redundant_constraints: u32,
@@ -301,7 +286,7 @@ impl LinkDriver {
                 }
                 match Kind::from_number(answer.kind) {
                     Some(Kind::Attached) => return self.note_attached(&answer, &message),
-                    _ => return Err(error::from_failure(&answer)),
+                    _ => return Err(from_failure(&answer)),
                 }
             }
             if monotonic_ns() >= deadline_ns {
@@ -378,7 +363,7 @@ impl LinkDriver {
         }
         if kind == Some(Kind::Failure) && answer.sequence == self.sequence {
             self.server_poll_end_ns = answer.poll_end_ns();
-            return Err(error::from_failure(&answer));
+            return Err(from_failure(&answer));
         }
         if kind != Some(Kind::State) || !wanted(&answer, self.sequence) {
             return Ok(false);

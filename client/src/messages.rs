@@ -1,9 +1,9 @@
-//! Small helpers on the contract's messages, so that a controller needs no linear-algebra library.
+//! Arithmetic on the contract's messages, so that a controller needs no linear-algebra library.
 
 use plantd_proto::v1;
 
+use crate::error::{Error, Result};
 use crate::rotation::difference;
-use crate::{Error, Result};
 
 /// Reading and writing of [`v1::Matrix`].
 pub trait MatrixExt: Sized {
@@ -95,7 +95,7 @@ pub trait GainExt {
     /// # Panics
     /// If the state has not as many entries as `K` has columns.
     fn control(&self, state: &v1::State) -> Vec<f64>;
-    /// The same for a state vector `x = (q, p, v)`.
+    /// The feedback law at a state vector `x = (q, p, v)`, as [`control`](Self::control).
     ///
     /// # Panics
     /// If `x` has not as many entries as `K` has columns.
