@@ -29,14 +29,14 @@ use self::expect::short;
 use self::prepare::Prepared;
 use self::run::{Outcome, Place, Status, lock, summary};
 use self::scenario::{Case, Controller, Pace, Scenario};
-use crate::FAILED;
-use crate::commands::Output;
-use crate::own_server::OwnServer;
+use crate::output::failure::FAILED;
+use crate::output::printer::Output;
+use crate::server::own::OwnServer;
 
 /// Something could not be run or judged.
 const NOT_RUN: u8 = 2;
 
-pub(crate) const EXAMPLE: &str = "\
+const EXAMPLE: &str = "\
 A scenario, `hold.toml`; client/TESTING.md explains every key:
 
   duration_s = 5.0
@@ -78,7 +78,9 @@ Exit codes:
   1  one did not
   2  a case could not be run or judged, or wrong usage";
 
+/// Runs scenarios and judges them, for tests of controllers.
 #[derive(Debug, Group)]
+#[command(after_help = EXAMPLE)]
 pub(crate) struct Options {
     /// Scenario files, and folders of them.
     #[arg(required_unless_present = "schema")]

@@ -12,7 +12,8 @@ use super::expression::Expression;
 use super::run::Place;
 use super::samples::Columns;
 use super::scenario::{Case, Controller, Event, Inputs, Lqr, Plant, Reference, Scenario};
-use crate::{json, optimize};
+use crate::contract::json;
+use crate::input::files;
 
 /// Part of a time step by which a time may miss a step and still mean it.
 const STEP_ROUNDING: f64 = 1e-6;
@@ -232,8 +233,7 @@ async fn motion(
             Ok(Motion { x: vec![x], u: vec![answer.u], trajectory: None })
         }
         Reference::Trajectory(file) => {
-            let result =
-                optimize::read_result(&folder.join(file)).context("reference.trajectory")?;
+            let result = files::read_result(&folder.join(file)).context("reference.trajectory")?;
             let trajectory = result.checkpoint.and_then(|checkpoint| checkpoint.trajectory);
             let trajectory =
                 trajectory.context("reference.trajectory: no trajectory in the file")?;
@@ -353,7 +353,7 @@ fn rows(inputs: &Inputs, model: &v1::Model, folder: &Path) -> Result<Vec<Vec<Opt
     let head = text.lines().next().unwrap_or_default();
     let columns: Vec<_> =
         head.split(',').map(|name| index("table", name.trim())).collect::<Result<_>>()?;
-    let matrix = optimize::table(&text).with_context(key)?;
+    let matrix = files::table(&text).with_context(key)?;
     ensure!(matrix.rows > 0, "{}: a row is needed", key());
     ensure!(matrix.cols as usize == columns.len(), "{}: the head has other columns", key());
     let row = |values: &[f64]| {

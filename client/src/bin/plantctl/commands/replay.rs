@@ -1,125 +1,55 @@
-//! Recordings: `record`, `replay` and `export`.
+//! `replay`: the steps of a recording, taken again and compared.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::fs::File;
-use std::io::{BufWriter, Write as _};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context as _, Result};
-use clap::Subcommand;
+use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use plantd_client::{Client, Error, MatrixExt as _, RecordingEntry, RecordingReader, v1};
 use serde_json::{Value, json};
 
-use crate::commands::Output;
-use crate::own_server::OwnServer;
-use crate::{FAILED, json, text};
+use crate::contract::names;
+use crate::output::failure::FAILED;
+use crate::server::context::Context;
+use crate::server::own::OwnServer;
 
 /// Most numbers in the answer to one call, and most steps.
 const REPLY_NUMBERS: usize = 200_000;
 const STEPS_PER_CALL: usize = 1000;
 
-/// What can be done with the recordings of a server.
-#[derive(Debug, Subcommand)]
-pub(crate) enum RecordCommand {
-    /// Starts to record a plant.
-    Start {
-        /// Plant.
-        id: String,
-        /// Name of the recording; the plant's id and the time if not given.
-        #[arg(long)]
-        name: Option<String>,
-        /// Time between snapshots, from which a replay can begin, s.
-        #[arg(long, value_name = "SECONDS", default_value_t = 0.0, hide_default_value = true)]
-        checkpoint_interval: f64,
-    },
-    /// Ends a recording.
-    Stop {
-        /// Name of the recording.
-        name: String,
-    },
-    /// Lists recordings.
-    List,
-    /// Fetches the file of a recording.
-    Get {
-        /// Name of the recording.
-        name: String,
-        /// File; NAME.mcap if not given.
-        file: Option<PathBuf>,
-    },
-    /// Deletes a recording.
-    Delete {
-        /// Name of the recording.
-        name: String,
-    },
+/// Takes the steps of a recording again and compares them, bit for bit.
+///
+/// The server that it starts for this has no other plants; with an address, the one there is used. The
+/// exit code is 1 when a step differs, and when no step could be compared.
+#[derive(Debug, Args)]
+pub(crate) struct Replay {
+    /// Recording.
+    file: PathBuf,
 }
 
-/// Runs `record`.
-pub(crate) async fn record(client: &Client, output: Output, command: RecordCommand) -> Result<()> {
-    let print = |recording: &v1::Recording| {
-        let one = std::slice::from_ref(recording);
-        output.print(|| json::message("Recording", recording), || text::recordings(one))
-    };
-    match command {
-        RecordCommand::Start { id, name, checkpoint_interval } => {
-            let request = v1::StartRecordingRequest {
-                id,
-                name: name.unwrap_or_default(),
-                checkpoint_interval_s: checkpoint_interval,
-            };
-            print(&client.start_recording(request).await?)?;
-        }
-        RecordCommand::Stop { name } => print(&client.stop_recording(name).await?)?,
-        RecordCommand::List => {
-            let all = client.list_recordings().await?;
-            output.print(|| json::messages("Recording", &all), || text::recordings(&all))?;
-        }
-        RecordCommand::Get { name, file } => {
-            let path = file.unwrap_or_else(|| PathBuf::from(&name).with_extension("mcap"));
-            let mut pieces = client.get_recording(&name).await?;
-            let cannot_write = || format!("cannot write {}", path.display());
-            let mut file = BufWriter::new(File::create(&path).with_context(cannot_write)?);
-            let mut bytes = 0;
-            while let Some(piece) = pieces.next().await? {
-                file.write_all(&piece.data).with_context(cannot_write)?;
-                bytes += piece.data.len();
+impl Replay {
+    pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
+        let mut recording = RecordingReader::open(self.file)?;
+        let (server, address) = match &context.address {
+            Some(address) => (None, address.clone()),
+            None => {
+                let server = OwnServer::start(None).await?;
+                let address = server.address().to_owned();
+                (Some(server), address)
             }
-            file.flush().with_context(cannot_write)?;
-            output.done(json!({ "recording": name, "file": path, "bytes": bytes }))?;
+        };
+        let client = Client::connect(&address).await?;
+        let outcome = replay_on(&client, &mut recording).await;
+        if let Some(server) = server {
+            server.stop().await;
         }
-        RecordCommand::Delete { name } => {
-            client.delete_recording(&name).await?;
-            output.done(json!({ "deleted": { "recording": name } }))?;
-        }
+        let outcome = outcome?;
+        context.output.print(|| outcome.to_json(), || outcome.to_text())?;
+        let is_good = outcome.difference.is_none() && outcome.steps > 0;
+        Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::from(FAILED) })
     }
-    Ok(())
-}
-
-/// Runs `replay`: on the server at the address, or on one of its own.
-pub(crate) async fn replay(
-    address: Option<String>,
-    output: Output,
-    file: &Path,
-) -> Result<ExitCode> {
-    let mut recording = RecordingReader::open(file)?;
-    let (server, address) = match address {
-        Some(address) => (None, address),
-        None => {
-            let server = OwnServer::start(None).await?;
-            let address = server.address().to_owned();
-            (Some(server), address)
-        }
-    };
-    let client = Client::connect(&address).await?;
-    let outcome = replay_on(&client, &mut recording).await;
-    if let Some(server) = server {
-        server.stop().await;
-    }
-    let outcome = outcome?;
-    output.print(|| outcome.to_json(), || outcome.to_text())?;
-    let is_good = outcome.difference.is_none() && outcome.steps > 0;
-    Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::from(FAILED) })
 }
 
 async fn replay_on(client: &Client, recording: &mut RecordingReader) -> Result<Outcome> {
@@ -275,12 +205,12 @@ impl<'a> Twin<'a> {
             client.delete_model(id).await?;
             return Err(error).with_context(of);
         }
-        let names = state_names(model);
+        let names = names::recorded(model);
         let batch_max = (REPLY_NUMBERS / names.len().max(1)).clamp(1, STEPS_PER_CALL);
         Ok(Self {
             client,
             id: id.to_owned(),
-            width: input_names(model).len(),
+            width: names::input(model).len(),
             names,
             batch_max,
             parameters: plant.parameters.iter().map(|p| (p.path.clone(), p.value)).collect(),
@@ -363,10 +293,7 @@ impl<'a> Twin<'a> {
     async fn take(&mut self, steps: &[v1::StepRecord]) -> Result<Result<(), String>> {
         let rows: Vec<_> = steps.iter().map(|step| step.u.clone()).collect();
         let width = self.width;
-        anyhow::ensure!(
-            rows.iter().all(|row| row.len() == width),
-            "an input without {width} entries"
-        );
+        ensure!(rows.iter().all(|row| row.len() == width), "an input without {width} entries");
         let (u, hold) = match width {
             // A matrix without columns has no rows that could be counted.
             0 => (None, rows.len() as u32),
@@ -402,7 +329,7 @@ impl<'a> Twin<'a> {
         number("step", recorded.step as f64, replayed.step as f64)
             .or_else(|| number("time_s", recorded.time_s, replayed.time_s))
             .or_else(|| {
-                let (a, b) = (numbers(recorded), numbers(replayed));
+                let (a, b) = (names::recorded_numbers(recorded), names::recorded_numbers(replayed));
                 let length = number("the number of entries", a.len() as f64, b.len() as f64);
                 let entry = |(i, (a, b)): (usize, (&f64, &f64))| {
                     number(self.names.get(i).map_or("?", String::as_str), *a, *b)
@@ -463,89 +390,4 @@ fn impulses(steps: &[v1::StepRecord]) -> Result<Option<v1::Matrix>> {
     };
     let rows = steps.iter().map(row).collect::<Result<Vec<_>>>()?;
     Ok(Some(v1::Matrix::from_rows(&rows)))
-}
-
-/// All numbers of a state.
-fn numbers(state: &v1::State) -> Vec<f64> {
-    [&state.q[..], &state.p, &state.v, &state.multipliers].concat()
-}
-
-/// Names of these numbers.
-fn state_names(model: &v1::Model) -> Vec<String> {
-    let all = model.coordinates.iter().map(|c| c.name.clone());
-    let (dynamic, prescribed): (Vec<_>, Vec<_>) =
-        model.coordinates.iter().partition(|coordinate| !coordinate.prescribed);
-    all.chain(dynamic.iter().map(|c| format!("p({})", c.name)))
-        .chain(prescribed.iter().map(|c| format!("v({})", c.name)))
-        .chain(model.constraints.iter().map(|name| format!("impulse({name})")))
-        .collect()
-}
-
-/// Names of the entries of u.
-fn input_names(model: &v1::Model) -> Vec<String> {
-    let prescribed = model.coordinates.iter().filter(|coordinate| coordinate.prescribed);
-    let inputs = model.inputs.iter().cloned();
-    inputs.chain(prescribed.map(|coordinate| coordinate.name.clone())).collect()
-}
-
-/// Runs `export`: one line per step, the first one with the names of its columns.
-pub(crate) fn export(output: Output, file: &Path, csv: &Path) -> Result<()> {
-    let mut recording = RecordingReader::open(file)?;
-    let record = recording.plant().clone();
-    let model = record.model.unwrap_or_default();
-    let cannot_write = || format!("cannot write {}", csv.display());
-    let sink: Box<dyn std::io::Write> = match csv.to_str() {
-        Some("-") => Box::new(std::io::stdout().lock()),
-        _ => Box::new(File::create(csv).with_context(cannot_write)?),
-    };
-    let mut sink = BufWriter::new(sink);
-    let (states, inputs) = (state_names(&model), input_names(&model));
-    let inputs = inputs.iter().map(|name| format!("u({name})"));
-    let outputs = record.outputs.iter().map(|name| format!("y({name})"));
-    let names = ["step", "time_s"].into_iter().map(str::to_owned).chain(states.clone());
-    let names = names.chain(inputs.clone()).chain(outputs.clone());
-    let head: Vec<_> = names.map(|name| quoted(&name)).collect();
-    writeln!(sink, "{}", head.join(",")).with_context(cannot_write)?;
-    let mut line = |state: &v1::State, u: &[f64], y: &[f64]| {
-        write!(sink, "{},{:?}", state.step, state.time_s)?;
-        let (u, y) = (padded(u.to_vec(), inputs.len()), padded(y.to_vec(), outputs.len()));
-        for cell in padded(numbers(state), states.len()).chain(u).chain(y) {
-            match cell {
-                // Rust prints as many digits as bring the number back.
-                Some(number) => write!(sink, ",{number:?}")?,
-                None => write!(sink, ",")?,
-            }
-        }
-        writeln!(sink)
-    };
-    let mut steps = 0;
-    if let Some(state) = record.plant.and_then(|plant| plant.state) {
-        line(&state, &[], &[]).with_context(cannot_write)?;
-    }
-    while let Some(entry) = recording.next_entry()? {
-        let RecordingEntry::Step(step) = entry else { continue };
-        let y = step.outputs.as_ref().map_or(&[][..], |outputs| &outputs.y);
-        line(&step.state.clone().unwrap_or_default(), &step.u, y).with_context(cannot_write)?;
-        steps += 1;
-    }
-    sink.flush().with_context(cannot_write)?;
-    drop(sink);
-    if csv.to_str() != Some("-") {
-        output.done(json!({ "file": csv, "steps": steps, "cut_short": recording.is_cut() }))?;
-    }
-    Ok(())
-}
-
-/// The numbers, and nothing where there are too few.
-fn padded(numbers: Vec<f64>, count: usize) -> impl Iterator<Item = Option<f64>> {
-    numbers.into_iter().map(Some).chain(std::iter::repeat(None)).take(count)
-}
-
-/// A cell of a table.
-fn quoted(text: &str) -> String {
-    if text.contains([',', '"', '\n', '\r']) {
-        format!("\"{}\"", text.replace('"', "\"\""))
-    } else {
-        text.to_owned()
-    }
 }

@@ -3,24 +3,24 @@
 use std::sync::LazyLock;
 
 use anyhow::Result;
-use plantd_client::Error;
-use prost_reflect::{DescriptorPool, DynamicMessage, SerializeOptions};
-use serde_json::{Value, json};
-
-use crate::optimize::SearchStopped;
+use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor, SerializeOptions};
+use serde_json::Value;
 
 static CONTRACT: LazyLock<DescriptorPool> = LazyLock::new(|| {
     DescriptorPool::decode(plantd_proto::FILE_DESCRIPTOR_SET).expect("the contract is well-formed")
 });
 
+fn descriptor(name: &str) -> MessageDescriptor {
+    CONTRACT
+        .get_message_by_name(&format!("plantd.v1.{name}"))
+        .expect("the name of a message of the contract")
+}
+
 /// A message as JSON; `name` is its name in the package, for example `PlantInfo`. Fields that have
 /// no value are there with their default, so that a script need not guess them.
 pub(crate) fn message(name: &str, message: &impl prost::Message) -> Value {
-    let descriptor = CONTRACT
-        .get_message_by_name(&format!("plantd.v1.{name}"))
-        .expect("the name of a message of the contract");
     let bytes = message.encode_to_vec();
-    let dynamic = DynamicMessage::decode(descriptor, bytes.as_slice())
+    let dynamic = DynamicMessage::decode(descriptor(name), bytes.as_slice())
         .expect("the bytes were encoded from the same contract");
     let options = SerializeOptions::new()
         .use_proto_field_name(true)
@@ -33,11 +33,8 @@ pub(crate) fn message(name: &str, message: &impl prost::Message) -> Value {
 
 /// Reads a message back from JSON.
 pub(crate) fn read<M: prost::Message + Default>(name: &str, text: &str) -> Result<M> {
-    let descriptor = CONTRACT
-        .get_message_by_name(&format!("plantd.v1.{name}"))
-        .expect("the name of a message of the contract");
     let mut deserializer = serde_json::Deserializer::from_str(text);
-    let dynamic = DynamicMessage::deserialize(descriptor, &mut deserializer)?;
+    let dynamic = DynamicMessage::deserialize(descriptor(name), &mut deserializer)?;
     deserializer.end()?;
     Ok(dynamic.transcode_to()?)
 }
@@ -47,29 +44,10 @@ pub(crate) fn messages<M: prost::Message>(name: &str, all: &[M]) -> Value {
     all.iter().map(|one| message(name, one)).collect()
 }
 
-/// An error as JSON.
-pub(crate) fn error(error: &anyhow::Error) -> Value {
-    let stopped = error.downcast_ref::<SearchStopped>().map(|stopped| &stopped.refusal);
-    let refusal = error.downcast_ref::<Error>().and_then(Error::refusal).or(stopped);
-    let Some(refusal) = refusal else {
-        return json!({ "error": { "message": format!("{error:#}") } });
-    };
-    let violations: Vec<Value> = refusal
-        .violations
-        .iter()
-        .map(|v| json!({ "field": v.field, "description": v.description }))
-        .collect();
-    json!({ "error": {
-        "code": refusal.code_name(),
-        "reason": refusal.reason,
-        "message": refusal.message,
-        "violations": violations,
-    } })
-}
-
 #[cfg(test)]
 mod tests {
     use plantd_client::v1;
+    use serde_json::json;
 
     use super::*;
 
