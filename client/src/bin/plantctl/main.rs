@@ -4,8 +4,10 @@ mod commands;
 mod contract;
 mod input;
 mod output;
+mod report;
+mod scenario;
 mod server;
-mod test;
+mod trial;
 
 use std::process::ExitCode;
 
@@ -15,7 +17,7 @@ use clap::{Parser, Subcommand};
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard,
     inventory, kalman, linearize, lqr, optimize, parameters, record, reference, replay, run, scene,
-    settle, state, step, timing, watch,
+    settle, state, step, test, timing, watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
@@ -106,7 +108,7 @@ enum Command {
     Reset(state::Reset),
     Snapshot(state::Snapshot),
     Restore(state::Restore),
-    Test(crate::test::Options),
+    Test(test::Test),
     Delete(inventory::Delete),
 }
 
@@ -166,9 +168,7 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Reset(command) => command.run(context).await?,
         Command::Snapshot(command) => command.run(context).await?,
         Command::Restore(command) => command.run(context).await?,
-        Command::Test(options) => {
-            return test::run(context.address.clone(), context.output, options).await;
-        }
+        Command::Test(command) => return command.run(context).await,
         Command::Delete(command) => command.run(context).await?,
     }
     Ok(ExitCode::SUCCESS)

@@ -8,7 +8,7 @@ use clap::{Args, Subcommand};
 use plantd_client::v1;
 use serde_json::json;
 
-use crate::input::files::{read_message, read_text};
+use crate::input::files::{parse_message, read_text};
 use crate::output::text::number;
 use crate::server::context::Context;
 
@@ -74,7 +74,7 @@ impl Channels {
         let output = context.output;
         match self.command {
             ChannelsCommand::Set { id, file } => {
-                let channels: v1::Channels = read_message("Channels", &read_text(&file)?)?;
+                let channels: v1::Channels = parse_message("Channels", &read_text(&file)?)?;
                 let answer = client.set_channels(id, channels).await?;
                 let outputs = v1::Outputs { y: answer.y.clone(), lost: Vec::new() };
                 let as_text = || declared(answer.info.as_ref(), &outputs);

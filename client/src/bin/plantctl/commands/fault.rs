@@ -8,7 +8,7 @@ use plantd_client::v1;
 use serde_json::json;
 
 use crate::contract::json;
-use crate::input::files::read_message;
+use crate::input::files::parse_message;
 use crate::server::context::Context;
 
 const FAULTS: &str = "\
@@ -66,7 +66,7 @@ impl Fault {
         match self.command {
             FaultCommand::Inject { id, fault } => {
                 let fault =
-                    client.inject_fault(id, read_message("FaultSpec", &fault.join("\n"))?).await?;
+                    client.inject_fault(id, parse_message("FaultSpec", &fault.join("\n"))?).await?;
                 let as_text = || faults(std::slice::from_ref(&fault));
                 Ok(output.message("FaultInfo", &fault, as_text)?)
             }
@@ -154,7 +154,7 @@ mod tests {
 
     fn fault(fields: &[&str]) -> Result<v1::FaultSpec> {
         let lines: Vec<String> = fields.iter().map(|field| assignment(field).unwrap()).collect();
-        read_message("FaultSpec", &lines.join("\n"))
+        parse_message("FaultSpec", &lines.join("\n"))
     }
 
     #[test]

@@ -25,5 +25,6 @@ pub(crate) mod scene;
 pub(crate) mod settle;
 pub(crate) mod state;
 pub(crate) mod step;
+pub(crate) mod test;
 pub(crate) mod timing;
 pub(crate) mod watch;

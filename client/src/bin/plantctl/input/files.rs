@@ -24,7 +24,7 @@ pub(crate) fn write(path: &Path, contents: impl AsRef<[u8]>) -> Result<()> {
 }
 
 /// Reads a message from TOML or JSON in the field names of the contract.
-pub(crate) fn read_message<M: prost::Message + Default>(name: &str, text: &str) -> Result<M> {
+pub(crate) fn parse_message<M: prost::Message + Default>(name: &str, text: &str) -> Result<M> {
     if text.trim_start().starts_with('{') {
         return json::read(name, text);
     }
@@ -49,11 +49,11 @@ pub(crate) fn read_result(file: &Path) -> Result<v1::OptimizationResult> {
 
 /// Comma-separated numbers, a row per line; a first line that is none is a head.
 pub(crate) fn read_table(file: &Path) -> Result<v1::Matrix> {
-    table(&read_text(file)?).with_context(|| file.display().to_string())
+    parse_table(&read_text(file)?).with_context(|| file.display().to_string())
 }
 
 /// The table of a text; see [`read_table`].
-pub(crate) fn table(text: &str) -> Result<v1::Matrix> {
+pub(crate) fn parse_table(text: &str) -> Result<v1::Matrix> {
     let mut rows: Vec<Vec<f64>> = Vec::new();
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     for (index, (number, line)) in lines.enumerate() {
@@ -80,18 +80,18 @@ mod tests {
     fn channels_are_read_from_toml_and_json() {
         let toml = "seed = 7\n[[outputs]]\nname = \"angle\"\ncoordinate = \"theta\"\nnoise = 0.1\n\
                     [[inputs]]\ninput = \"tau\"\ndelay_s = 0.02\nhold = \"HOLD_FIRST_ORDER\"";
-        let channels: v1::Channels = read_message("Channels", toml).unwrap();
+        let channels: v1::Channels = parse_message("Channels", toml).unwrap();
         assert_eq!((channels.seed, channels.outputs[0].noise), (7, 0.1));
         assert_eq!(channels.inputs[0].hold(), v1::Hold::FirstOrder);
         let text = json::message("Channels", &channels).to_string();
-        assert_eq!(read_message::<v1::Channels>("Channels", &text).unwrap(), channels);
+        assert_eq!(parse_message::<v1::Channels>("Channels", &text).unwrap(), channels);
     }
 
     #[test]
     fn a_table_may_have_a_head() {
-        let with_head = table("theta, phi\n1,2\n\n3,-4e0\n").unwrap();
+        let with_head = parse_table("theta, phi\n1,2\n\n3,-4e0\n").unwrap();
         assert_eq!((with_head.rows, with_head.data), (2, vec![1.0, 2.0, 3.0, -4.0]));
-        assert!(table("1,2\n3\n").unwrap_err().to_string().contains("line 2"));
-        assert!(table("1,2\na,b\n").unwrap_err().to_string().contains("line 2"));
+        assert!(parse_table("1,2\n3\n").unwrap_err().to_string().contains("line 2"));
+        assert!(parse_table("1,2\na,b\n").unwrap_err().to_string().contains("line 2"));
     }
 }

@@ -84,6 +84,19 @@ pub(crate) fn number(x: f64) -> String {
     }
 }
 
+/// A number for people: four significant digits where more would only be noise.
+pub(crate) fn short(x: f64) -> String {
+    if !x.is_finite() {
+        return x.to_string();
+    }
+    let magnitude = x.abs();
+    if magnitude != 0.0 && !(1e-3..1e6).contains(&magnitude) {
+        return format!("{x:.3e}");
+    }
+    let text = format!("{x:.4}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
 /// Numbers, comma-separated.
 pub(crate) fn numbers(values: &[f64]) -> String {
     values.iter().map(|&x| number(x)).collect::<Vec<_>>().join(", ")

@@ -11,7 +11,7 @@ use anyhow::{Context as _, Result};
 use rustix::process::{Pid, Signal, kill_process_group};
 use tokio::process::Child;
 
-use super::scenario::Command;
+use crate::scenario::file::Command;
 
 /// Output that is kept, bytes; of more, the end.
 const OUTPUT_MAX_BYTES: usize = 64 << 10;
@@ -21,7 +21,7 @@ const GRACE: Duration = Duration::from_secs(2);
 const OUTPUT_WAIT: Duration = Duration::from_millis(100);
 
 /// A running controller; dropping it kills it.
-pub(crate) struct Controller {
+pub(crate) struct Process {
     child: Child,
     group: Option<Pid>,
     output: Arc<Mutex<Output>>,
@@ -58,7 +58,7 @@ impl Assignment<'_> {
     }
 }
 
-impl Controller {
+impl Process {
     /// Starts a controller in `folder`.
     pub(crate) fn start(command: &Command, folder: &Path, told: &Assignment<'_>) -> Result<Self> {
         let values = told.values();
@@ -137,7 +137,7 @@ impl Controller {
     }
 }
 
-impl Drop for Controller {
+impl Drop for Process {
     fn drop(&mut self) {
         self.signal(Signal::KILL);
     }
@@ -177,7 +177,7 @@ mod tests {
         assert!(text.len() <= OUTPUT_MAX_BYTES + 6);
     }
 
-    fn shell(script: &str) -> Controller {
+    fn shell(script: &str) -> Process {
         let command = Command {
             run: ["/bin/sh", "-c", script].map(str::to_owned).to_vec(),
             link: false,
@@ -191,7 +191,7 @@ mod tests {
             steps: 3,
             duration_s: 0.5,
         };
-        Controller::start(&command, Path::new("/"), &told).unwrap()
+        Process::start(&command, Path::new("/"), &told).unwrap()
     }
 
     #[tokio::test]

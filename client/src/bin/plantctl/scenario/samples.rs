@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 
 use plantd_client::v1;
 
+use crate::contract::names;
+
 /// Columns of equal length: `q(theta)`, `p(theta)`, `v(lift)`, `u(tau)`, `force(pin.x)`, `kinetic`,
 /// `potential`, `y(tip.x)`; with a reference also `ref.q(theta)` and `error.q(theta)`, and so on.
 ///
@@ -112,24 +114,18 @@ impl Columns {
         has_reference: bool,
         has_energy: bool,
     ) -> Self {
-        let named = |quantity: &str, names: &mut dyn Iterator<Item = &String>| {
-            names.map(|name| format!("{quantity}({name})")).collect::<Vec<_>>()
-        };
-        let all = || model.coordinates.iter();
-        let prescribed = || all().filter(|c| c.prescribed).map(|c| &c.name);
-        let rotations = all().enumerate().filter_map(|(i, coordinate)| {
-            let group = &coordinate.rotation_group;
-            let is_first = i == 0 || model.coordinates[i - 1].rotation_group != *group;
-            (!group.is_empty() && is_first).then_some(i as u32)
-        });
+        fn named<'a>(quantity: &str, names: impl IntoIterator<Item = &'a String>) -> Vec<String> {
+            names.into_iter().map(|name| format!("{quantity}({name})")).collect()
+        }
+        let prescribed = || names::prescribed(model);
         Self {
-            q: named("q", &mut all().map(|c| &c.name)),
-            p: named("p", &mut all().filter(|c| !c.prescribed).map(|c| &c.name)),
-            v: named("v", &mut prescribed()),
-            u: named("u", &mut model.inputs.iter().chain(prescribed())),
-            force: named("force", &mut model.constraints.iter()),
-            y: named("y", &mut outputs.iter()),
-            rotations: rotations.collect(),
+            q: named("q", model.coordinates.iter().map(|c| &c.name)),
+            p: named("p", names::dynamic(model)),
+            v: named("v", prescribed()),
+            u: named("u", model.inputs.iter().chain(prescribed())),
+            force: named("force", &model.constraints),
+            y: named("y", outputs),
+            rotations: plantd_client::rotations(model),
             has_reference,
             has_energy,
         }

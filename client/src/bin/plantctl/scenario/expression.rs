@@ -6,7 +6,7 @@ use std::fmt;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::samples::Samples;
+use crate::scenario::samples::Samples;
 
 /// Longest text of an expression, bytes; bounds how deep one can be.
 const TEXT_MAX_BYTES: usize = 500;

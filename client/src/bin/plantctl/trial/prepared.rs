@@ -4,16 +4,16 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use plantd_client::{
-    Client, MatrixExt as _, StateExt as _, WeightsExt as _, diagonal, operating_point, v1,
-};
+use plantd_client::{Client, MatrixExt as _, StateExt as _, WeightsExt as _, operating_point, v1};
 
-use super::expression::Expression;
-use super::run::Place;
-use super::samples::Columns;
-use super::scenario::{Case, Controller, Event, Inputs, Lqr, Plant, Reference, Scenario};
-use crate::contract::json;
-use crate::input::files;
+use crate::contract::{json, names};
+use crate::input::files::{parse_table, read_result};
+use crate::input::settings::Settings;
+use crate::input::weights::diagonals;
+use crate::scenario::expression::Expression;
+use crate::scenario::file::{Case, Controller, Event, Inputs, Lqr, Plant, Reference, Scenario};
+use crate::scenario::samples::Columns;
+use crate::trial::server::TestServer;
 
 /// Part of a time step by which a time may miss a step and still mean it.
 const STEP_ROUNDING: f64 = 1e-6;
@@ -23,28 +23,28 @@ pub(crate) struct Prepared {
     pub(crate) file: PathBuf,
     pub(crate) name: String,
     pub(crate) scenario: Scenario,
-    pub(super) model: v1::Model,
-    pub(super) columns: Columns,
-    pub(super) reference: Option<Motion>,
-    pub(super) channels: Option<v1::Channels>,
-    pub(super) faults: Vec<Vec<v1::FaultSpec>>,
+    pub(crate) model: v1::Model,
+    pub(crate) columns: Columns,
+    pub(crate) reference: Option<ReferenceMotion>,
+    pub(crate) channels: Option<v1::Channels>,
+    pub(crate) faults: Vec<Vec<v1::FaultSpec>>,
     /// Rows of inputs, as far as they are given; the last one holds on.
-    pub(super) inputs: Vec<Vec<Option<f64>>>,
-    pub(super) policy: Option<v1::InputPolicy>,
-    pub(super) uses_energy: bool,
-    pub(super) steps: u64,
+    pub(crate) inputs: Vec<Vec<Option<f64>>>,
+    pub(crate) policy: Option<v1::InputPolicy>,
+    pub(crate) uses_energy: bool,
+    pub(crate) steps: u64,
 }
 
 /// A reference: one state and input, or those of every step.
-pub(super) struct Motion {
+pub(crate) struct ReferenceMotion {
     x: Vec<Vec<f64>>,
     u: Vec<Vec<f64>>,
     trajectory: Option<v1::Trajectory>,
 }
 
-impl Motion {
+impl ReferenceMotion {
     /// State at a step, and the input of the step that leads there.
-    pub(super) fn at(&self, step: u64) -> (&[f64], &[f64]) {
+    pub(crate) fn at(&self, step: u64) -> (&[f64], &[f64]) {
         let row = |rows: &'_ [Vec<f64>], k: u64| {
             let k = usize::try_from(k).unwrap_or(usize::MAX);
             rows.len().checked_sub(1).map(|last| k.min(last))
@@ -57,16 +57,20 @@ impl Motion {
 
 impl Prepared {
     /// Makes the model known to the server and reads what the scenario refers to.
-    pub(crate) async fn new(place: &Place, file: PathBuf, scenario: Scenario) -> Result<Self> {
+    pub(crate) async fn new(
+        server: &TestServer,
+        file: PathBuf,
+        scenario: Scenario,
+    ) -> Result<Self> {
         let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let name = scenario.name.clone().unwrap_or(stem);
         let folder = file.parent().unwrap_or(Path::new(""));
-        let model = model(&place.client, &scenario.plant, folder).await?;
+        let model = model(&server.client, &scenario.plant, folder).await?;
         let time_step_s = scenario.plant.time_step_s.unwrap_or(model.time_step_s);
         let steps = scenario.steps(time_step_s)?;
         let reference = match &scenario.reference {
             None => None,
-            Some(reference) => Some(motion(place, &scenario, &model, reference, folder).await?),
+            Some(reference) => Some(motion(server, &scenario, &model, reference, folder).await?),
         };
         let all = || scenario.expect.iter().flat_map(|e| e.expressions()).chain(&scenario.plot);
         let uses_energy = all().any(Expression::uses_energy);
@@ -74,7 +78,7 @@ impl Prepared {
             true => None,
             false => Some(message("Channels", &scenario.channels).context("channels")?),
         };
-        let outputs = channels.as_ref().map(outputs).unwrap_or_default();
+        let outputs = channels.as_ref().map(output_names).unwrap_or_default();
         let columns = Columns::new(&model, &outputs, reference.is_some(), uses_energy);
         let nothing = columns.empty();
         for (i, expectation) in scenario.expect.iter().enumerate() {
@@ -88,18 +92,18 @@ impl Prepared {
             known.with_context(|| format!("plot[{i}]"))?;
         }
         let faults = scenario.events.iter().enumerate().map(|(i, event)| {
-            faults(event, &model, time_step_s).with_context(|| format!("events[{i}]"))
+            fault_specs(event, &model, time_step_s).with_context(|| format!("events[{i}]"))
         });
         let mut faults: Vec<_> = faults.collect::<Result<_>>()?;
         let mut inputs = Vec::new();
         match &scenario.controller {
             Controller::Inputs(given) if scenario.is_stepped() => {
-                inputs = rows(given, &model, folder)?;
+                inputs = input_rows(given, &model, folder)?;
             }
             Controller::Inputs(Inputs { constant, .. }) => {
                 // Nobody drives a plant that runs by itself: the forces act from the beginning.
                 let event = Event { inputs: constant.clone(), ..Event::default() };
-                let forces = self::faults(&event, &model, time_step_s);
+                let forces = fault_specs(&event, &model, time_step_s);
                 faults.push(forces.context("controller.inputs.constant")?);
             }
             _ => {}
@@ -124,7 +128,7 @@ impl Prepared {
         })
     }
 
-    pub(super) fn folder(&self) -> &Path {
+    pub(crate) fn folder(&self) -> &Path {
         // The current folder has no name.
         self.file.parent().filter(|path| *path != Path::new("")).unwrap_or(Path::new("."))
     }
@@ -153,22 +157,22 @@ async fn model(client: &Client, plant: &Plant, folder: &Path) -> Result<v1::Mode
     }
 }
 
-pub(super) fn settings(plant: &Plant) -> v1::PlantSettings {
-    let split = if plant.paper { v1::ForceSplit::Paper } else { v1::ForceSplit::Unspecified };
-    let precision = if plant.fast { v1::Precision::Fast } else { v1::Precision::Unspecified };
-    v1::PlantSettings {
-        time_step_s: plant.time_step_s.unwrap_or(0.0),
-        force_split: split.into(),
-        order: plant.order.unwrap_or(0),
-        substeps: plant.substeps.unwrap_or(0),
+/// How the plant is stepped.
+pub(crate) fn settings(plant: &Plant) -> v1::PlantSettings {
+    let settings = Settings {
+        dt: plant.time_step_s,
+        paper: plant.paper,
+        order: plant.order,
+        substeps: plant.substeps,
         halvings: plant.halvings,
-        precision: precision.into(),
-        ..Default::default()
-    }
+        fast: plant.fast,
+        ..Settings::default()
+    };
+    settings.into()
 }
 
 /// Step with which an event begins.
-pub(super) fn begins(event: &Event, time_step_s: f64) -> u64 {
+pub(crate) fn first_step(event: &Event, time_step_s: f64) -> u64 {
     (event.at_s / time_step_s - STEP_ROUNDING).ceil().max(0.0) as u64
 }
 
@@ -178,7 +182,7 @@ fn message<M: prost::Message + Default>(name: &str, fields: &toml::Table) -> Res
 }
 
 /// Names of the numbers that output channels deliver.
-fn outputs(channels: &v1::Channels) -> Vec<String> {
+fn output_names(channels: &v1::Channels) -> Vec<String> {
     use v1::output_channel::Source;
     let names = |output: &v1::OutputChannel| {
         let suffixes: &[&str] = match output.source {
@@ -192,7 +196,7 @@ fn outputs(channels: &v1::Channels) -> Vec<String> {
 }
 
 /// What an event lets go wrong.
-fn faults(event: &Event, model: &v1::Model, time_step_s: f64) -> Result<Vec<v1::FaultSpec>> {
+fn fault_specs(event: &Event, model: &v1::Model, time_step_s: f64) -> Result<Vec<v1::FaultSpec>> {
     use v1::fault_spec::{Kind, Start, Target};
     let mut faults = Vec::new();
     for (name, value) in &event.inputs {
@@ -207,7 +211,7 @@ fn faults(event: &Event, model: &v1::Model, time_step_s: f64) -> Result<Vec<v1::
         faults.push(message("FaultSpec", &event.fault).context("fault")?);
     }
     for fault in &mut faults {
-        fault.start = Some(Start::StartStep(begins(event, time_step_s)));
+        fault.start = Some(Start::StartStep(first_step(event, time_step_s)));
         fault.duration_s = event.for_s.unwrap_or(0.0);
     }
     Ok(faults)
@@ -215,12 +219,12 @@ fn faults(event: &Event, model: &v1::Model, time_step_s: f64) -> Result<Vec<v1::
 
 /// The reference, state by state.
 async fn motion(
-    place: &Place,
+    server: &TestServer,
     scenario: &Scenario,
     model: &v1::Model,
     reference: &Reference,
     folder: &Path,
-) -> Result<Motion> {
+) -> Result<ReferenceMotion> {
     match reference {
         Reference::At(point) => {
             let request = v1::LinearizeRequest {
@@ -228,12 +232,12 @@ async fn motion(
                 settings: Some(settings(&scenario.plant)),
                 point: Some(operating_point(point)),
             };
-            let answer = place.client.linearize(request).await.context("reference.at")?;
+            let answer = server.client.linearize(request).await.context("reference.at")?;
             let x = answer.state.context("a linearization without a state")?.x();
-            Ok(Motion { x: vec![x], u: vec![answer.u], trajectory: None })
+            Ok(ReferenceMotion { x: vec![x], u: vec![answer.u], trajectory: None })
         }
         Reference::Trajectory(file) => {
-            let result = files::read_result(&folder.join(file)).context("reference.trajectory")?;
+            let result = read_result(&folder.join(file)).context("reference.trajectory")?;
             let trajectory = result.checkpoint.and_then(|checkpoint| checkpoint.trajectory);
             let trajectory =
                 trajectory.context("reference.trajectory: no trajectory in the file")?;
@@ -247,31 +251,22 @@ async fn motion(
                 "reference.trajectory: states of {} entries; the model has {entries}",
                 x.cols
             );
-            Ok(Motion { x: rows(&x), u, trajectory: Some(trajectory) })
+            Ok(ReferenceMotion { x: rows(&x), u, trajectory: Some(trajectory) })
         }
     }
 }
 
 /// The regulator about the reference.
-pub(super) async fn feedback(
+pub(crate) async fn feedback(
     client: &Client,
     scenario: &Scenario,
     model: &v1::Model,
-    reference: &Motion,
+    reference: &ReferenceMotion,
     lqr: &Lqr,
     id: &str,
 ) -> Result<v1::SetFeedbackRequest> {
     use v1::set_feedback_request::Reference as Form;
-    let states = 2 * model.coordinates.len();
-    let prescribed = model.coordinates.iter().filter(|c| c.prescribed).count();
-    let weight = |values: &[f64], count: usize| match values {
-        [value] => diagonal(vec![*value; count]),
-        values => diagonal(values),
-    };
-    let mut weights = plantd_client::weights(
-        weight(&lqr.q, states),
-        weight(&lqr.r, model.inputs.len() + prescribed),
-    );
+    let mut weights = diagonals(&lqr.q, &lqr.r, model);
     if lqr.projected_momentum {
         weights = weights.on_projected_momentum();
     }
@@ -301,7 +296,7 @@ pub(super) async fn feedback(
 }
 
 /// The initial state with the case's entries.
-pub(super) fn changed(
+pub(crate) fn initial_state(
     state: &v1::State,
     model: &v1::Model,
     case: &Case,
@@ -335,9 +330,8 @@ pub(super) fn changed(
 }
 
 /// Inputs step by step, as far as they are given.
-fn rows(inputs: &Inputs, model: &v1::Model, folder: &Path) -> Result<Vec<Vec<Option<f64>>>> {
-    let prescribed = model.coordinates.iter().filter(|c| c.prescribed).map(|c| &c.name);
-    let names: Vec<_> = model.inputs.iter().chain(prescribed).collect();
+fn input_rows(inputs: &Inputs, model: &v1::Model, folder: &Path) -> Result<Vec<Vec<Option<f64>>>> {
+    let names = names::input(model);
     let index = |key: &str, name: &str| {
         let index = names.iter().position(|n| *n == name);
         index.with_context(|| format!("controller.inputs.{key}: {}", no_input(name, model)))
@@ -353,7 +347,7 @@ fn rows(inputs: &Inputs, model: &v1::Model, folder: &Path) -> Result<Vec<Vec<Opt
     let head = text.lines().next().unwrap_or_default();
     let columns: Vec<_> =
         head.split(',').map(|name| index("table", name.trim())).collect::<Result<_>>()?;
-    let matrix = files::table(&text).with_context(key)?;
+    let matrix = parse_table(&text).with_context(key)?;
     ensure!(matrix.rows > 0, "{}: a row is needed", key());
     ensure!(matrix.cols as usize == columns.len(), "{}: the head has other columns", key());
     let row = |values: &[f64]| {

@@ -1,19 +1,19 @@
 //! Runs one case: makes the plant, lets it be driven, and collects what is seen of it.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
-use std::sync::Mutex;
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use plantd_client::{Answers, Client, Error, v1};
+use plantd_client::{Answers, Error, v1};
 use tokio::time::{Instant, sleep_until, timeout_at};
 
-use super::controller::{Assignment, Controller as Process};
-use super::expect::{Curve, Facts, Verdict};
-use super::prepare::{Prepared, begins, changed, feedback, settings};
-use super::samples::{Sample, Samples};
-use super::scenario::{Case, Controller, Event, Pace};
+use crate::scenario::file::{Case, Controller, Event, Pace};
+use crate::scenario::samples::{Sample, Samples};
+use crate::scenario::verdict::{Curve, Facts, judge};
+use crate::trial::outcome::Outcome;
+use crate::trial::prepared::{Prepared, feedback, first_step, initial_state, settings};
+use crate::trial::process::{Assignment, Process};
+use crate::trial::server::TestServer;
 
 /// Samples that may wait to be read.
 const WATCH_QUEUE: u32 = 2048;
@@ -26,56 +26,9 @@ const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// How often it is looked whether a driver has come.
 const DRIVER_PERIOD: Duration = Duration::from_millis(2);
 
-/// Where cases run.
-pub(crate) struct Place {
-    pub(crate) client: Client,
-    pub(crate) address: String,
-    pub(crate) link_root: Option<PathBuf>,
-    /// Plants that are to be deleted.
-    pub(crate) plants: Mutex<BTreeSet<String>>,
-}
-
-/// What came of a case.
-pub(crate) struct Outcome {
-    pub(crate) case: String,
-    pub(crate) seed: u64,
-    pub(crate) verdicts: Vec<Verdict>,
-    /// Why the run ended before its time.
-    pub(crate) ended: Option<String>,
-    /// Why the case could not be run or judged.
-    pub(crate) error: Option<String>,
-    pub(crate) time_s: Vec<f64>,
-    pub(crate) plots: Vec<Curve>,
-    /// What the controller has written.
-    pub(crate) output: String,
-    pub(crate) elapsed: Duration,
-    pub(crate) steps: u64,
-}
-
-/// The result of a case, in order of gravity.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Status {
-    Passed,
-    Failed,
-    /// It could not be run or judged.
-    Error,
-}
-
-impl Outcome {
-    pub(crate) fn status(&self) -> Status {
-        let is_broken = |verdict: &Verdict| verdict.broken.is_some();
-        match self {
-            Self { error: Some(_), .. } => Status::Error,
-            Self { ended: Some(_), .. } => Status::Failed,
-            _ if self.verdicts.iter().any(is_broken) => Status::Failed,
-            _ => Status::Passed,
-        }
-    }
-}
-
 /// A run as it goes on.
 struct Run<'a> {
-    place: &'a Place,
+    server: &'a TestServer,
     prepared: &'a Prepared,
     deadline: Instant,
     time_step_s: f64,
@@ -91,64 +44,58 @@ struct Run<'a> {
     output: String,
 }
 
-impl Prepared {
-    /// Runs a case and judges it.
-    pub(crate) async fn run(&self, place: &Place, case: &Case, plant: &str) -> Outcome {
-        let start = Instant::now();
-        let deadline = start + Duration::from_secs_f64(self.scenario.timeout_s);
-        let mut run = Run {
-            place,
-            prepared: self,
-            deadline,
-            time_step_s: 0.0,
-            samples: self.columns.empty(),
-            facts: Facts::default(),
-            y: Vec::new(),
-            last_step: 0,
-            until: 0,
-            lost: 0,
-            ended: None,
-            output: String::new(),
-        };
-        lock(&place.plants).insert(plant.to_owned());
-        let done = run.drive(case, plant).await;
-        // It may never have been made, or be gone.
-        let _ = place.client.delete_plant(plant).await;
-        lock(&place.plants).remove(plant);
-        let Run { samples, facts, ended, output, last_step, .. } = run;
-        let mut outcome = Outcome {
-            case: case.name.clone(),
-            seed: self.scenario.seed,
-            verdicts: Vec::new(),
-            ended,
-            error: done.err().map(|error| format!("{error:#}")),
-            time_s: samples.time_s().to_vec(),
-            plots: Vec::new(),
-            output,
-            elapsed: start.elapsed(),
-            steps: last_step,
-        };
-        // Of what was never seen there is nothing to judge.
-        let is_unseen = outcome.error.is_some() && samples.len() == 0;
-        for expectation in self.scenario.expect.iter().filter(|_| !is_unseen) {
-            match expectation.judge(&samples, &facts) {
-                Ok(verdict) => outcome.verdicts.push(verdict),
-                Err(error) => outcome.error = outcome.error.or(Some(error)),
-            }
+/// Runs a case and judges it.
+pub(crate) async fn run_case(
+    server: &TestServer,
+    prepared: &Prepared,
+    case: &Case,
+    plant: &str,
+) -> Outcome {
+    let start = Instant::now();
+    let deadline = start + Duration::from_secs_f64(prepared.scenario.timeout_s);
+    let mut run = Run {
+        server,
+        prepared,
+        deadline,
+        time_step_s: 0.0,
+        samples: prepared.columns.empty(),
+        facts: Facts::default(),
+        y: Vec::new(),
+        last_step: 0,
+        until: 0,
+        lost: 0,
+        ended: None,
+        output: String::new(),
+    };
+    server.plants().insert(plant.to_owned());
+    let done = run.drive(case, plant).await;
+    // It may never have been made, or be gone.
+    let _ = server.client.delete_plant(plant).await;
+    server.plants().remove(plant);
+    let Run { samples, facts, ended, output, last_step, .. } = run;
+    let mut outcome = Outcome {
+        case: case.name.clone(),
+        seed: prepared.scenario.seed,
+        verdicts: Vec::new(),
+        ended,
+        error: done.err().map(|error| format!("{error:#}")),
+        time_s: samples.time_s().to_vec(),
+        plots: Vec::new(),
+        output,
+        elapsed: start.elapsed(),
+        steps: last_step,
+    };
+    // Of what was never seen there is nothing to judge.
+    let is_unseen = outcome.error.is_some() && samples.len() == 0;
+    for expectation in prepared.scenario.expect.iter().filter(|_| !is_unseen) {
+        match judge(expectation, &samples, &facts) {
+            Ok(verdict) => outcome.verdicts.push(verdict),
+            Err(error) => outcome.error = outcome.error.or(Some(error)),
         }
-        for expression in &self.scenario.plot {
-            let Ok(values) = expression.values(&samples) else { continue };
-            outcome.plots.push(Curve {
-                name: expression.to_string(),
-                low: vec![f64::NEG_INFINITY; values.len()],
-                high: vec![f64::INFINITY; values.len()],
-                values,
-                from_s: 0.0,
-                until_s: f64::INFINITY,
-            });
-        }
-        outcome
     }
+    let curves = prepared.scenario.plot.iter().map(|signal| Curve::unbounded(signal, &samples));
+    outcome.plots.extend(curves.flatten());
+    outcome
 }
 
 impl Run<'_> {
@@ -162,15 +109,15 @@ impl Run<'_> {
         let messages = self.watch(plant).await?;
         let mut events = None;
         if scenario.pace == Pace::Lockstep {
-            events = Some(self.place.client.watch_events(plant, None).await?);
+            events = Some(self.server.client.watch_events(plant, None).await?);
             self.let_run(plant, 0).await?;
         }
         let mut process = match &scenario.controller {
             Controller::Command(command) => {
                 let told = Assignment {
-                    address: &self.place.address,
+                    address: &self.server.address,
                     plant,
-                    link_root: self.place.link_root.as_deref(),
+                    link_root: self.server.link_root.as_deref(),
                     seed: case.seed,
                     steps: self.prepared.steps,
                     duration_s: scenario.duration_s,
@@ -188,7 +135,7 @@ impl Run<'_> {
             self.hear_out(plant, events).await?;
         }
         if scenario.pace == Pace::Paced {
-            let timing = self.place.client.timing(plant, false).await?;
+            let timing = self.server.client.timing(plant, false).await?;
             self.facts.deadline_misses = Some(timing.overruns);
         }
         self.check_lost(scenario.may_lose_samples)
@@ -196,7 +143,7 @@ impl Run<'_> {
 
     /// Makes the plant as the case wants it, and returns its state.
     async fn create(&mut self, case: &Case, id: &str) -> Result<v1::State> {
-        let client = &self.place.client;
+        let client = &self.server.client;
         let Prepared { scenario, model, reference, .. } = self.prepared;
         let initial = &scenario.plant.initial;
         let open_link = match &scenario.controller {
@@ -224,7 +171,8 @@ impl Run<'_> {
         }
         self.change(id, &case.parameters).await.context("plant.parameters")?;
         if !(case.q.is_empty() && case.v.is_empty() && case.p.is_empty()) {
-            let form = changed(&state, model, case, initial.project).context("plant.initial")?;
+            let form =
+                initial_state(&state, model, case, initial.project).context("plant.initial")?;
             let initial = Some(v1::InitialState { form: Some(form) });
             let request = v1::ResetRequest { id: id.to_owned(), initial };
             state = client.reset_to(request).await.context("plant.initial")?;
@@ -254,14 +202,14 @@ impl Run<'_> {
             parameters: parameters.iter().map(parameter).collect(),
             ..Default::default()
         };
-        self.place.client.set_parameters(request).await?;
+        self.server.client.set_parameters(request).await?;
         Ok(())
     }
 
     /// Drives the plant with the built-in controller.
     async fn step(&mut self, id: &str, initial: v1::State) -> Result<()> {
         let Prepared { scenario, model, inputs, uses_energy, steps, .. } = self.prepared;
-        let client = &self.place.client;
+        let client = &self.server.client;
         // Without other inputs: no forces, and prescribed coordinates stay.
         let dynamic = initial.p.len();
         let mut rest = vec![0.0; model.inputs.len()];
@@ -277,7 +225,7 @@ impl Run<'_> {
                 sleep_until(self.deadline.min(start + elapsed)).await;
             }
             for event in &scenario.events {
-                if begins(event, self.time_step_s) == k {
+                if first_step(event, self.time_step_s) == k {
                     self.change(id, &event.parameters).await.context("events")?;
                 }
             }
@@ -313,7 +261,7 @@ impl Run<'_> {
 
     async fn energy(&self, id: &str) -> Result<Option<v1::Energy>> {
         match self.prepared.uses_energy {
-            true => Ok(self.place.client.get_plant(id).await?.energy),
+            true => Ok(self.server.client.get_plant(id).await?.energy),
             false => Ok(None),
         }
     }
@@ -328,7 +276,7 @@ impl Run<'_> {
         }
         let queue = WATCH_QUEUE;
         let request = v1::WatchRequest { id: id.to_owned(), fields, queue, ..Default::default() };
-        Ok(self.place.client.watch(request).await?)
+        Ok(self.server.client.watch(request).await?)
     }
 
     /// Lets the plant go on from `step`: to the next change of parameters or to the end, and in lockstep
@@ -337,7 +285,7 @@ impl Run<'_> {
         let Prepared { scenario, policy, steps, .. } = self.prepared;
         let mut until = *steps;
         for event in scenario.events.iter().filter(|event| !event.parameters.is_empty()) {
-            match begins(event, self.time_step_s) {
+            match first_step(event, self.time_step_s) {
                 begin if begin == step => {
                     self.change(id, &event.parameters).await.context("events")?
                 }
@@ -360,7 +308,7 @@ impl Run<'_> {
         let steps = until - step;
         let request =
             v1::RunRequest { id: id.to_owned(), settings: Some(settings), steps, wait: false };
-        self.place.client.run(request).await?;
+        self.server.client.run(request).await?;
         self.until = until;
         Ok(())
     }
@@ -469,21 +417,22 @@ impl Run<'_> {
         mut events: Answers<v1::WatchEventsResponse>,
     ) -> Result<()> {
         // The last one.
-        self.place.client.pause(id).await?;
+        self.server.client.pause(id).await?;
         while !self.hear(events.next().await?)? {}
         Ok(())
     }
 
     /// Whether parameters change at a step.
     fn changes_at(&self, step: u64) -> bool {
-        let is_it =
-            |event: &Event| !event.parameters.is_empty() && begins(event, self.time_step_s) == step;
+        let is_it = |event: &Event| {
+            !event.parameters.is_empty() && first_step(event, self.time_step_s) == step
+        };
         self.prepared.scenario.events.iter().any(is_it)
     }
 
     /// The plant and its step.
     async fn plant_step(&self, id: &str) -> Result<(v1::PlantInfo, u64)> {
-        let plant = self.place.client.get_plant(id).await?.plant.context("no plant")?;
+        let plant = self.server.client.get_plant(id).await?.plant.context("no plant")?;
         let step = plant.state.as_ref().map_or(0, |state| state.step);
         Ok((plant, step))
     }
@@ -542,35 +491,4 @@ impl Run<'_> {
         );
         Ok(())
     }
-}
-
-/// The outcome of a case as JSON.
-pub(crate) fn summary(prepared: &Prepared, outcome: &Outcome, replay: &str) -> serde_json::Value {
-    let verdict = |verdict: &Verdict| {
-        serde_json::json!({
-            "expectation": verdict.expectation,
-            "passed": verdict.broken.is_none(),
-            "message": verdict.message,
-            "time_s": verdict.broken.and_then(|broken| broken.time_s),
-            "value": verdict.broken.and_then(|broken| broken.value),
-        })
-    };
-    serde_json::json!({
-        "scenario": prepared.name,
-        "file": prepared.file,
-        "case": outcome.case,
-        "status": format!("{:?}", outcome.status()).to_lowercase(),
-        "expectations": outcome.verdicts.iter().map(verdict).collect::<Vec<_>>(),
-        "ended": outcome.ended,
-        "error": outcome.error,
-        "steps": outcome.steps,
-        "elapsed_s": outcome.elapsed.as_secs_f64(),
-        "seed": outcome.seed,
-        "replay": replay,
-        "output": outcome.output,
-    })
-}
-
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }

@@ -2,11 +2,12 @@
 
 use std::fmt::Write as _;
 
-use super::run::Status;
-use super::{Replay, Report, faults};
+use crate::report::markup::escaped;
+use crate::report::results::{Replay, Report};
+use crate::trial::outcome::Status;
 
 /// A document: a suite for each file, a test case for each case.
-pub(super) fn document(report: &Report, replay: &Replay<'_>) -> String {
+pub(crate) fn document(report: &Report, replay: &Replay<'_>) -> String {
     let mut xml =
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites name=\"plantctl test\">\n"
             .to_owned();
@@ -33,10 +34,10 @@ pub(super) fn document(report: &Report, replay: &Replay<'_>) -> String {
                 continue;
             }
             let tag = if outcome.status() == Status::Error { "error" } else { "failure" };
-            let faults = faults(outcome);
-            let first = escaped(faults.first().map_or("", String::as_str));
+            let problems = outcome.problems();
+            let first = escaped(problems.first().map_or("", String::as_str));
             let again = replay.command(&tested.prepared, outcome);
-            let body = format!("{}\nseed {}; again: {again}", faults.join("\n"), outcome.seed);
+            let body = format!("{}\nseed {}; again: {again}", problems.join("\n"), outcome.seed);
             let _ = writeln!(xml, ">\n      <{tag} message=\"{first}\">{}</{tag}>", escaped(&body));
             if !outcome.output.is_empty() {
                 let _ =
@@ -58,35 +59,4 @@ pub(super) fn document(report: &Report, replay: &Replay<'_>) -> String {
     }
     xml.push_str("</testsuites>\n");
     xml
-}
-
-/// Text for XML and HTML, without the characters that XML does not allow.
-pub(super) fn escaped(text: &str) -> String {
-    let mut escaped = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => escaped.push_str("&amp;"),
-            '<' => escaped.push_str("&lt;"),
-            '>' => escaped.push_str("&gt;"),
-            '"' => escaped.push_str("&quot;"),
-            '\n' | '\t' => escaped.push(c),
-            '\r' => {}
-            c if c < ' ' || matches!(c, '\u{fffe}' | '\u{ffff}') => escaped.push('\u{fffd}'),
-            c => escaped.push(c),
-        }
-    }
-    escaped
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn nothing_in_a_text_is_taken_for_markup() {
-        assert_eq!(
-            escaped("|a| < \"b\" & c\u{1b}[0m\n"),
-            "|a| &lt; &quot;b&quot; &amp; c\u{fffd}[0m\n"
-        );
-    }
 }

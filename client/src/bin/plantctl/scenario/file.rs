@@ -7,9 +7,9 @@ use anyhow::{Context as _, Result, ensure};
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::draw::Distribution;
-use super::expect::Expectation;
-use super::expression::Expression;
+use crate::scenario::distribution::{Distribution, case_seed};
+use crate::scenario::expectation::Expectation;
+use crate::scenario::expression::Expression;
 
 /// Most cases of one scenario.
 const CASES_MAX: usize = 100_000;
@@ -293,7 +293,8 @@ impl Scenario {
         Self::parse(&text).with_context(|| path.display().to_string())
     }
 
-    fn parse(text: &str) -> Result<Self> {
+    /// Reads a text.
+    pub(crate) fn parse(text: &str) -> Result<Self> {
         let deserializer =
             toml::Deserializer::parse(text).map_err(|error| located("", &error, text))?;
         let scenario: Self = serde_path_to_error::deserialize(deserializer)
@@ -410,7 +411,7 @@ impl Scenario {
         let initial = &self.plant.initial;
         let base = |name: &str, number: u64| Case {
             name: name.to_owned(),
-            seed: super::draw::case_seed(self.seed, number),
+            seed: case_seed(self.seed, number),
             q: initial.q.clone(),
             v: initial.v.clone(),
             p: initial.p.clone(),
@@ -547,18 +548,6 @@ mod tests {
         assert_eq!(parse(text).cases(), cases);
         let other = parse(&text.replace("seed = 5", "seed = 6")).cases();
         assert_ne!(other[2].q, cases[2].q);
-    }
-
-    #[test]
-    fn the_scenarios_in_the_help_and_in_the_guide_are_some() {
-        let (_, help) = super::super::EXAMPLE.split_once(":\n\n").unwrap();
-        let (help, _) = help.split_once("\n\nExamples").unwrap();
-        assert_eq!(Scenario::parse(help).unwrap().cases().len(), 20);
-        let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/TESTING.md");
-        let guide = std::fs::read_to_string(guide).unwrap();
-        let (_, block) = guide.split_once("```toml\n").unwrap();
-        let (block, _) = block.split_once("```").unwrap();
-        assert_eq!(Scenario::parse(block).unwrap().cases().len(), 12);
     }
 
     #[test]
