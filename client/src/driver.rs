@@ -12,6 +12,18 @@ use crate::error::{Error, Result};
 
 /// Holds the lease of a plant: steps it in lockstep, or gives inputs to one that runs by itself.
 ///
+/// ```no_run
+/// # async fn damp(client: plantd_client::Client) -> plantd_client::Result<()> {
+/// let mut driver = client.drive("pendulum").await?;
+/// let mut torque = 0.0;
+/// for _ in 0..1000 {
+///     let state = driver.step(&[torque]).await?.state.expect("a step has a state");
+///     torque = -0.5 * state.p[0];
+/// }
+/// driver.close().await
+/// # }
+/// ```
+///
 /// The lease ends when the driver is dropped; [`Driver::close`] also waits for the server to have
 /// noticed, so that the next driver is sure to be let in.
 #[derive(Debug)]

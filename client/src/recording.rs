@@ -28,6 +28,20 @@ pub enum RecordingEntry {
 
 /// Reads a recording (MCAP), entry by entry.
 ///
+/// ```no_run
+/// use plantd_client::{RecordingEntry, RecordingReader};
+///
+/// # fn main() -> plantd_client::Result<()> {
+/// let mut recording = RecordingReader::open("trial.mcap")?;
+/// while let Some(entry) = recording.next_entry()? {
+///     if let RecordingEntry::Step(step) = entry {
+///         println!("{:?}", step.state.map(|state| state.q));
+///     }
+/// }
+/// # Ok(())
+/// # }
+/// ```
+///
 /// One whose writer was killed ends where the file does: see [`RecordingReader::is_cut`].
 pub struct RecordingReader {
     path: PathBuf,

@@ -68,6 +68,21 @@ pub(crate) fn check(gain: &v1::Gain) -> Result<()> {
 /// Time-varying gains as a feedback law: those of `SolveTrajectoryLqr` or of `ProjectReference`, or
 /// gains of one's own.
 ///
+/// ```no_run
+/// use plantd_client::{Client, GainSchedule, v1};
+///
+/// # async fn track(client: Client, request: v1::SolveTrajectoryLqrRequest) -> plantd_client::Result<()> {
+/// let answers = client.solve_trajectory_lqr(request).await?.collect().await?;
+/// let law = GainSchedule::from_gains(answers.into_iter().filter_map(|answer| answer.gain))?;
+/// let mut driver = client.drive("pendulum").await?;
+/// let mut state = driver.plant().state.clone().expect("a plant has a state");
+/// for _ in law.gains() {
+///     state = driver.step(&law.input(&state)?).await?.state.expect("a step has a state");
+/// }
+/// # Ok(())
+/// # }
+/// ```
+///
 /// Before the first gain's step that gain holds about its own reference; after the last one the last
 /// gain holds, about the final state if the gains end with one.
 #[derive(Clone, Debug, PartialEq)]

@@ -7,9 +7,8 @@ use clap::Args;
 use plantd_client::v1;
 
 use crate::contract::names;
-use crate::input::numbers::{Numbers, numbers, or_none};
+use crate::input::numbers::{Numbers, numbers, or_empty};
 use crate::input::point::{Point, space};
-use crate::input::settings::Settings;
 use crate::output::text::{matrix, number, table};
 use crate::server::context::Context;
 
@@ -18,8 +17,6 @@ use crate::server::context::Context;
 pub(crate) struct Analyze {
     #[command(flatten)]
     point: Point,
-    #[command(flatten)]
-    settings: Settings,
     /// Outputs, comma-separated entries of x such as `theta` or `p(theta)`; all if not given.
     #[arg(long, value_delimiter = ',')]
     outputs: Vec<String>,
@@ -34,18 +31,18 @@ pub(crate) struct Analyze {
 impl Analyze {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let (model, settings, point) = self.point.resolve(&client, self.settings).await?;
+        let (model, settings, point) = self.point.resolve(&client).await?;
         let request = v1::AnalyzeRequest {
             model: model.name.clone(),
             settings: Some(settings),
             point: Some(point),
             outputs: self.outputs,
-            frequencies_hz: or_none(self.frequencies),
+            frequencies_hz: or_empty(self.frequencies),
             constraints: space(self.full).into(),
             ..Default::default()
         };
         let answer = client.analyze(request).await?;
-        Ok(context.output.message("AnalyzeResponse", &answer, || text(&answer, &model))?)
+        context.output.message("AnalyzeResponse", &answer, || text(&answer, &model))
     }
 }
 

@@ -78,13 +78,13 @@ impl Channels {
                 let answer = client.set_channels(id, channels).await?;
                 let outputs = v1::Outputs { y: answer.y.clone(), lost: Vec::new() };
                 let as_text = || declared(answer.info.as_ref(), &outputs);
-                Ok(output.message("SetChannelsResponse", &answer, as_text)?)
+                output.message("SetChannelsResponse", &answer, as_text)
             }
             ChannelsCommand::Show { id } => {
                 let answer = client.get_channels(id).await?;
                 let outputs = v1::Outputs { y: answer.y.clone(), lost: answer.lost.clone() };
                 let as_text = || declared(answer.info.as_ref(), &outputs);
-                Ok(output.message("GetChannelsResponse", &answer, as_text)?)
+                output.message("GetChannelsResponse", &answer, as_text)
             }
             ChannelsCommand::Clear { id } => {
                 let had = client.get_channels(&id).await?.info.and_then(|info| info.channels);
@@ -92,7 +92,7 @@ impl Channels {
                 if had.is_none_or(|had| had.outputs.is_empty() && had.inputs.is_empty()) {
                     output.nothing_to_do(&format!("plant `{id}` has no channels"));
                 }
-                Ok(output.done(json!({ "cleared": { "plant": id } }))?)
+                output.done(json!({ "cleared": { "plant": id } }))
             }
         }
     }

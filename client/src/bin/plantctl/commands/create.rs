@@ -41,8 +41,8 @@ impl Create {
             open_link: self.link,
         };
         let plant = client.create_plant(request).await?;
-        Ok(context.output.message("PlantInfo", &plant, || {
+        context.output.message("PlantInfo", &plant, || {
             plant::list(std::slice::from_ref(&plant)) + &plant::stepping(&plant)
-        })?)
+        })
     }
 }

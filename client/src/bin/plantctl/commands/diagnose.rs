@@ -41,7 +41,7 @@ impl Diagnose {
             }
         };
         let answer = client.diagnose(request).await?;
-        Ok(context.output.message("DiagnoseResponse", &answer, || text(&answer, &model))?)
+        context.output.message("DiagnoseResponse", &answer, || text(&answer, &model))
     }
 }
 

@@ -7,7 +7,7 @@ use clap::Args;
 use plantd_client::v1;
 
 use crate::contract::names;
-use crate::input::numbers::{Numbers, numbers, or_none};
+use crate::input::numbers::{Numbers, numbers, or_empty};
 use crate::output::derivatives::slices;
 use crate::output::text::{matrix, number, table};
 use crate::server::context::Context;
@@ -44,14 +44,14 @@ impl Dynamics {
         let request = v1::EvaluateDynamicsRequest {
             model: self.model,
             operating_point: self.at,
-            q: or_none(self.q),
-            v: or_none(self.v),
-            inputs: or_none(self.inputs),
-            prescribed_acceleration: or_none(self.prescribed_acceleration),
+            q: or_empty(self.q),
+            v: or_empty(self.v),
+            inputs: or_empty(self.inputs),
+            prescribed_acceleration: or_empty(self.prescribed_acceleration),
             order: self.order,
         };
         let answer = client.evaluate_dynamics(request).await?;
-        Ok(context.output.message("EvaluateDynamicsResponse", &answer, || text(&answer, &model))?)
+        context.output.message("EvaluateDynamicsResponse", &answer, || text(&answer, &model))
     }
 }
 

@@ -68,7 +68,7 @@ impl Fault {
                 let fault =
                     client.inject_fault(id, parse_message("FaultSpec", &fault.join("\n"))?).await?;
                 let as_text = || faults(std::slice::from_ref(&fault));
-                Ok(output.message("FaultInfo", &fault, as_text)?)
+                output.message("FaultInfo", &fault, as_text)
             }
             FaultCommand::List { id } => {
                 let all = client.list_faults(id).await?;
@@ -76,14 +76,14 @@ impl Fault {
                     [] => "no faults\n".to_owned(),
                     all => faults(all),
                 };
-                Ok(output.print(|| json::messages("FaultInfo", &all), as_text)?)
+                output.print(|| json::messages("FaultInfo", &all), as_text)
             }
             FaultCommand::Clear { id, fault, all: _ } => {
                 let cleared = client.clear_fault(&id, fault.unwrap_or(0)).await?;
                 if cleared == 0 {
                     output.nothing_to_do(&format!("plant `{id}` has no faults"));
                 }
-                Ok(output.done(json!({ "cleared": { "plant": id, "faults": cleared } }))?)
+                output.done(json!({ "cleared": { "plant": id, "faults": cleared } }))
             }
         }
     }

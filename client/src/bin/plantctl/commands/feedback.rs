@@ -15,7 +15,7 @@ use crate::input::weights::RegulatorWeights;
 use crate::output::plant::feedback;
 use crate::output::printer::Output;
 use crate::output::text::{matrix, numbers};
-use crate::server::context::{Context, model_of, next_or_interrupt, plant};
+use crate::server::context::{Context, for_each, model_of, plant};
 
 /// Gives a plant a reference with its regulator, or takes it away.
 #[derive(Debug, Args)]
@@ -72,6 +72,7 @@ struct Reference {
     trajectory: Option<PathBuf>,
 }
 
+/// What a feedback does in the plant's own loop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Mode {
     /// Nothing: the gains are for those who watch them.
@@ -116,7 +117,7 @@ impl Feedback {
                 if had.is_none() {
                     context.output.nothing_to_do(&format!("plant `{id}` has no feedback"));
                 }
-                Ok(context.output.done(json!({ "cleared": { "plant": id } }))?)
+                context.output.done(json!({ "cleared": { "plant": id } }))
             }
         }
     }
@@ -145,7 +146,7 @@ impl Set {
             ..Default::default()
         };
         let info = client.set_feedback(request).await?;
-        Ok(output.message("FeedbackInfo", &info, || feedback(&info))?)
+        output.message("FeedbackInfo", &info, || feedback(&info))
     }
 }
 
@@ -153,15 +154,10 @@ impl Gains {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
         let model = model_of(&client, &self.id).await?;
-        let mut messages = client.watch_gains(self.id).await?;
-        let mut seen = 0;
-        while self.count.is_none_or(|count| seen < count) {
-            let Some(message) = next_or_interrupt(&mut messages).await? else { break };
-            let as_text = || watched(&message, &model);
-            context.output.message("WatchGainsResponse", &message, as_text)?;
-            seen += 1;
-        }
-        Ok(())
+        for_each(client.watch_gains(self.id).await?, self.count, |message| {
+            context.output.message("WatchGainsResponse", &message, || watched(&message, &model))
+        })
+        .await
     }
 }
 

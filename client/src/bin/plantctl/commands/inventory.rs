@@ -75,7 +75,7 @@ impl List {
             let tables = [models.as_deref().map(model::list), plants.as_deref().map(plant::list)];
             tables.into_iter().flatten().collect::<Vec<_>>().join("\n")
         };
-        Ok(context.output.print(as_json, as_text)?)
+        context.output.print(as_json, as_text)
     }
 }
 
@@ -85,7 +85,7 @@ impl Show {
         match self.what {
             Singular::Model => {
                 let model = client.get_model(self.name).await?;
-                Ok(context.output.message("Model", &model, || model::known(&model))?)
+                context.output.message("Model", &model, || model::known(&model))
             }
             Singular::Plant => show_plant(&client, context.output, self.name).await,
         }
@@ -105,7 +105,7 @@ impl Delete {
                 "plant"
             }
         };
-        Ok(context.output.done(json!({ "deleted": { kind: self.name } }))?)
+        context.output.done(json!({ "deleted": { kind: self.name } }))
     }
 }
 
@@ -127,7 +127,7 @@ async fn show_plant(client: &Client, output: Output, id: String) -> Result<()> {
         .flatten()
         .collect()
     };
-    Ok(output.message("GetPlantResponse", &answer, as_text)?)
+    output.message("GetPlantResponse", &answer, as_text)
 }
 
 /// The bounds that protect a plant, and which of them holds it.

@@ -7,7 +7,6 @@ use plantd_client::v1;
 use crate::contract::names;
 use crate::input::numbers::{Numbers, numbers};
 use crate::input::point::{Point, space};
-use crate::input::settings::Settings;
 use crate::output::text::{matrix, number};
 use crate::server::context::Context;
 
@@ -16,8 +15,6 @@ use crate::server::context::Context;
 pub(crate) struct Kalman {
     #[command(flatten)]
     point: Point,
-    #[command(flatten)]
-    settings: Settings,
     /// What is measured, comma-separated entries of x such as `theta` or `p(theta)`; all if not
     /// given.
     #[arg(long, value_delimiter = ',')]
@@ -39,8 +36,8 @@ pub(crate) struct Kalman {
 impl Kalman {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let Self { point, settings, outputs, measurement, process, input, full } = self;
-        let (model, settings, point) = point.resolve(&client, settings).await?;
+        let Self { point, outputs, measurement, process, input, full } = self;
+        let (model, settings, point) = point.resolve(&client).await?;
         let (states, inputs) = (names::state(&model).len(), names::input(&model).len());
         let count = if outputs.is_empty() { states } else { outputs.len() };
         let request = v1::SolveKalmanRequest {
@@ -56,7 +53,7 @@ impl Kalman {
             constraints: space(full).into(),
         };
         let answer = client.solve_kalman(request).await?;
-        Ok(context.output.message("SolveKalmanResponse", &answer, || text(&answer, &model))?)
+        context.output.message("SolveKalmanResponse", &answer, || text(&answer, &model))
     }
 }
 

@@ -5,9 +5,8 @@ use clap::Args;
 use plantd_client::v1;
 
 use crate::contract::names;
-use crate::input::numbers::{Numbers, numbers, or_none};
+use crate::input::numbers::{Numbers, numbers, or_empty};
 use crate::input::point::Point;
-use crate::input::settings::Settings;
 use crate::output::derivatives::{linearization, slices};
 use crate::output::text::matrix;
 use crate::server::context::Context;
@@ -17,8 +16,6 @@ use crate::server::context::Context;
 pub(crate) struct Linearize {
     #[command(flatten)]
     point: Point,
-    #[command(flatten)]
-    settings: Settings,
 }
 
 /// Second derivatives of the discrete map: all tensors, or contracted with weights.
@@ -26,8 +23,6 @@ pub(crate) struct Linearize {
 pub(crate) struct SecondOrder {
     #[command(flatten)]
     point: Point,
-    #[command(flatten)]
-    settings: Settings,
     /// Weights of the entries of x[k+1], comma-separated: print the contraction.
     #[arg(long, value_name = "Z", value_parser = numbers, allow_hyphen_values = true)]
     weights: Option<Numbers>,
@@ -39,30 +34,30 @@ pub(crate) struct SecondOrder {
 impl Linearize {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let (model, settings, point) = self.point.resolve(&client, self.settings).await?;
+        let (model, settings, point) = self.point.resolve(&client).await?;
         let request = v1::LinearizeRequest {
             model: model.name.clone(),
             settings: Some(settings),
             point: Some(point),
         };
         let answer = client.linearize(request).await?;
-        Ok(context.output.message("LinearizeResponse", &answer, || {
+        context.output.message("LinearizeResponse", &answer, || {
             let rank = answer.controllability_rank;
             let order = 2 * model.coordinates.len();
             let matrices = answer.linearization.as_ref().map(|l| linearization(l, &model));
             format!("{}\ncontrollability rank: {rank} of {order}\n", matrices.unwrap_or_default())
-        })?)
+        })
     }
 }
 
 impl SecondOrder {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let (model, settings, point) = self.point.resolve(&client, self.settings).await?;
+        let (model, settings, point) = self.point.resolve(&client).await?;
         let is_contracted = self.weights.is_some() || self.multiplier_weights.is_some();
         let weights = v1::ContractionWeights {
-            x: or_none(self.weights),
-            multipliers: or_none(self.multiplier_weights),
+            x: or_empty(self.weights),
+            multipliers: or_empty(self.multiplier_weights),
         };
         let request = v1::LinearizeSecondOrderRequest {
             model: model.name.clone(),
@@ -71,11 +66,11 @@ impl SecondOrder {
             weights: is_contracted.then_some(weights),
         };
         let answer = client.linearize_second_order(request).await?;
-        Ok(context.output.message("LinearizeSecondOrderResponse", &answer, || {
+        context.output.message("LinearizeSecondOrderResponse", &answer, || {
             let tensors = answer.tensors.as_ref().map(|t| second_order(t, &model));
             let contraction = answer.contraction.as_ref().map(|c| contraction(c, &model));
             tensors.or(contraction).unwrap_or_default()
-        })?)
+        })
     }
 }
 

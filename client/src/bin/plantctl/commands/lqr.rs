@@ -5,7 +5,6 @@ use clap::Args;
 use plantd_client::v1;
 
 use crate::input::point::{Point, space};
-use crate::input::settings::Settings;
 use crate::input::weights::RegulatorWeights;
 use crate::output::derivatives;
 use crate::output::text::number;
@@ -17,8 +16,6 @@ pub(crate) struct Lqr {
     #[command(flatten)]
     point: Point,
     #[command(flatten)]
-    settings: Settings,
-    #[command(flatten)]
     weights: RegulatorWeights,
     /// Solve on the full state of a constrained model instead of on its manifold.
     #[arg(long)]
@@ -28,7 +25,7 @@ pub(crate) struct Lqr {
 impl Lqr {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let (model, settings, point) = self.point.resolve(&client, self.settings).await?;
+        let (model, settings, point) = self.point.resolve(&client).await?;
         let request = v1::SolveLqrRequest {
             model: model.name.clone(),
             settings: Some(settings),
@@ -37,7 +34,7 @@ impl Lqr {
             constraints: space(self.full).into(),
         };
         let answer = client.solve_lqr(request).await?;
-        Ok(context.output.message("SolveLqrResponse", &answer, || {
+        context.output.message("SolveLqrResponse", &answer, || {
             let gain = answer.gain.as_ref().map(|g| derivatives::gain(g, &model));
             format!(
                 "{}\nspectral radius of the closed loop: {}\nRiccati residual: {}\n",
@@ -45,6 +42,6 @@ impl Lqr {
                 number(answer.spectral_radius),
                 number(answer.residual),
             )
-        })?)
+        })
     }
 }

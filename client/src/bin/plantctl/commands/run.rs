@@ -4,7 +4,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use plantd_client::{Client, Error, v1};
 
-use crate::input::numbers::{Numbers, numbers, or_none};
+use crate::input::numbers::{Numbers, numbers, or_empty};
 use crate::output::plant::state;
 use crate::output::printer::Output;
 use crate::server::context::{Context, plant};
@@ -104,7 +104,7 @@ impl Run {
             timeout_s: timeout.unwrap_or(0.0),
             action: action.unwrap_or_default().into(),
             ramp_s: ramp.unwrap_or(0.0),
-            safe: or_none(safe),
+            safe: or_empty(safe),
             latch,
         });
         // Without a pace the settings stay as they are.
@@ -139,7 +139,7 @@ impl Pause {
         }
         let paused = client.pause(id).await?;
         let as_text = || paused.state.as_ref().map(state).unwrap_or_default();
-        Ok(context.output.message("PauseResponse", &paused, as_text)?)
+        context.output.message("PauseResponse", &paused, as_text)
     }
 }
 

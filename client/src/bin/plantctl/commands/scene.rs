@@ -46,7 +46,7 @@ impl Upload {
             ..Default::default()
         };
         let model = client.create_model_as(request).await?;
-        Ok(context.output.message("Model", &model, || model::known(&model))?)
+        context.output.message("Model", &model, || model::known(&model))
     }
 }
 

@@ -50,10 +50,10 @@ impl Settle {
             ..Default::default()
         };
         let answer = client.settle(request).await?;
-        Ok(context.output.message("SettleResponse", &answer, || match self.toml {
+        context.output.message("SettleResponse", &answer, || match self.toml {
             true => operating_point(&answer, &model),
             false => settled(&answer, &model),
-        })?)
+        })
     }
 }
 

@@ -44,7 +44,7 @@ impl Reset {
         let client = context.connect().await?;
         let request = v1::ResetRequest { id: self.id, initial: self.initial.into() };
         let state = client.reset_to(request).await?;
-        Ok(context.output.message("State", &state, || plant::state(&state))?)
+        context.output.message("State", &state, || plant::state(&state))
     }
 }
 
@@ -53,7 +53,7 @@ impl Snapshot {
         let client = context.connect().await?;
         let snapshot = client.snapshot(&self.id).await?;
         files::write(&self.file, &snapshot)?;
-        Ok(context.output.done(json!({ "plant": self.id, "bytes": snapshot.len() }))?)
+        context.output.done(json!({ "plant": self.id, "bytes": snapshot.len() }))
     }
 }
 
@@ -63,6 +63,6 @@ impl Restore {
         let snapshot = std::fs::read(&self.file)
             .with_context(|| format!("cannot read {}", self.file.display()))?;
         let state = client.restore(self.id, snapshot).await?;
-        Ok(context.output.message("State", &state, || plant::state(&state))?)
+        context.output.message("State", &state, || plant::state(&state))
     }
 }

@@ -42,10 +42,10 @@ impl Step {
             ..Default::default()
         };
         let answer = client.step(request).await?;
-        Ok(context.output.message("StepResponse", &answer, || {
+        context.output.message("StepResponse", &answer, || {
             let states = answer.states.iter().map(plant::state);
             states.chain(answer.report.as_ref().map(plant::report)).collect()
-        })?)
+        })
     }
 }
 

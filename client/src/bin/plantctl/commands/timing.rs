@@ -22,7 +22,7 @@ impl Timing {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
         let timing = client.timing(self.id, self.clear).await?;
-        Ok(context.output.message("GetTimingResponse", &timing, || text(&timing))?)
+        context.output.message("GetTimingResponse", &timing, || text(&timing))
     }
 }
 

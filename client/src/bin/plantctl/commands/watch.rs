@@ -7,7 +7,7 @@ use plantd_client::v1;
 use crate::input::weights::RegulatorWeights;
 use crate::output::text::numbers;
 use crate::output::{derivatives, plant};
-use crate::server::context::{Context, model_of, next_or_interrupt};
+use crate::server::context::{Context, for_each, model_of};
 
 /// Prints what a plant does while somebody drives it. Ends with Ctrl-C or after `--count`.
 #[derive(Debug, Args)]
@@ -33,6 +33,7 @@ pub(crate) struct Watch {
     weights: RegulatorWeights,
 }
 
+/// What a watch prints.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Field {
     State,
@@ -73,14 +74,10 @@ impl Watch {
             coordinates,
             queue,
         };
-        let mut messages = client.watch(request).await?;
-        let mut seen = 0;
-        while count.is_none_or(|count| seen < count) {
-            let Some(message) = next_or_interrupt(&mut messages).await? else { break };
-            context.output.message("WatchResponse", &message, || watched(&message, &model))?;
-            seen += 1;
-        }
-        Ok(())
+        for_each(client.watch(request).await?, count, |message| {
+            context.output.message("WatchResponse", &message, || watched(&message, &model))
+        })
+        .await
     }
 }
 

@@ -24,7 +24,7 @@ pub(crate) fn diagonal(values: &[f64], count: usize) -> v1::Weight {
 }
 
 /// The numbers of an option; none if it was not given.
-pub(crate) fn or_none(given: Option<Numbers>) -> Vec<f64> {
+pub(crate) fn or_empty(given: Option<Numbers>) -> Vec<f64> {
     given.map_or_else(Vec::new, |numbers| numbers.0)
 }
 

@@ -44,23 +44,20 @@ impl From<Initial> for Option<v1::InitialState> {
     }
 }
 
-/// A model and a point of its map.
+/// A model, how it is stepped, and a point of its map.
 #[derive(Debug, Args)]
 pub(crate) struct Point {
     /// Name of a model.
     #[arg(required_unless_present = "plant")]
-    pub(crate) model: Option<String>,
+    model: Option<String>,
     /// Operating point.
     #[arg(long, value_name = "POINT", default_value = "initial")]
-    pub(crate) at: String,
+    at: String,
     /// Instead: the model, the settings and the present state of this plant.
     #[arg(long, value_name = "ID", conflicts_with_all = ["model", "at", "Settings"])]
-    pub(crate) plant: Option<String>,
-}
-
-/// The space on which a constrained model is looked at.
-pub(crate) fn space(full: bool) -> v1::ConstraintHandling {
-    if full { v1::ConstraintHandling::Full } else { v1::ConstraintHandling::Manifold }
+    plant: Option<String>,
+    #[command(flatten)]
+    settings: Settings,
 }
 
 impl Point {
@@ -68,14 +65,18 @@ impl Point {
     pub(crate) async fn resolve(
         self,
         client: &Client,
-        settings: Settings,
     ) -> Result<(v1::Model, v1::PlantSettings, v1::Point)> {
         let Some(id) = self.plant else {
             let model = client.get_model(self.model.unwrap_or_default()).await?;
-            return Ok((model, settings.into(), operating_point(self.at)));
+            return Ok((model, self.settings.into(), operating_point(self.at)));
         };
         let plant = plant(client, &id).await?;
         let model = client.get_model(plant.model).await?;
         Ok((model, plant.settings.unwrap_or_default(), present_state(plant.id)))
     }
+}
+
+/// The space on which a constrained model is looked at.
+pub(crate) fn space(full: bool) -> v1::ConstraintHandling {
+    if full { v1::ConstraintHandling::Full } else { v1::ConstraintHandling::Manifold }
 }

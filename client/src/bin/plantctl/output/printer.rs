@@ -2,6 +2,7 @@
 
 use std::io::Write as _;
 
+use anyhow::Result;
 use serde_json::{Value, json};
 
 use crate::contract::json;
@@ -18,14 +19,14 @@ impl Output {
         self,
         json: impl FnOnce() -> Value,
         text: impl FnOnce() -> String,
-    ) -> std::io::Result<()> {
+    ) -> Result<()> {
         let mut out = std::io::stdout().lock();
         if self.json {
             writeln!(out, "{}", json())?;
         } else {
             out.write_all(text().as_bytes())?;
         }
-        out.flush()
+        Ok(out.flush()?)
     }
 
     /// Prints a message of the contract; `name` is its name there.
@@ -34,7 +35,7 @@ impl Output {
         name: &str,
         message: &impl prost::Message,
         text: impl FnOnce() -> String,
-    ) -> std::io::Result<()> {
+    ) -> Result<()> {
         self.print(|| json::message(name, message), text)
     }
 
@@ -48,7 +49,7 @@ impl Output {
     }
 
     /// Confirms what has no result of its own; people see that it went well by the silence.
-    pub(crate) fn done(self, json: Value) -> std::io::Result<()> {
+    pub(crate) fn done(self, json: Value) -> Result<()> {
         self.print(|| json, String::new)
     }
 }

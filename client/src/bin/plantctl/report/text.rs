@@ -23,7 +23,7 @@ pub(crate) fn print_case(
     outcome: &Outcome,
     replay: &str,
 ) -> Result<()> {
-    Ok(output.print(|| json(prepared, outcome, replay), || text(prepared, outcome, replay))?)
+    output.print(|| json(prepared, outcome, replay), || text(prepared, outcome, replay))
 }
 
 /// A line for a case, and what went wrong in it.
@@ -94,8 +94,8 @@ pub(crate) fn print_unusable(output: Output, unusable: &[Unusable]) -> Result<()
 pub(crate) fn print_summary(output: Output, report: &Report) -> Result<()> {
     let [passed, failed, errors] =
         [Status::Passed, Status::Failed, Status::Error].map(|status| report.count(status));
-    Ok(output.print(
+    output.print(
         || json!({ "passed": passed, "failed": failed, "errors": errors }),
         || format!("{passed} passed, {failed} failed, {errors} not run\n"),
-    )?)
+    )
 }

@@ -30,10 +30,21 @@ pub(crate) async fn model_of(client: &Client, id: &str) -> Result<v1::Model> {
     Ok(client.get_model(plant(client, id).await?.model).await?)
 }
 
-/// The next message; none at the end of the stream, or when Ctrl-C is pressed.
-pub(crate) async fn next_or_interrupt<T>(messages: &mut Answers<T>) -> Result<Option<T>> {
-    tokio::select! {
-        next = messages.next() => Ok(next?),
-        _ = tokio::signal::ctrl_c() => Ok(None),
+/// Hands over the messages of a stream until it ends, Ctrl-C is pressed, or there were `count`.
+pub(crate) async fn for_each<T>(
+    mut messages: Answers<T>,
+    count: Option<u64>,
+    mut print: impl FnMut(T) -> Result<()>,
+) -> Result<()> {
+    let mut seen = 0;
+    while count.is_none_or(|count| seen < count) {
+        let next = tokio::select! {
+            next = messages.next() => next?,
+            _ = tokio::signal::ctrl_c() => None,
+        };
+        let Some(message) = next else { break };
+        print(message)?;
+        seen += 1;
     }
+    Ok(())
 }

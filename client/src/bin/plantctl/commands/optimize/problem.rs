@@ -58,11 +58,14 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
 pub(crate) struct Problem {
     model: String,
     steps: usize,
-    time_step_s: Option<f64>,
+    #[serde(default)]
+    time_step_s: f64,
     #[serde(default)]
     paper: bool,
-    order: Option<u32>,
-    substeps: Option<u32>,
+    #[serde(default)]
+    order: u32,
+    #[serde(default)]
+    substeps: u32,
     halvings: Option<u32>,
     #[serde(default)]
     fast: bool,
@@ -266,10 +269,10 @@ impl Problem {
 
     fn settings(&self) -> v1::PlantSettings {
         let settings = Settings {
-            dt: self.time_step_s,
+            dt: Some(self.time_step_s),
             paper: self.paper,
-            order: self.order,
-            substeps: self.substeps,
+            order: Some(self.order),
+            substeps: Some(self.substeps),
             halvings: self.halvings,
             fast: self.fast,
             ..Settings::default()
