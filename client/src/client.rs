@@ -115,7 +115,7 @@ impl Client {
     /// Uploads a scene (TOML or JSON) under its own name.
     ///
     /// # Errors
-    /// A faulty scene is refused with all its errors in [`Error::violations`].
+    /// A scene with errors is refused with all of them in [`Error::violations`].
     pub async fn create_model(&self, scene: impl Into<String>) -> Result<v1::Model> {
         let request = v1::CreateModelRequest { scene: scene.into(), ..Default::default() };
         self.create_model_as(request).await

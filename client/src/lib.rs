@@ -35,14 +35,14 @@
 //! of time; [`Client::follow_gains`] applies them in one call, [`GainSchedule`] those that were
 //! collected, and [`Estimator`] runs a Kalman filter on what is measured.
 //!
-//! What the server refuses comes back as an [`Error`] with the gRPC code, the reason and the faults
-//! of the request:
+//! What the server refuses comes back as an [`Error`] with the gRPC code, the reason and what
+//! is wrong with the request:
 //!
 //! ```no_run
 //! # async fn upload(client: plantd_client::Client, scene: String) -> plantd_client::Result<()> {
 //! if let Err(error) = client.create_model(scene).await {
-//!     for fault in error.violations() {
-//!         eprintln!("{}: {}", fault.field, fault.description);
+//!     for violation in error.violations() {
+//!         eprintln!("{}: {}", violation.field, violation.description);
 //!     }
 //! }
 //! # Ok(())

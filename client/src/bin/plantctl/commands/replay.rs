@@ -68,7 +68,7 @@ fn nanoseconds() -> u32 {
     now.map_or(0, |now| now.subsec_nanos())
 }
 
-/// What a replay has found.
+/// Deviation a replay has found.
 #[derive(Debug, Default)]
 struct Outcome {
     /// Steps that were compared.
@@ -87,12 +87,12 @@ struct Outcome {
 struct Difference {
     /// Step of the plant.
     step: u64,
-    /// Which steps of the recording were the same before it.
-    what: What,
+    /// How it went another way.
+    deviation: Deviation,
 }
 
 #[derive(Debug)]
-enum What {
+enum Deviation {
     /// A number.
     Number { entry: String, recorded: f64, replayed: f64 },
     /// The step failed.
@@ -105,8 +105,8 @@ impl Outcome {
     fn to_json(&self) -> Value {
         let difference = self.difference.as_ref().map(|difference| {
             let step = difference.step;
-            match &difference.what {
-                What::Number { entry, recorded, replayed } => json!({
+            match &difference.deviation {
+                Deviation::Number { entry, recorded, replayed } => json!({
                     "step": step,
                     "entry": entry,
                     "recorded": recorded,
@@ -114,8 +114,8 @@ impl Outcome {
                     "replayed": replayed,
                     "replayed_bits": format!("{:016x}", replayed.to_bits()),
                 }),
-                What::Failure(message) => json!({ "step": step, "failure": message }),
-                What::Snapshot => json!({ "step": step, "entry": "snapshot" }),
+                Deviation::Failure(message) => json!({ "step": step, "failure": message }),
+                Deviation::Snapshot => json!({ "step": step, "entry": "snapshot" }),
             }
         });
         json!({
@@ -133,18 +133,18 @@ impl Outcome {
         let steps = self.steps;
         let _ = match &self.difference {
             None => writeln!(text, "{steps} steps, identical"),
-            Some(Difference { step, what }) => match what {
-                What::Number { entry, recorded, replayed } => writeln!(
+            Some(Difference { step, deviation }) => match deviation {
+                Deviation::Number { entry, recorded, replayed } => writeln!(
                     text,
                     "step {step} differs in {entry}, after {steps} identical steps\n  \
                      recorded  {:016x}  {recorded:e}\n  replayed  {:016x}  {replayed:e}",
                     recorded.to_bits(),
                     replayed.to_bits(),
                 ),
-                What::Failure(message) => {
+                Deviation::Failure(message) => {
                     writeln!(text, "step {step} fails, after {steps} identical steps: {message}")
                 }
-                What::Snapshot => writeln!(
+                Deviation::Snapshot => writeln!(
                     text,
                     "the snapshot after step {step} differs, after {steps} identical steps"
                 ),
@@ -229,7 +229,7 @@ impl<'a> Twin<'a> {
     async fn follow(&mut self, recording: &mut RecordingReader) -> Result<Outcome> {
         let mut is_lost = false;
         while self.outcome.difference.is_none() {
-            // What is damaged shows as a step that differs, if there is one.
+            // Deviation is damaged shows as a step that differs, if there is one.
             let entry = match recording.next_entry() {
                 Ok(entry) => entry,
                 Err(error) => {
@@ -279,8 +279,8 @@ impl<'a> Twin<'a> {
         for step in &batch {
             if let Err(failure) = self.take(std::slice::from_ref(step)).await? {
                 let step = step.state.as_ref().map_or(0, |state| state.step);
-                let what = What::Failure(failure);
-                self.outcome.difference = Some(Difference { step, what });
+                let deviation = Deviation::Failure(failure);
+                self.outcome.difference = Some(Difference { step, deviation });
             }
             if self.outcome.difference.is_some() {
                 break;
@@ -308,8 +308,8 @@ impl<'a> Twin<'a> {
         };
         for (step, replayed) in steps.iter().zip(&replayed) {
             let recorded = step.state.clone().unwrap_or_default();
-            if let Some(what) = self.difference(&recorded, replayed) {
-                self.outcome.difference = Some(Difference { step: recorded.step, what });
+            if let Some(deviation) = self.difference(&recorded, replayed) {
+                self.outcome.difference = Some(Difference { step: recorded.step, deviation });
                 break;
             }
             self.outcome.steps += 1;
@@ -317,10 +317,10 @@ impl<'a> Twin<'a> {
         Ok(Ok(()))
     }
 
-    fn difference(&self, recorded: &v1::State, replayed: &v1::State) -> Option<What> {
+    fn difference(&self, recorded: &v1::State, replayed: &v1::State) -> Option<Deviation> {
         let number = |entry: &str, recorded: f64, replayed: f64| {
             let entry = entry.to_owned();
-            (recorded.to_bits() != replayed.to_bits()).then_some(What::Number {
+            (recorded.to_bits() != replayed.to_bits()).then_some(Deviation::Number {
                 entry,
                 recorded,
                 replayed,
@@ -369,15 +369,15 @@ impl<'a> Twin<'a> {
         }
         let goes_on = !is_lost && mark.lost == 0 && mark.reason() != v1::MarkReason::Reset;
         if goes_on && self.client.snapshot(&self.id).await? != mark.snapshot {
-            let what = What::Snapshot;
-            self.outcome.difference = Some(Difference { step: mark.step, what });
+            let deviation = Deviation::Snapshot;
+            self.outcome.difference = Some(Difference { step: mark.step, deviation });
         }
         self.client.restore(&self.id, mark.snapshot).await?;
         Ok(false)
     }
 }
 
-/// What pushed the plant before steps; none if nothing did.
+/// Deviation pushed the plant before steps; none if nothing did.
 fn impulses(steps: &[v1::StepRecord]) -> Result<Option<v1::Matrix>> {
     let width = steps.iter().map(|step| step.impulse.len()).max().unwrap_or(0);
     if width == 0 {

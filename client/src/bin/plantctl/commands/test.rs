@@ -16,14 +16,14 @@ use tokio::signal::unix::{SignalKind, signal};
 use crate::input::files::write;
 use crate::output::failure::FAILED;
 use crate::output::printer::Output;
-use crate::report::results::{Replay, Report, Tested, Unusable};
+use crate::report::results::{Replay, Report, ScenarioResult, UnusableFile};
 use crate::report::text::{print_case, print_summary, print_unusable, title};
 use crate::report::{html, junit};
 use crate::scenario::file::{Case, Controller, Pace, Scenario};
 use crate::server::context::Context;
 use crate::server::own::OwnServer;
 use crate::trial::outcome::Status;
-use crate::trial::prepared::Prepared;
+use crate::trial::prepared::PreparedScenario;
 use crate::trial::run::run_case;
 use crate::trial::server::TestServer;
 
@@ -189,7 +189,7 @@ impl Test {
     }
 
     /// The scenarios, and the files that are none.
-    fn read_suites(&self) -> Result<(Vec<Suite>, Vec<Unusable>)> {
+    fn read_suites(&self) -> Result<(Vec<Suite>, Vec<UnusableFile>)> {
         let mut unusable = Vec::new();
         let mut scenarios = Vec::new();
         for file in files(&self.suites)? {
@@ -198,7 +198,7 @@ impl Test {
                     scenario.seed = self.seed.unwrap_or(scenario.seed);
                     scenarios.push((file, scenario));
                 }
-                Err(error) => unusable.push(Unusable { file, error: format!("{error:#}") }),
+                Err(error) => unusable.push(UnusableFile { file, error: format!("{error:#}") }),
             }
         }
         Ok((scenarios, unusable))
@@ -228,7 +228,7 @@ impl Test {
         scenarios: Vec<Suite>,
         output: Output,
         replay: &Replay<'_>,
-    ) -> Result<(Vec<Tested>, Vec<Unusable>)> {
+    ) -> Result<(Vec<ScenarioResult>, Vec<UnusableFile>)> {
         let jobs = self.jobs.map_or_else(
             || std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
             usize::from,
@@ -237,17 +237,17 @@ impl Test {
         let mut tested = Vec::new();
         for (file, scenario) in scenarios {
             let named = file.clone();
-            match Prepared::new(server, file, scenario).await {
-                Ok(prepared) => tested.push(Tested { prepared, outcomes: Vec::new() }),
+            match PreparedScenario::new(server, file, scenario).await {
+                Ok(prepared) => tested.push(ScenarioResult { prepared, outcomes: Vec::new() }),
                 Err(error) => {
                     let error = format!("{}: {error:#}", named.display());
-                    unusable.push(Unusable { file: named, error });
+                    unusable.push(UnusableFile { file: named, error });
                 }
             }
         }
         let counter = AtomicU64::new(0);
         let mut cases = Vec::new();
-        for (index, Tested { prepared, .. }) in tested.iter().enumerate() {
+        for (index, ScenarioResult { prepared, .. }) in tested.iter().enumerate() {
             cases.extend(self.cases(&prepared.scenario).into_iter().map(|case| (index, case)));
         }
         let finished = {
@@ -295,7 +295,7 @@ fn print_errors(log: &str) {
 }
 
 /// The id of a case's plant. Somebody who drives it from outside must be able to guess it.
-fn plant_id(prepared: &Prepared, case: &Case, number: u64) -> String {
+fn plant_id(prepared: &PreparedScenario, case: &Case, number: u64) -> String {
     const NAME_MAX: usize = 40;
     let name = title(&prepared.name, &case.name);
     let plain = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' };

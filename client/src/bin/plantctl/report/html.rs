@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use crate::report::markup::escaped;
 use crate::report::plot::svg;
-use crate::report::results::{Replay, Report, Tested};
+use crate::report::results::{Replay, Report, ScenarioResult};
 use crate::scenario::verdict::{Curve, Verdict};
 use crate::trial::outcome::{Outcome, Status};
 
@@ -65,7 +65,7 @@ fn overview(html: &mut String, report: &Report) {
         "<table><thead><tr><th>scenario</th><th>passed</th><th>failed</th><th>not run</th>\
          <th>s</th></tr></thead><tbody>\n",
     );
-    for (index, Tested { prepared, outcomes }) in report.tested.iter().enumerate() {
+    for (index, ScenarioResult { prepared, outcomes }) in report.tested.iter().enumerate() {
         let count = |status| outcomes.iter().filter(|o| o.status() == status).count();
         let cell = |status| match count(status) {
             0 => "<td class=\"none\">0</td>".to_owned(),
@@ -92,8 +92,8 @@ fn overview(html: &mut String, report: &Report) {
     );
 }
 
-fn scenario(html: &mut String, index: usize, tested: &Tested, replay: &Replay<'_>) {
-    let Tested { prepared, outcomes } = tested;
+fn scenario(html: &mut String, index: usize, tested: &ScenarioResult, replay: &Replay<'_>) {
+    let ScenarioResult { prepared, outcomes } = tested;
     let _ = writeln!(
         html,
         "<section id=\"s{index}\"><h2>{}</h2>\n<p>{} <code>{}</code></p>",

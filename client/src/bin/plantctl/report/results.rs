@@ -4,24 +4,24 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use crate::trial::outcome::{Outcome, Status};
-use crate::trial::prepared::Prepared;
+use crate::trial::prepared::PreparedScenario;
 
 /// A scenario with what came of its cases.
-pub(crate) struct Tested {
-    pub(crate) prepared: Prepared,
+pub(crate) struct ScenarioResult {
+    pub(crate) prepared: PreparedScenario,
     pub(crate) outcomes: Vec<Outcome>,
 }
 
 /// A file that could not be run at all.
-pub(crate) struct Unusable {
+pub(crate) struct UnusableFile {
     pub(crate) file: PathBuf,
     pub(crate) error: String,
 }
 
 /// What a run of suites came to.
 pub(crate) struct Report {
-    pub(crate) tested: Vec<Tested>,
-    pub(crate) unusable: Vec<Unusable>,
+    pub(crate) tested: Vec<ScenarioResult>,
+    pub(crate) unusable: Vec<UnusableFile>,
 }
 
 /// Where the words of a command that replays a case come from.
@@ -31,7 +31,7 @@ pub(crate) struct Replay<'a> {
 }
 
 impl Replay<'_> {
-    pub(crate) fn command(&self, prepared: &Prepared, outcome: &Outcome) -> String {
+    pub(crate) fn command(&self, prepared: &PreparedScenario, outcome: &Outcome) -> String {
         let mut command = "plantctl".to_owned();
         let mut flag = |name: &str, value: &str| {
             let _ = write!(command, " {name} {}", quoted(value));

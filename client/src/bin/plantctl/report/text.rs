@@ -6,10 +6,10 @@ use anyhow::Result;
 use serde_json::json;
 
 use crate::output::printer::Output;
-use crate::report::results::{Report, Unusable};
+use crate::report::results::{Report, UnusableFile};
 use crate::scenario::verdict::Verdict;
 use crate::trial::outcome::{Outcome, Status};
-use crate::trial::prepared::Prepared;
+use crate::trial::prepared::PreparedScenario;
 
 /// A case by the name of its scenario and its own.
 pub(crate) fn title(scenario: &str, case: &str) -> String {
@@ -19,7 +19,7 @@ pub(crate) fn title(scenario: &str, case: &str) -> String {
 /// Prints what came of a case.
 pub(crate) fn print_case(
     output: Output,
-    prepared: &Prepared,
+    prepared: &PreparedScenario,
     outcome: &Outcome,
     replay: &str,
 ) -> Result<()> {
@@ -27,7 +27,7 @@ pub(crate) fn print_case(
 }
 
 /// A line for a case, and what went wrong in it.
-fn text(prepared: &Prepared, outcome: &Outcome, replay: &str) -> String {
+fn text(prepared: &PreparedScenario, outcome: &Outcome, replay: &str) -> String {
     let word = match outcome.status() {
         Status::Passed => "pass ",
         Status::Failed => "FAIL ",
@@ -53,7 +53,7 @@ fn text(prepared: &Prepared, outcome: &Outcome, replay: &str) -> String {
 }
 
 /// The outcome of a case as JSON.
-fn json(prepared: &Prepared, outcome: &Outcome, replay: &str) -> serde_json::Value {
+fn json(prepared: &PreparedScenario, outcome: &Outcome, replay: &str) -> serde_json::Value {
     let verdict = |verdict: &Verdict| {
         json!({
             "expectation": verdict.expectation,
@@ -80,8 +80,8 @@ fn json(prepared: &Prepared, outcome: &Outcome, replay: &str) -> serde_json::Val
 }
 
 /// Prints the files that could not be run.
-pub(crate) fn print_unusable(output: Output, unusable: &[Unusable]) -> Result<()> {
-    for Unusable { file, error } in unusable {
+pub(crate) fn print_unusable(output: Output, unusable: &[UnusableFile]) -> Result<()> {
+    for UnusableFile { file, error } in unusable {
         output.print(
             || json!({ "file": file, "status": "error", "error": error }),
             || format!("ERROR  {error}\n"),

@@ -429,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn faults_are_named_with_their_place() {
+    fn errors_are_named_with_their_place() {
         for (text, part) in [
             ("", "a name or a number is missing at character 1"),
             ("theta +", "missing at character 8"),

@@ -481,7 +481,7 @@ mod tests {
     }
 
     #[test]
-    fn faults_name_their_key() {
+    fn errors_name_their_key() {
         Scenario::parse(&format!("{LEAST}{EXPECT}")).unwrap();
         for (rest, part) in [
             ("durations = 3", "unknown field `durations`"),

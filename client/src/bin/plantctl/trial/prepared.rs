@@ -19,7 +19,7 @@ use crate::trial::server::TestServer;
 const STEP_ROUNDING: f64 = 1e-6;
 
 /// A scenario with all that its cases share.
-pub(crate) struct Prepared {
+pub(crate) struct PreparedScenario {
     pub(crate) file: PathBuf,
     pub(crate) name: String,
     pub(crate) scenario: Scenario,
@@ -55,7 +55,7 @@ impl ReferenceMotion {
     }
 }
 
-impl Prepared {
+impl PreparedScenario {
     /// Makes the model known to the server and reads what the scenario refers to.
     pub(crate) async fn new(
         server: &TestServer,

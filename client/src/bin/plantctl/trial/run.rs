@@ -11,7 +11,7 @@ use crate::scenario::file::{Case, Controller, Event, Pace};
 use crate::scenario::samples::{Sample, Samples};
 use crate::scenario::verdict::{Curve, Facts, judge};
 use crate::trial::outcome::Outcome;
-use crate::trial::prepared::{Prepared, feedback, first_step, initial_state, settings};
+use crate::trial::prepared::{PreparedScenario, feedback, first_step, initial_state, settings};
 use crate::trial::process::{Assignment, Process};
 use crate::trial::server::TestServer;
 
@@ -29,7 +29,7 @@ const DRIVER_PERIOD: Duration = Duration::from_millis(2);
 /// A run as it goes on.
 struct Run<'a> {
     server: &'a TestServer,
-    prepared: &'a Prepared,
+    prepared: &'a PreparedScenario,
     deadline: Instant,
     time_step_s: f64,
     samples: Samples,
@@ -47,7 +47,7 @@ struct Run<'a> {
 /// Runs a case and judges it.
 pub(crate) async fn run_case(
     server: &TestServer,
-    prepared: &Prepared,
+    prepared: &PreparedScenario,
     case: &Case,
     plant: &str,
 ) -> Outcome {
@@ -144,7 +144,7 @@ impl Run<'_> {
     /// Makes the plant as the case wants it, and returns its state.
     async fn create(&mut self, case: &Case, id: &str) -> Result<v1::State> {
         let client = &self.server.client;
-        let Prepared { scenario, model, reference, .. } = self.prepared;
+        let PreparedScenario { scenario, model, reference, .. } = self.prepared;
         let initial = &scenario.plant.initial;
         let open_link = match &scenario.controller {
             Controller::Command(command) => command.link,
@@ -208,7 +208,7 @@ impl Run<'_> {
 
     /// Drives the plant with the built-in controller.
     async fn step(&mut self, id: &str, initial: v1::State) -> Result<()> {
-        let Prepared { scenario, model, inputs, uses_energy, steps, .. } = self.prepared;
+        let PreparedScenario { scenario, model, inputs, uses_energy, steps, .. } = self.prepared;
         let client = &self.server.client;
         // Without other inputs: no forces, and prescribed coordinates stay.
         let dynamic = initial.p.len();
@@ -282,7 +282,7 @@ impl Run<'_> {
     /// Lets the plant go on from `step`: to the next change of parameters or to the end, and in lockstep
     /// no further than what can wait to be seen.
     async fn let_run(&mut self, id: &str, step: u64) -> Result<()> {
-        let Prepared { scenario, policy, steps, .. } = self.prepared;
+        let PreparedScenario { scenario, policy, steps, .. } = self.prepared;
         let mut until = *steps;
         for event in scenario.events.iter().filter(|event| !event.parameters.is_empty()) {
             match first_step(event, self.time_step_s) {
@@ -322,7 +322,7 @@ impl Run<'_> {
         mut events: Option<&mut Answers<v1::WatchEventsResponse>>,
         mut process: Option<&mut Process>,
     ) -> Result<()> {
-        let Prepared { scenario, steps, .. } = self.prepared;
+        let PreparedScenario { scenario, steps, .. } = self.prepared;
         let has_driver =
             matches!(scenario.controller, Controller::Command(_) | Controller::External(_));
         let is_paced = scenario.pace == Pace::Paced;

@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn a_problem_names_its_faults() {
+    fn a_problem_names_its_errors() {
         let least = "model = \"m\"\nsteps = 2\n[cost]\nq = [1]\nr = [[1.0]]\n";
         let cost = |rest: &str| Problem::parse(&format!("{least}{rest}")).unwrap().cost();
         assert!(cost("x = [[0.0]]").is_ok());
