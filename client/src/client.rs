@@ -7,8 +7,11 @@ use plantd_proto::v1::{
 };
 use tonic::transport::Channel;
 
-use crate::channel::{self, ConnectOptions, MAX_RECEIVE_BYTES};
-use crate::{Answers, Driver, Error, Result};
+use crate::connection::{ConnectOptions, MAX_RECEIVE_BYTES, connect};
+use crate::driver::Driver;
+use crate::error::{Error, Result};
+use crate::follower::Follower;
+use crate::stream::Answers;
 
 /// A connection to a server. Clones share it and are cheap.
 ///
@@ -32,7 +35,7 @@ impl Client {
 
     /// Connects with other limits than the default ones.
     pub async fn connect_with(address: impl AsRef<str>, options: ConnectOptions) -> Result<Self> {
-        let channel = channel::connect(address.as_ref(), &options).await?;
+        let channel = connect(address.as_ref(), &options).await?;
         Ok(Self { channel, options })
     }
 
@@ -69,10 +72,6 @@ impl Client {
         self.channel.clone()
     }
 
-    pub(crate) fn request_timeout(&self) -> std::time::Duration {
-        self.options.request_timeout
-    }
-
     /// A request that the server gives up after the connection's request timeout.
     fn limited<T>(&self, message: T) -> tonic::Request<T> {
         let mut request = tonic::Request::new(message);
@@ -85,8 +84,7 @@ impl Client {
         &self,
         call: impl Future<Output = Result<tonic::Response<tonic::Streaming<T>>, tonic::Status>>,
     ) -> Result<Answers<T>> {
-        let response = channel::within(self.options.request_timeout, call).await?;
-        Ok(Answers::new(response.into_inner()))
+        Answers::open(self.options.request_timeout, call).await
     }
 }
 
@@ -117,7 +115,7 @@ impl Client {
     /// Uploads a scene (TOML or JSON) under its own name.
     ///
     /// # Errors
-    /// A faulty scene is refused with all its errors in [`Error::violations`].
+    /// A scene with errors is refused with all of them in [`Error::violations`].
     pub async fn create_model(&self, scene: impl Into<String>) -> Result<v1::Model> {
         let request = v1::CreateModelRequest { scene: scene.into(), ..Default::default() };
         self.create_model_as(request).await
@@ -200,26 +198,24 @@ impl Client {
 
     /// Takes the lease of a plant, to step it in lockstep.
     pub async fn drive(&self, id: impl Into<String>) -> Result<Driver> {
-        let open = v1::DriveOpen { id: id.into(), ..Default::default() };
-        Driver::open(self, open, self.options.request_timeout).await
+        self.drive_as(v1::DriveOpen { id: id.into(), ..Default::default() }).await
     }
 
-    /// The same with the linearization of each step in its answer.
+    /// Takes the lease of a plant; each answer has the linearization of its step.
     pub async fn drive_linearized(&self, id: impl Into<String>) -> Result<Driver> {
         let open = v1::DriveOpen { id: id.into(), linearization: true, ..Default::default() };
-        Driver::open(self, open, self.options.request_timeout).await
+        self.drive_as(open).await
     }
 
-    /// The same with all that can be asked for: a lease that outlives a broken connection
-    /// (`grace_s`), or one that did (`resume`, with [`Driver::lease_token`]).
+    /// Takes the lease of a plant with all that can be asked for: a lease that outlives a broken
+    /// connection (`grace_s`), or one that did (`resume`, with [`Driver::lease_token`]).
     pub async fn drive_as(&self, open: v1::DriveOpen) -> Result<Driver> {
-        Driver::open(self, open, self.options.request_timeout).await
+        Driver::open(self.plants(), open, self.options.request_timeout).await
     }
 
     /// Watches a plant. Latest wins: who reads slowly loses messages, which `dropped` counts.
     pub async fn watch(&self, request: v1::WatchRequest) -> Result<Answers<v1::WatchResponse>> {
-        let mut stub = self.plants();
-        self.open(stub.watch(request)).await
+        self.open(self.plants().watch(request)).await
     }
 
     /// Puts a plant back to step 0, in the state that it was created with.
@@ -289,8 +285,8 @@ impl Client {
         id: impl Into<String>,
         since: Option<u64>,
     ) -> Result<Answers<v1::WatchEventsResponse>> {
-        let (mut stub, request) = (self.plants(), v1::WatchEventsRequest { id: id.into(), since });
-        self.open(stub.watch_events(request)).await
+        let request = v1::WatchEventsRequest { id: id.into(), since };
+        self.open(self.plants().watch_events(request)).await
     }
 
     /// Gives a plant a reference with its regulator: for [`Client::watch_gains`], and for the plant's
@@ -314,8 +310,15 @@ impl Client {
         id: impl Into<String>,
     ) -> Result<Answers<v1::WatchGainsResponse>> {
         let request = v1::WatchGainsRequest { id: id.into() };
-        let mut stub = self.plants();
-        self.open(stub.watch_gains(request)).await
+        self.open(self.plants().watch_gains(request)).await
+    }
+
+    /// Follows the gains of a plant's feedback (see [`Client::set_feedback`]), to apply them here.
+    ///
+    /// # Errors
+    /// `FAILED_PRECONDITION` with reason `NO_FEEDBACK` if the plant has none.
+    pub async fn follow_gains(&self, id: impl Into<String>) -> Result<Follower> {
+        Follower::open(self.plants(), id.into(), self.options.request_timeout).await
     }
 
     /// Opens the shared-memory link of a plant and says how to reach it.
@@ -359,8 +362,7 @@ impl Client {
         &self,
         request: v1::LinearizeTrajectoryRequest,
     ) -> Result<Answers<v1::LinearizeTrajectoryResponse>> {
-        let mut stub = self.control();
-        self.open(stub.linearize_trajectory(request)).await
+        self.open(self.control().linearize_trajectory(request)).await
     }
 
     /// Infinite-horizon LQR about an equilibrium.
@@ -374,8 +376,7 @@ impl Client {
         &self,
         request: v1::SolveTrajectoryLqrRequest,
     ) -> Result<Answers<v1::SolveTrajectoryLqrResponse>> {
-        let mut stub = self.control();
-        self.open(stub.solve_trajectory_lqr(request)).await
+        self.open(self.control().solve_trajectory_lqr(request)).await
     }
 
     /// Finds a trajectory of least cost: one message per iteration, the result last. Dropping the
@@ -384,11 +385,11 @@ impl Client {
         &self,
         request: v1::OptimizeTrajectoryRequest,
     ) -> Result<Answers<v1::OptimizeTrajectoryResponse>> {
-        let mut stub = self.control();
-        self.open(stub.optimize_trajectory(request)).await
+        self.open(self.control().optimize_trajectory(request)).await
     }
 
-    /// The same to its end: `progress` gets each iteration, the last message comes back.
+    /// Finds a trajectory of least cost and waits for the end: `progress` gets each iteration, the
+    /// result comes back.
     pub async fn find_trajectory(
         &self,
         request: v1::OptimizeTrajectoryRequest,
@@ -412,8 +413,7 @@ impl Client {
         &self,
         request: v1::ProjectReferenceRequest,
     ) -> Result<Answers<v1::ProjectReferenceResponse>> {
-        let mut stub = self.control();
-        self.open(stub.project_reference(request)).await
+        self.open(self.control().project_reference(request)).await
     }
 
     /// Steady-state Kalman filter about an equilibrium.
@@ -429,8 +429,7 @@ impl Client {
         &self,
         request: v1::SolveTrajectoryKalmanRequest,
     ) -> Result<Answers<v1::SolveTrajectoryKalmanResponse>> {
-        let mut stub = self.control();
-        self.open(stub.solve_trajectory_kalman(request)).await
+        self.open(self.control().solve_trajectory_kalman(request)).await
     }
 
     /// Runs many simulations at once; answers come in the order in which they end. Each may have failed by
@@ -439,8 +438,7 @@ impl Client {
         &self,
         request: v1::RolloutRequest,
     ) -> Result<Answers<v1::RolloutResponse>> {
-        let mut stub = self.control();
-        self.open(stub.rollout(request)).await
+        self.open(self.control().rollout(request)).await
     }
 }
 
@@ -533,5 +531,19 @@ impl Client {
         let request = v1::DeleteRecordingRequest { name: name.into() };
         self.recordings().delete_recording(self.limited(request)).await?;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn calls_may_be_made_on_other_threads() {
+        fn assert_send<T: Send>(_: impl FnOnce(&'static Client) -> T) {}
+        assert_send(|client| client.list_models());
+        assert_send(|client| client.drive("a"));
+        assert_send(|client| client.watch_gains("a"));
+        assert_send(|client| client.follow_gains("a"));
     }
 }

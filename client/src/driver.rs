@@ -2,14 +2,27 @@
 
 use std::time::Duration;
 
-use plantd_proto::v1;
+use plantd_proto::v1::{self, plant_service_client::PlantServiceClient};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::Channel;
 
-use crate::channel::within;
-use crate::{Client, Error, Result};
+use crate::connection::within;
+use crate::error::{Error, Result};
 
 /// Holds the lease of a plant: steps it in lockstep, or gives inputs to one that runs by itself.
+///
+/// ```no_run
+/// # async fn damp(client: plantd_client::Client) -> plantd_client::Result<()> {
+/// let mut driver = client.drive("pendulum").await?;
+/// let mut torque = 0.0;
+/// for _ in 0..1000 {
+///     let state = driver.step(&[torque]).await?.state.expect("a step has a state");
+///     torque = -0.5 * state.p[0];
+/// }
+/// driver.close().await
+/// # }
+/// ```
 ///
 /// The lease ends when the driver is dropped; [`Driver::close`] also waits for the server to have
 /// noticed, so that the next driver is sure to be let in.
@@ -27,7 +40,7 @@ pub struct Driver {
 
 impl Driver {
     pub(crate) async fn open(
-        client: &Client,
+        mut plants: PlantServiceClient<Channel>,
         open: v1::DriveOpen,
         step_timeout: Duration,
     ) -> Result<Self> {
@@ -35,7 +48,6 @@ impl Driver {
         let (requests, queue) = mpsc::channel(1);
         let open = v1::drive_request::Request::Open(open);
         requests.try_send(v1::DriveRequest { request: Some(open) }).expect("the queue is empty");
-        let mut plants = client.plants();
         let call = plants.drive(ReceiverStream::new(queue));
         let mut responses = within(step_timeout, call).await?.into_inner();
         let opened = within(step_timeout, responses.message()).await?;

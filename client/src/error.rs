@@ -143,7 +143,7 @@ impl Error {
         self.refusal().map_or("", |refusal| &refusal.reason)
     }
 
-    /// The faults found in the request, each with its path; empty if it was not the request.
+    /// What is wrong with the request, each with its path; empty if it was not the request.
     pub fn violations(&self) -> &[Violation] {
         self.refusal().map_or(&[], |refusal| &refusal.violations)
     }
@@ -164,11 +164,11 @@ pub struct Refusal {
     pub message: String,
     /// Upper-case reason (`google.rpc.ErrorInfo`), or empty.
     pub reason: String,
-    /// Faults of the request (`google.rpc.BadRequest`).
+    /// What is wrong with the request (`google.rpc.BadRequest`).
     pub violations: Vec<Violation>,
 }
 
-/// One fault of a request.
+/// One thing that is wrong with a request.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Violation {
     /// Path of the field, for example `frames[3].body.mass` in a scene.

@@ -2,8 +2,9 @@
 
 use plantd_proto::v1;
 
+use crate::error::{Error, Result};
+use crate::messages::MatrixExt as _;
 use crate::rotation::{compose, difference};
-use crate::{Error, MatrixExt as _, Result};
 
 /// A steady-state Kalman filter about an equilibrium, from the answer of
 /// [`Client::solve_kalman`](crate::Client::solve_kalman).

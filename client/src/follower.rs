@@ -1,150 +1,22 @@
-//! Feedback laws that come as gains: streamed by the server, or collected beforehand.
+//! Feedback laws that come as gains: streamed by the server.
 
-use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
-use plantd_proto::v1;
+use plantd_proto::v1::{self, plant_service_client::PlantServiceClient};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
+use tonic::transport::Channel;
 
-use crate::channel::within;
-use crate::link::StateView;
-use crate::{Answers, Client, Error, GainExt as _, Refusal, Result, StateExt as _};
+use crate::connection::within;
+use crate::error::{Error, Refusal, Result};
+use crate::schedule::{LawState, check, input_of};
+use crate::stream::Answers;
 
 /// Gains of a trajectory that are kept ahead of the step asked for.
 const WINDOW: usize = 1024;
-
-/// A state that a feedback law can be asked about: of a [`Driver`](crate::Driver), a watch or a
-/// [`LinkDriver`](crate::link::LinkDriver).
-pub trait LawState {
-    /// Steps since the plant was created or reset.
-    fn step_index(&self) -> u64;
-    /// `x = (q, p, v)`.
-    fn state_vector(&self) -> Cow<'_, [f64]>;
-}
-
-impl LawState for v1::State {
-    fn step_index(&self) -> u64 {
-        self.step
-    }
-
-    fn state_vector(&self) -> Cow<'_, [f64]> {
-        Cow::Owned(self.x())
-    }
-}
-
-impl LawState for StateView<'_> {
-    fn step_index(&self) -> u64 {
-        self.step
-    }
-
-    fn state_vector(&self) -> Cow<'_, [f64]> {
-        Cow::Borrowed(self.x)
-    }
-}
-
-/// `gain`'s input at `state`, about another reference state if one is given.
-fn input_of(gain: &v1::Gain, state: &impl LawState, about: Option<&[f64]>) -> Result<Vec<f64>> {
-    let x = state.state_vector();
-    let expected = gain.x_reference.len();
-    if x.len() != expected {
-        return Err(Error::StateLength { expected, actual: x.len() });
-    }
-    match about {
-        None => Ok(gain.control_at(&x)),
-        Some(x_reference) => {
-            Ok(v1::Gain { x_reference: x_reference.to_vec(), ..gain.clone() }.control_at(&x))
-        }
-    }
-}
-
-/// Whether the contract's promises on a gain hold, so that it can be applied.
-fn check(gain: &v1::Gain) -> Result<()> {
-    let (inputs, states) = (gain.u_reference.len(), gain.x_reference.len());
-    let fits = gain.k.as_ref().is_none_or(|k| {
-        (k.rows as usize, k.cols as usize) == (inputs, states) && k.data.len() == inputs * states
-    });
-    if fits { Ok(()) } else { Err(Error::Protocol("a gain whose sizes do not fit")) }
-}
-
-/// Time-varying gains as a feedback law: those of `SolveTrajectoryLqr` or of `ProjectReference`, or
-/// gains of one's own.
-///
-/// Before the first gain's step that gain holds about its own reference; after the last one the last
-/// gain holds, about the final state if the gains end with one.
-#[derive(Clone, Debug, PartialEq)]
-pub struct GainSchedule {
-    /// In the order of their steps, none without `k`.
-    gains: Vec<v1::Gain>,
-    final_state: Option<Vec<f64>>,
-}
-
-impl GainSchedule {
-    /// A schedule of gains in the order of their steps; the last may hold only the final reference
-    /// state, as `SolveTrajectoryLqr` sends it.
-    ///
-    /// # Errors
-    /// [`Error::Gains`] if there is none, if steps do not increase or if sizes do not fit.
-    pub fn from_gains(gains: impl IntoIterator<Item = v1::Gain>) -> Result<Self> {
-        let mut gains: Vec<_> = gains.into_iter().collect();
-        let final_state = match gains.last() {
-            Some(last) if last.k.is_none() => gains.pop().map(|last| last.x_reference),
-            _ => None,
-        };
-        let first = gains.first().ok_or(Error::Gains("there is no gain with `k`"))?;
-        let (states, inputs) = (first.x_reference.len(), first.u_reference.len());
-        for gain in &gains {
-            if gain.k.is_none() {
-                return Err(Error::Gains("only the last one may be without `k`"));
-            }
-            check(gain).map_err(|_| Error::Gains("`k` does not fit the references"))?;
-            if (gain.x_reference.len(), gain.u_reference.len()) != (states, inputs) {
-                return Err(Error::Gains("their references differ in length"));
-            }
-        }
-        if final_state.as_ref().is_some_and(|x| x.len() != states) {
-            return Err(Error::Gains("the final state differs in length from the references"));
-        }
-        if gains.windows(2).any(|pair| pair[0].step >= pair[1].step) {
-            return Err(Error::Gains("their steps do not increase"));
-        }
-        Ok(Self { gains, final_state })
-    }
-
-    /// The same gains with the first one at this step of a plant.
-    #[must_use]
-    pub fn starting_at(mut self, step: u64) -> Self {
-        let first = self.gains[0].step;
-        for gain in &mut self.gains {
-            gain.step = gain.step - first + step;
-        }
-        self
-    }
-
-    /// The gains, without the message that holds only the final state.
-    pub fn gains(&self) -> &[v1::Gain] {
-        &self.gains
-    }
-
-    /// The gain that holds at a step.
-    pub fn gain_at(&self, step: u64) -> &v1::Gain {
-        let after = self.gains.partition_point(|gain| gain.step <= step);
-        &self.gains[after.saturating_sub(1)]
-    }
-
-    /// The input `u_reference + feedforward − K (x − x_reference)` at a state.
-    ///
-    /// # Errors
-    /// [`Error::StateLength`] if the state is not one of the gains' plant.
-    pub fn input(&self, state: &impl LawState) -> Result<Vec<f64>> {
-        let step = state.step_index();
-        let last = self.gains[self.gains.len() - 1].step;
-        let about = self.final_state.as_deref().filter(|_| step > last);
-        input_of(self.gain_at(step), state, about)
-    }
-}
 
 /// The feedback law of a plant, applied here with the gains that the server streams.
 ///
@@ -168,7 +40,8 @@ impl GainSchedule {
 #[derive(Debug)]
 pub struct Follower {
     shared: Arc<Shared>,
-    client: Client,
+    /// Longest wait for a gain.
+    timeout: Duration,
     runtime: Handle,
     task: JoinHandle<()>,
 }
@@ -307,32 +180,28 @@ impl Window {
     }
 }
 
-impl Client {
-    /// Follows the gains of a plant's feedback (see [`Client::set_feedback`]), to apply them here.
-    ///
-    /// # Errors
-    /// `FAILED_PRECONDITION` with reason `NO_FEEDBACK` if the plant has none.
-    pub async fn follow_gains(&self, id: impl Into<String>) -> Result<Follower> {
-        let id = id.into();
-        let mut answers = self.watch_gains(&id).await?;
-        let shared = Arc::new(Shared::default());
-        // The first message says whether there is a feedback at all.
-        let first = within(self.request_timeout(), answers.next()).await?;
-        shared.window().note(first.ok_or(Error::StreamClosed)?)?;
-        let (client, window) = (self.clone(), shared.clone());
-        let task = tokio::spawn(async move {
-            let end = read(&client, &id, answers, &window).await;
-            window.window().end = Some(end);
-            window.arrived.notify_waiters();
-        });
-        Ok(Follower { shared, client: self.clone(), runtime: Handle::current(), task })
+/// Where the gains of a plant come from.
+struct Source {
+    plants: PlantServiceClient<Channel>,
+    id: String,
+    /// Longest wait for the stream to open, and for its first message.
+    timeout: Duration,
+}
+
+impl Source {
+    /// Opens the stream; the first message says whether there is a feedback at all.
+    async fn open(&mut self) -> Result<(Answers<v1::WatchGainsResponse>, v1::WatchGainsResponse)> {
+        let request = v1::WatchGainsRequest { id: self.id.clone() };
+        let call = self.plants.watch_gains(request);
+        let mut answers = Answers::open(self.timeout, call).await?;
+        let first = within(self.timeout, answers.next()).await?;
+        Ok((answers, first.ok_or(Error::StreamClosed)?))
     }
 }
 
 /// Reads the stream until it ends, and opens it anew when the plant has gone back.
 async fn read(
-    client: &Client,
-    id: &str,
+    mut source: Source,
     mut answers: Answers<v1::WatchGainsResponse>,
     shared: &Shared,
 ) -> Ended {
@@ -343,12 +212,7 @@ async fn read(
             (window.is_behind, window.has_room())
         };
         if is_behind {
-            let again = async {
-                let mut answers = client.watch_gains(id).await?;
-                let first = within(client.request_timeout(), answers.next()).await?;
-                Ok::<_, Error>((answers, first.ok_or(Error::StreamClosed)?))
-            };
-            let first = match again.await {
+            let first = match source.open().await {
                 Ok((fresh, first)) => {
                     answers = fresh;
                     first
@@ -385,6 +249,25 @@ async fn read(
 }
 
 impl Follower {
+    /// Opens the stream of a plant's gains and takes its first message in.
+    pub(crate) async fn open(
+        plants: PlantServiceClient<Channel>,
+        id: String,
+        timeout: Duration,
+    ) -> Result<Self> {
+        let mut source = Source { plants, id, timeout };
+        let (answers, first) = source.open().await?;
+        let shared = Arc::new(Shared::default());
+        shared.window().note(first)?;
+        let window = shared.clone();
+        let task = tokio::spawn(async move {
+            let end = read(source, answers, &window).await;
+            window.window().end = Some(end);
+            window.arrived.notify_waiters();
+        });
+        Ok(Self { shared, timeout, runtime: Handle::current(), task })
+    }
+
     /// The input `u_reference + feedforward − K (x − x_reference)` at a state of the plant, with the
     /// gain of the state's step.
     ///
@@ -397,11 +280,12 @@ impl Follower {
         if let Some(u) = self.try_input(state)? {
             return Ok(u);
         }
-        within(self.client.request_timeout(), self.wait_for_input(state)).await
+        within(self.timeout, self.wait_for_input(state)).await
     }
 
-    /// The same for a thread outside the runtime, such as one that steps a
-    /// [`LinkDriver`](crate::link::LinkDriver). The runtime must have threads of its own.
+    /// The input at a state for a thread outside the runtime, such as one that steps a
+    /// [`LinkDriver`](crate::link::LinkDriver); see [`input`](Self::input). The runtime must have
+    /// threads of its own.
     ///
     /// # Panics
     /// If it is called on a thread of an asynchronous runtime and the gain is not there yet.
@@ -412,7 +296,7 @@ impl Follower {
         }
     }
 
-    /// The same without waiting; `None` if the gain of the state's step is not there yet.
+    /// The input at a state without waiting; `None` if the gain of the state's step is not there yet.
     pub fn try_input(&self, state: &impl LawState) -> Result<Option<Vec<f64>>> {
         let mut window = self.shared.window();
         let had_room = window.has_room();
@@ -478,25 +362,7 @@ impl Drop for Follower {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::MatrixExt as _;
-
-    fn gain(step: u64, k: f64, reference: f64) -> v1::Gain {
-        v1::Gain {
-            step,
-            k: Some(v1::Matrix::from_rows(&[[k, 0.0]])),
-            x_reference: vec![reference, 0.0],
-            u_reference: vec![0.0],
-            ..Default::default()
-        }
-    }
-
-    fn end_state(step: u64, reference: f64) -> v1::Gain {
-        v1::Gain { step, x_reference: vec![reference, 0.0], ..Default::default() }
-    }
-
-    fn state(step: u64, q: f64) -> v1::State {
-        v1::State { step, q: vec![q], p: vec![0.0], ..Default::default() }
-    }
+    use crate::schedule::tests::{end_state, gain, state};
 
     fn message(revision: u64, gain: v1::Gain, horizon: u32) -> v1::WatchGainsResponse {
         v1::WatchGainsResponse {
@@ -506,39 +372,6 @@ mod tests {
             horizon,
             ..Default::default()
         }
-    }
-
-    #[test]
-    fn a_schedule_holds_its_ends() {
-        let gains = [gain(0, 1.0, 0.0), gain(1, 2.0, 1.0), end_state(2, 5.0)];
-        let law = GainSchedule::from_gains(gains).unwrap().starting_at(7);
-        let at = |step, q| law.input(&state(step, q)).unwrap()[0];
-        assert_eq!(at(0, 1.0), -1.0);
-        assert_eq!(at(7, 1.0), -1.0);
-        assert_eq!(at(8, 2.0), -2.0);
-        assert_eq!(at(9, 6.0), -2.0);
-        assert_eq!(at(1000, 5.0), 0.0);
-        assert_eq!(law.gains().len(), 2);
-    }
-
-    #[test]
-    fn a_schedule_says_what_is_wrong_with_its_gains() {
-        for (gains, part) in [
-            (vec![], "no gain"),
-            (vec![end_state(0, 0.0), gain(1, 1.0, 0.0)], "only the last"),
-            (vec![gain(1, 1.0, 0.0), gain(1, 1.0, 0.0)], "increase"),
-            (vec![v1::Gain { u_reference: vec![], ..gain(0, 1.0, 0.0) }], "fit"),
-            (
-                vec![gain(0, 1.0, 0.0), v1::Gain { x_reference: vec![], ..end_state(1, 0.0) }],
-                "final state",
-            ),
-        ] {
-            let error = GainSchedule::from_gains(gains).unwrap_err().to_string();
-            assert!(error.contains(part), "{error}");
-        }
-        let law = GainSchedule::from_gains([gain(0, 1.0, 0.0)]).unwrap();
-        let short = v1::State::default();
-        assert!(matches!(law.input(&short), Err(Error::StateLength { expected: 2, actual: 0 })));
     }
 
     #[test]

@@ -35,44 +35,46 @@
 //! of time; [`Client::follow_gains`] applies them in one call, [`GainSchedule`] those that were
 //! collected, and [`Estimator`] runs a Kalman filter on what is measured.
 //!
-//! What the server refuses comes back as an [`Error`] with the gRPC code, the reason and the faults
-//! of the request:
+//! What the server refuses comes back as an [`Error`] with the gRPC code, the reason and what
+//! is wrong with the request:
 //!
 //! ```no_run
 //! # async fn upload(client: plantd_client::Client, scene: String) -> plantd_client::Result<()> {
 //! if let Err(error) = client.create_model(scene).await {
-//!     for fault in error.violations() {
-//!         eprintln!("{}: {}", fault.field, fault.description);
+//!     for violation in error.violations() {
+//!         eprintln!("{}: {}", violation.field, violation.description);
 //!     }
 //! }
 //! # Ok(())
 //! # }
 //! ```
 
-mod channel;
 mod client;
+mod connection;
 mod driver;
 mod error;
 mod estimator;
 mod follower;
 pub mod link;
-mod matrix;
+mod messages;
 mod recording;
 mod rotation;
+mod schedule;
 mod stream;
 
-pub use channel::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use client::Client;
+pub use connection::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
 pub use driver::Driver;
 pub use error::{ConnectProblem, Error, Refusal, Result, Violation};
 pub use estimator::Estimator;
-pub use follower::{Follower, GainSchedule, LawState};
-pub use matrix::{
+pub use follower::Follower;
+pub use messages::{
     GainExt, MatrixExt, RolloutExt, StateExt, WeightsExt, diagonal, full, operating_point,
     present_state, weights,
 };
 pub use recording::{RecordingEntry, RecordingReader};
 pub use rotation::{compose, difference, rotations};
+pub use schedule::{GainSchedule, LawState};
 pub use stream::Answers;
 
 /// The messages and stubs of the contract, `plantd.v1`.

@@ -10,7 +10,7 @@ use mcap::sans_io::LinearReaderOptions;
 use plantd_proto::v1;
 use prost::Message as _;
 
-use crate::{Error, Result};
+use crate::error::{Error, Result};
 
 /// Longest record that is read, bytes.
 const RECORD_BYTES_MAX: usize = 1 << 30;
@@ -27,6 +27,20 @@ pub enum RecordingEntry {
 }
 
 /// Reads a recording (MCAP), entry by entry.
+///
+/// ```no_run
+/// use plantd_client::{RecordingEntry, RecordingReader};
+///
+/// # fn main() -> plantd_client::Result<()> {
+/// let mut recording = RecordingReader::open("trial.mcap")?;
+/// while let Some(entry) = recording.next_entry()? {
+///     if let RecordingEntry::Step(step) = entry {
+///         println!("{:?}", step.state.map(|state| state.q));
+///     }
+/// }
+/// # Ok(())
+/// # }
+/// ```
 ///
 /// One whose writer was killed ends where the file does: see [`RecordingReader::is_cut`].
 pub struct RecordingReader {

@@ -2,10 +2,12 @@
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
+use std::time::Duration;
 
 use futures::{Stream, StreamExt as _};
 
-use crate::{Error, Result};
+use crate::connection::within;
+use crate::error::{Error, Result};
 
 /// Messages that the server sends until it ends the stream; dropping it tells the server to stop.
 #[derive(Debug)]
@@ -15,8 +17,12 @@ pub struct Answers<T> {
 }
 
 impl<T> Answers<T> {
-    pub(crate) fn new(inner: tonic::Streaming<T>) -> Self {
-        Self { inner }
+    /// Waits until a stream is open, but not longer than `limit`.
+    pub(crate) async fn open(
+        limit: Duration,
+        call: impl Future<Output = Result<tonic::Response<tonic::Streaming<T>>, tonic::Status>>,
+    ) -> Result<Self> {
+        Ok(Self { inner: within(limit, call).await?.into_inner() })
     }
 
     /// The next message; `None` when the server is done.

@@ -223,7 +223,7 @@ impl std::fmt::Display for LeaseHolder {
 }
 
 /// The error that a failure message speaks of.
-pub(super) fn from_failure(answer: &Header) -> LinkError {
+pub(crate) fn from_failure(answer: &Header) -> LinkError {
     let (a, b) = (answer.detail_a as usize, answer.detail_b as usize);
     let (value, iterations) = (answer.detail_value, answer.iterations);
     let step = match Code::from_number(answer.code) {

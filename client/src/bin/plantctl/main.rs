@@ -1,61 +1,187 @@
 //! `plantctl`: looks at, drives and asks a plantd server from a shell.
 
-mod args;
-mod channels;
 mod commands;
-mod feedback;
-mod json;
-mod optimize;
-mod own_server;
-mod replay;
-mod run;
-mod test;
-mod text;
+mod contract;
+mod input;
+mod output;
+mod report;
+mod scenario;
+mod server;
+mod trial;
 
 use std::process::ExitCode;
 
-use clap::Parser as _;
-use plantd_client::Error;
+use anyhow::Result;
+use clap::{Parser, Subcommand};
 
-/// The server refused, a stream broke, or a file could not be read or written.
-const FAILED: u8 = 1;
-/// What was asked for makes no sense; clap's code for it.
-const WRONG_USAGE: u8 = 2;
-/// There is no server at the address.
-const NO_SERVER: u8 = 3;
-/// A search ended before it converged; what it found is there.
-const STOPPED_EARLY: u8 = 4;
+use crate::commands::{
+    analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard,
+    inventory, kalman, linearize, lqr, optimize, parameters, record, reference, replay, run, scene,
+    settle, state, step, test, timing, watch,
+};
+use crate::output::failure;
+use crate::output::printer::Output;
+use crate::server::context::Context;
+
+const EXAMPLES: &str = "\
+Examples:
+  plantctl list                                     models and plants of the server
+  plantctl create pendulum --id p1 --at upright     a plant at a named operating point
+  plantctl step p1 --u 0.1 --count 100              100 steps with the input 0.1
+  plantctl watch p1 --fields state,energy --json    one JSON object per step
+  plantctl linearize cart-pole --at upright         A and B of x[k+1] = f(x[k], u[k])
+  plantctl lqr cart-pole --at upright --q 100,1,1,1 --r 0.1
+  plantctl analyze cart-pole --at hanging --outputs theta --frequencies 0.1,0.5,1
+  plantctl optimize swing-up.toml --save best.json  one line per iteration, then the result
+  plantctl kalman cart-pole --at upright --outputs x,theta --measurement 1e-4 --process 1e-6
+  plantctl set-parameter p1 'frames[pole].body.mass=1.2'
+  plantctl feedback set p1 --at upright --q 100,1 --r 1 --mode replace
+  plantctl channels set p1 sensors.toml             sensors and actuators of a plant
+  plantctl fault inject p1 input=tau stuck=true start_s=2 duration_s=0.5
+  plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
+  plantctl validate arm.toml                        all errors of a scene, with their paths
+  plantctl record start p1 --name trial             then `record stop trial`, `record get trial`
+  plantctl replay trial.mcap                        the same steps again, compared bit for bit
+  plantctl export trial.mcap --csv trial.csv
+  plantctl test scenarios --junit junit.xml         scenarios with their expectations
+  plantctl --address unix:/run/plantd/plantd.sock list plants";
+
+const EXIT_CODES: &str = "\
+Data goes to standard output, messages to standard error.
+
+Exit codes:
+  0  done; where things already were as asked for, a message says so
+  1  refused by the server, or failed; `validate`: the scene has errors; `replay`: a step differs;
+     `run --wait`: something else has stopped the plant
+  2  wrong usage
+  3  no server at the address
+  4  `optimize`: the search stopped before it converged; what it found is printed, and saved if asked for";
+
+/// Looks at, drives and asks a plantd server.
+#[derive(Debug, Parser)]
+#[command(name = "plantctl", version, before_help = EXAMPLES, after_help = EXIT_CODES, max_term_width = 100)]
+struct Args {
+    /// Server: http://host:port or unix:/path.
+    /// http://127.0.0.1:50051 if not given; `test` then starts a server of its own.
+    #[arg(long, global = true, env = "PLANTD_ADDRESS")]
+    address: Option<String>,
+    /// Print JSON, in the field names of the contract; streams print one object per line.
+    #[arg(long, global = true)]
+    json: bool,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    List(inventory::List),
+    Show(inventory::Show),
+    Upload(scene::Upload),
+    Create(create::Create),
+    Step(step::Step),
+    Watch(watch::Watch),
+    Linearize(linearize::Linearize),
+    Lqr(lqr::Lqr),
+    SecondOrder(linearize::SecondOrder),
+    Dynamics(dynamics::Dynamics),
+    Analyze(analyze::Analyze),
+    Optimize(optimize::Optimize),
+    ProjectReference(reference::ProjectReference),
+    Kalman(kalman::Kalman),
+    SetParameter(parameters::SetParameter),
+    Feedback(feedback::Feedback),
+    Channels(channels::Channels),
+    Run(run::Run),
+    Pause(run::Pause),
+    Guard(guard::Guard),
+    Timing(timing::Timing),
+    Events(events::Events),
+    Fault(fault::Fault),
+    Gains(feedback::Gains),
+    Settle(settle::Settle),
+    Diagnose(diagnose::Diagnose),
+    Validate(scene::Validate),
+    Explain(scene::Explain),
+    Record(record::Record),
+    Replay(replay::Replay),
+    Export(export::Export),
+    Reset(state::Reset),
+    Snapshot(state::Snapshot),
+    Restore(state::Restore),
+    Test(test::Test),
+    Delete(inventory::Delete),
+}
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> ExitCode {
-    let args = args::Args::parse();
-    let as_json = args.json;
-    match commands::run(args).await {
+    let args = Args::parse();
+    let context = Context { address: args.address, output: Output { json: args.json } };
+    match run(args.command, &context).await {
         Ok(code) => code,
         // Whoever reads our output has seen enough (`plantctl watch ... | head`).
-        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) if failure::is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            if as_json {
-                eprintln!("{}", json::error(&error));
+            if args.json {
+                eprintln!("{}", failure::as_json(&error));
             } else {
                 eprintln!("plantctl: {error:#}");
             }
-            ExitCode::from(code(&error))
+            ExitCode::from(failure::code(&error))
         }
     }
 }
 
-fn code(error: &anyhow::Error) -> u8 {
-    match error.downcast_ref::<Error>() {
-        Some(Error::Address { .. }) => WRONG_USAGE,
-        Some(Error::Connect { .. }) => NO_SERVER,
-        _ if error.is::<optimize::SearchStopped>() => STOPPED_EARLY,
-        _ => FAILED,
+/// Runs a command; the code is that of a command which ran.
+async fn run(command: Command, context: &Context) -> Result<ExitCode> {
+    match command {
+        Command::List(command) => command.run(context).await?,
+        Command::Show(command) => command.run(context).await?,
+        Command::Upload(command) => command.run(context).await?,
+        Command::Create(command) => command.run(context).await?,
+        Command::Step(command) => command.run(context).await?,
+        Command::Watch(command) => command.run(context).await?,
+        Command::Linearize(command) => command.run(context).await?,
+        Command::Lqr(command) => command.run(context).await?,
+        Command::SecondOrder(command) => command.run(context).await?,
+        Command::Dynamics(command) => command.run(context).await?,
+        Command::Analyze(command) => command.run(context).await?,
+        Command::Optimize(command) => command.run(context).await?,
+        Command::ProjectReference(command) => command.run(context).await?,
+        Command::Kalman(command) => command.run(context).await?,
+        Command::SetParameter(command) => command.run(context).await?,
+        Command::Feedback(command) => command.run(context).await?,
+        Command::Channels(command) => command.run(context).await?,
+        Command::Run(command) => command.run(context).await?,
+        Command::Pause(command) => command.run(context).await?,
+        Command::Guard(command) => command.run(context).await?,
+        Command::Timing(command) => command.run(context).await?,
+        Command::Events(command) => command.run(context).await?,
+        Command::Fault(command) => command.run(context).await?,
+        Command::Gains(command) => command.run(context).await?,
+        Command::Settle(command) => command.run(context).await?,
+        Command::Diagnose(command) => command.run(context).await?,
+        Command::Validate(command) => return command.run(context).await,
+        Command::Explain(command) => return command.run(context).await,
+        Command::Record(command) => command.run(context).await?,
+        Command::Replay(command) => return command.run(context).await,
+        Command::Export(command) => command.run(context)?,
+        Command::Reset(command) => command.run(context).await?,
+        Command::Snapshot(command) => command.run(context).await?,
+        Command::Restore(command) => command.run(context).await?,
+        Command::Test(command) => return command.run(context).await,
+        Command::Delete(command) => command.run(context).await?,
     }
+    Ok(ExitCode::SUCCESS)
 }
 
-fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    error
-        .downcast_ref::<std::io::Error>()
-        .is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Args::command().debug_assert();
+    }
 }

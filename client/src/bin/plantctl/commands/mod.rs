@@ -1,0 +1,30 @@
+//! The commands: a module for each, or for a few that share a thing, with their arguments and what
+//! they do.
+
+pub(crate) mod analyze;
+pub(crate) mod channels;
+pub(crate) mod create;
+pub(crate) mod diagnose;
+pub(crate) mod dynamics;
+pub(crate) mod events;
+pub(crate) mod export;
+pub(crate) mod fault;
+pub(crate) mod feedback;
+pub(crate) mod guard;
+pub(crate) mod inventory;
+pub(crate) mod kalman;
+pub(crate) mod linearize;
+pub(crate) mod lqr;
+pub(crate) mod optimize;
+pub(crate) mod parameters;
+pub(crate) mod record;
+pub(crate) mod reference;
+pub(crate) mod replay;
+pub(crate) mod run;
+pub(crate) mod scene;
+pub(crate) mod settle;
+pub(crate) mod state;
+pub(crate) mod step;
+pub(crate) mod test;
+pub(crate) mod timing;
+pub(crate) mod watch;

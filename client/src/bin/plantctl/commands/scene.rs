@@ -1,0 +1,95 @@
+//! `upload`, `validate` and `explain`: scenes as files.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Args;
+use plantd_client::v1;
+use serde_json::json;
+
+use crate::input::files::read_text;
+use crate::output::failure::FAILED;
+use crate::output::model;
+use crate::server::context::Context;
+
+/// Uploads a scene (TOML or JSON) as a model.
+#[derive(Debug, Args)]
+pub(crate) struct Upload {
+    /// File; `-` reads standard input.
+    scene: PathBuf,
+    /// Name; the scene's own if not given.
+    #[arg(long)]
+    name: Option<String>,
+}
+
+/// Checks a scene and prints all its errors.
+#[derive(Debug, Args)]
+pub(crate) struct Validate {
+    /// File; `-` reads standard input.
+    scene: PathBuf,
+}
+
+/// Prints what a step of a model evaluates and what it skips.
+#[derive(Debug, Args)]
+pub(crate) struct Explain {
+    /// File of a scene, or name of a model.
+    scene: String,
+}
+
+impl Upload {
+    pub(crate) async fn run(self, context: &Context) -> Result<()> {
+        let client = context.connect().await?;
+        let request = v1::CreateModelRequest {
+            name: self.name.unwrap_or_default(),
+            scene: read_text(&self.scene)?,
+            ..Default::default()
+        };
+        let model = client.create_model_as(request).await?;
+        context.output.message("Model", &model, || model::known(&model))
+    }
+}
+
+impl Validate {
+    pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
+        let client = context.connect().await?;
+        let answer = client.validate_scene(read_text(&self.scene)?).await?;
+        context.output.message("ValidateSceneResponse", &answer, || match &answer.model {
+            Some(model) if answer.problems.is_empty() => model::validated(model),
+            _ => problems(&answer.problems),
+        })?;
+        Ok(verdict(&answer))
+    }
+}
+
+impl Explain {
+    pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
+        let client = context.connect().await?;
+        let output = context.output;
+        let print_plan = |plan: &str| {
+            output.print(|| json!({ "plan": plan }), || format!("{}\n", plan.trim_end()))
+        };
+        let path = Path::new(&self.scene);
+        // A file goes before a model of the same name.
+        if !path.is_file() && self.scene != "-" {
+            print_plan(&client.get_model(&self.scene).await?.plan)?;
+            return Ok(ExitCode::SUCCESS);
+        }
+        let answer = client.validate_scene(read_text(path)?).await?;
+        match &answer.model {
+            Some(model) => print_plan(&model.plan)?,
+            None => {
+                output.message("ValidateSceneResponse", &answer, || problems(&answer.problems))?
+            }
+        }
+        Ok(verdict(&answer))
+    }
+}
+
+fn verdict(answer: &v1::ValidateSceneResponse) -> ExitCode {
+    if answer.problems.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) }
+}
+
+fn problems(problems: &[v1::SceneProblem]) -> String {
+    problems.iter().map(|p| format!("{}: {}\n", p.path, p.message)).collect()
+}

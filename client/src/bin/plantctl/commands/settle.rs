@@ -1,0 +1,118 @@
+//! `settle`: configurations in which a model rests.
+
+use std::fmt::Write as _;
+
+use anyhow::Result;
+use clap::Args;
+use plantd_client::v1;
+
+use crate::input::numbers::{Assignment, assignment, by_name};
+use crate::output::plant;
+use crate::output::text::{number, table};
+use crate::server::context::Context;
+
+/// Finds a configuration in which a model rests, from a guess.
+#[derive(Debug, Args)]
+pub(crate) struct Settle {
+    /// Name of a model.
+    model: String,
+    /// Coordinates that keep their value of the guess, comma-separated.
+    #[arg(long, value_delimiter = ',')]
+    hold: Vec<String>,
+    /// Values of coordinates of the guess; the scene's initial ones if not given.
+    #[arg(long, num_args = 1.., value_name = "NAME=VALUE", value_parser = assignment)]
+    guess: Vec<Assignment>,
+    /// Input forces that act.
+    #[arg(long, num_args = 1.., value_name = "NAME=VALUE", value_parser = assignment)]
+    inputs: Vec<Assignment>,
+    /// Only satisfy the constraints.
+    #[arg(long)]
+    constraints: bool,
+    /// Print an operating point in the notation of a scene.
+    #[arg(long)]
+    toml: bool,
+}
+
+impl Settle {
+    pub(crate) async fn run(self, context: &Context) -> Result<()> {
+        let client = context.connect().await?;
+        let model = client.get_model(&self.model).await?;
+        let goal = match self.constraints {
+            true => v1::SettleGoal::Constraints,
+            false => v1::SettleGoal::Equilibrium,
+        };
+        let request = v1::SettleRequest {
+            model: self.model,
+            hold: self.hold,
+            guess: by_name(self.guess),
+            inputs: by_name(self.inputs),
+            goal: goal.into(),
+            ..Default::default()
+        };
+        let answer = client.settle(request).await?;
+        context.output.message("SettleResponse", &answer, || match self.toml {
+            true => operating_point(&answer, &model),
+            false => settled(&answer, &model),
+        })
+    }
+}
+
+/// A settled configuration.
+fn settled(answer: &v1::SettleResponse, model: &v1::Model) -> String {
+    let coordinates = model.coordinates.iter().map(|c| c.name.as_str());
+    let inputs = model.inputs.iter().map(String::as_str);
+    let rows: Vec<_> = coordinates
+        .zip(&answer.q)
+        .chain(inputs.zip(&answer.u))
+        .map(|(name, value)| vec![name.to_owned(), number(*value)])
+        .collect();
+    let mut text = table(&["coordinate or input", "value"], &rows);
+    if let Some(equilibrium) = &answer.equilibrium {
+        let kind = if equilibrium.stable { "stable" } else { "unstable" };
+        let _ = write!(
+            text,
+            "\n{kind} equilibrium after {} iterations: {} J, smallest stiffness {}, residual {}\n",
+            equilibrium.iterations,
+            number(equilibrium.potential_j),
+            number(equilibrium.smallest_stiffness),
+            number(equilibrium.residual)
+        );
+        let _ = write!(text, "{}", plant::forces(&equilibrium.constraint_forces, model));
+    }
+    text
+}
+
+/// A settled configuration as an operating point of a scene: what differs from the initial one, in
+/// all digits.
+fn operating_point(answer: &v1::SettleResponse, model: &v1::Model) -> String {
+    let list = |entries: Vec<String>| format!("{{ {} }}", entries.join(", "));
+    let coordinates: Vec<_> = model
+        .coordinates
+        .iter()
+        .zip(&answer.q)
+        .filter(|(coordinate, value)| coordinate.initial != **value)
+        .map(|(coordinate, value)| format!("{} = {value:?}", key(&coordinate.name)))
+        .collect();
+    let mut text =
+        format!("[[operating_points]]\nname = \"settled\"\ncoordinates = {}\n", list(coordinates));
+    let inputs: Vec<_> = model
+        .inputs
+        .iter()
+        .zip(&answer.u)
+        .filter(|(_, value)| **value != 0.0)
+        .map(|(name, value)| format!("{} = {value:?}", key(name)))
+        .collect();
+    if !inputs.is_empty() {
+        let _ = writeln!(text, "inputs = {}", list(inputs));
+    }
+    text
+}
+
+/// A key of TOML, quoted where it must be.
+fn key(name: &str) -> String {
+    let is_bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    if !name.is_empty() && name.chars().all(is_bare) {
+        return name.to_owned();
+    }
+    format!("{:?}", name)
+}

@@ -1,0 +1,105 @@
+//! `watch`: what a plant does while somebody drives it.
+
+use anyhow::Result;
+use clap::{Args, ValueEnum};
+use plantd_client::v1;
+
+use crate::input::weights::RegulatorWeights;
+use crate::output::text::numbers;
+use crate::output::{derivatives, plant};
+use crate::server::context::{Context, for_each, model_of};
+
+/// Prints what a plant does while somebody drives it. Ends with Ctrl-C or after `--count`.
+#[derive(Debug, Args)]
+pub(crate) struct Watch {
+    /// Plant.
+    id: String,
+    /// What to print.
+    #[arg(long, value_delimiter = ',', default_value = "state")]
+    fields: Vec<Field>,
+    /// Only steps divisible by this.
+    #[arg(long, default_value_t = 1)]
+    every: u32,
+    /// Coordinates to print, comma-separated; all if not given.
+    #[arg(long, value_delimiter = ',')]
+    coordinates: Vec<String>,
+    /// End after this many messages.
+    #[arg(long, short = 'n', value_parser = clap::value_parser!(u64).range(1..))]
+    count: Option<u64>,
+    /// Messages that may wait to be printed; of more, the oldest are lost.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    queue: u32,
+    #[command(flatten)]
+    weights: RegulatorWeights,
+}
+
+/// What a watch prints.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Field {
+    State,
+    Report,
+    Energy,
+    Linearization,
+    Gain,
+    Input,
+    Outputs,
+}
+
+impl From<Field> for v1::WatchField {
+    fn from(field: Field) -> Self {
+        match field {
+            Field::State => Self::State,
+            Field::Report => Self::Report,
+            Field::Energy => Self::Energy,
+            Field::Linearization => Self::Linearization,
+            Field::Gain => Self::Gain,
+            Field::Input => Self::Input,
+            Field::Outputs => Self::Outputs,
+        }
+    }
+}
+
+impl Watch {
+    pub(crate) async fn run(self, context: &Context) -> Result<()> {
+        let client = context.connect().await?;
+        let Self { id, fields, every, coordinates, count, queue, weights } = self;
+        let named = fields.iter().any(|f| matches!(f, Field::Linearization | Field::Gain));
+        let model = if named { model_of(&client, &id).await? } else { v1::Model::default() };
+        let has_gain = fields.contains(&Field::Gain);
+        let request = v1::WatchRequest {
+            fields: fields.into_iter().map(|f| v1::WatchField::from(f).into()).collect(),
+            weights: has_gain.then(|| weights.for_model(&model)),
+            id,
+            every,
+            coordinates,
+            queue,
+        };
+        for_each(client.watch(request).await?, count, |message| {
+            context.output.message("WatchResponse", &message, || watched(&message, &model))
+        })
+        .await
+    }
+}
+
+/// A message of a watch as text.
+fn watched(message: &v1::WatchResponse, model: &v1::Model) -> String {
+    let head = match &message.state {
+        Some(state) => plant::state(state),
+        None => format!("step {}\n", message.step),
+    };
+    let lost = (message.dropped > 0).then(|| format!("  {} messages lost\n", message.dropped));
+    let failure = message.failure.as_ref().map(|f| format!("  {}: {}\n", f.reason, f.message));
+    let input = (!message.u.is_empty()).then(|| format!("  u: {}\n", numbers(&message.u)));
+    let parts = [
+        Some(head),
+        input,
+        message.outputs.as_ref().map(plant::outputs),
+        message.report.as_ref().map(plant::report),
+        message.energy.as_ref().map(plant::energy),
+        message.linearization.as_ref().map(|l| derivatives::linearization(l, model)),
+        message.gain.as_ref().map(|g| derivatives::gain(g, model)),
+        failure,
+        lost,
+    ];
+    parts.into_iter().flatten().collect()
+}

@@ -1,0 +1,4 @@
+//! Messages of the contract: as JSON, and the names of their entries.
+
+pub(crate) mod json;
+pub(crate) mod names;

@@ -1,0 +1,90 @@
+//! Models as text.
+
+use std::fmt::Write as _;
+
+use plantd_client::v1;
+
+use crate::output::text::{number, table};
+
+/// A model of the server.
+pub(crate) fn known(model: &v1::Model) -> String {
+    described(model, if model.builtin { "built in" } else { "uploaded" })
+}
+
+/// The model of a scene that was only looked at.
+pub(crate) fn validated(model: &v1::Model) -> String {
+    described(model, "valid, not uploaded")
+}
+
+fn described(model: &v1::Model, origin: &str) -> String {
+    let mut text = format!("{}: {}\n", model.name, model.description);
+    let _ = writeln!(text, "{origin}, time step {} s", number(model.time_step_s));
+    let rows: Vec<_> = model.coordinates.iter().map(coordinate).collect();
+    let _ = write!(text, "\n{}", table(&["coordinate", "kind", "unit", "initial"], &rows));
+    for (title, names) in [
+        ("inputs", &model.inputs),
+        ("constraints", &model.constraints),
+        ("operating points", &model.operating_points),
+    ] {
+        let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+        let _ = writeln!(text, "\n{title}: {names}");
+    }
+    if !model.signals.is_empty() {
+        let row = |s: &v1::Signal| {
+            let effect = if s.replaces { "replaces u" } else { "added to u" };
+            vec![s.drives.clone(), s.kind.clone(), format!("{effect}[{}]", s.u_index)]
+        };
+        let rows: Vec<_> = model.signals.iter().map(row).collect();
+        let _ = write!(text, "\n{}", table(&["signal drives", "kind", "effect"], &rows));
+    }
+    text.push_str(&guess(&model.initial_violations));
+    text
+}
+
+/// Warns of an initial configuration that is only a guess; the first few of many violations.
+fn guess(violations: &[v1::ConstraintViolation]) -> String {
+    const SHOWN: usize = 8;
+    if violations.is_empty() {
+        return String::new();
+    }
+    let by = |v: &v1::ConstraintViolation| format!("{} by {:.3e}", v.constraint, v.value);
+    let mut shown: Vec<_> = violations.iter().take(SHOWN).map(by).collect();
+    if violations.len() > SHOWN {
+        shown.push(format!("{} more", violations.len() - SHOWN));
+    }
+    format!(
+        "\nwarning: the initial configuration is only a guess, which violates {}; no plant starts there: `plantctl settle` finds one that satisfies the constraints\n",
+        shown.join(", ")
+    )
+}
+
+fn coordinate(c: &v1::Coordinate) -> Vec<String> {
+    let kind = if c.prescribed { "prescribed" } else { "dynamic" };
+    let unit = match c.unit() {
+        v1::Unit::Metre => "m",
+        v1::Unit::Radian => "rad",
+        v1::Unit::Unspecified => "",
+    };
+    let unit = match c.rotation_group.as_str() {
+        "" => unit.to_owned(),
+        joint => format!("{unit}, rotation vector of {joint}"),
+    };
+    vec![c.name.clone(), kind.to_owned(), unit, number(c.initial)]
+}
+
+/// Models, one per row.
+pub(crate) fn list(models: &[v1::Model]) -> String {
+    let row = |m: &v1::Model| {
+        let prescribed = m.coordinates.iter().filter(|c| c.prescribed).count();
+        vec![
+            m.name.clone(),
+            (m.coordinates.len() - prescribed).to_string(),
+            prescribed.to_string(),
+            m.inputs.len().to_string(),
+            m.constraints.len().to_string(),
+            m.description.clone(),
+        ]
+    };
+    let head = ["model", "dynamic", "prescribed", "inputs", "constraints", "description"];
+    table(&head, &models.iter().map(row).collect::<Vec<_>>())
+}

@@ -1,0 +1,131 @@
+//! Plants as text: their settings, states and what acts on them.
+
+use std::fmt::Write as _;
+
+use plantd_client::v1;
+
+use crate::output::text::{number, numbers, table};
+
+/// Plants, one per row.
+pub(crate) fn list(plants: &[v1::PlantInfo]) -> String {
+    let row = |p: &v1::PlantInfo| {
+        let state = p.state.as_ref();
+        let dt = p.settings.as_ref().map_or(0.0, |s| s.time_step_s);
+        let driver = if p.driver.is_empty() { "-" } else { &p.driver };
+        let link = if p.link_open { "open" } else { "-" };
+        vec![
+            p.id.clone(),
+            p.model.clone(),
+            number(dt),
+            state.map_or(0, |s| s.step).to_string(),
+            number(state.map_or(0.0, |s| s.time_s)),
+            driver.to_owned(),
+            link.to_owned(),
+        ]
+    };
+    let head = ["plant", "model", "dt/s", "step", "time/s", "driver", "link"];
+    table(&head, &plants.iter().map(row).collect::<Vec<_>>())
+}
+
+/// By which method a plant is stepped.
+pub(crate) fn stepping(plant: &v1::PlantInfo) -> String {
+    let settings = plant.settings.unwrap_or_default();
+    let precision = if settings.precision() == v1::Precision::Fast { "fast" } else { "exact" };
+    let (order, substeps, halvings) = (settings.order, settings.substeps, settings.halvings());
+    let accuracy = plant.accuracy.as_ref().map_or(String::new(), |accuracy| {
+        format!("; off by {} over {} steps", number(accuracy.error), accuracy.periods)
+    });
+    format!(
+        "  order {order}, substeps {substeps}, halvings {halvings} at most, {precision}{accuracy}\n"
+    )
+}
+
+/// A state; vectors that the model does not have are left out.
+pub(crate) fn state(state: &v1::State) -> String {
+    let mut text = format!("step {}, time {} s\n", state.step, number(state.time_s));
+    for (name, values) in
+        [("q", &state.q), ("p", &state.p), ("v", &state.v), ("multipliers", &state.multipliers)]
+    {
+        if !values.is_empty() {
+            let _ = writeln!(text, "  {name}: {}", numbers(values));
+        }
+    }
+    text
+}
+
+/// An energy.
+pub(crate) fn energy(energy: &v1::Energy) -> String {
+    let (kinetic, potential) = (energy.kinetic_j, energy.potential_j);
+    format!(
+        "  energy: {} J kinetic, {} J potential, {} J in all\n",
+        number(kinetic),
+        number(potential),
+        number(kinetic + potential)
+    )
+}
+
+/// A step report.
+pub(crate) fn report(report: &v1::StepReport) -> String {
+    let redundant = match report.redundant_constraints {
+        0 => String::new(),
+        count => format!(", {count} redundant constraints"),
+    };
+    let steps = match (report.steps, report.halvings) {
+        (0 | 1, _) => String::new(),
+        (steps, 0) => format!(" in {steps} steps"),
+        (steps, halvings) => format!(" in {steps} steps, halved {halvings} times"),
+    };
+    format!(
+        "  solver: {} iterations, {} factorizations{steps}, residual {} round-offs{redundant}\n",
+        report.iterations,
+        report.factorizations,
+        number(report.residual)
+    )
+}
+
+/// What a watcher sees of the outputs.
+pub(crate) fn outputs(outputs: &v1::Outputs) -> String {
+    let mut text = format!("  y: {}\n", numbers(&outputs.y));
+    if !outputs.lost.is_empty() {
+        let _ = writeln!(text, "  lost: {:?}", outputs.lost);
+    }
+    text
+}
+
+/// Numbers of the scene that were changed for a plant; nothing if none were.
+pub(crate) fn parameters(plant: &v1::PlantInfo) -> String {
+    let line = |p: &v1::Parameter| format!("  {} = {}\n", p.path, number(p.value));
+    plant.parameters.iter().map(line).collect()
+}
+
+/// What a feedback is and does.
+pub(crate) fn feedback(feedback: &v1::FeedbackInfo) -> String {
+    let about = match feedback.horizon {
+        0 => "about an operating point".to_owned(),
+        steps => format!("along {steps} steps from step {} on", feedback.first_step),
+    };
+    let mode = match feedback.mode() {
+        v1::FeedbackMode::Unspecified | v1::FeedbackMode::WatchOnly => "watch only",
+        v1::FeedbackMode::Replace => "replaces the driver's input",
+        v1::FeedbackMode::Add => "adds to the driver's input",
+        v1::FeedbackMode::Guard => "guards",
+    };
+    let mut text = format!("feedback {about}, revision {}: {mode}\n", feedback.revision);
+    if let Some(step) = feedback.tripped_at_step {
+        let _ = writeln!(text, "  took over at step {step} because of {}", feedback.tripped_by);
+    }
+    if let Some(failure) = &feedback.failure {
+        let _ = writeln!(text, "  {}: {}", failure.reason, failure.message);
+    }
+    text
+}
+
+/// Constraint forces, one per row; nothing without constraints.
+pub(crate) fn forces(forces: &[f64], model: &v1::Model) -> String {
+    if forces.is_empty() {
+        return String::new();
+    }
+    let row = |(name, force): (&String, &f64)| vec![name.clone(), number(*force)];
+    let rows: Vec<_> = model.constraints.iter().zip(forces).map(row).collect();
+    format!("\n{}", table(&["constraint", "force"], &rows))
+}

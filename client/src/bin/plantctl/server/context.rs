@@ -1,0 +1,50 @@
+//! What every command is given: the server's address, and where results go.
+
+use anyhow::{Context as _, Result};
+use plantd_client::{Answers, Client, DEFAULT_ADDRESS, v1};
+
+use crate::output::printer::Output;
+
+/// What every command is given.
+pub(crate) struct Context {
+    /// The server's address, if one was given.
+    pub(crate) address: Option<String>,
+    /// Where results go.
+    pub(crate) output: Output,
+}
+
+impl Context {
+    /// Connects to the server.
+    pub(crate) async fn connect(&self) -> Result<Client> {
+        Ok(Client::connect(self.address.as_deref().unwrap_or(DEFAULT_ADDRESS)).await?)
+    }
+}
+
+/// A plant as it is now.
+pub(crate) async fn plant(client: &Client, id: &str) -> Result<v1::PlantInfo> {
+    client.get_plant(id).await?.plant.context("no plant in the answer")
+}
+
+/// The model of a plant.
+pub(crate) async fn model_of(client: &Client, id: &str) -> Result<v1::Model> {
+    Ok(client.get_model(plant(client, id).await?.model).await?)
+}
+
+/// Hands over the messages of a stream until it ends, Ctrl-C is pressed, or there were `count`.
+pub(crate) async fn for_each<T>(
+    mut messages: Answers<T>,
+    count: Option<u64>,
+    mut print: impl FnMut(T) -> Result<()>,
+) -> Result<()> {
+    let mut seen = 0;
+    while count.is_none_or(|count| seen < count) {
+        let next = tokio::select! {
+            next = messages.next() => next?,
+            _ = tokio::signal::ctrl_c() => None,
+        };
+        let Some(message) = next else { break };
+        print(message)?;
+        seen += 1;
+    }
+    Ok(())
+}

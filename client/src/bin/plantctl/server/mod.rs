@@ -1,0 +1,4 @@
+//! The server that a command speaks to.
+
+pub(crate) mod context;
+pub(crate) mod own;

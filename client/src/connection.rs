@@ -1,0 +1,241 @@
+//! Connections: addresses, timeouts and limits.
+
+use std::io;
+use std::os::unix::fs::FileTypeExt as _;
+use std::path::Path;
+use std::time::Duration;
+
+use tonic::codegen::http::uri::PathAndQuery;
+use tonic::transport::{Channel, Endpoint};
+
+use crate::error::{ConnectProblem, Error, Result, root_cause};
+
+/// Where a server listens unless it is told otherwise.
+pub const DEFAULT_ADDRESS: &str = "http://127.0.0.1:50051";
+
+/// Largest message accepted from a server, bytes. Answers hold no more than a request asked for, so
+/// this only stops a runaway peer: the linearization of 512 coordinates takes 50 MiB.
+pub const MAX_RECEIVE_BYTES: usize = 256 << 20;
+
+/// Bytes that the server may send ahead on one stream. Small, so that a watcher that pauses finds
+/// little that is stale when it goes on.
+const STREAM_WINDOW_BYTES: u32 = 64 << 10;
+
+/// Bytes that the server may send ahead on all streams of a connection. The HTTP/2 library closes a
+/// connection on which the unread small frames cost more memory than half of this, at 256 bytes a
+/// frame; a stream window full of the smallest states costs a third of a MiB.
+const CONNECTION_WINDOW_BYTES: u32 = 64 << 20;
+
+/// Limits of a connection.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ConnectOptions {
+    /// Longest wait for the connection; 5 s by default.
+    pub connect_timeout: Duration,
+    /// Longest wait for the answer of a call, for the opening of a stream and for each step of a
+    /// [`Driver`](crate::Driver); 60 s by default. Sent to the server, which gives up as well.
+    pub request_timeout: Duration,
+}
+
+impl Default for ConnectOptions {
+    fn default() -> Self {
+        Self { connect_timeout: Duration::from_secs(5), request_timeout: Duration::from_secs(60) }
+    }
+}
+
+/// Opens a channel to `http://host:port`, `host:port` or `unix:/path`.
+pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<Channel> {
+    let endpoint = endpoint(address)?
+        .connect_timeout(options.connect_timeout)
+        // Without it a round trip waits for the peer's delayed acknowledgement, 40 ms.
+        .tcp_nodelay(true)
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
+        .tcp_keepalive(Some(Duration::from_secs(30)))
+        .http2_keep_alive_interval(Duration::from_secs(30))
+        .user_agent(concat!("plantd-client/", env!("CARGO_PKG_VERSION")))
+        .expect("the user agent is a valid header");
+    let failed = |problem| Error::Connect { address: address.to_owned(), problem };
+    let limit = options.connect_timeout;
+    let channel = match tokio::time::timeout(limit, endpoint.connect()).await {
+        Ok(Ok(channel)) => channel,
+        Ok(Err(error)) => return Err(failed(problem(address, &error, limit))),
+        Err(_) => return Err(failed(ConnectProblem::TimedOut(limit))),
+    };
+    match tokio::time::timeout(limit, speaks_grpc(channel.clone())).await {
+        Ok(Ok(())) => Ok(channel),
+        Ok(Err(problem)) => Err(failed(problem)),
+        Err(_) => Err(failed(ConnectProblem::Silent(limit))),
+    }
+}
+
+/// Why a connection could not be made.
+fn problem(
+    address: &str,
+    error: &(dyn std::error::Error + 'static),
+    limit: Duration,
+) -> ConnectProblem {
+    let socket = address.strip_prefix("unix:").map(|path| Path::new(path.trim_start_matches("//")));
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        if error.to_string() == "dns error" {
+            return ConnectProblem::UnknownHost;
+        }
+        cause = error.source();
+    }
+    let cause = root_cause(error);
+    let kind = cause.downcast_ref::<io::Error>().map(io::Error::kind);
+    match (kind, socket) {
+        (Some(io::ErrorKind::ConnectionRefused), None) => ConnectProblem::Refused,
+        (Some(io::ErrorKind::ConnectionRefused), Some(path)) if is_socket(path) => {
+            ConnectProblem::DeadSocket
+        }
+        (Some(io::ErrorKind::ConnectionRefused), Some(_)) => ConnectProblem::NotASocket,
+        (Some(io::ErrorKind::NotFound), Some(_)) => ConnectProblem::NoSocket,
+        (Some(io::ErrorKind::PermissionDenied), Some(_)) => ConnectProblem::Denied,
+        (Some(io::ErrorKind::TimedOut), _) => ConnectProblem::TimedOut(limit),
+        _ => ConnectProblem::Other(cause.to_string()),
+    }
+}
+
+fn is_socket(path: &Path) -> bool {
+    std::fs::metadata(path).is_ok_and(|metadata| metadata.file_type().is_socket())
+}
+
+/// Whether there is a gRPC server at the other end: it says of a method that nobody has that it has none.
+/// HTTP/2 does not wait for the other side before it calls a connection made.
+async fn speaks_grpc(channel: Channel) -> Result<(), ConnectProblem> {
+    let mut stub = tonic::client::Grpc::new(channel);
+    let path = PathAndQuery::from_static("/plantd.v1.Connection/Probe");
+    let not_grpc = |error: &(dyn std::error::Error + 'static)| {
+        Err(ConnectProblem::NotGrpc(root_cause(error).to_string()))
+    };
+    if let Err(error) = stub.ready().await {
+        return not_grpc(&error);
+    }
+    let codec = tonic_prost::ProstCodec::<(), ()>::default();
+    match stub.unary(tonic::Request::new(()), path, codec).await {
+        Err(status) if is_local(&status) => not_grpc(&status),
+        _ => Ok(()),
+    }
+}
+
+/// No gRPC server has said it.
+fn is_local(status: &tonic::Status) -> bool {
+    std::error::Error::source(status).is_some()
+        || status.message().starts_with("grpc-status header missing")
+}
+
+/// Waits for `work`, but not longer than `limit`. Unlike a deadline sent with the request it does not
+/// end a stream that has been opened.
+pub(crate) async fn within<T, E: Into<Error>>(
+    limit: Duration,
+    work: impl Future<Output = Result<T, E>>,
+) -> Result<T> {
+    match tokio::time::timeout(limit, work).await {
+        Ok(result) => result.map_err(Into::into),
+        Err(_) => Err(tonic::Status::deadline_exceeded(format!("no answer in {limit:?}")).into()),
+    }
+}
+
+fn endpoint(address: &str) -> Result<Endpoint> {
+    let refused = |problem| Error::Address { address: address.to_owned(), problem };
+    let url = if address.contains("://") || address.starts_with("unix:") {
+        address.to_owned()
+    } else {
+        format!("http://{address}")
+    };
+    let problem = match url.split_once(':') {
+        Some(("unix", path)) if path.trim_start_matches("//").starts_with('/') => None,
+        Some(("unix", _)) => Some("the path of a socket begins with `/`"),
+        Some(("http", rest)) => {
+            let has_host = rest.strip_prefix("//").is_some_and(|host| !host.is_empty());
+            (!has_host).then_some("it names no host")
+        }
+        Some(("https", _)) => Some("plantd does not speak TLS"),
+        _ => Some("the scheme is unknown"),
+    };
+    if let Some(problem) = problem {
+        return Err(refused(problem));
+    }
+    Endpoint::from_shared(url).map_err(|_| refused("it cannot be read"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses() {
+        for good in ["http://127.0.0.1:1", "localhost:50051", "unix:/run/plantd.sock", "unix:///a"]
+        {
+            assert!(endpoint(good).is_ok(), "{good}");
+        }
+        for (bad, said) in [
+            ("", "no host"),
+            ("http://", "no host"),
+            ("unix:", "begins with `/`"),
+            ("unix:relative", "begins with `/`"),
+            ("ftp://a:1", "scheme"),
+            ("https://a:1", "TLS"),
+            ("a b", "cannot be read"),
+        ] {
+            let error = endpoint(bad).unwrap_err();
+            assert!(matches!(error, Error::Address { .. }), "{bad}");
+            assert!(error.to_string().contains(said), "{bad}: {error}");
+        }
+    }
+
+    /// What is said of an address, which the sentence names.
+    async fn failure(address: &str) -> ConnectProblem {
+        let options =
+            ConnectOptions { connect_timeout: Duration::from_millis(500), ..Default::default() };
+        let error = connect(address, &options).await.unwrap_err();
+        let sentence = error.to_string();
+        assert!(sentence.contains(address) && !sentence.contains("transport error"), "{sentence}");
+        match error {
+            Error::Connect { problem, .. } => problem,
+            other => panic!("{other}"),
+        }
+    }
+
+    #[tokio::test]
+    async fn each_mistake_has_a_name_of_its_own() {
+        // Bound and dropped: a port that nobody listens on.
+        let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        assert_eq!(failure(&format!("http://127.0.0.1:{port}")).await, ConnectProblem::Refused);
+        let unknown = failure("http://no-such-host.invalid:1").await;
+        assert!(
+            matches!(unknown, ConnectProblem::UnknownHost | ConnectProblem::TimedOut(_)),
+            "{unknown}"
+        );
+
+        let directory = tempfile::tempdir().unwrap();
+        let path = |name: &str| format!("unix:{}", directory.path().join(name).display());
+        assert_eq!(failure(&path("nothing")).await, ConnectProblem::NoSocket);
+        std::fs::write(directory.path().join("file"), "").unwrap();
+        assert_eq!(failure(&path("file")).await, ConnectProblem::NotASocket);
+        let listener = std::os::unix::net::UnixListener::bind(directory.path().join("socket"));
+        drop(listener.unwrap());
+        assert_eq!(failure(&path("socket")).await, ConnectProblem::DeadSocket);
+    }
+
+    #[tokio::test]
+    async fn servers_of_something_else_are_told_from_those_that_are_not_there() {
+        use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let silent = failure(&address).await;
+        assert_eq!(silent, ConnectProblem::Silent(Duration::from_millis(500)));
+
+        tokio::spawn(async move {
+            while let Ok((mut stream, _)) = listener.accept().await {
+                tokio::spawn(async move {
+                    let _ = stream.read(&mut [0; 1024]).await;
+                    let _ = stream.write_all(b"HTTP/1.1 400 Bad Request\r\n\r\n").await;
+                });
+            }
+        });
+        let other = failure(&address).await;
+        assert!(matches!(other, ConnectProblem::NotGrpc(_)), "{other}");
+    }
+}

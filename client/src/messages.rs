@@ -1,0 +1,213 @@
+//! Arithmetic on the contract's messages, so that a controller needs no linear-algebra library.
+
+use plantd_proto::v1;
+
+use crate::error::{Error, Result};
+use crate::rotation::difference;
+
+/// Reading and writing of [`v1::Matrix`].
+pub trait MatrixExt: Sized {
+    /// A matrix of these rows, which must have equal lengths; no rows give a 0 × 0 matrix.
+    ///
+    /// # Panics
+    /// If the rows differ in length.
+    fn from_rows<R: AsRef<[f64]>>(rows: &[R]) -> Self;
+    /// The rows, top to bottom.
+    fn rows_iter(&self) -> impl Iterator<Item = &[f64]>;
+    /// Entry of row `row` and column `col`.
+    ///
+    /// # Panics
+    /// If there is no such entry.
+    fn at(&self, row: usize, col: usize) -> f64;
+    /// The product with a column vector.
+    ///
+    /// # Panics
+    /// If the vector has not as many entries as the matrix has columns.
+    fn times(&self, vector: &[f64]) -> Vec<f64>;
+}
+
+impl MatrixExt for v1::Matrix {
+    fn from_rows<R: AsRef<[f64]>>(rows: &[R]) -> Self {
+        let cols = rows.first().map_or(0, |row| row.as_ref().len());
+        let mut data = Vec::with_capacity(rows.len() * cols);
+        for row in rows {
+            assert_eq!(row.as_ref().len(), cols, "rows differ in length");
+            data.extend_from_slice(row.as_ref());
+        }
+        Self { rows: rows.len() as u32, cols: cols as u32, data }
+    }
+
+    fn rows_iter(&self) -> impl Iterator<Item = &[f64]> {
+        let cols = self.cols as usize;
+        (0..self.rows as usize).map(move |row| &self.data[row * cols..(row + 1) * cols])
+    }
+
+    fn at(&self, row: usize, col: usize) -> f64 {
+        assert!(col < self.cols as usize, "column {col} of {}", self.cols);
+        self.data[row * self.cols as usize + col]
+    }
+
+    fn times(&self, vector: &[f64]) -> Vec<f64> {
+        assert_eq!(vector.len(), self.cols as usize, "length of the vector");
+        let dot = |row: &[f64]| row.iter().zip(vector).map(|(a, b)| a * b).sum();
+        self.rows_iter().map(dot).collect()
+    }
+}
+
+/// Reading of [`v1::RolloutResponse`].
+pub trait RolloutExt {
+    /// The states of a case that came to its end.
+    ///
+    /// # Errors
+    /// What kept it from that: its initial state was refused, and there are no states, or a step failed, and
+    /// the message holds those before.
+    fn into_states(self) -> Result<Vec<v1::State>>;
+}
+
+impl RolloutExt for v1::RolloutResponse {
+    fn into_states(self) -> Result<Vec<v1::State>> {
+        match self.failure {
+            Some(failure) => Err(Error::Rpc(Box::new(failure.into()))),
+            None => Ok(self.states),
+        }
+    }
+}
+
+/// Reading of [`v1::State`].
+pub trait StateExt {
+    /// The state vector `x = (q, p, v)` in which linearizations and gains are expressed.
+    fn x(&self) -> Vec<f64>;
+}
+
+impl StateExt for v1::State {
+    fn x(&self) -> Vec<f64> {
+        [self.q.as_slice(), &self.p, &self.v].concat()
+    }
+}
+
+/// Use of [`v1::Gain`].
+pub trait GainExt {
+    /// The feedback law `u = u_reference + feedforward − K (x − x_reference)`.
+    ///
+    /// Differences of angles are taken as they are: a joint that has turned by 2π is 2π away. Those of
+    /// ball joints are rotation vectors, see [`difference`].
+    ///
+    /// # Panics
+    /// If the state has not as many entries as `K` has columns.
+    fn control(&self, state: &v1::State) -> Vec<f64>;
+    /// The feedback law at a state vector `x = (q, p, v)`, as [`control`](Self::control).
+    ///
+    /// # Panics
+    /// If `x` has not as many entries as `K` has columns.
+    fn control_at(&self, x: &[f64]) -> Vec<f64>;
+}
+
+impl GainExt for v1::Gain {
+    fn control(&self, state: &v1::State) -> Vec<f64> {
+        self.control_at(&state.x())
+    }
+
+    fn control_at(&self, x: &[f64]) -> Vec<f64> {
+        let error = difference(&self.x_reference, x, &self.rotations);
+        let correction = self.k.as_ref().map(|k| k.times(&error)).unwrap_or_default();
+        let mut u = self.u_reference.clone();
+        for (u, forward) in u.iter_mut().zip(&self.feedforward) {
+            *u += forward;
+        }
+        for (u, du) in u.iter_mut().zip(correction) {
+            *u -= du;
+        }
+        u
+    }
+}
+
+/// The present state of a plant, where a linearization, an analysis or a regulator is wanted.
+pub fn present_state(plant: impl Into<String>) -> v1::Point {
+    v1::Point { source: Some(v1::point::Source::Plant(plant.into())) }
+}
+
+/// A weight with these diagonal entries.
+pub fn diagonal(values: impl Into<Vec<f64>>) -> v1::Weight {
+    let diagonal = v1::Diagonal { values: values.into() };
+    v1::Weight { form: Some(v1::weight::Form::Diagonal(diagonal)) }
+}
+
+/// A weight that is a full symmetric matrix.
+pub fn full(matrix: v1::Matrix) -> v1::Weight {
+    v1::Weight { form: Some(v1::weight::Form::Full(matrix)) }
+}
+
+/// Weights of a regulator: `Σ ½ xᵀ q x + ½ uᵀ r u`, the final one being `q` as well.
+pub fn weights(q: v1::Weight, r: v1::Weight) -> v1::LqrWeights {
+    v1::LqrWeights { q: Some(q), r: Some(r), ..Default::default() }
+}
+
+/// Parts of [`v1::LqrWeights`] that not everybody needs.
+pub trait WeightsExt: Sized {
+    /// With the cross term `xᵀ s u`; `s` has a row per entry of x and a column per entry of u.
+    fn with_cross(self, s: v1::Matrix) -> Self;
+    /// With `½ xᵀ q_final x` at the end of a finite horizon.
+    fn with_final(self, q_final: v1::Weight) -> Self;
+    /// On the projected momentum in place of the state's own.
+    fn on_projected_momentum(self) -> Self;
+}
+
+impl WeightsExt for v1::LqrWeights {
+    fn with_cross(self, s: v1::Matrix) -> Self {
+        Self { s: Some(s), ..self }
+    }
+
+    fn with_final(self, q_final: v1::Weight) -> Self {
+        Self { q_final: Some(q_final), ..self }
+    }
+
+    fn on_projected_momentum(self) -> Self {
+        Self { momentum: v1::Momentum::Projected.into(), ..self }
+    }
+}
+
+/// The operating point of that name, where a linearization or a regulator is wanted.
+pub fn operating_point(name: impl Into<String>) -> v1::Point {
+    v1::Point { source: Some(v1::point::Source::OperatingPoint(name.into())) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gain_steers_against_the_error() {
+        let gain = v1::Gain {
+            step: 0,
+            k: Some(v1::Matrix::from_rows(&[[2.0, 3.0]])),
+            x_reference: vec![1.0, 0.5],
+            u_reference: vec![10.0],
+            ..Default::default()
+        };
+        let state = v1::State { q: vec![2.0], p: vec![0.0], ..Default::default() };
+        assert_eq!(gain.control(&state), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);
+        let forward = v1::Gain { feedforward: vec![0.25], ..gain };
+        assert_eq!(forward.control_at(&[2.0, 0.0]), [10.25 - 2.0 * 1.0 + 3.0 * 0.5]);
+    }
+
+    #[test]
+    fn weights_keep_what_is_added() {
+        let cross = v1::Matrix::from_rows(&[[0.5], [0.0]]);
+        let weights = weights(diagonal([1.0, 2.0]), full(v1::Matrix::from_rows(&[[3.0]])))
+            .with_cross(cross.clone())
+            .with_final(diagonal([4.0, 5.0]))
+            .on_projected_momentum();
+        assert_eq!(weights.momentum(), v1::Momentum::Projected);
+        assert_eq!((weights.s, weights.q_final), (Some(cross), Some(diagonal([4.0, 5.0]))));
+        assert_eq!(weights.q, Some(diagonal([1.0, 2.0])));
+    }
+
+    #[test]
+    fn rows_come_back_as_they_went_in() {
+        let matrix = v1::Matrix::from_rows(&[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]);
+        assert_eq!((matrix.rows, matrix.cols), (2, 3));
+        assert_eq!(matrix.rows_iter().nth(1), Some([4.0, 5.0, 6.0].as_slice()));
+        assert_eq!(matrix.at(1, 0), 4.0);
+        assert_eq!(v1::Matrix::from_rows::<[f64; 1]>(&[]).rows_iter().count(), 0);
+    }
+}
