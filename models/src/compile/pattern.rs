@@ -5,7 +5,6 @@ use std::collections::BTreeSet;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::lagrangian::potentials;
 use crate::math::elimination::SymbolicElimination;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Forces, MixedPair, Model, Pair, Potentials, Spring};
@@ -87,9 +86,7 @@ pub(super) fn check(model: &Model) {
     if model.potentials.any || model.forces.is_some() {
         poses.evaluate(tree, &q, &orientations(model, &q));
     }
-    potentials::for_each_second_derivative(&model.potentials, tree, &poses, &q, |i, j, _| {
-        check("spring", i, j);
-    });
+    model.for_each_spring_derivative(&poses, &q, |i, j, _| check("spring", i, j));
     if let Some(forces) = &model.forces {
         let (velocity, inputs) = (vec![1.0; q.len()], vec![0.0; d.inputs]);
         let mut momenta = Momenta::new(tree);

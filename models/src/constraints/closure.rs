@@ -18,7 +18,7 @@ use crate::math::norms::larger;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::{
-    Alignment, Carries, Constraint, ConstraintKind, Length, Model, PathJoint, PointPair, Polynomial,
+    Alignment, Constraint, ConstraintKind, Length, Model, PointPair, Polynomial,
 };
 use crate::model::tree::{JointKind, Tree};
 
@@ -341,19 +341,13 @@ impl Constraint {
                 let at = points.separation(tree, poses);
                 let weight = at.difference.scaled(2.0);
                 for joint in &points.path {
-                    let (point, weight) = match joint.carries {
-                        Carries::A => (at.a, weight),
-                        _ => (at.b, -weight),
-                    };
-                    let gradient = poses.point_gradient(tree, joint.joint, point);
-                    row[joint.coordinate] += weight.dot(gradient);
+                    row[joint.coordinate] += weight.dot(joint.gradient(tree, poses, &at));
                 }
             }
             ConstraintKind::Axis(points, axis) => {
                 let at = points.separation(tree, poses);
                 for joint in &points.path {
-                    let gradient = joint.gradient_in_world(tree, poses, &at);
-                    row[joint.coordinate] += gradient[*axis];
+                    row[joint.coordinate] += joint.gradient(tree, poses, &at)[*axis];
                 }
             }
             ConstraintKind::Product(product) => {
@@ -389,45 +383,19 @@ impl Constraint {
         match &self.kind {
             ConstraintKind::Distance(points, length) => {
                 let at = points.separation(tree, poses);
-                for (k, row) in points.path.iter().enumerate() {
-                    let row_gradient = row.gradient(tree, poses, &at);
-                    for column in &points.path[..=k] {
-                        let gradient = column.gradient(tree, poses, &at);
-                        let both = [(row, row_gradient), (column, gradient)];
-                        let (second, mirrored) = PathJoint::seconds(both, tree, poses);
-                        let product = gradient.dot(row_gradient);
-                        let value = |second: Vec3<S>| (product + at.difference.dot(second)) * 2.0;
-                        entry(row.coordinate, column.coordinate, value(second));
-                        if row.joint != column.joint {
-                            entry(column.coordinate, row.coordinate, value(mirrored));
-                        }
-                    }
-                }
+                let value = |[row, column]: [Vec3<S>; 2], seconds: [Vec3<S>; 2]| {
+                    let product = column.dot(row);
+                    seconds.map(|second| (product + at.difference.dot(second)) * 2.0)
+                };
+                points.for_each_pair((tree, poses, &at), value, &mut entry);
                 if let Length::Driven(length) = *length {
                     entry(length, length, S::constant(-2.0));
                 }
             }
             ConstraintKind::Axis(points, axis) => {
                 let at = points.separation(tree, poses);
-                for (k, row) in points.path.iter().enumerate() {
-                    let row_gradient = row.gradient_in_world(tree, poses, &at);
-                    for column in &points.path[..=k] {
-                        let gradient = column.gradient_in_world(tree, poses, &at);
-                        let (row_at, column_at) = ((row, row_gradient), (column, gradient));
-                        let second = row.second_in_world(row_gradient, tree, poses, column_at);
-                        entry(row.coordinate, column.coordinate, second[*axis]);
-                        if row.joint == column.joint {
-                            continue;
-                        }
-                        // Only within a ball joint does the order matter.
-                        let mirrored = if tree.one_ball(row.joint, column.joint) {
-                            column.second_in_world(gradient, tree, poses, row_at)
-                        } else {
-                            second
-                        };
-                        entry(column.coordinate, row.coordinate, mirrored[*axis]);
-                    }
-                }
+                let value = |_: [Vec3<S>; 2], seconds: [Vec3<S>; 2]| seconds.map(|s| s[*axis]);
+                points.for_each_pair((tree, poses, &at), value, entry);
             }
             ConstraintKind::Product(product) => {
                 ProductAt::new(product, tree, poses).for_each_second_derivative(entry);

@@ -24,7 +24,6 @@ pub(crate) mod system;
 
 use crate::integrator::collocation::sweep::Sweep;
 use crate::integrator::collocation::system::System;
-use crate::integrator::predictor::Past;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::workspace::{StepContext, Workspace};
@@ -39,7 +38,7 @@ pub(crate) struct Collocation {
     pub(crate) tableau: Tableau,
     /// Inputs at the stages, one after the other.
     pub(crate) inputs: Vec<f64>,
-    /// Velocities at the stages, one after the other, then forces `L_q + f`.
+    /// Velocities at the stages of the solution, one after the other, then forces `L_q + f`.
     pub(crate) motion: Vec<f64>,
     /// One stage after the other, where there are many unknowns.
     sweep: Option<Box<Sweep>>,
@@ -57,11 +56,6 @@ impl Collocation {
             sweep: (stages * d.dynamic > AT_ONCE).then(|| Box::new(Sweep::new(model, stages))),
             system: None,
         }
-    }
-
-    /// Velocities at the stages of the solution, one after the other, then forces.
-    pub(crate) fn motion(&self) -> &[f64] {
-        &self.motion
     }
 
     /// Solves one step, which starts at a time; the solution stays here and in the workspace. `u` has no
@@ -104,11 +98,7 @@ impl Collocation {
         let StepContext { model, settings, state, u } = at;
         let d = model.dimensions;
         let h = settings.time_step_s;
-        let is_guessed = match &state.past {
-            Past::Stages(past) => past.predict(&self.tableau, &mut self.motion),
-            Past::Increments(_) | Past::Trail(_) => false,
-        };
-        if !is_guessed {
+        if !state.past.predict_stages(&self.tableau, &mut self.motion) {
             workspace.prepare(at);
             workspace.ballistic(model, settings, state);
             let half = self.motion.len() / 2;

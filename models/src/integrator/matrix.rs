@@ -9,7 +9,6 @@ use crate::kkt::planar::MatrixKind;
 use crate::kkt::schur::{SchurComplement, fill_schur};
 use crate::kkt::system::{Factors, Linearized};
 use crate::lagrangian::mechanics::Mechanics;
-use crate::lagrangian::potentials;
 use crate::model::mechanism::{Forces, Model};
 
 impl Workspace {
@@ -109,15 +108,13 @@ impl Workspace {
             );
         }
         if model.potentials.any {
-            potentials::add_to_newton_matrix(
-                &model.potentials,
-                &model.dynamics,
-                &self.mid.mechanics.poses,
-                &self.mid.q,
-                h,
-                &model.elimination,
-                &mut self.kkt.tree,
-            );
+            let (dynamic, matrix) = (model.dimensions.dynamic, &mut self.kkt.tree);
+            let poses = &self.mid.mechanics.poses;
+            model.for_each_spring_derivative(poses, &self.mid.q, |i, j, value| {
+                if i < dynamic && j < dynamic {
+                    matrix.add(&model.elimination, i, j, -0.25 * h * value);
+                }
+            });
         }
         for (i, c) in model.damping.iter().enumerate() {
             let slot = model.elimination.offsets[i + 1] - 1;
@@ -146,13 +143,9 @@ impl Workspace {
         let diagonal = &mut self.kkt.diagonal;
         diagonal.fill(0.0);
         if model.potentials.any {
-            potentials::for_each_second_derivative(
-                &model.potentials,
-                &model.dynamics,
-                &self.mid.mechanics.poses,
-                &self.mid.q,
-                |i, _, value| diagonal[i] -= 0.25 * h * value,
-            );
+            let poses = &self.mid.mechanics.poses;
+            let add = |i: usize, _, value| diagonal[i] -= 0.25 * h * value;
+            model.for_each_spring_derivative(poses, &self.mid.q, add);
         }
         let a = settings.force_split.at_start();
         for (entry, c) in diagonal.iter_mut().zip(&model.damping) {

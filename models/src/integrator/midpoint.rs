@@ -3,9 +3,9 @@
 use std::f64::consts::TAU;
 
 use crate::integrator::state::PreciseState;
+use crate::lagrangian::forces;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::lagrangian::{forces, potentials};
 use crate::math::scalar::{Side, side_by_side};
 use crate::math::simd::wide;
 use crate::math::spatial::Mat3;
@@ -69,25 +69,21 @@ impl Midpoint {
         }
     }
 
-    wide! {
-        /// Goes to the midpoint of an increment: `q0 + ½x`, and `x/h` with `1/h` given.
-        pub(crate) fn go_to(mut self, state: &PreciseState, increment: &[f64], inverse: f64)
-            = go_to_portable, go_to_avx2;
-    }
-
-    #[inline(always)]
-    fn go_to_portable(&mut self, state: &PreciseState, increment: &[f64], inverse: f64) {
-        let nd = increment.len();
-        side_by_side!(for (
-            x in &increment[..nd],
-            q in &state.q[..nd],
-            q_low in &state.q_low[..nd],
-            per_radian in &self.turns_per_radian[..nd],
-        ) let more = x * 0.5 + q_low; {
-            middle(&mut self.q[..nd]) = q + more;
-            velocity(&mut self.velocity[..nd]) = x * inverse;
-            angle(&mut self.angles[..nd]) = Side::unwound(q, more, per_radian);
-        });
+    /// Goes to the midpoint of an increment: `q0 + ½x`, and `x/h` with `1/h` given.
+    pub(crate) fn go_to(&mut self, state: &PreciseState, increment: &[f64], inverse: f64) {
+        wide!({
+            let nd = increment.len();
+            side_by_side!(for (
+                x in &increment[..nd],
+                q in &state.q[..nd],
+                q_low in &state.q_low[..nd],
+                per_radian in &self.turns_per_radian[..nd],
+            ) let more = x * 0.5 + q_low; {
+                middle(&mut self.q[..nd]) = q + more;
+                velocity(&mut self.velocity[..nd]) = x * inverse;
+                angle(&mut self.angles[..nd]) = Side::unwound(q, more, per_radian);
+            });
+        })
     }
 
     /// Gradient of the Lagrangian, and forces.
@@ -101,8 +97,7 @@ impl Midpoint {
             [&mut *l_q, &mut *l_v],
         );
         if model.potentials.any {
-            let poses = &self.mechanics.poses;
-            potentials::add_gradient(&model.potentials, &model.dynamics, poses, &self.q, l_q);
+            model.add_spring_gradient(&self.mechanics.poses, &self.q, l_q);
         }
         if !model.damping.is_empty() {
             forces::add_damping(&model.damping, &self.velocity, &self.input_force, force);

@@ -30,28 +30,24 @@ use crate::math::spatial::{Vec3, three};
 use crate::model::mechanism::Model;
 
 impl Residual {
-    wide! {
-        /// Sums up `r1 = p0 + D1Ld + F⁻`, without constraints, and the magnitudes; `half` is `½h`, `weight`
-        /// is `a h`.
-        pub(crate) fn sum_up(mut self, state: &PreciseState, mid: &Midpoint, half: f64, weight: f64)
-            = sum_up_portable, sum_up_avx2;
-    }
-
-    #[inline(always)]
-    fn sum_up_portable(&mut self, state: &PreciseState, mid: &Midpoint, half: f64, weight: f64) {
-        let nd = self.dynamics.len();
-        side_by_side!(for (
-            p in &state.p[..nd],
-            p_low in &state.p_low[..nd],
-            l_q in &mid.l_q[..nd],
-            l_v in &mid.l_v[..nd],
-            force in &mid.force[..nd],
-            angle in &mid.angles[..nd],
-        ) let (half_q, force) = (l_q * half, force * weight); {
-            residual(&mut self.dynamics[..nd]) = ((p - l_v) + (half_q + force)) + p_low;
-            magnitude(&mut self.magnitudes[..nd]) =
-                p.abs() + l_v.abs() + half_q.abs() * (angle.abs() + 1.0) + force.abs();
-        });
+    /// Sums up `r1 = p0 + D1Ld + F⁻`, without constraints, and the magnitudes; `half` is `½h`, `weight`
+    /// is `a h`.
+    pub(crate) fn sum_up(&mut self, state: &PreciseState, mid: &Midpoint, half: f64, weight: f64) {
+        wide!({
+            let nd = self.dynamics.len();
+            side_by_side!(for (
+                p in &state.p[..nd],
+                p_low in &state.p_low[..nd],
+                l_q in &mid.l_q[..nd],
+                l_v in &mid.l_v[..nd],
+                force in &mid.force[..nd],
+                angle in &mid.angles[..nd],
+            ) let (half_q, force) = (l_q * half, force * weight); {
+                residual(&mut self.dynamics[..nd]) = ((p - l_v) + (half_q + force)) + p_low;
+                magnitude(&mut self.magnitudes[..nd]) =
+                    p.abs() + l_v.abs() + half_q.abs() * (angle.abs() + 1.0) + force.abs();
+            });
+        })
     }
 }
 

@@ -21,7 +21,7 @@ use crate::kkt::loops::column::Column;
 use crate::kkt::planar::{Diagonal, MatrixKind, Method, PlanarRecursion, add_to, dot3, product};
 use crate::lagrangian::planar::{Fours, Joints, Vec2, Vec3, cross};
 use crate::math::rows::{Block, LANES, padded};
-use crate::math::simd::wide;
+use crate::math::simd::widest;
 use crate::math::tree_lu::SmallestPivot;
 use crate::model::loop_plan::{Above, BODY, Loops, Opened, Step};
 use crate::model::planar_tree::PlanarJoint;
@@ -257,42 +257,10 @@ impl Multifrontal {
         }
     }
 
-    wide! {
-        /// Factors the matrix at the second derivatives of the tree. With fronts of `m` rows `4 m²` flops a
-        /// joint and equation.
-        #[inline(never)]
-        pub(crate) fn factor(
-            mut self,
-            at: Mechanism<'_>,
-            diagonal: &[f64],
-            scales: Scales<'_>,
-            time_step_s: f64,
-            kind: MatrixKind,
-        ) -> Pivots = factor_portable, factor_avx2, factor_avx512;
-
-        /// Solves for `x` and `λ` in place; `constraints` are all that the model has.
-        #[inline(never)]
-        pub(crate) fn solve(
-            mut self,
-            loops: &Loops,
-            x: &mut [f64],
-            constraints: &mut [f64],
-        ) = solve_portable, solve_avx2, solve_avx512;
-
-        /// As [`PlanarRecursion::linearize`], with multipliers. About `8 m` flops for each joint or equation
-        /// and column beside those of a tree.
-        #[inline(never)]
-        pub(crate) fn linearize(
-            mut self,
-            at: Mechanism<'_>,
-            diagonal: &Diagonal<'_>,
-            closures: &Closures<'_>,
-            out: Derivatives<'_>,
-        ) = linearize_portable, linearize_avx2, linearize_avx512;
-    }
-
-    #[inline(always)]
-    fn factor_portable(
+    /// Factors the matrix at the second derivatives of the tree. With fronts of `m` rows `4 m²` flops a
+    /// joint and equation.
+    #[inline(never)]
+    pub(crate) fn factor(
         &mut self,
         at: Mechanism<'_>,
         diagonal: &[f64],
@@ -300,92 +268,159 @@ impl Multifrontal {
         time_step_s: f64,
         kind: MatrixKind,
     ) -> Pivots {
-        let Mechanism { loops, joints, tree, start, end } = at;
-        let method = Method::new(time_step_s, kind);
-        self.tree.step = time_step_s;
-        self.fronts.fill(0.0);
-        let mut pivots = Pivots { joints: SmallestPivot::NONE, equations: 1.0, steepness: 1.0 };
-        let (mut factors, mut closed) = (&mut self.factors[..], &mut self.closed[..]);
-        for step in &loops.plan.steps {
-            let (i, place) = (step.joint, step.place);
-            absorb(&self.shapes, &mut self.fronts, step);
-            let Shape { entry, stride, .. } = self.shapes[step.front];
-            let mut front =
-                Front { entries: &mut self.fronts[entry..][..step.rows * stride], stride };
-            for opened in &step.opened {
-                front
-                    .open(opened, [start, end].map(|closures| &closures.wrenches[opened.equation]));
-            }
+        widest!({
+            let Mechanism { loops, joints, tree, start, end } = at;
+            let method = Method::new(time_step_s, kind);
+            self.tree.step = time_step_s;
+            self.fronts.fill(0.0);
+            let mut pivots = Pivots { joints: SmallestPivot::NONE, equations: 1.0, steepness: 1.0 };
+            let (mut factors, mut closed) = (&mut self.factors[..], &mut self.closed[..]);
+            for step in &loops.plan.steps {
+                let (i, place) = (step.joint, step.place);
+                absorb(&self.shapes, &mut self.fronts, step);
+                let Shape { entry, stride, .. } = self.shapes[step.front];
+                let mut front =
+                    Front { entries: &mut self.fronts[entry..][..step.rows * stride], stride };
+                for opened in &step.opened {
+                    front.open(
+                        opened,
+                        [start, end].map(|closures| &closures.wrenches[opened.equation]),
+                    );
+                }
 
-            // D = K_jj + minusᵀ A plus,  U = upper + A plus,  W = lower + Aᵀ minus.
-            let joint = &joints[i];
-            let link = tree.link(i);
-            let ([upper, lower], generator) = method.generator(&link, joint);
-            let turn = joint.body.turn;
-            let minus = six(generator.minus, [turn, start.slide[i][0], start.slide[i][1]]);
-            let plus = six(generator.plus, [turn, end.slide[i][0], end.slide[i][1]]);
-            let [column, row] = take_mut(&mut factors, stride);
-            project(front.entries, stride, place, &plus, column);
-            row.fill(0.0);
-            for (k, factor) in minus.iter().enumerate() {
-                add_row(row, *factor, front.row(place + k));
-            }
-            let k_jj = dot3(generator.minus, upper) + diagonal[i];
-            let a_plus = column[place..].iter().zip(minus).map(|(a_plus, minus)| a_plus * minus);
-            let pivot = k_jj + a_plus.sum::<f64>();
-            pivots.joints.see(i, pivot, k_jj.abs().max(scales.inertia[i] * method.inverse.abs()));
-            let inverse = 1.0 / pivot;
-            for k in 0..3 {
-                column[place + k] += upper[k];
-                row[place + k] += lower[k];
-            }
-            // A −= U Wᵀ / D.
-            front.eliminate(column, row, inverse);
+                // D = K_jj + minusᵀ A plus,  U = upper + A plus,  W = lower + Aᵀ minus.
+                let joint = &joints[i];
+                let link = tree.link(i);
+                let ([upper, lower], generator) = method.generator(&link, joint);
+                let turn = joint.body.turn;
+                let minus = six(generator.minus, [turn, start.slide[i][0], start.slide[i][1]]);
+                let plus = six(generator.plus, [turn, end.slide[i][0], end.slide[i][1]]);
+                let [column, row] = take_mut(&mut factors, stride);
+                project(front.entries, stride, place, &plus, column);
+                row.fill(0.0);
+                for (k, factor) in minus.iter().enumerate() {
+                    add_row(row, *factor, front.row(place + k));
+                }
+                let k_jj = dot3(generator.minus, upper) + diagonal[i];
+                let a_plus =
+                    column[place..].iter().zip(minus).map(|(a_plus, minus)| a_plus * minus);
+                let pivot = k_jj + a_plus.sum::<f64>();
+                pivots.joints.see(
+                    i,
+                    pivot,
+                    k_jj.abs().max(scales.inertia[i] * method.inverse.abs()),
+                );
+                let inverse = 1.0 / pivot;
+                for k in 0..3 {
+                    column[place + k] += upper[k];
+                    row[place + k] += lower[k];
+                }
+                // A −= U Wᵀ / D.
+                front.eliminate(column, row, inverse);
 
-            // Equations that are closed here, the steepest first.
-            let closing = take_first(&mut closed, step.closed.len());
-            for (closed, &(equation, row)) in closing.iter_mut().zip(&step.closed) {
-                let weight = scales.weight[loops.equations[equation].constraint];
-                *closed =
-                    Closed { equation, row, weight, whole: front.diagonal(row), inverse: 0.0 };
-            }
-            for m in 0..closing.len() {
-                let size =
-                    |k: usize| closing[k].weight.powi(2) * front.diagonal(closing[k].row).abs();
-                let largest =
-                    (m + 1..closing.len()).fold(m, |a, b| if size(b) > size(a) { b } else { a });
-                let steepness = size(largest) / time_step_s.abs();
-                closing.swap(m, largest);
-                let closed = &mut closing[m];
-                let pivot = front.diagonal(closed.row);
-                // A NaN counts as zero.
-                pivots.equations = pivots.equations.min((pivot / closed.whole).abs().max(0.0));
-                pivots.steepness = pivots.steepness.min(steepness.max(0.0));
-                closed.inverse = 1.0 / pivot;
-                front.close(closed, take_mut(&mut factors, stride));
-            }
+                // Equations that are closed here, the steepest first.
+                let closing = take_first(&mut closed, step.closed.len());
+                for (closed, &(equation, row)) in closing.iter_mut().zip(&step.closed) {
+                    let weight = scales.weight[loops.equations[equation].constraint];
+                    *closed =
+                        Closed { equation, row, weight, whole: front.diagonal(row), inverse: 0.0 };
+                }
+                for m in 0..closing.len() {
+                    let size =
+                        |k: usize| closing[k].weight.powi(2) * front.diagonal(closing[k].row).abs();
+                    let largest = (m + 1..closing.len())
+                        .fold(m, |a, b| if size(b) > size(a) { b } else { a });
+                    let steepness = size(largest) / time_step_s.abs();
+                    closing.swap(m, largest);
+                    let closed = &mut closing[m];
+                    let pivot = front.diagonal(closed.row);
+                    // A NaN counts as zero.
+                    pivots.equations = pivots.equations.min((pivot / closed.whole).abs().max(0.0));
+                    pivots.steepness = pivots.steepness.min(steepness.max(0.0));
+                    closed.inverse = 1.0 / pivot;
+                    front.close(closed, take_mut(&mut factors, stride));
+                }
 
-            let edges = [link.edge, start.edge[i], end.edge[i]];
-            front.pass_on(step, edges);
-            self.pivots[i] = Pivot { minus, plus, inverse, edges };
-        }
-        pivots
+                let edges = [link.edge, start.edge[i], end.edge[i]];
+                front.pass_on(step, edges);
+                self.pivots[i] = Pivot { minus, plus, inverse, edges };
+            }
+            pivots
+        })
     }
 
-    #[inline(always)]
-    fn solve_portable(&mut self, loops: &Loops, x: &mut [f64], constraints: &mut [f64]) {
-        for (side, equation) in self.sides.iter_mut().zip(&loops.equations) {
-            *side = constraints[equation.constraint];
-        }
-        constraints.fill(0.0);
-        let mut flows = std::mem::take(&mut self.flows);
-        let mut multipliers = std::mem::take(&mut self.multipliers);
-        self.eliminate(loops, x, &self.sides, &mut multipliers, &mut flows);
-        self.substitute(loops, x, &mut multipliers, &mut flows);
-        for (multiplier, equation) in multipliers.iter().zip(&loops.equations) {
-            constraints[equation.constraint] = *multiplier;
-        }
-        (self.flows, self.multipliers) = (flows, multipliers);
+    /// Solves for `x` and `λ` in place; `constraints` are all that the model has.
+    #[inline(never)]
+    pub(crate) fn solve(&mut self, loops: &Loops, x: &mut [f64], constraints: &mut [f64]) {
+        widest!({
+            for (side, equation) in self.sides.iter_mut().zip(&loops.equations) {
+                *side = constraints[equation.constraint];
+            }
+            constraints.fill(0.0);
+            let mut flows = std::mem::take(&mut self.flows);
+            let mut multipliers = std::mem::take(&mut self.multipliers);
+            self.eliminate(loops, x, &self.sides, &mut multipliers, &mut flows);
+            self.substitute(loops, x, &mut multipliers, &mut flows);
+            for (multiplier, equation) in multipliers.iter().zip(&loops.equations) {
+                constraints[equation.constraint] = *multiplier;
+            }
+            (self.flows, self.multipliers) = (flows, multipliers);
+        })
+    }
+
+    /// As [`PlanarRecursion::linearize`], with multipliers. About `8 m` flops for each joint or equation
+    /// and column beside those of a tree.
+    #[inline(never)]
+    pub(crate) fn linearize(
+        &mut self,
+        at: Mechanism<'_>,
+        diagonal: &Diagonal<'_>,
+        closures: &Closures<'_>,
+        out: Derivatives<'_>,
+    ) {
+        widest!({
+            let Mechanism { loops, joints, tree, start, .. } = at;
+            let (n, stride) = (joints.len(), out.stride);
+            out.multipliers.fill(0.0);
+            self.tree.find_slopes(tree, joints);
+            for first in (0..stride).step_by(LANES) {
+                self.tree.start_columns(tree, joints, diagonal, first);
+                let columns = first..n.min(first + LANES);
+                let PlanarRecursion { increment, momentum, .. } = &mut self.tree;
+                for (i, (x, p)) in increment.iter_mut().zip(momentum).enumerate() {
+                    if first < n {
+                        let row = &closures.hessian[i * n..][columns.clone()];
+                        for (lane, value) in row.iter().enumerate() {
+                            x.0[lane] -= value;
+                            p.0[lane] -= value;
+                        }
+                    }
+                    *x = x.times(-1.0);
+                }
+                for (side, equation) in self.block_sides.iter_mut().zip(&loops.equations) {
+                    *side = Block::ZERO;
+                    if first < n {
+                        let row = &closures.jacobian[equation.constraint * n..][columns.clone()];
+                        side.0.iter_mut().zip(row).for_each(|(to, from)| *to = -from);
+                    }
+                }
+                let mut x = std::mem::take(&mut self.tree.increment);
+                let mut flows = std::mem::take(&mut self.block_flows);
+                let mut multipliers = std::mem::take(&mut self.block_multipliers);
+                self.eliminate(loops, &mut x, &self.block_sides, &mut multipliers, &mut flows);
+                self.substitute(loops, &mut x, &mut multipliers, &mut flows);
+                (self.tree.increment, self.block_flows) = (x, flows);
+                self.tree.carry_down(joints, diagonal);
+                self.tree.gather(joints);
+                self.push_back(loops, joints, start, &multipliers);
+                self.tree.write_columns(out.increment, out.momentum, first, stride);
+                for (value, equation) in multipliers.iter().zip(&loops.equations) {
+                    let row = &mut out.multipliers[equation.constraint * stride..][..stride];
+                    row[first..][..LANES].copy_from_slice(&value.0);
+                }
+                self.block_multipliers = multipliers;
+            }
+        })
     }
 
     /// From the leaves to the root.
@@ -487,57 +522,6 @@ impl Multifrontal {
                     all[self.shapes[other.front].row + to] = all[first + from];
                 }
             }
-        }
-    }
-
-    #[inline(always)]
-    fn linearize_portable(
-        &mut self,
-        at: Mechanism<'_>,
-        diagonal: &Diagonal<'_>,
-        closures: &Closures<'_>,
-        out: Derivatives<'_>,
-    ) {
-        let Mechanism { loops, joints, tree, start, .. } = at;
-        let (n, stride) = (joints.len(), out.stride);
-        out.multipliers.fill(0.0);
-        self.tree.find_slopes(tree, joints);
-        for first in (0..stride).step_by(LANES) {
-            self.tree.start_columns(tree, joints, diagonal, first);
-            let columns = first..n.min(first + LANES);
-            let PlanarRecursion { increment, momentum, .. } = &mut self.tree;
-            for (i, (x, p)) in increment.iter_mut().zip(momentum).enumerate() {
-                if first < n {
-                    let row = &closures.hessian[i * n..][columns.clone()];
-                    for (lane, value) in row.iter().enumerate() {
-                        x.0[lane] -= value;
-                        p.0[lane] -= value;
-                    }
-                }
-                *x = x.times(-1.0);
-            }
-            for (side, equation) in self.block_sides.iter_mut().zip(&loops.equations) {
-                *side = Block::ZERO;
-                if first < n {
-                    let row = &closures.jacobian[equation.constraint * n..][columns.clone()];
-                    side.0.iter_mut().zip(row).for_each(|(to, from)| *to = -from);
-                }
-            }
-            let mut x = std::mem::take(&mut self.tree.increment);
-            let mut flows = std::mem::take(&mut self.block_flows);
-            let mut multipliers = std::mem::take(&mut self.block_multipliers);
-            self.eliminate(loops, &mut x, &self.block_sides, &mut multipliers, &mut flows);
-            self.substitute(loops, &mut x, &mut multipliers, &mut flows);
-            (self.tree.increment, self.block_flows) = (x, flows);
-            self.tree.carry_down(joints, diagonal);
-            self.tree.gather(joints);
-            self.push_back(loops, joints, start, &multipliers);
-            self.tree.write_columns(out.increment, out.momentum, first, stride);
-            for (value, equation) in multipliers.iter().zip(&loops.equations) {
-                let row = &mut out.multipliers[equation.constraint * stride..][..stride];
-                row[first..][..LANES].copy_from_slice(&value.0);
-            }
-            self.block_multipliers = multipliers;
         }
     }
 

@@ -23,7 +23,7 @@
 
 use crate::lagrangian::planar::{Fours, Joints, Link, Vec2, Vec3, cross, dot, linear};
 use crate::math::rows::{Block, LANES};
-use crate::math::simd::wide;
+use crate::math::simd::{wide, widest};
 use crate::math::tree_lu::SmallestPivot;
 use crate::model::planar_tree::PlanarJoint;
 
@@ -185,45 +185,11 @@ impl PlanarRecursion {
         }
     }
 
-    wide! {
-        /// Factors the matrix that belongs to the second derivatives of `tree`; all joints are dynamic, in
-        /// the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
-        /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 150 flops a joint.
-        #[inline(never)]
-        pub(crate) fn factor(
-            mut self,
-            tree: &Joints<Fours>,
-            joints: &[PlanarJoint],
-            diagonal: &[f64],
-            inertia: &[f64],
-            step: f64,
-            kind: MatrixKind,
-        ) -> SmallestPivot = factor_portable, factor_avx2;
-
-        /// Solves `K x = b` in place, about 55 flops a joint.
-        #[inline(never)]
-        pub(crate) fn solve(mut self, joints: &[PlanarJoint], x: &mut [f64])
-            = solve_portable, solve_avx2;
-
-        /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
-        /// momentum, `[h L_qq 1] + (½h L_qq + L_qv) X`, by configuration and momentum; springs and dampers
-        /// of coordinates are added by `diagonal`s. Rows are those of coordinates, `stride` apart and whole
-        /// blocks. Four passes over the joints for each block of columns, about 95 flops a joint and
-        /// column.
-        #[inline(never)]
-        pub(crate) fn linearize(
-            mut self,
-            tree: &Joints<Fours>,
-            joints: &[PlanarJoint],
-            diagonal: &Diagonal<'_>,
-            increment: &mut [f64],
-            momentum: &mut [f64],
-            stride: usize,
-        ) = linearize_portable, linearize_avx2, linearize_avx512;
-    }
-
-    #[inline(always)]
-    fn factor_portable(
+    /// Factors the matrix that belongs to the second derivatives of `tree`; all joints are dynamic, in
+    /// the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
+    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 150 flops a joint.
+    #[inline(never)]
+    pub(crate) fn factor(
         &mut self,
         tree: &Joints<Fours>,
         joints: &[PlanarJoint],
@@ -232,108 +198,119 @@ impl PlanarRecursion {
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot {
-        let method = Method::new(step, kind);
-        self.step = step;
-        let mut smallest = SmallestPivot::NONE;
-        // `A` of the joint that follows, about its parent.
-        let mut below = [[0.0; 3]; 3];
-        for (row, joint) in joints.iter().enumerate().rev() {
-            let mut sum = if joint.is_followed { below } else { [[0.0; 3]; 3] };
-            if joint.has_branches {
-                sum = plus33(sum, std::mem::take(&mut self.branches[row]));
-            }
-            let [a, b, c] = sum;
-            let link = tree.link(row);
-            let ([upper, lower], mut generator) = method.generator(&link, joint);
-            let Generator { minus, plus, .. } = generator;
+        wide!({
+            let method = Method::new(step, kind);
+            self.step = step;
+            let mut smallest = SmallestPivot::NONE;
+            // `A` of the joint that follows, about its parent.
+            let mut below = [[0.0; 3]; 3];
+            for (row, joint) in joints.iter().enumerate().rev() {
+                let mut sum = if joint.is_followed { below } else { [[0.0; 3]; 3] };
+                if joint.has_branches {
+                    sum = plus33(sum, std::mem::take(&mut self.branches[row]));
+                }
+                let [a, b, c] = sum;
+                let link = tree.link(row);
+                let ([upper, lower], mut generator) = method.generator(&link, joint);
+                let Generator { minus, plus, .. } = generator;
 
-            // D = K_jj + minusᵀ A plus,  U = upper + A plus,  W = lower + Aᵀ minus.
-            let a_plus = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
-            let k_jj = dot3(minus, upper) + diagonal[row];
-            let d = k_jj + dot3(minus, a_plus);
-            smallest.see(row, d, k_jj.abs().max(inertia[row] * method.inverse));
-            let inverse_d = 1.0 / d;
-            let a_minus = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
-            let (u, w) = (plus3(upper, a_plus), plus3(lower, a_minus));
-            // A, U and W / D about the parent: all that can be done before D is known.
-            let edge = link.edge;
-            let [ex, ey] = edge;
-            let moved = |v: Vec3| [v[0] + cross(edge, linear(v)), v[1], v[2]];
-            let (a, b, c) = (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
-            let (u, w_over_d) = (moved(u), scaled(inverse_d, moved(w)));
-            // A − U Wᵀ / D, for the parent.
-            let sum = [
-                add_scaled(a, -u[0], w_over_d),
-                add_scaled(b, -u[1], w_over_d),
-                add_scaled(c, -u[2], w_over_d),
-            ];
-            match joint.parent {
-                0 => {}
-                parent if parent == row => below = sum,
-                parent => {
-                    self.branches[parent - 1] = plus33(self.branches[parent - 1], sum);
+                // D = K_jj + minusᵀ A plus,  U = upper + A plus,  W = lower + Aᵀ minus.
+                let a_plus = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
+                let k_jj = dot3(minus, upper) + diagonal[row];
+                let d = k_jj + dot3(minus, a_plus);
+                smallest.see(row, d, k_jj.abs().max(inertia[row] * method.inverse));
+                let inverse_d = 1.0 / d;
+                let a_minus = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
+                let (u, w) = (plus3(upper, a_plus), plus3(lower, a_minus));
+                // A, U and W / D about the parent: all that can be done before D is known.
+                let edge = link.edge;
+                let [ex, ey] = edge;
+                let moved = |v: Vec3| [v[0] + cross(edge, linear(v)), v[1], v[2]];
+                let (a, b, c) =
+                    (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
+                let (u, w_over_d) = (moved(u), scaled(inverse_d, moved(w)));
+                // A − U Wᵀ / D, for the parent.
+                let sum = [
+                    add_scaled(a, -u[0], w_over_d),
+                    add_scaled(b, -u[1], w_over_d),
+                    add_scaled(c, -u[2], w_over_d),
+                ];
+                match joint.parent {
+                    0 => {}
+                    parent if parent == row => below = sum,
+                    parent => {
+                        self.branches[parent - 1] = plus33(self.branches[parent - 1], sum);
+                    }
+                }
+                // Right-hand sides pass by 1 − U minusᵀ / D up, and by 1 − plus Wᵀ / D down.
+                let (u_over_d, wrench) = (scaled(inverse_d, u), [1.0, -ey, ex]);
+                let unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+                self.passages[row] = Passage {
+                    up: [
+                        add_scaled(wrench, -u_over_d[0], minus),
+                        add_scaled(unit[1], -u_over_d[1], minus),
+                        add_scaled(unit[2], -u_over_d[2], minus),
+                    ],
+                    u_over_d,
+                    down: [
+                        add_scaled(unit[0], -plus[0], w_over_d),
+                        add_scaled([-ey, 1.0, 0.0], -plus[1], w_over_d),
+                        add_scaled([ex, 0.0, 1.0], -plus[2], w_over_d),
+                    ],
+                    w_over_d,
+                };
+                generator.inverse_d = inverse_d;
+                self.generators[row] = generator;
+            }
+            smallest
+        })
+    }
+
+    /// Solves `K x = b` in place, about 55 flops a joint.
+    #[inline(never)]
+    pub(crate) fn solve(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
+        wide!({
+            let Self { generators, passages, flows_of_branches: branches, flow: flows, .. } = self;
+            let mut below = [0.0; 3];
+            for (i, joint) in joints.iter().enumerate().rev() {
+                let (Generator { minus, inverse_d, .. }, passage) = (&generators[i], &passages[i]);
+                let mut flow = if joint.is_followed { below } else { [0.0; 3] };
+                if joint.has_branches {
+                    flow = plus3(flow, std::mem::take(&mut branches[i]));
+                }
+                let b = x[i];
+                x[i] = (b - dot3(*minus, flow)) * inverse_d;
+                let up = passed(&passage.up, flow, b, passage.u_over_d);
+                match joint.parent {
+                    0 => {}
+                    parent if parent == i => below = up,
+                    parent => branches[parent - 1] = plus3(branches[parent - 1], up),
                 }
             }
-            // Right-hand sides pass by 1 − U minusᵀ / D up, and by 1 − plus Wᵀ / D down.
-            let (u_over_d, wrench) = (scaled(inverse_d, u), [1.0, -ey, ex]);
-            let unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-            self.passages[row] = Passage {
-                up: [
-                    add_scaled(wrench, -u_over_d[0], minus),
-                    add_scaled(unit[1], -u_over_d[1], minus),
-                    add_scaled(unit[2], -u_over_d[2], minus),
-                ],
-                u_over_d,
-                down: [
-                    add_scaled(unit[0], -plus[0], w_over_d),
-                    add_scaled([-ey, 1.0, 0.0], -plus[1], w_over_d),
-                    add_scaled([ex, 0.0, 1.0], -plus[2], w_over_d),
-                ],
-                w_over_d,
-            };
-            generator.inverse_d = inverse_d;
-            self.generators[row] = generator;
-        }
-        smallest
+            let mut above = [0.0; 3];
+            for (i, joint) in joints.iter().enumerate() {
+                let flow = match joint.parent {
+                    0 => [0.0; 3],
+                    parent if parent == i => above,
+                    parent => flows[parent - 1],
+                };
+                let (own, passage) = (x[i], &passages[i]);
+                x[i] = own - dot3(passage.w_over_d, flow);
+                above = passed(&passage.down, flow, own, generators[i].plus);
+                if joint.has_branches {
+                    flows[i] = above;
+                }
+            }
+        })
     }
 
-    #[inline(always)]
-    fn solve_portable(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
-        let Self { generators, passages, flows_of_branches: branches, flow: flows, .. } = self;
-        let mut below = [0.0; 3];
-        for (i, joint) in joints.iter().enumerate().rev() {
-            let (Generator { minus, inverse_d, .. }, passage) = (&generators[i], &passages[i]);
-            let mut flow = if joint.is_followed { below } else { [0.0; 3] };
-            if joint.has_branches {
-                flow = plus3(flow, std::mem::take(&mut branches[i]));
-            }
-            let b = x[i];
-            x[i] = (b - dot3(*minus, flow)) * inverse_d;
-            let up = passed(&passage.up, flow, b, passage.u_over_d);
-            match joint.parent {
-                0 => {}
-                parent if parent == i => below = up,
-                parent => branches[parent - 1] = plus3(branches[parent - 1], up),
-            }
-        }
-        let mut above = [0.0; 3];
-        for (i, joint) in joints.iter().enumerate() {
-            let flow = match joint.parent {
-                0 => [0.0; 3],
-                parent if parent == i => above,
-                parent => flows[parent - 1],
-            };
-            let (own, passage) = (x[i], &passages[i]);
-            x[i] = own - dot3(passage.w_over_d, flow);
-            above = passed(&passage.down, flow, own, generators[i].plus);
-            if joint.has_branches {
-                flows[i] = above;
-            }
-        }
-    }
-
-    #[inline(always)]
-    pub(super) fn linearize_portable(
+    /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
+    /// momentum, `[h L_qq 1] + (½h L_qq + L_qv) X`, by configuration and momentum; springs and dampers
+    /// of coordinates are added by `diagonal`s. Rows are those of coordinates, `stride` apart and whole
+    /// blocks. Four passes over the joints for each block of columns, about 95 flops a joint and
+    /// column.
+    #[inline(never)]
+    pub(crate) fn linearize(
         &mut self,
         tree: &Joints<Fours>,
         joints: &[PlanarJoint],
@@ -342,14 +319,16 @@ impl PlanarRecursion {
         momentum: &mut [f64],
         stride: usize,
     ) {
-        self.find_slopes(tree, joints);
-        for first in (0..stride).step_by(LANES) {
-            self.start_columns(tree, joints, diagonal, first);
-            self.eliminate(joints);
-            self.substitute(joints, diagonal);
-            self.gather(joints);
-            self.write_columns(increment, momentum, first, stride);
-        }
+        widest!({
+            self.find_slopes(tree, joints);
+            for first in (0..stride).step_by(LANES) {
+                self.start_columns(tree, joints, diagonal, first);
+                self.eliminate(joints);
+                self.substitute(joints, diagonal);
+                self.gather(joints);
+                self.write_columns(increment, momentum, first, stride);
+            }
+        })
     }
 
     /// At the second derivatives of the last factorization.

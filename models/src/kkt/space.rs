@@ -113,28 +113,11 @@ impl SpatialRecursion {
         }
     }
 
-    wide! {
-        /// Factors the matrix that belongs to the second derivatives of `mechanics`; all joints are dynamic,
-        /// in the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
-        /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 450 flops a joint.
-        #[inline(never)]
-        pub(crate) fn factor(
-            mut self,
-            tree: &Tree,
-            mechanics: &Mechanics,
-            diagonal: &[f64],
-            inertia: &[f64],
-            step: f64,
-            kind: MatrixKind,
-        ) -> SmallestPivot = factor_portable, factor_avx2;
-
-        /// Solves `K x = b` in place, about 65 flops a joint.
-        #[inline(never)]
-        pub(crate) fn solve(mut self, tree: &Tree, x: &mut [f64]) = solve_portable, solve_avx2;
-    }
-
-    #[inline(always)]
-    fn factor_portable(
+    /// Factors the matrix that belongs to the second derivatives of `mechanics`; all joints are dynamic,
+    /// in the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
+    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 450 flops a joint.
+    #[inline(never)]
+    pub(crate) fn factor(
         &mut self,
         tree: &Tree,
         mechanics: &Mechanics,
@@ -143,86 +126,91 @@ impl SpatialRecursion {
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot {
-        let Mechanics { momenta, curvature, .. } = mechanics;
-        let motion = if kind == MatrixKind::Mass { 0.0 } else { 0.5 };
-        let (half, inverse) = (step * motion, 1.0 / step);
-        let [e1, e2] = self.horizontal;
-        let weight = 0.5 * half * self.gravity;
-        let mut smallest = SmallestPivot::NONE;
-        for (row, joint) in tree.joints.iter().enumerate().rev() {
-            let (axis, rate) = (momenta.axis[row], momenta.axis_rate[row]);
-            let (force, slope) = (curvature.force[row], curvature.rate[row]);
-            let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
-            let weight = [weight * force.f.dot(e2), -weight * force.f.dot(e1)];
-            let axis = lanes(axis.w, axis.v, [0.0; 2]);
-            let rate = lanes(rate.w * half, rate.v * half, tilt);
-            let force = lanes(force.n * inverse, force.f * inverse, [0.0; 2]);
-            let slope = lanes(slope.n * motion, slope.f * motion, weight);
-            let (plus, minus) = (rate.plus(axis), rate.plus(axis.times(-1.0)));
-            let (upper, lower) = (slope.plus(force), slope.plus(force.times(-1.0)));
+        wide!({
+            let Mechanics { momenta, curvature, .. } = mechanics;
+            let motion = if kind == MatrixKind::Mass { 0.0 } else { 0.5 };
+            let (half, inverse) = (step * motion, 1.0 / step);
+            let [e1, e2] = self.horizontal;
+            let weight = 0.5 * half * self.gravity;
+            let mut smallest = SmallestPivot::NONE;
+            for (row, joint) in tree.joints.iter().enumerate().rev() {
+                let (axis, rate) = (momenta.axis[row], momenta.axis_rate[row]);
+                let (force, slope) = (curvature.force[row], curvature.rate[row]);
+                let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
+                let weight = [weight * force.f.dot(e2), -weight * force.f.dot(e1)];
+                let axis = lanes(axis.w, axis.v, [0.0; 2]);
+                let rate = lanes(rate.w * half, rate.v * half, tilt);
+                let force = lanes(force.n * inverse, force.f * inverse, [0.0; 2]);
+                let slope = lanes(slope.n * motion, slope.f * motion, weight);
+                let (plus, minus) = (rate.plus(axis), rate.plus(axis.times(-1.0)));
+                let (upper, lower) = (slope.plus(force), slope.plus(force.times(-1.0)));
 
-            let place = self.places[row];
-            let (sums, own) = self.sums.split_at_mut(place);
-            let own = &mut own[0];
-            // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
-            let mut a_plus = Block::ZERO;
-            for (a_plus, line) in a_plus.0.iter_mut().zip(&*own) {
-                *a_plus = dot(line, &plus);
-            }
-            let u = upper.plus(a_plus);
-            let mut w = lower;
-            for (two, lines) in minus.0.as_chunks::<2>().0.iter().zip(own.as_chunks::<2>().0) {
-                w = w.plus(lines[0].times(two[0]).plus(lines[1].times(two[1])));
-            }
-            let k_jj = dot(&minus, &upper) + diagonal[row];
-            let d = k_jj + dot(&minus, &a_plus);
-            smallest.see(row, d, k_jj.abs().max(inertia[row] * inverse.abs()));
-            let inverse_d = 1.0 / d;
-            let w_over_d = w.times(inverse_d);
-            // A −= U Wᵀ / D, and on to the parent.
-            for (line, u) in own.iter_mut().zip(u.0) {
-                *line = line.plus(w_over_d.times(-u));
-            }
-            match self.places.get(joint.parent) {
-                Some(&to) if to == place => {}
-                to => {
-                    if let Some(&to) = to {
-                        for (target, line) in sums[to].iter_mut().zip(&*own) {
-                            *target = target.plus(*line);
-                        }
-                    }
-                    *own = [Block::ZERO; 8];
+                let place = self.places[row];
+                let (sums, own) = self.sums.split_at_mut(place);
+                let own = &mut own[0];
+                // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
+                let mut a_plus = Block::ZERO;
+                for (a_plus, line) in a_plus.0.iter_mut().zip(&*own) {
+                    *a_plus = dot(line, &plus);
                 }
+                let u = upper.plus(a_plus);
+                let mut w = lower;
+                for (two, lines) in minus.0.as_chunks::<2>().0.iter().zip(own.as_chunks::<2>().0) {
+                    w = w.plus(lines[0].times(two[0]).plus(lines[1].times(two[1])));
+                }
+                let k_jj = dot(&minus, &upper) + diagonal[row];
+                let d = k_jj + dot(&minus, &a_plus);
+                smallest.see(row, d, k_jj.abs().max(inertia[row] * inverse.abs()));
+                let inverse_d = 1.0 / d;
+                let w_over_d = w.times(inverse_d);
+                // A −= U Wᵀ / D, and on to the parent.
+                for (line, u) in own.iter_mut().zip(u.0) {
+                    *line = line.plus(w_over_d.times(-u));
+                }
+                match self.places.get(joint.parent) {
+                    Some(&to) if to == place => {}
+                    to => {
+                        if let Some(&to) = to {
+                            for (target, line) in sums[to].iter_mut().zip(&*own) {
+                                *target = target.plus(*line);
+                            }
+                        }
+                        *own = [Block::ZERO; 8];
+                    }
+                }
+                self.generators[row] = Generator { minus, plus, u, w_over_d };
+                self.inverse_d[row] = inverse_d;
             }
-            self.generators[row] = Generator { minus, plus, u, w_over_d };
-            self.inverse_d[row] = inverse_d;
-        }
-        smallest
+            smallest
+        })
     }
 
-    #[inline(always)]
-    fn solve_portable(&mut self, tree: &Tree, x: &mut [f64]) {
-        let Self { generators, inverse_d, places, flows, .. } = self;
-        flows.fill(Block::ZERO);
-        for (i, joint) in tree.joints.iter().enumerate().rev() {
-            let (generator, place) = (&generators[i], places[i]);
-            let flow = flows[place];
-            x[i] = (x[i] - dot(&generator.minus, &flow)) * inverse_d[i];
-            let flow = flow.plus(generator.u.times(x[i]));
-            match places.get(joint.parent) {
-                Some(&to) if to == place => flows[to] = flow,
-                to => {
-                    flows[place] = Block::ZERO;
-                    if let Some(&to) = to {
-                        flows[to] = flows[to].plus(flow);
+    /// Solves `K x = b` in place, about 65 flops a joint.
+    #[inline(never)]
+    pub(crate) fn solve(&mut self, tree: &Tree, x: &mut [f64]) {
+        wide!({
+            let Self { generators, inverse_d, places, flows, .. } = self;
+            flows.fill(Block::ZERO);
+            for (i, joint) in tree.joints.iter().enumerate().rev() {
+                let (generator, place) = (&generators[i], places[i]);
+                let flow = flows[place];
+                x[i] = (x[i] - dot(&generator.minus, &flow)) * inverse_d[i];
+                let flow = flow.plus(generator.u.times(x[i]));
+                match places.get(joint.parent) {
+                    Some(&to) if to == place => flows[to] = flow,
+                    to => {
+                        flows[place] = Block::ZERO;
+                        if let Some(&to) = to {
+                            flows[to] = flows[to].plus(flow);
+                        }
                     }
                 }
             }
-        }
-        for (i, joint) in tree.joints.iter().enumerate() {
-            let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
-            x[i] -= dot(&generators[i].w_over_d, &flow);
-            flows[places[i]] = flow.plus(generators[i].plus.times(x[i]));
-        }
+            for (i, joint) in tree.joints.iter().enumerate() {
+                let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
+                x[i] -= dot(&generators[i].w_over_d, &flow);
+                flows[places[i]] = flow.plus(generators[i].plus.times(x[i]));
+            }
+        })
     }
 }

@@ -71,45 +71,42 @@ impl<S: Scalar> Curvature<S> {
         }
     }
 
-    wide! {
-        /// Computes the generators from poses and momenta of the same configuration and velocity.
-        #[inline(never)]
-        pub(crate) fn evaluate(mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>)
-            = evaluate_portable, evaluate_avx2;
-    }
-
-    #[inline(always)]
-    fn evaluate_portable(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
-        for (i, joint) in tree.joints.iter().enumerate() {
-            let rotation = &poses.rotation[i];
-            let spin = match &joint.body.inertia {
-                Rotational::None => {
-                    self.tensor[i] = Sym3::default();
-                    continue;
-                }
-                Rotational::Point => Sym3::default(),
-                Rotational::Isotropic(i) => {
-                    Sym3::lift(Sym3 { xx: *i, yy: *i, zz: *i, ..Sym3::default() })
-                }
-                Rotational::Full(tensor) => Sym3::lift(*tensor).rotated(rotation),
-            };
-            let center = poses.position[i] + rotation.apply(Vec3::lift(joint.body.center));
-            self.tensor[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
-        }
-        for (i, joint) in tree.joints.iter().enumerate().rev() {
-            if joint.parent != WORLD {
-                self.tensor[joint.parent] = self.tensor[joint.parent].add(&self.tensor[i]);
+    /// Computes the generators from poses and momenta of the same configuration and velocity.
+    #[inline(never)]
+    pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
+        wide!({
+            for (i, joint) in tree.joints.iter().enumerate() {
+                let rotation = &poses.rotation[i];
+                let spin = match &joint.body.inertia {
+                    Rotational::None => {
+                        self.tensor[i] = Sym3::default();
+                        continue;
+                    }
+                    Rotational::Point => Sym3::default(),
+                    Rotational::Isotropic(i) => {
+                        Sym3::lift(Sym3 { xx: *i, yy: *i, zz: *i, ..Sym3::default() })
+                    }
+                    Rotational::Full(tensor) => Sym3::lift(*tensor).rotated(rotation),
+                };
+                let center = poses.position[i] + rotation.apply(Vec3::lift(joint.body.center));
+                self.tensor[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
             }
-            let composite = Inertia {
-                mass: joint.subtree_mass,
-                moment: momenta.moment[i],
-                tensor: self.tensor[i],
-            };
-            let axis = momenta.axis[i];
-            self.force[i] = composite.momentum(axis);
-            self.rate[i] =
-                axis.cross_force(momenta.momentum[i]).add(composite.momentum(momenta.axis_rate[i]));
-        }
+            for (i, joint) in tree.joints.iter().enumerate().rev() {
+                if joint.parent != WORLD {
+                    self.tensor[joint.parent] = self.tensor[joint.parent].add(&self.tensor[i]);
+                }
+                let composite = Inertia {
+                    mass: joint.subtree_mass,
+                    moment: momenta.moment[i],
+                    tensor: self.tensor[i],
+                };
+                let axis = momenta.axis[i];
+                self.force[i] = composite.momentum(axis);
+                self.rate[i] = axis
+                    .cross_force(momenta.momentum[i])
+                    .add(composite.momentum(momenta.axis_rate[i]));
+            }
+        })
     }
 
     /// Second derivatives of a pair of joints on one path to the root.
@@ -158,24 +155,12 @@ impl<S: Scalar> Curvature<S> {
 }
 
 impl Curvature {
-    wide! {
-        /// Writes the Jacobian of the residual by the increment, without springs and forces:
-        /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
-        ///
-        /// Both entries of a pair come from `½h J̇ ∓ J` of the ancestor and `½P ± F/h` of the descendant.
-        #[inline(never)]
-        pub(crate) fn fill_newton_matrix(
-            self,
-            pairs: &[Pair],
-            momenta: &Momenta,
-            gravity: Option<Vec3>,
-            step: f64,
-            matrix: &mut TreeLu,
-        ) = fill_portable, fill_avx2;
-    }
-
-    #[inline(always)]
-    fn fill_portable(
+    /// Writes the Jacobian of the residual by the increment, without springs and forces:
+    /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
+    ///
+    /// Both entries of a pair come from `½h J̇ ∓ J` of the ancestor and `½P ± F/h` of the descendant.
+    #[inline(never)]
+    pub(crate) fn fill_newton_matrix(
         &self,
         pairs: &[Pair],
         momenta: &Momenta,
@@ -183,26 +168,28 @@ impl Curvature {
         step: f64,
         matrix: &mut TreeLu,
     ) {
-        let (half, inverse) = (0.5 * step, 1.0 / step);
-        let (mut plus, mut minus) = (Force::default(), Force::default());
-        let mut weight = Vec3::ZERO;
-        for pair in pairs.iter().rev() {
-            let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
-            if i == j {
-                // Pairs come grouped by descendant, and backwards the descendant itself comes first.
-                let (f, p) = (self.force[j], self.rate[j]);
-                plus = Force::default().add_scaled(0.5, p).add_scaled(inverse, f);
-                minus = Force::default().add_scaled(0.5, p).add_scaled(-inverse, f);
-                weight = gravity.map_or(Vec3::ZERO, |g| f.f.cross(g) * (0.25 * step));
+        wide!({
+            let (half, inverse) = (0.5 * step, 1.0 / step);
+            let (mut plus, mut minus) = (Force::default(), Force::default());
+            let mut weight = Vec3::ZERO;
+            for pair in pairs.iter().rev() {
+                let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
+                if i == j {
+                    // Pairs come grouped by descendant, and backwards the descendant itself comes first.
+                    let (f, p) = (self.force[j], self.rate[j]);
+                    plus = Force::default().add_scaled(0.5, p).add_scaled(inverse, f);
+                    minus = Force::default().add_scaled(0.5, p).add_scaled(-inverse, f);
+                    weight = gravity.map_or(Vec3::ZERO, |g| f.f.cross(g) * (0.25 * step));
+                }
+                let (axis, axis_rate) = (momenta.axis[i], momenta.axis_rate[i]);
+                let gravity_term = axis.w.dot(weight);
+                let scaled = Motion { w: axis_rate.w * half, v: axis_rate.v * half };
+                matrix.upper[pair.slot as usize] =
+                    scaled.add_scaled(-1.0, axis).dot(plus) + gravity_term;
+                matrix.lower[pair.slot as usize] =
+                    scaled.add_scaled(1.0, axis).dot(minus) + gravity_term;
             }
-            let (axis, axis_rate) = (momenta.axis[i], momenta.axis_rate[i]);
-            let gravity_term = axis.w.dot(weight);
-            let scaled = Motion { w: axis_rate.w * half, v: axis_rate.v * half };
-            matrix.upper[pair.slot as usize] =
-                scaled.add_scaled(-1.0, axis).dot(plus) + gravity_term;
-            matrix.lower[pair.slot as usize] =
-                scaled.add_scaled(1.0, axis).dot(minus) + gravity_term;
-        }
+        })
     }
 
     /// Writes the mass matrix `L_vv` of the dynamic coordinates.

@@ -23,7 +23,6 @@ use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::lagrangian::potentials;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::Mat3;
 use crate::model::mechanism::{CoordinateInput, Forces, Model};
@@ -143,13 +142,7 @@ impl<S: Scalar> Derivatives<S> {
             &mut self.l_v,
         );
         if model.potentials.any {
-            potentials::add_gradient(
-                &model.potentials,
-                &model.dynamics,
-                &self.poses,
-                q,
-                &mut self.l_q,
-            );
+            model.add_spring_gradient(&self.poses, q, &mut self.l_q);
         }
         self.evaluate_forces(model, velocity, inputs);
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
@@ -172,13 +165,9 @@ impl<S: Scalar> Derivatives<S> {
             }
         }
         if model.potentials.any {
-            potentials::for_each_second_derivative(
-                &model.potentials,
-                &model.dynamics,
-                &self.poses,
-                q,
-                |i, j, value| self.l_qq[i * n + j] -= value,
-            );
+            let l_qq = &mut self.l_qq;
+            model
+                .for_each_spring_derivative(&self.poses, q, |i, j, value| l_qq[i * n + j] -= value);
         }
     }
 

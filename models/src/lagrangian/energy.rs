@@ -2,7 +2,6 @@
 
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::lagrangian::potentials;
 use crate::model::mechanism::Model;
 
 /// Potential energy of gravity and springs, with poses and momenta evaluated at `q`.
@@ -15,7 +14,7 @@ pub(crate) fn potential_energy(model: &Model, poses: &Poses, momenta: &Momenta, 
             model.gravity.map_or(0.0, |g| g.dot(moment))
         })
         .sum();
-    potentials::potential(&model.potentials, tree, poses, q) - weight
+    model.spring_energy(poses, q) - weight
 }
 
 /// Kinetic and potential energy, J.

@@ -73,14 +73,22 @@ pub(crate) trait GeneralizedForce {
     }
 }
 
+/// The same expression of each force of each kind.
+macro_rules! for_each_force {
+    ($forces:expr, $force:ident => $value:expr) => {
+        let Forces { wrenches, point_forces, coordinate_forces, linear_dampers } = $forces;
+        wrenches.iter().for_each(|$force| $value);
+        point_forces.iter().for_each(|$force| $value);
+        coordinate_forces.iter().for_each(|$force| $value);
+        linear_dampers.iter().for_each(|$force| $value);
+    };
+}
+
 impl Forces {
     /// For each force, the coordinates that it couples with each other.
     pub(crate) fn couples(&self) -> Vec<Vec<usize>> {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
-        let mut all: Vec<_> = wrenches.iter().map(GeneralizedForce::couples).collect();
-        all.extend(point_forces.iter().map(GeneralizedForce::couples));
-        all.extend(coordinate_forces.iter().map(GeneralizedForce::couples));
-        all.extend(linear_dampers.iter().map(GeneralizedForce::couples));
+        let mut all = Vec::new();
+        for_each_force!(self, force => all.push(force.couples()));
         all
     }
 
@@ -92,11 +100,7 @@ impl Forces {
     /// Adds the generalized force to `force` (dynamic coordinates).
     #[inline(never)]
     pub(crate) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
-        wrenches.iter().for_each(|element| element.add(at, force));
-        point_forces.iter().for_each(|element| element.add(at, force));
-        coordinate_forces.iter().for_each(|element| element.add(at, force));
-        linear_dampers.iter().for_each(|element| element.add(at, force));
+        for_each_force!(self, element => element.add(at, force));
     }
 
     /// [`GeneralizedForce::for_each_derivative`] of each force.
@@ -106,11 +110,7 @@ impl Forces {
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S, S),
     ) {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
-        wrenches.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
-        point_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
-        coordinate_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
-        linear_dampers.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
+        for_each_force!(self, force => force.for_each_derivative(at, &mut entry));
     }
 
     /// [`GeneralizedForce::for_each_input_derivative`] of each force.
@@ -120,10 +120,6 @@ impl Forces {
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S),
     ) {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
-        wrenches.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
-        point_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
-        coordinate_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
-        linear_dampers.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
+        for_each_force!(self, force => force.for_each_input_derivative(at, &mut entry));
     }
 }

@@ -38,21 +38,17 @@ impl<S: Scalar> Poses<S> {
         self.rotation[joint].0[2]
     }
 
-    wide! {
-        /// Poses at the configuration `q`, with the orientations of ball joints: one pass from the roots
-        /// to the leaves, about 50 flops and one sine and cosine for each joint.
-        #[inline(never)]
-        pub(crate) fn evaluate(mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>])
-            = evaluate_portable, evaluate_avx2;
-    }
-
-    #[inline(always)]
-    fn evaluate_portable(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
-        if tree.has_other_joints {
-            self.walk::<true>(tree, q, orientations);
-        } else {
-            self.walk::<false>(tree, q, orientations);
-        }
+    /// Poses at the configuration `q`, with the orientations of ball joints: one pass from the roots
+    /// to the leaves, about 50 flops and one sine and cosine for each joint.
+    #[inline(never)]
+    pub(crate) fn evaluate(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
+        wide!({
+            if tree.has_other_joints {
+                self.walk::<true>(tree, q, orientations);
+            } else {
+                self.walk::<false>(tree, q, orientations);
+            }
+        })
     }
 
     /// `OTHER`: some joint is neither revolute nor prismatic.

@@ -40,22 +40,9 @@ impl<S: Scalar> Momenta<S> {
         }
     }
 
-    wide! {
-        /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones.
-        #[inline(never)]
-        pub(crate) fn gradient(
-            mut self,
-            tree: &Tree,
-            poses: &Poses<S>,
-            velocity: &[S],
-            gravity: Option<Vec3>,
-            l_q: &mut [S],
-            l_v: &mut [S],
-        ) = gradient_portable, gradient_avx2;
-    }
-
-    #[inline(always)]
-    fn gradient_portable(
+    /// Writes `∂L/∂q` and `∂L/∂v` of the dynamic coordinates, the first `l_q.len()` ones.
+    #[inline(never)]
+    pub(crate) fn gradient(
         &mut self,
         tree: &Tree,
         poses: &Poses<S>,
@@ -64,28 +51,30 @@ impl<S: Scalar> Momenta<S> {
         l_q: &mut [S],
         l_v: &mut [S],
     ) {
-        if tree.has_other_joints {
-            self.forward::<true>(tree, poses, velocity);
-        } else {
-            self.forward::<false>(tree, poses, velocity);
-        }
-        for (i, joint) in tree.joints.iter().enumerate().rev() {
-            let (momentum, moment) = (self.momentum[i], self.moment[i]);
-            if joint.parent != WORLD {
-                let parent = joint.parent;
-                self.momentum[parent] = self.momentum[parent].add(momentum);
-                self.moment[parent] += moment;
+        wide!({
+            if tree.has_other_joints {
+                self.forward::<true>(tree, poses, velocity);
+            } else {
+                self.forward::<false>(tree, poses, velocity);
             }
-            if let Some(l_v) = l_v.get_mut(joint.coordinate) {
-                let axis = self.axis[i];
-                *l_v = axis.dot(momentum);
-                l_q[joint.coordinate] = self.axis_rate[i].dot(momentum)
-                    + gravity.map_or(S::ZERO, |g| {
-                        let (g, mass) = (Vec3::lift(g), joint.subtree_mass);
-                        axis.dot(Force { n: moment.cross(g), f: g.scaled(mass) })
-                    });
+            for (i, joint) in tree.joints.iter().enumerate().rev() {
+                let (momentum, moment) = (self.momentum[i], self.moment[i]);
+                if joint.parent != WORLD {
+                    let parent = joint.parent;
+                    self.momentum[parent] = self.momentum[parent].add(momentum);
+                    self.moment[parent] += moment;
+                }
+                if let Some(l_v) = l_v.get_mut(joint.coordinate) {
+                    let axis = self.axis[i];
+                    *l_v = axis.dot(momentum);
+                    l_q[joint.coordinate] = self.axis_rate[i].dot(momentum)
+                        + gravity.map_or(S::ZERO, |g| {
+                            let (g, mass) = (Vec3::lift(g), joint.subtree_mass);
+                            axis.dot(Force { n: moment.cross(g), f: g.scaled(mass) })
+                        });
+                }
             }
-        }
+        })
     }
 
     /// `OTHER`: some joint is neither revolute nor prismatic.

@@ -469,26 +469,9 @@ impl<A: Arrangement> Joints<A> {
         }
     }
 
-    wide! {
-        /// From the roots to the leaves and back, about 60 flops a joint beside a sine and a cosine.
-        #[inline(never)]
-        pub(crate) fn gradient(
-            mut self,
-            joints: &PlanarJoints,
-            q: &[A::Number],
-            velocity: &[A::Number],
-            l_q: &mut [A::Number],
-            l_v: &mut [A::Number],
-        ) = gradient_portable, gradient_avx2;
-
-        /// Computes `F` and `P` of each joint at the last gradient.
-        #[inline(never)]
-        pub(crate) fn differentiate(mut self, joints: &PlanarJoints)
-            = differentiate_portable, differentiate_avx2;
-    }
-
-    #[inline(always)]
-    fn gradient_portable(
+    /// From the roots to the leaves and back, about 60 flops a joint beside a sine and a cosine.
+    #[inline(never)]
+    pub(crate) fn gradient(
         &mut self,
         joints: &PlanarJoints,
         q: &[A::Number],
@@ -496,11 +479,54 @@ impl<A: Arrangement> Joints<A> {
         l_q: &mut [A::Number],
         l_v: &mut [A::Number],
     ) {
-        if joints.have_sliders {
-            self.walk::<true>(joints, q, velocity, l_q, l_v);
-        } else {
-            self.walk::<false>(joints, q, velocity, l_q, l_v);
-        }
+        wide!({
+            if joints.have_sliders {
+                self.walk::<true>(joints, q, velocity, l_q, l_v);
+            } else {
+                self.walk::<false>(joints, q, velocity, l_q, l_v);
+            }
+        })
+    }
+
+    /// Computes `F` and `P` of each joint at the last gradient.
+    #[inline(never)]
+    pub(crate) fn differentiate(&mut self, joints: &PlanarJoints) {
+        wide!({
+            for link in &mut self.links {
+                link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
+            }
+            let branches = &mut self.inertia_of_branches[..];
+            let mut below = A::Number::ZERO;
+            for (block, link) in self.links.iter_mut().enumerate().rev() {
+                let first = A::COUNT * block;
+                let count = A::COUNT.min(joints.len() - first);
+                for (lane, joint) in joints[first..][..count].iter().enumerate().rev() {
+                    let mut sum = A::one(&link.inertia, lane);
+                    if joint.is_followed {
+                        sum += below;
+                    }
+                    if joint.has_branches {
+                        sum += std::mem::take(&mut branches[first + lane]);
+                    }
+                    A::put(sum, &mut link.total_inertia, lane);
+                    sum += A::one(&link.moved, lane);
+                    match joint.parent {
+                        0 => {}
+                        parent if parent == first + lane => below = sum,
+                        parent => branches[parent - 1] += sum,
+                    }
+                }
+            }
+            for (block, link) in self.links.iter_mut().enumerate() {
+                let Links { slide, rate, momentum, moment, total_inertia, .. } = *link;
+                let (body, f) = (A::body(joints, block), momentum);
+                let push = add(spun(moment, body.turn), times(slide, body.subtree_mass));
+                let pull = add(spun(f, body.turn), times(rate, body.subtree_mass));
+                link.force = [total_inertia * body.turn + cross(moment, slide), push[0], push[1]];
+                link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
+                link.weight = cross(push, body.gravity);
+            }
+        })
     }
 
     /// `SLIDES`: some joint is a slider.
@@ -706,44 +732,6 @@ impl<A: Arrangement> Joints<A> {
             A::scatter(joints, block, by_position, l_q);
         }
         below
-    }
-
-    #[inline(always)]
-    fn differentiate_portable(&mut self, joints: &PlanarJoints) {
-        for link in &mut self.links {
-            link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
-        }
-        let branches = &mut self.inertia_of_branches[..];
-        let mut below = A::Number::ZERO;
-        for (block, link) in self.links.iter_mut().enumerate().rev() {
-            let first = A::COUNT * block;
-            let count = A::COUNT.min(joints.len() - first);
-            for (lane, joint) in joints[first..][..count].iter().enumerate().rev() {
-                let mut sum = A::one(&link.inertia, lane);
-                if joint.is_followed {
-                    sum += below;
-                }
-                if joint.has_branches {
-                    sum += std::mem::take(&mut branches[first + lane]);
-                }
-                A::put(sum, &mut link.total_inertia, lane);
-                sum += A::one(&link.moved, lane);
-                match joint.parent {
-                    0 => {}
-                    parent if parent == first + lane => below = sum,
-                    parent => branches[parent - 1] += sum,
-                }
-            }
-        }
-        for (block, link) in self.links.iter_mut().enumerate() {
-            let Links { slide, rate, momentum, moment, total_inertia, .. } = *link;
-            let (body, f) = (A::body(joints, block), momentum);
-            let push = add(spun(moment, body.turn), times(slide, body.subtree_mass));
-            let pull = add(spun(f, body.turn), times(rate, body.subtree_mass));
-            link.force = [total_inertia * body.turn + cross(moment, slide), push[0], push[1]];
-            link.slope = [cross(slide, f) + cross(moment, rate), pull[0], pull[1]];
-            link.weight = cross(push, body.gravity);
-        }
     }
 
     /// Places the joints, for [`PlanarTree::pair`].

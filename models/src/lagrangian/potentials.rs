@@ -11,10 +11,8 @@ pub(crate) mod point_spring;
 pub(crate) mod spline_spring;
 
 use crate::lagrangian::kinematics::Poses;
-use crate::math::elimination::SymbolicElimination;
 use crate::math::scalar::Scalar;
-use crate::math::tree_lu::TreeLu;
-use crate::model::mechanism::{Potentials, Spring};
+use crate::model::mechanism::{Model, Spring};
 use crate::model::tree::Tree;
 
 /// A configuration, as far as potentials depend on it.
@@ -54,122 +52,60 @@ pub(crate) trait Potential {
     }
 }
 
+/// The same expression of a spring of each kind.
+macro_rules! of_each_kind {
+    ($any:expr, $spring:ident => $value:expr) => {
+        match $any {
+            Spring::Coordinate($spring) => $value,
+            Spring::Point($spring) => $value,
+            Spring::Spline($spring) => $value,
+            Spring::Path($spring) => $value,
+            Spring::Linear($spring) => $value,
+        }
+    };
+}
+
 impl Spring {
     /// Whether it may couple coordinates that are not on one path to the root, or prescribed ones.
     pub(crate) fn couples_branches(&self) -> bool {
-        match self {
-            Self::Coordinate(spring) => spring.couples_branches(),
-            Self::Point(spring) => spring.couples_branches(),
-            Self::Spline(spring) => spring.couples_branches(),
-            Self::Path(spring) => spring.couples_branches(),
-            Self::Linear(spring) => spring.couples_branches(),
-        }
+        of_each_kind!(self, spring => spring.couples_branches())
     }
 
     /// The coordinates that it couples with each other.
     pub(crate) fn couples(&self) -> Vec<usize> {
-        match self {
-            Self::Coordinate(spring) => spring.couples(),
-            Self::Point(spring) => spring.couples(),
-            Self::Spline(spring) => spring.couples(),
-            Self::Path(spring) => spring.couples(),
-            Self::Linear(spring) => spring.couples(),
+        of_each_kind!(self, spring => spring.couples())
+    }
+}
+
+impl Model {
+    /// Adds `−V_q` of all springs to `l_q` (dynamic coordinates).
+    #[inline(never)]
+    pub(crate) fn add_spring_gradient<S: Scalar>(&self, poses: &Poses<S>, q: &[S], l_q: &mut [S]) {
+        let at = Place { tree: &self.dynamics, poses, q };
+        for spring in &self.potentials.springs {
+            of_each_kind!(spring, spring => spring.add_gradient(at, l_q));
         }
     }
 
-    fn energy<S: Scalar>(&self, at: Place<'_, S>) -> S {
-        match self {
-            Self::Coordinate(spring) => spring.energy(at),
-            Self::Point(spring) => spring.energy(at),
-            Self::Spline(spring) => spring.energy(at),
-            Self::Path(spring) => spring.energy(at),
-            Self::Linear(spring) => spring.energy(at),
-        }
+    /// Potential energy of all springs, J.
+    pub(crate) fn spring_energy<S: Scalar>(&self, poses: &Poses<S>, q: &[S]) -> S {
+        let at = Place { tree: &self.dynamics, poses, q };
+        let energy = |spring: &Spring| of_each_kind!(spring, spring => spring.energy(at));
+        self.potentials.springs.iter().fold(S::ZERO, |sum, spring| sum + energy(spring))
     }
 
-    #[inline(always)]
-    fn add_gradient<S: Scalar>(&self, at: Place<'_, S>, l_q: &mut [S]) {
-        match self {
-            Self::Coordinate(spring) => spring.add_gradient(at, l_q),
-            Self::Point(spring) => spring.add_gradient(at, l_q),
-            Self::Spline(spring) => spring.add_gradient(at, l_q),
-            Self::Path(spring) => spring.add_gradient(at, l_q),
-            Self::Linear(spring) => spring.add_gradient(at, l_q),
-        }
-    }
-
-    #[inline(always)]
-    fn for_each_second_derivative<S: Scalar>(
+    /// [`Potential::for_each_second_derivative`] of each spring.
+    pub(crate) fn for_each_spring_derivative<S: Scalar>(
         &self,
-        at: Place<'_, S>,
-        entry: &mut impl FnMut(usize, usize, S),
+        poses: &Poses<S>,
+        q: &[S],
+        mut entry: impl FnMut(usize, usize, S),
     ) {
-        match self {
-            Self::Coordinate(spring) => spring.for_each_second_derivative(at, entry),
-            Self::Point(spring) => spring.for_each_second_derivative(at, entry),
-            Self::Spline(spring) => spring.for_each_second_derivative(at, entry),
-            Self::Path(spring) => spring.for_each_second_derivative(at, entry),
-            Self::Linear(spring) => spring.for_each_second_derivative(at, entry),
+        let at = Place { tree: &self.dynamics, poses, q };
+        for spring in &self.potentials.springs {
+            of_each_kind!(spring, spring => spring.for_each_second_derivative(at, &mut entry));
         }
     }
-}
-
-/// Adds `−V_q` to `l_q` (dynamic coordinates).
-#[inline(never)]
-pub(crate) fn add_gradient<S: Scalar>(
-    potentials: &Potentials,
-    tree: &Tree,
-    poses: &Poses<S>,
-    q: &[S],
-    l_q: &mut [S],
-) {
-    let at = Place { tree, poses, q };
-    potentials.springs.iter().for_each(|spring| spring.add_gradient(at, l_q));
-}
-
-/// Potential energy of all springs, J.
-pub(crate) fn potential<S: Scalar>(
-    potentials: &Potentials,
-    tree: &Tree,
-    poses: &Poses<S>,
-    q: &[S],
-) -> S {
-    let at = Place { tree, poses, q };
-    potentials.springs.iter().fold(S::ZERO, |sum, spring| sum + spring.energy(at))
-}
-
-/// Calls `entry(i, j, V_ij)` for ordered pairs of coordinates of each spring, as
-/// [`Potential::for_each_second_derivative`] does.
-pub(crate) fn for_each_second_derivative<S: Scalar>(
-    potentials: &Potentials,
-    tree: &Tree,
-    poses: &Poses<S>,
-    q: &[S],
-    mut entry: impl FnMut(usize, usize, S),
-) {
-    let at = Place { tree, poses, q };
-    for spring in &potentials.springs {
-        spring.for_each_second_derivative(at, &mut entry);
-    }
-}
-
-/// Adds the springs' part `−¼h V_qq` to the Newton matrix.
-#[inline(never)]
-pub(crate) fn add_to_newton_matrix(
-    potentials: &Potentials,
-    tree: &Tree,
-    poses: &Poses,
-    q: &[f64],
-    step: f64,
-    elimination: &SymbolicElimination,
-    matrix: &mut TreeLu,
-) {
-    for_each_second_derivative(potentials, tree, poses, q, |i, j, value| {
-        let dynamic = elimination.len();
-        if i < dynamic && j < dynamic {
-            matrix.add(elimination, i, j, -0.25 * step * value);
-        }
-    });
 }
 
 #[cfg(test)]

@@ -48,7 +48,7 @@ fn size<S: Scalar>(v: Vec3<S>) -> f64 {
 }
 
 impl PathJoint {
-    /// Derivative of the difference `a − b` by the joint's coordinate; the joint carries one of them.
+    /// Derivative of the difference `a − b` by the joint's coordinate.
     #[inline(always)]
     pub(crate) fn gradient<S: Scalar>(
         &self,
@@ -56,15 +56,15 @@ impl PathJoint {
         poses: &Poses<S>,
         at: &Separation<S>,
     ) -> Vec3<S> {
-        if self.carries == Carries::A {
-            poses.point_gradient(tree, self.joint, at.a)
-        } else {
-            -poses.point_gradient(tree, self.joint, at.b)
+        match self.carries {
+            Carries::A => poses.point_gradient(tree, self.joint, at.a),
+            Carries::B => -poses.point_gradient(tree, self.joint, at.b),
+            Carries::Both => poses.turned(tree, self.joint, at.difference),
         }
     }
 
     /// Derivative of this joint's `gradient` by the coordinate of another: nested axes on one branch,
-    /// zero across branches.
+    /// zero across branches. Joints that carry both points are above all others.
     #[inline]
     pub(crate) fn second<S: Scalar>(
         &self,
@@ -73,58 +73,42 @@ impl PathJoint {
         poses: &Poses<S>,
         (column, column_gradient): (&PathJoint, Vec3<S>),
     ) -> Vec3<S> {
-        if self.carries == column.carries {
-            poses.turned_gradient(tree, (self.joint, gradient), (column.joint, column_gradient))
-        } else {
-            Vec3::ZERO
-        }
-    }
-
-    /// [`Self::second`] of the first joint by the second, and of the second by the first. They differ
-    /// within a ball joint only.
-    #[inline]
-    pub(crate) fn seconds<S: Scalar>(
-        [(row, row_gradient), (column, gradient)]: [(&PathJoint, Vec3<S>); 2],
-        tree: &Tree,
-        poses: &Poses<S>,
-    ) -> (Vec3<S>, Vec3<S>) {
-        let second = row.second(row_gradient, tree, poses, (column, gradient));
-        if tree.one_ball(row.joint, column.joint) {
-            (second, column.second(gradient, tree, poses, (row, row_gradient)))
-        } else {
-            (second, second)
-        }
-    }
-
-    /// [`Self::gradient`] where joints that carry both points are on the path, too.
-    #[inline]
-    pub(crate) fn gradient_in_world<S: Scalar>(
-        &self,
-        tree: &Tree,
-        poses: &Poses<S>,
-        at: &Separation<S>,
-    ) -> Vec3<S> {
-        if self.carries == Carries::Both {
-            poses.turned(tree, self.joint, at.difference)
-        } else {
-            self.gradient(tree, poses, at)
-        }
-    }
-
-    /// [`Self::second`] where joints that carry both points are on the path, too: they are above all
-    /// others.
-    pub(crate) fn second_in_world<S: Scalar>(
-        &self,
-        gradient: Vec3<S>,
-        tree: &Tree,
-        poses: &Poses<S>,
-        (column, column_gradient): (&PathJoint, Vec3<S>),
-    ) -> Vec3<S> {
         let above = |joint: &PathJoint| joint.carries == Carries::Both;
-        if above(self) || above(column) || self.carries == column.carries {
+        if self.carries == column.carries || above(self) || above(column) {
             poses.turned_gradient(tree, (self.joint, gradient), (column.joint, column_gradient))
         } else {
             Vec3::ZERO
+        }
+    }
+}
+
+impl PointPair {
+    /// Calls `entry(i, j, value)` for each ordered pair of joints on the path: `value` makes those of a pair
+    /// and of the pair mirrored from `d_i`, `d_j` and from `d_ij`, `d_ji`.
+    #[inline(always)]
+    pub(crate) fn for_each_pair<S: Scalar>(
+        &self,
+        (tree, poses, at): (&Tree, &Poses<S>, &Separation<S>),
+        value: impl Fn([Vec3<S>; 2], [Vec3<S>; 2]) -> [S; 2],
+        mut entry: impl FnMut(usize, usize, S),
+    ) {
+        for (k, row) in self.path.iter().enumerate() {
+            let row_gradient = row.gradient(tree, poses, at);
+            for column in &self.path[..=k] {
+                let gradient = column.gradient(tree, poses, at);
+                let second = row.second(row_gradient, tree, poses, (column, gradient));
+                // Only within a ball joint does the order matter.
+                let mirrored = if tree.one_ball(row.joint, column.joint) {
+                    column.second(gradient, tree, poses, (row, row_gradient))
+                } else {
+                    second
+                };
+                let [own, other] = value([row_gradient, gradient], [second, mirrored]);
+                entry(row.coordinate, column.coordinate, own);
+                if row.joint != column.joint {
+                    entry(column.coordinate, row.coordinate, other);
+                }
+            }
         }
     }
 }
@@ -173,20 +157,12 @@ impl<'a, S: Scalar> Distance<'a, S> {
     }
 
     /// Calls `entry(i, j, l_ij)` for each ordered pair of joints between the points.
-    pub(crate) fn for_each_second_derivative(&self, mut entry: impl FnMut(usize, usize, S)) {
-        let (tree, poses) = (self.tree, self.poses);
-        for row in &self.pair.path {
-            let row_gradient = row.gradient(tree, poses, &self.at);
-            let row_slope = self.direction.dot(row_gradient);
-            for column in &self.pair.path {
-                let gradient = column.gradient(tree, poses, &self.at);
-                let slope = self.direction.dot(gradient);
-                let turned = row.second(row_gradient, tree, poses, (column, gradient));
-                let across = row_gradient.dot(gradient) - row_slope * slope;
-                let second = across * self.inverse + self.direction.dot(turned);
-                entry(row.coordinate, column.coordinate, second);
-            }
-        }
+    pub(crate) fn for_each_second_derivative(&self, entry: impl FnMut(usize, usize, S)) {
+        let value = |[row, column]: [Vec3<S>; 2], seconds: [Vec3<S>; 2]| {
+            let across = row.dot(column) - self.direction.dot(row) * self.direction.dot(column);
+            seconds.map(|second| across * self.inverse + self.direction.dot(second))
+        };
+        self.pair.for_each_pair((self.tree, self.poses, &self.at), value, entry);
     }
 }
 

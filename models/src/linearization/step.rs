@@ -5,7 +5,6 @@ use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::kkt::system::Recursion;
 use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
-use crate::lagrangian::potentials;
 use crate::linearization::linearize::{Kind, Linearization};
 use crate::math::rows::{add_rows, add_rows_portable, padded};
 use crate::math::simd::wide;
@@ -114,13 +113,9 @@ impl Workspace {
         let [residual, slope] = &mut self.tangents.diagonals;
         if model.potentials.any {
             residual.fill(0.0);
-            potentials::for_each_second_derivative(
-                &model.potentials,
-                &model.dynamics,
-                &self.mid.mechanics.poses,
-                &self.mid.q,
-                |i, _, value| residual[i] -= 0.5 * h * value,
-            );
+            let poses = &self.mid.mechanics.poses;
+            let add = |i: usize, _, value| residual[i] -= 0.5 * h * value;
+            model.for_each_spring_derivative(poses, &self.mid.q, add);
         }
         for (i, slope) in slope.iter_mut().enumerate() {
             *slope = residual[i] - model.damping.get(i).copied().unwrap_or_default();
@@ -172,73 +167,103 @@ impl Workspace {
         Ok(true)
     }
 
-    wide! {
-        /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
-        pub(crate) fn fill_right_hand_sides(mut self, at: StepContext<'_>, out: &mut Linearization) = fill_portable, fill_avx2;
-
-        /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
-        /// `out.momentum`.
-        pub(crate) fn differentiate_momentum(mut self, at: StepContext<'_>, out: &mut Linearization)
-            = differentiate_momentum_portable, differentiate_momentum_avx2;
+    /// Writes `r1'` into `out.increment` and starts `out.momentum` with what does not depend on `x'`.
+    pub(crate) fn fill_right_hand_sides(&mut self, at: StepContext<'_>, out: &mut Linearization) {
+        wide!({
+            let model = at.model;
+            let h = at.settings.time_step_s;
+            let (nd, nk, stride) = (out.nd, out.nk, out.stride);
+            out.increment.fill(0.0);
+            out.momentum.fill(0.0);
+            out.turnings.clear();
+            if !model.orientations.is_empty() {
+                self.evaluate_turned(model, at.settings, at.state);
+                self.take_turned(out);
+                return;
+            }
+            for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
+                place.momentum = h * input.gain;
+                place.residual = out.at_start * place.momentum;
+            }
+            self.tangents.stiffness.fill(0.0);
+            self.tangents.end_slopes.fill(0.0);
+            for pair in &model.pairs {
+                let (i, j) = (pair.row as usize, pair.column as usize);
+                let second = self.mid.mechanics.pair(
+                    model,
+                    pair.ancestor as usize,
+                    pair.descendant as usize,
+                );
+                let half = 0.5 * h * second.qq;
+                out.increment[i * stride + j] = half - second.v_above_q_below;
+                out.increment[j * stride + i] = half - second.q_above_v_below;
+                self.tangents.end_slopes[i * nd + j] = half + second.q_above_v_below;
+                self.tangents.end_slopes[j * nd + i] = half + second.v_above_q_below;
+                self.tangents.stiffness[i * nd + j] = h * second.qq;
+                self.tangents.stiffness[j * nd + i] = h * second.qq;
+            }
+            for pair in &model.mixed_pairs {
+                let second = self.mid.mechanics.pair(model, pair.ancestor, pair.descendant);
+                let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
+                let descendant = model.dynamics.joints[pair.descendant].coordinate;
+                // Row of the dynamic coordinate, column of the prescribed one.
+                let (row, column, vq, qv) = if ancestor < nd {
+                    (ancestor, descendant, second.v_above_q_below, second.q_above_v_below)
+                } else {
+                    (descendant, ancestor, second.q_above_v_below, second.v_above_q_below)
+                };
+                let c_q = 0.25 * h * second.qq - 0.5 * vq;
+                let c_v = 0.5 * qv - second.vv / h;
+                let next = nd + column + nk;
+                out.increment[row * stride + column] += c_q - c_v;
+                out.increment[row * stride + next] += c_q + c_v;
+                out.momentum[row * stride + column] += 0.5 * h * second.qq - qv;
+                out.momentum[row * stride + next] += 0.5 * h * second.qq + qv;
+            }
+            self.add_springs(at, out);
+            self.add_forces(at, out);
+            self.add_constraint_hessian(at, out);
+            for i in 0..nd {
+                let momentum = i * stride + nd + nk + i;
+                out.increment[momentum] = 1.0;
+                out.momentum[momentum] += 1.0;
+            }
+        })
     }
 
-    #[inline(always)]
-    fn fill_portable(&mut self, at: StepContext<'_>, out: &mut Linearization) {
-        let model = at.model;
-        let h = at.settings.time_step_s;
-        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
-        out.increment.fill(0.0);
-        out.momentum.fill(0.0);
-        out.turnings.clear();
-        if !model.orientations.is_empty() {
-            self.evaluate_turned(model, at.settings, at.state);
-            self.take_turned(out);
-            return;
-        }
-        for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
-            place.momentum = h * input.gain;
-            place.residual = out.at_start * place.momentum;
-        }
-        self.tangents.stiffness.fill(0.0);
-        self.tangents.end_slopes.fill(0.0);
-        for pair in &model.pairs {
-            let (i, j) = (pair.row as usize, pair.column as usize);
-            let second =
-                self.mid.mechanics.pair(model, pair.ancestor as usize, pair.descendant as usize);
-            let half = 0.5 * h * second.qq;
-            out.increment[i * stride + j] = half - second.v_above_q_below;
-            out.increment[j * stride + i] = half - second.q_above_v_below;
-            self.tangents.end_slopes[i * nd + j] = half + second.q_above_v_below;
-            self.tangents.end_slopes[j * nd + i] = half + second.v_above_q_below;
-            self.tangents.stiffness[i * nd + j] = h * second.qq;
-            self.tangents.stiffness[j * nd + i] = h * second.qq;
-        }
-        for pair in &model.mixed_pairs {
-            let second = self.mid.mechanics.pair(model, pair.ancestor, pair.descendant);
-            let ancestor = model.dynamics.joints[pair.ancestor].coordinate;
-            let descendant = model.dynamics.joints[pair.descendant].coordinate;
-            // Row of the dynamic coordinate, column of the prescribed one.
-            let (row, column, vq, qv) = if ancestor < nd {
-                (ancestor, descendant, second.v_above_q_below, second.q_above_v_below)
-            } else {
-                (descendant, ancestor, second.q_above_v_below, second.v_above_q_below)
-            };
-            let c_q = 0.25 * h * second.qq - 0.5 * vq;
-            let c_v = 0.5 * qv - second.vv / h;
-            let next = nd + column + nk;
-            out.increment[row * stride + column] += c_q - c_v;
-            out.increment[row * stride + next] += c_q + c_v;
-            out.momentum[row * stride + column] += 0.5 * h * second.qq - qv;
-            out.momentum[row * stride + next] += 0.5 * h * second.qq + qv;
-        }
-        self.add_springs(at, out);
-        self.add_forces(at, out);
-        self.add_constraint_hessian(at, out);
-        for i in 0..nd {
-            let momentum = i * stride + nd + nk + i;
-            out.increment[momentum] = 1.0;
-            out.momentum[momentum] += 1.0;
-        }
+    /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
+    /// `out.momentum`.
+    pub(crate) fn differentiate_momentum(&mut self, at: StepContext<'_>, out: &mut Linearization) {
+        wide!({
+            for x in &mut out.increment {
+                *x = -*x;
+            }
+            let model = at.model;
+            let d = model.dimensions;
+            let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
+            if model.orientations.is_empty() {
+                for (i, c) in model.damping.iter().enumerate() {
+                    self.tangents.end_slopes[i * nd + i] -= c;
+                }
+            }
+            for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
+                let stiffness = &self.tangents.stiffness[i * nd..][..nd];
+                target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
+                let slopes = self.tangents.end_slopes[i * nd..][..nd].iter().enumerate();
+                self.tangents.terms.clear();
+                self.tangents
+                    .terms
+                    .extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
+                add_rows_portable(target, &out.increment, stride, &self.tangents.terms);
+            }
+            for (c, constraint) in model.constraints.iter().enumerate() {
+                for &i in constraint.dynamic_coordinates() {
+                    let entry = self.constraints.start.jacobian[c * n + i];
+                    let target = &mut out.momentum[i * stride..][..stride];
+                    add_rows_portable(target, &out.multipliers, stride, &[(-entry, c)]);
+                }
+            }
+        })
     }
 
     /// Springs add `−V_qq` to `L_qq`.
@@ -250,7 +275,11 @@ impl Workspace {
         let h = at.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
         let (stiffness, slopes) = (&mut self.tangents.stiffness, &mut self.tangents.end_slopes);
-        let mut add = |row: usize, column: usize, value: f64| {
+        let poses = &self.mid.mechanics.poses;
+        model.for_each_spring_derivative(poses, &self.mid.q, |row, column, value| {
+            if row >= nd {
+                return;
+            }
             if column < nd {
                 out.increment[row * stride + column] -= 0.5 * h * value;
                 slopes[row * nd + column] -= 0.5 * h * value;
@@ -261,18 +290,7 @@ impl Workspace {
                     out.momentum[row * stride + column] -= 0.5 * h * value;
                 }
             }
-        };
-        potentials::for_each_second_derivative(
-            &model.potentials,
-            &model.dynamics,
-            &self.mid.mechanics.poses,
-            &self.mid.q,
-            |i, j, value| {
-                if i < nd {
-                    add(i, j, value);
-                }
-            },
-        );
+        });
     }
 
     /// Forces add `a h f_q` to `C_q`, `a h f_v` to `C_v`, and `h (f_q q' + f_v v')` to `p[k+1]'`.
@@ -356,36 +374,6 @@ impl Workspace {
             self.tangents.terms.clear();
             self.tangents.terms.extend(responses.map(|(c, r)| (-r, c)));
             add_rows(target, &out.multipliers, stride, &self.tangents.terms);
-        }
-    }
-
-    #[inline(always)]
-    fn differentiate_momentum_portable(&mut self, at: StepContext<'_>, out: &mut Linearization) {
-        for x in &mut out.increment {
-            *x = -*x;
-        }
-        let model = at.model;
-        let d = model.dimensions;
-        let (n, nd, stride) = (d.coordinates(), d.dynamic, out.stride);
-        if model.orientations.is_empty() {
-            for (i, c) in model.damping.iter().enumerate() {
-                self.tangents.end_slopes[i * nd + i] -= c;
-            }
-        }
-        for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
-            let stiffness = &self.tangents.stiffness[i * nd..][..nd];
-            target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
-            let slopes = self.tangents.end_slopes[i * nd..][..nd].iter().enumerate();
-            self.tangents.terms.clear();
-            self.tangents.terms.extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
-            add_rows_portable(target, &out.increment, stride, &self.tangents.terms);
-        }
-        for (c, constraint) in model.constraints.iter().enumerate() {
-            for &i in constraint.dynamic_coordinates() {
-                let entry = self.constraints.start.jacobian[c * n + i];
-                let target = &mut out.momentum[i * stride..][..stride];
-                add_rows_portable(target, &out.multipliers, stride, &[(-entry, c)]);
-            }
         }
     }
 }

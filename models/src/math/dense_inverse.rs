@@ -5,7 +5,7 @@
 
 use crate::math::rows::{LANES, Term, add_rows};
 use crate::math::scalar::{Lanes, Scalar};
-use crate::math::simd::wide;
+use crate::math::simd::{wide, widest};
 
 /// A square matrix, row-major, then the inverse of it with its rows exchanged.
 #[derive(Clone, Debug)]
@@ -37,73 +37,69 @@ impl DenseInverse {
         }
     }
 
-    wide! {
-        /// Inverts what stands in `matrix`, in its place, about `2n³` flops; false if it is singular.
-        #[inline(never)]
-        pub(crate) fn invert(mut self) -> bool = invert_portable, invert_avx2, invert_avx512;
-
-        /// Solves `A x = b` in place.
-        #[inline(never)]
-        pub(crate) fn solve(mut self, x: &mut [f64]) = solve_portable, solve_avx2;
-    }
-
-    #[inline(always)]
-    fn invert_portable(&mut self) -> bool {
-        let (n, stride) = (self.order, self.stride);
-        for k in 0..n {
-            let (mut pivot, mut size) = (k, 0.0);
-            for (i, row) in self.matrix.chunks_exact(stride).enumerate().skip(k) {
-                let entry = row[k].abs();
-                let is_larger = entry > size;
-                pivot = if is_larger { i } else { pivot };
-                size = if is_larger { entry } else { size };
-            }
-            let inverse = 1.0 / self.matrix[pivot * stride + k];
-            if !inverse.is_finite() {
-                return false;
-            }
-            self.exchanged[k] = pivot;
-            if pivot > k {
-                let (above, below) = self.matrix.split_at_mut(pivot * stride);
-                above[k * stride..][..stride].swap_with_slice(&mut below[..stride]);
-            }
-            let (above, rest) = self.matrix.split_at_mut(k * stride);
-            let (row, below) = rest.split_at_mut(stride);
-            row.iter_mut().for_each(|entry| *entry *= inverse);
-            let others = above.chunks_exact_mut(stride).chain(below.chunks_exact_mut(stride));
-            for target in others {
-                let factor = target[k];
-                for (target, entries) in
-                    target.as_chunks_mut::<LANES>().0.iter_mut().zip(row.as_chunks::<LANES>().0)
-                {
-                    let mut left = *target;
-                    for (left, entry) in left.iter_mut().zip(entries) {
-                        *left -= factor * entry;
-                    }
-                    *target = left;
+    /// Inverts what stands in `matrix`, in its place, about `2n³` flops; false if it is singular.
+    #[inline(never)]
+    pub(crate) fn invert(&mut self) -> bool {
+        widest!({
+            let (n, stride) = (self.order, self.stride);
+            for k in 0..n {
+                let (mut pivot, mut size) = (k, 0.0);
+                for (i, row) in self.matrix.chunks_exact(stride).enumerate().skip(k) {
+                    let entry = row[k].abs();
+                    let is_larger = entry > size;
+                    pivot = if is_larger { i } else { pivot };
+                    size = if is_larger { entry } else { size };
                 }
-                target[k] = -factor * inverse;
+                let inverse = 1.0 / self.matrix[pivot * stride + k];
+                if !inverse.is_finite() {
+                    return false;
+                }
+                self.exchanged[k] = pivot;
+                if pivot > k {
+                    let (above, below) = self.matrix.split_at_mut(pivot * stride);
+                    above[k * stride..][..stride].swap_with_slice(&mut below[..stride]);
+                }
+                let (above, rest) = self.matrix.split_at_mut(k * stride);
+                let (row, below) = rest.split_at_mut(stride);
+                row.iter_mut().for_each(|entry| *entry *= inverse);
+                let others = above.chunks_exact_mut(stride).chain(below.chunks_exact_mut(stride));
+                for target in others {
+                    let factor = target[k];
+                    for (target, entries) in
+                        target.as_chunks_mut::<LANES>().0.iter_mut().zip(row.as_chunks::<LANES>().0)
+                    {
+                        let mut left = *target;
+                        for (left, entry) in left.iter_mut().zip(entries) {
+                            *left -= factor * entry;
+                        }
+                        *target = left;
+                    }
+                    target[k] = -factor * inverse;
+                }
+                row[k] = inverse;
             }
-            row[k] = inverse;
-        }
-        true
+            true
+        })
     }
 
-    #[inline(always)]
-    fn solve_portable(&mut self, x: &mut [f64]) {
-        let n = self.order;
-        self.work[..n].copy_from_slice(x);
-        for (k, &other) in self.exchanged.iter().enumerate() {
-            self.work.swap(k, other);
-        }
-        for (x, row) in x.iter_mut().zip(self.matrix.chunks_exact(self.stride)) {
-            let mut sums = Lanes::ZERO;
-            for (entries, b) in row.as_chunks().0.iter().zip(self.work.as_chunks().0) {
-                sums += Lanes(*entries) * Lanes(*b);
+    /// Solves `A x = b` in place.
+    #[inline(never)]
+    pub(crate) fn solve(&mut self, x: &mut [f64]) {
+        wide!({
+            let n = self.order;
+            self.work[..n].copy_from_slice(x);
+            for (k, &other) in self.exchanged.iter().enumerate() {
+                self.work.swap(k, other);
             }
-            let [a, b, c, d] = sums.0;
-            *x = (a + c) + (b + d);
-        }
+            for (x, row) in x.iter_mut().zip(self.matrix.chunks_exact(self.stride)) {
+                let mut sums = Lanes::ZERO;
+                for (entries, b) in row.as_chunks().0.iter().zip(self.work.as_chunks().0) {
+                    sums += Lanes(*entries) * Lanes(*b);
+                }
+                let [a, b, c, d] = sums.0;
+                *x = (a + c) + (b + d);
+            }
+        })
     }
 
     /// Solves `A X = B` in place; rows are `stride` long, whole blocks. Allocates when there are more
@@ -147,6 +143,7 @@ mod tests {
     use nalgebra::{DMatrix, DVector};
 
     use super::*;
+    use crate::math::simd::narrowly;
 
     #[test]
     fn solutions_are_those_of_a_known_library() {
@@ -158,7 +155,7 @@ mod tests {
                 row[..order].iter_mut().zip(&matrix.row(i)).for_each(|(to, from)| *to = *from);
             }
             let mut narrow = inverse.clone();
-            assert!(inverse.invert() && narrow.invert_portable());
+            assert!(inverse.invert() && narrowly(|| narrow.invert()));
             assert_eq!(inverse.matrix, narrow.matrix, "the same bits in any register");
             let right = DVector::from_fn(order, |i, _| 1.0 + i as f64);
             let expected = matrix.clone().lu().solve(&right).unwrap();

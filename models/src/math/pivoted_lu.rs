@@ -87,54 +87,51 @@ impl PivotedLu {
         Self { independent, ..self }
     }
 
-    wide! {
-        /// Factors what stands in `matrix`.
-        #[inline(never)]
-        pub(crate) fn factor(mut self) = factor_portable, factor_avx2;
-    }
-
-    #[inline(always)]
-    fn factor_portable(&mut self) {
-        let n = self.order;
-        for (i, row) in self.matrix.chunks_exact_mut(n.max(1)).enumerate() {
-            (self.rows[i], self.columns[i]) = (i, i);
-            for (entry, scale) in row.iter_mut().zip(&self.scale) {
-                *entry *= self.scale[i] * scale;
-            }
-        }
-        self.rank = n;
-        self.null_vectors = 0;
-        self.rest = 0.0;
-        let mut largest = Largest::default();
-        for (i, row) in self.matrix.chunks_exact(n.max(1)).enumerate() {
-            largest.find(i, 0, row);
-        }
-        let first = largest.size;
-        for k in 0..n {
-            let smallest = if k < self.independent { NOISE } else { DEPENDENT };
-            // Written so that a NaN ends the factorization too.
-            if !(largest.size > smallest * first) {
-                self.rank = k;
-                self.rest = largest.size;
-                self.find_null();
-                return;
-            }
-            self.swap(k, largest.row, largest.column);
-            let inverse = 1.0 / self.matrix[k * n + k];
-            self.inverse_pivot[k] = inverse;
-            let (above, below) = self.matrix.split_at_mut((k + 1) * n);
-            let pivot_row = &above[k * n + k + 1..];
-            largest = Largest { row: k + 1, column: k + 1, size: 0.0 };
-            for (i, row) in below.chunks_exact_mut(n).enumerate() {
-                let factor = row[k] * inverse;
-                row[k] = factor;
-                let row = &mut row[k + 1..];
-                for (entry, pivot) in row.iter_mut().zip(pivot_row) {
-                    *entry -= factor * pivot;
+    /// Factors what stands in `matrix`.
+    #[inline(never)]
+    pub(crate) fn factor(&mut self) {
+        wide!({
+            let n = self.order;
+            for (i, row) in self.matrix.chunks_exact_mut(n.max(1)).enumerate() {
+                (self.rows[i], self.columns[i]) = (i, i);
+                for (entry, scale) in row.iter_mut().zip(&self.scale) {
+                    *entry *= self.scale[i] * scale;
                 }
-                largest.find(k + 1 + i, k + 1, row);
             }
-        }
+            self.rank = n;
+            self.null_vectors = 0;
+            self.rest = 0.0;
+            let mut largest = Largest::default();
+            for (i, row) in self.matrix.chunks_exact(n.max(1)).enumerate() {
+                largest.find(i, 0, row);
+            }
+            let first = largest.size;
+            for k in 0..n {
+                let smallest = if k < self.independent { NOISE } else { DEPENDENT };
+                // Written so that a NaN ends the factorization too.
+                if !(largest.size > smallest * first) {
+                    self.rank = k;
+                    self.rest = largest.size;
+                    self.find_null();
+                    return;
+                }
+                self.swap(k, largest.row, largest.column);
+                let inverse = 1.0 / self.matrix[k * n + k];
+                self.inverse_pivot[k] = inverse;
+                let (above, below) = self.matrix.split_at_mut((k + 1) * n);
+                let pivot_row = &above[k * n + k + 1..];
+                largest = Largest { row: k + 1, column: k + 1, size: 0.0 };
+                for (i, row) in below.chunks_exact_mut(n).enumerate() {
+                    let factor = row[k] * inverse;
+                    row[k] = factor;
+                    let row = &mut row[k + 1..];
+                    for (entry, pivot) in row.iter_mut().zip(pivot_row) {
+                        *entry -= factor * pivot;
+                    }
+                    largest.find(k + 1 + i, k + 1, row);
+                }
+            }
+        })
     }
 
     /// Takes over the factorization of another matrix of the same order and scale.

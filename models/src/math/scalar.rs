@@ -4,9 +4,46 @@
 //! [`Dual`] numbers, which differentiates it exactly, to round-off.
 
 use std::fmt::Debug;
-use std::ops::{Add, AddAssign, Mul, MulAssign, Neg, Sub, SubAssign};
+use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 
 use crate::math::trigonometry;
+
+/// Operators of a type: by what they make of one or two operands, and of what they put in its place.
+macro_rules! operators {
+    ($generic:tt $type:ty; $($operator:ident $name:ident $operands:tt $body:tt)+) => {
+        $($crate::math::scalar::operators!(@one $generic $type, $operator $name $operands $body);)+
+    };
+    (@one [$($generic:tt)*] $type:ty, $operator:ident $name:ident($a:ident) $new:block) => {
+        impl<$($generic)*> $operator for $type {
+            type Output = Self;
+            #[inline(always)]
+            fn $name(self) -> Self {
+                let $a = self;
+                $new
+            }
+        }
+    };
+    (@one [$($generic:tt)*] $type:ty, $operator:ident $name:ident($a:ident, $b:ident: $right:ty) $new:block) => {
+        impl<$($generic)*> $operator<$right> for $type {
+            type Output = Self;
+            #[inline(always)]
+            fn $name(self, $b: $right) -> Self {
+                let $a = self;
+                $new
+            }
+        }
+    };
+    (@one [$($generic:tt)*] $type:ty, $operator:ident $name:ident(mut $a:ident, $b:ident) $own:block) => {
+        impl<$($generic)*> $operator for $type {
+            #[inline(always)]
+            fn $name(&mut self, $b: Self) {
+                let $a = self;
+                *$a = $own;
+            }
+        }
+    };
+}
+pub(crate) use operators;
 
 /// A real number, or one that carries derivatives.
 pub(crate) trait Scalar:
@@ -24,7 +61,6 @@ pub(crate) trait Scalar:
     + Mul<f64, Output = Self>
     + AddAssign
     + SubAssign
-    + MulAssign
 {
     const ZERO: Self;
     const ONE: Self;
@@ -132,81 +168,16 @@ impl<S: Scalar> Scalar for Dual<S> {
     }
 }
 
-impl<S: Scalar> Neg for Dual<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn neg(self) -> Self {
-        Self::new(-self.re, -self.eps)
-    }
-}
-
-impl<S: Scalar> Add for Dual<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn add(self, o: Self) -> Self {
-        Self::new(self.re + o.re, self.eps + o.eps)
-    }
-}
-
-impl<S: Scalar> Sub for Dual<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn sub(self, o: Self) -> Self {
-        Self::new(self.re - o.re, self.eps - o.eps)
-    }
-}
-
-impl<S: Scalar> Mul for Dual<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn mul(self, o: Self) -> Self {
-        Self::new(self.re * o.re, self.re * o.eps + self.eps * o.re)
-    }
-}
-
-impl<S: Scalar> Add<f64> for Dual<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn add(self, o: f64) -> Self {
-        Self::new(self.re + o, self.eps)
-    }
-}
-
-impl<S: Scalar> Sub<f64> for Dual<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn sub(self, o: f64) -> Self {
-        Self::new(self.re - o, self.eps)
-    }
-}
-
-impl<S: Scalar> Mul<f64> for Dual<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn mul(self, o: f64) -> Self {
-        Self::new(self.re * o, self.eps * o)
-    }
-}
-
-impl<S: Scalar> AddAssign for Dual<S> {
-    #[inline(always)]
-    fn add_assign(&mut self, o: Self) {
-        *self = *self + o;
-    }
-}
-
-impl<S: Scalar> SubAssign for Dual<S> {
-    #[inline(always)]
-    fn sub_assign(&mut self, o: Self) {
-        *self = *self - o;
-    }
-}
-
-impl<S: Scalar> MulAssign for Dual<S> {
-    #[inline(always)]
-    fn mul_assign(&mut self, o: Self) {
-        *self = *self * o;
-    }
+operators! { [S: Scalar] Dual<S>;
+    Neg neg(a) { Self::new(-a.re, -a.eps) }
+    Add add(a, b: Self) { Self::new(a.re + b.re, a.eps + b.eps) }
+    Sub sub(a, b: Self) { Self::new(a.re - b.re, a.eps - b.eps) }
+    Mul mul(a, b: Self) { Self::new(a.re * b.re, a.re * b.eps + a.eps * b.re) }
+    Add add(a, b: f64) { Self::new(a.re + b, a.eps) }
+    Sub sub(a, b: f64) { Self::new(a.re - b, a.eps) }
+    Mul mul(a, b: f64) { Self::new(a.re * b, a.eps * b) }
+    AddAssign add_assign(mut a, b) { *a + b }
+    SubAssign sub_assign(mut a, b) { *a - b }
 }
 
 /// Four numbers side by side, for the same computation on each: a register's worth.
@@ -339,81 +310,16 @@ impl Side for Lanes {
     }
 }
 
-impl Neg for Lanes {
-    type Output = Self;
-    #[inline(always)]
-    fn neg(self) -> Self {
-        self.each(|x| -x)
-    }
-}
-
-impl Add for Lanes {
-    type Output = Self;
-    #[inline(always)]
-    fn add(self, o: Self) -> Self {
-        self.with(o, |x, y| x + y)
-    }
-}
-
-impl Add<f64> for Lanes {
-    type Output = Self;
-    #[inline(always)]
-    fn add(self, o: f64) -> Self {
-        self.each(|x| x + o)
-    }
-}
-
-impl AddAssign for Lanes {
-    #[inline(always)]
-    fn add_assign(&mut self, o: Self) {
-        *self = *self + o;
-    }
-}
-
-impl Sub for Lanes {
-    type Output = Self;
-    #[inline(always)]
-    fn sub(self, o: Self) -> Self {
-        self.with(o, |x, y| x - y)
-    }
-}
-
-impl Sub<f64> for Lanes {
-    type Output = Self;
-    #[inline(always)]
-    fn sub(self, o: f64) -> Self {
-        self.each(|x| x - o)
-    }
-}
-
-impl SubAssign for Lanes {
-    #[inline(always)]
-    fn sub_assign(&mut self, o: Self) {
-        *self = *self - o;
-    }
-}
-
-impl Mul for Lanes {
-    type Output = Self;
-    #[inline(always)]
-    fn mul(self, o: Self) -> Self {
-        self.with(o, |x, y| x * y)
-    }
-}
-
-impl Mul<f64> for Lanes {
-    type Output = Self;
-    #[inline(always)]
-    fn mul(self, o: f64) -> Self {
-        self.each(|x| x * o)
-    }
-}
-
-impl MulAssign for Lanes {
-    #[inline(always)]
-    fn mul_assign(&mut self, o: Self) {
-        *self = *self * o;
-    }
+operators! { [] Lanes;
+    Neg neg(a) { a.each(|x| -x) }
+    Add add(a, b: Self) { a.with(b, |x, y| x + y) }
+    Sub sub(a, b: Self) { a.with(b, |x, y| x - y) }
+    Mul mul(a, b: Self) { a.with(b, |x, y| x * y) }
+    Add add(a, b: f64) { a.each(|x| x + b) }
+    Sub sub(a, b: f64) { a.each(|x| x - b) }
+    Mul mul(a, b: f64) { a.each(|x| x * b) }
+    AddAssign add_assign(mut a, b) { *a + b }
+    SubAssign sub_assign(mut a, b) { *a - b }
 }
 
 #[cfg(test)]

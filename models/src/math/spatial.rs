@@ -5,7 +5,7 @@
 
 use std::ops::{Add, AddAssign, Index, Mul, Neg, Sub};
 
-use crate::math::scalar::Scalar;
+use crate::math::scalar::{Scalar, operators};
 
 /// A vector in three dimensions.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -50,43 +50,12 @@ impl<S: Scalar> Index<usize> for Vec3<S> {
     }
 }
 
-impl<S: Scalar> Add for Vec3<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn add(self, o: Self) -> Self {
-        Self([self.0[0] + o.0[0], self.0[1] + o.0[1], self.0[2] + o.0[2]])
-    }
-}
-
-impl<S: Scalar> AddAssign for Vec3<S> {
-    #[inline(always)]
-    fn add_assign(&mut self, o: Self) {
-        *self = *self + o;
-    }
-}
-
-impl<S: Scalar> Sub for Vec3<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn sub(self, o: Self) -> Self {
-        Self([self.0[0] - o.0[0], self.0[1] - o.0[1], self.0[2] - o.0[2]])
-    }
-}
-
-impl<S: Scalar> Neg for Vec3<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn neg(self) -> Self {
-        Self([-self.0[0], -self.0[1], -self.0[2]])
-    }
-}
-
-impl<S: Scalar> Mul<S> for Vec3<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn mul(self, s: S) -> Self {
-        Self([self.0[0] * s, self.0[1] * s, self.0[2] * s])
-    }
+operators! { [S: Scalar] Vec3<S>;
+    Neg neg(a) { Self([-a[0], -a[1], -a[2]]) }
+    Add add(a, b: Self) { Self([a[0] + b[0], a[1] + b[1], a[2] + b[2]]) }
+    Sub sub(a, b: Self) { Self([a[0] - b[0], a[1] - b[1], a[2] - b[2]]) }
+    Mul mul(a, b: S) { Self([a[0] * b, a[1] * b, a[2] * b]) }
+    AddAssign add_assign(mut a, b) { *a + b }
 }
 
 /// A 3 by 3 matrix, as its columns.

@@ -3,7 +3,7 @@
 
 use crate::math::elimination::SymbolicElimination;
 use crate::math::rows::{Term, add_rows_portable};
-use crate::math::simd::wide;
+use crate::math::simd::{wide, widest};
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
 #[derive(Clone, Debug, Default)]
@@ -77,69 +77,82 @@ impl TreeLu {
         triangle[slot] += value;
     }
 
-    wide! {
-        /// Factors in place, from the last row to the first. Each pivot is compared with the larger of
-        /// its diagonal entry and `scale · factor` of its row.
-        #[inline(never)]
-        pub(crate) fn factor(
-            mut self,
-            elimination: &SymbolicElimination,
-            scale: &[f64],
-            factor: f64,
-        ) -> SmallestPivot = factor_portable, factor_avx2;
-
-        /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
-        /// are whole blocks.
-        #[inline(never)]
-        pub(crate) fn solve_rows(
-            mut self,
-            elimination: &SymbolicElimination,
-            x: &mut [f64],
-            stride: usize,
-            columns: usize,
-        ) = solve_rows_portable, solve_rows_avx2, solve_rows_avx512;
-    }
-
-    #[inline(always)]
-    fn factor_portable(
+    /// Factors in place, from the last row to the first. Each pivot is compared with the larger of
+    /// its diagonal entry and `scale · factor` of its row.
+    #[inline(never)]
+    pub(crate) fn factor(
         &mut self,
         elimination: &SymbolicElimination,
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot {
-        for ((reference, end), scale) in
-            self.reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
-        {
-            *reference = self.upper[end - 1].abs().max(scale * factor);
-        }
-        let mut smallest = SmallestPivot::NONE;
-        for k in (0..elimination.len()).rev() {
-            let start = elimination.offsets[k];
-            let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
-            let depth = ancestors.len();
-            let (upper_above, upper_row) = self.upper.split_at_mut(start);
-            let (lower_above, lower_row) = self.lower.split_at_mut(start);
-            let pivot = upper_row[depth];
-            smallest.see(k, pivot, self.reference[k]);
-            let inverse = 1.0 / pivot;
-            self.inverse_pivot[k] = inverse;
-            for entry in &mut upper_row[..depth] {
-                *entry *= inverse;
+        wide!({
+            for ((reference, end), scale) in
+                self.reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
+            {
+                *reference = self.upper[end - 1].abs().max(scale * factor);
             }
-            for (d, &ancestor) in ancestors.iter().enumerate().rev() {
-                let target = elimination.offsets[ancestor];
-                let (l, u) = (lower_row[d], upper_row[d]);
-                let upper_target = &mut upper_above[target..=target + d];
-                for (t, s) in upper_target.iter_mut().zip(&upper_row[..=d]) {
-                    *t -= l * s;
+            let mut smallest = SmallestPivot::NONE;
+            for k in (0..elimination.len()).rev() {
+                let start = elimination.offsets[k];
+                let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
+                let depth = ancestors.len();
+                let (upper_above, upper_row) = self.upper.split_at_mut(start);
+                let (lower_above, lower_row) = self.lower.split_at_mut(start);
+                let pivot = upper_row[depth];
+                smallest.see(k, pivot, self.reference[k]);
+                let inverse = 1.0 / pivot;
+                self.inverse_pivot[k] = inverse;
+                for entry in &mut upper_row[..depth] {
+                    *entry *= inverse;
                 }
-                let lower_target = &mut lower_above[target..target + d];
-                for (t, s) in lower_target.iter_mut().zip(&lower_row[..d]) {
-                    *t -= u * s;
+                for (d, &ancestor) in ancestors.iter().enumerate().rev() {
+                    let target = elimination.offsets[ancestor];
+                    let (l, u) = (lower_row[d], upper_row[d]);
+                    let upper_target = &mut upper_above[target..=target + d];
+                    for (t, s) in upper_target.iter_mut().zip(&upper_row[..=d]) {
+                        *t -= l * s;
+                    }
+                    let lower_target = &mut lower_above[target..target + d];
+                    for (t, s) in lower_target.iter_mut().zip(&lower_row[..d]) {
+                        *t -= u * s;
+                    }
                 }
             }
-        }
-        smallest
+            smallest
+        })
+    }
+
+    /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
+    /// are whole blocks.
+    #[inline(never)]
+    pub(crate) fn solve_rows(
+        &mut self,
+        elimination: &SymbolicElimination,
+        x: &mut [f64],
+        stride: usize,
+        columns: usize,
+    ) {
+        widest!({
+            for i in (0..elimination.len()).rev() {
+                let (row, below) = x[i * stride..].split_at_mut(stride);
+                let terms = elimination.below(i).iter();
+                self.terms.clear();
+                self.terms.extend(terms.map(|&(j, slot)| (-self.upper[slot], j - i - 1)));
+                add_rows_portable(&mut row[..columns], below, stride, &self.terms);
+            }
+            for i in 0..elimination.len() {
+                let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;
+                let (above, row) = x.split_at_mut(i * stride);
+                let row = &mut row[..columns];
+                let ancestors = elimination.ancestors[range.clone()].iter();
+                self.terms.clear();
+                self.terms.extend(ancestors.zip(&self.lower[range]).map(|(&j, l)| (-l, j)));
+                add_rows_portable(row, above, stride, &self.terms);
+                let inverse = self.inverse_pivot[i];
+                row.iter_mut().for_each(|entry| *entry *= inverse);
+            }
+        })
     }
 
     /// Solves `K x = b` in place.
@@ -163,35 +176,6 @@ impl TreeLu {
                 value -= l * x[ancestor];
             }
             x[k] = value * self.inverse_pivot[k];
-        }
-    }
-
-    #[inline(always)]
-    fn solve_rows_portable(
-        &mut self,
-        elimination: &SymbolicElimination,
-        x: &mut [f64],
-        stride: usize,
-        columns: usize,
-    ) {
-        for i in (0..elimination.len()).rev() {
-            let (row, below) = x[i * stride..].split_at_mut(stride);
-            let terms = elimination.below(i).iter();
-            self.terms.clear();
-            self.terms.extend(terms.map(|&(j, slot)| (-self.upper[slot], j - i - 1)));
-            add_rows_portable(&mut row[..columns], below, stride, &self.terms);
-        }
-        for i in 0..elimination.len() {
-            let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;
-            let (above, row) = x.split_at_mut(i * stride);
-            let row = &mut row[..columns];
-            let ancestors = elimination.ancestors[range.clone()].iter();
-            self.terms.clear();
-            self.terms.extend(ancestors.zip(&self.lower[range]).map(|(&j, l)| (-l, j)));
-            add_rows_portable(row, above, stride, &self.terms);
-            for entry in row {
-                *entry *= self.inverse_pivot[i];
-            }
         }
     }
 }

@@ -10,7 +10,6 @@
 //! period was halved is in its report: it is another map then.
 
 use crate::integrator::collocation::Collocation;
-use crate::integrator::predictor::Past;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::state::PreciseState;
@@ -161,9 +160,9 @@ impl PreciseState {
         }
         self.v.copy_from_slice(&workspace.mid.velocity[nd..]);
         self.multipliers.copy_from_slice(&workspace.step.multipliers);
-        match (&mut self.past, collocation) {
-            (Past::Stages(past), Some(collocation)) => past.record(collocation.motion()),
-            (past, _) => past.record(h, &workspace.step.increment, &model.conditioning.inertia),
+        match collocation {
+            Some(collocation) => self.past.record_stages(&collocation.motion),
+            None => self.past.record(h, &workspace.step.increment, &model.conditioning.inertia),
         }
     }
 }

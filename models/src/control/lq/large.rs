@@ -7,7 +7,7 @@ use crate::control::lq::kernels::{add_products, scale, set_sums, subtract};
 use crate::control::lq::stage::{NotConvex, Stage};
 use crate::math::gemm::{Into, LANES, Operand, Scratch, mirror_head, product, transpose};
 use crate::math::rows::{Term, add_rows_portable};
-use crate::math::simd::wide;
+use crate::math::simd::widest;
 use crate::math::sparse_map::Map;
 
 /// Room for the kernel; nothing here outlives a step.
@@ -44,21 +44,8 @@ fn panel(map: &Map) -> usize {
 
 impl LargeKernel {
     // For wider registers with the same bits, but for those of products.
-    wide! {
-        /// One stage back. `S` has no entries of states that are not active.
-        pub(super) fn step(
-            mut self,
-            map: &Map,
-            stage: Stage<'_>,
-            cost: &mut CostToGo,
-            factor: &mut DMatrix<f64>,
-            gain: &mut DMatrix<f64>,
-            offset: &mut DVector<f64>,
-        ) -> Result<(), NotConvex> = step_portable, step_avx2, step_avx512;
-    }
-
-    #[inline(always)]
-    fn step_portable(
+    /// One stage back. `S` has no entries of states that are not active.
+    pub(super) fn step(
         &mut self,
         map: &Map,
         stage: Stage<'_>,
@@ -67,15 +54,17 @@ impl LargeKernel {
         gain: &mut DMatrix<f64>,
         offset: &mut DVector<f64>,
     ) -> Result<(), NotConvex> {
-        self.find_bracket(map, cost);
-        self.set_cross(map, stage, &cost.linear);
-        factorize(self.cross.numbers(), panel(map), map.inputs, &mut self.terms)?;
-        self.find_law(map, factor);
-        self.write_law(map, gain, offset);
-        self.subtract_gained(map, stage, cost);
-        self.write_value(map, stage, cost);
-        self.write_linear(map, stage, cost);
-        Ok(())
+        widest!({
+            self.find_bracket(map, cost);
+            self.set_cross(map, stage, &cost.linear);
+            factorize(self.cross.numbers(), panel(map), map.inputs, &mut self.terms)?;
+            self.find_law(map, factor);
+            self.write_law(map, gain, offset);
+            self.subtract_gained(map, stage, cost);
+            self.write_value(map, stage, cost);
+            self.write_linear(map, stage, cost);
+            Ok(())
+        })
     }
 
     /// `PM`, and the lower triangle of `G = MᵀPM`.

@@ -3,7 +3,6 @@
 use crate::integrator::workspace::Workspace;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::Planar;
-use crate::lagrangian::potentials;
 use crate::math::scalar::Side;
 use crate::model::mechanism::Model;
 
@@ -72,9 +71,8 @@ impl Hessian {
         let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
         let Self { qq, qv, qu, .. } = self;
         if model.potentials.any {
-            let (tree, poses) = (&model.dynamics, &workspace.mid.mechanics.poses);
-            let q = &workspace.mid.q;
-            potentials::for_each_second_derivative(&model.potentials, tree, poses, q, |i, j, k| {
+            let (poses, q) = (&workspace.mid.mechanics.poses, &workspace.mid.q);
+            model.for_each_spring_derivative(poses, q, |i, j, k| {
                 if i < nd {
                     qq[(i * n + j) * width + stage] -= k;
                 }

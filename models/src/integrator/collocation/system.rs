@@ -200,48 +200,115 @@ impl System {
         magnitude
     }
 
-    wide! {
-        /// Configurations and velocities of four stages.
-        pub(crate) fn move_to(mut self, state: &PreciseState, per_radian: &[f64], n: usize, g: usize)
-            = move_to_portable, move_to_avx2;
-
-        /// Impulses of four stages, from the derivatives of `L`.
-        pub(crate) fn take_impulses(
-            mut self,
-            state: &PreciseState,
-            damping: &[f64],
-            n: usize,
-            g: usize,
-        ) -> f64 = take_impulses_portable, take_impulses_avx2;
-
-        /// Writes the residuals of all stages; returns the largest.
-        pub(crate) fn find_residuals(mut self, state: &PreciseState) -> f64
-            = find_residuals_portable, find_residuals_avx2;
-
-        /// Takes the last correction, which `residual` holds, into the impulses, which were evaluated
-        /// before it.
-        pub(crate) fn correct_impulses(mut self, n: usize) = correct_impulses_portable, correct_impulses_avx2;
-
-        /// Derivatives of the residuals `R_i = p + Σ μ_ij P_j − L_v,i` by all `Y`:
-        ///
-        /// ```text
-        /// ∂R_i/∂Y_k = Σ_j μ_ij h_j (L_qq + f_q)_j μ_jk + μ_ik ((L_qv + f_v)_k − (L_vq)_i) − δ_ik (L_vv)_i / h_i
-        /// ```
-        pub(crate) fn fill_matrix(mut self, n: usize) = fill_matrix_portable, fill_matrix_avx2;
+    /// Configurations and velocities of four stages.
+    pub(crate) fn move_to(&mut self, state: &PreciseState, per_radian: &[f64], n: usize, g: usize) {
+        wide!({
+            let first = g * Lanes::COUNT;
+            let rates = Lanes::load(&self.rates[first..]);
+            for (a, per_radian) in per_radian.iter().enumerate() {
+                let own = &self.increment[a * self.width..][..self.width];
+                let groups = self.groups();
+                let more =
+                    Self::coupled(&self.columns, groups, g, &own[..self.count]) + state.q_low[a];
+                let [angle, rest] = without_turns(state.q[a], *per_radian);
+                self.q[g * n + a] = more + rest + angle;
+                self.velocity[g * n + a] = Lanes::load(&own[first..]) * rates;
+            }
+        })
     }
 
-    #[inline(always)]
-    fn move_to_portable(&mut self, state: &PreciseState, per_radian: &[f64], n: usize, g: usize) {
-        let first = g * Lanes::COUNT;
-        let rates = Lanes::load(&self.rates[first..]);
-        for (a, per_radian) in per_radian.iter().enumerate() {
-            let own = &self.increment[a * self.width..][..self.width];
-            let groups = self.groups();
-            let more = Self::coupled(&self.columns, groups, g, &own[..self.count]) + state.q_low[a];
-            let [angle, rest] = without_turns(state.q[a], *per_radian);
-            self.q[g * n + a] = more + rest + angle;
-            self.velocity[g * n + a] = Lanes::load(&own[first..]) * rates;
-        }
+    /// Impulses of four stages, from the derivatives of `L`.
+    pub(crate) fn take_impulses(
+        &mut self,
+        state: &PreciseState,
+        damping: &[f64],
+        n: usize,
+        g: usize,
+    ) -> f64 {
+        wide!({
+            let first = g * Lanes::COUNT;
+            let lengths = Lanes::load(&self.lengths[first..]);
+            let mut largest = [0.0; Lanes::COUNT];
+            for (a, (l_q, l_v)) in self.l_q.iter().zip(&self.l_v).enumerate() {
+                let at = a * self.width + first;
+                let mut force = Lanes::load(&self.held[at..]);
+                if let Some(c) = damping.get(a) {
+                    force -= self.velocity[g * n + a] * *c;
+                }
+                let (by_position, by_force) = (*l_q * lengths, force * lengths);
+                (by_position + by_force).store(&mut self.impulse[at..]);
+                l_v.store(&mut self.momentum[at..]);
+                let by_angle = by_position.abs() * (self.q[g * n + a].abs() + 1.0);
+                let size = l_v.abs() + (by_angle + by_force.abs()) * 0.5 + state.p[a].abs();
+                for (largest, size) in largest.iter_mut().zip(size.0) {
+                    *largest = if size > *largest { size } else { *largest };
+                }
+            }
+            largest.into_iter().fold(0.0, f64::max)
+        })
+    }
+
+    /// Writes the residuals of all stages; returns the largest.
+    pub(crate) fn find_residuals(&mut self, state: &PreciseState) -> f64 {
+        wide!({
+            let (groups, mut sizes) = (self.groups(), Lanes::ZERO);
+            for (a, residual) in self.residual.chunks_exact_mut(self.count).enumerate() {
+                let own = &self.impulse[a * self.width..][..self.width];
+                for (g, residual) in residual.chunks_mut(Lanes::COUNT).enumerate() {
+                    let first = g * Lanes::COUNT;
+                    let sum = Self::coupled(&self.columns, groups, g, &own[..self.count]);
+                    let momentum = Lanes::load(&self.momentum[a * self.width + first..]);
+                    let value = (-momentum + state.p[a] + sum) + state.p_low[a];
+                    residual.copy_from_slice(&value.0[..residual.len()]);
+                    for (size, value) in sizes.0.iter_mut().zip(&*residual) {
+                        *size = larger(*size, *value);
+                    }
+                }
+            }
+            sizes.0.into_iter().fold(0.0, larger)
+        })
+    }
+
+    /// Takes the last correction, which `residual` holds, into the impulses, which were evaluated
+    /// before it.
+    pub(crate) fn correct_impulses(&mut self, n: usize) {
+        wide!({
+            let (count, width, groups) = (self.count, self.width, self.groups());
+            let nd = self.increment.len() / width;
+            for g in 0..groups {
+                let first = g * Lanes::COUNT;
+                let lengths = Lanes::load(&self.lengths[first..]);
+                for b in 0..nd {
+                    let corrections = &self.residual[b * count..][..count];
+                    let moved = Self::coupled(&self.columns, groups, g, corrections);
+                    let mut own = Lanes::ZERO;
+                    let rest = &corrections[first..];
+                    let length = rest.len().min(Lanes::COUNT);
+                    own.0[..length].copy_from_slice(&rest[..length]);
+                    for a in 0..nd {
+                        let at = (a * n + b) * width + first;
+                        let by_position = Lanes::load(&self.hessian.qq[at..]) * moved * lengths;
+                        let by_velocity = Lanes::load(&self.hessian.qv[at..]) * own;
+                        let impulse = &mut self.impulse[a * width + first..];
+                        (Lanes::load(impulse) - (by_position + by_velocity)).store(impulse);
+                    }
+                }
+            }
+        })
+    }
+
+    /// Derivatives of the residuals `R_i = p + Σ μ_ij P_j − L_v,i` by all `Y`:
+    ///
+    /// ```text
+    /// ∂R_i/∂Y_k = Σ_j μ_ij h_j (L_qq + f_q)_j μ_jk + μ_ik ((L_qv + f_v)_k − (L_vq)_i) − δ_ik (L_vv)_i / h_i
+    /// ```
+    pub(crate) fn fill_matrix(&mut self, n: usize) {
+        wide!({
+            match self.groups() {
+                1 => self.fill_groups::<1>(n),
+                _ => self.fill_groups::<2>(n),
+            }
+        })
     }
 
     /// Derivatives of `L` at one stage, with springs and forces.
@@ -267,54 +334,6 @@ impl System {
             self.l_q[a].0[lane] = workspace.mid.l_q[a] + others;
             self.l_v[a].0[lane] = workspace.mid.l_v[a];
         }
-    }
-
-    #[inline(always)]
-    fn take_impulses_portable(
-        &mut self,
-        state: &PreciseState,
-        damping: &[f64],
-        n: usize,
-        g: usize,
-    ) -> f64 {
-        let first = g * Lanes::COUNT;
-        let lengths = Lanes::load(&self.lengths[first..]);
-        let mut largest = [0.0; Lanes::COUNT];
-        for (a, (l_q, l_v)) in self.l_q.iter().zip(&self.l_v).enumerate() {
-            let at = a * self.width + first;
-            let mut force = Lanes::load(&self.held[at..]);
-            if let Some(c) = damping.get(a) {
-                force -= self.velocity[g * n + a] * *c;
-            }
-            let (by_position, by_force) = (*l_q * lengths, force * lengths);
-            (by_position + by_force).store(&mut self.impulse[at..]);
-            l_v.store(&mut self.momentum[at..]);
-            let by_angle = by_position.abs() * (self.q[g * n + a].abs() + 1.0);
-            let size = l_v.abs() + (by_angle + by_force.abs()) * 0.5 + state.p[a].abs();
-            for (largest, size) in largest.iter_mut().zip(size.0) {
-                *largest = if size > *largest { size } else { *largest };
-            }
-        }
-        largest.into_iter().fold(0.0, f64::max)
-    }
-
-    #[inline(always)]
-    fn find_residuals_portable(&mut self, state: &PreciseState) -> f64 {
-        let (groups, mut sizes) = (self.groups(), Lanes::ZERO);
-        for (a, residual) in self.residual.chunks_exact_mut(self.count).enumerate() {
-            let own = &self.impulse[a * self.width..][..self.width];
-            for (g, residual) in residual.chunks_mut(Lanes::COUNT).enumerate() {
-                let first = g * Lanes::COUNT;
-                let sum = Self::coupled(&self.columns, groups, g, &own[..self.count]);
-                let momentum = Lanes::load(&self.momentum[a * self.width + first..]);
-                let value = (-momentum + state.p[a] + sum) + state.p_low[a];
-                residual.copy_from_slice(&value.0[..residual.len()]);
-                for (size, value) in sizes.0.iter_mut().zip(&*residual) {
-                    *size = larger(*size, *value);
-                }
-            }
-        }
-        sizes.0.into_iter().fold(0.0, larger)
     }
 
     /// Corrects all stages by chord Newton; the Jacobian is renewed where that saves corrections.
@@ -387,39 +406,6 @@ impl System {
         }
         for (g, mechanics) in self.mechanics.iter_mut().enumerate() {
             self.hessian.take(model, mechanics, g * Lanes::COUNT);
-        }
-    }
-
-    #[inline(always)]
-    fn correct_impulses_portable(&mut self, n: usize) {
-        let (count, width, groups) = (self.count, self.width, self.groups());
-        let nd = self.increment.len() / width;
-        for g in 0..groups {
-            let first = g * Lanes::COUNT;
-            let lengths = Lanes::load(&self.lengths[first..]);
-            for b in 0..nd {
-                let corrections = &self.residual[b * count..][..count];
-                let moved = Self::coupled(&self.columns, groups, g, corrections);
-                let mut own = Lanes::ZERO;
-                let rest = &corrections[first..];
-                let length = rest.len().min(Lanes::COUNT);
-                own.0[..length].copy_from_slice(&rest[..length]);
-                for a in 0..nd {
-                    let at = (a * n + b) * width + first;
-                    let by_position = Lanes::load(&self.hessian.qq[at..]) * moved * lengths;
-                    let by_velocity = Lanes::load(&self.hessian.qv[at..]) * own;
-                    let impulse = &mut self.impulse[a * width + first..];
-                    (Lanes::load(impulse) - (by_position + by_velocity)).store(impulse);
-                }
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn fill_matrix_portable(&mut self, n: usize) {
-        match self.groups() {
-            1 => self.fill_groups::<1>(n),
-            _ => self.fill_groups::<2>(n),
         }
     }
 

@@ -16,6 +16,7 @@ use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
 use crate::linearization::second_order::tensors::SecondOrder;
 use crate::math::rows::padded;
+use crate::math::simd::narrowly;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
@@ -365,12 +366,12 @@ fn wider_registers_give_the_same_bits() {
         let mut wide = fronts.clone();
         let mut narrow = wide.clone();
         wide.factor(at, &numbers, scales, 0.01, MatrixKind::Newton);
-        narrow.factor_portable(at, &numbers, scales, 0.01, MatrixKind::Newton);
+        narrowly(|| narrow.factor(at, &numbers, scales, 0.01, MatrixKind::Newton));
         assert_eq!(wide.factors, narrow.factors);
         let [mut x, mut narrow_x] = [0; 2].map(|_| numbers.clone());
         let [mut lambda, mut narrow_lambda] = [0; 2].map(|_| vec![0.3; d.constraints]);
         wide.solve(loops, &mut x, &mut lambda);
-        narrow.solve_portable(loops, &mut narrow_x, &mut narrow_lambda);
+        narrowly(|| narrow.solve(loops, &mut narrow_x, &mut narrow_lambda));
         assert_eq!((x, lambda), (narrow_x, narrow_lambda));
         let results = [(wide, true), (narrow, false)].map(|(mut matrix, is_wide)| {
             let stride = padded(2 * d.dynamic);
@@ -385,7 +386,7 @@ fn wider_registers_give_the_same_bits() {
             if is_wide {
                 matrix.linearize(at, &diagonal, &closures, out);
             } else {
-                matrix.linearize_portable(at, &diagonal, &closures, out);
+                narrowly(|| matrix.linearize(at, &diagonal, &closures, out));
             }
             (increment, momentum, multipliers)
         });

@@ -11,6 +11,7 @@ use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
 use crate::math::rows::padded;
+use crate::math::simd::narrowly;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
@@ -206,7 +207,9 @@ fn linearizations_have_the_same_bits_in_any_register() {
         let mut narrow = wide.clone();
         let [mut x, mut p, mut narrow_x, mut narrow_p] = [0; 4].map(|_| vec![0.0; n * stride]);
         wide.linearize(tree, joints, &diagonal, &mut x, &mut p, stride);
-        narrow.linearize_portable(tree, joints, &diagonal, &mut narrow_x, &mut narrow_p, stride);
+        narrowly(|| {
+            narrow.linearize(tree, joints, &diagonal, &mut narrow_x, &mut narrow_p, stride);
+        });
         assert!(x.iter().any(|x| *x != 0.0) && x.iter().chain(&p).all(|x| x.is_finite()));
         assert!(x == narrow_x && p == narrow_p);
     }

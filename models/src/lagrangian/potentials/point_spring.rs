@@ -11,7 +11,7 @@ use crate::lagrangian::potentials::{Place, Potential};
 use crate::lagrangian::vectors::Separation;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::Vec3;
-use crate::model::mechanism::{PathJoint, PointSpring};
+use crate::model::mechanism::PointSpring;
 
 /// A two-point spring at one configuration.
 struct Stretched<S> {
@@ -71,24 +71,12 @@ impl Potential for PointSpring {
         at: Place<'_, S>,
         entry: &mut impl FnMut(usize, usize, S),
     ) {
-        let (tree, poses) = (at.tree, at.poses);
         let s = stretched(self, at);
-        for (k, row) in self.ends.path.iter().enumerate() {
-            let row_gradient = row.gradient(tree, poses, &s.at);
-            let bend = s.bend * s.at.difference.dot(row_gradient);
-            for column in &self.ends.path[..=k] {
-                let gradient = column.gradient(tree, poses, &s.at);
-                let both = [(row, row_gradient), (column, gradient)];
-                let (second, mirrored) = PathJoint::seconds(both, tree, poses);
-                let product = gradient.dot(row_gradient);
-                let along = bend * s.at.difference.dot(gradient);
-                let value =
-                    |second: Vec3<S>| s.tension * (product + s.at.difference.dot(second)) + along;
-                entry(row.coordinate, column.coordinate, value(second));
-                if row.joint != column.joint {
-                    entry(column.coordinate, row.coordinate, value(mirrored));
-                }
-            }
-        }
+        let value = |[row, column]: [Vec3<S>; 2], seconds: [Vec3<S>; 2]| {
+            let along = s.bend * s.at.difference.dot(row) * s.at.difference.dot(column);
+            let product = column.dot(row);
+            seconds.map(|second| s.tension * (product + s.at.difference.dot(second)) + along)
+        };
+        self.ends.for_each_pair((at.tree, at.poses, &s.at), value, entry);
     }
 }
