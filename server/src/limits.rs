@@ -58,6 +58,8 @@ limits! {
     message_bytes = 16_777_216 in 4096..=1_073_741_824;
     /// Bytes of one message to the channel service, whose many small parts take much more room than they have bytes.
     channel_message_bytes = 262_144 in 4096..=1_073_741_824;
+    /// Cases, stages, parameters, names and the like in one message, however deep: entries of repeated fields other than numbers, each of which may take some hundred bytes in memory.
+    message_parts = 131_072 in 1024..=1_000_000_000;
     /// Bytes of messages to the server that are held until they are whole, together.
     unfinished_message_bytes = 268_435_456 in 4096..=1_000_000_000_000;
     /// Seconds for which a message that has begun may stand still, and in which it must come, with one more for each 64 KiB of it.

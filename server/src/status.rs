@@ -14,7 +14,7 @@
 //! | INVALID_ARGUMENT | `INVALID_SNAPSHOT`, `SNAPSHOT_MISMATCH` | BadRequest | damaged, or of another model or other settings |
 //! | INVALID_ARGUMENT | `INVALID_WEIGHT` | BadRequest | a weight has the wrong size or definiteness |
 //! | INVALID_ARGUMENT | `INVALID_COVARIANCE` | BadRequest | a covariance of noise has the wrong size or definiteness |
-//! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice |
+//! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice; or the bytes of a long message are none that the method takes |
 //! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED`, `FAULT_NOT_FOUND`, `RECORDING_NOT_FOUND` | ResourceInfo | no such thing, or deleted meanwhile |
 //! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS`, `RECORDING_EXISTS` | ResourceInfo | the name is taken |
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |

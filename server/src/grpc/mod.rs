@@ -13,6 +13,7 @@ mod kalman;
 pub mod model;
 pub mod observe;
 mod optimize;
+mod parts;
 pub mod plant;
 pub mod record;
 mod reference;

@@ -112,7 +112,8 @@ where
         };
         let limits = Arc::clone(&self.layer.limits);
         let connection = Connection::of(request.extensions());
-        let response = self.inner.call(request.map(|body| self.layer.unfinished.follow(body)));
+        let unfinished = &self.layer.unfinished;
+        let response = self.inner.call(request.map(|body| unfinished.follow(call.method, body)));
         Box::pin(async move {
             let mut response = connection.work(response).await?;
             if let Some(status) = Status::from_header_map(response.headers()) {

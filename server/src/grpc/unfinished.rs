@@ -3,6 +3,9 @@
 //! A message is held until its last byte has come. What comes in one piece, as the messages of a
 //! control loop do, is not counted; a body whose messages come in several pieces reserves the bytes
 //! of the longest one and keeps them until it ends, because its decoder keeps the buffer.
+//!
+//! Long messages are also walked through as they come, and refused when they have too many parts: see
+//! [`super::parts`].
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -12,9 +15,10 @@ use std::time::Duration;
 
 use http_body::{Body as HttpBody, Frame, SizeHint};
 use tokio::time::{Instant, Sleep, sleep_until};
-use tonic::Status;
 use tonic::body::Body;
+use tonic::{Code, Status};
 
+use super::parts::{self, Malformed, PART_BYTES_MIN, Walk};
 use crate::limits::{LimitExceeded, Limits};
 use crate::status::Fault;
 
@@ -25,21 +29,26 @@ const BYTES_PER_SECOND: u64 = 64 << 10;
 pub(super) struct Budget {
     bytes: u64,
     seconds: u64,
+    parts: u64,
     held: AtomicU64,
 }
 
 impl Budget {
     pub(super) fn new(limits: &Limits) -> Self {
-        let (bytes, seconds) = (limits.unfinished_message_bytes, limits.message_s);
-        Self { bytes, seconds, held: AtomicU64::new(0) }
+        Self {
+            bytes: limits.unfinished_message_bytes,
+            seconds: limits.message_s,
+            parts: limits.message_parts,
+            held: AtomicU64::new(0),
+        }
     }
 
-    /// A body that keeps to the budget.
-    pub(super) fn follow(self: &Arc<Self>, body: Body) -> Body {
+    /// The body of a request to this path, which keeps to the budget.
+    pub(super) fn follow(self: &Arc<Self>, path: &str, body: Body) -> Body {
         Body::new(Followed {
             body,
             budget: Arc::clone(self),
-            position: Position::default(),
+            position: Position::of(parts::request_of(path), self.parts),
             held: 0,
             times: None,
             timer: None,
@@ -67,9 +76,40 @@ impl Budget {
     }
 }
 
+/// Why nothing more is read of a message.
+#[derive(Debug)]
+enum Refused {
+    Limit(LimitExceeded),
+    Malformed,
+}
+
+impl From<LimitExceeded> for Refused {
+    fn from(error: LimitExceeded) -> Self {
+        Self::Limit(error)
+    }
+}
+
+impl From<Malformed> for Refused {
+    fn from(_: Malformed) -> Self {
+        Self::Malformed
+    }
+}
+
+impl From<Refused> for Fault {
+    fn from(refused: Refused) -> Self {
+        let sentence = "the bytes are not a message that this method takes";
+        match refused {
+            Refused::Limit(error) => error.into(),
+            Refused::Malformed => Self::new(Code::InvalidArgument, "PROTOCOL", sentence),
+        }
+    }
+}
+
 /// Where a body stands in its messages, each a flag, a length of four bytes and as many bytes.
-#[derive(Default)]
 struct Position {
+    /// The message that the method takes, and how many parts it may have.
+    request: Option<usize>,
+    parts: u64,
     head: [u8; 5],
     /// Bytes of the head that have come.
     in_head: usize,
@@ -77,10 +117,16 @@ struct Position {
     came: u64,
     /// Bytes that it lacks, once its head is whole.
     lacks: usize,
+    /// Counts its parts, if it is long enough for too many.
+    walk: Option<Walk>,
 }
 
 impl Position {
-    fn advance(&mut self, mut piece: &[u8]) {
+    fn of(request: Option<usize>, parts: u64) -> Self {
+        Self { request, parts, head: [0; 5], in_head: 0, came: 0, lacks: 0, walk: None }
+    }
+
+    fn advance(&mut self, mut piece: &[u8]) -> Result<(), Refused> {
         while !piece.is_empty() {
             if self.in_head < self.head.len() {
                 let count = piece.len().min(self.head.len() - self.in_head);
@@ -90,16 +136,28 @@ impl Position {
                 piece = &piece[count..];
                 let [_, length @ ..] = self.head;
                 self.lacks = u32::from_be_bytes(length) as usize;
+                let is_long = self.lacks as u64 / PART_BYTES_MIN > self.parts;
+                if self.in_head == self.head.len() && is_long {
+                    self.walk = self.request.map(|request| Walk::new(request, self.lacks as u64));
+                }
             } else {
                 let count = piece.len().min(self.lacks);
+                if let Some(walk) = &mut self.walk {
+                    walk.advance(&piece[..count])?;
+                    let (name, limit) = ("message_parts", self.parts);
+                    let what = "texts and messages within one message";
+                    let actual = usize::try_from(walk.parts).unwrap_or(usize::MAX);
+                    LimitExceeded::check(name, limit, what, actual)?;
+                }
                 self.lacks -= count;
                 self.came += count as u64;
                 piece = &piece[count..];
             }
             if self.in_head == self.head.len() && self.lacks == 0 {
-                *self = Self::default();
+                *self = Self::of(self.request, self.parts);
             }
         }
+        Ok(())
     }
 }
 
@@ -116,8 +174,8 @@ struct Followed {
 }
 
 impl Followed {
-    fn take(&mut self, piece: &[u8]) -> Result<(), LimitExceeded> {
-        self.position.advance(piece);
+    fn take(&mut self, piece: &[u8]) -> Result<(), Refused> {
+        self.position.advance(piece)?;
         let came = self.position.came;
         if came == 0 {
             self.times = None;
@@ -144,11 +202,11 @@ impl Followed {
         timer.as_mut().poll(context).is_ready()
     }
 
-    fn refuse(&mut self, error: LimitExceeded) -> Status {
+    fn refuse(&mut self, refused: Refused) -> Status {
         // Nothing more is read of it.
         self.body = Body::empty();
         self.times = None;
-        Fault::from(error).into()
+        Fault::from(refused).into()
     }
 }
 
@@ -164,12 +222,12 @@ impl HttpBody for Followed {
         let polled = Pin::new(&mut this.body).poll_frame(context);
         let kept = match &polled {
             Poll::Ready(Some(Ok(frame))) => frame.data_ref().map_or(Ok(()), |data| this.take(data)),
-            Poll::Pending if this.is_overdue(context) => Err(this.budget.overdue()),
+            Poll::Pending if this.is_overdue(context) => Err(this.budget.overdue().into()),
             _ => Ok(()),
         };
         match kept {
             Ok(()) => polled,
-            Err(error) => Poll::Ready(Some(Err(this.refuse(error)))),
+            Err(refused) => Poll::Ready(Some(Err(this.refuse(refused)))),
         }
     }
 
@@ -203,10 +261,10 @@ mod tests {
     fn what_is_not_whole_is_counted_however_it_is_cut() {
         let bytes = [message(3), message(0), message(10)].concat();
         for size in 1..=bytes.len() {
-            let mut position = Position::default();
+            let mut position = Position::of(None, 0);
             let mut end = 0;
             for piece in bytes.chunks(size) {
-                position.advance(piece);
+                position.advance(piece).unwrap();
                 end += piece.len();
                 // Where the message begins that holds the last byte.
                 let begin = [0, 8, 13, 28].into_iter().rfind(|begin| *begin <= end).unwrap();
@@ -219,7 +277,7 @@ mod tests {
         Followed {
             body: Body::empty(),
             budget: Arc::clone(budget),
-            position: Position::default(),
+            position: Position::of(None, 0),
             held: 0,
             times: None,
             timer: None,
@@ -237,7 +295,7 @@ mod tests {
         first.take(&message(60)[..64]).unwrap();
         first.take(&[7; 1]).unwrap();
         assert_eq!(held(), 64, "its decoder keeps the buffer");
-        let error = second.take(&message(60)[..60]).unwrap_err();
+        let Refused::Limit(error) = second.take(&message(60)[..60]).unwrap_err() else { panic!() };
         assert_eq!((error.name, error.limit, error.actual), ("unfinished_message_bytes", 100, 124));
         drop(first);
         second.take(&[7; 1]).unwrap();
