@@ -402,9 +402,7 @@ fn load_scene(hub: &Hub, path: &Path) -> Result<()> {
     let scene = plantd_models::Scene::from_text(&text)?;
     let model = Model::compile(&scene)?;
     let name = model.scene().name.clone();
-    hub.catalog
-        .insert(&name, Arc::new(model))
-        .map_err(|fault| anyhow::anyhow!("{}", tonic::Status::from(fault).message()))?;
+    hub.catalog.insert(&name, Arc::new(model))?;
     tracing::info!(model = name, "scene loaded");
     Ok(())
 }

@@ -7,7 +7,40 @@ use plantd_models::{Model, builtin};
 
 use crate::core::limits::LimitExceeded;
 use crate::core::metrics::Metrics;
-use crate::wire::status::RpcError;
+
+/// Why a model was not found, kept or forgotten.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CatalogError {
+    /// There is no model of that name.
+    #[error("there is no model `{name}`")]
+    NotFound {
+        /// The name.
+        name: String,
+    },
+    /// The name is taken, by an uploaded or a built-in model.
+    #[error("there already is a model `{name}`")]
+    Exists {
+        /// The name.
+        name: String,
+    },
+    /// Built-in models stay.
+    #[error("model `{name}` came with the server and cannot be deleted")]
+    Builtin {
+        /// The name.
+        name: String,
+    },
+    /// There are as many uploaded models as there may be.
+    #[error(transparent)]
+    Limit(#[from] LimitExceeded),
+    /// A defect: a built-in scene does not compile.
+    #[error("the built-in scene `{name}` does not compile: {problem}")]
+    Broken {
+        /// The name.
+        name: String,
+        /// Why not.
+        problem: String,
+    },
+}
 
 /// A model by name.
 #[derive(Clone, Debug)]
@@ -44,16 +77,17 @@ impl Catalog {
     }
 
     /// The model of that name. May compile it: call it on a worker.
-    pub fn get(&self, name: &str) -> Result<Entry, RpcError> {
+    pub fn get(&self, name: &str) -> Result<Entry, CatalogError> {
         if let Some(model) = lock(&self.uploaded).get(name) {
             let model = Arc::clone(model);
             return Ok(Entry { name: name.to_owned(), builtin: false, model });
         }
-        let model = self.builtin(name)?.ok_or_else(|| RpcError::model_not_found(name))?;
+        let model =
+            self.builtin(name)?.ok_or_else(|| CatalogError::NotFound { name: name.to_owned() })?;
         Ok(Entry { name: name.to_owned(), builtin: true, model })
     }
 
-    fn builtin(&self, name: &str) -> Result<Option<Arc<Model>>, RpcError> {
+    fn builtin(&self, name: &str) -> Result<Option<Arc<Model>>, CatalogError> {
         if let Some(cell) = self.named.get(name) {
             if let Some(model) = cell.get() {
                 return Ok(Some(Arc::clone(model)));
@@ -72,13 +106,13 @@ impl Catalog {
     }
 
     /// Keeps an uploaded model.
-    pub fn insert(&self, name: &str, model: Arc<Model>) -> Result<Entry, RpcError> {
+    pub fn insert(&self, name: &str, model: Arc<Model>) -> Result<Entry, CatalogError> {
         if builtin::scene(name).is_some() {
-            return Err(RpcError::model_exists(name));
+            return Err(CatalogError::Exists { name: name.to_owned() });
         }
         let mut uploaded = lock(&self.uploaded);
         if uploaded.contains_key(name) {
-            return Err(RpcError::model_exists(name));
+            return Err(CatalogError::Exists { name: name.to_owned() });
         }
         LimitExceeded::check("models", self.models_max, "uploaded models", uploaded.len() + 1)?;
         uploaded.insert(name.to_owned(), Arc::clone(&model));
@@ -87,22 +121,21 @@ impl Catalog {
     }
 
     /// Forgets an uploaded model.
-    pub fn remove(&self, name: &str) -> Result<(), RpcError> {
+    pub fn remove(&self, name: &str) -> Result<(), CatalogError> {
         let mut uploaded = lock(&self.uploaded);
         if uploaded.remove(name).is_some() {
             self.metrics.set_models(uploaded.len());
             return Ok(());
         }
         if builtin::scene(name).is_some() {
-            let problem = format!("model `{name}` came with the server and cannot be deleted");
-            return Err(RpcError::precondition("BUILTIN_MODEL", format!("model:{name}"), problem));
+            return Err(CatalogError::Builtin { name: name.to_owned() });
         }
-        Err(RpcError::model_not_found(name))
+        Err(CatalogError::NotFound { name: name.to_owned() })
     }
 
     /// Up to `size` models after the one named `after` (none: from the start), and whether there are
     /// more. May compile: call it on a worker.
-    pub fn page(&self, after: &str, size: usize) -> Result<(Vec<Entry>, bool), RpcError> {
+    pub fn page(&self, after: &str, size: usize) -> Result<(Vec<Entry>, bool), CatalogError> {
         let builtin_names = self.named.keys().map(|name| (*name).to_owned());
         let uploaded_names: Vec<String> = lock(&self.uploaded).keys().cloned().collect();
         let is_uploaded = !after.is_empty() && !self.named.contains_key(after);
@@ -117,18 +150,19 @@ impl Catalog {
             match self.get(&name) {
                 Ok(entry) => entries.push(entry),
                 // Deleted since the names were read.
-                Err(fault) if fault.reason() == "MODEL_NOT_FOUND" => {}
-                Err(fault) => return Err(fault),
+                Err(CatalogError::NotFound { .. }) => {}
+                Err(error) => return Err(error),
             }
         }
         Ok((entries, has_more))
     }
 }
 
-fn compile_builtin(name: &str) -> Result<Option<Arc<Model>>, RpcError> {
+fn compile_builtin(name: &str) -> Result<Option<Arc<Model>>, CatalogError> {
     let Some(scene) = builtin::scene(name) else { return Ok(None) };
-    let model = Model::compile(&scene).map_err(|error| {
-        RpcError::internal(format!("the built-in scene `{name}` does not compile: {error}"))
+    let model = Model::compile(&scene).map_err(|error| CatalogError::Broken {
+        name: name.to_owned(),
+        problem: error.to_string(),
     })?;
     Ok(Some(Arc::new(model)))
 }

@@ -1,11 +1,5 @@
 //! Over which connection a call comes: what the server shares out is shared out fairly between them.
 
-use std::sync::Arc;
-
-use tonic::codegen::http::Extensions;
-
-use crate::wire::admission::Place;
-
 tokio::task_local! {
     static CONNECTION: Connection;
 }
@@ -15,9 +9,9 @@ tokio::task_local! {
 pub struct Connection(u64);
 
 impl Connection {
-    /// That of a request.
-    pub fn of(extensions: &Extensions) -> Self {
-        Self(extensions.get::<Arc<Place>>().map_or(0, |place| place.id() + 1))
+    /// The connection of that number; 0 is the server's own.
+    pub(crate) fn numbered(number: u64) -> Self {
+        Self(number)
     }
 
     /// The connection for which the present task works.

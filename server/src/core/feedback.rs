@@ -6,10 +6,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use plantd_models::{Model, Plant, StepError};
-use plantd_proto::v1;
 
 use crate::core::limits::LimitExceeded;
-use crate::core::regulator::Spec;
+use crate::core::regulator::{RegulatorError, Spec};
 
 /// What a feedback does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -100,6 +99,23 @@ pub struct Trip {
     pub bound: usize,
 }
 
+/// What there is to say of a feedback.
+#[derive(Clone, Debug)]
+pub struct FeedbackInfo {
+    /// What it does.
+    pub mode: Mode,
+    /// Which of the plant's computations of laws it comes from.
+    pub revision: u64,
+    /// Step at which a trajectory begins.
+    pub first_step: u64,
+    /// Steps of the trajectory; 0 about a point.
+    pub horizon: usize,
+    /// Step at which the watchdog took over, and the entry of x that left its bound.
+    pub tripped: Option<(u64, String)>,
+    /// Why the last computation of its law failed.
+    pub failure: Option<Arc<RegulatorError>>,
+}
+
 /// A plant's feedback.
 #[derive(Debug)]
 pub struct Feedback {
@@ -123,7 +139,7 @@ pub struct Feedback {
     /// [`crate::core::session::Session`].
     pub generation: u64,
     /// Why that computation failed.
-    pub failure: Option<v1::Failure>,
+    pub failure: Option<Arc<RegulatorError>>,
     error: Vec<f64>,
 }
 
@@ -182,22 +198,15 @@ impl Feedback {
         Ok(true)
     }
 
-    /// What a client is told.
-    pub fn info(&self) -> v1::FeedbackInfo {
-        let mode = match self.mode {
-            Mode::WatchOnly => v1::FeedbackMode::WatchOnly,
-            Mode::Replace => v1::FeedbackMode::Replace,
-            Mode::Add => v1::FeedbackMode::Add,
-            Mode::Guard => v1::FeedbackMode::Guard,
-        };
-        let tripped_by = self.tripped.and_then(|trip| self.guard.get(trip.bound));
-        v1::FeedbackInfo {
-            mode: mode.into(),
+    /// What there is to say of it.
+    pub fn info(&self) -> FeedbackInfo {
+        let entry = |trip: Trip| self.guard.get(trip.bound).map(|bound| bound.name.clone());
+        FeedbackInfo {
+            mode: self.mode,
             revision: self.revision,
             first_step: self.first_step,
-            horizon: self.law.horizon() as u32,
-            tripped_at_step: self.tripped.map(|trip| trip.step),
-            tripped_by: tripped_by.map(|bound| bound.name.clone()).unwrap_or_default(),
+            horizon: self.law.horizon(),
+            tripped: self.tripped.map(|trip| (trip.step, entry(trip).unwrap_or_default())),
             failure: self.failure.clone(),
         }
     }
@@ -237,7 +246,7 @@ pub struct InForce {
     /// Which computation it comes from.
     pub revision: u64,
     /// Why the last computation failed, and for which parameters and time step.
-    pub failure: Option<(u64, v1::Failure)>,
+    pub failure: Option<(u64, Arc<RegulatorError>)>,
 }
 
 impl InForce {
@@ -250,29 +259,6 @@ impl InForce {
     pub fn first(&self, step: u64) -> usize {
         let k = usize::try_from(step.saturating_sub(self.first_step)).unwrap_or(usize::MAX);
         k.min(self.law.stages.len() - 1)
-    }
-
-    /// The `index`-th message; `rotations` are those of the model.
-    pub fn gain(&self, index: usize, rotations: &[u32]) -> v1::Gain {
-        let rotations = rotations.to_vec();
-        let step = match self.law.end {
-            Some(_) => self.first_step.saturating_add(index as u64),
-            None => self.since_step,
-        };
-        let Some(stage) = self.law.stages.get(index) else {
-            let x_reference = self.law.end.clone().unwrap_or_default();
-            return v1::Gain { step, x_reference, rotations, ..Default::default() };
-        };
-        let (rows, cols) = (stage.u.len() as u32, stage.x.len() as u32);
-        v1::Gain {
-            step,
-            k: Some(v1::Matrix { rows, cols, data: stage.k.clone() }),
-            x_reference: stage.x.clone(),
-            u_reference: stage.u.clone(),
-            rotations,
-            feedforward: stage.feedforward.clone(),
-            ..Default::default()
-        }
     }
 }
 

@@ -5,8 +5,10 @@
 pub mod catalog;
 pub mod channels;
 pub mod connection;
+pub mod failure;
 pub mod feedback;
 pub mod frame;
+pub mod inputs;
 pub mod limits;
 pub mod metrics;
 pub mod modes;

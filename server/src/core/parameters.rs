@@ -6,8 +6,6 @@ use std::collections::BTreeMap;
 use plantd_models::{Model, Scene, SceneError};
 use serde_json::Value;
 
-use crate::wire::status::RpcError;
-
 /// Numbers that differ from those of the model that a plant was made from, by path. A path has one
 /// notation here: names where entries have them.
 pub type Parameters = BTreeMap<String, f64>;
@@ -24,9 +22,10 @@ pub struct Changed {
 }
 
 /// Why a change was refused.
-#[derive(Debug)]
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ChangeError {
     /// The `index`-th change names no number, or none that may be changed.
+    #[error("change {index}: {problem}")]
     Path {
         /// Which of the changes.
         index: usize,
@@ -34,21 +33,11 @@ pub enum ChangeError {
         problem: String,
     },
     /// The changed scene is refused.
+    #[error(transparent)]
     Scene(SceneError),
     /// The changed scene has other coordinates, inputs or constraints.
+    #[error("{0}")]
     Structure(String),
-}
-
-impl From<ChangeError> for RpcError {
-    fn from(error: ChangeError) -> Self {
-        match error {
-            ChangeError::Path { index, problem } => {
-                Self::field(format!("parameters[{index}].path"), problem)
-            }
-            ChangeError::Scene(error) => error.into(),
-            ChangeError::Structure(problem) => Self::field("parameters", problem),
-        }
-    }
 }
 
 /// Changes numbers of a model's scene. `before` are the changes that led to this model.

@@ -5,19 +5,97 @@ use std::sync::Arc;
 
 use nalgebra::DMatrix;
 use plantd_models::control::{
-    self, FiniteHorizon, Momentum, Regulator, Sample, Tangent, TrajectoryWeights, Values, Weights,
+    self, FiniteHorizon, Momentum, Regulator, RiccatiError, Sample, Tangent, TrajectoryWeights,
+    Values, Weights, WeightsError,
 };
-use plantd_models::{Initial, Linearization, Model, Plant, Settings, State};
-use plantd_proto::v1;
+use plantd_models::{
+    Initial, InitialError, Linearization, Model, Plant, Settings, Spare, State, StepError,
+};
 
+use crate::core::channels::Origin;
 use crate::core::feedback::{Law, Room, Stage};
+use crate::core::inputs::{Inputs, at_operating_point};
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::core::workers::Abandoned;
-use crate::wire::convert::{self, Inputs, Start};
-use crate::wire::status::RpcError;
+use crate::core::workers::{Abandoned, WorkError};
 
 /// Acceleration, in m/s² or rad/s², below which a point counts as an equilibrium.
 const EQUILIBRIUM_DRIFT_MAX: f64 = 1e-4;
+
+/// Why there is no such regulator.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RegulatorError {
+    /// A step fails at the point or along the trajectory.
+    #[error("{error}")]
+    Step {
+        /// The step's error.
+        error: StepError,
+        /// Steps of the trajectory before it.
+        steps_taken: Option<usize>,
+    },
+    /// The point is no equilibrium.
+    #[error(
+        "the point is not an equilibrium: coordinate `{coordinate}` moves by {distance:e} in a step of \
+         {time_step_s} s"
+    )]
+    Moves {
+        /// The coordinate that moves most.
+        coordinate: String,
+        /// By how much, in a step.
+        distance: f64,
+        /// The step, s.
+        time_step_s: f64,
+    },
+    /// The plant cannot be put where the feedback is about.
+    #[error("{error}")]
+    Initial {
+        /// Field of the request.
+        field: &'static str,
+        /// Why not.
+        error: InitialError,
+    },
+    /// The trajectory belongs to another time step than the plant's.
+    #[error(
+        "the trajectory of the feedback was given for a time step of {given_s} s; the plant's is \
+         {present_s} s now: call SetFeedback with a trajectory for it"
+    )]
+    TimeStepChanged {
+        /// That of the trajectory, s.
+        given_s: f64,
+        /// The plant's, s.
+        present_s: f64,
+    },
+    /// There are no weights.
+    #[error("are missing")]
+    NoWeights,
+    /// A weight has the wrong size or definiteness.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The Riccati equation has no solution, or it was not found.
+    #[error(transparent)]
+    Riccati(#[from] RiccatiError),
+    /// It needs more memory than there may be.
+    #[error(transparent)]
+    Limit(#[from] LimitExceeded),
+    /// It was not computed.
+    #[error(transparent)]
+    Work(#[from] WorkError),
+}
+
+impl From<StepError> for RegulatorError {
+    fn from(error: StepError) -> Self {
+        Self::Step { error, steps_taken: None }
+    }
+}
+
+/// Where a state was refused.
+fn refused(field: &'static str) -> impl Fn(InitialError) -> RegulatorError {
+    move |error| RegulatorError::Initial { field, error }
+}
+
+/// The numbers of a matrix, row by row.
+fn row_major(matrix: &DMatrix<f64>) -> Vec<f64> {
+    matrix.transpose().as_slice().to_vec()
+}
 
 /// On which space a regulator is solved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,17 +107,6 @@ pub enum Constraints {
 }
 
 impl Constraints {
-    /// From a request.
-    pub fn new(handling: i32) -> Result<Self, RpcError> {
-        match v1::ConstraintHandling::try_from(handling) {
-            Ok(v1::ConstraintHandling::Unspecified | v1::ConstraintHandling::Manifold) => {
-                Ok(Self::Manifold)
-            }
-            Ok(v1::ConstraintHandling::Full) => Ok(Self::Full),
-            Err(_) => Err(RpcError::field("constraints", format!("{handling} is no such space"))),
-        }
-    }
-
     /// The tangent space of the constraints at the plant's state, if it is to be used.
     pub fn tangent(self, plant: &mut Plant) -> Option<Tangent> {
         let d = plant.model().dimensions();
@@ -50,7 +117,7 @@ impl Constraints {
 
 /// Refuses a point that moves. Two steps: a momentum that does not belong to the point shows in the
 /// second at the latest.
-pub fn check_equilibrium(mut plant: Plant, u: &[f64]) -> Result<(), RpcError> {
+pub fn check_equilibrium(mut plant: Plant, u: &[f64]) -> Result<(), RegulatorError> {
     let time_step_s = plant.settings().time_step_s;
     let mut q = plant.q().to_vec();
     for _ in 0..2 {
@@ -61,13 +128,8 @@ pub fn check_equilibrium(mut plant: Plant, u: &[f64]) -> Result<(), RpcError> {
         let drift = distance / (time_step_s * time_step_s);
         if drift > EQUILIBRIUM_DRIFT_MAX {
             let coordinate = &plant.model().coordinates()[index].name;
-            let message = format!(
-                "the point is not an equilibrium: coordinate `{coordinate}` moves by {distance:e} \
-                 in a step of {time_step_s} s"
-            );
-            return Err(RpcError::precondition("NOT_AN_EQUILIBRIUM", "point", message)
-                .with("coordinate", coordinate)
-                .with("drift", distance));
+            let coordinate = coordinate.clone();
+            return Err(RegulatorError::Moves { coordinate, distance, time_step_s });
         }
         q.copy_from_slice(plant.q());
     }
@@ -87,7 +149,7 @@ pub fn at_state(
     weights: &Weights,
     momentum: Momentum,
     constraints: Constraints,
-) -> Result<Regulator, RpcError> {
+) -> Result<Regulator, RegulatorError> {
     let (a, b) = (linearization.a(), linearization.b());
     let pulled = projection(momentum, plant).map(|by_state| weights.pull_back(&by_state));
     let pulled = pulled.transpose()?;
@@ -105,7 +167,7 @@ pub fn about_point(
     weights: &Weights,
     momentum: Momentum,
     constraints: Constraints,
-) -> Result<Regulator, RpcError> {
+) -> Result<Regulator, RegulatorError> {
     check_equilibrium(plant.clone(), u)?;
     let mut linearization = Linearization::new(plant.model());
     plant.linearize(u, &mut linearization)?;
@@ -128,7 +190,7 @@ pub struct Memory {
 impl Memory {
     /// Refuses a trajectory whose matrices would need too much memory: A, B, the gain, the tangent
     /// space twice, weights, what pulls them back and what it makes of them, and value functions.
-    pub fn check(self, limits: &Limits, model: &Model) -> Result<(), RpcError> {
+    pub fn check(self, limits: &Limits, model: &Model) -> Result<(), RegulatorError> {
         let d = model.dimensions();
         let (nx, nu) = (d.state(), d.input());
         let tangents = if d.constraints > 0 { 2 * nx * nx } else { 0 };
@@ -172,7 +234,7 @@ impl Path {
         momentum: Momentum,
         constraints: Constraints,
         abandoned: &Abandoned,
-    ) -> Result<Self, RpcError> {
+    ) -> Result<Self, RegulatorError> {
         let mut linearization = Linearization::new(plant.model());
         let mut path = Self {
             states: Vec::new(),
@@ -185,7 +247,7 @@ impl Path {
             path.note_state(&mut plant, momentum, constraints);
             plant
                 .step_and_linearize(inputs.get(k), &mut linearization)
-                .map_err(|error| RpcError::from(error).with("steps_taken", k))?;
+                .map_err(|error| RegulatorError::Step { error, steps_taken: Some(k) })?;
             path.samples.push(Sample { a: linearization.a(), b: linearization.b() });
         }
         path.note_state(&mut plant, momentum, constraints);
@@ -203,7 +265,7 @@ impl Path {
         &self,
         weights: &TrajectoryWeights,
         values: Values,
-    ) -> Result<FiniteHorizon, RpcError> {
+    ) -> Result<FiniteHorizon, RegulatorError> {
         let is_projected = !self.projections.is_empty();
         let pulled = is_projected.then(|| weights.pull_back(&self.projections)).transpose()?;
         let weights = pulled.as_ref().unwrap_or(weights);
@@ -255,7 +317,7 @@ pub struct Spec {
     /// Time step for which a trajectory was given, s.
     pub time_step_s: f64,
     /// Along a trajectory: the request, from which all this comes.
-    pub given: Option<v1::SetFeedbackRequest>,
+    pub given: Option<Origin>,
 }
 
 impl Spec {
@@ -272,63 +334,69 @@ impl Spec {
         limits: &Limits,
         room: &Arc<Room>,
         abandoned: &Abandoned,
-    ) -> Result<Law, RpcError> {
+    ) -> Result<Law, RegulatorError> {
         match &self.reference {
             Reference::Gain(stage) => {
                 let room = room.reserve(numbers(model, 1, 0))?;
                 Ok(Law { stages: vec![stage.clone()], end: None, room })
             }
             Reference::OperatingPoint(name) => {
-                let source = v1::point::Source::OperatingPoint(name.clone());
-                let point = v1::Point { source: Some(source) };
-                let (plant, u) = convert::point(Some(point), model, settings)?;
+                let point = at_operating_point(model, settings, name);
+                let (plant, u) = point.map_err(refused("point.operating_point"))?;
                 self.solve_about(plant, &u, room)
             }
             Reference::Point { start, u } => {
-                let start = Start::Initial(start.clone());
-                let plant = convert::plant(model, settings, &start, "point")?;
+                let spare = Spare::new(Arc::clone(model), settings).map_err(refused("point"))?;
+                let plant = spare.start(start).map_err(refused("point"))?;
                 self.solve_about(plant, u, room)
             }
             Reference::Trajectory { start, inputs } => {
                 if settings.time_step_s != self.time_step_s {
-                    return Err(RpcError::time_step_changed(
-                        self.time_step_s,
-                        settings.time_step_s,
-                    ));
+                    let (given_s, present_s) = (self.time_step_s, settings.time_step_s);
+                    return Err(RegulatorError::TimeStepChanged { given_s, present_s });
                 }
-                let missing = || RpcError::field("weights", "are missing");
+                let missing = || RegulatorError::NoWeights;
                 let weights = self.trajectory_weights.as_ref().ok_or_else(missing)?;
                 let (steps, stages) = (inputs.count(), weights.steps().unwrap_or(1));
                 let momentum = self.momentum;
                 Memory { steps, stages, momentum, values: Values::Drop }.check(limits, model)?;
                 // The request has the weights once more.
                 let room = room.reserve(numbers(model, steps, stages.saturating_mul(2)))?;
-                let start = Start::Initial(start.clone());
-                let plant = convert::plant(model, settings, &start, "trajectory.initial")?;
+                let field = "trajectory.initial";
+                let spare = Spare::new(Arc::clone(model), settings).map_err(refused(field))?;
+                let plant = spare.start(start).map_err(refused(field))?;
                 let path = Path::follow(plant, inputs, momentum, self.constraints, abandoned)?;
                 let solution = path.solve(weights, Values::Drop)?;
                 let mut feedforward = solution.feedforward.into_iter();
                 let mut states = path.states.into_iter().map(|state| state.x());
                 let stages = solution.gains.iter().zip(states.by_ref()).enumerate();
                 let stages = stages.map(|(k, (gain, x))| Stage {
-                    k: convert::matrix(gain).data,
+                    k: row_major(gain),
                     x,
                     u: inputs.get(k).to_vec(),
-                    feedforward: feedforward.next().map(convert::vector).unwrap_or_default(),
+                    feedforward: feedforward
+                        .next()
+                        .map(|u| u.as_slice().to_vec())
+                        .unwrap_or_default(),
                 });
                 Ok(Law { stages: stages.collect(), end: states.next(), room })
             }
         }
     }
 
-    fn solve_about(&self, mut plant: Plant, u: &[f64], room: &Arc<Room>) -> Result<Law, RpcError> {
-        let missing = || RpcError::field("weights", "are missing");
+    fn solve_about(
+        &self,
+        mut plant: Plant,
+        u: &[f64],
+        room: &Arc<Room>,
+    ) -> Result<Law, RegulatorError> {
+        let missing = || RegulatorError::NoWeights;
         let weights = self.weights.as_ref().ok_or_else(missing)?;
         let room = room.reserve(numbers(plant.model(), 1, 1))?;
         let regulator = about_point(&mut plant, u, weights, self.momentum, self.constraints)?;
         let stage = Stage {
-            k: convert::matrix(&regulator.gain).data,
-            x: convert::x(&plant),
+            k: row_major(&regulator.gain),
+            x: plant.state().x(),
             u: u.to_vec(),
             feedforward: Vec::new(),
         };

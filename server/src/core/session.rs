@@ -7,9 +7,7 @@ mod core;
 mod feedback;
 mod gate;
 mod lease;
-mod parameters;
 mod running;
-mod saved;
 pub(crate) mod tap;
 
 use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
@@ -18,11 +16,11 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
 use plantd_models::{
     Initial, InitialError, Model, Plant, Settings, Snapshot, SnapshotError, Spare, State,
 };
-use plantd_proto::v1::{self, MarkReason};
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 
-use crate::core::feedback::InForce;
+use crate::core::channels::ChannelMemory;
+use crate::core::feedback::{FeedbackInfo, InForce};
 use crate::core::frame::{Frame, record_words};
 use crate::core::limits::LimitExceeded;
 use crate::core::metrics::Metrics;
@@ -36,13 +34,32 @@ use crate::core::watch::{Relay, Subscription, Watchers};
 pub use self::core::{Core, Mechanics};
 use self::gate::Gate;
 pub use self::lease::{DriveError, DriverKind, Lease, LeaseHeld};
-pub use self::parameters::ParametersError;
 use self::running::Place;
-pub use self::running::{Run, RunStatus};
-pub use self::saved::PlantSnapshot;
+pub use self::running::{Run, RunError, RunStatus, StoppedBy};
+pub(crate) use self::tap::MarkReason;
 
 /// Records that the ring of a plant keeps: a quarter of a second at 1 kHz.
 const RING_RECORDS: usize = 256;
+
+/// Everything that a session's plant needs to go on bit for bit.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PlantSnapshot {
+    /// The plant.
+    pub plant: Snapshot,
+    /// What is under way in its channels and faults, if it has any.
+    pub channels: Option<ChannelMemory>,
+}
+
+/// What was promised when the method of a plant was chosen by a tolerance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Accuracy {
+    /// The tolerance.
+    pub tolerance: f64,
+    /// The error that was estimated.
+    pub error: f64,
+    /// Over how many periods.
+    pub periods: u32,
+}
 
 /// A plant as it is, to be shown.
 pub struct View {
@@ -53,7 +70,7 @@ pub struct View {
     /// Settings in force.
     pub settings: Settings,
     /// Feedback.
-    pub feedback: Option<v1::FeedbackInfo>,
+    pub feedback: Option<FeedbackInfo>,
     /// Numbers of the scene that were changed.
     pub parameters: Arc<Parameters>,
     /// What protects it.
@@ -70,11 +87,11 @@ pub struct Session {
     model: Arc<Model>,
     /// About how many instructions a step of order 2 takes.
     step_instructions: f64,
-    start: Snapshot,
+    pub(crate) start: Snapshot,
     start_state: State,
-    start_settings: Settings,
+    pub(crate) start_settings: Settings,
     /// Why the method is as it is, if it was chosen by a tolerance.
-    accuracy: Option<v1::Accuracy>,
+    accuracy: Option<Accuracy>,
     place: Mutex<Place>,
     /// How the plant is run; never held while a loop is waited for.
     run: Mutex<Run>,
@@ -120,7 +137,7 @@ impl Session {
         id: String,
         model_name: String,
         plant: Plant,
-        accuracy: Option<v1::Accuracy>,
+        accuracy: Option<Accuracy>,
         metrics: Arc<Metrics>,
         realtime: Arc<RealTime>,
     ) -> Arc<Self> {
@@ -183,7 +200,7 @@ impl Session {
     }
 
     /// What was promised when the method was chosen by a tolerance.
-    pub fn accuracy(&self) -> Option<v1::Accuracy> {
+    pub fn accuracy(&self) -> Option<Accuracy> {
         self.accuracy
     }
 
@@ -367,7 +384,7 @@ impl Session {
     fn replace_plant(
         self: &Arc<Self>,
         plant: Plant,
-        memory: Option<v1::ChannelMemory>,
+        memory: Option<ChannelMemory>,
     ) -> (State, f64) {
         let session = Arc::clone(self);
         // The former plant is dropped here, not in the core's hands.

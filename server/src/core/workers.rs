@@ -38,7 +38,6 @@ use self::queue::{Baton, May, Queue, Ticket};
 use crate::core::connection::Connection;
 use crate::core::limits::LimitExceeded;
 use crate::core::priority::Priority;
-use crate::wire::status::RpcError;
 
 /// How long a job keeps its turn while others wait for one.
 const TURN: Duration = Duration::from_millis(20);
@@ -62,6 +61,20 @@ pub(crate) fn beside_other_tasks<R>(compute: impl FnOnce() -> R) -> R {
     }
 }
 
+/// Why a computation has no result.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum WorkError {
+    /// Nobody waits for the result any more.
+    #[error("the caller has gone away")]
+    Cancelled,
+    /// Too many computations wait for a worker.
+    #[error(transparent)]
+    Limit(#[from] LimitExceeded),
+    /// The computation has panicked.
+    #[error("a computation broke off")]
+    BrokeOff,
+}
+
 /// Told to jobs that nobody waits for; also where a job lets others have their turn.
 pub struct Abandoned {
     token: CancellationToken,
@@ -79,7 +92,7 @@ impl fmt::Debug for Abandoned {
 impl Abandoned {
     /// Nobody waits for the result; a long job asks this every few milliseconds and ends early. May
     /// wait until other jobs have had their turn: ask it without holding a lock.
-    pub fn check(&self) -> Result<(), RpcError> {
+    pub fn check(&self) -> Result<(), WorkError> {
         self.check_caller()?;
         if self.turn_began.get().elapsed() >= TURN {
             self.pool.pass_on(self.id);
@@ -90,7 +103,7 @@ impl Abandoned {
 
     /// For a job in parts: true when this part has taken its time and others wait, an error when nobody
     /// waits for the result. Waits for nothing.
-    pub fn part_is_over(&self) -> Result<bool, RpcError> {
+    pub fn part_is_over(&self) -> Result<bool, WorkError> {
         self.check_caller()?;
         if self.turn_began.get().elapsed() < TURN {
             return Ok(false);
@@ -99,8 +112,8 @@ impl Abandoned {
         Ok(self.pool.keep_turn(self.id))
     }
 
-    fn check_caller(&self) -> Result<(), RpcError> {
-        if self.token.is_cancelled() { Err(RpcError::cancelled()) } else { Ok(()) }
+    fn check_caller(&self) -> Result<(), WorkError> {
+        if self.token.is_cancelled() { Err(WorkError::Cancelled) } else { Ok(()) }
     }
 }
 
@@ -133,33 +146,33 @@ impl Workers {
     }
 
     /// Runs a job. Dropping the returned future tells the job to stop.
-    pub async fn run<T: Send + 'static>(
+    pub async fn run<T: Send + 'static, E: From<WorkError> + Send + 'static>(
         &self,
-        job: impl FnOnce(&Abandoned) -> Result<T, RpcError> + Send + 'static,
-    ) -> Result<T, RpcError> {
+        job: impl FnOnce(&Abandoned) -> Result<T, E> + Send + 'static,
+    ) -> Result<T, E> {
         self.start(Admission::Bounded, Lane::Short, job).await
     }
 
     /// Runs the next part of a stream that was admitted: waits however long the queue is. The limit
     /// on streams bounds the queue.
-    pub async fn resume<T: Send + 'static>(
+    pub async fn resume<T: Send + 'static, E: From<WorkError> + Send + 'static>(
         &self,
-        job: impl FnOnce(&Abandoned) -> Result<T, RpcError> + Send + 'static,
-    ) -> Result<T, RpcError> {
+        job: impl FnOnce(&Abandoned) -> Result<T, E> + Send + 'static,
+    ) -> Result<T, E> {
         self.start(Admission::Granted, Lane::Short, job).await
     }
 
     /// Runs a long job part by part: `part` returns nothing when there is more to do and
     /// [`Abandoned::part_is_over`]. Between two parts it keeps neither a turn nor a thread.
-    pub(crate) async fn in_parts<T: Send + 'static>(
+    pub(crate) async fn in_parts<T: Send + 'static, E: From<WorkError> + Send + 'static>(
         &self,
         admission: Admission,
-        part: impl FnMut(&Abandoned) -> Result<Option<T>, RpcError> + Send + 'static,
-    ) -> Result<T, RpcError> {
+        part: impl FnMut(&Abandoned) -> Result<Option<T>, E> + Send + 'static,
+    ) -> Result<T, E> {
         let (mut admission, mut next) = (admission, part);
         loop {
             let mut part = next;
-            let job = move |abandoned: &Abandoned| Ok((part(abandoned)?, part));
+            let job = move |abandoned: &Abandoned| Ok::<_, E>((part(abandoned)?, part));
             let (outcome, rest) = self.start(admission, Lane::Long, job).await?;
             if let Some(outcome) = outcome {
                 return Ok(outcome);
@@ -169,12 +182,12 @@ impl Workers {
     }
 
     /// Runs a job that waits in a lane.
-    pub(crate) async fn start<T: Send + 'static>(
+    pub(crate) async fn start<T: Send + 'static, E: From<WorkError> + Send + 'static>(
         &self,
         admission: Admission,
         lane: Lane,
-        job: impl FnOnce(&Abandoned) -> Result<T, RpcError> + Send + 'static,
-    ) -> Result<T, RpcError> {
+        job: impl FnOnce(&Abandoned) -> Result<T, E> + Send + 'static,
+    ) -> Result<T, E> {
         let token = CancellationToken::new();
         let (sender, mut receiver) = oneshot::channel();
         let work = {
@@ -185,7 +198,7 @@ impl Workers {
                 let _ = sender.send(job(&Abandoned { token, pool, id, turn_began }));
             })
         };
-        let id = self.pool.submit(admission, lane, work)?;
+        let id = self.pool.submit(admission, lane, work).map_err(WorkError::from)?;
         let mut caller = Caller { pool: &self.pool, id, token, waits: true };
         let outcome = loop {
             match tokio::time::timeout(TURN_OVERDUE, &mut receiver).await {
@@ -196,7 +209,7 @@ impl Workers {
         caller.waits = false;
         outcome.unwrap_or_else(|_| {
             tracing::error!("a computation broke off");
-            Err(RpcError::internal("a computation broke off"))
+            Err(WorkError::BrokeOff.into())
         })
     }
 }
@@ -310,7 +323,7 @@ impl Pool {
         admission: Admission,
         lane: Lane,
         work: Work,
-    ) -> Result<u64, RpcError> {
+    ) -> Result<u64, LimitExceeded> {
         let connection = Connection::current();
         let mut state = self.state();
         state.last_id += 1;
@@ -327,7 +340,7 @@ impl Pool {
                 let refused = state.queue.remove(id);
                 drop(state);
                 drop(refused);
-                return Err(error.into());
+                return Err(error);
             }
         }
         Ok(id)
@@ -461,7 +474,7 @@ mod tests {
     }
 
     /// Computes until `stop` is set, asking whether somebody waits.
-    fn busy(stop: Arc<AtomicBool>) -> impl FnOnce(&Abandoned) -> Result<(), RpcError> {
+    fn busy(stop: Arc<AtomicBool>) -> impl FnOnce(&Abandoned) -> Result<(), WorkError> {
         move |abandoned| {
             while !stop.load(Ordering::Acquire) {
                 abandoned.check()?;
@@ -483,7 +496,7 @@ mod tests {
                         std::thread::yield_now();
                     }
                     let _ = stopped.send(());
-                    Ok(())
+                    Ok::<_, WorkError>(())
                 })
                 .await
         });
@@ -504,22 +517,22 @@ mod tests {
                     .run(move |_| {
                         let _ = started.send(());
                         let _ = wait.recv();
-                        Ok(())
+                        Ok::<_, WorkError>(())
                     })
                     .await
             }
         });
         has_started.await.unwrap();
-        let mut queued = Box::pin(workers.run(|_| Ok(())));
+        let mut queued = Box::pin(workers.run(|_| Ok::<_, WorkError>(())));
         assert!(futures::poll!(&mut queued).is_pending());
-        let refused = workers.run(|_| Ok(())).await.unwrap_err();
-        assert_eq!(refused.reason(), "LIMIT_EXCEEDED");
+        let refused = workers.run(|_| Ok::<_, WorkError>(())).await.unwrap_err();
+        assert!(matches!(refused, WorkError::Limit(_)));
         // What nobody waits for gives its place up.
         drop(queued);
-        let mut queued = Box::pin(workers.run(|_| Ok(())));
+        let mut queued = Box::pin(workers.run(|_| Ok::<_, WorkError>(())));
         assert!(futures::poll!(&mut queued).is_pending());
         // Parts of what was admitted are not counted.
-        let mut part = Box::pin(workers.resume(|_| Ok(())));
+        let mut part = Box::pin(workers.resume(|_| Ok::<_, WorkError>(())));
         assert!(futures::poll!(&mut part).is_pending());
         release.send(()).unwrap();
         queued.await.unwrap();
@@ -530,9 +543,9 @@ mod tests {
     #[tokio::test]
     async fn a_panic_in_a_job_is_an_internal_error() {
         let workers = workers(1, 1);
-        let fault = workers.run::<()>(|_| panic!("a defect")).await.unwrap_err();
-        assert_eq!(fault.reason(), "INTERNAL");
-        workers.run(|_| Ok(())).await.unwrap();
+        let fault = workers.run::<(), WorkError>(|_| panic!("a defect")).await.unwrap_err();
+        assert_eq!(fault, WorkError::BrokeOff);
+        workers.run(|_| Ok::<_, WorkError>(())).await.unwrap();
     }
 
     /// Jobs that would never end let a short one through, and each other.
@@ -560,7 +573,7 @@ mod tests {
             tokio::task::yield_now().await;
         }
         for _ in 0..3 {
-            workers.run(|_| Ok(())).await.unwrap();
+            workers.run(|_| Ok::<_, WorkError>(())).await.unwrap();
         }
         let running = |state: &State| state.begun.values().filter(|job| job.turn.is_some()).count();
         assert!(running(&workers.pool.state()) <= 2, "no more at a time than turns");
@@ -596,7 +609,7 @@ mod tests {
     #[tokio::test]
     async fn threads_end_with_the_pool() {
         let workers = workers(2, 4);
-        workers.run(|_| Ok(())).await.unwrap();
+        workers.run(|_| Ok::<_, WorkError>(())).await.unwrap();
         let pool = Arc::clone(&workers.pool);
         drop(workers);
         while pool.state().threads > 0 {

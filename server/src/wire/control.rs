@@ -14,10 +14,11 @@ use tonic::{Request, Response, Status};
 
 use super::answers::Answers;
 use super::{analysis, derivatives, kalman, optimize, reference, rollout};
+use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::regulator::{self, Constraints, Memory, Path};
 use crate::core::workers::Abandoned;
-use crate::wire::convert::{self, Inputs, WeightFields};
+use crate::wire::convert::{self, WeightFields};
 use crate::wire::hub::Hub;
 use crate::wire::status::RpcError;
 

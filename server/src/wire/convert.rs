@@ -7,8 +7,8 @@ use nalgebra::{Complex, DMatrix, DVector};
 use plantd_models::control::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
 use plantd_models::scene::Signal;
 use plantd_models::{
-    Diagnostics, Dimensions, Energy, ForceSplit, Initial, InitialError, Linearization, Model,
-    Plant, Precision, Scene, SceneError, Settings, Spare, State, StepReport, Violation,
+    Diagnostics, Dimensions, Energy, ForceSplit, Initial, Linearization, Model, Plant, Precision,
+    Scene, SceneError, Settings, Spare, State, StepReport, Violation,
 };
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
@@ -17,10 +17,12 @@ use v1::point::Source as PointSource;
 use v1::weight::Form as WeightForm;
 
 use crate::core::frame::Timing;
+use crate::core::inputs::{Inputs, at_operating_point, hold_input};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::parameters::Parameters;
 use crate::core::realtime::utc_ns;
-use crate::core::session::PlantSnapshot;
+use crate::core::regulator::Constraints;
+use crate::core::session::{Accuracy, Core, PlantSnapshot};
 use crate::core::workers::Abandoned;
 use crate::wire::status::RpcError;
 
@@ -175,6 +177,37 @@ pub fn outputs(y: &[f64], lost: &[f64]) -> Option<v1::Outputs> {
     (!lost.is_empty()).then(outputs)
 }
 
+/// What the output channels of a plant deliver, if there are any.
+pub fn core_outputs(core: &Core) -> Option<v1::Outputs> {
+    let published = core.published();
+    outputs(published.outputs, published.lost)
+}
+
+/// What was promised of a method that a tolerance has chosen.
+pub fn accuracy(accuracy: Accuracy) -> v1::Accuracy {
+    let Accuracy { tolerance, error, periods } = accuracy;
+    v1::Accuracy { tolerance, error, periods }
+}
+
+/// The same from a saved plant.
+pub fn accuracy_of(accuracy: v1::Accuracy) -> Accuracy {
+    let v1::Accuracy { tolerance, error, periods } = accuracy;
+    Accuracy { tolerance, error, periods }
+}
+
+impl Constraints {
+    /// From a request.
+    pub fn new(handling: i32) -> Result<Self, RpcError> {
+        match v1::ConstraintHandling::try_from(handling) {
+            Ok(v1::ConstraintHandling::Unspecified | v1::ConstraintHandling::Manifold) => {
+                Ok(Self::Manifold)
+            }
+            Ok(v1::ConstraintHandling::Full) => Ok(Self::Full),
+            Err(_) => Err(RpcError::field("constraints", format!("{handling} is no such space"))),
+        }
+    }
+}
+
 /// When a state was there; `monotonic_ns` 0 means now.
 pub fn clocks(plant_s: f64, monotonic_ns: u64) -> v1::Clocks {
     let monotonic_ns = if monotonic_ns == 0 { self::monotonic_ns() } else { monotonic_ns };
@@ -291,7 +324,7 @@ pub fn accurate_plant(
     tolerance: f64,
     limits: &Limits,
     abandoned: &Abandoned,
-) -> Result<(Plant, v1::Accuracy), RpcError> {
+) -> Result<(Plant, Accuracy), RpcError> {
     let (name, limit) = ("settle_coordinates", limits.settle_coordinates);
     let count = model.dimensions().coordinates();
     LimitExceeded::check(name, limit, "coordinates to choose a method for", count)?;
@@ -302,7 +335,7 @@ pub fn accurate_plant(
         .choose_method(tolerance, &mut || abandoned.check().is_ok())?;
     let settings = Settings { order: choice.order, substeps: choice.substeps, ..settings };
     check_method(&settings, model, limits)?;
-    let accuracy = v1::Accuracy { tolerance, error: choice.error, periods: choice.periods };
+    let accuracy = Accuracy { tolerance, error: choice.error, periods: choice.periods };
     Ok((plant(model, settings, start, "initial")?, accuracy))
 }
 
@@ -316,14 +349,8 @@ pub fn point(
         None => Err(RpcError::field("point", "is missing")),
         Some(PointSource::Plant(_)) => Err(RpcError::field("point.plant", "is not for this call")),
         Some(PointSource::OperatingPoint(name)) => {
-            let field = "point.operating_point";
-            let input = model.operating_points().iter().find(|point| point.name == name);
-            let input = input.map(|point| point.u.clone()).ok_or_else(|| {
-                let kind = "operating point";
-                RpcError::from_initial(InitialError::Unknown { kind, name: name.clone() }, field)
-            })?;
-            let start = Start::Initial(Initial::OperatingPoint(name));
-            Ok((plant(model, settings, &start, field)?, input))
+            let point = at_operating_point(model, settings, &name);
+            point.map_err(|error| RpcError::from_initial(error, "point.operating_point"))
         }
         Some(PointSource::StateAndInput(given)) => {
             let field = "point.state_and_input.state";
@@ -366,31 +393,16 @@ pub fn trajectory_in(
     Ok((plant, inputs))
 }
 
-/// The input that exerts no force and leaves prescribed coordinates where they are.
-pub fn hold_input(plant: &Plant) -> Vec<f64> {
-    let mut input = vec![0.0; plant.model().dimensions().input()];
-    plant.hold_input(&mut input);
-    input
-}
-
-/// A sequence of inputs.
-#[derive(Clone, Debug)]
-pub struct Inputs {
-    columns: usize,
-    count: usize,
-    numbers: Vec<f64>,
-}
-
 impl Inputs {
     /// Checks a matrix whose rows are inputs of `columns` entries.
     pub fn new(field: &str, u: Option<v1::Matrix>, columns: usize) -> Result<Self, RpcError> {
-        let Some(u) = u else { return Ok(Self { columns, count: 0, numbers: Vec::new() }) };
+        let Some(u) = u else { return Ok(Self::from_numbers(columns, 0, Vec::new())) };
         check_shape(field, &u)?;
         if u.rows > 0 && u.cols as usize != columns {
             let problem = format!("has {} columns; {columns} are needed", u.cols);
             return Err(RpcError::field(format!("{field}.cols"), problem));
         }
-        Ok(Self { columns, count: u.rows as usize, numbers: u.data })
+        Ok(Self::from_numbers(columns, u.rows as usize, u.data))
     }
 
     /// The inputs of a trajectory: one row at least, and no more than a horizon may have.
@@ -401,32 +413,11 @@ impl Inputs {
         limits: &Limits,
     ) -> Result<Self, RpcError> {
         let inputs = Self::new(field, u, columns)?;
-        LimitExceeded::check("horizon", limits.horizon, "steps", inputs.count)?;
-        if inputs.count == 0 {
+        LimitExceeded::check("horizon", limits.horizon, "steps", inputs.count())?;
+        if inputs.count() == 0 {
             return Err(RpcError::field(field, "is missing: it needs one row at least"));
         }
         Ok(inputs)
-    }
-
-    /// The rows of a matrix.
-    pub fn from_rows(u: &DMatrix<f64>) -> Self {
-        let (count, columns) = u.shape();
-        Self { columns, count, numbers: u.transpose().as_slice().to_vec() }
-    }
-
-    /// Number of inputs.
-    pub fn count(&self) -> usize {
-        self.count
-    }
-
-    /// Input of step `k`.
-    pub fn get(&self, k: usize) -> &[f64] {
-        &self.numbers[k * self.columns..][..self.columns]
-    }
-
-    /// The last input.
-    pub fn last(&self) -> Option<&[f64]> {
-        self.count.checked_sub(1).map(|k| self.get(k))
     }
 }
 

@@ -345,7 +345,7 @@ impl Driving {
                 state: Some(state),
                 report: Some(convert::report(core.report())),
                 u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
-                outputs: core.outputs(),
+                outputs: convert::core_outputs(core),
                 ..Default::default()
             }
         });

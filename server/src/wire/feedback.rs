@@ -15,12 +15,14 @@ use v1::set_feedback_request::Reference as Form;
 
 use super::answers::{Answers, Messages};
 use super::plant::plant_info;
-use crate::core::feedback::{Feedback, GuardBound, InForce, Law, Mode, Stage};
+use crate::core::channels::Origin;
+use crate::core::feedback::{Feedback, FeedbackInfo, GuardBound, InForce, Law, Mode, Stage};
+use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
-use crate::core::regulator::{Constraints, Memory, Reference, Spec};
+use crate::core::regulator::{Constraints, Memory, Reference, RegulatorError, Spec};
 use crate::core::session::{Mechanics, Session};
-use crate::core::workers::Abandoned;
-use crate::wire::convert::{self, Inputs, WeightFields};
+use crate::core::workers::{Abandoned, WorkError};
+use crate::wire::convert::{self, WeightFields};
 use crate::wire::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -91,17 +93,18 @@ async fn solve_again(
     hub: &Arc<Hub>,
     spec: &Arc<Spec>,
     mechanics: Mechanics,
-) -> Result<Law, RpcError> {
+) -> Result<Law, RegulatorError> {
     let _permit = match spec.reference {
         Reference::Trajectory { .. } => {
             let permit = Arc::clone(&hub.trajectory_solves).acquire_owned().await;
-            Some(permit.map_err(|_| RpcError::shutting_down())?)
+            // It is never closed.
+            Some(permit.map_err(|_| WorkError::Cancelled)?)
         }
         _ => None,
     };
     let (solver, spec) = (Arc::clone(hub), Arc::clone(spec));
     let job = move |abandoned: &Abandoned| solve(&solver, &spec, &mechanics, abandoned);
-    hub.workers.resume(job).await
+    hub.workers.workers().resume(job).await
 }
 
 fn solve(
@@ -109,7 +112,7 @@ fn solve(
     spec: &Spec,
     mechanics: &Mechanics,
     abandoned: &Abandoned,
-) -> Result<Law, RpcError> {
+) -> Result<Law, RegulatorError> {
     let Mechanics { model, settings, .. } = mechanics;
     spec.solve(model, *settings, &hub.limits, &hub.feedback_room, abandoned)
 }
@@ -139,7 +142,7 @@ pub(crate) async fn set_feedback(
             if !request.stages.is_empty() && !is_trajectory {
                 return Err(RpcError::field("stages", "are for trajectories only"));
             }
-            let given = is_trajectory.then(|| request.clone());
+            let given = is_trajectory.then(|| Arc::new(request.clone()) as Origin);
             let constraints = Constraints::new(request.constraints)?;
             let reference = reference(&hub, request.reference, session.model_name(), &mechanics)?;
             let model = &mechanics.model;
@@ -179,7 +182,7 @@ pub(crate) async fn set_feedback(
     if is_outdated {
         recompute(Arc::clone(hub), session);
     }
-    Ok(v1::SetFeedbackResponse { feedback: Some(info) })
+    Ok(v1::SetFeedbackResponse { feedback: Some(feedback_info(info)) })
 }
 
 fn mode(mode: i32) -> Result<Mode, RpcError> {
@@ -323,6 +326,56 @@ pub(super) fn watch_gains(
     Ok(watcher.into_answers())
 }
 
+impl InForce {
+    /// The `index`-th message; `rotations` are those of the model.
+    pub fn gain(&self, index: usize, rotations: &[u32]) -> v1::Gain {
+        let rotations = rotations.to_vec();
+        let step = match self.law.end {
+            Some(_) => self.first_step.saturating_add(index as u64),
+            None => self.since_step,
+        };
+        let Some(stage) = self.law.stages.get(index) else {
+            let x_reference = self.law.end.clone().unwrap_or_default();
+            return v1::Gain { step, x_reference, rotations, ..Default::default() };
+        };
+        let (rows, cols) = (stage.u.len() as u32, stage.x.len() as u32);
+        v1::Gain {
+            step,
+            k: Some(v1::Matrix { rows, cols, data: stage.k.clone() }),
+            x_reference: stage.x.clone(),
+            u_reference: stage.u.clone(),
+            rotations,
+            feedforward: stage.feedforward.clone(),
+            ..Default::default()
+        }
+    }
+}
+
+/// What a client is told of a feedback.
+pub(crate) fn feedback_info(info: FeedbackInfo) -> v1::FeedbackInfo {
+    let FeedbackInfo { mode, revision, first_step, horizon, tripped, failure } = info;
+    let mode = match mode {
+        Mode::WatchOnly => v1::FeedbackMode::WatchOnly,
+        Mode::Replace => v1::FeedbackMode::Replace,
+        Mode::Add => v1::FeedbackMode::Add,
+        Mode::Guard => v1::FeedbackMode::Guard,
+    };
+    let (tripped_at_step, tripped_by) = tripped.unzip();
+    v1::FeedbackInfo {
+        mode: mode.into(),
+        revision,
+        first_step,
+        horizon: horizon as u32,
+        tripped_at_step,
+        tripped_by: tripped_by.unwrap_or_default(),
+        failure: failure.map(failure_message),
+    }
+}
+
+fn failure_message(error: Arc<RegulatorError>) -> v1::Failure {
+    RpcError::from(Arc::unwrap_or_clone(error)).into()
+}
+
 struct Watcher {
     hub: Arc<Hub>,
     session: Arc<Session>,
@@ -394,7 +447,7 @@ impl Watcher {
             gain,
             revision: self.revision,
             dropped: self.dropped,
-            failure: present.failure.map(|(_, failure)| failure),
+            failure: present.failure.map(|(_, failure)| failure_message(failure)),
             first_step: if present.law.end.is_some() { present.first_step } else { 0 },
             horizon: present.law.horizon() as u32,
         }))

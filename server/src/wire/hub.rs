@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use futures::{StreamExt, future, stream};
 use plantd_models::Plant;
-use plantd_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
@@ -18,9 +17,10 @@ use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::metrics::Metrics;
 use crate::core::priority::Priority;
 use crate::core::realtime::{RealTime, RealTimeSettings};
-use crate::core::session::Session;
+use crate::core::session::{Accuracy, Session};
 use crate::core::workers::Workers;
 use crate::wire::answers::Answers;
+use crate::wire::jobs::Jobs;
 use crate::wire::link::{LinkError, LinkHost, LinkInfo};
 use crate::wire::record::Recordings;
 use crate::wire::state::StateDirectory;
@@ -33,13 +33,13 @@ pub struct Hub {
     /// Metrics.
     pub metrics: Arc<Metrics>,
     /// Workers for long computations, at low priority.
-    pub workers: Workers,
+    pub workers: Jobs,
     /// Workers for what belongs to the running of plants, at the usual priority: long computations do
     /// not keep it waiting.
-    pub attendants: Workers,
+    pub attendants: Jobs,
     /// Workers for steps in lockstep that take long, alone or together: the attendants stay free for
     /// others.
-    pub steppers: Workers,
+    pub steppers: Jobs,
     /// Models.
     pub catalog: Catalog,
     /// Permits to hold a trajectory's regulator, filter or optimisation in memory.
@@ -72,11 +72,13 @@ impl Hub {
     ) -> Self {
         let metrics = Arc::new(Metrics::default());
         let realtime = RealTime::new(realtime, &metrics);
-        let usual = |name| Workers::new(name, worker_count, limits.queued_jobs, Priority::Normal);
+        let pool = |name, priority| {
+            Jobs::new(Workers::new(name, worker_count, limits.queued_jobs, priority))
+        };
         Self {
-            workers: Workers::new("worker", worker_count, limits.queued_jobs, priority),
-            attendants: usual("attendant"),
-            steppers: usual("stepper"),
+            workers: pool("worker", priority),
+            attendants: pool("attendant", Priority::Normal),
+            steppers: pool("stepper", Priority::Normal),
             catalog: Catalog::new(limits.models, Arc::clone(&metrics)),
             trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
             feedback_room: Room::new(
@@ -127,7 +129,7 @@ impl Hub {
         id: String,
         model_name: String,
         plant: Plant,
-        accuracy: Option<v1::Accuracy>,
+        accuracy: Option<Accuracy>,
     ) -> Result<Arc<Session>, RpcError> {
         let mut plants = self.plants();
         let id = if id.is_empty() { free_id(&plants) } else { id };

@@ -8,10 +8,11 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::analysis::Outputs;
 use super::control::{at_point, check_linearization, model_and_settings};
+use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::regulator::{Constraints, Path, check_equilibrium};
 use crate::core::workers::Abandoned;
-use crate::wire::convert::{self, Inputs};
+use crate::wire::convert;
 use crate::wire::hub::Hub;
 use crate::wire::status::RpcError;
 

@@ -124,7 +124,8 @@ impl v1::model_service_server::ModelService for ModelService {
         &self,
         request: Request<v1::DeleteModelRequest>,
     ) -> Result<Response<v1::DeleteModelResponse>, Status> {
-        self.hub.catalog.remove(&request.into_inner().name)?;
+        let name = request.into_inner().name;
+        self.hub.catalog.remove(&name).map_err(RpcError::from)?;
         Ok(Response::new(v1::DeleteModelResponse {}))
     }
 

@@ -111,7 +111,8 @@ where
             _open: request.extensions().get::<Arc<Place>>().cloned().map(Place::call),
         };
         let limits = Arc::clone(&self.layer.limits);
-        let connection = Connection::of(request.extensions());
+        let place = request.extensions().get::<Arc<Place>>();
+        let connection = Connection::numbered(place.map_or(0, |place| place.id() + 1));
         let unfinished = &self.layer.unfinished;
         let response = self.inner.call(request.map(|body| unfinished.follow(call.method, body)));
         Box::pin(async move {

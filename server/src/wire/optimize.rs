@@ -18,9 +18,10 @@ use v1::optimize_trajectory_response::Response as Answer;
 
 use super::answers::Answers;
 use super::control::model_and_settings;
+use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::Abandoned;
-use crate::wire::convert::{self, Inputs, WeightFields};
+use crate::wire::convert::{self, WeightFields};
 use crate::wire::hub::Hub;
 use crate::wire::status::RpcError;
 

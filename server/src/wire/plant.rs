@@ -10,10 +10,11 @@ use tonic::{Request, Response, Status, Streaming};
 use super::answers::{Answers, cut_page};
 use super::drive::DriveStream;
 use super::{feedback, run, watch};
+use crate::core::inputs::{Inputs, hold_input};
 use crate::core::limits::LimitExceeded;
 use crate::core::session::{Core, DriverKind, Lease, PlantSnapshot, Session, View};
 use crate::core::workers::{Abandoned, Admission};
-use crate::wire::convert::{self, Inputs, Start};
+use crate::wire::convert::{self, Start};
 use crate::wire::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -110,7 +111,7 @@ impl PlantService {
                 return Ok(response);
             }
         }
-        let part = move |abandoned: &Abandoned| steps.go_on(|| abandoned.part_is_over());
+        let part = move |abandoned: &Abandoned| steps.go_on(|| Ok(abandoned.part_is_over()?));
         self.hub.steppers.in_parts(Admission::Bounded, part).await
     }
 
@@ -159,7 +160,7 @@ impl Steps {
         let held = match plan.inputs.last() {
             Some(last) => last.to_vec(),
             None => lease
-                .look(|core| convert::hold_input(core.plant()))
+                .look(|core| hold_input(core.plant()))
                 .map_err(|error| RpcError::from_drive(error, lease.session()))?,
         };
         let mut response = v1::StepResponse::default();
@@ -196,7 +197,7 @@ impl Steps {
                 response.report = Some(convert::report(core.report()));
                 response.clocks = Some(convert::clocks(core.plant().time_s(), 0));
                 response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
-                response.outputs = core.outputs();
+                response.outputs = convert::core_outputs(core);
             }
         };
         let impulse = if k < plan.impulses.count() { plan.impulses.get(k) } else { &[] };
@@ -222,8 +223,8 @@ fn info(session: &Session, view: View) -> v1::PlantInfo {
         state: Some(convert::state(&view.state, view.time_s)),
         driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
         link_open: session.link_open(),
-        feedback: view.feedback,
-        accuracy: session.accuracy(),
+        feedback: view.feedback.map(feedback::feedback_info),
+        accuracy: session.accuracy().map(convert::accuracy),
         run: Some(run::run_info(session)),
         parameters: convert::parameters(&view.parameters),
         safety: run::safety_info(&view.safety, view.frozen, session.model()),

@@ -9,10 +9,11 @@ use tokio::sync::OwnedSemaphorePermit;
 use v1::project_reference_response::Response as Answer;
 
 use super::control::model_and_settings;
+use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::regulator::{Constraints, Memory, Path};
 use crate::core::workers::Abandoned;
-use crate::wire::convert::{self, Inputs, Start};
+use crate::wire::convert::{self, Start};
 use crate::wire::hub::Hub;
 use crate::wire::status::RpcError;
 

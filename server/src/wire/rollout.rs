@@ -8,10 +8,12 @@ use plantd_proto::v1;
 
 use super::answers::Answers;
 use super::control::model_and_settings;
+use crate::core::inputs::{Inputs, hold_input};
 use crate::core::limits::LimitExceeded;
-use crate::core::workers::{Abandoned, Admission, Workers};
-use crate::wire::convert::{self, Inputs, Start};
+use crate::core::workers::{Abandoned, Admission};
+use crate::wire::convert::{self, Start};
 use crate::wire::hub::Hub;
+use crate::wire::jobs::Jobs;
 use crate::wire::status::RpcError;
 
 /// A checked request.
@@ -59,7 +61,7 @@ impl Rollout {
     }
 
     /// The answers, in the order in which the cases end.
-    pub(super) fn run(self, workers: Workers) -> Answers<v1::RolloutResponse> {
+    pub(super) fn run(self, workers: Jobs) -> Answers<v1::RolloutResponse> {
         let parallel = workers.count();
         let shared = self.shared;
         let answers = stream::iter(self.cases).map(move |case| {
@@ -94,7 +96,7 @@ impl Simulation {
 
     /// Goes on for a part; the answer when the case has ended.
     fn go_on(&mut self, abandoned: &Abandoned) -> Result<Option<v1::RolloutResponse>, RpcError> {
-        match self.simulate(|| abandoned.part_is_over()) {
+        match self.simulate(|| Ok(abandoned.part_is_over()?)) {
             Ok(false) => return Ok(None),
             Ok(true) => {}
             Err(fault) if fault.reason() == "CANCELLED" => return Err(fault),
@@ -113,7 +115,7 @@ impl Simulation {
                 let plant = convert::plant(&shared.model, shared.settings, &case.start, &field)?;
                 *held = match case.inputs.last() {
                     Some(last) => last.to_vec(),
-                    None => convert::hold_input(&plant),
+                    None => hold_input(&plant),
                 };
                 self.plant.insert(Box::new(plant))
             }

@@ -93,7 +93,7 @@ pub(crate) fn run_info(session: &Session) -> v1::RunInfo {
         settings: Some(v1::RunSettings { pace: pace.into(), speed, input }),
         running: run.is_running,
         steps_left,
-        stopped_by: run.stopped_by,
+        stopped_by: run.stopped_by.map(|why| RpcError::from_stopped(why, session).into()),
     }
 }
 

@@ -194,9 +194,7 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     };
     let start_model = match hub.catalog.get(&info.model) {
         Ok(entry) if entry.model.digest() == start_model.digest() => entry.model,
-        Err(_) if !model.name.is_empty() => {
-            hub.catalog.insert(&info.model, start_model).map_err(sentence)?.model
-        }
+        Err(_) if !model.name.is_empty() => hub.catalog.insert(&info.model, start_model)?.model,
         _ => start_model,
     };
     let spare = |model: &Arc<Model>, settings| -> Result<Spare> {
@@ -216,7 +214,8 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     } else {
         present.restore(&snapshot.plant)?
     };
-    let session = hub.insert(id.to_owned(), info.model, start, info.accuracy).map_err(sentence)?;
+    let accuracy = info.accuracy.map(convert::accuracy_of);
+    let session = hub.insert(id.to_owned(), info.model, start, accuracy).map_err(sentence)?;
     let changed = info.parameters.into_iter().map(|p| (p.path, p.value)).collect();
     session.resume(present, changed);
     let warn = |what: &str, fault: RpcError| {

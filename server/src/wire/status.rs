@@ -60,6 +60,7 @@ use plantd_proto::v1;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
+use crate::core::failure::step_error_reason;
 use crate::core::limits::LimitExceeded;
 use crate::core::realtime::watchdog::{Quantity, Trip};
 use crate::core::session::{DriveError, LeaseHeld, Session};
@@ -219,15 +220,6 @@ impl RpcError {
         Self::precondition("START_PASSED", "fault.start", message)
             .with("start_step", start)
             .with("step", step)
-    }
-
-    /// A trajectory belongs to another time step than the plant's.
-    pub fn time_step_changed(given_s: f64, present_s: f64) -> Self {
-        let message = format!(
-            "the trajectory of the feedback was given for a time step of {given_s} s; the plant's is \
-             {present_s} s now: call SetFeedback with a trajectory for it"
-        );
-        Self::precondition("TIME_STEP_CHANGED", "trajectory", message)
     }
 
     /// The server ends.
@@ -408,21 +400,6 @@ impl From<SnapshotError> for RpcError {
     }
 }
 
-/// The reason of a failed step, as in `google.rpc.ErrorInfo`.
-pub fn step_error_reason(error: &StepError) -> &'static str {
-    match error {
-        StepError::Dimension { .. } => "INPUT_DIMENSION",
-        StepError::InputNotFinite { .. } => "INPUT_NOT_FINITE",
-        StepError::NotConverged { .. } => "NOT_CONVERGED",
-        StepError::NotFinite { .. } => "MOTION_NOT_FINITE",
-        StepError::TooFast { .. } => "TOO_FAST",
-        StepError::Singular { .. } => "SINGULAR",
-        StepError::SingularConstraints { .. } => "SINGULAR_CONSTRAINTS",
-        StepError::InconsistentConstraints { .. } => "INCONSISTENT_CONSTRAINTS",
-        StepError::TooManySteps { .. } => "TOO_MANY_STEPS",
-    }
-}
-
 impl From<StepError> for RpcError {
     fn from(error: StepError) -> Self {
         let reason = step_error_reason(&error);
@@ -495,15 +472,6 @@ impl RpcError {
     pub fn input_lost(id: &str) -> Self {
         let why = format!("plant `{id}` has no valid input, and was to stop then");
         Self::precondition("INPUT_LOST", id, why)
-    }
-
-    /// No thread for a loop.
-    pub fn no_loop(error: std::io::Error) -> Self {
-        Self::new(
-            Code::Unavailable,
-            "LOOP_FAILED",
-            format!("no thread for plants that run: {error}"),
-        )
     }
 }
 

@@ -4,14 +4,11 @@
 //! is active is a function of the step alone.
 
 use std::ops::Range;
-use std::sync::Arc;
 
 use plantd_models::{Plant, Site};
-use plantd_proto::v1;
-use prost::Message as _;
-use v1::fault_spec::{Pattern as GivenPattern, Start as GivenStart};
 
-use super::noise::{self, Stream};
+use super::Origin;
+use super::noise::Stream;
 
 /// When a fault is active, in steps of the plant. On inputs, and of pushes, `k` is the step from `k` to
 /// `k + 1`; on outputs the measurement at `k`.
@@ -129,7 +126,7 @@ impl Start {
 #[derive(Clone, Debug)]
 pub(crate) struct Line {
     pub(crate) range: Range<usize>,
-    disturbance: Disturbance,
+    pub(crate) disturbance: Disturbance,
     /// The last values given.
     held: Vec<f64>,
     /// Those after the step that is tried.
@@ -216,6 +213,21 @@ struct Draw {
     stream: Stream,
 }
 
+/// What is under way in a fault.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FaultMemory {
+    /// Number of the fault.
+    pub id: u64,
+    /// Hash of what was asked for, and its start: only the same fault goes on with it.
+    pub fault: u64,
+    /// What it keeps from one step to the next.
+    pub numbers: Vec<f64>,
+    /// It was active in the last step.
+    pub active: bool,
+    /// How often it has begun.
+    pub beginnings: u64,
+}
+
 /// A fault of a plant.
 #[derive(Clone, Debug)]
 pub(crate) struct Injected {
@@ -223,9 +235,9 @@ pub(crate) struct Injected {
     pub(crate) schedule: Schedule,
     pub(crate) effect: Effect,
     pub(crate) start: Start,
-    duration: Option<u64>,
+    pub(crate) duration: Option<u64>,
     /// As it was asked for.
-    pub(crate) given: Arc<v1::FaultSpec>,
+    pub(crate) given: Origin,
     /// Hash of that.
     hash: u64,
     stream: Stream,
@@ -244,7 +256,8 @@ impl Injected {
         start: Start,
         duration: Option<u64>,
         pattern: Pattern,
-        given: v1::FaultSpec,
+        given: Origin,
+        hash: u64,
     ) -> Self {
         Self {
             id,
@@ -252,8 +265,8 @@ impl Injected {
             effect,
             start,
             duration,
-            hash: noise::hash(&given.encode_to_vec()),
-            given: Arc::new(given),
+            hash,
+            given,
             stream: Stream::of("fault").part(id as usize),
             is_active: false,
             has_changed: false,
@@ -332,60 +345,16 @@ impl Injected {
         }
     }
 
-    /// What a client is told at a step of the plant.
-    pub(crate) fn info(&self, step: u64, time_step_s: f64) -> v1::FaultInfo {
-        let seconds = |steps: u64| steps as f64 * time_step_s;
-        let mut fault = (*self.given).clone();
-        fault.start = Some(GivenStart::StartStep(self.schedule.start));
-        fault.duration_s = self.duration.map_or(0.0, seconds);
-        match (&mut fault.pattern, self.schedule.pattern) {
-            (Some(GivenPattern::Intermittent(given)), Pattern::Intermittent { period, on }) => {
-                given.period_s = seconds(period);
-                given.duty = on as f64 / period as f64;
-            }
-            (Some(GivenPattern::Chance(given)), Pattern::Random { window, .. }) => {
-                given.window_s = seconds(window);
-            }
-            _ => {}
-        }
-        if let (
-            Some(v1::fault_spec::Kind::Delay(given)),
-            Effect::Input(line) | Effect::Output { line, .. },
-        ) = (&mut fault.kind, &self.effect)
-            && let Disturbance::Delay(steps) = line.disturbance
-        {
-            given.delay_s = seconds(steps as u64);
-        }
-        // The last of its steps that can have been taken.
-        let last = match self.effect {
-            Effect::Output { .. } => Some(step),
-            _ => step.checked_sub(1),
-        };
-        let phase = match last {
-            _ if self.is_active => v1::FaultPhase::Active,
-            Some(last) if self.schedule.is_over(last.saturating_add(1)) => v1::FaultPhase::Over,
-            Some(last) if last >= self.schedule.start => v1::FaultPhase::Paused,
-            _ => v1::FaultPhase::Waiting,
-        };
-        v1::FaultInfo {
-            id: self.id,
-            fault: Some(fault),
-            phase: phase.into(),
-            beginnings: self.beginnings,
-            refused: false,
-        }
-    }
-
     /// What it keeps from one step to the next.
-    pub(super) fn memory(&mut self) -> v1::FaultMemory {
+    pub(super) fn memory(&mut self) -> FaultMemory {
         let fault = self.hash ^ self.schedule.start;
         let (active, beginnings) = (self.is_active, self.beginnings);
         let numbers = self.numbers_mut().map(|number| *number).collect();
-        v1::FaultMemory { id: self.id, fault, numbers, active, beginnings }
+        FaultMemory { id: self.id, fault, numbers, active, beginnings }
     }
 
     /// Goes on with what it kept, if it was this one.
-    pub(super) fn recall(&mut self, memory: &v1::FaultMemory) {
+    pub(super) fn recall(&mut self, memory: &FaultMemory) {
         if (self.id, self.hash ^ self.schedule.start) != (memory.id, memory.fault)
             || self.numbers_mut().count() != memory.numbers.len()
         {
@@ -479,9 +448,9 @@ mod tests {
     fn disturbed(disturbance: Disturbance) -> Vec<f64> {
         let line = Line::new(0..1, disturbance);
         let schedule = schedule(3, Some(6), Pattern::Always);
-        let (start, given) = (Start::Step(3), v1::FaultSpec::default());
+        let (start, given): (_, Origin) = (Start::Step(3), std::sync::Arc::new(()));
         let effect = Effect::Input(line);
-        let mut fault = Injected::new(1, effect, start, Some(3), Pattern::Always, given);
+        let mut fault = Injected::new(1, effect, start, Some(3), Pattern::Always, given, 0);
         fault.schedule = schedule;
         fault.begin(&[0.0], &[]);
         (0..8)

@@ -7,24 +7,36 @@
 //! Where a plant begins, is reset or restored, everything on its way has the value that it has there.
 
 pub(crate) mod actuator;
-mod commands;
-pub(crate) mod declare;
 pub(crate) mod fault;
 pub(crate) mod noise;
 pub(crate) mod sensor;
 pub(crate) mod timeline;
 
+use std::any::Any;
 use std::sync::Arc;
 
 use plantd_models::{Model, Plant, Site};
-use plantd_proto::v1;
-use prost::Message as _;
 
 use self::actuator::Actuator;
-use self::fault::{Effect, Injected};
+use self::fault::{Effect, FaultMemory, Injected};
 use self::sensor::{Instant, Sensor};
 use self::timeline::{Set, Timeline};
 use crate::core::parameters::Parameters;
+
+/// What channels, a fault or a feedback were made from, as whoever declared them keeps it. The core hands
+/// it back and does not look into it.
+pub type Origin = Arc<dyn Any + Send + Sync>;
+
+/// What is under way in the channels and faults of a plant.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ChannelMemory {
+    /// Hash of what was declared: only the same channels go on with it.
+    pub declared: u64,
+    /// What the channels keep from one step to the next, and what they deliver.
+    pub numbers: Vec<f64>,
+    /// What is under way in faults.
+    pub faults: Vec<FaultMemory>,
+}
 
 /// The channels and faults of a plant.
 #[derive(Clone, Debug)]
@@ -36,9 +48,9 @@ pub struct Channels {
     /// Of faults that change parameters.
     pub(crate) timeline: Option<Box<Timeline>>,
     /// What they were made from.
-    pub(crate) declared: Arc<v1::Channels>,
+    pub(crate) declared: Origin,
     /// The same with times in whole steps.
-    pub(crate) info: Arc<v1::ChannelsInfo>,
+    pub(crate) info: Origin,
     /// Hash of what was declared.
     hash: u64,
     output: Vec<f64>,
@@ -64,8 +76,9 @@ impl Channels {
         seed: u64,
         sensors: Vec<Sensor>,
         actuators: Vec<Actuator>,
-        declared: v1::Channels,
-        info: v1::ChannelsInfo,
+        declared: Origin,
+        info: Origin,
+        hash: u64,
         model: &Model,
     ) -> Self {
         let n = model.dimensions().coordinates();
@@ -85,9 +98,9 @@ impl Channels {
             actuators,
             faults: Vec::new(),
             timeline: None,
-            hash: noise::hash(&declared.encode_to_vec()),
-            declared: Arc::new(declared),
-            info: Arc::new(info),
+            hash,
+            declared,
+            info,
             rates,
         }
     }
@@ -153,8 +166,8 @@ impl Channels {
     }
 
     /// Everything that is under way.
-    pub(crate) fn memory(&mut self) -> v1::ChannelMemory {
-        v1::ChannelMemory {
+    pub(crate) fn memory(&mut self) -> ChannelMemory {
+        ChannelMemory {
             declared: self.hash,
             numbers: self.numbers_mut().map(|number| *number).collect(),
             faults: self.faults.iter_mut().map(Injected::memory).collect(),
@@ -162,7 +175,7 @@ impl Channels {
     }
 
     /// Goes on with what was under way, in the channels and faults that are those of then.
-    pub(crate) fn recall(&mut self, memory: &v1::ChannelMemory) {
+    pub(crate) fn recall(&mut self, memory: &ChannelMemory) {
         if self.hash == memory.declared && self.numbers_mut().count() == memory.numbers.len() {
             for (number, kept) in self.numbers_mut().zip(&memory.numbers) {
                 *number = *kept;

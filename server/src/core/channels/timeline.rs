@@ -6,12 +6,28 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use plantd_models::{Model, Plant, Settings, Site, Spare};
+use plantd_models::{InitialError, Model, Plant, Settings, Site, Spare};
 
 use super::fault::{Pattern, Schedule};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::parameters::{self, ChangeError, Parameters};
-use crate::wire::status::RpcError;
+
+/// Why changes of parameters cannot be made ready.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub(crate) enum TimelineError {
+    /// A change is refused.
+    #[error(transparent)]
+    Change(#[from] ChangeError),
+    /// Too many sets of changes, or too many changed numbers.
+    #[error(transparent)]
+    Limit(#[from] LimitExceeded),
+    /// The changed mechanics are none.
+    #[error(transparent)]
+    Plant(#[from] InitialError),
+    /// More than six changes come and go at the same time.
+    #[error("has too many changes that come and go at the same time")]
+    TooManyBlinking,
+}
 
 /// A set of changes, by the bits of their numbers.
 pub(crate) type Set = u64;
@@ -76,7 +92,7 @@ impl Timeline {
         changes: &[Change],
         sites: impl Fn(&Model) -> Vec<Site>,
         limits: &Limits,
-    ) -> Result<Self, RpcError> {
+    ) -> Result<Self, TimelineError> {
         let (mut entries, mut unchanged) = (Vec::new(), Parameters::new());
         for set in sets(changes, limits)? {
             let (mut model, mut parameters) =
@@ -84,7 +100,7 @@ impl Timeline {
             let chosen = changes.iter().enumerate().filter(|(bit, _)| set >> bit & 1 == 1);
             for (_, change) in chosen {
                 let changed = parameters::change(&model, &parameters, &change.numbers);
-                let changed = changed.map_err(refused)?;
+                let changed = changed?;
                 // The first change of a number in a set is one of the base.
                 for (path, former) in changed.former {
                     unchanged.entry(path).or_insert(former);
@@ -95,7 +111,7 @@ impl Timeline {
             LimitExceeded::check("parameters", limits.parameters, what, count)?;
             let (digest, sites) = (model.digest(), sites(&model));
             let plant = Spare::new(model, base.settings);
-            let plant = plant.map_err(|error| RpcError::from_initial(error, "fault.parameters"))?;
+            let plant = plant?;
             entries.push(Entry { set, digest, plant, parameters, sites });
         }
         let (base, unchanged) = (base.clone(), Arc::new(unchanged));
@@ -219,17 +235,8 @@ impl Timeline {
     }
 }
 
-fn refused(error: ChangeError) -> RpcError {
-    match error {
-        ChangeError::Path { index, problem } => {
-            RpcError::field(format!("fault.parameters.parameters[{index}].path"), problem)
-        }
-        error => error.into(),
-    }
-}
-
 /// The sets that can be in force, the empty one first.
-fn sets(changes: &[Change], limits: &Limits) -> Result<BTreeSet<Set>, RpcError> {
+fn sets(changes: &[Change], limits: &Limits) -> Result<BTreeSet<Set>, TimelineError> {
     let (name, limit) = ("parameter_sets", limits.parameter_sets);
     let what = "sets of changed parameters that can be in force together";
     LimitExceeded::check(name, limit.min(64), what, changes.len())?;
@@ -249,8 +256,7 @@ fn sets(changes: &[Change], limits: &Limits) -> Result<BTreeSet<Set>, RpcError> 
         }
         LimitExceeded::check(name, limit, what, 1 << blinking.len().min(BLINKING_MAX + 1))?;
         if blinking.len() > BLINKING_MAX {
-            let problem = "has too many changes that come and go at the same time";
-            return Err(RpcError::field("fault.parameters", problem));
+            return Err(TimelineError::TooManyBlinking);
         }
         for subset in 0..1_u64 << blinking.len() {
             let chosen = blinking.iter().enumerate().filter(|(i, _)| subset >> i & 1 == 1);

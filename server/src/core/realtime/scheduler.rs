@@ -15,8 +15,7 @@ use super::watchdog::WatchdogAction;
 use super::{CATCH_UP_NS, Live, Pace, Permit, RealTimeSettings, RunSettings, TimingCounts};
 use crate::core::frame::Timing;
 use crate::core::priority::{Priority, allow_cpus, sharpen_timers};
-use crate::core::session::{Core, DriveError, Session};
-use crate::wire::status::RpcError;
+use crate::core::session::{Core, DriveError, Session, StoppedBy};
 
 /// Overruns are told at most once in this time, ns.
 const OVERRUN_PERIOD_NS: u64 = 1_000_000_000;
@@ -240,7 +239,7 @@ pub(crate) enum Stop {
     /// The plant was deleted.
     Closed,
     /// It may not go on.
-    Refused(RpcError),
+    Refused(StoppedBy),
 }
 
 /// A plant that a loop runs.
@@ -339,7 +338,7 @@ impl Runner {
         if let Some(trip) = self.core.take_trip() {
             match trip.dog.action {
                 WatchdogAction::Freeze => {
-                    return Err(Stop::Refused(RpcError::watchdog(&self.session, &trip)));
+                    return Err(Stop::Refused(DriveError::Frozen(trip).into()));
                 }
                 WatchdogAction::Disconnect => self.session.revoke_lease(),
                 WatchdogAction::Reset => {}
@@ -391,7 +390,7 @@ impl Runner {
             Change::Back => self.core.note(EventKind::InputBack, 0, 0.0),
             Change::Stop => {
                 self.core.note(EventKind::InputLost, 0, age_s);
-                return Err(Stop::Refused(RpcError::input_lost(self.session.id())));
+                return Err(Stop::Refused(StoppedBy::InputLost));
             }
         }
         for counts in [&self.live.counts, &*self.all] {
@@ -419,7 +418,7 @@ impl Runner {
         if action == Some(WatchdogAction::Disconnect) {
             self.session.revoke_lease();
         }
-        Err(Stop::Refused(RpcError::from_drive(error, &self.session)))
+        Err(Stop::Refused(error.into()))
     }
 
     /// Counts the times of a step.

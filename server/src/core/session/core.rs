@@ -6,20 +6,18 @@ use plantd_models::{
     Initial, InitialError, Linearization, Model, Plant, Settings, Spare, State, StepError,
     StepReport,
 };
-use plantd_proto::v1::{self, MarkReason};
 
-use super::saved::PlantSnapshot;
-use super::tap::Tap;
+use super::PlantSnapshot;
+use super::tap::{MarkReason, Tap};
 use super::{DriveError, View};
-use crate::core::channels::Channels;
 use crate::core::channels::timeline::{Base, Timeline};
+use crate::core::channels::{ChannelMemory, Channels};
 use crate::core::feedback::Feedback;
 use crate::core::frame::{Published, Timing};
 use crate::core::parameters::Parameters;
 use crate::core::realtime::event::{EventKind, Events};
 use crate::core::realtime::watchdog::{Guard, Safety, Trip, WatchdogAction};
 use crate::core::ring::Ring;
-use crate::wire::convert;
 
 /// A plant with what its steps need. One owner at a time: whoever holds the session's lock, or the loop
 /// that runs the plant.
@@ -239,7 +237,7 @@ impl Core {
     }
 
     /// Lets a plant stand still because of its watchdog of that index, which found a value at a step.
-    pub(super) fn freeze(&mut self, watchdog: usize, value: f64, step: u64) {
+    pub(crate) fn freeze(&mut self, watchdog: usize, value: f64, step: u64) {
         let dogs = self.guard.as_ref().map(|guard| &guard.safety.watchdogs);
         let dog = dogs.and_then(|dogs| dogs.get(watchdog)).copied();
         self.frozen = dog.map(|dog| Trip { watchdog, dog, value, step });
@@ -378,12 +376,6 @@ impl Core {
         &self.plant
     }
 
-    /// What the output channels deliver, if there are any.
-    pub fn outputs(&self) -> Option<v1::Outputs> {
-        let published = self.published();
-        convert::outputs(published.outputs, published.lost)
-    }
-
     /// Report of the last step.
     pub fn report(&self) -> &StepReport {
         &self.report
@@ -395,7 +387,7 @@ impl Core {
     }
 
     /// The plant as it is, to be shown.
-    pub(super) fn view(&self) -> View {
+    pub(crate) fn view(&self) -> View {
         let (state, time_s) = self.state();
         View {
             state,
@@ -440,11 +432,7 @@ impl Core {
 
     /// Puts a copy of the plant in its place that is in another state, and what was under way there in its
     /// channels, as far as it is known.
-    pub(crate) fn replace_plant(
-        &mut self,
-        plant: Plant,
-        memory: Option<&v1::ChannelMemory>,
-    ) -> Spare {
+    pub(crate) fn replace_plant(&mut self, plant: Plant, memory: Option<&ChannelMemory>) -> Spare {
         plant.hold_input(&mut self.input);
         self.release();
         self.has_applied = false;

@@ -3,14 +3,12 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use plantd_proto::v1;
 use tokio::sync::watch::Receiver;
 
 use super::{Mechanics, Session};
-use crate::core::feedback::{Feedback, InForce, Law};
+use crate::core::feedback::{Feedback, FeedbackInfo, InForce, Law};
 use crate::core::limits::LimitExceeded;
-use crate::core::regulator::Spec;
-use crate::wire::status::RpcError;
+use crate::core::regulator::{RegulatorError, Spec};
 
 impl Session {
     /// Puts a feedback in force. `generation` is that of the mechanics for which its law was computed;
@@ -20,7 +18,7 @@ impl Session {
         mut feedback: Box<Feedback>,
         generation: u64,
         first_step: Option<u64>,
-    ) -> (v1::FeedbackInfo, bool) {
+    ) -> (FeedbackInfo, bool) {
         let session = Arc::clone(self);
         let (info, is_outdated, _former) = self.with_core(move |core| {
             core.revision += 1;
@@ -65,7 +63,7 @@ impl Session {
         self: &Arc<Self>,
         spec: &Arc<Spec>,
         generation: u64,
-        outcome: Result<Law, RpcError>,
+        outcome: Result<Law, RegulatorError>,
     ) {
         let (session, spec) = (Arc::clone(self), Arc::clone(spec));
         self.with_core(move |core| {
@@ -82,7 +80,7 @@ impl Session {
                     feedback.law = Arc::new(law);
                     feedback.failure = None;
                 }
-                Err(fault) => feedback.failure = Some(fault.into()),
+                Err(error) => feedback.failure = Some(Arc::new(error)),
             }
             session.in_force.send_replace(Some(feedback.in_force()));
         });

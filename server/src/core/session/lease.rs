@@ -11,10 +11,10 @@ use plantd_proto::link::monotonic_ns;
 
 use super::running::Place;
 use super::{Core, PlantSnapshot, Session, lock};
+use crate::core::failure::step_error_reason;
 use crate::core::realtime::event::EventKind;
 use crate::core::realtime::slot::Arrival;
 use crate::core::realtime::watchdog::{Trip, WatchdogAction};
-use crate::wire::status::step_error_reason;
 
 /// One step in this many is timed for the histogram of step times.
 const TIMED_STEP_INTERVAL: u64 = 64;

@@ -3,16 +3,43 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use plantd_proto::v1;
 use tokio::sync::watch::Receiver;
 
-use super::{Core, RING_RECORDS, Session, lock};
+use super::{Core, DriveError, RING_RECORDS, Session, lock};
 use crate::core::frame::record_words;
+use crate::core::limits::LimitExceeded;
 use crate::core::realtime::event::EventKind;
 use crate::core::realtime::{Handle, Live, Pace, Permit, RunSettings, Runner, Stop, TimingCounts};
 use crate::core::ring::Ring;
 use crate::core::watch::Relay;
-use crate::wire::status::RpcError;
+
+/// Why a plant stands still although nobody has paused it.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum StoppedBy {
+    /// Its step failed, or a watchdog holds it.
+    #[error(transparent)]
+    Drive(#[from] DriveError),
+    /// It had no valid input, and was to stop then.
+    #[error("no valid input")]
+    InputLost,
+}
+
+/// Why a plant is not run as it was asked for.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// The plant was deleted.
+    #[error("plant `{plant}` was deleted")]
+    Deleted {
+        /// Its id.
+        plant: String,
+    },
+    /// The system gave no thread for its loop.
+    #[error("no thread for plants that run: {0}")]
+    NoLoop(std::io::Error),
+    /// As many plants run by themselves as may.
+    #[error(transparent)]
+    Limit(#[from] LimitExceeded),
+}
 
 /// Where the core is.
 pub(super) enum Place {
@@ -43,7 +70,7 @@ pub struct Run {
     /// It may take steps.
     pub is_running: bool,
     /// Why it stands still although nobody has paused it.
-    pub stopped_by: Option<v1::Failure>,
+    pub stopped_by: Option<StoppedBy>,
     /// Counts the calls of [`Session::run`].
     pub number: u64,
 }
@@ -56,17 +83,17 @@ impl Session {
         settings: Option<RunSettings>,
         steps: u64,
         running_max: u64,
-    ) -> Result<u64, RpcError> {
+    ) -> Result<u64, RunError> {
         let _changing = lock(&self.changing_run);
         if self.is_closed() {
-            return Err(RpcError::plant_deleted(&self.id));
+            return Err(RunError::Deleted { plant: self.id.clone() });
         }
         let former = lock(&self.run).settings.clone();
         let settings = settings.unwrap_or_else(|| former.clone());
         let runs_by_itself = settings.pace != Pace::Lockstep;
         let threads = || Ok((self.realtime.pump()?, self.realtime.assign(settings.pace)?));
         let threads =
-            if runs_by_itself { Some(threads().map_err(RpcError::no_loop)?) } else { None };
+            if runs_by_itself { Some(threads().map_err(RunError::NoLoop)?) } else { None };
         // Its room is kept by a plant that has one.
         let permit = match (self.halt(), &threads) {
             (Some(permit), Some(_)) => Some(permit),
@@ -200,7 +227,7 @@ impl Session {
                 None
             }
             Stop::Closed => None,
-            Stop::Refused(fault) => Some(fault.into()),
+            Stop::Refused(why) => Some(why),
         };
         {
             // Both at once: whoever learns that it stands still can step it.

@@ -7,7 +7,6 @@ use std::thread::Thread;
 use std::time::{Duration, Instant};
 
 use plantd_models::{Plant, Snapshot};
-use plantd_proto::v1::MarkReason;
 
 use super::{Core, Session};
 use crate::core::channels::timeline::Announced;
@@ -25,6 +24,17 @@ const MARKS_MAX: usize = 256;
 /// Longest wait of a step for the recorder, and how often it looks.
 const WAIT_MAX: Duration = Duration::from_millis(if cfg!(test) { 50 } else { 5000 });
 const WAIT_STEP: Duration = Duration::from_micros(100);
+
+/// Why there is a mark.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum MarkReason {
+    /// It was asked for, or is due.
+    Checkpoint,
+    /// The plant was put into another state.
+    Reset,
+    /// Its parameters or its time step were changed.
+    Parameters,
+}
 
 /// The plant as it is between two steps.
 pub(crate) struct Mark {
@@ -116,7 +126,7 @@ impl Core {
     }
 
     /// Tells the recorder, if there is one, what happens between two steps.
-    pub(super) fn mark(&self, reason: MarkReason) {
+    pub(crate) fn mark(&self, reason: MarkReason) {
         if let Some(tap) = &self.tap {
             tap.push(self.marked(tap.ring.written(), reason));
         }

@@ -18,7 +18,7 @@ pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1:
         model: session.model_name().to_owned(),
         settings: Some(convert::settings_message(plant.settings())),
         state: Some(convert::plant_state(plant)),
-        accuracy: session.accuracy(),
+        accuracy: session.accuracy().map(convert::accuracy),
         parameters: all_parameters(&mark.announced.unchanged, &mark.parameters),
         run: Some(run_info(session)),
         ..Default::default()

@@ -20,7 +20,7 @@ use crate::core::parameters::Parameters;
 use crate::core::realtime::event::EventReader;
 use crate::core::ring::Reader;
 use crate::core::session::Session;
-use crate::core::session::tap::{Mark, Tap};
+use crate::core::session::tap::{Mark, MarkReason as Marked, Tap};
 use crate::wire::run::event_message;
 
 /// How often the ring is looked at.
@@ -231,7 +231,7 @@ impl Work {
         self.unchanged.extend(changed);
         self.announced = mark.announced.clone();
         let message = v1::MarkRecord {
-            reason: mark.reason.into(),
+            reason: reason(mark.reason).into(),
             step: mark.step,
             snapshot: mark.snapshot.to_bytes(),
             parameters: all_parameters(&self.unchanged, &mark.parameters),
@@ -310,6 +310,15 @@ impl Work {
         let lost = self.reader.lost() - self.lost;
         self.lost += lost;
         lost
+    }
+}
+
+/// Why there is a mark, as a message says it.
+fn reason(reason: Marked) -> MarkReason {
+    match reason {
+        Marked::Checkpoint => MarkReason::Checkpoint,
+        Marked::Reset => MarkReason::Reset,
+        Marked::Parameters => MarkReason::Parameters,
     }
 }
 

@@ -2,16 +2,18 @@
 
 use std::collections::HashSet;
 use std::ops::Range;
+use std::sync::Arc;
 
 use plantd_models::{Model, Site};
 use plantd_proto::v1;
+use prost::Message as _;
 use v1::fault_spec::{Kind, Pattern as GivenPattern, Start as GivenStart, Target};
 use v1::output_channel::Source as GivenSource;
 
-use super::Channels;
-use super::actuator::{Actuator, ActuatorSettings, Hold};
-use super::fault::{Disturbance, Effect, Injected, Line, Pattern, Start};
-use super::sensor::{Sensor, SensorSettings, Source};
+use crate::core::channels::actuator::{Actuator, ActuatorSettings, Hold};
+use crate::core::channels::fault::{Disturbance, Effect, Injected, Line, Pattern, Start};
+use crate::core::channels::sensor::{Sensor, SensorSettings, Source};
+use crate::core::channels::{Channels, noise};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::wire::status::RpcError;
 
@@ -268,7 +270,9 @@ pub(crate) fn channels(
     }
     let seed = declared.seed;
     let info = v1::ChannelsInfo { channels: Some(in_force), names: all_names };
-    let channels = Channels::new(seed, sensors, actuators, declared, info, model);
+    let hash = noise::hash(&declared.encode_to_vec());
+    let (declared, info) = (Arc::new(declared), Arc::new(info));
+    let channels = Channels::new(seed, sensors, actuators, declared, info, hash, model);
     check_numbers(channels.numbers(), limits)?;
     Ok(channels)
 }
@@ -327,7 +331,8 @@ pub(crate) fn fault(
             disturbed(&given, disturbance, model, info)?
         }
     };
-    Ok(Injected::new(id, effect, start, duration, pattern, given))
+    let hash = noise::hash(&given.encode_to_vec());
+    Ok(Injected::new(id, effect, start, duration, pattern, Arc::new(given), hash))
 }
 
 fn no_target(given: &v1::FaultSpec) -> Result<(), RpcError> {

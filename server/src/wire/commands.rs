@@ -7,17 +7,69 @@ use std::sync::Arc;
 
 use plantd_models::{Model, Settings, Site};
 use plantd_proto::v1;
-use v1::fault_spec::{Kind, Target};
+use v1::fault_spec::{Kind, Pattern as GivenPattern, Start as GivenStart, Target};
 use v1::output_channel::Source;
 
-use super::Channels;
-use super::declare::{self, check_numbers};
-use super::fault::{Effect, Injected, Pattern, Schedule, Start};
-use super::timeline::{Base, Change, Timeline};
+use crate::core::channels::fault::{Disturbance, Effect, Injected, Pattern, Schedule, Start};
+use crate::core::channels::timeline::{Base, Change, Timeline};
+use crate::core::channels::{Channels, Origin};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::realtime::event::EventKind;
 use crate::core::session::{Core, Session};
+use crate::wire::convert;
+use crate::wire::declare::{self, check_numbers};
 use crate::wire::status::RpcError;
+
+/// The message that something of the core was made from.
+pub(super) fn origin<M: Default + Send + Sync + 'static>(origin: &Origin) -> Arc<M> {
+    Arc::clone(origin).downcast().unwrap_or_default()
+}
+
+impl Injected {
+    /// What a client is told at a step of the plant.
+    pub(crate) fn info(&self, step: u64, time_step_s: f64) -> v1::FaultInfo {
+        let seconds = |steps: u64| steps as f64 * time_step_s;
+        let mut fault = v1::FaultSpec::clone(&origin(&self.given));
+        fault.start = Some(GivenStart::StartStep(self.schedule.start));
+        fault.duration_s = self.duration.map_or(0.0, seconds);
+        match (&mut fault.pattern, self.schedule.pattern) {
+            (Some(GivenPattern::Intermittent(given)), Pattern::Intermittent { period, on }) => {
+                given.period_s = seconds(period);
+                given.duty = on as f64 / period as f64;
+            }
+            (Some(GivenPattern::Chance(given)), Pattern::Random { window, .. }) => {
+                given.window_s = seconds(window);
+            }
+            _ => {}
+        }
+        if let (
+            Some(v1::fault_spec::Kind::Delay(given)),
+            Effect::Input(line) | Effect::Output { line, .. },
+        ) = (&mut fault.kind, &self.effect)
+            && let Disturbance::Delay(steps) = line.disturbance
+        {
+            given.delay_s = seconds(steps as u64);
+        }
+        // The last of its steps that can have been taken.
+        let last = match self.effect {
+            Effect::Output { .. } => Some(step),
+            _ => step.checked_sub(1),
+        };
+        let phase = match last {
+            _ if self.is_active => v1::FaultPhase::Active,
+            Some(last) if self.schedule.is_over(last.saturating_add(1)) => v1::FaultPhase::Over,
+            Some(last) if last >= self.schedule.start => v1::FaultPhase::Paused,
+            _ => v1::FaultPhase::Waiting,
+        };
+        v1::FaultInfo {
+            id: self.id,
+            fault: Some(fault),
+            phase: phase.into(),
+            beginnings: self.beginnings,
+            refused: false,
+        }
+    }
+}
 
 /// What a session's channels and faults were made from.
 struct Present {
@@ -58,8 +110,8 @@ impl Present {
             ..PresentFault::of(fault)
         };
         Self {
-            declared: Arc::clone(&channels.declared),
-            info: Arc::clone(&channels.info),
+            declared: origin(&channels.declared),
+            info: origin(&channels.info),
             faults: channels.faults.iter().map(fault).collect(),
             numbers: channels.numbers(),
             is_there: true,
@@ -83,7 +135,7 @@ impl PresentFault {
     fn of(fault: &Injected) -> Self {
         Self {
             id: fault.id,
-            given: Arc::clone(&fault.given),
+            given: origin(&fault.given),
             start: fault.start,
             schedule: fault.schedule,
             is_over: false,
@@ -124,18 +176,18 @@ impl Session {
         let (model, h) = (&present.base.model, present.base.settings.time_step_s);
         let mut channels = declare::channels(declared, model, h, limits)?;
         channels.timeline =
-            timeline(&present.base, &channels.declared, present.faults.iter(), limits)?;
+            timeline(&present.base, &origin(&channels.declared), present.faults.iter(), limits)?;
+        let info: Arc<v1::ChannelsInfo> = origin(&channels.info);
         // Where the faults of outputs go.
         let places: Vec<Option<(usize, Range<usize>)>> = present
             .faults
             .iter()
             .map(|fault| match &fault.given.target {
-                Some(Target::Output(name)) => declare::output(&channels.info, name),
+                Some(Target::Output(name)) => declare::output(&info, name),
                 _ => Some((0, 0..0)),
             })
             .collect();
         channels.faults.reserve_exact(places.len());
-        let info = Arc::clone(&channels.info);
         let (former, output) = self.with_core(move |core| {
             let mut former = core.channels.take();
             let faults = former.iter_mut().flat_map(|former| former.faults.drain(..));
@@ -167,8 +219,8 @@ impl Session {
     /// The channels with what they deliver.
     pub fn channels(&self) -> (Arc<v1::ChannelsInfo>, v1::Outputs) {
         self.with_core(|core| {
-            let info = core.channels.as_ref().map(|channels| Arc::clone(&channels.info));
-            (info.unwrap_or_default(), core.outputs().unwrap_or_default())
+            let info = core.channels.as_ref().map(|channels| origin(&channels.info));
+            (info.unwrap_or_default(), convert::core_outputs(core).unwrap_or_default())
         })
     }
 
@@ -339,7 +391,7 @@ impl Session {
         let mut channels = declare::channels((*present.declared).clone(), model, h, limits)?;
         for PresentFault { id, given, start, .. } in present.faults {
             let given = (*given).clone();
-            let mut fault = declare::fault(id, given, model, h, &channels.info, limits)?;
+            let mut fault = declare::fault(id, given, model, h, &origin(&channels.info), limits)?;
             fault.start = start;
             channels.faults.push(fault);
         }

@@ -3,11 +3,10 @@
 use std::sync::Arc;
 
 use plantd_models::{InitialError, Settings, Spare};
-use plantd_proto::v1::MarkReason;
 
-use super::{Session, lock};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::parameters::{self, ChangeError};
+use crate::core::session::{MarkReason, Session};
 use crate::wire::status::RpcError;
 
 impl Session {
@@ -20,7 +19,7 @@ impl Session {
         time_step_s: Option<f64>,
         limits: &Limits,
     ) -> Result<bool, ParametersError> {
-        let _replacing = lock(&self.replacing);
+        let _replacing = self.replacing();
         let (before, parameters) =
             self.with_core(|core| (core.mechanics(), Arc::clone(&core.parameters)));
         let (model, parameters) = if changes.is_empty() {

@@ -7,30 +7,27 @@ use plantd_proto::v1;
 use prost::Message as _;
 use v1::set_feedback_request::Reference;
 
-use super::Session;
 use crate::core::channels::fault::Injected;
+use crate::core::channels::{ChannelMemory, fault::FaultMemory};
 use crate::core::feedback::{GuardBound, InForce, Trip};
 use crate::core::parameters::Parameters;
 use crate::core::regulator::Spec;
+use crate::core::session::{PlantSnapshot, Session};
+use crate::wire::commands::origin;
 use crate::wire::convert;
+use crate::wire::feedback::feedback_info;
 use crate::wire::run::safety_info;
-
-/// Everything that a session's plant needs to go on bit for bit.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PlantSnapshot {
-    /// The plant.
-    pub plant: Snapshot,
-    /// What is under way in its channels and faults, if it has any.
-    pub channels: Option<v1::ChannelMemory>,
-}
 
 impl PlantSnapshot {
     /// Encodes: a plant without channels as itself, else a `ChannelSnapshot`.
     pub fn to_bytes(&self) -> Vec<u8> {
         let plant = self.plant.to_bytes();
-        match self.channels.clone() {
+        match &self.channels {
             None => plant,
-            channels => v1::ChannelSnapshot { plant, channels }.encode_to_vec(),
+            Some(memory) => {
+                let channels = Some(memory_message(memory));
+                v1::ChannelSnapshot { plant, channels }.encode_to_vec()
+            }
         }
     }
 
@@ -38,11 +35,33 @@ impl PlantSnapshot {
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, SnapshotError> {
         match v1::ChannelSnapshot::decode(bytes) {
             Ok(v1::ChannelSnapshot { plant, channels }) if !plant.is_empty() => {
+                let channels = channels.map(memory_of);
                 Ok(Self { plant: Snapshot::from_bytes(&plant)?, channels })
             }
             _ => Ok(Self { plant: Snapshot::from_bytes(bytes)?, channels: None }),
         }
     }
+}
+
+fn memory_message(memory: &ChannelMemory) -> v1::ChannelMemory {
+    let fault = |memory: &FaultMemory| {
+        let FaultMemory { id, fault, numbers, active, beginnings } = memory.clone();
+        v1::FaultMemory { id, fault, numbers, active, beginnings }
+    };
+    v1::ChannelMemory {
+        declared: memory.declared,
+        numbers: memory.numbers.clone(),
+        faults: memory.faults.iter().map(fault).collect(),
+    }
+}
+
+fn memory_of(memory: v1::ChannelMemory) -> ChannelMemory {
+    let fault = |memory: v1::FaultMemory| {
+        let v1::FaultMemory { id, fault, numbers, active, beginnings } = memory;
+        FaultMemory { id, fault, numbers, active, beginnings }
+    };
+    let v1::ChannelMemory { declared, numbers, faults } = memory;
+    ChannelMemory { declared, numbers, faults: faults.into_iter().map(fault).collect() }
 }
 
 impl Session {
@@ -56,27 +75,28 @@ impl Session {
                 feedback.map(|f| (Arc::clone(&f.spec), f.in_force(), f.guard.clone(), f.info()));
             let channels = core.channels.as_ref().map(|channels| {
                 let faults = channels.faults.iter().map(saved_fault).collect::<Vec<_>>();
-                (Arc::clone(&channels.declared), faults)
+                (origin::<v1::Channels>(&channels.declared), faults)
             });
             (core.base(), core.view(), core.snapshot(), feedback, channels, core.faults)
         });
-        let rotations = convert::rotations(&self.model);
+        let rotations = convert::rotations(self.model());
         let time_step_s = base.settings.time_step_s;
         let (feedback, feedback_info) = feedback
             .map(|(spec, law, guard, info)| {
+                let info = feedback_info(info);
                 (feedback_request(&spec, time_step_s, &law, &guard, &info, &rotations), info)
             })
             .unzip();
         let info = v1::PlantInfo {
-            id: self.id.clone(),
-            model: self.model_name.clone(),
+            id: self.id().to_owned(),
+            model: self.model_name().to_owned(),
             settings: Some(convert::settings_message(&base.settings)),
             state: Some(convert::state(&view.state, view.time_s)),
             link_open: self.keeps_link(),
             feedback: feedback_info,
-            accuracy: self.accuracy,
+            accuracy: self.accuracy().map(convert::accuracy),
             parameters: convert::parameters(&base.parameters),
-            safety: safety_info(&view.safety, view.frozen, &self.model),
+            safety: safety_info(&view.safety, view.frozen, self.model()),
             ..Default::default()
         };
         let (declared, faults) = channels.unzip();
@@ -128,7 +148,7 @@ impl Session {
 }
 
 fn saved_fault(fault: &Injected) -> (u64, Arc<v1::FaultSpec>, u64) {
-    (fault.id, Arc::clone(&fault.given), fault.schedule.start)
+    (fault.id, origin(&fault.given), fault.schedule.start)
 }
 
 /// The request that puts a feedback's present law in force: about a point as it stands; along a trajectory
@@ -142,7 +162,10 @@ fn feedback_request(
     rotations: &[u32],
 ) -> Option<v1::SetFeedbackRequest> {
     if let Some(given) = &spec.given {
-        let request = v1::SetFeedbackRequest { first_step: Some(info.first_step), ..given.clone() };
+        let request = v1::SetFeedbackRequest {
+            first_step: Some(info.first_step),
+            ..v1::SetFeedbackRequest::clone(&origin(given))
+        };
         return (spec.time_step_s == time_step_s).then_some(request);
     }
     let bound = |bound: &GuardBound| v1::Bound {
