@@ -45,7 +45,7 @@ use crate::wire::observe::ObserveLayer;
 use crate::wire::plant::PlantService;
 use crate::wire::record::Recordings;
 use crate::wire::recordings::RecordingService;
-use crate::wire::state::StateDirectory;
+use crate::wire::state_directory::StateDirectory;
 
 /// Longest wait at the end for plants to be saved on a disk that does not answer.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use plantd_models::{Dimensions, State, StepReport};
 
+use crate::core::report::{from_words, to_words};
 use crate::core::ring::{Reader, Ring};
 
 /// Room for the numbers of a frame that are neither state nor input.
@@ -93,7 +94,6 @@ pub fn record_words(d: Dimensions) -> usize {
 impl Published<'_> {
     /// The words of a record.
     pub(crate) fn record(&self) -> impl Iterator<Item = u64> {
-        let report = &self.report;
         let timing = &self.timing;
         let fixed = [
             self.step,
@@ -107,21 +107,12 @@ impl Published<'_> {
             timing.input_sequence,
             timing.input_age_ns,
             timing.flags,
-            report.iterations.into(),
-            report.factorizations.into(),
-            report.redundant_constraints.into(),
-            report.steps.into(),
-            report.halvings.into(),
-            report.residual.to_bits(),
-            report.constraint_residual.to_bits(),
-            report.reciprocal_condition.to_bits(),
-            report.constraint_reciprocal_condition.to_bits(),
         ];
         let Self { q, p, v, multipliers, input, driver_input, impulse, outputs, lost, .. } = *self;
         let vectors = [q, p, v, multipliers, input, driver_input, impulse, outputs, lost];
         let sizes = vectors.map(|vector| vector.len() as u64);
         let numbers = vectors.into_iter().flatten().map(|number| number.to_bits());
-        fixed.into_iter().chain(sizes).chain(numbers)
+        fixed.into_iter().chain(to_words(&self.report)).chain(sizes).chain(numbers)
     }
 }
 
@@ -169,17 +160,7 @@ impl Frame {
             input_age_ns: next(),
             flags: next(),
         };
-        self.report = StepReport {
-            iterations: next() as u32,
-            factorizations: next() as u32,
-            redundant_constraints: next() as u32,
-            steps: next() as u32,
-            halvings: next() as u32,
-            residual: number(next()),
-            constraint_residual: number(next()),
-            reciprocal_condition: number(next()),
-            constraint_reciprocal_condition: number(next()),
-        };
+        self.report = from_words(&mut next);
         let sizes: [usize; 9] = std::array::from_fn(|_| next() as usize);
         let vectors = [
             &mut self.state.q,

@@ -208,16 +208,6 @@ impl Limits {
         Ok(())
     }
 
-    /// Name and value of the limit on messages to a method, by its path.
-    pub fn message(&self, path: &str) -> (&'static str, u64) {
-        let is_small = path.starts_with("/plantd.v1.ChannelService/");
-        if is_small && self.channel_message_bytes < self.message_bytes {
-            ("channel_message_bytes", self.channel_message_bytes)
-        } else {
-            ("message_bytes", self.message_bytes)
-        }
-    }
-
     /// A limit as a size in memory.
     pub fn size(value: u64) -> usize {
         usize::try_from(value).unwrap_or(usize::MAX)

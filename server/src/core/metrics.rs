@@ -36,8 +36,8 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::registry::{Registry, Unit};
 
-use crate::core::realtime::TimingCounts;
-use crate::core::session::DriverKind;
+use crate::core::driver::DriverKind;
+use crate::core::realtime::counts::TimingCounts;
 
 /// Shortest step that the histogram tells apart, s, and its number of buckets, each twice as wide:
 /// up to half a second.

@@ -5,6 +5,7 @@
 pub mod catalog;
 pub mod channels;
 pub mod connection;
+pub mod driver;
 pub mod failure;
 pub mod feedback;
 pub mod frame;
@@ -16,6 +17,7 @@ pub mod parameters;
 pub mod priority;
 pub mod realtime;
 pub mod regulator;
+pub(crate) mod report;
 pub mod ring;
 pub mod session;
 pub mod watch;

@@ -33,10 +33,11 @@ use crate::core::watch::{Relay, Subscription, Watchers};
 
 pub use self::core::{Core, Mechanics};
 use self::gate::Gate;
-pub use self::lease::{DriveError, DriverKind, Lease, LeaseHeld};
+pub use self::lease::{DriveError, Lease, LeaseHeld};
 use self::running::Place;
 pub use self::running::{Run, RunError, RunStatus, StoppedBy};
 pub(crate) use self::tap::MarkReason;
+pub use crate::core::driver::DriverKind;
 
 /// Records that the ring of a plant keeps: a quarter of a second at 1 kHz.
 const RING_RECORDS: usize = 256;

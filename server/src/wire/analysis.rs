@@ -5,7 +5,7 @@ use plantd_models::control::{self, Mode, Tangent, TransferFunction};
 use plantd_models::{Linearization, Model, Plant};
 use plantd_proto::v1;
 
-use super::control::{at_point, check_linearization};
+use super::points::{at_point, check_linearization};
 use crate::core::limits::LimitExceeded;
 use crate::core::regulator::Constraints;
 use crate::core::workers::Abandoned;

@@ -7,19 +7,21 @@ use std::sync::Arc;
 use futures::{StreamExt, stream};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::{self, Values};
-use plantd_models::{Linearization, Model, Plant, Settings, State};
+use plantd_models::{Linearization, Plant, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status};
 
 use super::answers::Answers;
+use super::points::{at_point, check_linearization, model_and_settings, model_at};
 use super::{analysis, derivatives, kalman, optimize, reference, rollout};
 use crate::core::inputs::Inputs;
-use crate::core::limits::LimitExceeded;
 use crate::core::regulator::{self, Constraints, Memory, Path};
 use crate::core::workers::Abandoned;
 use crate::wire::convert::{self, WeightFields};
 use crate::wire::hub::Hub;
+
+use crate::wire::report::report_message;
 use crate::wire::status::RpcError;
 
 /// Numbers that one portion of a stream holds, about: 2 MB.
@@ -37,48 +39,6 @@ impl ControlService {
     }
 }
 
-/// The model and the settings of a request.
-pub(super) fn model_and_settings(
-    hub: &Hub,
-    name: &str,
-    settings: Option<v1::PlantSettings>,
-) -> Result<(Arc<Model>, Settings), RpcError> {
-    let model = hub.catalog.get(name)?.model;
-    let settings = convert::settings(settings, &model, &hub.limits)?;
-    Ok((model, settings))
-}
-
-/// A plant at a point, and the input there.
-pub(super) fn at_point(
-    hub: &Hub,
-    model: &str,
-    settings: Option<v1::PlantSettings>,
-    point: Option<v1::Point>,
-) -> Result<(Plant, Vec<f64>), RpcError> {
-    if let Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) = &point {
-        return Ok(hub.session(id)?.copy_plant_and_input());
-    }
-    let (model, settings) = model_and_settings(hub, model, settings)?;
-    convert::point(point, &model, settings)
-}
-
-/// Name of the model that such a point is of.
-fn model_at(hub: &Hub, model: &str, point: Option<&v1::Point>) -> Result<String, RpcError> {
-    match point {
-        Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) => {
-            Ok(hub.session(id)?.model_name().to_owned())
-        }
-        _ => Ok(model.to_owned()),
-    }
-}
-
-/// Refuses matrices that no client would take.
-pub(super) fn check_linearization(hub: &Hub, model: &Model) -> Result<(), RpcError> {
-    let numbers = convert::linearization_numbers(model.dimensions());
-    let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
-    Ok(LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?)
-}
-
 fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse, RpcError> {
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
@@ -92,7 +52,7 @@ fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeRe
         controllability_rank: u32::try_from(rank).unwrap_or(u32::MAX),
         state: Some(state),
         u,
-        report: Some(convert::report(&report)),
+        report: Some(report_message(&report)),
     })
 }
 
@@ -149,7 +109,7 @@ impl LinearizedTrajectory {
             let state = convert::plant_state(&self.plant);
             let u = self.inputs.get(self.steps_taken);
             let report = match self.plant.step_and_linearize(u, &mut self.linearization) {
-                Ok(report) => convert::report(&report),
+                Ok(report) => report_message(&report),
                 Err(error) => {
                     let fault = RpcError::from(error).with("steps_taken", self.steps_taken);
                     portion.push_back(Err(fault));

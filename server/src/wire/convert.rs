@@ -8,7 +8,7 @@ use plantd_models::control::{Momentum, StageWeights, TrajectoryWeights, Weights,
 use plantd_models::scene::Signal;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, ForceSplit, Initial, Linearization, Model, Plant, Precision,
-    Scene, SceneError, Settings, Spare, State, StepReport, Violation,
+    Scene, SceneError, Settings, Spare, State, Violation,
 };
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
@@ -688,21 +688,6 @@ fn multipliers(step: u64, multipliers: &[f64]) -> Vec<f64> {
 /// `x = (q, p, v)` of a plant.
 pub fn x(plant: &Plant) -> Vec<f64> {
     [plant.q(), plant.p(), plant.v()].concat()
-}
-
-/// A report as a message.
-pub fn report(report: &StepReport) -> v1::StepReport {
-    v1::StepReport {
-        iterations: report.iterations,
-        factorizations: report.factorizations,
-        residual: report.residual,
-        constraint_residual: report.constraint_residual,
-        reciprocal_condition: report.reciprocal_condition,
-        constraint_reciprocal_condition: report.constraint_reciprocal_condition,
-        redundant_constraints: report.redundant_constraints,
-        steps: report.steps,
-        halvings: report.halvings,
-    }
 }
 
 /// Changed numbers of a scene as messages.

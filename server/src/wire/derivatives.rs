@@ -8,10 +8,12 @@ use plantd_models::{
 };
 use plantd_proto::v1;
 
-use super::control::{at_point, check_linearization};
+use super::points::{at_point, check_linearization};
 use crate::core::limits::LimitExceeded;
 use crate::wire::convert;
 use crate::wire::hub::Hub;
+
+use crate::wire::report::report_message;
 use crate::wire::status::RpcError;
 
 /// Answers a LinearizeSecondOrder call.
@@ -52,7 +54,7 @@ pub(super) fn linearize_second_order(
         u,
         tensors,
         contraction,
-        report: Some(convert::report(&report)),
+        report: Some(report_message(&report)),
     })
 }
 

@@ -24,13 +24,14 @@ use v1::drive_request::Request as Message;
 use v1::drive_response::Response as Answer;
 
 use super::observe::with_limit_details;
-use super::plant::{INLINE_INSTRUCTIONS_MAX, plant_info};
+use super::plant_info::{INLINE_INSTRUCTIONS_MAX, plant_info};
 use crate::core::limits::LimitExceeded;
 use crate::core::session::{DriveError, DriverKind, Lease, RunStatus};
 use crate::core::watch::Subscription;
 use crate::core::workers::{Admission, Lane};
 use crate::wire::convert;
 use crate::wire::hub::Hub;
+use crate::wire::report::report_message;
 use crate::wire::status::RpcError;
 
 /// Answers in a row after which the stream lets others on its thread run.
@@ -323,7 +324,7 @@ impl Driving {
         Poll::Ready(Ok(Answer::Step(v1::DriveStep {
             sequence: frame.timing.input_sequence,
             state: Some(convert::state(&frame.state, frame.time_s)),
-            report: Some(convert::report(&frame.report)),
+            report: Some(report_message(&frame.report)),
             linearization: None,
             u: frame.input.clone(),
             outputs: convert::outputs(&frame.outputs, &frame.lost),
@@ -343,7 +344,7 @@ impl Driving {
                 sequence,
                 clocks: Some(convert::clocks(state.time_s, 0)),
                 state: Some(state),
-                report: Some(convert::report(core.report())),
+                report: Some(report_message(core.report())),
                 u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
                 outputs: convert::core_outputs(core),
                 ..Default::default()

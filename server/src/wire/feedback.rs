@@ -14,9 +14,9 @@ use v1::point::Source;
 use v1::set_feedback_request::Reference as Form;
 
 use super::answers::{Answers, Messages};
-use super::plant::plant_info;
+use super::plant_info::{failure_message, feedback_info, plant_info};
 use crate::core::channels::Origin;
-use crate::core::feedback::{Feedback, FeedbackInfo, GuardBound, InForce, Law, Mode, Stage};
+use crate::core::feedback::{Feedback, GuardBound, InForce, Law, Mode, Stage};
 use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::regulator::{Constraints, Memory, Reference, RegulatorError, Spec};
@@ -349,31 +349,6 @@ impl InForce {
             ..Default::default()
         }
     }
-}
-
-/// What a client is told of a feedback.
-pub(crate) fn feedback_info(info: FeedbackInfo) -> v1::FeedbackInfo {
-    let FeedbackInfo { mode, revision, first_step, horizon, tripped, failure } = info;
-    let mode = match mode {
-        Mode::WatchOnly => v1::FeedbackMode::WatchOnly,
-        Mode::Replace => v1::FeedbackMode::Replace,
-        Mode::Add => v1::FeedbackMode::Add,
-        Mode::Guard => v1::FeedbackMode::Guard,
-    };
-    let (tripped_at_step, tripped_by) = tripped.unzip();
-    v1::FeedbackInfo {
-        mode: mode.into(),
-        revision,
-        first_step,
-        horizon: horizon as u32,
-        tripped_at_step,
-        tripped_by: tripped_by.unwrap_or_default(),
-        failure: failure.map(failure_message),
-    }
-}
-
-fn failure_message(error: Arc<RegulatorError>) -> v1::Failure {
-    RpcError::from(Arc::unwrap_or_clone(error)).into()
 }
 
 struct Watcher {

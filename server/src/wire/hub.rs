@@ -23,7 +23,7 @@ use crate::wire::answers::Answers;
 use crate::wire::jobs::Jobs;
 use crate::wire::link::{LinkError, LinkHost, LinkInfo};
 use crate::wire::record::Recordings;
-use crate::wire::state::StateDirectory;
+use crate::wire::state_directory::StateDirectory;
 use crate::wire::status::RpcError;
 
 /// Everything that belongs to one server.

@@ -7,7 +7,7 @@ use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::analysis::Outputs;
-use super::control::{at_point, check_linearization, model_and_settings};
+use super::points::{at_point, check_linearization, model_and_settings};
 use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::regulator::{Constraints, Path, check_equilibrium};

@@ -43,13 +43,23 @@ fn method_label(path: &str) -> &'static str {
     METHODS.get(path).map_or("other", |path| path.as_str())
 }
 
+/// Name and value of the limit on messages to a method, by its path.
+fn message_limit(limits: &Limits, path: &str) -> (&'static str, u64) {
+    let is_small = path.starts_with("/plantd.v1.ChannelService/");
+    if is_small && limits.channel_message_bytes < limits.message_bytes {
+        ("channel_message_bytes", limits.channel_message_bytes)
+    } else {
+        ("message_bytes", limits.message_bytes)
+    }
+}
+
 /// Turns tonic's refusal of an oversized message into the server's own.
 pub(super) fn with_limit_details(status: Status, path: &str, limits: &Limits) -> Status {
     // No service of this server answers OUT_OF_RANGE, so this is tonic's decoder.
     if status.code() != Code::OutOfRange {
         return status;
     }
-    let (name, limit) = limits.message(path);
+    let (name, limit) = message_limit(limits, path);
     let actual = status
         .message()
         .split_once("found ")

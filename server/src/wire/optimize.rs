@@ -17,7 +17,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use v1::optimize_trajectory_response::Response as Answer;
 
 use super::answers::Answers;
-use super::control::model_and_settings;
+use super::points::model_and_settings;
 use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::Abandoned;

@@ -9,17 +9,17 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::answers::{Answers, cut_page};
 use super::drive::DriveStream;
+use super::plant_info::{INLINE_INSTRUCTIONS_MAX, info, plant_info};
 use super::{feedback, run, watch};
 use crate::core::inputs::{Inputs, hold_input};
 use crate::core::limits::LimitExceeded;
-use crate::core::session::{Core, DriverKind, Lease, PlantSnapshot, Session, View};
+use crate::core::session::{Core, DriverKind, Lease, PlantSnapshot, Session};
 use crate::core::workers::{Abandoned, Admission};
 use crate::wire::convert::{self, Start};
 use crate::wire::hub::Hub;
+use crate::wire::report::report_message;
 use crate::wire::status::RpcError;
 
-/// Instructions of a step up to which a Step call begins at once instead of on a worker: about 0.3 ms.
-pub(super) const INLINE_INSTRUCTIONS_MAX: f64 = 1e6;
 /// How long a Step call goes on there: not much longer than the way to a worker and back.
 const INLINE_TIME_MAX: Duration = Duration::from_micros(300);
 
@@ -194,7 +194,7 @@ impl Steps {
                 response.states.push(convert::plant_state(core.plant()));
             }
             if is_last {
-                response.report = Some(convert::report(core.report()));
+                response.report = Some(report_message(core.report()));
                 response.clocks = Some(convert::clocks(core.plant().time_s(), 0));
                 response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
                 response.outputs = convert::core_outputs(core);
@@ -206,28 +206,6 @@ impl Steps {
             .map_err(|error| RpcError::from_drive(error, lease.session()).with("steps_taken", k))?;
         *taken += 1;
         Ok(())
-    }
-}
-
-/// A plant as a message. Waits for a step in progress, which is long on a large model: call it on a
-/// worker unless you hold the lease.
-pub(super) fn plant_info(session: &Session) -> v1::PlantInfo {
-    info(session, session.view())
-}
-
-fn info(session: &Session, view: View) -> v1::PlantInfo {
-    v1::PlantInfo {
-        id: session.id().to_owned(),
-        model: session.model_name().to_owned(),
-        settings: Some(convert::settings_message(&view.settings)),
-        state: Some(convert::state(&view.state, view.time_s)),
-        driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
-        link_open: session.link_open(),
-        feedback: view.feedback.map(feedback::feedback_info),
-        accuracy: session.accuracy().map(convert::accuracy),
-        run: Some(run::run_info(session)),
-        parameters: convert::parameters(&view.parameters),
-        safety: run::safety_info(&view.safety, view.frozen, session.model()),
     }
 }
 

@@ -8,7 +8,7 @@ use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use v1::project_reference_response::Response as Answer;
 
-use super::control::model_and_settings;
+use super::points::model_and_settings;
 use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::regulator::{Constraints, Memory, Path};

@@ -7,7 +7,7 @@ use plantd_models::{Model, Plant, Settings};
 use plantd_proto::v1;
 
 use super::answers::Answers;
-use super::control::model_and_settings;
+use super::points::model_and_settings;
 use crate::core::inputs::{Inputs, hold_input};
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::{Abandoned, Admission};

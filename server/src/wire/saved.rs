@@ -15,8 +15,8 @@ use crate::core::regulator::Spec;
 use crate::core::session::{PlantSnapshot, Session};
 use crate::wire::commands::origin;
 use crate::wire::convert;
-use crate::wire::feedback::feedback_info;
-use crate::wire::run::safety_info;
+use crate::wire::plant_info::feedback_info;
+use crate::wire::run_info::safety_info;
 
 impl PlantSnapshot {
     /// Encodes: a plant without channels as itself, else a `ChannelSnapshot`.

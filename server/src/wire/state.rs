@@ -3,11 +3,10 @@
 //! A file `ID.plant` is a `PlantRecord` in protobuf and the FNV-1a hash (u64, little-endian) of it. It is
 //! written aside and renamed: what is there is complete.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::io::{self, Write as _};
-use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
 
 use anyhow::{Context as _, Result, bail};
 use plantd_models::{Initial, Model, Snapshot, Spare};
@@ -15,46 +14,17 @@ use plantd_proto::v1;
 use prost::Message as _;
 
 use crate::core::channels::noise::hash;
-use crate::core::modes::Mode;
 use crate::core::session::{PlantSnapshot, Session};
 use crate::wire::convert;
 use crate::wire::feedback::set_feedback;
 use crate::wire::hub::Hub;
 use crate::wire::model::compile;
-use crate::wire::run::{protect, run, run_info};
+use crate::wire::run::{protect, run};
+use crate::wire::run_info::run_info;
+use crate::wire::state_directory::{EXTENSION, Saved, StateDirectory};
 use crate::wire::status::RpcError;
 
-const EXTENSION: &str = "plant";
-
-/// A directory in which plants survive their server.
-pub struct StateDirectory {
-    path: PathBuf,
-    mode: Mode,
-    saved: Mutex<BTreeMap<String, Saved>>,
-    /// Ids of the plants that were not paused when the server began to pause them all.
-    running: OnceLock<BTreeSet<String>>,
-}
-
-/// What is known of a file.
-enum Saved {
-    /// It holds a plant of this server.
-    Plant {
-        /// Model in force when it was written.
-        model: Arc<Model>,
-        /// Hash of everything else.
-        hash: u64,
-    },
-    /// It cannot be used and stays as it is.
-    Broken,
-}
-
 impl StateDirectory {
-    /// The directory at a path, made if there is none; the mode is that of its files.
-    pub fn open(path: &Path, mode: Mode) -> io::Result<Self> {
-        mode.create_directory(path)?;
-        Ok(Self { path: path.to_owned(), mode, saved: Mutex::default(), running: OnceLock::new() })
-    }
-
     /// Makes the plants anew that the directory holds. What cannot be used is named in the log and
     /// left as it is.
     pub async fn load(&self, hub: &Arc<Hub>) -> io::Result<()> {
@@ -79,13 +49,6 @@ impl StateDirectory {
             self.saved().insert(id.to_owned(), saved);
         }
         Ok(())
-    }
-
-    /// Notes which plants are not paused: they go on with the next server.
-    pub fn note_running(&self, plants: &[Arc<Session>]) {
-        let is_running = |session: &&Arc<Session>| run_info(session).running;
-        let ids = plants.iter().filter(is_running).map(|session| session.id().to_owned());
-        let _ = self.running.set(ids.collect());
     }
 
     /// Saves all plants that have changed since they were saved.
@@ -143,36 +106,6 @@ impl StateDirectory {
         self.write(session.id(), record.encode_to_vec())?;
         saved.insert(session.id().to_owned(), Saved::Plant { model, hash });
         Ok(())
-    }
-
-    fn write(&self, id: &str, mut bytes: Vec<u8>) -> Result<()> {
-        bytes.extend(hash(&bytes).to_le_bytes());
-        let path = self.file(id);
-        let aside = path.with_extension("partial");
-        let mut file = self.mode.create(&aside)?;
-        file.write_all(&bytes)?;
-        file.sync_data()?;
-        drop(file);
-        Ok(fs::rename(aside, path)?)
-    }
-
-    /// Forgets a plant that was deleted.
-    pub fn remove(&self, id: &str) {
-        let mut saved = self.saved();
-        if let Some(Saved::Plant { .. }) = saved.get(id) {
-            saved.remove(id);
-            if let Err(error) = fs::remove_file(self.file(id)) {
-                tracing::error!(plant = id, %error, "saved plant not removed");
-            }
-        }
-    }
-
-    fn file(&self, id: &str) -> PathBuf {
-        self.path.join(id).with_extension(EXTENSION)
-    }
-
-    fn saved(&self) -> MutexGuard<'_, BTreeMap<String, Saved>> {
-        self.saved.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

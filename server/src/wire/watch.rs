@@ -21,6 +21,7 @@ use crate::core::session::Session;
 use crate::core::watch::Subscription;
 use crate::wire::convert;
 use crate::wire::hub::Hub;
+use crate::wire::report::report_message;
 use crate::wire::status::RpcError;
 
 /// What a watcher has asked for.
@@ -131,7 +132,7 @@ impl Messages for Watcher {
             response.timing = convert::step_timing(&frame.timing);
         }
         if self.wanted.report {
-            response.report = Some(convert::report(&frame.report));
+            response.report = Some(report_message(&frame.report));
         }
         if self.wanted.state {
             let mut state = convert::state(&frame.state, frame.time_s);

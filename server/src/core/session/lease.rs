@@ -11,6 +11,7 @@ use plantd_proto::link::monotonic_ns;
 
 use super::running::Place;
 use super::{Core, PlantSnapshot, Session, lock};
+use crate::core::driver::DriverKind;
 use crate::core::failure::step_error_reason;
 use crate::core::realtime::event::EventKind;
 use crate::core::realtime::slot::Arrival;
@@ -18,46 +19,6 @@ use crate::core::realtime::watchdog::{Trip, WatchdogAction};
 
 /// One step in this many is timed for the histogram of step times.
 const TIMED_STEP_INTERVAL: u64 = 64;
-
-/// Who may step a plant.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum DriverKind {
-    /// A unary call that holds the lease while it runs.
-    Step,
-    /// A `Drive` stream.
-    Drive,
-    /// A driver over shared memory.
-    Link,
-}
-
-impl DriverKind {
-    /// The name in `PlantInfo.driver` and in metrics.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Step => "step",
-            Self::Drive => "drive",
-            Self::Link => "link",
-        }
-    }
-
-    fn code(self) -> u8 {
-        match self {
-            Self::Step => 1,
-            Self::Drive => 2,
-            Self::Link => 3,
-        }
-    }
-
-    /// The kind with that number, 0 for none.
-    pub fn from_code(code: u8) -> Option<Self> {
-        match code {
-            1 => Some(Self::Step),
-            2 => Some(Self::Drive),
-            3 => Some(Self::Link),
-            _ => None,
-        }
-    }
-}
 
 /// The lease is held by somebody else.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]

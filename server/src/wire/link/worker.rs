@@ -15,6 +15,7 @@ use plantd_proto::link::{
 use super::LinkConfig;
 use crate::core::frame::{Frames, OUTPUTS_MAX, Published, Timing};
 use crate::core::session::{DriveError, DriverKind, Lease, Session};
+use crate::wire::report::with_report;
 
 /// How often the thread looks whether it shall end and whether its driver lives, ns.
 const CHECK_PERIOD_NS: u64 = 100_000_000;
@@ -474,21 +475,6 @@ fn send_state(
     let Published { q, p, v, multipliers, outputs, lost, .. } = *published;
     let parts = [q, p, v, multipliers, outputs, lost];
     endpoint.send(header, &parts, poll_end_ns)
-}
-
-fn with_report(header: Header, report: &StepReport) -> Header {
-    Header {
-        iterations: report.iterations,
-        factorizations: report.factorizations,
-        residual: report.residual,
-        constraint_residual: report.constraint_residual,
-        reciprocal_condition: report.reciprocal_condition,
-        constraint_reciprocal_condition: report.constraint_reciprocal_condition,
-        redundant_constraints: report.redundant_constraints,
-        steps: report.steps,
-        halvings: report.halvings,
-        ..header
-    }
 }
 
 fn holder(by: DriverKind) -> Holder {

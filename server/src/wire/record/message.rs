@@ -8,7 +8,8 @@ use crate::core::parameters::Parameters;
 use crate::core::session::Session;
 use crate::core::session::tap::Mark;
 use crate::wire::convert;
-use crate::wire::run::run_info;
+use crate::wire::report::report_message;
+use crate::wire::run_info::run_info;
 
 /// The plant at the beginning of a recording.
 pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecord {
@@ -58,6 +59,6 @@ pub(super) fn fill(record: &mut v1::StepRecord, frame: &Frame) {
         target.clone_from(source);
     }
     record.outputs = convert::outputs(&frame.outputs, &frame.lost);
-    record.report = Some(convert::report(&frame.report));
+    record.report = Some(report_message(&frame.report));
     record.timing = convert::step_timing(&frame.timing);
 }

@@ -21,7 +21,7 @@ use crate::core::realtime::event::EventReader;
 use crate::core::ring::Reader;
 use crate::core::session::Session;
 use crate::core::session::tap::{Mark, MarkReason as Marked, Tap};
-use crate::wire::run::event_message;
+use crate::wire::run_info::event_message;
 
 /// How often the ring is looked at.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
