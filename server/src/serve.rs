@@ -28,24 +28,24 @@ use v1::model_service_server::ModelServiceServer;
 use v1::plant_service_server::PlantServiceServer;
 use v1::recording_service_server::RecordingServiceServer;
 
-use crate::admission::Places;
 use crate::config::{Config, Listen};
-use crate::grpc::channels::ChannelService;
-use crate::grpc::control::ControlService;
-use crate::grpc::ending::ending_with;
-use crate::grpc::gate::GateLayer;
-use crate::grpc::model::ModelService;
-use crate::grpc::observe::ObserveLayer;
-use crate::grpc::plant::PlantService;
-use crate::grpc::record::RecordingService;
-use crate::grpc::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT};
-use crate::hub::Hub;
-use crate::limits::Limits;
-use crate::link::LinkHost;
-use crate::listen::{UnixSocket, bind_tcp};
-use crate::record::Recordings;
-use crate::state::StateDirectory;
-use crate::{memory, metrics_http};
+use crate::core::limits::Limits;
+use crate::listen::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT, UnixSocket, bind_tcp};
+use crate::memory;
+use crate::wire::admission::Places;
+use crate::wire::channels::ChannelService;
+use crate::wire::control::ControlService;
+use crate::wire::ending::ending_with;
+use crate::wire::gate::GateLayer;
+use crate::wire::hub::Hub;
+use crate::wire::link::LinkHost;
+use crate::wire::metrics_http;
+use crate::wire::model::ModelService;
+use crate::wire::observe::ObserveLayer;
+use crate::wire::plant::PlantService;
+use crate::wire::record::Recordings;
+use crate::wire::recordings::RecordingService;
+use crate::wire::state_directory::StateDirectory;
 
 /// Longest wait at the end for plants to be saved on a disk that does not answer.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
@@ -402,9 +402,7 @@ fn load_scene(hub: &Hub, path: &Path) -> Result<()> {
     let scene = plantd_models::Scene::from_text(&text)?;
     let model = Model::compile(&scene)?;
     let name = model.scene().name.clone();
-    hub.catalog
-        .insert(&name, Arc::new(model))
-        .map_err(|fault| anyhow::anyhow!("{}", tonic::Status::from(fault).message()))?;
+    hub.catalog.insert(&name, Arc::new(model))?;
     tracing::info!(model = name, "scene loaded");
     Ok(())
 }

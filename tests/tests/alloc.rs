@@ -9,16 +9,16 @@ use plantd_models::{
     Contraction, ForceSplit, Linearization, Model, Plant, Scene, SecondOrder, Settings, builtin,
 };
 use plantd_proto::v1;
-use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
-use plantd_server::limits::Limits;
-use plantd_server::metrics::Metrics;
-use plantd_server::modes;
-use plantd_server::realtime::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
-use plantd_server::realtime::{Pace, RealTime, RealTimeSettings, RunSettings};
-use plantd_server::record::Recordings;
-use plantd_server::regulator::{Constraints, Reference, Spec};
-use plantd_server::ring::Reader;
-use plantd_server::session::{DriverKind, Session};
+use plantd_server::core::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
+use plantd_server::core::limits::Limits;
+use plantd_server::core::metrics::Metrics;
+use plantd_server::core::modes;
+use plantd_server::core::realtime::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
+use plantd_server::core::realtime::{Pace, RealTime, RealTimeSettings, RunSettings};
+use plantd_server::core::regulator::{Constraints, Reference, Spec};
+use plantd_server::core::ring::Reader;
+use plantd_server::core::session::{DriverKind, Session};
+use plantd_server::wire::record::Recordings;
 
 /// Counts the allocations of each thread, so that tests in other threads do not disturb.
 struct Counting;

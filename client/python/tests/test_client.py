@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import plantd
-from plantd.v1 import common_pb2, control_service_pb2
+from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
 
 SCENE = """
 format = 1
@@ -54,6 +54,7 @@ def test_every_way_to_step_gives_the_same_bits(client):
 
 def test_methods(client):
     method = {"order": 6, "substeps": 2, "halvings": 1, "precision": "fast"}
+    method["singular_below"] = 1e-12
     plant = client.create_plant("cart-pole", **method)
     assert {name: getattr(plant, name) for name in method} == method
     with client.drive(plant.id) as driver:
@@ -70,6 +71,16 @@ def test_methods(client):
     assert refused.value.violations[0].field == "settings.order"
     with pytest.raises(TypeError, match="odrer"):
         client.create_plant("four-bar", odrer=4)
+
+
+def test_every_setting_and_every_field_of_a_report_has_a_name_here():
+    settings = plant_service_pb2.PlantSettings.DESCRIPTOR.fields_by_name.keys()
+    ours = {"dt": "time_step_s", "paper": "force_split"}
+    keywords = {ours.get(name, name) for name in plantd.Stepping.__annotations__}
+    # The one is for tests of the solver, the other for plants alone.
+    assert keywords == set(settings) - {"max_iterations", "tolerance"}
+    report = common_pb2.StepReport.DESCRIPTOR.fields_by_name.keys()
+    assert set(plantd.StepReport.__dataclass_fields__) == set(report)
 
 
 def test_linearization_at_a_point(client):

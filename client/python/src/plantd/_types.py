@@ -609,6 +609,8 @@ class Plant:
     accuracy: Accuracy | None = None
     #: The bounds that protect it and which of them holds it, if there are any.
     safety: realtime_pb2.SafetyInfo | None = None
+    #: Reciprocal condition below which a step is refused as singular.
+    singular_below: float = 1e-14
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
@@ -628,6 +630,7 @@ class Plant:
             plant_service_pb2.Precision.Name(m.settings.precision)[10:].lower(),
             Accuracy._from(m.accuracy) if m.HasField("accuracy") else None,
             m.safety if m.HasField("safety") else None,
+            m.settings.singular_below,
         )
 
 

@@ -1,0 +1,45 @@
+//! What speaks to clients: the services of `plantd.v1`, the shared-memory link, recordings and saved
+//! plants. Requests are checked and translated here; what they ask for is done by [`crate::core`].
+
+pub mod admission;
+mod analysis;
+pub mod answers;
+mod change;
+pub mod channels;
+mod commands;
+pub mod control;
+pub mod convert;
+mod declare;
+mod derivatives;
+pub mod drive;
+pub mod ending;
+pub(crate) mod feedback;
+pub mod gate;
+pub mod hub;
+pub mod jobs;
+mod kalman;
+pub mod link;
+pub mod metrics_http;
+pub mod model;
+pub mod names;
+pub mod observe;
+mod optimize;
+mod parts;
+pub mod plant;
+mod plant_info;
+mod points;
+pub mod record;
+pub mod recordings;
+mod reference;
+mod refusals;
+pub mod report;
+mod rollout;
+pub(crate) mod run;
+pub(crate) mod run_info;
+mod saved;
+mod settle;
+pub mod state;
+pub mod state_directory;
+pub mod status;
+mod unfinished;
+pub mod watch;
