@@ -54,9 +54,11 @@ def test_every_way_to_step_gives_the_same_bits(client):
 
 def test_methods(client):
     method = {"order": 6, "substeps": 2, "halvings": 1, "precision": "fast"}
-    method["singular_below"] = 1e-12
+    method |= {"singular_below": 1e-12, "newton_iterations": 30}
     plant = client.create_plant("cart-pole", **method)
     assert {name: getattr(plant, name) for name in method} == method
+    assert not plant.paper
+    assert client.create_plant("cart-pole", paper=True).paper
     with client.drive(plant.id) as driver:
         state = driver.step(0.5)
     assert (driver.report.steps, driver.report.halvings) == (2, 0)
@@ -75,10 +77,10 @@ def test_methods(client):
 
 def test_every_setting_and_every_field_of_a_report_has_a_name_here():
     settings = plant_service_pb2.PlantSettings.DESCRIPTOR.fields_by_name.keys()
-    ours = {"dt": "time_step_s", "paper": "force_split"}
+    ours = {"dt": "time_step_s", "paper": "force_split", "newton_iterations": "max_iterations"}
     keywords = {ours.get(name, name) for name in plantd.Stepping.__annotations__}
-    # The one is for tests of the solver, the other for plants alone.
-    assert keywords == set(settings) - {"max_iterations", "tolerance"}
+    # `create_plant` takes a tolerance in place of order and substeps.
+    assert keywords | {"tolerance"} == set(settings)
     report = common_pb2.StepReport.DESCRIPTOR.fields_by_name.keys()
     assert set(plantd.StepReport.__dataclass_fields__) == set(report)
 
