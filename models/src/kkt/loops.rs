@@ -443,7 +443,8 @@ impl Multifrontal {
         }
     }
 
-    /// From the root to the leaves.
+    /// From the root to the leaves. What elimination has left in rows that are not open is met by zeros of the
+    /// factors.
     #[inline(always)]
     fn substitute<S: Column>(
         &self,
@@ -452,7 +453,6 @@ impl Multifrontal {
         multipliers: &mut [S],
         flows: &mut [S],
     ) {
-        flows.fill(S::ZERO);
         let (mut factors, mut closed) = (&self.factors[..], &self.closed[..]);
         for step in loops.plan.steps.iter().rev() {
             let Shape { row: first, stride, .. } = self.shapes[step.front];
@@ -550,7 +550,6 @@ impl Multifrontal {
         start: &InPlane,
         multipliers: &[Block],
     ) {
-        self.wrenches.fill([Block::ZERO; 3]);
         for ((equation, wrenches), lambda) in
             loops.equations.iter().zip(&start.wrenches).zip(multipliers)
         {
@@ -563,13 +562,14 @@ impl Multifrontal {
             }
         }
         for (i, joint) in joints.iter().enumerate().rev() {
-            let [n, fx, fy] = self.wrenches[i + 1];
+            let [n, fx, fy] = std::mem::replace(&mut self.wrenches[i + 1], [Block::ZERO; 3]);
             let ([dx, dy], [ex, ey]) = (start.slide[i], start.edge[i]);
             let momentum = &mut self.tree.momentum[i];
             *momentum = momentum.plus(product([joint.body.turn, dx, dy], [n, fx, fy]));
             let moved = n.plus(fy.times(ex)).plus(fx.times(-ey));
             add_to(&mut self.wrenches[joint.parent], [moved, fx, fy]);
         }
+        self.wrenches[0] = [Block::ZERO; 3];
     }
 }
 
