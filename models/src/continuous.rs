@@ -159,7 +159,7 @@ impl Continuous {
             varied: None,
             mass: TreeLu::new(&model.elimination),
             responses: vec![0.0; nd * padded(nc)],
-            schur: PivotedLu::new(&model.conditioning.weight, stride),
+            schur: PivotedLu::of_constraints(&model, stride),
             value: Accelerations { acceleration: vec![0.0; nd], multipliers: vec![0.0; nc] },
             tangent: vec![0.0; (nd + nc) * stride],
             model,

@@ -4,6 +4,7 @@ mod common;
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
+use common::exact::Mechanism;
 use common::{Numbers, builtin, plant, wave};
 use nalgebra::{DMatrix, Matrix2};
 use plantd_models::{Initial, Linearization, Plant, Scene, StepError};
@@ -371,4 +372,105 @@ fn mass_on_the_axis_of_its_hinge_is_refused() {
     for (bob_at, inertia, damping) in [(1e-3, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 0.1)] {
         assert_eq!(spinning(bob_at, inertia, damping), Ok(()));
     }
+}
+
+/// A scissor of so many pairs with its links at an angle to the rail, and how it moves with that angle.
+fn scissor(pairs: usize, opening: f64) -> [Vec<f64>; 2] {
+    let (mut q, mut slopes) = (vec![5.0 * opening.cos()], vec![-5.0 * opening.sin()]);
+    for (i, right) in
+        [0, 1].into_iter().flat_map(|side| (0..pairs).map(move |i| (i, (i + side) % 2 == 0)))
+    {
+        let slope = if right { -1.0 } else { 1.0 } * if i == 0 { 1.0 } else { 2.0 };
+        let closed = if right || i > 0 { PI } else { 0.0 };
+        q.push(closed + slope * opening);
+        slopes.push(slope);
+    }
+    [q, slopes]
+}
+
+/// A parallelogram of hinges with its cranks at an angle to its base.
+fn parallelogram(angle: f64) -> Scene {
+    let crank = |name: &str, at: f64| {
+        format!(
+            r#"
+[[frames]]
+name = "{name}"
+translation = [{at}, 0.0, 0.0]
+joint = {{ type = "revolute", axis = [0.0, 1.0, 0.0] }}
+body = {{ mass = {MASS}, center_of_mass = [0.3, 0.0, 0.0], inertia = [0.1, 0.1, 0.1] }}
+[[coordinates]]
+name = "{name}"
+initial = {angle}
+"#
+        )
+    };
+    let (crank, rocker) = (crank("crank", 0.0), crank("rocker", 1.1));
+    Scene::from_toml(&format!(
+        r#"
+format = 1
+name = "parallelogram"
+time_step_s = 0.01
+gravity = [0.0, 0.0, -{GRAVITY}]
+{crank}
+[[frames]]
+name = "coupler"
+parent = "crank"
+translation = [{LENGTH}, 0.0, 0.0]
+joint = {{ type = "revolute", axis = [0.0, 1.0, 0.0] }}
+body = {{ mass = 1.2, center_of_mass = [0.6, 0.0, 0.0], inertia = [0.1, 0.1, 0.1] }}
+[[coordinates]]
+name = "coupler"
+initial = -{angle}
+{rocker}
+[[constraints]]
+type = "point_to_point"
+name = "pin"
+a = {{ frame = "coupler", at = [1.1, 0.0, 0.0] }}
+b = {{ frame = "rocker", at = [{LENGTH}, 0.0, 0.0] }}
+axes = ["x", "z"]
+"#
+    ))
+    .unwrap()
+}
+
+/// Past and next to singular configurations multipliers and their derivatives are as exact as the whole
+/// matrix `[K −A0ᵀ; A1 0]` makes them with complete pivoting. What both are off by is the round-off of
+/// `h(q[k+1])` over the square of the distance.
+#[test]
+fn multipliers_are_as_exact_as_those_of_the_whole_matrix() {
+    let mut random = Numbers::new(5);
+    let mut check = |scene: &Scene, place: &dyn Fn(f64) -> [Vec<f64>; 2]| {
+        let mechanism = Mechanism::new(scene);
+        let mut plant = plant(scene, |s| s.halvings = 0);
+        let mut start = |distance: f64, rate: f64, steps: usize| {
+            let [q, slopes] = place(distance);
+            let v = slopes.iter().map(|slope| slope * rate).collect();
+            plant.initialize(&Initial::Velocity { q, v }).unwrap();
+            let errors: Vec<_> = (0..steps).map(|_| mechanism.errors(&mut plant)).collect();
+            // Single errors of either may be small by chance.
+            for (what, part) in ["multipliers", "derivatives"].iter().zip(0..) {
+                let mean = |which: usize| {
+                    let logarithms = errors.iter().map(|e| e[part][which].max(1e-16).ln());
+                    (logarithms.sum::<f64>() / steps as f64).exp()
+                };
+                let (found, whole) = (mean(0), mean(1));
+                let name = &scene.name;
+                assert!(
+                    found < 3.0 * whole,
+                    "{name} from {distance:e}: {what} to {found:e}, not to {whole:e}"
+                );
+            }
+        };
+        // Twenty-five steps before and after.
+        start(-0.155, 0.613, 50);
+        for distance in [1e-3, 1e-4, 1e-5, 3e-6, 1e-6] {
+            start(distance * random.between(0.9, 1.1), distance, 2);
+        }
+    };
+    for pairs in [1, 2, 4] {
+        let place = |distance: f64| scissor(pairs, FRAC_PI_2 + distance);
+        check(&builtin(&format!("scissor-{pairs}")), &place);
+    }
+    let place = |angle: f64| [vec![angle, -angle, angle], vec![1.0, -1.0, 1.0]];
+    check(&parallelogram(1.0), &place);
 }

@@ -129,7 +129,7 @@ impl SolvedStep {
             inputs: zeros(d.inputs),
             multipliers: zeros(d.constraints),
             responses: zeros(d.dynamic * padded(d.constraints)),
-            schur: PivotedLu::new(&model.conditioning.weight, 1),
+            schur: PivotedLu::of_constraints(model, 1),
             in_loops: false,
         }
     }

@@ -195,7 +195,7 @@ impl Workspace {
             end: Closure::new(model),
             end_is_exact: false,
             responses: zeros(nd * padded(nc)),
-            schur: PivotedLu::new(&model.conditioning.weight, spread(padded(2 * n))),
+            schur: PivotedLu::of_constraints(model, spread(padded(2 * n))),
             in_loops: false,
             constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
             end_slopes: zeros(nd * nd),

@@ -3,10 +3,20 @@
 //! Rows that depend on others (redundant constraints) show as vanishing pivots and are left out. Of
 //! all solutions the one of least norm is taken: what a solution has along the null space of the
 //! matrix is removed. A matrix of full rank pays nothing for that.
+//!
+//! **Near a singular configuration** the pivot of an equation that is not redundant vanishes as the square
+//! of the distance from there. It says the same as it did further away: left out, the equation would be
+//! violated and its multiplier lost. So the first `r` pivots, of `r` equations that are independent in
+//! general, are in use as long as more than noise is left of them; redundant equations come after them.
 
+use crate::Model;
 use crate::plant::conditioning::DEPENDENT;
 use crate::plant::rows::{Term, add_rows};
 use crate::wide::wide;
+
+/// Relative to the first, pivots below this are noise. Steps with such pivots are refused unless
+/// [`Settings::singular_below`](crate::Settings::singular_below) allows them.
+const NOISE: f64 = 1e-14;
 
 /// A square matrix, row-major, and its factorization in place.
 #[derive(Clone, Debug)]
@@ -14,6 +24,8 @@ pub(crate) struct PivotedLu {
     pub(crate) matrix: Vec<f64>,
     order: usize,
     rank: usize,
+    /// Equations that are independent in general.
+    independent: usize,
     rows: Vec<usize>,
     columns: Vec<usize>,
     scale: Vec<f64>,
@@ -59,6 +71,7 @@ impl PivotedLu {
             matrix: vec![0.0; order * order],
             order,
             rank: 0,
+            independent: 0,
             rows: vec![0; order],
             columns: vec![0; order],
             scale: scale.to_vec(),
@@ -69,6 +82,12 @@ impl PivotedLu {
             scratch: vec![0.0; order * stride.max(1)],
             terms: Vec::with_capacity(order),
         }
+    }
+
+    /// For the constraints of a model, the independent ones of which are known.
+    pub(crate) fn of_constraints(model: &Model, stride: usize) -> Self {
+        let independent = model.constraint_rank();
+        Self { independent, ..Self::new(&model.conditioning.weight, stride) }
     }
 
     wide! {
@@ -95,8 +114,9 @@ impl PivotedLu {
         }
         let first = largest.size;
         for k in 0..n {
+            let smallest = if k < self.independent { NOISE } else { DEPENDENT };
             // Written so that a NaN ends the factorization too.
-            if !(largest.size > DEPENDENT * first) {
+            if !(largest.size > smallest * first) {
                 self.rank = k;
                 self.rest = largest.size;
                 self.find_null();

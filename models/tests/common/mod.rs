@@ -1,6 +1,7 @@
 //! Mechanisms and helpers that the tests of motion share.
 #![allow(dead_code, reason = "each test program uses some of it")]
 
+pub(crate) mod exact;
 pub(crate) mod linearization;
 mod numbers;
 pub(crate) mod oracle;

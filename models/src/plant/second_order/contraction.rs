@@ -180,7 +180,7 @@ impl Contraction {
             adjoint: vec![0.0; rows],
             impulse: vec![0.0; n],
             quadratic: Quadratic::new(layout),
-            schur: PivotedLu::new(&model.conditioning.weight, 1),
+            schur: PivotedLu::of_constraints(model, 1),
             dense: model.loops.as_ref().map(|_| Dense {
                 matrix: TreeLu::new(&model.elimination),
                 responses: vec![0.0; layout.nd * padded(layout.nc)],
