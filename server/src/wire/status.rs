@@ -62,8 +62,10 @@ use tonic_types::{ErrorDetails, StatusExt};
 
 use crate::core::failure::step_error_reason;
 use crate::core::limits::LimitExceeded;
-use crate::core::realtime::watchdog::{Quantity, Trip};
-use crate::core::session::{DriveError, LeaseHeld, Session};
+use crate::core::plant::error::DriveError;
+use crate::core::plant::watchdog::{Quantity, Trip};
+use crate::core::session::lease::LeaseHeld;
+use crate::core::session::shared::Session;
 
 /// Longest text of one message, name or description, bytes. Statuses travel in trailers, of which
 /// clients accept about 8 KiB.

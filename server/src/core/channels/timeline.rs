@@ -8,9 +8,10 @@ use std::sync::Arc;
 
 use plantd_models::{InitialError, Model, Plant, Settings, Site, Spare};
 
-use super::fault::{Pattern, Schedule};
+use crate::core::channels::fault::{Pattern, Schedule};
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::core::parameters::{self, ChangeError, Parameters};
+use crate::core::parameters;
+use crate::core::parameters::{ChangeError, Parameters};
 
 /// Why changes of parameters cannot be made ready.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -58,7 +59,7 @@ struct Entry {
     digest: u64,
     plant: Spare,
     parameters: Arc<Parameters>,
-    /// Those of outputs and pushes, in the order of [`super::Channels::sites_mut`].
+    /// Those of outputs and pushes, in the order of [`crate::core::channels::pipeline::Channels::sites_mut`].
     sites: Vec<Site>,
 }
 

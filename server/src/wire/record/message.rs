@@ -3,13 +3,13 @@
 use plantd_models::Plant;
 use plantd_proto::v1;
 
-use crate::core::frame::Frame;
 use crate::core::parameters::Parameters;
-use crate::core::session::Session;
-use crate::core::session::tap::Mark;
-use crate::wire::convert;
-use crate::wire::report::report_message;
-use crate::wire::run_info::run_info;
+use crate::core::plant::mark::Mark;
+use crate::core::publish::frame::Frame;
+use crate::core::session::shared::Session;
+use crate::wire::message::convert;
+use crate::wire::message::report::report_message;
+use crate::wire::message::run_info::run_info;
 
 /// The plant at the beginning of a recording.
 pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecord {
