@@ -70,7 +70,8 @@ pub struct RunningServer {
     hub: Arc<Hub>,
     config: Config,
     addresses: Addresses,
-    health: HealthReporter,
+    /// Until it was said that the server serves no more: whoever watches it hears that once.
+    health: Option<HealthReporter>,
     /// Somebody asks whether the server is healthy, and learns before its end that it is going.
     is_asked_for_health: Arc<AtomicBool>,
     listeners: JoinSet<Result<(), tonic::transport::Error>>,
@@ -168,7 +169,7 @@ impl RunningServer {
         let mut server = Self {
             is_asked_for_health,
             addresses: Addresses { link_root, pid: std::process::id(), ..Addresses::default() },
-            health,
+            health: Some(health),
             listeners: JoinSet::new(),
             closing: CancellationToken::new(),
             saver: tokio::spawn(save_plants(Arc::clone(&hub), config.state_interval())),
@@ -286,7 +287,7 @@ impl RunningServer {
 
     /// Says that it is not serving any more, and serves on for the configured time, so that balancers
     /// send nobody here who would not be let in. Nobody waits where nobody asks for its health.
-    pub async fn drain(&self, hurry: impl Future<Output = ()>) {
+    pub async fn drain(&mut self, hurry: impl Future<Output = ()>) {
         self.say_not_serving().await;
         let drain = self.config.drain();
         if drain.is_zero() || !self.is_asked_for_health.load(Ordering::Relaxed) {
@@ -299,12 +300,13 @@ impl RunningServer {
         }
     }
 
-    async fn say_not_serving(&self) {
-        self.health.set_not_serving::<ModelServiceServer<ModelService>>().await;
-        self.health.set_not_serving::<PlantServiceServer<PlantService>>().await;
-        self.health.set_not_serving::<ControlServiceServer<ControlService>>().await;
-        self.health.set_not_serving::<ChannelServiceServer<ChannelService>>().await;
-        self.health.set_not_serving::<RecordingServiceServer<RecordingService>>().await;
+    async fn say_not_serving(&mut self) {
+        let Some(health) = self.health.take() else { return };
+        health.set_not_serving::<ModelServiceServer<ModelService>>().await;
+        health.set_not_serving::<PlantServiceServer<PlantService>>().await;
+        health.set_not_serving::<ControlServiceServer<ControlService>>().await;
+        health.set_not_serving::<ChannelServiceServer<ChannelService>>().await;
+        health.set_not_serving::<RecordingServiceServer<RecordingService>>().await;
     }
 
     /// Ends: no new connections, streams end with UNAVAILABLE, calls may finish within the grace.

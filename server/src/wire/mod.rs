@@ -6,6 +6,7 @@ pub mod control;
 pub mod edge;
 pub mod link;
 pub mod message;
+pub(crate) mod model_errors;
 pub mod models;
 pub mod names;
 pub mod plants;

@@ -6,8 +6,7 @@ use plantd_models::{Model, Plant, Site};
 
 use crate::core::channels::actuator::Actuator;
 use crate::core::channels::fault::{Effect, FaultMemory, Injected};
-use crate::core::channels::sensor::Source;
-use crate::core::channels::sensor::{Instant, Sensor};
+use crate::core::channels::sensor::{Instant, Sensor, Source};
 use crate::core::channels::timeline::{Set, Timeline};
 use crate::core::origin::Origin;
 use crate::core::parameters::Parameters;

@@ -10,8 +10,7 @@ use plantd_models::{InitialError, Model, Plant, Settings, Site, Spare};
 
 use crate::core::channels::fault::{Pattern, Schedule};
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::core::parameters;
-use crate::core::parameters::{ChangeError, Parameters};
+use crate::core::parameters::{self, ChangeError, Parameters};
 
 /// Why changes of parameters cannot be made ready.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -15,8 +15,7 @@ use crate::core::connection::Connection;
 use crate::core::limits::LimitExceeded;
 use crate::core::mutex::lock;
 use crate::core::priority::Priority;
-use crate::core::workers::queue::{Admission, Lane, Work};
-use crate::core::workers::queue::{Baton, May, Queue, Ticket};
+use crate::core::workers::queue::{Admission, Baton, Lane, May, Queue, Ticket, Work};
 
 /// How long a job keeps its turn while others wait for one.
 const TURN: Duration = Duration::from_millis(20);

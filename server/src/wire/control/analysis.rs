@@ -9,7 +9,7 @@ use crate::core::feedback::regulator::Constraints;
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::control::points::{at_point, check_linearization};
-use crate::wire::message::convert;
+use crate::wire::message::{checks, matrices, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -50,7 +50,7 @@ pub(crate) fn analyze(
         modes: modes.into_iter().map(mode).collect(),
         responses,
         outputs: outputs.names,
-        state: Some(convert::plant_state(&plant)),
+        state: Some(states::plant_state(&plant)),
         u,
     })
 }
@@ -88,10 +88,10 @@ impl Outputs {
             let problem = format!("has {} rows; the state has {nx} entries", given.rows);
             return Err(RpcError::field(format!("{prefix}output_x.rows"), problem));
         }
-        let x = convert::matrix_of(&format!("{prefix}output_x"), given, None, nx)?;
+        let x = matrices::matrix_of(&format!("{prefix}output_x"), given, None, nx)?;
         let u = match u {
             Some(given) => {
-                convert::matrix_of(&format!("{prefix}output_u"), given, Some(x.nrows()), nu)?
+                matrices::matrix_of(&format!("{prefix}output_u"), given, Some(x.nrows()), nu)?
             }
             None => DMatrix::zeros(x.nrows(), nu),
         };
@@ -102,7 +102,7 @@ impl Outputs {
     /// Entries of x by name; all of them when there are no names.
     fn named(prefix: &str, names: Vec<String>, model: &Model) -> Result<Self, RpcError> {
         let d = model.dimensions();
-        let known = convert::state_names(model);
+        let known = states::state_names(model);
         if names.is_empty() {
             let identity = DMatrix::identity(d.state(), d.state());
             return Ok(Self { names: known, x: identity, u: DMatrix::zeros(d.state(), d.input()) });
@@ -131,7 +131,7 @@ fn check_frequencies(hub: &Hub, frequencies_hz: &[f64], outputs: &Outputs) -> Re
     let numbers = count.saturating_mul(2 * outputs.u.len());
     let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
     LimitExceeded::check(name, limit, "numbers in the responses", numbers)?;
-    convert::check_finite("frequencies_hz", frequencies_hz)
+    checks::check_finite("frequencies_hz", frequencies_hz)
 }
 
 fn responses(
@@ -152,8 +152,8 @@ fn responses(
         let response = transfer.at(frequency_hz)?;
         Ok(v1::FrequencyResponse {
             frequency_hz,
-            magnitude: Some(convert::matrix(&response.map(|entry| entry.norm()))),
-            phase_rad: Some(convert::matrix(&response.map(|entry| entry.arg()))),
+            magnitude: Some(matrices::matrix(&response.map(|entry| entry.norm()))),
+            phase_rad: Some(matrices::matrix(&response.map(|entry| entry.arg()))),
         })
     };
     frequencies_hz.iter().map(response).collect()

@@ -10,10 +10,9 @@ use plantd_proto::v1;
 
 use crate::core::limits::LimitExceeded;
 use crate::wire::control::points::{at_point, check_linearization};
-use crate::wire::message::convert;
-use crate::wire::shared::hub::Hub;
-
 use crate::wire::message::report::report_message;
+use crate::wire::message::{checks, matrices, states};
+use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
 /// Answers a LinearizeSecondOrder call.
@@ -26,7 +25,7 @@ pub(crate) fn linearize_second_order(
     let d = model.dimensions();
     check_linearization(hub, &model)?;
     check_second_order(hub, d.state() + d.constraints, d.state() + d.input())?;
-    let state = convert::plant_state(&plant);
+    let state = states::plant_state(&plant);
     let mut first = Linearization::new(&model);
     let (report, tensors, contraction) = match request.weights {
         None => {
@@ -48,8 +47,8 @@ pub(crate) fn linearize_second_order(
     };
     plant.step(&u)?;
     Ok(v1::LinearizeSecondOrderResponse {
-        linearization: Some(convert::linearization(state.step, &first)),
-        next: Some(convert::plant_state(&plant)),
+        linearization: Some(states::linearization(state.step, &first)),
+        next: Some(states::plant_state(&plant)),
         state: Some(state),
         u,
         tensors,
@@ -79,7 +78,7 @@ pub(crate) fn evaluate_dynamics(
         if given.is_empty() {
             return Ok(default);
         }
-        convert::check_numbers(field, &given, default.len())?;
+        checks::check_numbers(field, &given, default.len())?;
         Ok(given)
     };
     let at = ContinuousPoint {
@@ -120,7 +119,7 @@ pub(crate) fn evaluate_dynamics(
     Ok(v1::EvaluateDynamicsResponse {
         acceleration: value.acceleration,
         multipliers: value.multipliers,
-        jacobian: jacobian.map(|jacobian| convert::matrix(&jacobian)),
+        jacobian: jacobian.map(|jacobian| matrices::matrix(&jacobian)),
         hessian,
     })
 }
@@ -137,7 +136,7 @@ fn weights_of(field: &str, weights: Vec<f64>, expected: usize) -> Result<Vec<f64
     if weights.is_empty() {
         return Ok(vec![0.0; expected]);
     }
-    convert::check_numbers(field, &weights, expected)?;
+    checks::check_numbers(field, &weights, expected)?;
     Ok(weights)
 }
 
@@ -168,8 +167,8 @@ fn tensor(slices: &[DMatrix<f64>], first: usize, second: usize) -> v1::Tensor {
 
 fn contraction(sum: &Contraction) -> v1::Contraction {
     v1::Contraction {
-        xx: Some(convert::matrix(&sum.xx)),
-        xu: Some(convert::matrix(&sum.xu)),
-        uu: Some(convert::matrix(&sum.uu)),
+        xx: Some(matrices::matrix(&sum.xx)),
+        xu: Some(matrices::matrix(&sum.xu)),
+        uu: Some(matrices::matrix(&sum.uu)),
     }
 }

@@ -12,7 +12,7 @@ use crate::core::limits::LimitExceeded;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::control::analysis::Outputs;
 use crate::wire::control::points::{at_point, check_linearization, model_and_settings};
-use crate::wire::message::convert;
+use crate::wire::message::{matrices, states, weights};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -37,23 +37,23 @@ pub(crate) fn solve(
         }
         None => control::steady_state_kalman(&a, &b, &outputs.x, &noise)?,
     };
-    let x = convert::x(&plant);
+    let x = states::x(&plant);
     Ok(v1::SolveKalmanResponse {
-        gain: Some(convert::matrix(&filter.gain)),
-        predicted_covariance: Some(convert::matrix(&filter.predicted)),
-        filtered_covariance: Some(convert::matrix(&filter.filtered)),
-        error_modes: convert::complex(&filter.error_modes),
+        gain: Some(matrices::matrix(&filter.gain)),
+        predicted_covariance: Some(matrices::matrix(&filter.predicted)),
+        filtered_covariance: Some(matrices::matrix(&filter.filtered)),
+        error_modes: matrices::complex(&filter.error_modes),
         residual: filter.residual,
         iterations: filter.iterations,
         reciprocal_condition: filter.reciprocal_condition,
-        linearization: Some(convert::linearization(step, &linearization)),
+        linearization: Some(states::linearization(step, &linearization)),
         y_reference: outputs.at(&x, &u),
         x_reference: x,
         u_reference: u,
-        output_x: Some(convert::matrix(&outputs.x)),
-        output_u: Some(convert::matrix(&outputs.u)),
+        output_x: Some(matrices::matrix(&outputs.x)),
+        output_u: Some(matrices::matrix(&outputs.u)),
         outputs: outputs.names,
-        rotations: convert::rotations(plant.model()),
+        rotations: states::rotations(plant.model()),
     })
 }
 
@@ -69,7 +69,7 @@ impl Outputs {
         if !u.is_empty() {
             y += &self.u * DVector::from_column_slice(u);
         }
-        convert::vector(y)
+        matrices::vector(y)
     }
 }
 
@@ -81,11 +81,11 @@ fn noise(
     let noise = noise.ok_or_else(|| RpcError::field("noise", "is missing"))?;
     let d = model.dimensions();
     let optional = |field: &str, given: Option<v1::Weight>, size: usize| {
-        given.map(|given| convert::weight(field, Some(given), size)).transpose()
+        given.map(|given| weights::weight(field, Some(given), size)).transpose()
     };
     let process = optional("noise.process", noise.process, d.state())?;
     let input = optional("noise.input", noise.input, d.input())?;
-    let measurement = convert::weight("noise.measurement", noise.measurement, outputs.x.nrows())?;
+    let measurement = weights::weight("noise.measurement", noise.measurement, outputs.x.nrows())?;
     Ok(NoiseCovariances::new(process, input, measurement)?)
 }
 
@@ -115,11 +115,11 @@ impl TrajectoryFilter {
         let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
         check_linearization(hub, &model)?;
         let (plant, inputs) =
-            convert::trajectory(request.trajectory, &model, settings, &hub.limits)?;
+            matrices::trajectory(request.trajectory, &model, settings, &hub.limits)?;
         let outputs = outputs(request.measurement, &model)?;
         let noise = [noise(request.noise, &outputs, &model)?];
         let size = model.dimensions().state();
-        let initial = convert::weight("initial_covariance", request.initial_covariance, size)?;
+        let initial = weights::weight("initial_covariance", request.initial_covariance, size)?;
         let values = if request.covariances { Values::Keep } else { Values::Drop };
         check_memory(hub, &model, inputs.count(), outputs.x.nrows(), request.covariances)?;
         let path = Path::follow(plant, &inputs, Momentum::State, constraints, abandoned)?;
@@ -140,7 +140,7 @@ impl TrajectoryFilter {
             samples: path.samples.into_iter(),
             inputs,
             outputs,
-            rotations: convert::rotations(&model),
+            rotations: states::rotations(&model),
             next: 0,
             _permit: permit,
         })
@@ -176,25 +176,25 @@ impl Iterator for TrajectoryFilter {
         let u = if k < self.inputs.count() { self.inputs.get(k).to_vec() } else { Vec::new() };
         let linearization = self.samples.next().map(|sample| v1::Linearization {
             step: k as u64,
-            a: Some(convert::matrix(&sample.a)),
-            b: Some(convert::matrix(&sample.b)),
+            a: Some(matrices::matrix(&sample.a)),
+            b: Some(matrices::matrix(&sample.b)),
             ..Default::default()
         });
         let (predicted, filtered) = self.covariances.next().unzip();
         let is_first = k == 0;
         Some(v1::SolveTrajectoryKalmanResponse {
             step: k as u64,
-            gain: self.gains.next().map(|gain| convert::matrix(&gain)),
+            gain: self.gains.next().map(|gain| matrices::matrix(&gain)),
             linearization,
             y_reference: self.outputs.at(&x, &u),
             x_reference: x,
             u_reference: u,
-            predicted_covariance: predicted.as_ref().map(convert::matrix),
-            filtered_covariance: filtered.as_ref().map(convert::matrix),
+            predicted_covariance: predicted.as_ref().map(matrices::matrix),
+            filtered_covariance: filtered.as_ref().map(matrices::matrix),
             reciprocal_condition: self.reciprocal_conditions.next().unwrap_or_default(),
             rotations: self.rotations.clone(),
-            output_x: is_first.then(|| convert::matrix(&self.outputs.x)),
-            output_u: is_first.then(|| convert::matrix(&self.outputs.u)),
+            output_x: is_first.then(|| matrices::matrix(&self.outputs.x)),
+            output_u: is_first.then(|| matrices::matrix(&self.outputs.u)),
         })
     }
 }

@@ -21,8 +21,8 @@ use crate::core::limits::LimitExceeded;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::answers::Answers;
 use crate::wire::control::points::model_and_settings;
-use crate::wire::message::convert;
-use crate::wire::message::convert::WeightFields;
+use crate::wire::message::weights::{self, WeightFields};
+use crate::wire::message::{checks, matrices, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -142,8 +142,8 @@ impl Search {
             last_derivative,
         } = self.optimizer.checkpoint();
         let state =
-            |state: &State| Some(convert::state(state, state.step as f64 * self.time_step_s));
-        let u = Some(convert::matrix(&inputs));
+            |state: &State| Some(states::state(state, state.step as f64 * self.time_step_s));
+        let u = Some(matrices::matrix(&inputs));
         v1::OptimizationCheckpoint {
             trajectory: Some(v1::Trajectory { initial: state(&initial), u }),
             iterations,
@@ -164,7 +164,7 @@ impl Search {
             cost: self.optimizer.cost(),
             bound_violation: self.optimizer.bound_violation(),
             checkpoint: Some(self.checkpoint()),
-            x: Some(convert::matrix(&self.optimizer.states())),
+            x: Some(matrices::matrix(&self.optimizer.states())),
         }
     }
 }
@@ -231,7 +231,8 @@ fn trajectory(
     model: &Arc<Model>,
     settings: plantd_models::Settings,
 ) -> Result<(Plant, DMatrix<f64>), RpcError> {
-    let (plant, inputs) = convert::trajectory_in(field, Some(given), model, settings, &hub.limits)?;
+    let (plant, inputs) =
+        matrices::trajectory_in(field, Some(given), model, settings, &hub.limits)?;
     if inputs.count() == 0 {
         return Err(RpcError::field(format!("{field}.u"), "is missing: it needs one row at least"));
     }
@@ -246,9 +247,9 @@ fn rows(inputs: &Inputs, width: usize) -> DMatrix<f64> {
 fn state(field: &str, state: v1::State, model: &Model) -> Result<State, RpcError> {
     let d = model.dimensions();
     let v = if state.v.is_empty() { vec![0.0; d.prescribed] } else { state.v };
-    convert::check_numbers(&format!("{field}.q"), &state.q, d.coordinates())?;
-    convert::check_numbers(&format!("{field}.p"), &state.p, d.dynamic)?;
-    convert::check_numbers(&format!("{field}.v"), &v, d.prescribed)?;
+    checks::check_numbers(&format!("{field}.q"), &state.q, d.coordinates())?;
+    checks::check_numbers(&format!("{field}.p"), &state.p, d.dynamic)?;
+    checks::check_numbers(&format!("{field}.v"), &v, d.prescribed)?;
     let multipliers = vec![0.0; d.constraints];
     Ok(State { step: state.step, q: state.q, p: state.p, v, multipliers })
 }
@@ -268,8 +269,8 @@ fn check_memory(
     let result = (steps + 1).saturating_mul(nx).saturating_add(steps.saturating_mul(nu));
     let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
     LimitExceeded::check(name, limit, "numbers in the trajectory found", result)?;
-    let linearizations = if uses_newton { 2 * convert::linearization_numbers(d) } else { 0 };
-    let momentum = convert::momentum_in("cost.weights", cost.weights.as_ref())?;
+    let linearizations = if uses_newton { 2 * states::linearization_numbers(d) } else { 0 };
+    let momentum = weights::momentum_in("cost.weights", cost.weights.as_ref())?;
     let is_projected = momentum == Momentum::Projected && d.constraints > 0;
     let projections = if is_projected { d.dynamic * nx } else { 0 };
     let of_step = nx * nx + 3 * nx * nu + linearizations + projections + 8 * (nx + nu);
@@ -286,14 +287,14 @@ fn trajectory_cost(
 ) -> Result<TrajectoryCost, RpcError> {
     let d = model.dimensions();
     let x = cost.x.ok_or_else(|| RpcError::field("cost.x", "is missing"))?;
-    let x = convert::matrix_of("cost.x", &x, Some(steps + 1), d.state())?;
+    let x = matrices::matrix_of("cost.x", &x, Some(steps + 1), d.state())?;
     let u = match cost.u {
-        Some(u) => convert::matrix_of("cost.u", &u, Some(steps), d.input())?,
+        Some(u) => matrices::matrix_of("cost.u", &u, Some(steps), d.input())?,
         None => DMatrix::zeros(steps, d.input()),
     };
     let fields = WeightFields { weights: "cost.weights", stages: "cost.stages", are_convex: false };
-    let momentum = convert::momentum_in(fields.weights, cost.weights.as_ref())?;
-    let weights = convert::trajectory_weights(fields, cost.weights, cost.stages, steps, model)?;
+    let momentum = weights::momentum_in(fields.weights, cost.weights.as_ref())?;
+    let weights = weights::trajectory_weights(fields, cost.weights, cost.stages, steps, model)?;
     Ok(TrajectoryCost { x, u, weights, momentum })
 }
 
@@ -304,21 +305,21 @@ fn bounds(given: v1::TrajectoryBounds, model: &Model) -> Result<Bounds, RpcError
             return Err(RpcError::field(format!("bounds.{list}"), problem));
         }
         let bound = |(i, bound): (usize, v1::Bound)| {
-            let (index, ..) = convert::bound(&format!("bounds.{list}[{i}]"), &bound, names)?;
+            let (index, ..) = states::bound(&format!("bounds.{list}[{i}]"), &bound, names)?;
             Ok(Bound { index, min: bound.min, max: bound.max })
         };
         given.into_iter().enumerate().map(bound).collect::<Result<Vec<_>, RpcError>>()
     };
-    let states = convert::state_names(model);
+    let states = states::state_names(model);
     Ok(Bounds {
         states: list("state", given.state, &states)?,
-        inputs: list("input", given.input, &convert::input_names(model))?,
+        inputs: list("input", given.input, &states::input_names(model))?,
         final_state: list("final_state", given.final_state, &states)?,
     })
 }
 
 fn free_initial(given: v1::FreeInitialState, model: &Model) -> Result<FreeInitialState, RpcError> {
-    let names = convert::state_names(model);
+    let names = states::state_names(model);
     if given.entries.len() > names.len() {
         let problem = format!("has {} entries; there are {}", given.entries.len(), names.len());
         return Err(RpcError::field("free_initial.entries", problem));
@@ -330,7 +331,7 @@ fn free_initial(given: v1::FreeInitialState, model: &Model) -> Result<FreeInitia
         })
     };
     let entries = given.entries.iter().enumerate().map(index).collect::<Result<_, RpcError>>()?;
-    let weight = |given| convert::weight("free_initial.weight", Some(given), names.len());
+    let weight = |given| weights::weight("free_initial.weight", Some(given), names.len());
     Ok(FreeInitialState { entries, weight: given.weight.map(weight).transpose()? })
 }
 
@@ -356,7 +357,7 @@ fn given_options(
         near_last_step: given.near_last_step,
         projection: match given.projection {
             None => None,
-            weights => Some(convert::state_weights_in("options.projection", weights, model)?),
+            weights => Some(weights::state_weights_in("options.projection", weights, model)?),
         },
         bound_tolerance: or(given.bound_tolerance, defaults.bound_tolerance),
     };

@@ -6,7 +6,7 @@ use plantd_models::{Model, Plant, Settings};
 use plantd_proto::v1;
 
 use crate::core::limits::LimitExceeded;
-use crate::wire::message::convert;
+use crate::wire::message::{settings, start, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -17,7 +17,7 @@ pub(crate) fn model_and_settings(
     settings: Option<v1::PlantSettings>,
 ) -> Result<(Arc<Model>, Settings), RpcError> {
     let model = hub.catalog.get(name)?.model;
-    let settings = convert::settings(settings, &model, &hub.limits)?;
+    let settings = settings::settings(settings, &model, &hub.limits)?;
     Ok((model, settings))
 }
 
@@ -32,7 +32,7 @@ pub(crate) fn at_point(
         return Ok(hub.session(id)?.copy_plant_and_input());
     }
     let (model, settings) = model_and_settings(hub, model, settings)?;
-    convert::point(point, &model, settings)
+    start::point(point, &model, settings)
 }
 
 /// Name of the model that such a point is of.
@@ -51,7 +51,7 @@ pub(crate) fn model_at(
 
 /// Refuses matrices that no client would take.
 pub(crate) fn check_linearization(hub: &Hub, model: &Model) -> Result<(), RpcError> {
-    let numbers = convert::linearization_numbers(model.dimensions());
+    let numbers = states::linearization_numbers(model.dimensions());
     let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
     Ok(LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?)
 }

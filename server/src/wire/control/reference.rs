@@ -13,8 +13,8 @@ use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::control::points::model_and_settings;
-use crate::wire::message::convert;
-use crate::wire::message::convert::Start;
+use crate::wire::message::start::{self, Start};
+use crate::wire::message::{matrices, states, weights};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -46,7 +46,7 @@ impl Projection {
         let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
         let d = model.dimensions();
         let q = request.q.ok_or_else(|| RpcError::field("q", "is missing"))?;
-        let q = convert::matrix_of("q", &q, None, d.coordinates())?;
+        let q = matrices::matrix_of("q", &q, None, d.coordinates())?;
         if q.nrows() < 2 {
             return Err(RpcError::field("q", format!("has {} rows; two are needed", q.nrows())));
         }
@@ -55,17 +55,17 @@ impl Projection {
         let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
         let numbers = steps.saturating_mul(2 * d.input());
         LimitExceeded::check(name, limit, "numbers in the report's inputs", numbers)?;
-        let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
+        let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
         Memory { steps, stages: 0, momentum, values: Values::Drop }.check(&hub.limits, &model)?;
         let u =
-            request.u.map(|u| convert::matrix_of("u", &u, Some(steps), d.input())).transpose()?;
+            request.u.map(|u| matrices::matrix_of("u", &u, Some(steps), d.input())).transpose()?;
         let pull = match request.projection {
             None => None,
-            given => Some(convert::state_weights_in("projection", given, &model)?),
+            given => Some(weights::state_weights_in("projection", given, &model)?),
         };
         let weights = match request.weights {
             None => None,
-            given => Some(convert::weights(given, &model)?),
+            given => Some(weights::weights(given, &model)?),
         };
 
         let spare = Spare::new(model.clone(), settings)
@@ -82,15 +82,15 @@ impl Projection {
             None => Vec::new(),
             Some(weights) => {
                 let inputs = Inputs::from_rows(&projected.inputs);
-                let start = Start::Initial(convert::momentum_of(&projected.initial));
-                let plant = convert::plant(&model, settings, &start, "q")?;
+                let start = Start::Initial(start::momentum_of(&projected.initial));
+                let plant = start::plant(&model, settings, &start, "q")?;
                 let path = Path::follow(plant, &inputs, momentum, constraints, abandoned)?;
                 path.solve(&weights.into(), Values::Drop)?.gains
             }
         };
         Ok(Self {
             report: Some(report(&assessment, &projected, tolerance, settings.time_step_s)),
-            common: convert::gain_of(&request.model, &model, &settings),
+            common: states::gain_of(&request.model, &model, &settings),
             inputs: projected.inputs,
             states: projected.states,
             gains: gains.into_iter(),
@@ -141,8 +141,8 @@ fn report(
     time_step_s: f64,
 ) -> v1::ReferenceReport {
     let initial = &projected.initial;
-    let initial = convert::state(initial, initial.step as f64 * time_step_s);
-    let u = Some(convert::matrix(&projected.inputs));
+    let initial = states::state(initial, initial.step as f64 * time_step_s);
+    let u = Some(matrices::matrix(&projected.inputs));
     v1::ReferenceReport {
         feasible: assessment.is_feasible(tolerance),
         constraint_violation: assessment.constraint_violation,
@@ -154,7 +154,7 @@ fn report(
         unexplained_acceleration: assessment.unexplained_acceleration,
         unexplained_step: assessment.unexplained_step as u32,
         unexplained_coordinate: assessment.unexplained_coordinate.clone(),
-        u: Some(convert::matrix(&assessment.inputs)),
+        u: Some(matrices::matrix(&assessment.inputs)),
         deviation: projected.deviation,
         deviation_step: projected.deviation_step as u32,
         deviation_coordinate: projected.deviation_coordinate.clone(),
@@ -180,7 +180,7 @@ impl Iterator for Projection {
                 self.next += 1;
                 Answer::Step(v1::Gain {
                     step: k as u64,
-                    k: self.gains.next().map(|gain| convert::matrix(&gain)),
+                    k: self.gains.next().map(|gain| matrices::matrix(&gain)),
                     x_reference: row(&self.states, k),
                     u_reference: row(&self.inputs, k),
                     ..self.common.clone()

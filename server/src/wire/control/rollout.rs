@@ -12,8 +12,8 @@ use crate::core::workers::pool::Abandoned;
 use crate::core::workers::queue::Admission;
 use crate::wire::answers::Answers;
 use crate::wire::control::points::model_and_settings;
-use crate::wire::message::convert;
-use crate::wire::message::convert::Start;
+use crate::wire::message::start::{self, Start};
+use crate::wire::message::states;
 use crate::wire::shared::hub::Hub;
 use crate::wire::shared::jobs::Jobs;
 use crate::wire::status::RpcError;
@@ -45,7 +45,7 @@ impl Rollout {
         LimitExceeded::check("rollout_cases", limits.rollout_cases, "cases", count)?;
         let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
         let every = (request.every > 0).then_some(request.every as usize);
-        let state_numbers = convert::state_numbers(model.dimensions());
+        let state_numbers = states::state_numbers(model.dimensions());
         let mut cases = Vec::with_capacity(count);
         for (index, case) in (0..).zip(request.cases) {
             let field = format!("cases[{index}].u");
@@ -56,7 +56,7 @@ impl Rollout {
             let numbers = states.saturating_mul(state_numbers);
             let (name, limit) = ("reply_numbers", limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in the states of a case", numbers)?;
-            let start = convert::start(case.initial, &model, &hub.limits)?;
+            let start = start::start(case.initial, &model, &hub.limits)?;
             cases.push(Case { index, start, inputs, steps });
         }
         Ok(Self { shared: Arc::new(Shared { model, settings, every }), cases })
@@ -114,7 +114,7 @@ impl Simulation {
             Some(plant) => plant,
             None => {
                 let field = format!("cases[{}].initial", case.index);
-                let plant = convert::plant(&shared.model, shared.settings, &case.start, &field)?;
+                let plant = start::plant(&shared.model, shared.settings, &case.start, &field)?;
                 *held = match case.inputs.last() {
                     Some(last) => last.to_vec(),
                     None => hold_input(&plant),
@@ -131,14 +131,14 @@ impl Simulation {
             }
             *taken += 1;
             if shared.every.is_some_and(|every| *taken % every == 0) {
-                response.states.push(convert::plant_state(plant));
+                response.states.push(states::plant_state(plant));
             }
             if *taken < case.steps && is_over()? {
                 return Ok(false);
             }
         }
         if shared.every.is_none() {
-            response.states.push(convert::plant_state(plant));
+            response.states.push(states::plant_state(plant));
         }
         Ok(outcome.map(|()| true)?)
     }

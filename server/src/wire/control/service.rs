@@ -12,18 +12,16 @@ use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status};
 
-use crate::core::feedback::regulator;
-use crate::core::feedback::regulator::{Constraints, Memory, Path};
+use crate::core::feedback::regulator::{self, Constraints, Memory, Path};
 use crate::core::inputs::Inputs;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::answers::Answers;
 use crate::wire::control::points::{at_point, check_linearization, model_and_settings, model_at};
 use crate::wire::control::{analysis, derivatives, kalman, optimize, reference, rollout};
-use crate::wire::message::convert;
-use crate::wire::message::convert::WeightFields;
-use crate::wire::shared::hub::Hub;
-
 use crate::wire::message::report::report_message;
+use crate::wire::message::weights::{self, WeightFields};
+use crate::wire::message::{matrices, states};
+use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
 /// Numbers that one portion of a stream holds, about: 2 MB.
@@ -44,13 +42,13 @@ impl ControlService {
 fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse, RpcError> {
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
-    let state = convert::plant_state(&plant);
+    let state = states::plant_state(&plant);
     let mut linearization = Linearization::new(plant.model());
     let report = plant.step_and_linearize(&u, &mut linearization)?;
     let rank = control::controllability_rank(&linearization.a(), &linearization.b());
     Ok(v1::LinearizeResponse {
-        linearization: Some(convert::linearization(state.step, &linearization)),
-        next: Some(convert::plant_state(&plant)),
+        linearization: Some(states::linearization(state.step, &linearization)),
+        next: Some(states::plant_state(&plant)),
         controllability_rank: u32::try_from(rank).unwrap_or(u32::MAX),
         state: Some(state),
         u,
@@ -63,21 +61,21 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
     let model = model_at(hub, &request.model, request.point.as_ref())?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     check_linearization(hub, plant.model())?;
-    let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
-    let weights = convert::weights(request.weights, plant.model())?;
+    let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
+    let weights = weights::weights(request.weights, plant.model())?;
     let regulator = regulator::about_point(&mut plant, &u, &weights, momentum, constraints)?;
     Ok(v1::SolveLqrResponse {
         gain: Some(v1::Gain {
-            k: Some(convert::matrix(&regulator.gain)),
-            x_reference: convert::x(&plant),
+            k: Some(matrices::matrix(&regulator.gain)),
+            x_reference: states::x(&plant),
             u_reference: u,
-            ..convert::gain_of(&model, plant.model(), plant.settings())
+            ..states::gain_of(&model, plant.model(), plant.settings())
         }),
-        value: Some(convert::matrix(&regulator.value)),
+        value: Some(matrices::matrix(&regulator.value)),
         spectral_radius: regulator.spectral_radius,
         residual: regulator.residual,
         iterations: regulator.iterations,
-        closed_loop: convert::complex(&regulator.closed_loop),
+        closed_loop: matrices::complex(&regulator.closed_loop),
         reciprocal_condition: regulator.reciprocal_condition,
     })
 }
@@ -96,8 +94,8 @@ impl LinearizedTrajectory {
         let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
         check_linearization(hub, &model)?;
         let (plant, inputs) =
-            convert::trajectory(request.trajectory, &model, settings, &hub.limits)?;
-        let numbers = convert::linearization_numbers(model.dimensions()).max(1);
+            matrices::trajectory(request.trajectory, &model, settings, &hub.limits)?;
+        let numbers = states::linearization_numbers(model.dimensions()).max(1);
         let portion = (PORTION_NUMBERS / numbers).max(1);
         let linearization = Linearization::new(&model);
         Ok(Self { plant, inputs, linearization, steps_taken: 0, portion })
@@ -108,7 +106,7 @@ impl LinearizedTrajectory {
         let mut portion = VecDeque::new();
         while portion.len() < self.portion && self.steps_taken < self.inputs.count() {
             abandoned.check()?;
-            let state = convert::plant_state(&self.plant);
+            let state = states::plant_state(&self.plant);
             let u = self.inputs.get(self.steps_taken);
             let report = match self.plant.step_and_linearize(u, &mut self.linearization) {
                 Ok(report) => report_message(&report),
@@ -120,7 +118,7 @@ impl LinearizedTrajectory {
                 }
             };
             portion.push_back(Ok(v1::LinearizeTrajectoryResponse {
-                linearization: Some(convert::linearization(state.step, &self.linearization)),
+                linearization: Some(states::linearization(state.step, &self.linearization)),
                 state: Some(state),
                 report: Some(report),
             }));
@@ -195,15 +193,15 @@ impl TrajectoryRegulator {
         let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
         check_linearization(hub, &model)?;
         let (plant, inputs) =
-            convert::trajectory(request.trajectory, &model, settings, &hub.limits)?;
+            matrices::trajectory(request.trajectory, &model, settings, &hub.limits)?;
         let values = if request.values { Values::Keep } else { Values::Drop };
-        let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
+        let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
         let (steps, stages) = (inputs.count(), request.stages.len());
         Memory { steps, stages, momentum, values }.check(&hub.limits, &model)?;
         let fields = WeightFields::default();
         let (weights, stages) = (request.weights, request.stages);
-        let weights = convert::trajectory_weights(fields, weights, stages, steps, &model)?;
-        let common = convert::gain_of(&request.model, plant.model(), plant.settings());
+        let weights = weights::trajectory_weights(fields, weights, stages, steps, &model)?;
+        let common = states::gain_of(&request.model, plant.model(), plant.settings());
         let path = Path::follow(plant, &inputs, momentum, constraints, abandoned)?;
         let solution = path.solve(&weights, values)?;
         Ok(Self {
@@ -230,17 +228,17 @@ impl Iterator for TrajectoryRegulator {
         let u = if k < self.inputs.count() { self.inputs.get(k).to_vec() } else { Vec::new() };
         let gain = v1::Gain {
             step: k as u64,
-            k: self.gains.next().map(|gain| convert::matrix(&gain)),
+            k: self.gains.next().map(|gain| matrices::matrix(&gain)),
             x_reference: state.x(),
             u_reference: u,
-            feedforward: self.feedforward.next().map(convert::vector).unwrap_or_default(),
+            feedforward: self.feedforward.next().map(matrices::vector).unwrap_or_default(),
             ..self.common.clone()
         };
         let (value, linear) = self.values.next().unzip();
         Some(v1::SolveTrajectoryLqrResponse {
             gain: Some(gain),
-            value: value.as_ref().map(convert::matrix),
-            value_linear: linear.map(convert::nonzero).unwrap_or_default(),
+            value: value.as_ref().map(matrices::matrix),
+            value_linear: linear.map(matrices::nonzero).unwrap_or_default(),
             reciprocal_condition: self.reciprocal_conditions.next().unwrap_or_default(),
         })
     }

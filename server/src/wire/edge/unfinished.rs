@@ -19,8 +19,7 @@ use tonic::body::Body;
 use tonic::{Code, Status};
 
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::wire::edge::parts;
-use crate::wire::edge::parts::{Malformed, PART_BYTES_MIN, Walk};
+use crate::wire::edge::parts::{self, Malformed, PART_BYTES_MIN, Walk};
 use crate::wire::status::RpcError;
 
 /// A second more for this many bytes, so that a long message may come over a slow line.

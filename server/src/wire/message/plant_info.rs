@@ -9,8 +9,8 @@ use crate::core::feedback::active::{FeedbackInfo, Mode};
 use crate::core::feedback::regulator::RegulatorError;
 use crate::core::plant::view::View;
 use crate::core::session::shared::Session;
-use crate::wire::message::convert;
 use crate::wire::message::run_info::{run_info, safety_info};
+use crate::wire::message::{settings, states};
 use crate::wire::status::RpcError;
 
 /// Instructions of a step up to which a Step call begins at once instead of on a worker: about 0.3 ms.
@@ -26,14 +26,14 @@ pub(crate) fn info(session: &Session, view: View) -> v1::PlantInfo {
     v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
-        settings: Some(convert::settings_message(&view.settings)),
-        state: Some(convert::state(&view.state, view.time_s)),
+        settings: Some(settings::settings_message(&view.settings)),
+        state: Some(states::state(&view.state, view.time_s)),
         driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
         link_open: session.link_open(),
         feedback: view.feedback.map(feedback_info),
-        accuracy: session.accuracy().map(convert::accuracy),
+        accuracy: session.accuracy().map(settings::accuracy),
         run: Some(run_info(session)),
-        parameters: convert::parameters(&view.parameters),
+        parameters: settings::parameters(&view.parameters),
         safety: safety_info(&view.safety, view.frozen, session.model()),
     }
 }

@@ -4,8 +4,7 @@ use plantd_models::Model;
 use plantd_proto::v1;
 
 use crate::core::driver::DriverKind;
-use crate::core::plant::event::Event;
-use crate::core::plant::event::EventKind;
+use crate::core::plant::event::{Event, EventKind};
 use crate::core::plant::watchdog::{Quantity, Safety, Trip, Watchdog, WatchdogAction};
 use crate::core::realtime::clock::utc_ns;
 use crate::core::realtime::input::InputAction;

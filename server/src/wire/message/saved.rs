@@ -14,10 +14,10 @@ use crate::core::feedback::regulator::Spec;
 use crate::core::parameters::Parameters;
 use crate::core::plant::view::PlantSnapshot;
 use crate::core::session::shared::Session;
-use crate::wire::message::convert;
 use crate::wire::message::declare::origin;
 use crate::wire::message::plant_info::feedback_info;
 use crate::wire::message::run_info::safety_info;
+use crate::wire::message::{settings, states};
 
 impl PlantSnapshot {
     /// Encodes: a plant without channels as itself, else a `ChannelSnapshot`.
@@ -80,7 +80,7 @@ impl Session {
             });
             (core.base(), core.view(), core.snapshot(), feedback, channels, core.faults)
         });
-        let rotations = convert::rotations(self.model());
+        let rotations = states::rotations(self.model());
         let time_step_s = base.settings.time_step_s;
         let (feedback, feedback_info) = feedback
             .map(|(spec, law, guard, info)| {
@@ -91,12 +91,12 @@ impl Session {
         let info = v1::PlantInfo {
             id: self.id().to_owned(),
             model: self.model_name().to_owned(),
-            settings: Some(convert::settings_message(&base.settings)),
-            state: Some(convert::state(&view.state, view.time_s)),
+            settings: Some(settings::settings_message(&base.settings)),
+            state: Some(states::state(&view.state, view.time_s)),
             link_open: self.keeps_link(),
             feedback: feedback_info,
-            accuracy: self.accuracy().map(convert::accuracy),
-            parameters: convert::parameters(&base.parameters),
+            accuracy: self.accuracy().map(settings::accuracy),
+            parameters: settings::parameters(&base.parameters),
             safety: safety_info(&view.safety, view.frozen, self.model()),
             ..Default::default()
         };
@@ -112,7 +112,7 @@ impl Session {
             model_digest: base.model.digest(),
             snapshot: snapshot.to_bytes(),
             start_snapshot: self.start().to_bytes(),
-            start_settings: Some(convert::settings_message(&self.start_settings())),
+            start_settings: Some(settings::settings_message(&self.start_settings())),
             feedback: feedback.flatten(),
             channels: declared.map(Arc::unwrap_or_clone),
             faults: faults.into_iter().flatten().map(fault).collect(),

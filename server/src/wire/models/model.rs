@@ -9,7 +9,7 @@ use tonic::{Request, Response, Status};
 use crate::core::catalog::Entry;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::wire::answers::cut_page;
-use crate::wire::message::convert;
+use crate::wire::message::{checks, models, settings};
 use crate::wire::models::settle;
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
@@ -32,7 +32,7 @@ pub(crate) fn compile(
     format: i32,
     limits: &Limits,
 ) -> Result<Result<Model, SceneError>, RpcError> {
-    let scene = convert::scene(text, format, limits)?;
+    let scene = settings::scene(text, format, limits)?;
     let model = match scene.and_then(|scene| Model::compile(&scene)) {
         Ok(model) => model,
         Err(error) => return Ok(Err(error)),
@@ -43,7 +43,7 @@ pub(crate) fn compile(
 }
 
 fn message(entry: &Entry, with_texts: bool) -> v1::Model {
-    convert::model(&entry.name, entry.builtin, &entry.model, with_texts)
+    models::model(&entry.name, entry.builtin, &entry.model, with_texts)
 }
 
 #[tonic::async_trait]
@@ -53,7 +53,7 @@ impl v1::model_service_server::ModelService for ModelService {
         request: Request<v1::ListModelsRequest>,
     ) -> Result<Response<v1::ListModelsResponse>, Status> {
         let request = request.into_inner();
-        let (size, after) = convert::page(request.page_size, &request.page_token)?;
+        let (size, after) = checks::page(request.page_size, &request.page_token)?;
         let (hub, after) = (Arc::clone(&self.hub), after.to_owned());
         let job = move |_: &_| {
             let (entries, has_more) = hub.catalog.page(&after, size)?;
@@ -83,7 +83,7 @@ impl v1::model_service_server::ModelService for ModelService {
     ) -> Result<Response<v1::CreateModelResponse>, Status> {
         let request = request.into_inner();
         if !request.name.is_empty() {
-            convert::check_name("name", &request.name)?;
+            checks::check_name("name", &request.name)?;
         }
         let hub = Arc::clone(&self.hub);
         let job = move |_: &_| {
@@ -92,7 +92,7 @@ impl v1::model_service_server::ModelService for ModelService {
                 name if name.is_empty() => model.scene().name.clone(),
                 name => name,
             };
-            convert::check_name("name", &name)?;
+            checks::check_name("name", &name)?;
             Ok(message(&hub.catalog.insert(&name, Arc::new(model))?, true))
         };
         let model = Some(self.hub.workers.run(job).await?);
@@ -108,7 +108,7 @@ impl v1::model_service_server::ModelService for ModelService {
         let job = move |_: &_| {
             Ok(match compile(&request.scene, request.format, &hub.limits)? {
                 Ok(model) => {
-                    let model = convert::model(&model.scene().name, false, &model, true);
+                    let model = models::model(&model.scene().name, false, &model, true);
                     v1::ValidateSceneResponse { problems: Vec::new(), model: Some(model) }
                 }
                 Err(error) => {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use plantd_models::{Initial, Model, Plant, Settings, SettleRequest};
 use plantd_proto::v1;
 
-use crate::wire::message::convert;
+use crate::wire::message::{checks, start};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -27,7 +27,7 @@ pub(crate) fn settle(
         let q = plant.q().to_vec();
         return Ok(v1::SettleResponse { u: input(&model, &inputs, &q), q, equilibrium: None });
     }
-    convert::check_settling(&model, &hub.limits)?;
+    start::check_settling(&model, &hub.limits)?;
     let rest = model
         .settle(&SettleRequest { q: guess, hold: request.hold, inputs })
         .map_err(|error| RpcError::from_settle(error, "guess"))?;
@@ -48,9 +48,9 @@ pub(crate) fn settle(
 /// The initial configuration, or `q`, with single values put in.
 fn guess(model: &Model, q: Vec<f64>, values: &HashMap<String, f64>) -> Result<Vec<f64>, RpcError> {
     let mut guess = if q.is_empty() {
-        convert::initial_configuration(model)
+        start::initial_configuration(model)
     } else {
-        convert::check_numbers("q", &q, model.dimensions().coordinates())?;
+        checks::check_numbers("q", &q, model.dimensions().coordinates())?;
         q
     };
     for (name, &value) in values {

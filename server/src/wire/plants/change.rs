@@ -5,8 +5,7 @@ use std::sync::Arc;
 use plantd_models::{InitialError, Settings, Spare};
 
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::core::parameters;
-use crate::core::parameters::ChangeError;
+use crate::core::parameters::{self, ChangeError};
 use crate::core::plant::mark::MarkReason;
 use crate::core::session::shared::Session;
 use crate::wire::status::RpcError;

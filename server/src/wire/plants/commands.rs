@@ -17,8 +17,8 @@ use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::plant::core::Core;
 use crate::core::plant::event::EventKind;
 use crate::core::session::shared::Session;
-use crate::wire::message::declare::{check_numbers, origin};
-use crate::wire::message::{convert, declare};
+use crate::wire::message::declare::{self, check_numbers, origin};
+use crate::wire::message::states;
 use crate::wire::status::RpcError;
 
 impl Injected {
@@ -216,7 +216,7 @@ impl Session {
     pub fn channels(&self) -> (Arc<v1::ChannelsInfo>, v1::Outputs) {
         self.with_core(|core| {
             let info = core.channels.as_ref().map(|channels| origin(&channels.info));
-            (info.unwrap_or_default(), convert::core_outputs(core).unwrap_or_default())
+            (info.unwrap_or_default(), states::core_outputs(core).unwrap_or_default())
         })
     }
 

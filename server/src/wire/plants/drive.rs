@@ -29,12 +29,11 @@ use crate::core::plant::error::DriveError;
 use crate::core::publish::subscription::Subscription;
 use crate::core::session::lease::Lease;
 use crate::core::session::run::RunStatus;
-use crate::core::workers::queue::Admission;
-use crate::core::workers::queue::Lane;
+use crate::core::workers::queue::{Admission, Lane};
 use crate::wire::edge::observe::with_limit_details;
-use crate::wire::message::convert;
 use crate::wire::message::plant_info::{INLINE_INSTRUCTIONS_MAX, plant_info};
 use crate::wire::message::report::report_message;
+use crate::wire::message::{settings, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -242,7 +241,7 @@ impl Driving {
         let session = hub.session(&open.id)?;
         let dimensions = session.model().dimensions();
         if open.linearization {
-            let numbers = convert::linearization_numbers(dimensions);
+            let numbers = states::linearization_numbers(dimensions);
             let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?;
         }
@@ -265,7 +264,7 @@ impl Driving {
         }
         let linearization = open.linearization.then(|| Linearization::new(session.model()));
         let settings = session.mechanics().settings;
-        let instructions = convert::period_instructions(session.step_instructions(), &settings);
+        let instructions = settings::period_instructions(session.step_instructions(), &settings);
         Ok(Self {
             deleted: Box::pin(session.closed()),
             status: WatchStream::from_changes(session.run_status()),
@@ -327,13 +326,13 @@ impl Driving {
         let (frame, dropped) = std::task::ready!(states.poll_next(context));
         Poll::Ready(Ok(Answer::Step(v1::DriveStep {
             sequence: frame.timing.input_sequence,
-            state: Some(convert::state(&frame.state, frame.time_s)),
+            state: Some(states::state(&frame.state, frame.time_s)),
             report: Some(report_message(&frame.report)),
             linearization: None,
             u: frame.input.clone(),
-            outputs: convert::outputs(&frame.outputs, &frame.lost),
-            clocks: Some(convert::clocks(frame.time_s, frame.timing.ended_ns)),
-            timing: convert::step_timing(&frame.timing),
+            outputs: states::outputs(&frame.outputs, &frame.lost),
+            clocks: Some(states::clocks(frame.time_s, frame.timing.ended_ns)),
+            timing: states::step_timing(&frame.timing),
             dropped,
         })))
     }
@@ -343,14 +342,14 @@ impl Driving {
         let (lease, linearization) = (&mut self.lease, &mut self.linearization);
         let began = Instant::now();
         let step = lease.step_and(u, linearization.as_mut(), |core| {
-            let state = convert::plant_state(core.plant());
+            let state = states::plant_state(core.plant());
             v1::DriveStep {
                 sequence,
-                clocks: Some(convert::clocks(state.time_s, 0)),
+                clocks: Some(states::clocks(state.time_s, 0)),
                 state: Some(state),
                 report: Some(report_message(core.report())),
                 u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
-                outputs: convert::core_outputs(core),
+                outputs: states::core_outputs(core),
                 ..Default::default()
             }
         });
@@ -359,7 +358,7 @@ impl Driving {
         let mut step = step?;
         if let Some(linearization) = &self.linearization {
             let from = step.state.as_ref().map_or(0, |state| state.step - 1);
-            step.linearization = Some(convert::linearization(from, linearization));
+            step.linearization = Some(states::linearization(from, linearization));
         }
         Ok(step)
     }

@@ -23,9 +23,9 @@ use crate::core::plant::view::Mechanics;
 use crate::core::session::shared::Session;
 use crate::core::workers::pool::{Abandoned, WorkError};
 use crate::wire::answers::{Answers, Messages};
-use crate::wire::message::convert;
-use crate::wire::message::convert::WeightFields;
 use crate::wire::message::plant_info::{failure_message, feedback_info, plant_info};
+use crate::wire::message::weights::{self, WeightFields};
+use crate::wire::message::{checks, matrices, start, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -149,7 +149,7 @@ pub(crate) async fn set_feedback(
             let constraints = Constraints::new(request.constraints)?;
             let reference = reference(&hub, request.reference, session.model_name(), &mechanics)?;
             let model = &mechanics.model;
-            let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
+            let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
             let (weights, trajectory_weights) = match &reference {
                 Reference::Gain(_) => (None, None),
                 Reference::Trajectory { inputs, .. } => {
@@ -158,10 +158,10 @@ pub(crate) async fn set_feedback(
                     let memory = Memory { steps, stages: count, momentum, values };
                     memory.check(&hub.limits, model)?;
                     let (fields, weights) = (WeightFields::default(), request.weights);
-                    let all = convert::trajectory_weights(fields, weights, stages, steps, model)?;
+                    let all = weights::trajectory_weights(fields, weights, stages, steps, model)?;
                     (None, Some(all))
                 }
-                _ => (Some(convert::weights(request.weights, model)?), None),
+                _ => (Some(weights::weights(request.weights, model)?), None),
             };
             let time_step_s = mechanics.settings.time_step_s;
             let spec = Arc::new(Spec {
@@ -206,13 +206,13 @@ fn guard(bounds: &[v1::Bound], mode: Mode, model: &Model) -> Result<Vec<GuardBou
         (Mode::Guard, false) | (_, true) => {}
         (_, false) => return Err(RpcError::field("guard", "is for FEEDBACK_MODE_GUARD only")),
     }
-    let names = convert::state_names(model);
+    let names = states::state_names(model);
     if bounds.len() > names.len() {
         let problem = format!("has {} entries; the state has {}", bounds.len(), names.len());
         return Err(RpcError::field("guard", problem));
     }
     let bound = |(i, bound): (usize, &v1::Bound)| {
-        let (index, min, max) = convert::bound(&format!("guard[{i}]"), bound, &names)?;
+        let (index, min, max) = states::bound(&format!("guard[{i}]"), bound, &names)?;
         Ok(GuardBound { index, name: bound.entry.clone(), min, max })
     };
     bounds.iter().enumerate().map(bound).collect()
@@ -252,7 +252,7 @@ fn reference(
         }
         Some(Form::Point(point)) => {
             // Checks the lengths and the constraints.
-            let (plant, u) = convert::point(Some(point), model, settings)?;
+            let (plant, u) = start::point(Some(point), model, settings)?;
             let (q, p, v) = (plant.q().to_vec(), plant.p().to_vec(), plant.v().to_vec());
             Ok(Reference::Point { start: Initial::Momentum { q, p, v }, u })
         }
@@ -286,13 +286,13 @@ fn check_origin(gain: &v1::Gain, model: &str, time_step_s: f64) -> Result<(), Rp
 fn stage(gain: v1::Gain, model: &Model) -> Result<Stage, RpcError> {
     let d = model.dimensions();
     let k = gain.k.ok_or_else(|| RpcError::field("gain.k", "is missing"))?;
-    convert::matrix_of("gain.k", &k, Some(d.input()), d.state())?;
-    convert::check_numbers("gain.x_reference", &gain.x_reference, d.state())?;
-    convert::check_numbers("gain.u_reference", &gain.u_reference, d.input())?;
+    matrices::matrix_of("gain.k", &k, Some(d.input()), d.state())?;
+    checks::check_numbers("gain.x_reference", &gain.x_reference, d.state())?;
+    checks::check_numbers("gain.u_reference", &gain.u_reference, d.input())?;
     if !gain.feedforward.is_empty() {
-        convert::check_numbers("gain.feedforward", &gain.feedforward, d.input())?;
+        checks::check_numbers("gain.feedforward", &gain.feedforward, d.input())?;
     }
-    let rotations = convert::rotations(model);
+    let rotations = states::rotations(model);
     if gain.rotations != rotations {
         let problem = format!("are {:?}; those of the model are {rotations:?}", gain.rotations);
         return Err(RpcError::field("gain.rotations", problem));
@@ -318,7 +318,7 @@ pub(crate) fn watch_gains(
     }
     let watcher = Watcher {
         hub: Arc::clone(hub),
-        rotations: convert::rotations(session.model()),
+        rotations: states::rotations(session.model()),
         session,
         in_force,
         revision: 0,

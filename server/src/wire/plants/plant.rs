@@ -17,10 +17,10 @@ use crate::core::session::shared::Session;
 use crate::core::workers::pool::Abandoned;
 use crate::core::workers::queue::Admission;
 use crate::wire::answers::{Answers, cut_page};
-use crate::wire::message::convert;
-use crate::wire::message::convert::Start;
 use crate::wire::message::plant_info::{INLINE_INSTRUCTIONS_MAX, info, plant_info};
 use crate::wire::message::report::report_message;
+use crate::wire::message::start::{self, Start};
+use crate::wire::message::{checks, settings, states};
 use crate::wire::plants::drive::DriveStream;
 use crate::wire::plants::{feedback, run, watch};
 use crate::wire::shared::hub::Hub;
@@ -43,7 +43,7 @@ impl PlantService {
     async fn create(&self, request: v1::CreatePlantRequest) -> Result<Arc<Session>, RpcError> {
         let v1::CreatePlantRequest { id, model, settings, initial, open_link } = request;
         if !id.is_empty() {
-            convert::check_name("id", &id)?;
+            checks::check_name("id", &id)?;
         }
         self.hub.check_new_plant(&id)?;
         let mut settings = settings.unwrap_or_default();
@@ -60,15 +60,15 @@ impl PlantService {
         let hub = Arc::clone(&self.hub);
         let job = move |abandoned: &Abandoned| {
             let entry = hub.catalog.get(&model)?;
-            let settings = convert::settings(Some(settings), &entry.model, &hub.limits)?;
-            let start = convert::start(initial, &entry.model, &hub.limits)?;
+            let settings = settings::settings(Some(settings), &entry.model, &hub.limits)?;
+            let start = start::start(initial, &entry.model, &hub.limits)?;
             let (model, limits) = (&entry.model, &hub.limits);
             let (plant, accuracy) = if is_chosen {
                 let chosen =
-                    convert::accurate_plant(model, settings, &start, tolerance, limits, abandoned)?;
+                    start::accurate_plant(model, settings, &start, tolerance, limits, abandoned)?;
                 (chosen.0, Some(chosen.1))
             } else {
-                (convert::plant(model, settings, &start, "initial")?, None)
+                (start::plant(model, settings, &start, "initial")?, None)
             };
             hub.insert(id, entry.name, plant, accuracy)
         };
@@ -101,14 +101,14 @@ impl PlantService {
         let limits = &self.hub.limits;
         LimitExceeded::check("steps_per_call", limits.steps_per_call, "steps", plan.steps)?;
         if plan.all_states {
-            let numbers = plan.steps.saturating_mul(convert::state_numbers(dimensions));
+            let numbers = plan.steps.saturating_mul(states::state_numbers(dimensions));
             let (name, limit) = ("reply_numbers", limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in all states", numbers)?;
         }
         let lease = session.acquire(DriverKind::Step)?;
         let settings = lease.look(|core| *core.plant().settings());
         let settings = settings.map_err(|error| RpcError::from_drive(error, &session))?;
-        let instructions = convert::period_instructions(session.step_instructions(), &settings);
+        let instructions = settings::period_instructions(session.step_instructions(), &settings);
         let mut steps = Steps::new(plan, lease)?;
         if instructions <= INLINE_INSTRUCTIONS_MAX {
             let began = Instant::now();
@@ -130,7 +130,7 @@ impl PlantService {
         let mut lease = self.hub.session(id)?.acquire(DriverKind::Step)?;
         let job = move |_: &_| {
             let (state, time_s) = change(&mut lease)?;
-            Ok(convert::state(&state, time_s))
+            Ok(states::state(&state, time_s))
         };
         self.hub.attendants.run(job).await
     }
@@ -197,13 +197,13 @@ impl Steps {
         let is_last = k + 1 == plan.steps;
         let look = |core: &Core| {
             if plan.all_states || is_last {
-                response.states.push(convert::plant_state(core.plant()));
+                response.states.push(states::plant_state(core.plant()));
             }
             if is_last {
                 response.report = Some(report_message(core.report()));
-                response.clocks = Some(convert::clocks(core.plant().time_s(), 0));
+                response.clocks = Some(states::clocks(core.plant().time_s(), 0));
                 response.u = core.applied_input().map(<[f64]>::to_vec).unwrap_or_default();
-                response.outputs = convert::core_outputs(core);
+                response.outputs = states::core_outputs(core);
             }
         };
         let impulse = if k < plan.impulses.count() { plan.impulses.get(k) } else { &[] };
@@ -278,7 +278,7 @@ impl v1::plant_service_server::PlantService for PlantService {
         let session = self.hub.session(&request.into_inner().id)?;
         let job = move |_: &_| {
             let (view, mut copy) = session.view_and_copy();
-            let energy = Some(convert::energy(copy.energy()));
+            let energy = Some(states::energy(copy.energy()));
             Ok(v1::GetPlantResponse { plant: Some(info(&session, view)), energy })
         };
         Ok(Response::new(self.hub.attendants.run(job).await?))
@@ -289,7 +289,7 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<v1::ListPlantsRequest>,
     ) -> Result<Response<v1::ListPlantsResponse>, Status> {
         let request = request.into_inner();
-        let (size, after) = convert::page(request.page_size, &request.page_token)?;
+        let (size, after) = checks::page(request.page_size, &request.page_token)?;
         let (sessions, has_more) = self.hub.page(after, size);
         let job = move |_: &_| {
             let mut plants: Vec<_> = sessions.iter().map(|session| plant_info(session)).collect();
@@ -342,7 +342,7 @@ impl v1::plant_service_server::PlantService for PlantService {
         let (hub, model) = (Arc::clone(&self.hub), Arc::clone(self.hub.session(&id)?.model()));
         let change = move |lease: &mut Lease| match initial {
             None => lease.reset().map_err(|error| RpcError::from_initial(error, "initial")),
-            Some(initial) => match convert::start(Some(initial), &model, &hub.limits)? {
+            Some(initial) => match start::start(Some(initial), &model, &hub.limits)? {
                 Start::Snapshot(snapshot) => Ok(lease.restore(*snapshot)?),
                 Start::Initial(initial) => initialize(lease, &initial),
             },
@@ -417,14 +417,14 @@ impl v1::plant_service_server::PlantService for PlantService {
                 hub.session(&id)?.copy_plant()
             } else if id.is_empty() {
                 let model = hub.catalog.get(&model)?.model;
-                let start = convert::start(initial, &model, &hub.limits)?;
-                let settings = convert::settings(None, &model, &hub.limits)?;
-                convert::plant(&model, settings, &start, "initial")?
+                let start = start::start(initial, &model, &hub.limits)?;
+                let settings = settings::settings(None, &model, &hub.limits)?;
+                start::plant(&model, settings, &start, "initial")?
             } else {
                 return Err(RpcError::field("model", "is given together with `id`"));
             };
             let step = plant.step_index();
-            Ok(convert::diagnostics(step, plant.diagnose()))
+            Ok(states::diagnostics(step, plant.diagnose()))
         };
         Ok(Response::new(self.hub.attendants.run(job).await?))
     }

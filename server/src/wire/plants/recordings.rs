@@ -9,7 +9,7 @@ use plantd_proto::v1;
 use tonic::{Request, Response, Status};
 
 use crate::wire::answers::Answers;
-use crate::wire::message::convert;
+use crate::wire::message::checks;
 use crate::wire::record::directory::Recordings;
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
@@ -93,7 +93,7 @@ impl v1::recording_service_server::RecordingService for RecordingService {
         request: Request<v1::ListRecordingsRequest>,
     ) -> Result<Response<v1::ListRecordingsResponse>, Status> {
         let request = request.into_inner();
-        let (size, after) = convert::page(request.page_size, &request.page_token)?;
+        let (size, after) = checks::page(request.page_size, &request.page_token)?;
         let after = after.to_owned();
         let page = self.run(move |_, recordings| recordings.page(&after, size)).await?;
         let (recordings, has_more) = page;

@@ -11,14 +11,13 @@ use plantd_proto::v1;
 use crate::core::metrics::counts::TimingCounts;
 use crate::core::metrics::histogram::{Histogram, Summary};
 use crate::core::plant::event::{Event, EventReader};
-use crate::core::plant::watchdog;
-use crate::core::plant::watchdog::{Safety, Watchdog, WatchdogAction};
+use crate::core::plant::watchdog::{self, Safety, Watchdog, WatchdogAction};
 use crate::core::realtime::input::{InputAction, InputPolicy};
 use crate::core::realtime::settings::{Pace, RunSettings};
 use crate::core::session::shared::Session;
 use crate::wire::answers::{Answers, Messages};
-use crate::wire::message::convert;
 use crate::wire::message::run_info::{event_message, run_info};
+use crate::wire::message::states;
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -66,7 +65,7 @@ pub(crate) async fn run_and_wait(
 pub(crate) fn pause(hub: &Hub, id: &str) -> Result<v1::PauseResponse, RpcError> {
     let session = hub.session(id)?;
     session.pause();
-    let state = session.with_core(|core| convert::plant_state(core.plant()));
+    let state = session.with_core(|core| states::plant_state(core.plant()));
     Ok(v1::PauseResponse { run: Some(run_info(&session)), state: Some(state) })
 }
 

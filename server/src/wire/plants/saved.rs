@@ -3,10 +3,9 @@
 //! A file `ID.plant` is a `PlantRecord` in protobuf and the FNV-1a hash (u64, little-endian) of it. It is
 //! written aside and renamed: what is there is complete.
 
-use std::fs;
-use std::io;
 use std::path::Path;
 use std::sync::Arc;
+use std::{fs, io};
 
 use anyhow::{Context as _, Result, bail};
 use plantd_models::{Initial, Model, Snapshot, Spare};
@@ -16,8 +15,8 @@ use prost::Message as _;
 use crate::core::channels::noise::hash;
 use crate::core::plant::view::PlantSnapshot;
 use crate::core::session::shared::Session;
-use crate::wire::message::convert;
 use crate::wire::message::run_info::run_info;
+use crate::wire::message::{checks, models, settings, start};
 use crate::wire::models::model::compile;
 use crate::wire::plants::feedback::set_feedback;
 use crate::wire::plants::run::{protect, run};
@@ -99,7 +98,7 @@ impl StateDirectory {
             let name = entry.as_ref().map_or("", |_| name);
             let builtin = entry.as_ref().is_some_and(|entry| entry.builtin);
             let plan = String::new();
-            v1::Model { plan, ..convert::model(name, builtin, model, true) }
+            v1::Model { plan, ..models::model(name, builtin, model, true) }
         };
         record.model = Some(message(&model));
         let start = session.model();
@@ -120,7 +119,7 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     if info.id != id {
         bail!("the plant in it is `{}`", info.id);
     }
-    convert::check_name("id", id).map_err(sentence)?;
+    checks::check_name("id", id).map_err(sentence)?;
     let in_force = Arc::new(scene(hub, &model)?);
     let start_model = match &start_model {
         Some(model) => Arc::new(scene(hub, model)?),
@@ -132,7 +131,7 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
         _ => start_model,
     };
     let spare = |model: &Arc<Model>, settings| -> Result<Spare> {
-        let settings = convert::settings(settings, model, &hub.limits).map_err(sentence)?;
+        let settings = settings::settings(settings, model, &hub.limits).map_err(sentence)?;
         Ok(Spare::new(Arc::clone(model), settings)?)
     };
     let start = Snapshot::from_bytes(&record.start_snapshot)?;
@@ -142,13 +141,13 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     let present = spare(&in_force, info.settings)?;
     let present = if record.faults.iter().any(is_change) {
         // The snapshot may be of a changed plant: until that is there, the plant rests nearby.
-        let nearby = || convert::initial_configuration(&in_force);
+        let nearby = || start::initial_configuration(&in_force);
         let q = info.state.as_ref().map_or_else(nearby, |state| state.q.clone());
         present.start(&Initial::Projection { q, hold: Vec::new() })?
     } else {
         present.restore(&snapshot.plant)?
     };
-    let accuracy = info.accuracy.map(convert::accuracy_of);
+    let accuracy = info.accuracy.map(settings::accuracy_of);
     let session = hub.insert(id.to_owned(), info.model, start, accuracy).map_err(sentence)?;
     let changed = info.parameters.into_iter().map(|p| (p.path, p.value)).collect();
     session.resume(present, changed);

@@ -12,16 +12,15 @@ use plantd_models::{Initial, Linearization, Plant, StepError};
 use plantd_proto::v1;
 use v1::WatchField;
 
-use crate::core::feedback::regulator;
-use crate::core::feedback::regulator::Constraints;
+use crate::core::feedback::regulator::{self, Constraints};
 use crate::core::limits::LimitExceeded;
 use crate::core::publish::frame::{Frame, record_words};
 use crate::core::publish::subscription::Subscription;
 use crate::core::room::Reservation;
 use crate::core::session::shared::Session;
 use crate::wire::answers::{Answers, Messages};
-use crate::wire::message::convert;
 use crate::wire::message::report::report_message;
+use crate::wire::message::{matrices, states, weights};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -77,14 +76,14 @@ pub(crate) fn stream(
     let wanted = Wanted::new(&request.fields)?;
     let mask = Mask::new(&request.coordinates, &session)?;
     if wanted.linearization || wanted.gain {
-        let numbers = convert::linearization_numbers(session.model().dimensions());
+        let numbers = states::linearization_numbers(session.model().dimensions());
         let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
         LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?;
     }
     let weights = match wanted.gain {
         true => {
-            let momentum = convert::momentum_in("weights", request.weights.as_ref())?;
-            Some(Arc::new((convert::weights(request.weights, session.model())?, momentum)))
+            let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
+            Some(Arc::new((weights::weights(request.weights, session.model())?, momentum)))
         }
         false => None,
     };
@@ -130,15 +129,15 @@ impl Messages for Watcher {
         };
         let mut response =
             v1::WatchResponse { dropped, step: frame.state.step, ..Default::default() };
-        response.clocks = Some(convert::clocks(frame.time_s, frame.timing.ended_ns));
+        response.clocks = Some(states::clocks(frame.time_s, frame.timing.ended_ns));
         if self.wanted.timing {
-            response.timing = convert::step_timing(&frame.timing);
+            response.timing = states::step_timing(&frame.timing);
         }
         if self.wanted.report {
             response.report = Some(report_message(&frame.report));
         }
         if self.wanted.state {
-            let mut state = convert::state(&frame.state, frame.time_s);
+            let mut state = states::state(&frame.state, frame.time_s);
             if let Some(mask) = &self.mask {
                 mask.apply(&mut state);
             }
@@ -148,7 +147,7 @@ impl Messages for Watcher {
             response.u.clone_from(&frame.input);
         }
         if self.wanted.outputs {
-            response.outputs = convert::outputs(&frame.outputs, &frame.lost);
+            response.outputs = states::outputs(&frame.outputs, &frame.lost);
         }
         if !self.wanted.needs_analysis() {
             return Ok(response);
@@ -210,13 +209,13 @@ impl Analysis {
         self.plant.set_step_index(state.step);
         self.plant.set_time_s(frame.time_s);
         if wanted.energy {
-            response.energy = Some(convert::energy(self.plant.energy()));
+            response.energy = Some(states::energy(self.plant.energy()));
         }
         if wanted.linearization || wanted.gain {
             self.linearize(&frame.input)?;
         }
         if wanted.linearization {
-            response.linearization = Some(convert::linearization(state.step, &self.linearization));
+            response.linearization = Some(states::linearization(state.step, &self.linearization));
         }
         if let Some((weights, momentum)) = weights {
             let space = Constraints::Manifold;
@@ -224,10 +223,10 @@ impl Analysis {
             let regulator = regulator::at_state(plant, linearization, weights, *momentum, space)?;
             response.gain = Some(v1::Gain {
                 step: state.step,
-                k: Some(convert::matrix(&regulator.gain)),
+                k: Some(matrices::matrix(&regulator.gain)),
                 x_reference: state.x(),
                 u_reference: frame.input.clone(),
-                rotations: convert::rotations(self.plant.model()),
+                rotations: states::rotations(self.plant.model()),
                 ..Default::default()
             });
         }

@@ -14,7 +14,7 @@ use tonic::Code;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::modes::Mode;
 use crate::core::session::shared::Session;
-use crate::wire::message::convert::check_name;
+use crate::wire::message::checks::check_name;
 use crate::wire::record::progress::{Options, sentence};
 use crate::wire::record::recorder::{Recorder, StartError};
 use crate::wire::status::RpcError;

@@ -1,8 +1,7 @@
 //! Workers for calls: computations whose errors go to a client.
 
 use crate::core::workers::pool::{Abandoned, Workers};
-use crate::core::workers::queue::Admission;
-use crate::core::workers::queue::Lane;
+use crate::core::workers::queue::{Admission, Lane};
 use crate::wire::status::RpcError;
 
 /// A pool of workers, see [`crate::core::workers::pool`].
