@@ -107,6 +107,13 @@ impl Channels {
         &self.lost
     }
 
+    /// Puts the faults in their places in the plant's time, with the last input.
+    pub(crate) fn place_faults(&mut self, plant: &Plant, input: &[f64]) {
+        for fault in &mut self.faults {
+            fault.place(plant, input, &self.output);
+        }
+    }
+
     /// Begins at the present state: everything on its way has the value it has here.
     pub(crate) fn begin(&mut self, plant: &mut Plant, input: &[f64]) {
         if let Some(timeline) = &mut self.timeline {

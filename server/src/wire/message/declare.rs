@@ -17,11 +17,23 @@ use crate::core::channels::pipeline::Channels;
 use crate::core::channels::sensor::{Sensor, SensorSettings, Source};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::origin::Origin;
+use crate::core::session::shared::Session;
+use crate::wire::message::states;
 use crate::wire::status::RpcError;
 
 /// The message that something of the core was made from.
 pub(crate) fn origin<M: Default + Send + Sync + 'static>(origin: &Origin) -> Arc<M> {
     Arc::clone(origin).downcast().unwrap_or_default()
+}
+
+impl Session {
+    /// The channels with what they deliver.
+    pub fn channels(&self) -> (Arc<v1::ChannelsInfo>, v1::Outputs) {
+        self.with_core(|core| {
+            let info = core.channels.as_ref().map(|channels| origin(&channels.info));
+            (info.unwrap_or_default(), states::core_outputs(core).unwrap_or_default())
+        })
+    }
 }
 
 /// Times in whole steps of so many seconds.

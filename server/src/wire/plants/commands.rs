@@ -18,7 +18,6 @@ use crate::core::plant::core::Core;
 use crate::core::plant::event::EventKind;
 use crate::core::session::shared::Session;
 use crate::wire::message::declare::{self, check_numbers, origin};
-use crate::wire::message::states;
 use crate::wire::status::RpcError;
 
 impl Injected {
@@ -210,14 +209,6 @@ impl Session {
         });
         drop(former);
         Ok((info, output))
-    }
-
-    /// The channels with what they deliver.
-    pub fn channels(&self) -> (Arc<v1::ChannelsInfo>, v1::Outputs) {
-        self.with_core(|core| {
-            let info = core.channels.as_ref().map(|channels| origin(&channels.info));
-            (info.unwrap_or_default(), states::core_outputs(core).unwrap_or_default())
-        })
     }
 
     /// Injects a fault.
@@ -463,11 +454,7 @@ impl Core {
             }
             Renewed::All(mut channels) => {
                 channels.begin(&mut self.plant, &self.last.input);
-                let mut faults = std::mem::take(&mut channels.faults);
-                for fault in &mut faults {
-                    fault.place(&self.plant, &self.last.input, channels.output());
-                }
-                channels.faults = faults;
+                channels.place_faults(&self.plant, &self.last.input);
                 self.channels.replace(channels)
             }
         }

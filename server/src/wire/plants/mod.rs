@@ -8,5 +8,5 @@ pub(crate) mod feedback;
 pub mod plant;
 pub mod recordings;
 pub(crate) mod run;
-pub mod saved;
+pub mod state;
 pub mod watch;
