@@ -79,7 +79,7 @@ pub struct Feedback {
     /// Which of the plant's computations of laws it comes from.
     pub revision: u64,
     /// Parameters and time step to which the last computation belongs; see
-    /// [`crate::core::session::shared::Session`].
+    /// `Changed::generation` of the core.
     pub generation: u64,
     /// Why that computation failed.
     pub failure: Option<Arc<RegulatorError>>,

@@ -34,7 +34,7 @@ pub struct RunStatus {
     pub pace: Pace,
     /// It may take steps.
     pub is_running: bool,
-    /// Number of the call of [`Session::run`] since which it is run so.
+    /// Number of the call of `Session::run` since which it is run so.
     pub run: u64,
     /// Number of the last lease that a watchdog has taken away.
     pub revoked: u64,
@@ -49,7 +49,7 @@ pub struct Run {
     pub is_running: bool,
     /// Why it stands still although nobody has paused it.
     pub stopped_by: Option<StoppedBy>,
-    /// Counts the calls of [`Session::run`].
+    /// Counts the calls of `Session::run`.
     pub number: u64,
 }
 

@@ -8,7 +8,7 @@
 //!              └──── a job that has had its time ◄───┘
 //! ```
 //!
-//! Whoever computes has a turn. A job that asks [`Abandoned::check`] now and then, as every long one
+//! Whoever computes has a turn. A job that asks [`pool::Abandoned::check`] now and then, as every long one
 //! must, gives its turn to the next in the queue when it has had it for 20 ms, and queues again: however
 //! many long computations there are, a short one waits for no more than one such time for each connection
 //! before it. What a job has begun stays on the stack of its thread meanwhile; there are a few more
