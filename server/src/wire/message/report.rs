@@ -1,5 +1,5 @@
 //! The report of a step as a message, and in the header of the link; its fields are listed in
-//! [`crate::core::publish::report`].
+//! `core::publish::report`.
 
 use plantd_models::StepReport;
 use plantd_proto::link::Header;
