@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 use crate::core::limits::{LimitError, Limits};
 use crate::core::modes::Mode;
 use crate::core::priority::{Priority, Scheduling};
-use crate::core::realtime::RealTimeSettings;
-use crate::wire::link::LinkConfig;
+use crate::core::realtime::settings::RealTimeSettings;
+use crate::wire::link::config::LinkConfig;
 use crate::wire::names::{Names, is_host_name, is_origin};
 
 /// Port of gRPC over TCP unless another one is given.

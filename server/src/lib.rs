@@ -8,6 +8,10 @@
 //!  core: session (one plant, one lease, many watchers), channels, loops, feedback, workers
 //! ```
 //!
+//! From the ground up, each folder knows only those before it: `core` (its own files), `core/metrics`, `publish`,
+//! `workers`, `channels`, `feedback`, `plant`, `realtime`, `session`; `wire` (its own files), `wire/edge`,
+//! `message`, `link`, `record`, `shared`, `models`, `control`, `plants`; the files beside this one.
+//!
 //! [`serve::run`] is the whole server; [`daemon`] makes a process of it.
 
 pub mod cli;

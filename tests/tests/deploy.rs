@@ -5,7 +5,7 @@ use std::process::Command;
 
 use plantd_server::config::{Config, Listen, LogFormat};
 use plantd_server::core::limits::Limits;
-use plantd_server::core::metrics::Metrics;
+use plantd_server::core::metrics::registry::Metrics;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")

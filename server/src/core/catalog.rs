@@ -1,12 +1,13 @@
 //! The models that a server knows: built-in ones, and uploaded ones.
 
 use std::collections::{BTreeMap, HashMap};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 
 use plantd_models::{Model, builtin};
+use prometheus_client::metrics::gauge::Gauge;
 
 use crate::core::limits::LimitExceeded;
-use crate::core::metrics::Metrics;
+use crate::core::mutex::lock;
 
 /// Why a model was not found, kept or forgotten.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -61,18 +62,19 @@ pub struct Catalog {
     generated: Mutex<HashMap<String, Weak<Model>>>,
     uploaded: Mutex<BTreeMap<String, Arc<Model>>>,
     models_max: u64,
-    metrics: Arc<Metrics>,
+    /// Shows how many are uploaded.
+    gauge: Gauge,
 }
 
 impl Catalog {
-    /// A catalog with room for `models_max` uploaded models.
-    pub fn new(models_max: u64, metrics: Arc<Metrics>) -> Self {
+    /// A catalog with room for `models_max` uploaded models, which the gauge counts.
+    pub fn new(models_max: u64, gauge: Gauge) -> Self {
         Self {
             named: builtin::NAMES.iter().map(|name| (*name, OnceLock::new())).collect(),
             generated: Mutex::default(),
             uploaded: Mutex::default(),
             models_max,
-            metrics,
+            gauge,
         }
     }
 
@@ -116,7 +118,7 @@ impl Catalog {
         }
         LimitExceeded::check("models", self.models_max, "uploaded models", uploaded.len() + 1)?;
         uploaded.insert(name.to_owned(), Arc::clone(&model));
-        self.metrics.set_models(uploaded.len());
+        self.gauge.set(uploaded.len() as i64);
         Ok(Entry { name: name.to_owned(), builtin: false, model })
     }
 
@@ -124,7 +126,7 @@ impl Catalog {
     pub fn remove(&self, name: &str) -> Result<(), CatalogError> {
         let mut uploaded = lock(&self.uploaded);
         if uploaded.remove(name).is_some() {
-            self.metrics.set_models(uploaded.len());
+            self.gauge.set(uploaded.len() as i64);
             return Ok(());
         }
         if builtin::scene(name).is_some() {
@@ -165,8 +167,4 @@ fn compile_builtin(name: &str) -> Result<Option<Arc<Model>>, CatalogError> {
         problem: error.to_string(),
     })?;
     Ok(Some(Arc::new(model)))
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

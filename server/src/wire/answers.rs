@@ -11,7 +11,7 @@ use crate::wire::status::RpcError;
 pub type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// What makes the messages of a stream, one after the other.
-pub(super) trait Messages: Sized + Send + 'static {
+pub(crate) trait Messages: Sized + Send + 'static {
     type Message: Send + 'static;
 
     /// The next message, or the error that ends the stream.
@@ -31,11 +31,11 @@ pub(super) trait Messages: Sized + Send + 'static {
 }
 
 /// Bytes of plants or models in one page of a list, at most: half of what clients take by default.
-pub(super) const PAGE_BYTES_MAX: usize = 2 << 20;
+pub(crate) const PAGE_BYTES_MAX: usize = 2 << 20;
 
 /// Cuts a page where it becomes too long for one message; true when something was cut off. At least
 /// one entry stays.
-pub(super) fn cut_page<M: prost::Message>(entries: &mut Vec<M>) -> bool {
+pub(crate) fn cut_page<M: prost::Message>(entries: &mut Vec<M>) -> bool {
     let mut bytes = 0;
     let fits = entries
         .iter()

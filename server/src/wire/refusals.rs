@@ -5,10 +5,12 @@ use tonic::Code;
 
 use crate::core::catalog::CatalogError;
 use crate::core::channels::timeline::TimelineError;
+use crate::core::feedback::regulator::RegulatorError;
 use crate::core::parameters::ChangeError;
-use crate::core::regulator::RegulatorError;
-use crate::core::session::{RunError, Session, StoppedBy};
-use crate::core::workers::WorkError;
+use crate::core::realtime::runner::StoppedBy;
+use crate::core::session::run::RunError;
+use crate::core::session::shared::Session;
+use crate::core::workers::pool::WorkError;
 use crate::wire::status::RpcError;
 
 impl From<ChangeError> for RpcError {

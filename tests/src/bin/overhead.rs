@@ -22,7 +22,7 @@ use plantd_client::link::{LinkDriver, LinkOptions, Wait};
 use plantd_client::{Client, Driver, v1};
 use plantd_proto::link::Header;
 use plantd_server::core::priority::allow_cpus;
-use plantd_server::wire::convert::{clocks, plant_state};
+use plantd_server::wire::message::states::{clocks, plant_state};
 use plantd_tests::links::{ChildProcess, PLANT, new_plant};
 use plantd_tests::server::{ServerProcess, binary};
 use rustix::process::{Pid, Signal, kill_process};

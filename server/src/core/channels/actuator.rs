@@ -4,7 +4,7 @@
 //! u ─► sampled and held ─► late ─► dead band ─► limited ─► rate limited ─► quantised ─► plant
 //! ```
 
-use super::sensor::quantised;
+use crate::core::channels::sensor::quantised;
 
 /// What happens between two samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -7,8 +7,8 @@ use std::ops::Range;
 
 use plantd_models::{Plant, Site};
 
-use super::Origin;
-use super::noise::Stream;
+use crate::core::channels::noise::Stream;
+use crate::core::origin::Origin;
 
 /// When a fault is active, in steps of the plant. On inputs, and of pushes, `k` is the step from `k` to
 /// `k + 1`; on outputs the measurement at `k`.
@@ -88,7 +88,7 @@ pub(crate) enum Effect {
     Output { line: Line, channel: usize },
     /// A force and a torque in world axes.
     Push { site: Box<Site>, force: [f64; 3], torque: [f64; 3] },
-    /// Numbers of the scene: the change of that number in the plant's [`super::timeline::Timeline`].
+    /// Numbers of the scene: the change of that number in the plant's [`crate::core::channels::timeline::Timeline`].
     Parameters { bit: u32 },
 }
 
@@ -131,7 +131,7 @@ pub(crate) struct Line {
     held: Vec<f64>,
     /// Those after the step that is tried.
     next: Vec<f64>,
-    /// Values on their way, by steps; see [`super::actuator`].
+    /// Values on their way, by steps; see [`crate::core::channels::actuator`].
     late: Vec<f64>,
 }
 

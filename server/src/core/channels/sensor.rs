@@ -6,7 +6,7 @@
 
 use plantd_models::{Plant, Site};
 
-use super::noise::Stream;
+use crate::core::channels::noise::Stream;
 
 /// What a sensor measures.
 #[derive(Clone, Debug)]

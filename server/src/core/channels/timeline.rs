@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use plantd_models::{InitialError, Model, Plant, Settings, Site, Spare};
 
-use super::fault::{Pattern, Schedule};
+use crate::core::channels::fault::{Pattern, Schedule};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::parameters::{self, ChangeError, Parameters};
 
@@ -58,7 +58,7 @@ struct Entry {
     digest: u64,
     plant: Spare,
     parameters: Arc<Parameters>,
-    /// Those of outputs and pushes, in the order of [`super::Channels::sites_mut`].
+    /// Those of outputs and pushes, in the order of [`crate::core::channels::pipeline::Channels::sites_mut`].
     sites: Vec<Site>,
 }
 

@@ -1,7 +1,7 @@
 //! Which input a loop applies when its driver is late, silent or gone.
 
-use super::slot::{Arrival, InputSlot};
-use crate::core::frame::Timing;
+use crate::core::publish::frame::Timing;
+use crate::core::realtime::slot::{Arrival, InputSlot};
 
 /// What a loop does without a valid input.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -5,8 +5,8 @@ use std::io;
 
 use rustix::process::{Resource, getrlimit};
 
-use super::RealTimeSettings;
 use crate::core::priority::{Scheduling, lock_memory, schedule, usable_cpus};
+use crate::core::realtime::settings::RealTimeSettings;
 
 /// Locks the memory if that is asked for, and tries everything else in a thread that ends at once. Returns a
 /// sentence for each key that is not granted.

@@ -3,12 +3,15 @@
 //! A loop wakes nobody. This thread knows when steps are due, looks a moment later, and hands on what it
 //! finds; while nobody watches a running plant, it sleeps.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use plantd_proto::link::monotonic_ns;
 
-use super::alarm::Alarm;
-use crate::core::session::Session;
+use crate::core::mutex::lock;
+use crate::core::publish::feed::Feed;
+use crate::core::realtime::alarm::Alarm;
+use crate::core::realtime::live::Live;
+use crate::core::realtime::settings::Pace;
 
 /// How long after a step is due it is looked for: about as long as a short step takes, ns.
 const AFTER_DUE_NS: u64 = 20_000;
@@ -19,9 +22,20 @@ const AGAIN_FREE_NS: u64 = 1_000_000;
 const SLEEP_MAX_NS: u64 = 5_000_000;
 const IDLE_MAX_NS: u64 = 500_000_000;
 
+/// What it has of a plant that runs.
+#[derive(Clone)]
+pub(crate) struct Pumped {
+    /// Whom it hands steps on to.
+    pub(crate) feed: Arc<Feed>,
+    /// When steps are due.
+    pub(crate) live: Arc<Live>,
+    /// Who decides when the plant takes them.
+    pub(crate) pace: Pace,
+}
+
 /// The thread's end for those who add plants to it.
 pub(crate) struct Pump {
-    plants: Arc<Mutex<Vec<Arc<Session>>>>,
+    plants: Arc<Mutex<Vec<Pumped>>>,
     alarm: Alarm,
 }
 
@@ -34,10 +48,11 @@ impl Pump {
     }
 
     /// From now on the plant runs.
-    pub(crate) fn add(&self, session: Arc<Session>) {
-        let mut plants = self.plants.lock().unwrap_or_else(PoisonError::into_inner);
-        if !plants.iter().any(|other| Arc::ptr_eq(other, &session)) {
-            plants.push(session);
+    pub(crate) fn add(&self, plant: Pumped) {
+        let mut plants = lock(&self.plants);
+        match plants.iter_mut().find(|other| Arc::ptr_eq(&other.feed, &plant.feed)) {
+            Some(present) => *present = plant,
+            None => plants.push(plant),
         }
         drop(plants);
         self.alarm.ring();
@@ -53,12 +68,12 @@ impl Pump {
         while Arc::strong_count(&self.plants) > 1 {
             self.alarm.take();
             let plants = {
-                let mut plants = self.plants.lock().unwrap_or_else(PoisonError::into_inner);
-                plants.retain(|session| session.relay().is_busy());
+                let mut plants = lock(&self.plants);
+                plants.retain(|plant| plant.feed.relay.is_busy());
                 plants.clone()
             };
             let now_ns = monotonic_ns();
-            let next_ns = plants.iter().map(|session| hand_on(session, now_ns)).min();
+            let next_ns = plants.iter().map(|plant| hand_on(plant, now_ns)).min();
             drop(plants);
             self.alarm.sleep_until(next_ns.unwrap_or(now_ns + IDLE_MAX_NS));
         }
@@ -66,11 +81,11 @@ impl Pump {
 }
 
 /// Hands on what is there; when to look again.
-fn hand_on(session: &Session, now_ns: u64) -> u64 {
-    session.relay().hand_on(session.watchers());
-    if session.watchers().count() == 0 {
+fn hand_on(plant: &Pumped, now_ns: u64) -> u64 {
+    plant.feed.hand_on();
+    if plant.feed.watchers.count() == 0 {
         return now_ns + IDLE_MAX_NS;
     }
-    let again_ns = if session.is_paced() { AGAIN_NS } else { AGAIN_FREE_NS };
-    session.live().look_ns(now_ns, AFTER_DUE_NS, again_ns).min(now_ns + SLEEP_MAX_NS)
+    let again_ns = if plant.pace == Pace::Paced { AGAIN_NS } else { AGAIN_FREE_NS };
+    plant.live.look_ns(now_ns, AFTER_DUE_NS, again_ns).min(now_ns + SLEEP_MAX_NS)
 }

@@ -2,23 +2,17 @@
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
-use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
 use plantd_proto::link::monotonic_ns;
 
-use super::alarm::Alarm;
-use super::event::EventKind;
-use super::input::{Change, LoopInput};
-use super::watchdog::WatchdogAction;
-use super::{CATCH_UP_NS, Live, Pace, Permit, RealTimeSettings, RunSettings, TimingCounts};
-use crate::core::frame::Timing;
+use crate::core::plant::core::Core;
 use crate::core::priority::{Priority, allow_cpus, sharpen_timers};
-use crate::core::session::{Core, DriveError, Session, StoppedBy};
+use crate::core::realtime::alarm::Alarm;
+use crate::core::realtime::permit::Permit;
+use crate::core::realtime::runner::Runner;
+use crate::core::realtime::settings::RealTimeSettings;
 
-/// Overruns are told at most once in this time, ns.
-const OVERRUN_PERIOD_NS: u64 = 1_000_000_000;
 /// Least time after which a command is obeyed although there is no time for it before the next step, ns;
 /// it is also this many times as long as commands take.
 const PATIENCE_NS: u64 = 1_000_000;
@@ -32,7 +26,7 @@ type Act = Box<dyn FnOnce(Option<&mut Core>) + Send>;
 enum Command {
     Start(Box<Runner>),
     Act(u64, Act),
-    /// Gives the core back to its session, and says what room the plant had.
+    /// Gives the core back to its owner, and says what room the plant had.
     Stop(u64, Sender<Option<Permit>>),
 }
 
@@ -87,7 +81,7 @@ impl Handle {
         self.tell(Command::Act(key, act));
     }
 
-    /// Takes a plant out of the loop, if it still runs here: its session has it then. The room that it had.
+    /// Takes a plant out of the loop, if it still runs here: its owner has it then. The room that it had.
     pub(crate) fn stop(&self, key: u64) -> Option<Permit> {
         let (give, taken) = channel();
         self.tell(Command::Stop(key, give));
@@ -159,7 +153,7 @@ impl Scheduler {
             Ok(due_ns) => self.due.push(Reverse((due_ns, slot))),
             Err(stop) => {
                 if let Some(runner) = self.runners[slot].take() {
-                    runner.session.loop_ended(runner.core, stop);
+                    runner.end(stop);
                 }
             }
         }
@@ -176,19 +170,19 @@ impl Scheduler {
                 self.runners[slot] = Some(runner);
             }
             Command::Act(key, act) => {
-                let runner = self.runners.iter_mut().flatten().find(|runner| runner.key == key);
-                act(runner.map(|runner| &mut *runner.core));
+                let runner = self.runners.iter_mut().flatten().find(|runner| runner.key() == key);
+                act(runner.map(|runner| runner.core_mut()));
             }
             Command::Stop(key, give) => {
                 let has_key = |runner: &Option<Box<Runner>>| {
-                    runner.as_ref().is_some_and(|runner| runner.key == key)
+                    runner.as_ref().is_some_and(|runner| runner.key() == key)
                 };
                 let slot = self.runners.iter().position(has_key);
                 let runner = slot.and_then(|slot| {
                     self.due.retain(|Reverse((_, other))| *other != slot);
                     self.runners[slot].take()
                 });
-                let permit = runner.and_then(|runner| runner.session.put_back(runner.core));
+                let permit = runner.and_then(|runner| runner.put_back());
                 // The receiver waits for it.
                 let _ = give.send(permit);
             }
@@ -229,219 +223,6 @@ impl Attention {
     fn obeyed(&mut self, began_ns: u64, ended_ns: u64) {
         self.cost_ns = (ended_ns - began_ns).max(self.cost_ns / 2);
         self.since_ns = ended_ns;
-    }
-}
-
-/// Why a loop lets go of a plant.
-pub(crate) enum Stop {
-    /// The steps that were asked for are taken.
-    StepsTaken,
-    /// The plant was deleted.
-    Closed,
-    /// It may not go on.
-    Refused(StoppedBy),
-}
-
-/// A plant that a loop runs.
-pub(crate) struct Runner {
-    key: u64,
-    core: Box<Core>,
-    session: Arc<Session>,
-    live: Arc<Live>,
-    all: Arc<TimingCounts>,
-    input: LoopInput,
-    /// Steps that may still be taken.
-    steps_left: u64,
-    is_paced: bool,
-    speed: f64,
-    /// Deadlines are `origin + k period`, so that they do not drift.
-    origin_ns: u64,
-    ticks: u64,
-    time_step_s: f64,
-    period_ns: f64,
-    /// Overruns that no event has told, and when the last one did, ns.
-    untold_overruns: u64,
-    overruns_told_ns: u64,
-}
-
-impl Runner {
-    /// A plant that begins to run now; `steps` 0 means without end.
-    pub(crate) fn new(
-        key: u64,
-        core: Box<Core>,
-        session: Arc<Session>,
-        settings: &RunSettings,
-        steps: u64,
-    ) -> Box<Self> {
-        let live = Arc::clone(session.live());
-        let forces = session.model().dimensions().inputs;
-        let (held, is_valid) = core.first_input();
-        let mut runner = Box::new(Self {
-            key,
-            live,
-            all: Arc::clone(session.loop_counts()),
-            session,
-            input: LoopInput::new(settings.input.clone(), held, forces, is_valid),
-            steps_left: if steps == 0 { u64::MAX } else { steps },
-            is_paced: settings.pace == Pace::Paced,
-            speed: settings.speed,
-            origin_ns: monotonic_ns(),
-            ticks: 0,
-            time_step_s: 0.0,
-            period_ns: 0.0,
-            untold_overruns: 0,
-            overruns_told_ns: 0,
-            core,
-        });
-        runner.set_period();
-        runner.live.steps_left.store(steps, Ordering::Relaxed);
-        // Also the first step has a time step to wait for.
-        runner.ticks = 1;
-        runner
-    }
-
-    /// The period of the plant's time step, which may change while it runs.
-    fn set_period(&mut self) {
-        let time_step_s = self.core.plant().settings().time_step_s;
-        if time_step_s != self.time_step_s {
-            self.origin_ns = self.due_ns();
-            self.ticks = 0;
-            self.time_step_s = time_step_s;
-            self.period_ns = if self.is_paced { time_step_s / self.speed * 1e9 } else { 0.0 };
-        }
-    }
-
-    fn due_ns(&self) -> u64 {
-        self.origin_ns + (self.ticks as f64 * self.period_ns) as u64
-    }
-
-    /// Takes the step that is due; when the next one is due.
-    fn step(&mut self, began_ns: u64) -> Result<u64, Stop> {
-        if self.session.is_closed() {
-            return Err(Stop::Closed);
-        }
-        let mut timing = Timing { due_ns: self.due_ns(), began_ns, ..Timing::default() };
-        self.find_input(began_ns, &mut timing)?;
-        let outcome = self.core.step(self.input.u(), None);
-        timing.ended_ns = monotonic_ns();
-        match outcome {
-            Ok(_) => self.core.timing = timing,
-            Err(error) => {
-                self.recover(error)?;
-                self.core.write_ring();
-                return Ok(self.schedule(timing.ended_ns));
-            }
-        }
-        self.core.write_ring();
-        let next_ns = self.schedule(timing.ended_ns);
-        self.count(&timing);
-        if let Some(trip) = self.core.take_trip() {
-            match trip.dog.action {
-                WatchdogAction::Freeze => {
-                    return Err(Stop::Refused(DriveError::Frozen(trip).into()));
-                }
-                WatchdogAction::Disconnect => self.session.revoke_lease(),
-                WatchdogAction::Reset => {}
-            }
-        }
-        if self.steps_left == u64::MAX {
-            return Ok(next_ns);
-        }
-        self.steps_left -= 1;
-        self.live.steps_left.store(self.steps_left, Ordering::Relaxed);
-        if self.steps_left == 0 { Err(Stop::StepsTaken) } else { Ok(next_ns) }
-    }
-
-    /// When the next step is due, after one that ended at `ended_ns`. Gives the schedule up when it cannot
-    /// be caught up with.
-    fn schedule(&mut self, ended_ns: u64) -> u64 {
-        self.set_period();
-        if self.is_paced {
-            self.ticks += 1;
-            let behind_ns = ended_ns.saturating_sub(self.due_ns());
-            for counts in [&self.live.counts, &*self.all] {
-                counts.overruns.fetch_add(u64::from(behind_ns > 0), Ordering::Relaxed);
-                counts.slips.fetch_add(u64::from(behind_ns > CATCH_UP_NS), Ordering::Relaxed);
-            }
-            if behind_ns > 0 {
-                self.tell_overrun(ended_ns);
-            }
-            if behind_ns > CATCH_UP_NS {
-                self.core.note(EventKind::Slipped, 0, behind_ns as f64 * 1e-9);
-                (self.origin_ns, self.ticks) = (ended_ns, 1);
-            }
-        } else {
-            // The others of this loop take their turns first.
-            (self.origin_ns, self.ticks) = (ended_ns, 0);
-        }
-        let next_ns = self.due_ns();
-        self.live.due_ns.store(next_ns, Ordering::Relaxed);
-        next_ns
-    }
-
-    fn find_input(&mut self, now_ns: u64, timing: &mut Timing) -> Result<(), Stop> {
-        let lease = self.session.input_lease();
-        let (input, slot) = (&mut self.input, &self.live.slot);
-        let change = input.next(slot, lease, now_ns, self.time_step_s, timing);
-        let age_s = input.age_s(self.time_step_s);
-        match change {
-            Change::None => {}
-            Change::Lost => self.core.note(EventKind::InputLost, 0, age_s),
-            Change::Back => self.core.note(EventKind::InputBack, 0, 0.0),
-            Change::Stop => {
-                self.core.note(EventKind::InputLost, 0, age_s);
-                return Err(Stop::Refused(StoppedBy::InputLost));
-            }
-        }
-        for counts in [&self.live.counts, &*self.all] {
-            if timing.flags & Timing::LATE == 0 {
-                counts.used_inputs.fetch_add(1, Ordering::Relaxed);
-            } else if lease != 0 {
-                counts.late_inputs.fetch_add(1, Ordering::Relaxed);
-            }
-            if timing.flags & Timing::SAFE != 0 {
-                counts.safe_inputs.fetch_add(1, Ordering::Relaxed);
-            }
-        }
-        Ok(())
-    }
-
-    /// Puts the plant back after a step that failed, or says why it stops.
-    fn recover(&mut self, error: DriveError) -> Result<(), Stop> {
-        if let DriveError::Step(error) = &error {
-            self.core.note_failure(error);
-        }
-        let action = self.core.on_step_failure();
-        if action == Some(WatchdogAction::Reset) && self.core.go_home() {
-            return Ok(());
-        }
-        if action == Some(WatchdogAction::Disconnect) {
-            self.session.revoke_lease();
-        }
-        Err(Stop::Refused(error.into()))
-    }
-
-    /// Counts the times of a step.
-    fn count(&self, timing: &Timing) {
-        for counts in [&self.live.counts, &*self.all] {
-            counts.steps.fetch_add(1, Ordering::Relaxed);
-            counts.step.record(timing.ended_ns.saturating_sub(timing.began_ns));
-            if self.is_paced {
-                counts.lateness.record(timing.began_ns.saturating_sub(timing.due_ns));
-            }
-            if timing.input_sequence != 0 {
-                counts.input_age.record(timing.input_age_ns);
-            }
-        }
-    }
-
-    fn tell_overrun(&mut self, now_ns: u64) {
-        self.untold_overruns += 1;
-        if now_ns.saturating_sub(self.overruns_told_ns) >= OVERRUN_PERIOD_NS {
-            let count = std::mem::take(&mut self.untold_overruns);
-            self.core.note(EventKind::Overran, 0, count as f64);
-            self.overruns_told_ns = monotonic_ns();
-        }
     }
 }
 

@@ -5,10 +5,12 @@ use std::sync::atomic::Ordering;
 
 use tokio::sync::watch::Receiver;
 
-use super::{Mechanics, Session};
-use crate::core::feedback::{Feedback, FeedbackInfo, InForce, Law};
+use crate::core::feedback::active::{Feedback, FeedbackInfo, InForce};
+use crate::core::feedback::law::Law;
+use crate::core::feedback::regulator::{RegulatorError, Spec};
 use crate::core::limits::LimitExceeded;
-use crate::core::regulator::{RegulatorError, Spec};
+use crate::core::plant::view::Mechanics;
+use crate::core::session::shared::Session;
 
 impl Session {
     /// Puts a feedback in force. `generation` is that of the mechanics for which its law was computed;
@@ -29,10 +31,10 @@ impl Session {
                 Some(_) => first_step.unwrap_or(present),
                 None => present,
             };
-            let is_outdated = generation != core.generation && !feedback.spec.is_fixed();
-            feedback.generation = if is_outdated { generation } else { core.generation };
+            let is_outdated = generation != core.changed.generation && !feedback.spec.is_fixed();
+            feedback.generation = if is_outdated { generation } else { core.changed.generation };
             let info = feedback.info();
-            session.in_force.send_replace(Some(feedback.in_force()));
+            session.gains.in_force.send_replace(Some(feedback.in_force()));
             (info, is_outdated, core.feedback.replace(feedback))
         });
         (info, is_outdated)
@@ -42,7 +44,7 @@ impl Session {
     pub fn clear_feedback(self: &Arc<Self>) -> bool {
         let session = Arc::clone(self);
         let former = self.with_core(move |core| {
-            session.in_force.send_replace(None);
+            session.gains.in_force.send_replace(None);
             core.feedback.take()
         });
         former.is_some()
@@ -52,7 +54,8 @@ impl Session {
     pub fn outdated_feedback(&self) -> Option<(Arc<Spec>, Mechanics)> {
         self.with_core(|core| {
             let feedback = core.feedback.as_ref()?;
-            let is_outdated = feedback.generation != core.generation && !feedback.spec.is_fixed();
+            let is_outdated =
+                feedback.generation != core.changed.generation && !feedback.spec.is_fixed();
             is_outdated.then(|| (Arc::clone(&feedback.spec), core.mechanics()))
         })
     }
@@ -82,18 +85,18 @@ impl Session {
                 }
                 Err(error) => feedback.failure = Some(Arc::new(error)),
             }
-            session.in_force.send_replace(Some(feedback.in_force()));
+            session.gains.in_force.send_replace(Some(feedback.in_force()));
         });
     }
 
     /// Claims the task of computing the feedback's law anew; false when somebody is at it.
     pub fn begin_recomputing(&self) -> bool {
-        !self.is_recomputing.swap(true, Ordering::AcqRel)
+        !self.gains.is_recomputing.swap(true, Ordering::AcqRel)
     }
 
     /// Gives that task back.
     pub fn end_recomputing(&self) {
-        self.is_recomputing.store(false, Ordering::Release);
+        self.gains.is_recomputing.store(false, Ordering::Release);
     }
 
     /// Tells of the feedback's law and of each that replaces it.
@@ -105,9 +108,9 @@ impl Session {
         let session = Arc::clone(self);
         // In the core's hands counting and subscribing are one.
         self.with_core(move |_| {
-            let count = session.in_force.receiver_count() + 1;
+            let count = session.gains.in_force.receiver_count() + 1;
             LimitExceeded::check(name, watchers_max, what, count)?;
-            Ok(session.in_force.subscribe())
+            Ok(session.gains.in_force.subscribe())
         })
     }
 }

@@ -5,8 +5,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use plantd_proto::link::monotonic_ns;
 
-use super::DriveError;
-use crate::core::realtime::CATCH_UP_NS;
+use crate::core::plant::error::DriveError;
+use crate::core::realtime::settings::CATCH_UP_NS;
 
 /// Lets steps through: all, none, so many, or at a speed. Open, it costs one load.
 #[derive(Debug)]

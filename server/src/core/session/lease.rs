@@ -4,18 +4,20 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use plantd_models::{
-    Initial, InitialError, Linearization, SnapshotError, State, StepError, StepReport,
-};
+use plantd_models::{Initial, InitialError, Linearization, SnapshotError, State, StepReport};
 use plantd_proto::link::monotonic_ns;
 
-use super::running::Place;
-use super::{Core, PlantSnapshot, Session, lock};
 use crate::core::driver::DriverKind;
 use crate::core::failure::step_error_reason;
-use crate::core::realtime::event::EventKind;
+use crate::core::mutex::lock;
+use crate::core::plant::core::Core;
+use crate::core::plant::error::DriveError;
+use crate::core::plant::event::EventKind;
+use crate::core::plant::view::PlantSnapshot;
+use crate::core::plant::watchdog::WatchdogAction;
 use crate::core::realtime::slot::Arrival;
-use crate::core::realtime::watchdog::{Trip, WatchdogAction};
+use crate::core::session::place::Place;
+use crate::core::session::shared::Session;
 
 /// One step in this many is timed for the histogram of step times.
 const TIMED_STEP_INTERVAL: u64 = 64;
@@ -28,40 +30,12 @@ pub struct LeaseHeld {
     pub by: DriverKind,
 }
 
-/// Why a lease's operation failed.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum DriveError {
-    /// The plant was deleted.
-    #[error("the plant was deleted")]
-    Closed,
-    /// The step failed; the plant is where it was.
-    #[error(transparent)]
-    Step(#[from] StepError),
-    /// The plant takes its steps in a loop of its own.
-    #[error("the plant runs by itself")]
-    Running,
-    /// The plant is paused, and this driver waits until it may go on.
-    #[error("the plant is paused")]
-    Paused,
-    /// The plant keeps a speed, and the next step is due later, ns on the monotonic clock.
-    #[error("the next step is due later")]
-    NotDue(u64),
-    /// A watchdog holds the plant.
-    #[error("a watchdog holds the plant")]
-    Frozen(Trip),
-    /// The lease was taken away.
-    #[error("the lease was taken away")]
-    Revoked,
-}
-
 impl Session {
     /// Takes the lease, which ends when the returned value is dropped.
     pub fn acquire(self: &Arc<Self>, kind: DriverKind) -> Result<Lease, LeaseHeld> {
-        self.driver
-            .compare_exchange(0, kind.code(), Ordering::AcqRel, Ordering::Acquire)
-            .map_err(|code| LeaseHeld { by: DriverKind::from_code(code).unwrap_or(kind) })?;
+        self.leases.claim(kind).map_err(|by| LeaseHeld { by })?;
         let lease = self.new_lease(kind);
-        self.holder.store(lease.number, Ordering::Release);
+        self.leases.put_in_force(lease.number);
         lease.begin();
         Ok(lease)
     }
@@ -69,14 +43,13 @@ impl Session {
     /// Takes the lease of that name over from whoever holds it: a stream whose connection broke, noticed
     /// or not.
     pub fn take_over(self: &Arc<Self>, token: &str) -> Option<Lease> {
-        let named = lock(&self.named).take_if(|(name, _)| name == token);
-        let (_, former) = named?;
+        let former = self.leases.take_named(token)?;
         let lease = self.new_lease(DriverKind::Drive);
         // Dropped, it gives up nothing that is not its own.
-        self.holder
-            .compare_exchange(former, lease.number, Ordering::AcqRel, Ordering::Acquire)
-            .ok()?;
-        self.revoked.store(former, Ordering::Release);
+        if !self.leases.replace(former, lease.number) {
+            return None;
+        }
+        self.leases.revoke(former);
         self.tell_run_status();
         lease.tell(EventKind::DriverLeft, 0);
         lease.begin();
@@ -85,27 +58,13 @@ impl Session {
 
     fn new_lease(self: &Arc<Self>, kind: DriverKind) -> Lease {
         self.metrics.driver_started(kind);
-        let number = self.leases.fetch_add(1, Ordering::Relaxed) + 1;
+        let number = self.leases.issue();
         Lease { session: Arc::clone(self), kind, number, untimed_steps: 0 }
-    }
-
-    /// Number of the lease under which inputs come; 0 for none.
-    pub(crate) fn input_lease(&self) -> u64 {
-        self.input_lease.load(Ordering::Acquire)
-    }
-
-    /// Takes the lease away from the driver, who is told so when it acts next.
-    pub(crate) fn revoke_lease(&self) {
-        let lease = self.input_lease();
-        if lease != 0 {
-            self.revoked.store(lease, Ordering::Release);
-            self.tell_run_status();
-        }
     }
 
     /// Who drives the plant.
     pub fn driver(&self) -> Option<DriverKind> {
-        DriverKind::from_code(self.driver.load(Ordering::Acquire))
+        self.leases.driver()
     }
 }
 
@@ -125,7 +84,7 @@ impl Lease {
 
     /// Takes one step.
     pub fn step(&mut self, u: &[f64]) -> Result<StepReport, DriveError> {
-        self.step_and(u, None, |core| core.report)
+        self.step_and(u, None, |core| core.last.report)
     }
 
     /// Takes one step and linearizes it.
@@ -134,7 +93,7 @@ impl Lease {
         u: &[f64],
         out: &mut Linearization,
     ) -> Result<StepReport, DriveError> {
-        self.step_and(u, Some(out), |core| core.report)
+        self.step_and(u, Some(out), |core| core.last.report)
     }
 
     /// Takes one step, linearizes it when asked to, and looks at the core before anybody else does.
@@ -166,7 +125,7 @@ impl Lease {
         let mut place = lock(&session.place);
         let Place::Rest(core) = &mut *place else { return Err(DriveError::Running) };
         if is_gated {
-            session.gate.pass()?;
+            session.run.gate.pass()?;
         }
         let started = is_timed.then(Instant::now);
         let outcome = core.step_pushed(u, impulse, linearization);
@@ -183,15 +142,15 @@ impl Lease {
         session.publish(core);
         core.write_ring();
         session.metrics.stepped(self.kind);
-        let is_last = is_gated && session.gate.passed(core.plant.settings().time_step_s);
+        let is_last = is_gated && session.run.gate.passed(core.plant.settings().time_step_s);
         if is_last {
             core.note(EventKind::StepsTaken, 0, 0.0);
         }
         let trip = core.take_trip();
-        let (seen, full) = (look(core), core.full_tap());
+        let (seen, full) = (look(core), core.records.full_tap());
         drop(place);
         if trip.is_some_and(|trip| trip.dog.action == WatchdogAction::Disconnect) {
-            session.revoke_lease();
+            session.revoke_driver();
         }
         if is_last {
             session.tell_run_status();
@@ -220,7 +179,7 @@ impl Lease {
         if self.is_revoked() {
             return Err(DriveError::Revoked);
         }
-        self.session.model.check_input(u)?;
+        self.session.model().check_input(u)?;
         let (live, arrived_ns) = (self.session.live(), monotonic_ns());
         live.slot.put(Arrival { lease: self.number, sequence, arrived_ns }, u);
         for counts in [&live.counts, &*self.session.realtime.counts] {
@@ -234,24 +193,24 @@ impl Lease {
 
     /// Gives it a name, under which it can be taken over.
     pub fn set_name(&self, token: String) {
-        *lock(&self.session.named) = Some((token, self.number));
+        self.session.leases.set_name(token, self.number);
     }
 
     /// It was taken away.
     pub fn is_revoked(&self) -> bool {
-        self.session.revoked.load(Ordering::Acquire) >= self.number
+        self.session.leases.revoked() >= self.number
     }
 
     /// Puts the plant back into the state in which the session began, and tells it. Changed parameters stay changed.
     pub fn reset(&mut self) -> Result<(State, f64), InitialError> {
-        let _replacing = lock(&self.session.replacing);
+        let _replacing = self.session.replacing();
         let plant = self.session.plant_at_start()?;
         Ok(self.session.replace_plant(plant, None))
     }
 
     /// Puts the plant into a state, step 0, and tells it.
     pub fn initialize(&mut self, initial: &Initial) -> Result<(State, f64), InitialError> {
-        let _replacing = lock(&self.session.replacing);
+        let _replacing = self.session.replacing();
         let plant = self.session.copy_plants().swap_remove(0).start(initial)?;
         Ok(self.session.replace_plant(plant, None))
     }
@@ -273,7 +232,7 @@ impl Lease {
         }
         let (session, code) = (Arc::clone(&self.session), self.kind.code().into());
         self.session.post(move |core| {
-            session.input_lease.store(input_lease, Ordering::Release);
+            session.leases.set_input(input_lease);
             core.note(event, code, 0.0);
         });
     }
@@ -289,13 +248,11 @@ impl Drop for Lease {
     fn drop(&mut self) {
         let (session, kind) = (&self.session, self.kind);
         session.metrics.driver_ended(kind);
-        let holds =
-            session.holder.compare_exchange(self.number, 0, Ordering::AcqRel, Ordering::Acquire);
-        if holds.is_err() {
+        if !session.leases.replace(self.number, 0) {
             // Somebody has taken it over.
             return;
         }
         self.tell(EventKind::DriverLeft, 0);
-        session.driver.store(0, Ordering::Release);
+        session.leases.vacate();
     }
 }

@@ -4,8 +4,20 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
-use super::{Admission, Work, lock};
 use crate::core::connection::Connection;
+use crate::core::mutex::lock;
+
+/// Whether a job counts against the limit of those that wait.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Admission {
+    /// Refused when the queue is full.
+    Bounded,
+    /// Part of something that was admitted.
+    Granted,
+}
+
+/// A job, told its number.
+pub(super) type Work = Box<dyn FnOnce(u64) + Send>;
 
 /// Where a job waits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -12,10 +12,17 @@ use plantd_proto::link::{
     ProcessIdentity, monotonic_ns, random_instance,
 };
 
-use super::LinkConfig;
-use crate::core::frame::{Frames, OUTPUTS_MAX, Published, Timing};
-use crate::core::session::{DriveError, DriverKind, Lease, Session};
-use crate::wire::report::with_report;
+use crate::core::driver::DriverKind;
+use crate::core::plant::error::DriveError;
+use crate::core::publish::frame::{Frames, OUTPUTS_MAX, Published, Timing};
+use crate::core::session::lease::Lease;
+use crate::core::session::shared::Session;
+use crate::wire::link::config::LinkConfig;
+use crate::wire::message::report::with_report;
+
+/// The kind of a message on which the thread of a link panics.
+#[cfg(test)]
+pub(super) const PANIC: u32 = 0xdead;
 
 /// How often the thread looks whether it shall end and whether its driver lives, ns.
 const CHECK_PERIOD_NS: u64 = 100_000_000;
@@ -232,7 +239,7 @@ impl Worker {
     fn handle(&mut self, message: &Message) -> Result<(), DomainError> {
         let request = *message.user_header();
         #[cfg(test)]
-        assert_ne!(request.kind, super::tests::PANIC, "as a test demands");
+        assert_ne!(request.kind, PANIC, "as a test demands");
         if !request.is_of_this_layout() {
             return self.refuse(&request, Failure::new(Code::Layout));
         }

@@ -9,7 +9,7 @@ use mcap::{McapError, WriteOptions};
 use plantd_proto::v1;
 use prost::Message;
 
-use super::schema::descriptors;
+use crate::wire::record::schema::descriptors;
 
 /// Bytes after which a chunk is written. What was not written is lost when the server is killed.
 const CHUNK_BYTES: u64 = 1 << 18;

@@ -3,13 +3,13 @@
 use plantd_models::Plant;
 use plantd_proto::v1;
 
-use crate::core::frame::Frame;
 use crate::core::parameters::Parameters;
-use crate::core::session::Session;
-use crate::core::session::tap::Mark;
-use crate::wire::convert;
-use crate::wire::report::report_message;
-use crate::wire::run_info::run_info;
+use crate::core::plant::mark::Mark;
+use crate::core::publish::frame::Frame;
+use crate::core::session::shared::Session;
+use crate::wire::message::report::report_message;
+use crate::wire::message::run_info::run_info;
+use crate::wire::message::{models, settings, states};
 
 /// The plant at the beginning of a recording.
 pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecord {
@@ -17,9 +17,9 @@ pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1:
     let info = v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
-        settings: Some(convert::settings_message(plant.settings())),
-        state: Some(convert::plant_state(plant)),
-        accuracy: session.accuracy().map(convert::accuracy),
+        settings: Some(settings::settings_message(plant.settings())),
+        state: Some(states::plant_state(plant)),
+        accuracy: session.accuracy().map(settings::accuracy),
         parameters: all_parameters(&mark.announced.unchanged, &mark.parameters),
         run: Some(run_info(session)),
         ..Default::default()
@@ -28,7 +28,7 @@ pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1:
         version: env!("CARGO_PKG_VERSION").to_owned(),
         plant: Some(info),
         model_digest: model.digest(),
-        model: Some(v1::Model { plan, ..convert::model(session.model_name(), false, model, true) }),
+        model: Some(v1::Model { plan, ..models::model(session.model_name(), false, model, true) }),
         snapshot: mark.snapshot.to_bytes(),
         outputs: session.channels().0.names.clone(),
         ..Default::default()
@@ -39,7 +39,7 @@ pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1:
 pub(super) fn all_parameters(unchanged: &Parameters, changed: &Parameters) -> Vec<v1::Parameter> {
     let mut all = unchanged.clone();
     all.extend(changed.iter().map(|(path, number)| (path.clone(), *number)));
-    convert::parameters(&all)
+    settings::parameters(&all)
 }
 
 /// Puts a frame into a message, whose memory is kept.
@@ -58,7 +58,7 @@ pub(super) fn fill(record: &mut v1::StepRecord, frame: &Frame) {
     ] {
         target.clone_from(source);
     }
-    record.outputs = convert::outputs(&frame.outputs, &frame.lost);
+    record.outputs = states::outputs(&frame.outputs, &frame.lost);
     record.report = Some(report_message(&frame.report));
-    record.timing = convert::step_timing(&frame.timing);
+    record.timing = states::step_timing(&frame.timing);
 }

@@ -1,32 +1,23 @@
 //! A recording in progress: its thread, and how it ends.
 
 use std::fs::File;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
 use mcap::McapError;
 use plantd_proto::v1::{self, RecordingStatus};
 
-use super::message::plant_record;
-use super::work::{Work, unix_ns};
-use crate::core::session::Session;
-use crate::core::session::tap::Tap;
+use crate::core::plant::tap::Tap;
+use crate::core::session::shared::Session;
+use crate::wire::record::message::plant_record;
+use crate::wire::record::progress::{Options, Shared, unix_ns};
+use crate::wire::record::work::Work;
 
 /// Longest wait for a recording to end whose disk does not answer.
 const END_WAIT_MAX: Duration = Duration::from_millis(if cfg!(test) { 300 } else { 10_000 });
-
-/// What is asked for.
-pub(super) struct Options {
-    /// Name.
-    pub(super) name: String,
-    /// Time between two snapshots.
-    pub(super) checkpoint_interval: Duration,
-    /// Most bytes of the file.
-    pub(super) bytes_max: u64,
-}
 
 /// A recording in progress, or one that has ended.
 pub(super) struct Recorder {
@@ -37,19 +28,6 @@ pub(super) struct Recorder {
     first: u64,
     /// Breaks off when the thread ends.
     ended: Mutex<Receiver<()>>,
-}
-
-/// What the thread shares with whoever ends it.
-pub(super) struct Shared {
-    pub(super) is_ending: AtomicBool,
-    pub(super) bytes: Arc<AtomicU64>,
-    pub(super) info: Mutex<v1::Recording>,
-}
-
-impl Shared {
-    pub(super) fn info(&self) -> MutexGuard<'_, v1::Recording> {
-        self.info.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 /// Why a recording was not started.
@@ -159,18 +137,11 @@ impl Recorder {
     }
 }
 
-/// An error with its cause.
-pub(super) fn sentence(error: &McapError) -> String {
-    match error {
-        McapError::Io(error) => error.to_string(),
-        other => other.to_string(),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::core::session::DriverKind;
+    use crate::core::driver::DriverKind;
+    use crate::wire::record::progress::sentence;
     use crate::wire::record::work::tests::{options, session};
 
     #[test]
@@ -190,7 +161,7 @@ mod tests {
         assert_eq!(info.status(), RecordingStatus::Failed);
         assert!(info.failure.contains("does not answer"), "{}", info.failure);
         assert_eq!(info.steps + info.lost, steps);
-        assert!(session.with_core(|core| core.ring.is_none()));
+        assert!(session.with_core(|core| core.records.ring.is_none()));
         // The next one is not its business when it goes on after all.
         let directory = tempfile::tempdir().unwrap();
         let file = File::create(directory.path().join("r.mcap")).unwrap();
@@ -215,7 +186,7 @@ mod tests {
         }
         let mut lease = session.acquire(DriverKind::Step).unwrap();
         lease.step(&[0.2]).unwrap();
-        assert!(session.with_core(|core| core.ring.is_none()));
+        assert!(session.with_core(|core| core.records.ring.is_none()));
         let directory = tempfile::tempdir().unwrap();
         let file = File::create(directory.path().join("r.mcap")).unwrap();
         let Ok(recorder) = Recorder::start(&session, file, options()) else {
@@ -227,6 +198,6 @@ mod tests {
         recorder.stop();
         let info = recorder.info();
         assert_eq!((info.status(), info.steps), (RecordingStatus::Done, 1));
-        assert!(session.with_core(|core| core.ring.is_none()));
+        assert!(session.with_core(|core| core.records.ring.is_none()));
     }
 }

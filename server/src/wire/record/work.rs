@@ -11,17 +11,18 @@ use mcap::McapError;
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1::{self, MarkReason, RecordingStatus};
 
-use super::file::{Times, Writer};
-use super::message::{all_parameters, fill};
-use super::recorder::{Options, Shared, sentence};
 use crate::core::channels::timeline::Announced;
-use crate::core::frame::Frame;
 use crate::core::parameters::Parameters;
-use crate::core::realtime::event::EventReader;
-use crate::core::ring::Reader;
-use crate::core::session::Session;
-use crate::core::session::tap::{Mark, MarkReason as Marked, Tap};
-use crate::wire::run_info::event_message;
+use crate::core::plant::event::EventReader;
+use crate::core::plant::mark::{Mark, MarkReason as Marked};
+use crate::core::plant::tap::Tap;
+use crate::core::publish::frame::Frame;
+use crate::core::publish::ring::Reader;
+use crate::core::session::shared::Session;
+use crate::wire::message::run_info::event_message;
+use crate::wire::record::file::{Times, Writer};
+use crate::wire::record::message::{all_parameters, fill};
+use crate::wire::record::progress::{Options, Shared, sentence, unix_ns};
 
 /// How often the ring is looked at.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
@@ -343,11 +344,6 @@ impl Clock {
     }
 }
 
-pub(super) fn unix_ns(time: SystemTime) -> u64 {
-    let since = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
-}
-
 #[cfg(test)]
 pub(super) mod tests {
     use std::sync::Mutex;
@@ -357,9 +353,10 @@ pub(super) mod tests {
     use prost::Message as _;
 
     use super::*;
-    use crate::core::metrics::Metrics;
-    use crate::core::realtime::{RealTime, RealTimeSettings};
-    use crate::core::session::DriverKind;
+    use crate::core::driver::DriverKind;
+    use crate::core::metrics::registry::Metrics;
+    use crate::core::realtime::loops::RealTime;
+    use crate::core::realtime::settings::RealTimeSettings;
     use crate::wire::record::message::plant_record;
 
     pub(in crate::wire::record) fn session() -> Arc<Session> {
@@ -481,14 +478,14 @@ pub(super) mod tests {
         let mut recorder = recorder(&session, &File::create(directory.path().join("r")).unwrap());
         let capacity = recorder.tap.ring.capacity();
         run(&session, capacity);
-        assert!(session.with_core(|core| core.full_tap().is_some()));
+        assert!(session.with_core(|core| core.records.full_tap().is_some()));
         recorder.tap.wait();
-        assert!(session.with_core(|core| core.full_tap().is_none()));
+        assert!(session.with_core(|core| core.records.full_tap().is_none()));
         // It goes on, and is waited for again.
         recorder.drain().unwrap();
-        assert!(session.with_core(|core| core.full_tap().is_none()));
+        assert!(session.with_core(|core| core.records.full_tap().is_none()));
         run(&session, capacity);
-        assert!(session.with_core(|core| core.full_tap().is_some()));
+        assert!(session.with_core(|core| core.records.full_tap().is_some()));
     }
 
     #[test]
