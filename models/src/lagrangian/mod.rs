@@ -1,5 +1,6 @@
 //! The Lagrangian.
 
+pub(crate) mod arrangement;
 pub(crate) mod curvature;
 pub(crate) mod derivatives;
 pub(crate) mod energy;
@@ -8,6 +9,7 @@ pub(crate) mod kinematics;
 pub(crate) mod mechanics;
 pub(crate) mod momenta;
 pub(crate) mod planar;
+pub(crate) mod plane;
 pub(crate) mod potentials;
 #[cfg(test)]
 pub(crate) mod samples;
