@@ -315,7 +315,7 @@ impl RunningServer {
         self.stop_within(future::pending()).await;
     }
 
-    /// The same, with a grace that `hurry` cuts short.
+    /// Ends, with a grace that `hurry` cuts short.
     async fn stop_within(mut self, hurry: impl Future<Output = ()>) {
         self.say_not_serving().await;
         self.closing.cancel();

@@ -138,7 +138,7 @@ struct Links<P> {
     faster: Vec2<P>,
     /// From the parent joint to this one.
     edge: Vec2<P>,
-    /// The same times the mass of the subtree.
+    /// The edge times the mass of the subtree.
     lever: Vec2<P>,
     /// `d` of a slider; zero for a hinge.
     slide: Vec2<P>,

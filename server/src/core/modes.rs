@@ -44,7 +44,7 @@ impl Mode {
         Ok(file)
     }
 
-    /// The same in place of a file that may have been left there.
+    /// Creates a file, in place of one that may have been left there.
     pub fn create(self, path: &Path) -> io::Result<File> {
         match fs::remove_file(path) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),

@@ -33,7 +33,7 @@ pub struct Channels {
     pub(crate) timeline: Option<Box<Timeline>>,
     /// What they were made from.
     pub(crate) declared: Origin,
-    /// The same with times in whole steps.
+    /// What they were made from, with times in whole steps.
     pub(crate) info: Origin,
     /// Hash of what was declared.
     hash: u64,

@@ -86,7 +86,7 @@ impl Core {
         self.step_pushed(driver, &[], linearization)
     }
 
-    /// The same with an impulse, one entry for each of the momentum or none, that is added to it before.
+    /// Takes a step after an impulse, one entry for each of the momentum or none, is added to it.
     pub(crate) fn step_pushed(
         &mut self,
         driver: &[f64],

@@ -109,7 +109,7 @@ impl Reader {
         self.read_before(u64::MAX)
     }
 
-    /// The same for records before `end`.
+    /// The next record before `end`, and its number.
     pub fn read_before(&mut self, end: u64) -> Option<(u64, &[u64])> {
         loop {
             if self.next >= self.ring.written().min(end) {

@@ -32,7 +32,7 @@ impl Watchers {
         self.publish_record(u64::MAX, published);
     }
 
-    /// The same for a record of the plant's ring: not to those who came after it.
+    /// Offers a record of the plant's ring, but not to those who came after it.
     pub(super) fn publish_record(&self, record: u64, published: &Published<'_>) {
         if self.count() == 0 {
             return;

@@ -106,7 +106,7 @@ impl Lease {
         self.step_pushed_and(u, &[], linearization, look)
     }
 
-    /// The same with an impulse that is added to the momentum before; none if it is empty.
+    /// Steps after an impulse is added to the momentum (none if it is empty), and looks at the core then.
     pub fn step_pushed_and<R>(
         &mut self,
         u: &[f64],

@@ -59,7 +59,7 @@ pub(super) struct RunControl {
     pub(super) present: Mutex<Run>,
     /// Held by whoever changes it.
     pub(super) changing: Mutex<()>,
-    /// The same in short, for those who wait for changes.
+    /// How it is run, in short, for those who wait for changes.
     pub(super) status: watch::Sender<RunStatus>,
     /// When the driver of a plant in lockstep may step.
     pub(super) gate: Gate,

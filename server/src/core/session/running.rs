@@ -93,7 +93,7 @@ impl Session {
         (run, steps_left)
     }
 
-    /// The same in short, and each change of it.
+    /// How the plant is run, in short, and each change of it.
     pub fn run_status(&self) -> Receiver<RunStatus> {
         self.run.status.subscribe()
     }

@@ -145,7 +145,7 @@ impl Session {
         self.with_core(|core| core.view())
     }
 
-    /// The same with a copy of it, to compute on.
+    /// The plant as it is, and a copy of it to compute on.
     pub fn view_and_copy(&self) -> (View, Plant) {
         self.with_core(|core| (core.view(), core.plant.clone()))
     }
@@ -179,12 +179,12 @@ impl Session {
         self.with_core(|core| core.copy_plants())
     }
 
-    /// The same with the number of changes of its parameters so far.
+    /// A copy of the plant, and the number of changes of its parameters so far.
     pub fn copy_plant_and_generation(&self) -> (Plant, u64) {
         self.with_core(|core| (core.plant.clone(), core.changed.generation))
     }
 
-    /// The same with the input of its last step; before the first one, the input that holds it.
+    /// A copy of the plant, and the input of its last step; before the first one, the input that holds it.
     pub fn copy_plant_and_input(&self) -> (Plant, Vec<f64>) {
         self.with_core(|core| (core.plant.clone(), core.last.input.clone()))
     }
@@ -283,7 +283,7 @@ impl Session {
         }
     }
 
-    /// The same without waiting for a plant that runs.
+    /// Does something with the core, without waiting for a plant that runs.
     pub(super) fn post(self: &Arc<Self>, act: impl FnOnce(&mut Core) + Send + 'static) {
         let (key, handle) = match &mut *lock(&self.place) {
             Place::Rest(core) => return act(core),

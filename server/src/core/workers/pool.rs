@@ -27,7 +27,7 @@ const TURN_OVERDUE: Duration = Duration::from_millis(40);
 /// Threads for each turn, at most: those that wait for their next turn included.
 const THREADS_PER_TURN: usize = 32;
 
-/// The same of the jobs of one connection.
+/// Threads for each turn of the jobs of one connection, at most.
 const CONNECTION_THREADS_PER_TURN: usize = 8;
 
 /// Runs a long computation, or a wait, on this thread, while the runtime that it may belong to moves its

@@ -127,7 +127,7 @@ pub fn accuracy(accuracy: Accuracy) -> v1::Accuracy {
     v1::Accuracy { tolerance, error, periods }
 }
 
-/// The same from a saved plant.
+/// What was promised of a saved plant's method.
 pub fn accuracy_of(accuracy: v1::Accuracy) -> Accuracy {
     let v1::Accuracy { tolerance, error, periods } = accuracy;
     Accuracy { tolerance, error, periods }

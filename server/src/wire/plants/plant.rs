@@ -151,7 +151,7 @@ struct StepPlan {
     all_states: bool,
 }
 
-/// The same on its way.
+/// A plan of steps on its way.
 struct Steps {
     plan: StepPlan,
     lease: Lease,

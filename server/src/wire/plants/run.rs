@@ -40,7 +40,7 @@ pub(crate) fn run(hub: &Hub, request: v1::RunRequest) -> Result<(u64, v1::RunRes
     Ok((number, v1::RunResponse { run: Some(run_info(&session)) }))
 }
 
-/// The same, after the steps that were asked for if that is wanted.
+/// Runs a plant, and answers after the steps that were asked for if that is wanted.
 pub(crate) async fn run_and_wait(
     hub: &Arc<Hub>,
     request: v1::RunRequest,
