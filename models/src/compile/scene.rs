@@ -12,8 +12,9 @@ use crate::math::spatial::{Mat3, Sym3, Vec3};
 use crate::math::trigonometry::sin_cos_of;
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
-    Alignment, Carries, Constraint, ConstraintKind, Coordinate, Dimensions, Length, Model,
-    OperatingPoint, PathJoint, PointPair, Polynomial, Product, Solver, Vector,
+    Alignment, AlongAxis, Carries, Constraint, ConstraintKind, Coordinate, Coupling, Dimensions,
+    Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance, PointPair, Polynomial,
+    Product, Solver, Vector,
 };
 use crate::model::planar_tree::planar;
 use crate::model::site::{Site, SiteJoint};
@@ -352,14 +353,16 @@ impl Layout {
             match constraint {
                 scene::Constraint::Distance { a, b, length, .. } => {
                     let points = places.between(self.attachment(a), self.attachment(b));
-                    let kind = ConstraintKind::Distance(points, self.length(length));
+                    let length = self.length(length);
+                    let kind = ConstraintKind::Distance(PointDistance { points, length });
                     equations.push(name.to_owned(), kind);
                 }
                 scene::Constraint::PointToPoint { a, b, axes, .. } => {
                     let points = places.between_in_world(self.attachment(a), self.attachment(b));
                     for &axis in axes {
                         let axis = axis as usize;
-                        let kind = ConstraintKind::Axis(points.clone(), axis);
+                        let points = points.clone();
+                        let kind = ConstraintKind::Axis(AlongAxis { points, axis });
                         equations.push(format!("{name}.{}", AXES[axis]), kind);
                     }
                 }
@@ -393,12 +396,13 @@ impl Layout {
                         coordinate: self.index[&term.coordinate],
                         coefficients: term.coefficients.clone(),
                     });
-                    let kind = ConstraintKind::Coupling(terms.collect(), *constant);
+                    let (terms, constant) = (terms.collect(), *constant);
+                    let kind = ConstraintKind::Coupling(Coupling { terms, constant });
                     equations.push(name.to_owned(), kind);
                 }
                 scene::Constraint::PathLength { points, length, .. } => {
-                    let kind =
-                        ConstraintKind::PathLength(places.segments(points), self.length(length));
+                    let (segments, length) = (places.segments(points), self.length(length));
+                    let kind = ConstraintKind::PathLength(PathLength { segments, length });
                     equations.push(name.to_owned(), kind);
                 }
             }
@@ -496,19 +500,12 @@ struct Equations {
 
 impl Equations {
     fn push(&mut self, name: String, kind: ConstraintKind) {
-        let all: Vec<usize> = match &kind {
-            ConstraintKind::Distance(points, _) | ConstraintKind::Axis(points, _) => {
-                points.coordinates().collect()
-            }
-            ConstraintKind::Product(product) => product.points.coordinates().collect(),
-            ConstraintKind::PathLength(segments, _) => {
-                segments.iter().flat_map(PointPair::coordinates).collect()
-            }
-            ConstraintKind::Coupling(terms, _) => terms.iter().map(|t| t.coordinate).collect(),
-        };
         let mut seen = BTreeSet::new();
-        let (mut coordinates, prescribed): (Vec<usize>, Vec<usize>) =
-            all.into_iter().filter(|c| seen.insert(*c)).partition(|c| *c < self.dynamic);
+        let (mut coordinates, prescribed): (Vec<usize>, Vec<usize>) = kind
+            .coordinates()
+            .into_iter()
+            .filter(|c| seen.insert(*c))
+            .partition(|c| *c < self.dynamic);
         let dynamic = coordinates.len();
         coordinates.extend(prescribed);
         self.constraints.push(Constraint { kind, coordinates, dynamic });

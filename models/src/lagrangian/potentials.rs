@@ -10,21 +10,12 @@ pub(crate) mod path_spring;
 pub(crate) mod point_spring;
 pub(crate) mod spline_spring;
 
-use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::kinematics::{Place, Poses};
 use crate::math::elimination::SymbolicElimination;
 use crate::math::scalar::Scalar;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::{Potentials, Spring};
 use crate::model::tree::Tree;
-
-/// A configuration, as far as potentials depend on it.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Place<'a, S = f64> {
-    pub(crate) tree: &'a Tree,
-    pub(crate) poses: &'a Poses<S>,
-    /// All coordinates.
-    pub(crate) q: &'a [S],
-}
 
 /// A potential `V(q)`.
 pub(crate) trait Potential {

@@ -17,6 +17,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use crate::lagrangian::derivatives::Derivatives;
+use crate::lagrangian::kinematics::Place;
 use crate::plant::facade::Plant;
 
 /// Eigenvalues of `Dh M⁻¹ Dhᵀ` below this, relative to the largest, belong to redundant equations.
@@ -101,8 +102,8 @@ impl Plant {
         let (mut hessian, mut rate) = (DMatrix::zeros(n, n), DMatrix::zeros(nc, n));
         let closure = &self.workspace.constraints.start;
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let (tree, q) = (&model.closure, &self.state.q[..]);
-            constraint.for_each_second_derivative(tree, &closure.poses, q, |i, j, value| {
+            let at = Place { tree: &model.closure, poses: &closure.poses, q: &self.state.q };
+            constraint.for_each_second_derivative(at, &mut |i, j, value| {
                 hessian[(i, j)] += mu[c] * value;
                 rate[(c, j)] += value * velocity[i];
             });

@@ -1,0 +1,69 @@
+//! Two points at a distance, fixed or prescribed.
+//!
+//! ```text
+//! h = |d|² − l²    h_i = 2 d·d_i    h_ij = 2 (d_i·d_j + d·d_ij)
+//! ```
+
+use crate::constraints::equations::Equation;
+use crate::lagrangian::kinematics::Place;
+use crate::math::scalar::Scalar;
+use crate::math::spatial::Vec3;
+use crate::model::mechanism::{Carries, Length, PathJoint, PointDistance};
+
+impl Equation for PointDistance {
+    fn coordinates(&self) -> Vec<usize> {
+        self.points.coordinates().collect()
+    }
+
+    #[inline(always)]
+    fn value<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>) -> (S, f64) {
+        let at = self.points.separation(tree, poses);
+        let length = self.length.at(q);
+        let square = at.difference.dot(at.difference);
+        let squared_length = length * length;
+        let round_off = 2.0 * square.value().sqrt() * at.magnitude + squared_length.value();
+        (square - squared_length, round_off)
+    }
+
+    #[inline(always)]
+    fn differentiate<S: Scalar>(&self, Place { tree, poses, q }: Place<'_, S>, row: &mut [S]) {
+        if let Length::Driven(length) = self.length {
+            row[length] = q[length] * -2.0;
+        }
+        let at = self.points.separation(tree, poses);
+        let weight = at.difference.scaled(2.0);
+        for joint in &self.points.path {
+            let (point, weight) = match joint.carries {
+                Carries::A => (at.a, weight),
+                _ => (at.b, -weight),
+            };
+            let gradient = poses.point_gradient(tree, joint.joint, point);
+            row[joint.coordinate] += weight.dot(gradient);
+        }
+    }
+
+    fn for_each_second_derivative<S: Scalar>(
+        &self,
+        Place { tree, poses, .. }: Place<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S),
+    ) {
+        let at = self.points.separation(tree, poses);
+        for (k, row) in self.points.path.iter().enumerate() {
+            let row_gradient = row.gradient(tree, poses, &at);
+            for column in &self.points.path[..=k] {
+                let gradient = column.gradient(tree, poses, &at);
+                let both = [(row, row_gradient), (column, gradient)];
+                let (second, mirrored) = PathJoint::seconds(both, tree, poses);
+                let product = gradient.dot(row_gradient);
+                let value = |second: Vec3<S>| (product + at.difference.dot(second)) * 2.0;
+                entry(row.coordinate, column.coordinate, value(second));
+                if row.joint != column.joint {
+                    entry(column.coordinate, row.coordinate, value(mirrored));
+                }
+            }
+        }
+        if let Length::Driven(length) = self.length {
+            entry(length, length, S::constant(-2.0));
+        }
+    }
+}
