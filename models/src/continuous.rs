@@ -26,9 +26,8 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::kkt::schur::room_for_schur;
+use crate::kkt::schur::SchurComplement;
 use crate::lagrangian::derivatives::Derivatives;
-use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rows::padded;
 use crate::math::scalar::{Dual, Scalar};
@@ -138,31 +137,18 @@ pub enum ContinuousError {
 pub struct Continuous {
     model: Arc<Model>,
     equations: Equations<f64>,
-    /// Equations in dual numbers, from the first second-order linearization on.
-    varied: Option<Box<Equations<Dual>>>,
     mass: TreeLu,
-    /// `M⁻¹ A_dᵀ`, row-major, nd by padded nc.
-    responses: Vec<f64>,
-    schur: PivotedLu,
-    value: Accelerations,
-    /// Right-hand sides and solutions, nd + nc rows over the parameters.
-    tangent: Vec<f64>,
+    /// `A_d M⁻¹ A_dᵀ`, with `M⁻¹ A_dᵀ`.
+    schur: SchurComplement,
 }
 
 impl Continuous {
     /// The dynamics of a model.
     pub fn new(model: Arc<Model>) -> Self {
-        let layout = Layout::new(&model);
-        let Layout { nd, nc, .. } = layout;
-        let stride = layout.stride();
         Self {
             equations: Equations::new(&model),
-            varied: None,
             mass: TreeLu::new(&model.elimination),
-            responses: vec![0.0; nd * padded(nc)],
-            schur: room_for_schur(&model, stride),
-            value: Accelerations { acceleration: vec![0.0; nd], multipliers: vec![0.0; nc] },
-            tangent: vec![0.0; (nd + nc) * stride],
+            schur: SchurComplement::new(&model, Layout::new(&model).stride()),
             model,
         }
     }
@@ -180,8 +166,7 @@ impl Continuous {
     ///
     /// Of redundant constraints, the multipliers are those of least norm.
     pub fn evaluate(&mut self, point: &ContinuousPoint) -> Result<Accelerations, ContinuousError> {
-        self.solve(point)?;
-        Ok(self.value.clone())
+        self.solve(point)
     }
 
     /// Accelerations and constraint forces with their first derivatives, exact. Their cost is that of one evaluation of the derivative
@@ -190,13 +175,11 @@ impl Continuous {
         &mut self,
         point: &ContinuousPoint,
     ) -> Result<ContinuousLinearization, ContinuousError> {
-        self.solve(point)?;
-        self.differentiate();
-        let layout = self.equations.layout;
+        let value = self.solve(point)?;
+        let (tangent, layout) = (self.differentiate(), self.equations.layout);
         let (rows, stride) = (layout.nd + layout.nc, layout.stride());
-        let jacobian =
-            DMatrix::from_fn(rows, layout.parameters(), |i, b| self.tangent[i * stride + b]);
-        Ok(ContinuousLinearization { value: self.value.clone(), jacobian })
+        let jacobian = DMatrix::from_fn(rows, layout.parameters(), |i, b| tangent[i * stride + b]);
+        Ok(ContinuousLinearization { value, jacobian })
     }
 
     /// Second derivatives: for each acceleration, then for each multiplier, a symmetric matrix over the
@@ -213,25 +196,24 @@ impl Continuous {
             return Err(ContinuousError::TooLarge { entries });
         }
         self.solve(point)?;
-        self.differentiate();
-        let mut varied =
-            self.varied.take().unwrap_or_else(|| Box::new(Equations::new(&self.model)));
+        let tangent = self.differentiate();
+        let mut varied = Equations::<Dual>::new(&self.model);
         let mut out = vec![DMatrix::zeros(size, size); rows];
         let mut second = vec![0.0; rows * stride];
         for a in 0..size {
-            varied.seed(&self.model, &self.equations, a, &self.tangent);
+            varied.seed(&self.model, &self.equations, a, &tangent);
             varied.evaluate(&self.model);
             for (i, row) in second.chunks_exact_mut(stride).enumerate() {
                 let block = &varied.jacobian[i * layout.columns()..][..layout.columns()];
                 let (by_parameters, by_unknowns) = block.split_at(size);
                 row.iter_mut().zip(by_parameters).for_each(|(entry, by)| *entry = by.eps);
-                for (by, tangent) in by_unknowns.iter().zip(self.tangent.chunks_exact(stride)) {
+                for (by, moved) in by_unknowns.iter().zip(tangent.chunks_exact(stride)) {
                     if by.eps != 0.0 {
-                        row.iter_mut().zip(tangent).for_each(|(entry, t)| *entry += by.eps * t);
+                        row.iter_mut().zip(moved).for_each(|(entry, t)| *entry += by.eps * t);
                     }
                 }
             }
-            self.solve_rows(&mut second);
+            self.solve_rows(&mut second, stride);
             for (out, row) in out.iter_mut().zip(second.chunks_exact(stride)) {
                 for b in 0..size {
                     out[(a, b)] = row[b];
@@ -242,12 +224,11 @@ impl Continuous {
         for out in &mut out {
             *out = (&*out + out.transpose()) * 0.5;
         }
-        self.varied = Some(varied);
         Ok(out)
     }
 
     /// Finds accelerations and multipliers, and keeps the factors of the equations.
-    fn solve(&mut self, point: &ContinuousPoint) -> Result<(), ContinuousError> {
+    fn solve(&mut self, point: &ContinuousPoint) -> Result<Accelerations, ContinuousError> {
         let model = &*self.model;
         let equations = &mut self.equations;
         equations.place(model, point)?;
@@ -261,28 +242,27 @@ impl Continuous {
         for (row, residual) in unknowns.chunks_exact_mut(width).zip(&self.equations.residual) {
             row[0] = *residual;
         }
-        self.solve_rows_of(&mut unknowns, width);
+        self.solve_rows(&mut unknowns, width);
         let (accelerations, multipliers) = unknowns.split_at(nd * width);
         let first = |rows: &[f64]| rows.iter().step_by(width).copied().collect();
-        self.value =
+        let value =
             Accelerations { acceleration: first(accelerations), multipliers: first(multipliers) };
-        self.check_solution()?;
-        let Accelerations { acceleration, multipliers } = &self.value;
-        self.equations.acceleration[..nd].copy_from_slice(acceleration);
-        self.equations.multipliers.copy_from_slice(multipliers);
-        Ok(())
+        self.check_solution(&value)?;
+        self.equations.acceleration[..nd].copy_from_slice(&value.acceleration);
+        self.equations.multipliers.copy_from_slice(&value.multipliers);
+        Ok(value)
     }
 
     /// The constraints' accelerations vanish, and everything is finite.
-    fn check_solution(&self) -> Result<(), ContinuousError> {
+    fn check_solution(&self, value: &Accelerations) -> Result<(), ContinuousError> {
         let (equations, layout) = (&self.equations, self.equations.layout);
-        let Accelerations { acceleration, multipliers } = &self.value;
+        let Accelerations { acceleration, multipliers } = value;
         if !acceleration.iter().chain(multipliers).all(|x| x.is_finite()) {
             return Err(ContinuousError::Overflow);
         }
         for (c, bias) in equations.residual[layout.nd..].iter().enumerate() {
-            let row = &equations.motion.jacobian[c * layout.n()..][..layout.nd];
-            let terms = row.iter().zip(acceleration).map(|(entry, a)| entry.re.re * a);
+            let row = &equations.closure.jacobian[c * layout.n()..][..layout.nd];
+            let terms = row.iter().zip(acceleration).map(|(entry, a)| entry * a);
             let (mut residual, mut scale) = (*bias, bias.abs());
             terms.for_each(|term| {
                 residual += term;
@@ -290,8 +270,9 @@ impl Continuous {
             });
             // Where nothing accelerates, what the constraints take away tells the round-off.
             for (other, multiplier) in multipliers.iter().enumerate() {
-                let responses = self.responses.iter().skip(other).step_by(padded(layout.nc));
-                let taken: f64 = row.iter().zip(responses).map(|(a, r)| a.re.re * r).sum();
+                let responses = self.schur.responses.iter().skip(other);
+                let responses = responses.step_by(padded(layout.nc));
+                let taken: f64 = row.iter().zip(responses).map(|(a, r)| a * r).sum();
                 scale += (taken * multiplier).abs();
             }
             if residual.abs() > INCONSISTENT * scale {
@@ -302,26 +283,25 @@ impl Continuous {
         Ok(())
     }
 
-    /// Derivatives of the unknowns by the parameters, into `tangent`.
-    fn differentiate(&mut self) {
+    /// Derivatives of the unknowns by the parameters: rows of them, a stride apart.
+    fn differentiate(&mut self) -> Vec<f64> {
         let layout = self.equations.layout;
         let stride = layout.stride();
         self.equations.evaluate(&self.model);
-        let mut tangent = std::mem::take(&mut self.tangent);
+        let mut tangent = vec![0.0; (layout.nd + layout.nc) * stride];
         let blocks = self.equations.jacobian.chunks_exact(layout.columns().max(1));
-        for (row, block) in tangent.chunks_exact_mut(stride.max(1)).zip(blocks) {
+        for (row, block) in tangent.chunks_exact_mut(stride).zip(blocks) {
             row[..layout.parameters()].copy_from_slice(&block[..layout.parameters()]);
         }
-        self.solve_rows(&mut tangent);
-        self.tangent = tangent;
+        self.solve_rows(&mut tangent, stride);
+        tangent
     }
 
     /// Factors the mass matrix and `S = A_d M⁻¹ A_dᵀ`.
     fn factor(&mut self) -> Result<(), ContinuousError> {
         let model = &*self.model;
-        let Layout { nd, nc, .. } = self.equations.layout;
-        let n = self.equations.layout.n();
-        let elimination = &model.elimination;
+        let Layout { nd, nk, nc, .. } = self.equations.layout;
+        let (n, elimination) = (nd + nk, &model.elimination);
         for row in 0..nd {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let entry = elimination.ancestors[slot] * n + row;
@@ -335,34 +315,30 @@ impl Continuous {
             return Err(ContinuousError::SingularMass { coordinate, pivot: pivot.relative });
         }
         if nc > 0 {
+            let Equations { closure, q, .. } = &mut self.equations;
+            closure.differentiate(model, q);
+            let SchurComplement { responses, lu } = &mut self.schur;
             let width = padded(nc);
-            let jacobian = &self.equations.motion.jacobian;
-            for i in 0..nd {
-                for c in 0..nc {
-                    self.responses[i * width + c] = jacobian[c * n + i].re.re;
-                }
+            for (c, row) in closure.jacobian.chunks_exact(n).enumerate() {
+                row[..nd]
+                    .iter()
+                    .enumerate()
+                    .for_each(|(i, entry)| responses[i * width + c] = *entry);
             }
-            self.mass.solve_rows(elimination, &mut self.responses, width, width);
-            for c in 0..nc {
-                let target = &mut self.schur.matrix[c * nc..][..nc];
+            self.mass.solve_rows(elimination, responses, width, width);
+            for (row, target) in closure.jacobian.chunks_exact(n).zip(lu.matrix.chunks_mut(nc)) {
                 target.fill(0.0);
-                for (entry, responses) in
-                    jacobian[c * n..][..nd].iter().zip(self.responses.chunks_exact(width))
-                {
-                    target.iter_mut().zip(responses).for_each(|(t, r)| *t += entry.re.re * r);
+                for (entry, responses) in row[..nd].iter().zip(responses.chunks_exact(width)) {
+                    target.iter_mut().zip(responses).for_each(|(t, r)| *t += entry * r);
                 }
             }
-            self.schur.factor();
+            lu.factor();
         }
         Ok(())
     }
 
-    fn solve_rows(&mut self, rows: &mut [f64]) {
-        self.solve_rows_of(rows, self.equations.layout.stride());
-    }
-
     /// Solves `M a + A_dᵀ λ = −r1`, `A_d a = −r2` in place; rows `(r1, r2)` become `(a, λ)`.
-    fn solve_rows_of(&mut self, rows: &mut [f64], stride: usize) {
+    fn solve_rows(&mut self, rows: &mut [f64], stride: usize) {
         let model = &*self.model;
         let Layout { nd, nc, .. } = self.equations.layout;
         let n = self.equations.layout.n();
@@ -371,17 +347,16 @@ impl Continuous {
         // S λ = r2 − A_d M⁻¹ r1, a = −M⁻¹ r1 − M⁻¹ A_dᵀ λ.
         if nc > 0 {
             for (c, target) in second.chunks_exact_mut(stride).enumerate() {
-                let jacobian = &self.equations.motion.jacobian[c * n..][..nd];
+                let jacobian = &self.equations.closure.jacobian[c * n..][..nd];
                 for (entry, row) in jacobian.iter().zip(first.chunks_exact(stride)) {
-                    let entry = entry.re.re;
                     target.iter_mut().zip(row).for_each(|(t, r)| *t -= entry * r);
                 }
             }
-            self.schur.solve_rows(second, stride);
+            self.schur.lu.solve_rows(second, stride);
         }
         for (i, row) in first.chunks_exact_mut(stride).enumerate() {
             row.iter_mut().for_each(|entry| *entry = -*entry);
-            let responses = &self.responses[i * padded(nc)..][..nc];
+            let responses = &self.schur.responses[i * padded(nc)..][..nc];
             for (response, lambda) in responses.iter().zip(second.chunks_exact(stride)) {
                 row.iter_mut().zip(lambda).for_each(|(entry, l)| *entry -= response * l);
             }
@@ -449,13 +424,7 @@ struct Equations<S> {
     /// Along the motion, twice.
     motion: Closure<Dual<Dual<S>>>,
     hessian: Vec<S>,
-    along_q: Vec<Dual<S>>,
-    along_v: Vec<Dual<S>>,
-    constant_inputs: Vec<Dual<S>>,
-    along_twice: Vec<Dual<Dual<S>>>,
     orientations: Vec<Mat3<S>>,
-    orientations_along: Vec<Mat3<Dual<S>>>,
-    orientations_twice: Vec<Mat3<Dual<Dual<S>>>>,
     /// nd + nc.
     residual: Vec<S>,
     /// nd + nc rows, [`Layout::columns`] columns.
@@ -466,7 +435,6 @@ impl<S: Scalar> Equations<S> {
     fn new(model: &Model) -> Self {
         let layout = Layout::new(model);
         let (n, rows) = (layout.n(), layout.nd + layout.nc);
-        let no = model.orientations.len();
         let zeros = |len: usize| vec![S::ZERO; len];
         Self {
             layout,
@@ -479,41 +447,28 @@ impl<S: Scalar> Equations<S> {
             closure: Closure::new(model),
             motion: Closure::new(model),
             hessian: zeros(if layout.nc > 0 { n * n } else { 0 }),
-            along_q: vec![Dual::ZERO; n],
-            along_v: vec![Dual::ZERO; n],
-            constant_inputs: vec![Dual::ZERO; layout.ni],
-            along_twice: vec![Dual::ZERO; n],
-            orientations: vec![Mat3::IDENTITY; no],
-            orientations_along: vec![Mat3::IDENTITY; no],
-            orientations_twice: vec![Mat3::IDENTITY; no],
+            orientations: vec![Mat3::IDENTITY; model.orientations.len()],
             residual: zeros(rows),
             jacobian: zeros(rows * layout.columns()),
         }
     }
 
     fn evaluate(&mut self, model: &Model) {
-        for i in 0..self.q.len() {
-            let (q, v, a) = (self.q[i], self.v[i], self.acceleration[i]);
-            self.along_q[i] = Dual::new(q, v);
-            self.along_v[i] = Dual::new(v, a);
-            self.along_twice[i] = Dual::new(Dual::new(q, v), Dual::new(v, a));
-        }
-        for (o, &i) in model.orientations.iter().enumerate() {
-            let still = self.orientations[o];
+        let (along_q, along_v) = (along(&self.q, &self.v), along(&self.v, &self.acceleration));
+        let constant = along(&self.inputs, &vec![S::ZERO; self.inputs.len()]);
+        let (mut turned, mut turned_twice) = (Vec::new(), Vec::new());
+        for (still, &i) in self.orientations.iter().zip(&model.orientations) {
             let (spin, change) = (three(&self.v, i), three(&self.acceleration, i));
-            let along = pairs(Vec3::ZERO, spin);
-            self.orientations_along[o] = at_rest(&still).times(&rotation::exp(along));
-            let twice = pairs(along, pairs(spin, change));
-            self.orientations_twice[o] = at_rest(&at_rest(&still)).times(&rotation::exp(twice));
+            let turn = pairs(Vec3::ZERO, spin);
+            turned.push(at_rest(still).times(&rotation::exp(turn)));
+            let twice = pairs(turn, pairs(spin, change));
+            turned_twice.push(at_rest(&at_rest(still)).times(&rotation::exp(twice)));
         }
-        for (along, input) in self.constant_inputs.iter_mut().zip(&self.inputs) {
-            *along = Dual::new(*input, S::ZERO);
-        }
-        let at = (&self.along_q[..], &self.orientations_along[..]);
-        self.blocks.evaluate(model, at, &self.along_v, &self.constant_inputs);
+        self.blocks.evaluate(model, (&along_q, &turned), &along_v, &constant);
         if self.layout.nc > 0 {
-            self.motion.evaluate(model, &self.along_twice, &self.orientations_twice);
-            self.motion.differentiate(model, &self.along_twice);
+            let twice = along(&along_q, &along_v);
+            self.motion.evaluate(model, &twice, &turned_twice);
+            self.motion.differentiate(model, &twice);
             self.closure.evaluate(model, &self.q, &self.orientations);
             self.closure.hessian(model, &self.q, &self.multipliers, &mut self.hessian);
         }
@@ -673,6 +628,11 @@ impl Equations<Dual> {
             self.multipliers[c] = Dual::new(at.multipliers[c], moved);
         }
     }
+}
+
+/// Numbers that change at the rates of others.
+fn along<S: Scalar>(re: &[S], eps: &[S]) -> Vec<Dual<S>> {
+    re.iter().zip(eps).map(|(re, eps)| Dual::new(*re, *eps)).collect()
 }
 
 fn pairs<S: Scalar>(re: Vec3<S>, eps: Vec3<S>) -> Vec3<Dual<S>> {
