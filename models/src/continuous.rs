@@ -34,7 +34,7 @@ use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3, three};
 use crate::math::tree_lu::TreeLu;
 use crate::model::manifold::orientations;
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Dimensions, Model};
 
 /// A pivot of the mass matrix below this fraction of the largest inertia of its coordinate is zero.
 const SINGULAR: f64 = 1e-14;
@@ -148,7 +148,7 @@ impl Continuous {
         Self {
             equations: Equations::new(&model),
             mass: TreeLu::new(&model.elimination),
-            schur: SchurComplement::new(&model, Layout::new(&model).stride()),
+            schur: SchurComplement::new(&model, model.dimensions.stride()),
             model,
         }
     }
@@ -176,9 +176,9 @@ impl Continuous {
         point: &ContinuousPoint,
     ) -> Result<ContinuousLinearization, ContinuousError> {
         let value = self.solve(point)?;
-        let (tangent, layout) = (self.differentiate(), self.equations.layout);
-        let (rows, stride) = (layout.nd + layout.nc, layout.stride());
-        let jacobian = DMatrix::from_fn(rows, layout.parameters(), |i, b| tangent[i * stride + b]);
+        let (tangent, d) = (self.differentiate(), self.equations.d);
+        let (rows, stride) = (d.dynamic + d.constraints, d.stride());
+        let jacobian = DMatrix::from_fn(rows, d.parameters(), |i, b| tangent[i * stride + b]);
         Ok(ContinuousLinearization { value, jacobian })
     }
 
@@ -189,8 +189,8 @@ impl Continuous {
         &mut self,
         point: &ContinuousPoint,
     ) -> Result<Vec<DMatrix<f64>>, ContinuousError> {
-        let layout = self.equations.layout;
-        let (size, rows, stride) = (layout.parameters(), layout.nd + layout.nc, layout.stride());
+        let d = self.equations.d;
+        let (size, rows, stride) = (d.parameters(), d.dynamic + d.constraints, d.stride());
         let entries = rows * size * size;
         if entries > ENTRIES_MAX {
             return Err(ContinuousError::TooLarge { entries });
@@ -204,7 +204,7 @@ impl Continuous {
             varied.seed(&self.model, &self.equations, a, &tangent);
             varied.evaluate(&self.model);
             for (i, row) in second.chunks_exact_mut(stride).enumerate() {
-                let block = &varied.jacobian[i * layout.columns()..][..layout.columns()];
+                let block = &varied.jacobian[i * d.columns()..][..d.columns()];
                 let (by_parameters, by_unknowns) = block.split_at(size);
                 row.iter_mut().zip(by_parameters).for_each(|(entry, by)| *entry = by.eps);
                 for (by, moved) in by_unknowns.iter().zip(tangent.chunks_exact(stride)) {
@@ -232,7 +232,7 @@ impl Continuous {
         let model = &*self.model;
         let equations = &mut self.equations;
         equations.place(model, point)?;
-        let Layout { nd, nc, .. } = equations.layout;
+        let (nd, nc) = (equations.d.dynamic, equations.d.constraints);
         equations.evaluate(model);
         self.factor()?;
 
@@ -255,13 +255,13 @@ impl Continuous {
 
     /// The constraints' accelerations vanish, and everything is finite.
     fn check_solution(&self, value: &Accelerations) -> Result<(), ContinuousError> {
-        let (equations, layout) = (&self.equations, self.equations.layout);
+        let (equations, d) = (&self.equations, self.equations.d);
         let Accelerations { acceleration, multipliers } = value;
         if !acceleration.iter().chain(multipliers).all(|x| x.is_finite()) {
             return Err(ContinuousError::Overflow);
         }
-        for (c, bias) in equations.residual[layout.nd..].iter().enumerate() {
-            let row = &equations.closure.jacobian[c * layout.n()..][..layout.nd];
+        for (c, bias) in equations.residual[d.dynamic..].iter().enumerate() {
+            let row = &equations.closure.jacobian[c * d.coordinates()..][..d.dynamic];
             let terms = row.iter().zip(acceleration).map(|(entry, a)| entry * a);
             let (mut residual, mut scale) = (*bias, bias.abs());
             terms.for_each(|term| {
@@ -271,7 +271,7 @@ impl Continuous {
             // Where nothing accelerates, what the constraints take away tells the round-off.
             for (other, multiplier) in multipliers.iter().enumerate() {
                 let responses = self.schur.responses.iter().skip(other);
-                let responses = responses.step_by(padded(layout.nc));
+                let responses = responses.step_by(padded(d.constraints));
                 let taken: f64 = row.iter().zip(responses).map(|(a, r)| a * r).sum();
                 scale += (taken * multiplier).abs();
             }
@@ -285,13 +285,13 @@ impl Continuous {
 
     /// Derivatives of the unknowns by the parameters: rows of them, a stride apart.
     fn differentiate(&mut self) -> Vec<f64> {
-        let layout = self.equations.layout;
-        let stride = layout.stride();
+        let d = self.equations.d;
+        let stride = d.stride();
         self.equations.evaluate(&self.model);
-        let mut tangent = vec![0.0; (layout.nd + layout.nc) * stride];
-        let blocks = self.equations.jacobian.chunks_exact(layout.columns().max(1));
+        let mut tangent = vec![0.0; (d.dynamic + d.constraints) * stride];
+        let blocks = self.equations.jacobian.chunks_exact(d.columns().max(1));
         for (row, block) in tangent.chunks_exact_mut(stride).zip(blocks) {
-            row[..layout.parameters()].copy_from_slice(&block[..layout.parameters()]);
+            row[..d.parameters()].copy_from_slice(&block[..d.parameters()]);
         }
         self.solve_rows(&mut tangent, stride);
         tangent
@@ -300,8 +300,8 @@ impl Continuous {
     /// Factors the mass matrix and `S = A_d M⁻¹ A_dᵀ`.
     fn factor(&mut self) -> Result<(), ContinuousError> {
         let model = &*self.model;
-        let Layout { nd, nk, nc, .. } = self.equations.layout;
-        let (n, elimination) = (nd + nk, &model.elimination);
+        let (d, elimination) = (self.equations.d, &model.elimination);
+        let (n, nd, nc) = (d.coordinates(), d.dynamic, d.constraints);
         for row in 0..nd {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let entry = elimination.ancestors[slot] * n + row;
@@ -340,8 +340,8 @@ impl Continuous {
     /// Solves `M a + A_dᵀ λ = −r1`, `A_d a = −r2` in place; rows `(r1, r2)` become `(a, λ)`.
     fn solve_rows(&mut self, rows: &mut [f64], stride: usize) {
         let model = &*self.model;
-        let Layout { nd, nc, .. } = self.equations.layout;
-        let n = self.equations.layout.n();
+        let d = self.equations.d;
+        let (n, nd, nc) = (d.coordinates(), d.dynamic, d.constraints);
         let (first, second) = rows.split_at_mut(nd * stride);
         self.mass.solve_rows(&model.elimination, first, stride, stride);
         // S λ = r2 − A_d M⁻¹ r1, a = −M⁻¹ r1 − M⁻¹ A_dᵀ λ.
@@ -364,28 +364,11 @@ impl Continuous {
     }
 }
 
-/// Sizes; the parameters are `(q, v, inputs, prescribed accelerations)`, after their columns come those
-/// of the unknowns.
-#[derive(Clone, Copy, Debug)]
-struct Layout {
-    nd: usize,
-    nk: usize,
-    ni: usize,
-    nc: usize,
-}
-
-impl Layout {
-    fn new(model: &Model) -> Self {
-        let d = model.dimensions;
-        Self { nd: d.dynamic, nk: d.prescribed, ni: d.inputs, nc: d.constraints }
-    }
-
-    fn n(&self) -> usize {
-        self.nd + self.nk
-    }
-
+/// The parameters are `(q, v, inputs, prescribed accelerations)`; after their columns come those of the
+/// unknowns.
+impl Dimensions {
     fn parameters(&self) -> usize {
-        2 * self.n() + self.ni + self.nk
+        2 * self.coordinates() + self.input()
     }
 
     fn stride(&self) -> usize {
@@ -394,15 +377,15 @@ impl Layout {
 
     /// Columns of the equations' Jacobian.
     fn columns(&self) -> usize {
-        self.parameters() + self.nd + self.nc
+        self.parameters() + self.dynamic + self.constraints
     }
 
     /// Column of the acceleration of a coordinate.
     fn acceleration(&self, coordinate: usize) -> usize {
-        if coordinate < self.nd {
+        if coordinate < self.dynamic {
             self.parameters() + coordinate
         } else {
-            2 * self.n() + self.ni + coordinate - self.nd
+            2 * self.coordinates() + self.inputs + coordinate - self.dynamic
         }
     }
 }
@@ -410,7 +393,7 @@ impl Layout {
 /// The equations of motion and constraint accelerations at a point, with their first derivatives.
 #[derive(Clone, Debug)]
 struct Equations<S> {
-    layout: Layout,
+    d: Dimensions,
     q: Vec<S>,
     v: Vec<S>,
     inputs: Vec<S>,
@@ -427,29 +410,29 @@ struct Equations<S> {
     orientations: Vec<Mat3<S>>,
     /// nd + nc.
     residual: Vec<S>,
-    /// nd + nc rows, [`Layout::columns`] columns.
+    /// nd + nc rows, [`Dimensions::columns`] columns.
     jacobian: Vec<S>,
 }
 
 impl<S: Scalar> Equations<S> {
     fn new(model: &Model) -> Self {
-        let layout = Layout::new(model);
-        let (n, rows) = (layout.n(), layout.nd + layout.nc);
+        let d = model.dimensions;
+        let (n, rows) = (d.coordinates(), d.dynamic + d.constraints);
         let zeros = |len: usize| vec![S::ZERO; len];
         Self {
-            layout,
+            d,
             q: zeros(n),
             v: zeros(n),
-            inputs: zeros(layout.ni),
+            inputs: zeros(d.inputs),
             acceleration: zeros(n),
-            multipliers: zeros(layout.nc),
+            multipliers: zeros(d.constraints),
             blocks: Derivatives::new(model),
             closure: Closure::new(model),
             motion: Closure::new(model),
-            hessian: zeros(if layout.nc > 0 { n * n } else { 0 }),
+            hessian: zeros(if d.constraints > 0 { n * n } else { 0 }),
             orientations: vec![Mat3::IDENTITY; model.orientations.len()],
             residual: zeros(rows),
-            jacobian: zeros(rows * layout.columns()),
+            jacobian: zeros(rows * d.columns()),
         }
     }
 
@@ -465,7 +448,7 @@ impl<S: Scalar> Equations<S> {
             turned_twice.push(at_rest(&at_rest(still)).times(&rotation::exp(twice)));
         }
         self.blocks.evaluate(model, (&along_q, &turned), &along_v, &constant);
-        if self.layout.nc > 0 {
+        if self.d.constraints > 0 {
             let twice = along(&along_q, &along_v);
             self.motion.evaluate(model, &twice, &turned_twice);
             self.motion.differentiate(model, &twice);
@@ -489,9 +472,8 @@ impl<S: Scalar> Equations<S> {
     /// by v, h      (e_j × ω)·X h
     /// ```
     fn turn(&mut self, model: &Model) {
-        let layout = self.layout;
-        let Layout { nd, nc, .. } = layout;
-        let (n, columns) = (layout.n(), layout.columns());
+        let d = self.d;
+        let (n, nd, nc, columns) = (d.coordinates(), d.dynamic, d.constraints, d.columns());
         for &i in &model.orientations {
             let (spin, change) = (three(&self.v, i), three(&self.acceleration, i));
             for b in 0..3 {
@@ -539,11 +521,10 @@ impl<S: Scalar> Equations<S> {
 
     /// Rows of the dynamic coordinates.
     fn fill_dynamics(&mut self) {
-        let (layout, blocks) = (self.layout, &self.blocks);
-        let Layout { nd, ni, nc, .. } = layout;
-        let n = layout.n();
+        let (d, blocks) = (self.d, &self.blocks);
+        let (n, nd, ni, nc) = (d.coordinates(), d.dynamic, d.inputs, d.constraints);
         for i in 0..nd {
-            let row = &mut self.jacobian[i * layout.columns()..][..layout.columns()];
+            let row = &mut self.jacobian[i * d.columns()..][..d.columns()];
             for j in 0..n {
                 let (entry, mirrored) = (i * n + j, j * n + i);
                 let l_vq = blocks.l_qv[mirrored];
@@ -553,7 +534,7 @@ impl<S: Scalar> Equations<S> {
                 }
                 row[n + j] =
                     blocks.l_vv[entry].eps + l_vq.re - blocks.l_qv[entry].re - blocks.f_v[entry].re;
-                row[layout.acceleration(j)] = blocks.l_vv[entry].re;
+                row[d.acceleration(j)] = blocks.l_vv[entry].re;
             }
             for j in 0..ni {
                 row[2 * n + j] = -blocks.f_u[i * ni + j].re;
@@ -561,7 +542,7 @@ impl<S: Scalar> Equations<S> {
             let mut residual = blocks.l_v[i].eps - blocks.l_q[i].re - blocks.force[i].re;
             for c in 0..nc {
                 let entry = self.motion.jacobian[c * n + i].re.re;
-                row[layout.parameters() + nd + c] = entry;
+                row[d.parameters() + nd + c] = entry;
                 residual += entry * self.multipliers[c];
             }
             self.residual[i] = residual;
@@ -570,17 +551,17 @@ impl<S: Scalar> Equations<S> {
 
     /// Rows of the constraints.
     fn fill_constraints(&mut self) {
-        let layout = self.layout;
-        let n = layout.n();
-        for c in 0..layout.nc {
-            let row = &mut self.jacobian[(layout.nd + c) * layout.columns()..][..layout.columns()];
+        let d = self.d;
+        let n = d.coordinates();
+        for c in 0..d.constraints {
+            let row = &mut self.jacobian[(d.dynamic + c) * d.columns()..][..d.columns()];
             for j in 0..n {
                 let entry = self.motion.jacobian[c * n + j];
                 row[j] = entry.eps.eps;
                 row[n + j] = entry.re.eps * 2.0;
-                row[layout.acceleration(j)] = entry.re.re;
+                row[d.acceleration(j)] = entry.re.re;
             }
-            self.residual[layout.nd + c] = self.motion.value[c].eps.eps;
+            self.residual[d.dynamic + c] = self.motion.value[c].eps.eps;
         }
     }
 }
@@ -588,8 +569,7 @@ impl<S: Scalar> Equations<S> {
 impl Equations<f64> {
     /// Takes a point over, with unknowns zero.
     fn place(&mut self, model: &Model, point: &ContinuousPoint) -> Result<(), ContinuousError> {
-        let Layout { nd, .. } = self.layout;
-        let (dynamic, prescribed) = self.acceleration.split_at_mut(nd);
+        let (dynamic, prescribed) = self.acceleration.split_at_mut(self.d.dynamic);
         dynamic.fill(0.0);
         self.multipliers.fill(0.0);
         take("q", &point.q, &mut self.q)?;
@@ -603,8 +583,8 @@ impl Equations<f64> {
 impl Equations<Dual> {
     /// The point of `at`, moving along the tangent of parameter `a`.
     fn seed(&mut self, model: &Model, at: &Equations<f64>, a: usize, tangent: &[f64]) {
-        let layout = self.layout;
-        let (n, stride) = (layout.n(), layout.stride());
+        let d = self.d;
+        let (n, stride) = (d.coordinates(), d.stride());
         let unit = |is: bool| if is { 1.0 } else { 0.0 };
         for (o, &i) in model.orientations.iter().enumerate() {
             let turn = Vec3([0, 1, 2].map(|b| Dual::new(0.0, unit(a == i + b))));
@@ -613,18 +593,15 @@ impl Equations<Dual> {
         for i in 0..n {
             self.q[i] = Dual::new(at.q[i], unit(a == i));
             self.v[i] = Dual::new(at.v[i], unit(a == n + i));
-            let moved = if i < layout.nd {
-                tangent[i * stride + a]
-            } else {
-                unit(a == layout.acceleration(i))
-            };
+            let moved =
+                if i < d.dynamic { tangent[i * stride + a] } else { unit(a == d.acceleration(i)) };
             self.acceleration[i] = Dual::new(at.acceleration[i], moved);
         }
-        for i in 0..layout.ni {
+        for i in 0..d.inputs {
             self.inputs[i] = Dual::new(at.inputs[i], unit(a == 2 * n + i));
         }
-        for c in 0..layout.nc {
-            let moved = tangent[(layout.nd + c) * stride + a];
+        for c in 0..d.constraints {
+            let moved = tangent[(d.dynamic + c) * stride + a];
             self.multipliers[c] = Dual::new(at.multipliers[c], moved);
         }
     }

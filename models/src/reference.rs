@@ -115,7 +115,7 @@ pub enum ReferenceError {
 }
 
 /// How a configuration trajectory compares with the motions of the plant.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Assessment {
     /// Largest violation `|h(q[k])|` of a constraint, in its unit. Inputs that prescribe other positions
     /// than `q` has count as well.
@@ -353,18 +353,10 @@ impl<'a> Assess<'a> {
             }
         }
         let mut assessment = Assessment {
-            constraint_violation: 0.0,
-            constraint_violation_step: 0,
-            constraint: String::new(),
-            unexplained_force: 0.0,
-            unexplained_force_step: 0,
-            unexplained_force_coordinate: String::new(),
-            unexplained_acceleration: 0.0,
-            unexplained_step: 0,
-            unexplained_coordinate: String::new(),
             inputs: self.inputs.clone(),
             states: DMatrix::zeros(steps + 1, d.state()),
             multipliers: DMatrix::zeros(steps, d.constraints),
+            ..Assessment::default()
         };
         self.explain(&terms, &nodes, &mut assessment);
         self.find_states(&terms, &mut assessment);

@@ -13,7 +13,6 @@ use crate::model::tree::{Attachment, Tree, WORLD};
 use crate::scene;
 use crate::scene::Scene;
 use crate::scene::forces::Component;
-use crate::scene::point::Point;
 
 /// The forces of a scene over the joints of a tree.
 struct Resolver<'a> {
@@ -90,9 +89,8 @@ impl Resolver<'_> {
             }
             scene::Force::Drag { frame, at, coefficient } => {
                 if *coefficient != 0.0 {
-                    let at = Point { frame: frame.clone(), at: *at };
                     let still = Attachment { joint: WORLD, point: Vec3::ZERO };
-                    let ends = self.places.between(layout.attachment(&at), still);
+                    let ends = self.places.between(layout.fixed(frame, *at), still);
                     let law = PointLaw::Drag(*coefficient);
                     forces.point_forces.push(PointForce { ends, law });
                 }
@@ -120,9 +118,7 @@ impl Resolver<'_> {
     }
 
     fn attachment(&self, frame: &str, at: [f64; 3]) -> Attachment {
-        let at = self.places.layout.attachment(&Point { frame: frame.to_owned(), at });
-        let joint = if at.joint == WORLD { WORLD } else { self.places.index[at.joint] };
-        Attachment { joint, ..at }
+        self.places.resolve(self.places.layout.fixed(frame, at))
     }
 
     fn wrench(

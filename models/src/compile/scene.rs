@@ -161,6 +161,7 @@ pub(crate) struct Placement {
 }
 
 /// The scene with its names resolved.
+#[derive(Default)]
 pub(crate) struct Layout {
     pub(crate) joints: Vec<Joint>,
     pub(crate) frames: BTreeMap<String, Placement>,
@@ -184,14 +185,8 @@ impl Layout {
             children.entry(&frame.parent).or_default().push(frame);
         }
         let world = Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
-        let mut layout = Self {
-            joints: Vec::new(),
-            frames: BTreeMap::from([("world".to_owned(), world)]),
-            coordinates: Vec::new(),
-            dynamic: 0,
-            index: BTreeMap::new(),
-            orientations: Vec::new(),
-        };
+        let frames = BTreeMap::from([("world".to_owned(), world)]);
+        let mut layout = Self { frames, ..Self::default() };
         let mut names = Vec::new();
         let mut stack: Vec<&scene::Frame> =
             children.get("world").map(|c| c.iter().rev().copied().collect()).unwrap_or_default();
@@ -298,7 +293,7 @@ impl Layout {
     }
 
     /// A point fixed in a frame.
-    fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
+    pub(super) fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
         let frame = self.frames[frame];
         Attachment { joint: frame.joint, point: frame.translation + frame.rotation.apply(Vec3(at)) }
     }
@@ -444,6 +439,12 @@ pub(crate) struct Places<'a> {
 }
 
 impl Places<'_> {
+    /// A point of the layout in the tree.
+    pub(crate) fn resolve(&self, at: Attachment) -> Attachment {
+        let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
+        Attachment { joint, ..at }
+    }
+
     /// Two points; joints that carry both drop out.
     pub(crate) fn between(&self, a: Attachment, b: Attachment) -> PointPair {
         let mut pair = self.between_in_world(a, b);
@@ -453,11 +454,7 @@ impl Places<'_> {
 
     /// Two points; joints that carry both drop out if they do not turn.
     fn between_in_world(&self, a: Attachment, b: Attachment) -> PointPair {
-        let resolve = |at: Attachment| {
-            let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
-            Attachment { joint, ..at }
-        };
-        let (a, b) = (resolve(a), resolve(b));
+        let (a, b) = (self.resolve(a), self.resolve(b));
         let (path_a, path_b) = (self.tree.path(a.joint), self.tree.path(b.joint));
         let common = path_a.iter().zip(&path_b).take_while(|(x, y)| x == y).count();
         let entry = |carries| {
@@ -557,7 +554,7 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
         None => Mat3::IDENTITY,
         Some(scene::Rotation::Matrix(rows)) => Mat3::from_rows(*rows),
         Some(scene::Rotation::Rpy([roll, pitch, yaw])) => {
-            about_z(*yaw).times(&about_y(*pitch)).times(&about_x(*roll))
+            about(2, *yaw).times(&about(1, *pitch)).times(&about(0, *roll))
         }
         Some(scene::Rotation::Quaternion(q)) => {
             let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
@@ -566,19 +563,14 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
     }
 }
 
-fn about_x(angle: f64) -> Mat3 {
+/// A turn about an axis of the frame.
+fn about(axis: usize, angle: f64) -> Mat3 {
     let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-}
-
-fn about_y(angle: f64) -> Mat3 {
-    let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-}
-
-fn about_z(angle: f64) -> Mat3 {
-    let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    let (next, last) = ((axis + 1) % 3, (axis + 2) % 3);
+    let mut columns = Mat3::IDENTITY.0;
+    (columns[next].0[next], columns[next].0[last]) = (c, s);
+    (columns[last].0[next], columns[last].0[last]) = (-s, c);
+    Mat3(columns)
 }
 
 /// A body of the scene in the frame of the joint that carries it.

@@ -9,7 +9,7 @@ mod signals;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::scene::forces::Force;
 use crate::scene::limits::{
@@ -46,6 +46,7 @@ impl Scene {
 struct Check<'a> {
     scene: &'a Scene,
     problems: Vec<Problem>,
+    inputs: BTreeSet<&'a str>,
     /// Index of the first frame of each name.
     frames: BTreeMap<&'a str, usize>,
     /// Parent of each frame; none for children of the world and of unknown parents.
@@ -63,6 +64,7 @@ impl<'a> Check<'a> {
         Self {
             scene,
             problems: Vec::new(),
+            inputs: scene.inputs.iter().map(|input| input.name.as_str()).collect(),
             frames: BTreeMap::new(),
             parents: Vec::new(),
             is_tree: true,
