@@ -16,7 +16,7 @@ use crate::model::mechanism::{
     OperatingPoint, PathJoint, PointPair, Polynomial, Product, Solver, Vector,
 };
 use crate::model::planar_tree::planar;
-use crate::model::site::{Site, SiteJoint};
+use crate::model::site::Site;
 use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 use crate::scene;
 use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError};
@@ -30,6 +30,30 @@ impl Scene {
 
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.
+    ///
+    /// ```
+    /// use plantd_models::{Model, Scene};
+    ///
+    /// let text = r#"
+    ///     format = 1
+    ///     name = "swing"
+    ///     gravity = [0.0, 0.0, -9.8]
+    ///
+    ///     [[frames]]
+    ///     name = "arm"
+    ///     joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+    ///     body = { mass = 1.0, center_of_mass = [0.0, 0.0, -0.5] }
+    /// "#;
+    /// let mut scene = Scene::from_toml(text)?;
+    /// let model = Model::compile(&scene)?;
+    /// assert_eq!(model.coordinates()[0].name, "arm");
+    /// assert_eq!(model.dimensions().state(), 2);
+    ///
+    /// scene.frames[0].parent = "ceiling".to_owned();
+    /// let error = Model::compile(&scene).unwrap_err();
+    /// assert_eq!(error.to_string(), "frames[0].parent: there is no frame `ceiling`");
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
         let problems = scene.problems();
         if !problems.is_empty() {
@@ -124,13 +148,7 @@ pub(crate) fn site(scene: &Scene, frame: &str, at: [f64; 3]) -> Option<Site> {
     let mut joints = Vec::new();
     let mut index = placement.joint;
     while let Some(joint) = layout.joints.get(index) {
-        joints.push(SiteJoint {
-            kind: joint.kind,
-            coordinate: joint.coordinate,
-            orientation: joint.orientation,
-            rotation: joint.rotation,
-            translation: joint.translation,
-        });
+        joints.push(joint.clone());
         index = joint.parent;
     }
     joints.reverse();

@@ -4,6 +4,8 @@ pub(crate) mod error;
 #[cfg(test)]
 mod tests;
 
+use std::ops::Deref;
+
 use nalgebra::{DMatrix, DVector};
 
 use crate::control::lq::stage::Stage;
@@ -229,26 +231,6 @@ impl Weights {
         Ok(Self { stage, q_final: congruent(t, &self.q_final) })
     }
 
-    /// Number of states.
-    pub fn states(&self) -> usize {
-        self.stage.states()
-    }
-    /// Number of inputs.
-    pub fn inputs(&self) -> usize {
-        self.stage.inputs()
-    }
-    /// State weight `Q`.
-    pub fn q(&self) -> &DMatrix<f64> {
-        &self.stage.q
-    }
-    /// Input weight `R`.
-    pub fn r(&self) -> &DMatrix<f64> {
-        &self.stage.r
-    }
-    /// Cross term `S`.
-    pub fn s(&self) -> Option<&DMatrix<f64>> {
-        self.stage.s.as_ref()
-    }
     /// Weights of each step.
     pub fn stage(&self) -> &StageWeights {
         &self.stage
@@ -256,6 +238,15 @@ impl Weights {
     /// Final weight `Q_f`.
     pub fn q_final(&self) -> &DMatrix<f64> {
         &self.q_final
+    }
+}
+
+/// The weights of each step.
+impl Deref for Weights {
+    type Target = StageWeights;
+
+    fn deref(&self) -> &StageWeights {
+        &self.stage
     }
 }
 
