@@ -384,7 +384,7 @@ impl Layout {
                         u: Vector::Difference,
                         w: Vector::WithA(normal),
                     };
-                    equations.push(name.to_owned(), product.into());
+                    equations.push(name.to_owned(), ConstraintKind::Product(product));
                 }
                 scene::Constraint::Orientation { a, b, .. } => {
                     equations.align(name, a, b, &places);
@@ -397,7 +397,8 @@ impl Layout {
                             u: Vector::Difference,
                             w: Vector::WithA(self.direction(a, axis)),
                         };
-                        equations.push(format!("{name}.{letter}"), product.into());
+                        let kind = ConstraintKind::Product(product);
+                        equations.push(format!("{name}.{letter}"), kind);
                     }
                     equations.align(name, a, b, &places);
                 }
@@ -540,16 +541,10 @@ impl Equations {
             w: Vector::WithB(layout.direction(b, Mat3::IDENTITY.0[j])),
         };
         for (letter, (i, j)) in AXES.iter().zip([(1, 2), (2, 0), (0, 1)]) {
-            self.push(format!("{name}.r{letter}"), product(i, j).into());
+            self.push(format!("{name}.r{letter}"), ConstraintKind::Product(product(i, j)));
         }
         let axes = [0, 1, 2].map(|i| product(i, i));
         self.alignments.push(Alignment { name: name.to_owned(), axes });
-    }
-}
-
-impl From<Product> for ConstraintKind {
-    fn from(product: Product) -> Self {
-        Self::Product(product)
     }
 }
 

@@ -2,7 +2,7 @@
 
 mod ending;
 #[cfg(test)]
-mod probe;
+mod tests;
 
 use nalgebra::DMatrix;
 

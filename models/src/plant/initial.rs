@@ -95,23 +95,17 @@ impl Model {
     }
 }
 
-impl Initial {
-    /// Whether it asks for the scene's initial configuration.
-    fn is_of_scene(&self) -> bool {
-        match self {
-            Self::Scene => true,
-            Self::OperatingPoint(name) => name == "initial",
-            _ => false,
-        }
-    }
-}
-
 impl Plant {
     /// Puts the plant into a state, step 0.
     pub fn initialize(&mut self, initial: &Initial) -> Result<(), InitialError> {
         let state = self.state_of(initial)?;
+        let is_of_scene = match initial {
+            Initial::Scene => true,
+            Initial::OperatingPoint(name) => name == "initial",
+            _ => false,
+        };
         self.check_constraints(&state.q).map_err(|error| match error {
-            InitialError::OffConstraint { constraint, violation } if initial.is_of_scene() => {
+            InitialError::OffConstraint { constraint, violation } if is_of_scene => {
                 InitialError::SceneIsGuess { constraint, violation }
             }
             error => error,
@@ -164,13 +158,10 @@ impl Plant {
             }
             Initial::Projection { q, hold } => {
                 let guess = checked("q", q, n)?;
-                let mut moves: Vec<bool> = (0..n).map(|i| i < nd).collect();
-                for name in hold {
-                    let index = self.model.coordinate_index(name).ok_or_else(|| {
-                        InitialError::Unknown { kind: "coordinate", name: name.clone() }
-                    })?;
-                    moves[index] = false;
-                }
+                let moves = self
+                    .model
+                    .free_coordinates(hold)
+                    .map_err(|name| InitialError::Unknown { kind: "coordinate", name })?;
                 state.q = self.project(guess, &moves)?;
             }
         }

@@ -148,6 +148,16 @@ impl Model {
     pub fn settle(&self, request: &SettleRequest) -> Result<Equilibrium, SettleError> {
         Search::new(self, request)?.run(&request.q)
     }
+
+    /// Which coordinates are dynamic and not held; the name of one to be held that is unknown.
+    pub(crate) fn free_coordinates(&self, hold: &[String]) -> Result<Vec<bool>, String> {
+        let d = self.dimensions;
+        let mut is_free: Vec<bool> = (0..d.coordinates()).map(|i| i < d.dynamic).collect();
+        for name in hold {
+            is_free[self.coordinate_index(name).ok_or(name)?] = false;
+        }
+        Ok(is_free)
+    }
 }
 
 /// The configuration an increment of the dynamic coordinates away.
@@ -187,7 +197,7 @@ struct Point {
 
 impl Point {
     fn residual(&self) -> f64 {
-        self.unbalanced.iter().fold(0.0, |a, x| a.max(x.abs()))
+        self.unbalanced.amax()
     }
 }
 
@@ -198,15 +208,9 @@ impl<'a> Search<'a> {
         let inputs =
             if request.inputs.is_empty() { vec![0.0; d.inputs] } else { request.inputs.clone() };
         check("inputs", &inputs, d.inputs)?;
-        let mut moves = vec![true; d.dynamic];
-        for name in &request.hold {
-            let index = model
-                .coordinate_index(name)
-                .ok_or_else(|| SettleError::Unknown { name: name.clone() })?;
-            if let Some(moves) = moves.get_mut(index) {
-                *moves = false;
-            }
-        }
+        let mut moves =
+            model.free_coordinates(&request.hold).map_err(|name| SettleError::Unknown { name })?;
+        moves.truncate(d.dynamic);
         let (blocks, closure) = (Derivatives::new(model), Closure::new(model));
         Ok(Self { model, blocks, closure, inputs, moves, largest: 0.0 })
     }
