@@ -108,6 +108,8 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+// In the order of an iteration: `search`, `problem` (the cost), `derivatives` of it, `linearizer` (of the map),
+// `projection`, `direction`, `trials`, and `search/ending`.
 mod bounds;
 mod chart;
 mod derivatives;

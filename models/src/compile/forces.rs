@@ -13,7 +13,6 @@ use crate::model::tree::{Attachment, Tree, WORLD};
 use crate::scene;
 use crate::scene::Scene;
 use crate::scene::forces::Component;
-use crate::scene::point::Point;
 
 /// The forces of a scene over the joints of a tree.
 struct Resolver<'a> {
@@ -40,11 +39,8 @@ impl Layout {
             resolver.add(force, &mut forces);
         }
         let Forces { wrenches, point_forces, coordinate_forces, linear_dampers } = &forces;
-        let none = wrenches.is_empty()
-            && point_forces.is_empty()
-            && coordinate_forces.is_empty()
-            && linear_dampers.is_empty();
-        (!none).then_some(forces)
+        let velocity_forces = point_forces.len() + coordinate_forces.len() + linear_dampers.len();
+        (wrenches.len() + velocity_forces > 0).then_some(forces)
     }
 
     pub(super) fn signals(&self, scene: &Scene) -> Vec<Signal> {
@@ -60,6 +56,11 @@ impl Resolver<'_> {
     fn add(&self, force: &scene::Force, forces: &mut Forces) {
         let (layout, index) = (self.places.layout, &self.places.layout.index);
         match force {
+            scene::Force::TwoPointDamper { damping: 0.0, .. }
+            | scene::Force::LinearDamper { damping: 0.0, .. }
+            | scene::Force::Drag { coefficient: 0.0, .. }
+            | scene::Force::CoordinateDrag { coefficient: 0.0, .. }
+            | scene::Force::Friction { force: 0.0, .. } => {}
             scene::Force::BodyWrench { frame, force, torque } => {
                 forces.wrenches.push(self.wrench(WrenchKind::Body, frame, force, torque));
             }
@@ -82,47 +83,34 @@ impl Resolver<'_> {
                 });
             }
             scene::Force::TwoPointDamper { a, b, damping } => {
-                if *damping != 0.0 {
-                    let ends = self.places.between(layout.attachment(a), layout.attachment(b));
-                    let law = PointLaw::Damper(*damping);
-                    forces.point_forces.push(PointForce { ends, law });
-                }
+                let ends = self.places.between(layout.attachment(a), layout.attachment(b));
+                let law = PointLaw::Damper(*damping);
+                forces.point_forces.push(PointForce { ends, law });
             }
             scene::Force::Drag { frame, at, coefficient } => {
-                if *coefficient != 0.0 {
-                    let at = Point { frame: frame.clone(), at: *at };
-                    let still = Attachment { joint: WORLD, point: Vec3::ZERO };
-                    let ends = self.places.between(layout.attachment(&at), still);
-                    let law = PointLaw::Drag(*coefficient);
-                    forces.point_forces.push(PointForce { ends, law });
-                }
+                let still = Attachment { joint: WORLD, point: Vec3::ZERO };
+                let ends = self.places.between(layout.fixed(frame, *at), still);
+                let law = PointLaw::Drag(*coefficient);
+                forces.point_forces.push(PointForce { ends, law });
             }
             scene::Force::CoordinateDrag { coordinate, coefficient } => {
-                if *coefficient != 0.0 {
-                    let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
-                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
-                }
+                let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
+                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
             }
             scene::Force::LinearDamper { terms, damping } => {
-                if *damping != 0.0 {
-                    let terms = layout.linear(terms);
-                    forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
-                }
+                let terms = layout.linear(terms);
+                forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
             }
             scene::Force::Friction { coordinate, force, velocity } => {
-                if *force != 0.0 {
-                    let law = CoordinateLaw::Friction { force: *force, velocity: *velocity };
-                    let coordinate = index[coordinate];
-                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
-                }
+                let law = CoordinateLaw::Friction { force: *force, velocity: *velocity };
+                let coordinate = index[coordinate];
+                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
             }
         }
     }
 
     fn attachment(&self, frame: &str, at: [f64; 3]) -> Attachment {
-        let at = self.places.layout.attachment(&Point { frame: frame.to_owned(), at });
-        let joint = if at.joint == WORLD { WORLD } else { self.places.index[at.joint] };
-        Attachment { joint, ..at }
+        self.places.resolve(self.places.layout.fixed(frame, at))
     }
 
     fn wrench(

@@ -17,7 +17,7 @@ use crate::model::mechanism::{
     Product, Solver, Vector,
 };
 use crate::model::planar_tree::planar;
-use crate::model::site::{Site, SiteJoint};
+use crate::model::site::Site;
 use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 use crate::scene;
 use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError};
@@ -31,6 +31,30 @@ impl Scene {
 
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.
+    ///
+    /// ```
+    /// use plantd_models::{Model, Scene};
+    ///
+    /// let text = r#"
+    ///     format = 1
+    ///     name = "swing"
+    ///     gravity = [0.0, 0.0, -9.8]
+    ///
+    ///     [[frames]]
+    ///     name = "arm"
+    ///     joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+    ///     body = { mass = 1.0, center_of_mass = [0.0, 0.0, -0.5] }
+    /// "#;
+    /// let mut scene = Scene::from_toml(text)?;
+    /// let model = Model::compile(&scene)?;
+    /// assert_eq!(model.coordinates()[0].name, "arm");
+    /// assert_eq!(model.dimensions().state(), 2);
+    ///
+    /// scene.frames[0].parent = "ceiling".to_owned();
+    /// let error = Model::compile(&scene).unwrap_err();
+    /// assert_eq!(error.to_string(), "frames[0].parent: there is no frame `ceiling`");
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
         let problems = scene.problems();
         if !problems.is_empty() {
@@ -125,13 +149,7 @@ pub(crate) fn site(scene: &Scene, frame: &str, at: [f64; 3]) -> Option<Site> {
     let mut joints = Vec::new();
     let mut index = placement.joint;
     while let Some(joint) = layout.joints.get(index) {
-        joints.push(SiteJoint {
-            kind: joint.kind,
-            coordinate: joint.coordinate,
-            orientation: joint.orientation,
-            rotation: joint.rotation,
-            translation: joint.translation,
-        });
+        joints.push(joint.clone());
         index = joint.parent;
     }
     joints.reverse();
@@ -162,6 +180,7 @@ pub(crate) struct Placement {
 }
 
 /// The scene with its names resolved.
+#[derive(Default)]
 pub(crate) struct Layout {
     pub(crate) joints: Vec<Joint>,
     pub(crate) frames: BTreeMap<String, Placement>,
@@ -185,14 +204,8 @@ impl Layout {
             children.entry(&frame.parent).or_default().push(frame);
         }
         let world = Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
-        let mut layout = Self {
-            joints: Vec::new(),
-            frames: BTreeMap::from([("world".to_owned(), world)]),
-            coordinates: Vec::new(),
-            dynamic: 0,
-            index: BTreeMap::new(),
-            orientations: Vec::new(),
-        };
+        let frames = BTreeMap::from([("world".to_owned(), world)]);
+        let mut layout = Self { frames, ..Self::default() };
         let mut names = Vec::new();
         let mut stack: Vec<&scene::Frame> =
             children.get("world").map(|c| c.iter().rev().copied().collect()).unwrap_or_default();
@@ -299,7 +312,7 @@ impl Layout {
     }
 
     /// A point fixed in a frame.
-    fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
+    pub(super) fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
         let frame = self.frames[frame];
         Attachment { joint: frame.joint, point: frame.translation + frame.rotation.apply(Vec3(at)) }
     }
@@ -374,7 +387,7 @@ impl Layout {
                         u: Vector::Difference,
                         w: Vector::WithA(normal),
                     };
-                    equations.push(name.to_owned(), product.into());
+                    equations.push(name.to_owned(), ConstraintKind::Product(product));
                 }
                 scene::Constraint::Orientation { a, b, .. } => {
                     equations.align(name, a, b, &places);
@@ -387,7 +400,8 @@ impl Layout {
                             u: Vector::Difference,
                             w: Vector::WithA(self.direction(a, axis)),
                         };
-                        equations.push(format!("{name}.{letter}"), product.into());
+                        let kind = ConstraintKind::Product(product);
+                        equations.push(format!("{name}.{letter}"), kind);
                     }
                     equations.align(name, a, b, &places);
                 }
@@ -448,6 +462,12 @@ pub(crate) struct Places<'a> {
 }
 
 impl Places<'_> {
+    /// A point of the layout in the tree.
+    pub(crate) fn resolve(&self, at: Attachment) -> Attachment {
+        let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
+        Attachment { joint, ..at }
+    }
+
     /// Two points; joints that carry both drop out.
     pub(crate) fn between(&self, a: Attachment, b: Attachment) -> PointPair {
         let mut pair = self.between_in_world(a, b);
@@ -457,11 +477,7 @@ impl Places<'_> {
 
     /// Two points; joints that carry both drop out if they do not turn.
     fn between_in_world(&self, a: Attachment, b: Attachment) -> PointPair {
-        let resolve = |at: Attachment| {
-            let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
-            Attachment { joint, ..at }
-        };
-        let (a, b) = (resolve(a), resolve(b));
+        let (a, b) = (self.resolve(a), self.resolve(b));
         let (path_a, path_b) = (self.tree.path(a.joint), self.tree.path(b.joint));
         let common = path_a.iter().zip(&path_b).take_while(|(x, y)| x == y).count();
         let entry = |carries| {
@@ -522,16 +538,10 @@ impl Equations {
             w: Vector::WithB(layout.direction(b, Mat3::IDENTITY.0[j])),
         };
         for (letter, (i, j)) in AXES.iter().zip([(1, 2), (2, 0), (0, 1)]) {
-            self.push(format!("{name}.r{letter}"), product(i, j).into());
+            self.push(format!("{name}.r{letter}"), ConstraintKind::Product(product(i, j)));
         }
         let axes = [0, 1, 2].map(|i| product(i, i));
         self.alignments.push(Alignment { name: name.to_owned(), axes });
-    }
-}
-
-impl From<Product> for ConstraintKind {
-    fn from(product: Product) -> Self {
-        Self::Product(product)
     }
 }
 
@@ -554,7 +564,7 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
         None => Mat3::IDENTITY,
         Some(scene::Rotation::Matrix(rows)) => Mat3::from_rows(*rows),
         Some(scene::Rotation::Rpy([roll, pitch, yaw])) => {
-            about_z(*yaw).times(&about_y(*pitch)).times(&about_x(*roll))
+            about(2, *yaw).times(&about(1, *pitch)).times(&about(0, *roll))
         }
         Some(scene::Rotation::Quaternion(q)) => {
             let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
@@ -563,19 +573,14 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
     }
 }
 
-fn about_x(angle: f64) -> Mat3 {
+/// A turn about an axis of the frame.
+fn about(axis: usize, angle: f64) -> Mat3 {
     let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-}
-
-fn about_y(angle: f64) -> Mat3 {
-    let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-}
-
-fn about_z(angle: f64) -> Mat3 {
-    let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    let (next, last) = ((axis + 1) % 3, (axis + 2) % 3);
+    let mut columns = Mat3::IDENTITY.0;
+    (columns[next].0[next], columns[next].0[last]) = (c, s);
+    (columns[last].0[next], columns[last].0[last]) = (-s, c);
+    Mat3(columns)
 }
 
 /// A body of the scene in the frame of the joint that carries it.

@@ -2,7 +2,7 @@
 
 mod ending;
 #[cfg(test)]
-mod probe;
+mod tests;
 
 use nalgebra::DMatrix;
 
@@ -72,7 +72,7 @@ pub struct Optimizer {
 }
 
 /// How far a search has come.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Course {
     iterations: u32,
     first_cost: f64,
@@ -148,8 +148,8 @@ impl Optimizer {
         fits(multipliers.len() == count, "the number of its multipliers")?;
         fits(multipliers.iter().all(|x| x.is_finite()), "a multiplier is not finite")?;
         let Checkpoint { iterations, backtracks, .. } = *checkpoint;
-        let status = Status::Running;
-        search.course = Course { iterations, first_cost, backtracks, last_derivative, status };
+        let course = &mut search.course;
+        *course = Course { iterations, first_cost, backtracks, last_derivative, ..*course };
         search.bounds.renewed_error = checkpoint.bound_violation;
         search.bounds.penalty = penalty;
         search.bounds.multipliers.copy_from_slice(multipliers);
@@ -191,13 +191,6 @@ impl Optimizer {
         let linearizer = Linearizer::new(&plant, steps, keeps);
         let mut trials = Trials::new(plant, &problem, &current);
         trials.simulate_guess(&problem, &mut current.trajectory)?;
-        let course = Course {
-            iterations: 0,
-            first_cost: 0.0,
-            backtracks: 0,
-            last_derivative: 0.0,
-            status: Status::Running,
-        };
         Ok(Self {
             derivatives: CostDerivatives::new(&problem),
             direction: Direction::new(&problem, keeps && projection.is_some()),
@@ -208,7 +201,7 @@ impl Optimizer {
             linearizer,
             projection,
             trials,
-            course,
+            course: Course::default(),
         })
     }
 
@@ -295,10 +288,7 @@ impl Optimizer {
             cost: merit,
             directional_derivative: f64::NAN,
             method: asked,
-            fallback: None,
-            step_length: 0.0,
-            backtracks: 0,
-            bound_violation: 0.0,
+            ..Progress::default()
         };
         self.step_or_end(asked, &mut progress, go_on)?;
         self.course.iterations += 1;

@@ -2,7 +2,7 @@
 
 use nalgebra::DMatrix;
 
-use crate::optimize::chart::retract;
+use crate::model::manifold::retract;
 use crate::optimize::direction::Direction;
 use crate::optimize::error::OptimizeError;
 use crate::optimize::linearizer::Linearizer;

@@ -17,8 +17,8 @@ use crate::math::spatial::{Mat3, Vec3};
 use crate::math::sums::two_sum;
 use crate::math::trigonometry::sin_cos_of;
 use crate::model::mechanism::Model;
-use crate::model::site::{Site, SiteJoint};
-use crate::model::tree::JointKind;
+use crate::model::site::Site;
+use crate::model::tree::{Joint, JointKind};
 use crate::plant::facade::Plant;
 
 /// Where a site is, in world axes.
@@ -97,7 +97,7 @@ impl Plant {
     }
 
     /// Rotation of the last joint and position of the point; calls `visit` with the axis of each joint.
-    fn walk(&self, site: &Site, mut visit: impl FnMut(&SiteJoint, &Axis)) -> (Mat3, Vec3) {
+    fn walk(&self, site: &Site, mut visit: impl FnMut(&Joint, &Axis)) -> (Mat3, Vec3) {
         let (mut rotation, mut origin) = (Mat3::IDENTITY, Vec3::ZERO);
         for joint in &site.joints {
             let q = self.state.q[joint.coordinate];

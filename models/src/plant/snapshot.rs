@@ -10,7 +10,6 @@ use crate::integrator::predictor::Past;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, Precision, Settings};
 use crate::integrator::state::PreciseState;
 use crate::math::hash::fnv1a;
-use crate::math::rotation::Quaternion;
 use crate::plant::facade::Plant;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
@@ -68,7 +67,7 @@ impl Plant {
 }
 
 impl PreciseState {
-    /// All numbers but orientations, in the order of the encoding.
+    /// All numbers, in the order of the encoding.
     fn numbers(&mut self) -> impl Iterator<Item = &mut f64> {
         let vectors = [
             &mut self.q,
@@ -79,7 +78,8 @@ impl PreciseState {
             &mut self.multipliers,
         ];
         let turns = self.orientations_low.as_flattened_mut();
-        vectors.into_iter().flatten().chain(turns).chain(self.past.numbers())
+        let orientations = self.orientations.iter_mut().flat_map(|q| &mut q.0);
+        vectors.into_iter().flatten().chain(turns).chain(self.past.numbers()).chain(orientations)
     }
 }
 
@@ -114,9 +114,6 @@ impl Snapshot {
         bytes.extend([state.halvings, state.calm]);
         bytes.extend(state.past.code());
         bytes.extend(state.numbers().flat_map(|value| value.to_le_bytes()));
-        for Quaternion(components) in &state.orientations {
-            bytes.extend(components.iter().flat_map(|value| value.to_le_bytes()));
-        }
         bytes.extend(fnv1a(&bytes).to_le_bytes());
         bytes
     }
@@ -176,14 +173,12 @@ impl Snapshot {
         let mut state = PreciseState::zeros(sizes, past);
         (state.step, state.time_origin_s) = (step, time_origin_s);
         (state.halvings, state.calm) = (halvings, calm);
-        let mut orientations = std::mem::take(&mut state.orientations);
-        for value in state.numbers().chain(orientations.iter_mut().flat_map(|q| &mut q.0)) {
+        for value in state.numbers() {
             *value = f64::from_le_bytes(reader.take()?);
             if !value.is_finite() {
                 return Err(malformed("a number is not finite"));
             }
         }
-        state.orientations = orientations;
         Ok(Self { model_digest, settings, state })
     }
 }

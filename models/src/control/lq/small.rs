@@ -1,4 +1,13 @@
 //! The kernel for few states and inputs: plain loops over arrays.
+//!
+//! It writes the formulas of the other kernel anew, for speed alone. A stage took so many nanoseconds with plain
+//! loops and in blocks:
+//!
+//! ```text
+//! 2 states, 1 input: 84, 295    4, 1: 182, 350    6, 2: 594, 490    8, 2: 916, 764    8, 8: 2080, 1280
+//! ```
+//!
+//! So it takes a tenth off an iteration of Newton's method with a pendulum, and nothing from five states on.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -7,7 +16,7 @@ use crate::control::lq::stage::{NotConvex, Stage};
 use crate::math::gemm::LANES;
 use crate::math::sparse_map::Map;
 
-/// States and inputs up to which plain loops are fastest.
+/// States and inputs up to which loops are plain.
 pub(super) const SMALL: usize = 8;
 
 /// A matrix by columns.
