@@ -260,17 +260,12 @@ impl Layout {
 
     /// Orders the coordinates: dynamic ones depth first, prescribed ones as listed.
     fn number(&mut self, scene: &Scene, joint_names: &[String]) {
-        let prescribed = |name: &str| {
-            settings(scene, name).is_some_and(|c| c.kind == CoordinateKind::Prescribed)
-        };
-        let dynamic = joint_names.iter().filter(|name| !prescribed(name)).cloned();
-        let listed = scene
-            .coordinates
-            .iter()
-            .filter(|c| c.kind == CoordinateKind::Prescribed)
-            .map(|c| c.name.clone());
-        let order: Vec<String> = dynamic.chain(listed).collect();
-        self.dynamic = joint_names.iter().filter(|name| !prescribed(name)).count();
+        let kind = |name: &str| settings(scene, name).map_or(CoordinateKind::Dynamic, |c| c.kind);
+        let is_dynamic = |name: &&String| kind(name) == CoordinateKind::Dynamic;
+        let mut order: Vec<String> = joint_names.iter().filter(is_dynamic).cloned().collect();
+        self.dynamic = order.len();
+        let listed = scene.coordinates.iter().filter(|c| c.kind == CoordinateKind::Prescribed);
+        order.extend(listed.map(|c| c.name.clone()));
         self.index = order.iter().cloned().enumerate().map(|(i, name)| (name, i)).collect();
         for (joint, name) in self.joints.iter_mut().zip(joint_names) {
             joint.coordinate = self.index[name];
@@ -283,11 +278,7 @@ impl Layout {
             .map(|name| {
                 let joint = joint_names.iter().position(|n| *n == name);
                 Coordinate {
-                    kind: if prescribed(&name) {
-                        CoordinateKind::Prescribed
-                    } else {
-                        CoordinateKind::Dynamic
-                    },
+                    kind: kind(&name),
                     is_angle: joint.is_some_and(|j| self.joints[j].kind != JointKind::Prismatic),
                     initial: initial(scene, &name),
                     name,
@@ -323,18 +314,14 @@ impl Layout {
 
     /// A joint is needed where it, or a joint below it, carries what the walk evaluates.
     fn needs(&self, scene: &Scene) -> Needs {
+        let has_body = |joint: &Joint| !matches!(joint.body.inertia, Rotational::None);
         let mut needs = Needs {
-            dynamics: self
-                .joints
-                .iter()
-                .map(|j| !matches!(j.body.inertia, Rotational::None))
-                .collect(),
+            dynamics: self.joints.iter().map(has_body).collect(),
             closure: vec![false; self.joints.len()],
         };
         let mark = |needed: &mut Vec<bool>, frame: &str| {
-            let joint = self.frames[frame].joint;
-            if joint != WORLD {
-                needed[joint] = true;
+            if let Some(needed) = needed.get_mut(self.frames[frame].joint) {
+                *needed = true;
             }
         };
         for point in scene.springs.iter().flat_map(scene::Spring::points) {

@@ -261,7 +261,7 @@ impl Optimizer {
 
     /// Initial state of the trajectory.
     pub fn initial_state(&self) -> State {
-        self.current.trajectory.initial(self.problem.model.dimensions())
+        self.current.trajectory.initial()
     }
 
     /// One iteration. `go_on` is asked every few steps of work; where it says no, the iteration ends

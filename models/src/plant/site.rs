@@ -14,12 +14,12 @@
 use crate::integrator::report::StepError;
 use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Vec3};
-use crate::math::sums::two_sum;
 use crate::math::trigonometry::sin_cos_of;
 use crate::model::mechanism::Model;
 use crate::model::site::Site;
 use crate::model::tree::{Joint, JointKind};
 use crate::plant::facade::Plant;
+use crate::plant::period::add;
 
 /// Where a site is, in world axes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -82,11 +82,10 @@ impl Plant {
     ) -> Result<T, StepError> {
         let (state, before) = (&mut self.state, &mut self.period.before_impulse);
         assert_eq!(impulse.len(), state.p.len(), "entries of the impulse");
-        for (i, impulse) in impulse.iter().enumerate() {
-            before[i] = [state.p[i], state.p_low[i]];
-            let (p, low) = two_sum(state.p[i], impulse + state.p_low[i]);
-            (state.p[i], state.p_low[i]) = (p, low);
+        for (before, (p, low)) in before.iter_mut().zip(state.p.iter().zip(&state.p_low)) {
+            *before = [*p, *low];
         }
+        add(&mut state.p, &mut state.p_low, impulse);
         let outcome = advance(self);
         if outcome.is_err() {
             for (i, [p, low]) in self.period.before_impulse.iter().enumerate() {
