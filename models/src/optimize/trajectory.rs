@@ -1,7 +1,5 @@
 //! Trajectories, row by row.
 
-use std::ops::Range;
-
 use nalgebra::DMatrix;
 
 use crate::integrator::state::State;
@@ -33,20 +31,6 @@ impl Trajectory {
             multipliers: vec![0.0; steps * d.constraints],
             cost: 0.0,
             merit: 0.0,
-        }
-    }
-
-    /// A copy of some steps.
-    pub(super) fn part(&self, steps: Range<usize>) -> Self {
-        let part = |numbers: &[f64], width: usize, rows: usize| {
-            numbers[steps.start * width..][..rows * width].to_vec()
-        };
-        Self {
-            first_step: self.first_step.saturating_add(steps.start as u64),
-            x: part(&self.x, self.d.state(), steps.len() + 1),
-            u: part(&self.u, self.d.input(), steps.len()),
-            multipliers: part(&self.multipliers, self.d.constraints, steps.len()),
-            ..*self
         }
     }
 
