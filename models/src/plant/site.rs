@@ -30,17 +30,11 @@ pub struct Pose {
     pub rotation: [f64; 3],
 }
 
-/// The axis of a joint in the world, and a point of it.
-struct Axis {
-    direction: Vec3,
-    origin: Vec3,
-}
-
 impl Plant {
     /// Where a site is at the present configuration. Costs a sine, a cosine and 60 flops for each joint
     /// above it; allocates nothing.
     pub fn pose(&self, site: &Site) -> Pose {
-        let (rotation, position) = self.walk(site, |_, _| {});
+        let (rotation, position) = self.walk(site, |_, _, _| {});
         let axes = rotation.times(&site.rotation);
         Pose { position: position.0, rotation: Quaternion::of_matrix(&axes).log().0 }
     }
@@ -55,14 +49,14 @@ impl Plant {
     pub fn add_wrench(&self, site: &Site, force: [f64; 3], torque: [f64; 3], out: &mut [f64]) {
         assert_eq!(out.len(), self.model.dimensions.dynamic, "entries of the generalized force");
         let (force, torque) = (Vec3(force), Vec3(torque));
-        let (_, point) = self.walk(site, |_, _| {});
-        self.walk(site, |joint, axis| {
+        let (_, point) = self.walk(site, |_, _, _| {});
+        self.walk(site, |joint, axis, origin| {
             let Some(out) = out.get_mut(joint.coordinate) else { return };
-            let moment = || axis.direction.dot(torque + (point - axis.origin).cross(force));
+            let moment = || axis.dot(torque + (point - origin).cross(force));
             *out += match joint.kind {
                 JointKind::Revolute | JointKind::Ball(_) => moment(),
-                JointKind::Prismatic => axis.direction.dot(force),
-                JointKind::Screw(pitch) => moment() + pitch * axis.direction.dot(force),
+                JointKind::Prismatic => axis.dot(force),
+                JointKind::Screw(pitch) => moment() + pitch * axis.dot(force),
             };
         });
     }
@@ -95,8 +89,9 @@ impl Plant {
         outcome
     }
 
-    /// Rotation of the last joint and position of the point; calls `visit` with the axis of each joint.
-    fn walk(&self, site: &Site, mut visit: impl FnMut(&Joint, &Axis)) -> (Mat3, Vec3) {
+    /// Rotation of the last joint and position of the point; calls `visit` with each joint, its axis
+    /// and a point of that.
+    fn walk(&self, site: &Site, mut visit: impl FnMut(&Joint, Vec3, Vec3)) -> (Mat3, Vec3) {
         let (mut rotation, mut origin) = (Mat3::IDENTITY, Vec3::ZERO);
         for joint in &site.joints {
             let q = self.state.q[joint.coordinate];
@@ -118,7 +113,7 @@ impl Plant {
                     rotation = Mat3([y, z, x]);
                 }
             }
-            visit(joint, &Axis { direction: rotation.0[2], origin });
+            visit(joint, rotation.0[2], origin);
         }
         (rotation, origin + rotation.apply(site.point))
     }
