@@ -81,9 +81,9 @@ impl Model {
 /// Compiles a scene that has been validated.
 fn compile(scene: &Scene) -> Model {
     let layout = Layout::new(scene);
-    let needs = layout.needs(scene);
-    let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &needs.dynamics);
-    let (closure, in_closure) = Tree::pruned(&layout.joints, &needs.closure);
+    let [dynamics, closure] = layout.needs(scene);
+    let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &dynamics);
+    let (closure, in_closure) = Tree::pruned(&layout.joints, &closure);
     let dynamic = layout.dynamic;
 
     let potentials = layout.potentials(scene, &dynamics, &in_dynamics);
@@ -187,14 +187,9 @@ pub(crate) struct Layout {
     pub(crate) coordinates: Vec<Coordinate>,
     pub(crate) dynamic: usize,
     pub(crate) index: BTreeMap<String, usize>,
+    pub(crate) inputs: BTreeMap<String, usize>,
     /// First coordinate of each orientation.
     pub(crate) orientations: Vec<usize>,
-}
-
-/// Which joints which walk needs.
-struct Needs {
-    dynamics: Vec<bool>,
-    closure: Vec<bool>,
 }
 
 impl Layout {
@@ -205,7 +200,8 @@ impl Layout {
         }
         let world = Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
         let frames = BTreeMap::from([("world".to_owned(), world)]);
-        let mut layout = Self { frames, ..Self::default() };
+        let inputs = scene.inputs.iter().enumerate().map(|(i, input)| (input.name.clone(), i));
+        let mut layout = Self { frames, inputs: inputs.collect(), ..Self::default() };
         let mut names = Vec::new();
         let mut stack: Vec<&scene::Frame> =
             children.get("world").map(|c| c.iter().rev().copied().collect()).unwrap_or_default();
@@ -261,17 +257,12 @@ impl Layout {
 
     /// Orders the coordinates: dynamic ones depth first, prescribed ones as listed.
     fn number(&mut self, scene: &Scene, joint_names: &[String]) {
-        let prescribed = |name: &str| {
-            settings(scene, name).is_some_and(|c| c.kind == CoordinateKind::Prescribed)
-        };
-        let dynamic = joint_names.iter().filter(|name| !prescribed(name)).cloned();
-        let listed = scene
-            .coordinates
-            .iter()
-            .filter(|c| c.kind == CoordinateKind::Prescribed)
-            .map(|c| c.name.clone());
-        let order: Vec<String> = dynamic.chain(listed).collect();
-        self.dynamic = joint_names.iter().filter(|name| !prescribed(name)).count();
+        let kind = |name: &str| settings(scene, name).map_or(CoordinateKind::Dynamic, |c| c.kind);
+        let is_dynamic = |name: &&String| kind(name) == CoordinateKind::Dynamic;
+        let mut order: Vec<String> = joint_names.iter().filter(is_dynamic).cloned().collect();
+        self.dynamic = order.len();
+        let listed = scene.coordinates.iter().filter(|c| c.kind == CoordinateKind::Prescribed);
+        order.extend(listed.map(|c| c.name.clone()));
         self.index = order.iter().cloned().enumerate().map(|(i, name)| (name, i)).collect();
         for (joint, name) in self.joints.iter_mut().zip(joint_names) {
             joint.coordinate = self.index[name];
@@ -284,11 +275,7 @@ impl Layout {
             .map(|name| {
                 let joint = joint_names.iter().position(|n| *n == name);
                 Coordinate {
-                    kind: if prescribed(&name) {
-                        CoordinateKind::Prescribed
-                    } else {
-                        CoordinateKind::Dynamic
-                    },
+                    kind: kind(&name),
                     is_angle: joint.is_some_and(|j| self.joints[j].kind != JointKind::Prismatic),
                     initial: initial(scene, &name),
                     name,
@@ -322,40 +309,34 @@ impl Layout {
         self.frames[frame].rotation.apply(direction)
     }
 
-    /// A joint is needed where it, or a joint below it, carries what the walk evaluates.
-    fn needs(&self, scene: &Scene) -> Needs {
-        let mut needs = Needs {
-            dynamics: self
-                .joints
-                .iter()
-                .map(|j| !matches!(j.body.inertia, Rotational::None))
-                .collect(),
-            closure: vec![false; self.joints.len()],
-        };
+    /// Which joints the walks of the dynamics and of the constraints need: a joint is needed where it, or a joint below it, carries what the walk evaluates.
+    fn needs(&self, scene: &Scene) -> [Vec<bool>; 2] {
+        let has_body = |joint: &Joint| !matches!(joint.body.inertia, Rotational::None);
+        let mut dynamics: Vec<bool> = self.joints.iter().map(has_body).collect();
+        let mut closure = vec![false; self.joints.len()];
         let mark = |needed: &mut Vec<bool>, frame: &str| {
-            let joint = self.frames[frame].joint;
-            if joint != WORLD {
-                needed[joint] = true;
+            if let Some(needed) = needed.get_mut(self.frames[frame].joint) {
+                *needed = true;
             }
         };
         for point in scene.springs.iter().flat_map(scene::Spring::points) {
-            mark(&mut needs.dynamics, &point.frame);
+            mark(&mut dynamics, &point.frame);
         }
         for force in &scene.forces {
-            force.points().for_each(|point| mark(&mut needs.dynamics, &point.frame));
+            force.points().for_each(|point| mark(&mut dynamics, &point.frame));
         }
         for constraint in &scene.constraints {
             let frames = constraint.frames();
-            frames.into_iter().for_each(|frame| mark(&mut needs.closure, frame));
+            frames.into_iter().for_each(|frame| mark(&mut closure, frame));
         }
         for i in (0..self.joints.len()).rev() {
             let parent = self.joints[i].parent;
             if parent != WORLD {
-                needs.dynamics[parent] |= needs.dynamics[i];
-                needs.closure[parent] |= needs.closure[i];
+                dynamics[parent] |= dynamics[i];
+                closure[parent] |= closure[i];
             }
         }
-        needs
+        [dynamics, closure]
     }
 
     fn equations(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Equations {

@@ -52,15 +52,16 @@ impl Model {
     }
 }
 
-/// `x ⊖ reference`, of configurations or whole states; `orientations` are the first coordinates of ball joints.
+/// `x ⊖ reference`, of configurations or whole states, as far as `out` goes; `orientations` are the first
+/// coordinates of ball joints.
 pub(crate) fn difference(orientations: &[usize], reference: &[f64], x: &[f64], out: &mut [f64]) {
     for (out, (x, r)) in out.iter_mut().zip(x.iter().zip(reference)) {
         *out = x - r;
     }
     for &i in orientations {
+        let Some(out) = out.get_mut(i..i + 3) else { continue };
         let from = Quaternion::exp(three(reference, i)).inverse();
-        let turned = from.times(Quaternion::exp(three(x, i)));
-        out[i..i + 3].copy_from_slice(&turned.log().0);
+        out.copy_from_slice(&from.times(Quaternion::exp(three(x, i))).log().0);
     }
 }
 

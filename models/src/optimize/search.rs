@@ -261,7 +261,7 @@ impl Optimizer {
 
     /// Initial state of the trajectory.
     pub fn initial_state(&self) -> State {
-        self.current.trajectory.initial(self.problem.model.dimensions())
+        self.current.trajectory.initial()
     }
 
     /// One iteration. `go_on` is asked every few steps of work; where it says no, the iteration ends
@@ -470,7 +470,6 @@ impl Optimizer {
             while backtracks > 0 {
                 self.trials.swap_kept();
                 if !self.try_armijo(backtracks - 1, derivative, go_on)? {
-                    self.linearizer.forget_trial();
                     self.trials.swap_kept();
                     break;
                 }
@@ -478,7 +477,7 @@ impl Optimizer {
             }
         }
         std::mem::swap(&mut self.current, &mut self.trials.last);
-        self.linearizer.accept_trial();
+        self.linearizer.forget();
         if let Some(projection) = &mut self.projection {
             projection.forget();
         }
@@ -512,19 +511,16 @@ impl Optimizer {
         enough: f64,
         go_on: Question<'_>,
     ) -> Result<bool, OptimizeError> {
-        let Self { problem, bounds, current, linearizer, projection, direction, trials, .. } = self;
+        let Self { problem, bounds, current, projection, direction, trials, .. } = self;
         let step = (&*direction, length);
         if !trials.start(problem, current, step) {
             return Ok(false);
-        }
-        if let Some(projection) = projection.as_mut().filter(|_| linearizer.looks_ahead()) {
-            projection.forget();
         }
         let gains = match projection {
             Some(projection) if !direction.is_projection => &projection.gains,
             _ => &direction.gains,
         };
         let point = Point { problem, bounds, motion: &current.trajectory };
-        trials.roll_out(point, step, gains, enough, linearizer, go_on)
+        trials.roll_out(point, step, gains, enough, go_on)
     }
 }

@@ -26,16 +26,12 @@ const REDUNDANT: f64 = 1e-11;
 impl Plant {
     /// Takes `x = (q, p, v)` as it is, whether it satisfies the constraints or not.
     pub(crate) fn place(&mut self, x: &[f64]) {
-        let state = &mut self.state;
-        let (q, rest) = x.split_at(state.q.len());
-        let (p, v) = rest.split_at(state.p.len());
-        state.q.copy_from_slice(q);
-        state.p.copy_from_slice(p);
-        state.v.copy_from_slice(v);
-        state.q_low.fill(0.0);
-        state.p_low.fill(0.0);
-        state.orient(&self.model);
-        self.workspace.forget();
+        let (q, rest) = x.split_at(self.state.q.len());
+        let (p, v) = rest.split_at(self.state.p.len());
+        self.place_configuration(q);
+        self.state.p.copy_from_slice(p);
+        self.state.p_low.fill(0.0);
+        self.state.v.copy_from_slice(v);
     }
 
     /// The derivative of `(q, p̃, v)` by `x = (q, p, v)`, square of `2 nd + 2 nk`: what weights on the
