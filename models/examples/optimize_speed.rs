@@ -59,8 +59,7 @@ fn main() -> Outcome<()> {
             }
             let mut fallback = String::new();
             let ms = least(5, || {
-                // Near the end, where steps are not shortened. The second iteration: the first has no
-                // linearizations that were made behind a roll-out.
+                // Near the end, where steps are not shortened; the second iteration, with warm caches.
                 let mut search = marionette.search(method, is_paper)?;
                 search.set_threads(threads);
                 search.iterate(&mut || true)?;

@@ -63,15 +63,7 @@ fn empty(name: String, description: String) -> Scene {
         description,
         time_step_s: 0.01,
         gravity: [0.0, 0.0, -9.8],
-        damping: 0.0,
-        frames: Vec::new(),
-        coordinates: Vec::new(),
-        springs: Vec::new(),
-        inputs: Vec::new(),
-        forces: Vec::new(),
-        signals: Vec::new(),
-        constraints: Vec::new(),
-        operating_points: Vec::new(),
+        ..Scene::default()
     }
 }
 
@@ -81,9 +73,9 @@ fn hinge(name: String, parent: &str, translation: [f64; 3], body: Body) -> Frame
         name,
         parent: parent.to_owned(),
         translation,
-        rotation: None,
         joint: Some(Joint::Revolute { axis: [0.0, 1.0, 0.0], coordinate: None }),
         body: Some(body),
+        ..Frame::default()
     }
 }
 
@@ -147,13 +139,13 @@ fn tree(n: usize) -> Scene {
             name: name.clone(),
             parent,
             translation,
-            rotation: None,
             joint: Some(Joint::Revolute { axis, coordinate: None }),
             body: Some(Body {
                 mass: 0.96,
                 center_of_mass: [0.01, 0.005, -0.1],
                 inertia: vec![0.003712, 0.003488, 0.0008],
             }),
+            ..Frame::default()
         });
         scene.coordinates.push(dynamic(name.clone(), 0.6 * sin_cos_of(0.7 + 1.3 * i as f64).0));
         scene.inputs.push(Input { name: format!("torque{i}"), coordinate: Some(name), gain: 1.0 });
@@ -183,10 +175,9 @@ fn scissor(n: usize) -> Scene {
     scene.frames.push(Frame {
         name: "slider".to_owned(),
         parent: "world".to_owned(),
-        translation: [0.0; 3],
-        rotation: None,
         joint: Some(Joint::Prismatic { axis: [1.0, 0.0, 0.0], coordinate: None }),
-        body: Some(Body { mass: 1.0, center_of_mass: [0.0; 3], inertia: Vec::new() }),
+        body: Some(Body { mass: 1.0, ..Body::default() }),
+        ..Frame::default()
     });
     scene.coordinates.push(dynamic("slider".to_owned(), LENGTH * sin_cos_of(OPENING).1));
     // Seen from its parent link, every link but the first of a strand folds back by twice the opening.

@@ -26,16 +26,15 @@ use std::sync::Arc;
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
-use crate::kkt::schur::room_for_schur;
+use crate::kkt::schur::SchurComplement;
 use crate::lagrangian::derivatives::Derivatives;
-use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rows::padded;
 use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3, three};
 use crate::math::tree_lu::TreeLu;
 use crate::model::manifold::orientations;
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Dimensions, Model};
 
 /// A pivot of the mass matrix below this fraction of the largest inertia of its coordinate is zero.
 const SINGULAR: f64 = 1e-14;
@@ -138,31 +137,18 @@ pub enum ContinuousError {
 pub struct Continuous {
     model: Arc<Model>,
     equations: Equations<f64>,
-    /// Equations in dual numbers, from the first second-order linearization on.
-    varied: Option<Box<Equations<Dual>>>,
     mass: TreeLu,
-    /// `M⁻¹ A_dᵀ`, row-major, nd by padded nc.
-    responses: Vec<f64>,
-    schur: PivotedLu,
-    value: Accelerations,
-    /// Right-hand sides and solutions, nd + nc rows over the parameters.
-    tangent: Vec<f64>,
+    /// `A_d M⁻¹ A_dᵀ`, with `M⁻¹ A_dᵀ`.
+    schur: SchurComplement,
 }
 
 impl Continuous {
     /// The dynamics of a model.
     pub fn new(model: Arc<Model>) -> Self {
-        let layout = Layout::new(&model);
-        let Layout { nd, nc, .. } = layout;
-        let stride = layout.stride();
         Self {
             equations: Equations::new(&model),
-            varied: None,
             mass: TreeLu::new(&model.elimination),
-            responses: vec![0.0; nd * padded(nc)],
-            schur: room_for_schur(&model, stride),
-            value: Accelerations { acceleration: vec![0.0; nd], multipliers: vec![0.0; nc] },
-            tangent: vec![0.0; (nd + nc) * stride],
+            schur: SchurComplement::new(&model, model.dimensions.stride()),
             model,
         }
     }
@@ -180,8 +166,7 @@ impl Continuous {
     ///
     /// Of redundant constraints, the multipliers are those of least norm.
     pub fn evaluate(&mut self, point: &ContinuousPoint) -> Result<Accelerations, ContinuousError> {
-        self.solve(point)?;
-        Ok(self.value.clone())
+        self.solve(point)
     }
 
     /// Accelerations and constraint forces with their first derivatives, exact. Their cost is that of one evaluation of the derivative
@@ -190,13 +175,11 @@ impl Continuous {
         &mut self,
         point: &ContinuousPoint,
     ) -> Result<ContinuousLinearization, ContinuousError> {
-        self.solve(point)?;
-        self.differentiate();
-        let layout = self.equations.layout;
-        let (rows, stride) = (layout.nd + layout.nc, layout.stride());
-        let jacobian =
-            DMatrix::from_fn(rows, layout.parameters(), |i, b| self.tangent[i * stride + b]);
-        Ok(ContinuousLinearization { value: self.value.clone(), jacobian })
+        let value = self.solve(point)?;
+        let (tangent, d) = (self.differentiate(), self.equations.d);
+        let (rows, stride) = (d.dynamic + d.constraints, d.stride());
+        let jacobian = DMatrix::from_fn(rows, d.parameters(), |i, b| tangent[i * stride + b]);
+        Ok(ContinuousLinearization { value, jacobian })
     }
 
     /// Second derivatives: for each acceleration, then for each multiplier, a symmetric matrix over the
@@ -206,32 +189,31 @@ impl Continuous {
         &mut self,
         point: &ContinuousPoint,
     ) -> Result<Vec<DMatrix<f64>>, ContinuousError> {
-        let layout = self.equations.layout;
-        let (size, rows, stride) = (layout.parameters(), layout.nd + layout.nc, layout.stride());
+        let d = self.equations.d;
+        let (size, rows, stride) = (d.parameters(), d.dynamic + d.constraints, d.stride());
         let entries = rows * size * size;
         if entries > ENTRIES_MAX {
             return Err(ContinuousError::TooLarge { entries });
         }
         self.solve(point)?;
-        self.differentiate();
-        let mut varied =
-            self.varied.take().unwrap_or_else(|| Box::new(Equations::new(&self.model)));
+        let tangent = self.differentiate();
+        let mut varied = Equations::<Dual>::new(&self.model);
         let mut out = vec![DMatrix::zeros(size, size); rows];
         let mut second = vec![0.0; rows * stride];
         for a in 0..size {
-            varied.seed(&self.model, &self.equations, a, &self.tangent);
+            varied.seed(&self.model, &self.equations, a, &tangent);
             varied.evaluate(&self.model);
             for (i, row) in second.chunks_exact_mut(stride).enumerate() {
-                let block = &varied.jacobian[i * layout.columns()..][..layout.columns()];
+                let block = &varied.jacobian[i * d.columns()..][..d.columns()];
                 let (by_parameters, by_unknowns) = block.split_at(size);
                 row.iter_mut().zip(by_parameters).for_each(|(entry, by)| *entry = by.eps);
-                for (by, tangent) in by_unknowns.iter().zip(self.tangent.chunks_exact(stride)) {
+                for (by, moved) in by_unknowns.iter().zip(tangent.chunks_exact(stride)) {
                     if by.eps != 0.0 {
-                        row.iter_mut().zip(tangent).for_each(|(entry, t)| *entry += by.eps * t);
+                        row.iter_mut().zip(moved).for_each(|(entry, t)| *entry += by.eps * t);
                     }
                 }
             }
-            self.solve_rows(&mut second);
+            self.solve_rows(&mut second, stride);
             for (out, row) in out.iter_mut().zip(second.chunks_exact(stride)) {
                 for b in 0..size {
                     out[(a, b)] = row[b];
@@ -242,16 +224,15 @@ impl Continuous {
         for out in &mut out {
             *out = (&*out + out.transpose()) * 0.5;
         }
-        self.varied = Some(varied);
         Ok(out)
     }
 
     /// Finds accelerations and multipliers, and keeps the factors of the equations.
-    fn solve(&mut self, point: &ContinuousPoint) -> Result<(), ContinuousError> {
+    fn solve(&mut self, point: &ContinuousPoint) -> Result<Accelerations, ContinuousError> {
         let model = &*self.model;
         let equations = &mut self.equations;
         equations.place(model, point)?;
-        let Layout { nd, nc, .. } = equations.layout;
+        let (nd, nc) = (equations.d.dynamic, equations.d.constraints);
         equations.evaluate(model);
         self.factor()?;
 
@@ -261,28 +242,27 @@ impl Continuous {
         for (row, residual) in unknowns.chunks_exact_mut(width).zip(&self.equations.residual) {
             row[0] = *residual;
         }
-        self.solve_rows_of(&mut unknowns, width);
+        self.solve_rows(&mut unknowns, width);
         let (accelerations, multipliers) = unknowns.split_at(nd * width);
         let first = |rows: &[f64]| rows.iter().step_by(width).copied().collect();
-        self.value =
+        let value =
             Accelerations { acceleration: first(accelerations), multipliers: first(multipliers) };
-        self.check_solution()?;
-        let Accelerations { acceleration, multipliers } = &self.value;
-        self.equations.acceleration[..nd].copy_from_slice(acceleration);
-        self.equations.multipliers.copy_from_slice(multipliers);
-        Ok(())
+        self.check_solution(&value)?;
+        self.equations.acceleration[..nd].copy_from_slice(&value.acceleration);
+        self.equations.multipliers.copy_from_slice(&value.multipliers);
+        Ok(value)
     }
 
     /// The constraints' accelerations vanish, and everything is finite.
-    fn check_solution(&self) -> Result<(), ContinuousError> {
-        let (equations, layout) = (&self.equations, self.equations.layout);
-        let Accelerations { acceleration, multipliers } = &self.value;
+    fn check_solution(&self, value: &Accelerations) -> Result<(), ContinuousError> {
+        let (equations, d) = (&self.equations, self.equations.d);
+        let Accelerations { acceleration, multipliers } = value;
         if !acceleration.iter().chain(multipliers).all(|x| x.is_finite()) {
             return Err(ContinuousError::Overflow);
         }
-        for (c, bias) in equations.residual[layout.nd..].iter().enumerate() {
-            let row = &equations.motion.jacobian[c * layout.n()..][..layout.nd];
-            let terms = row.iter().zip(acceleration).map(|(entry, a)| entry.re.re * a);
+        for (c, bias) in equations.residual[d.dynamic..].iter().enumerate() {
+            let row = &equations.closure.jacobian[c * d.coordinates()..][..d.dynamic];
+            let terms = row.iter().zip(acceleration).map(|(entry, a)| entry * a);
             let (mut residual, mut scale) = (*bias, bias.abs());
             terms.for_each(|term| {
                 residual += term;
@@ -290,8 +270,9 @@ impl Continuous {
             });
             // Where nothing accelerates, what the constraints take away tells the round-off.
             for (other, multiplier) in multipliers.iter().enumerate() {
-                let responses = self.responses.iter().skip(other).step_by(padded(layout.nc));
-                let taken: f64 = row.iter().zip(responses).map(|(a, r)| a.re.re * r).sum();
+                let responses = self.schur.responses.iter().skip(other);
+                let responses = responses.step_by(padded(d.constraints));
+                let taken: f64 = row.iter().zip(responses).map(|(a, r)| a * r).sum();
                 scale += (taken * multiplier).abs();
             }
             if residual.abs() > INCONSISTENT * scale {
@@ -302,26 +283,25 @@ impl Continuous {
         Ok(())
     }
 
-    /// Derivatives of the unknowns by the parameters, into `tangent`.
-    fn differentiate(&mut self) {
-        let layout = self.equations.layout;
-        let stride = layout.stride();
+    /// Derivatives of the unknowns by the parameters: rows of them, a stride apart.
+    fn differentiate(&mut self) -> Vec<f64> {
+        let d = self.equations.d;
+        let stride = d.stride();
         self.equations.evaluate(&self.model);
-        let mut tangent = std::mem::take(&mut self.tangent);
-        let blocks = self.equations.jacobian.chunks_exact(layout.columns().max(1));
-        for (row, block) in tangent.chunks_exact_mut(stride.max(1)).zip(blocks) {
-            row[..layout.parameters()].copy_from_slice(&block[..layout.parameters()]);
+        let mut tangent = vec![0.0; (d.dynamic + d.constraints) * stride];
+        let blocks = self.equations.jacobian.chunks_exact(d.columns().max(1));
+        for (row, block) in tangent.chunks_exact_mut(stride).zip(blocks) {
+            row[..d.parameters()].copy_from_slice(&block[..d.parameters()]);
         }
-        self.solve_rows(&mut tangent);
-        self.tangent = tangent;
+        self.solve_rows(&mut tangent, stride);
+        tangent
     }
 
     /// Factors the mass matrix and `S = A_d M⁻¹ A_dᵀ`.
     fn factor(&mut self) -> Result<(), ContinuousError> {
         let model = &*self.model;
-        let Layout { nd, nc, .. } = self.equations.layout;
-        let n = self.equations.layout.n();
-        let elimination = &model.elimination;
+        let (d, elimination) = (self.equations.d, &model.elimination);
+        let (n, nd, nc) = (d.coordinates(), d.dynamic, d.constraints);
         for row in 0..nd {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let entry = elimination.ancestors[slot] * n + row;
@@ -335,53 +315,48 @@ impl Continuous {
             return Err(ContinuousError::SingularMass { coordinate, pivot: pivot.relative });
         }
         if nc > 0 {
+            let Equations { closure, q, .. } = &mut self.equations;
+            closure.differentiate(model, q);
+            let SchurComplement { responses, lu } = &mut self.schur;
             let width = padded(nc);
-            let jacobian = &self.equations.motion.jacobian;
-            for i in 0..nd {
-                for c in 0..nc {
-                    self.responses[i * width + c] = jacobian[c * n + i].re.re;
-                }
+            for (c, row) in closure.jacobian.chunks_exact(n).enumerate() {
+                row[..nd]
+                    .iter()
+                    .enumerate()
+                    .for_each(|(i, entry)| responses[i * width + c] = *entry);
             }
-            self.mass.solve_rows(elimination, &mut self.responses, width, width);
-            for c in 0..nc {
-                let target = &mut self.schur.matrix[c * nc..][..nc];
+            self.mass.solve_rows(elimination, responses, width, width);
+            for (row, target) in closure.jacobian.chunks_exact(n).zip(lu.matrix.chunks_mut(nc)) {
                 target.fill(0.0);
-                for (entry, responses) in
-                    jacobian[c * n..][..nd].iter().zip(self.responses.chunks_exact(width))
-                {
-                    target.iter_mut().zip(responses).for_each(|(t, r)| *t += entry.re.re * r);
+                for (entry, responses) in row[..nd].iter().zip(responses.chunks_exact(width)) {
+                    target.iter_mut().zip(responses).for_each(|(t, r)| *t += entry * r);
                 }
             }
-            self.schur.factor();
+            lu.factor();
         }
         Ok(())
     }
 
-    fn solve_rows(&mut self, rows: &mut [f64]) {
-        self.solve_rows_of(rows, self.equations.layout.stride());
-    }
-
     /// Solves `M a + A_dᵀ λ = −r1`, `A_d a = −r2` in place; rows `(r1, r2)` become `(a, λ)`.
-    fn solve_rows_of(&mut self, rows: &mut [f64], stride: usize) {
+    fn solve_rows(&mut self, rows: &mut [f64], stride: usize) {
         let model = &*self.model;
-        let Layout { nd, nc, .. } = self.equations.layout;
-        let n = self.equations.layout.n();
+        let d = self.equations.d;
+        let (n, nd, nc) = (d.coordinates(), d.dynamic, d.constraints);
         let (first, second) = rows.split_at_mut(nd * stride);
         self.mass.solve_rows(&model.elimination, first, stride, stride);
         // S λ = r2 − A_d M⁻¹ r1, a = −M⁻¹ r1 − M⁻¹ A_dᵀ λ.
         if nc > 0 {
             for (c, target) in second.chunks_exact_mut(stride).enumerate() {
-                let jacobian = &self.equations.motion.jacobian[c * n..][..nd];
+                let jacobian = &self.equations.closure.jacobian[c * n..][..nd];
                 for (entry, row) in jacobian.iter().zip(first.chunks_exact(stride)) {
-                    let entry = entry.re.re;
                     target.iter_mut().zip(row).for_each(|(t, r)| *t -= entry * r);
                 }
             }
-            self.schur.solve_rows(second, stride);
+            self.schur.lu.solve_rows(second, stride);
         }
         for (i, row) in first.chunks_exact_mut(stride).enumerate() {
             row.iter_mut().for_each(|entry| *entry = -*entry);
-            let responses = &self.responses[i * padded(nc)..][..nc];
+            let responses = &self.schur.responses[i * padded(nc)..][..nc];
             for (response, lambda) in responses.iter().zip(second.chunks_exact(stride)) {
                 row.iter_mut().zip(lambda).for_each(|(entry, l)| *entry -= response * l);
             }
@@ -389,28 +364,11 @@ impl Continuous {
     }
 }
 
-/// Sizes; the parameters are `(q, v, inputs, prescribed accelerations)`, after their columns come those
-/// of the unknowns.
-#[derive(Clone, Copy, Debug)]
-struct Layout {
-    nd: usize,
-    nk: usize,
-    ni: usize,
-    nc: usize,
-}
-
-impl Layout {
-    fn new(model: &Model) -> Self {
-        let d = model.dimensions;
-        Self { nd: d.dynamic, nk: d.prescribed, ni: d.inputs, nc: d.constraints }
-    }
-
-    fn n(&self) -> usize {
-        self.nd + self.nk
-    }
-
+/// The parameters are `(q, v, inputs, prescribed accelerations)`; after their columns come those of the
+/// unknowns.
+impl Dimensions {
     fn parameters(&self) -> usize {
-        2 * self.n() + self.ni + self.nk
+        2 * self.coordinates() + self.input()
     }
 
     fn stride(&self) -> usize {
@@ -419,15 +377,15 @@ impl Layout {
 
     /// Columns of the equations' Jacobian.
     fn columns(&self) -> usize {
-        self.parameters() + self.nd + self.nc
+        self.parameters() + self.dynamic + self.constraints
     }
 
     /// Column of the acceleration of a coordinate.
     fn acceleration(&self, coordinate: usize) -> usize {
-        if coordinate < self.nd {
+        if coordinate < self.dynamic {
             self.parameters() + coordinate
         } else {
-            2 * self.n() + self.ni + coordinate - self.nd
+            2 * self.coordinates() + self.inputs + coordinate - self.dynamic
         }
     }
 }
@@ -435,7 +393,7 @@ impl Layout {
 /// The equations of motion and constraint accelerations at a point, with their first derivatives.
 #[derive(Clone, Debug)]
 struct Equations<S> {
-    layout: Layout,
+    d: Dimensions,
     q: Vec<S>,
     v: Vec<S>,
     inputs: Vec<S>,
@@ -449,71 +407,51 @@ struct Equations<S> {
     /// Along the motion, twice.
     motion: Closure<Dual<Dual<S>>>,
     hessian: Vec<S>,
-    along_q: Vec<Dual<S>>,
-    along_v: Vec<Dual<S>>,
-    constant_inputs: Vec<Dual<S>>,
-    along_twice: Vec<Dual<Dual<S>>>,
     orientations: Vec<Mat3<S>>,
-    orientations_along: Vec<Mat3<Dual<S>>>,
-    orientations_twice: Vec<Mat3<Dual<Dual<S>>>>,
     /// nd + nc.
     residual: Vec<S>,
-    /// nd + nc rows, [`Layout::columns`] columns.
+    /// nd + nc rows, [`Dimensions::columns`] columns.
     jacobian: Vec<S>,
 }
 
 impl<S: Scalar> Equations<S> {
     fn new(model: &Model) -> Self {
-        let layout = Layout::new(model);
-        let (n, rows) = (layout.n(), layout.nd + layout.nc);
-        let no = model.orientations.len();
+        let d = model.dimensions;
+        let (n, rows) = (d.coordinates(), d.dynamic + d.constraints);
         let zeros = |len: usize| vec![S::ZERO; len];
         Self {
-            layout,
+            d,
             q: zeros(n),
             v: zeros(n),
-            inputs: zeros(layout.ni),
+            inputs: zeros(d.inputs),
             acceleration: zeros(n),
-            multipliers: zeros(layout.nc),
+            multipliers: zeros(d.constraints),
             blocks: Derivatives::new(model),
             closure: Closure::new(model),
             motion: Closure::new(model),
-            hessian: zeros(if layout.nc > 0 { n * n } else { 0 }),
-            along_q: vec![Dual::ZERO; n],
-            along_v: vec![Dual::ZERO; n],
-            constant_inputs: vec![Dual::ZERO; layout.ni],
-            along_twice: vec![Dual::ZERO; n],
-            orientations: vec![Mat3::IDENTITY; no],
-            orientations_along: vec![Mat3::IDENTITY; no],
-            orientations_twice: vec![Mat3::IDENTITY; no],
+            hessian: zeros(if d.constraints > 0 { n * n } else { 0 }),
+            orientations: vec![Mat3::IDENTITY; model.orientations.len()],
             residual: zeros(rows),
-            jacobian: zeros(rows * layout.columns()),
+            jacobian: zeros(rows * d.columns()),
         }
     }
 
     fn evaluate(&mut self, model: &Model) {
-        for i in 0..self.q.len() {
-            let (q, v, a) = (self.q[i], self.v[i], self.acceleration[i]);
-            self.along_q[i] = Dual::new(q, v);
-            self.along_v[i] = Dual::new(v, a);
-            self.along_twice[i] = Dual::new(Dual::new(q, v), Dual::new(v, a));
-        }
-        for (o, &i) in model.orientations.iter().enumerate() {
-            let still = self.orientations[o];
+        let (along_q, along_v) = (along(&self.q, &self.v), along(&self.v, &self.acceleration));
+        let constant = along(&self.inputs, &vec![S::ZERO; self.inputs.len()]);
+        let (mut turned, mut turned_twice) = (Vec::new(), Vec::new());
+        for (still, &i) in self.orientations.iter().zip(&model.orientations) {
             let (spin, change) = (three(&self.v, i), three(&self.acceleration, i));
-            let along = pairs(Vec3::ZERO, spin);
-            self.orientations_along[o] = at_rest(&still).times(&rotation::exp(along));
-            let twice = pairs(along, pairs(spin, change));
-            self.orientations_twice[o] = at_rest(&at_rest(&still)).times(&rotation::exp(twice));
+            let turn = pairs(Vec3::ZERO, spin);
+            turned.push(at_rest(still).times(&rotation::exp(turn)));
+            let twice = pairs(turn, pairs(spin, change));
+            turned_twice.push(at_rest(&at_rest(still)).times(&rotation::exp(twice)));
         }
-        for (along, input) in self.constant_inputs.iter_mut().zip(&self.inputs) {
-            *along = Dual::new(*input, S::ZERO);
-        }
-        let at = (&self.along_q[..], &self.orientations_along[..]);
-        self.blocks.evaluate(model, at, &self.along_v, &self.constant_inputs);
-        if self.layout.nc > 0 {
-            self.motion.evaluate(model, &self.along_twice, &self.orientations_twice);
-            self.motion.differentiate(model, &self.along_twice);
+        self.blocks.evaluate(model, (&along_q, &turned), &along_v, &constant);
+        if self.d.constraints > 0 {
+            let twice = along(&along_q, &along_v);
+            self.motion.evaluate(model, &twice, &turned_twice);
+            self.motion.differentiate(model, &twice);
             self.closure.evaluate(model, &self.q, &self.orientations);
             self.closure.hessian(model, &self.q, &self.multipliers, &mut self.hessian);
         }
@@ -534,9 +472,8 @@ impl<S: Scalar> Equations<S> {
     /// by v, h      (e_j × ω)·X h
     /// ```
     fn turn(&mut self, model: &Model) {
-        let layout = self.layout;
-        let Layout { nd, nc, .. } = layout;
-        let (n, columns) = (layout.n(), layout.columns());
+        let d = self.d;
+        let (n, nd, nc, columns) = (d.coordinates(), d.dynamic, d.constraints, d.columns());
         for &i in &model.orientations {
             let (spin, change) = (three(&self.v, i), three(&self.acceleration, i));
             for b in 0..3 {
@@ -584,11 +521,10 @@ impl<S: Scalar> Equations<S> {
 
     /// Rows of the dynamic coordinates.
     fn fill_dynamics(&mut self) {
-        let (layout, blocks) = (self.layout, &self.blocks);
-        let Layout { nd, ni, nc, .. } = layout;
-        let n = layout.n();
+        let (d, blocks) = (self.d, &self.blocks);
+        let (n, nd, ni, nc) = (d.coordinates(), d.dynamic, d.inputs, d.constraints);
         for i in 0..nd {
-            let row = &mut self.jacobian[i * layout.columns()..][..layout.columns()];
+            let row = &mut self.jacobian[i * d.columns()..][..d.columns()];
             for j in 0..n {
                 let (entry, mirrored) = (i * n + j, j * n + i);
                 let l_vq = blocks.l_qv[mirrored];
@@ -598,7 +534,7 @@ impl<S: Scalar> Equations<S> {
                 }
                 row[n + j] =
                     blocks.l_vv[entry].eps + l_vq.re - blocks.l_qv[entry].re - blocks.f_v[entry].re;
-                row[layout.acceleration(j)] = blocks.l_vv[entry].re;
+                row[d.acceleration(j)] = blocks.l_vv[entry].re;
             }
             for j in 0..ni {
                 row[2 * n + j] = -blocks.f_u[i * ni + j].re;
@@ -606,7 +542,7 @@ impl<S: Scalar> Equations<S> {
             let mut residual = blocks.l_v[i].eps - blocks.l_q[i].re - blocks.force[i].re;
             for c in 0..nc {
                 let entry = self.motion.jacobian[c * n + i].re.re;
-                row[layout.parameters() + nd + c] = entry;
+                row[d.parameters() + nd + c] = entry;
                 residual += entry * self.multipliers[c];
             }
             self.residual[i] = residual;
@@ -615,17 +551,17 @@ impl<S: Scalar> Equations<S> {
 
     /// Rows of the constraints.
     fn fill_constraints(&mut self) {
-        let layout = self.layout;
-        let n = layout.n();
-        for c in 0..layout.nc {
-            let row = &mut self.jacobian[(layout.nd + c) * layout.columns()..][..layout.columns()];
+        let d = self.d;
+        let n = d.coordinates();
+        for c in 0..d.constraints {
+            let row = &mut self.jacobian[(d.dynamic + c) * d.columns()..][..d.columns()];
             for j in 0..n {
                 let entry = self.motion.jacobian[c * n + j];
                 row[j] = entry.eps.eps;
                 row[n + j] = entry.re.eps * 2.0;
-                row[layout.acceleration(j)] = entry.re.re;
+                row[d.acceleration(j)] = entry.re.re;
             }
-            self.residual[layout.nd + c] = self.motion.value[c].eps.eps;
+            self.residual[d.dynamic + c] = self.motion.value[c].eps.eps;
         }
     }
 }
@@ -633,8 +569,7 @@ impl<S: Scalar> Equations<S> {
 impl Equations<f64> {
     /// Takes a point over, with unknowns zero.
     fn place(&mut self, model: &Model, point: &ContinuousPoint) -> Result<(), ContinuousError> {
-        let Layout { nd, .. } = self.layout;
-        let (dynamic, prescribed) = self.acceleration.split_at_mut(nd);
+        let (dynamic, prescribed) = self.acceleration.split_at_mut(self.d.dynamic);
         dynamic.fill(0.0);
         self.multipliers.fill(0.0);
         take("q", &point.q, &mut self.q)?;
@@ -648,8 +583,8 @@ impl Equations<f64> {
 impl Equations<Dual> {
     /// The point of `at`, moving along the tangent of parameter `a`.
     fn seed(&mut self, model: &Model, at: &Equations<f64>, a: usize, tangent: &[f64]) {
-        let layout = self.layout;
-        let (n, stride) = (layout.n(), layout.stride());
+        let d = self.d;
+        let (n, stride) = (d.coordinates(), d.stride());
         let unit = |is: bool| if is { 1.0 } else { 0.0 };
         for (o, &i) in model.orientations.iter().enumerate() {
             let turn = Vec3([0, 1, 2].map(|b| Dual::new(0.0, unit(a == i + b))));
@@ -658,21 +593,23 @@ impl Equations<Dual> {
         for i in 0..n {
             self.q[i] = Dual::new(at.q[i], unit(a == i));
             self.v[i] = Dual::new(at.v[i], unit(a == n + i));
-            let moved = if i < layout.nd {
-                tangent[i * stride + a]
-            } else {
-                unit(a == layout.acceleration(i))
-            };
+            let moved =
+                if i < d.dynamic { tangent[i * stride + a] } else { unit(a == d.acceleration(i)) };
             self.acceleration[i] = Dual::new(at.acceleration[i], moved);
         }
-        for i in 0..layout.ni {
+        for i in 0..d.inputs {
             self.inputs[i] = Dual::new(at.inputs[i], unit(a == 2 * n + i));
         }
-        for c in 0..layout.nc {
-            let moved = tangent[(layout.nd + c) * stride + a];
+        for c in 0..d.constraints {
+            let moved = tangent[(d.dynamic + c) * stride + a];
             self.multipliers[c] = Dual::new(at.multipliers[c], moved);
         }
     }
+}
+
+/// Numbers that change at the rates of others.
+fn along<S: Scalar>(re: &[S], eps: &[S]) -> Vec<Dual<S>> {
+    re.iter().zip(eps).map(|(re, eps)| Dual::new(*re, *eps)).collect()
 }
 
 fn pairs<S: Scalar>(re: Vec3<S>, eps: Vec3<S>) -> Vec3<Dual<S>> {

@@ -14,6 +14,10 @@
 //! | how the map moves by itself | [`modes`] |
 //! | how it answers a sinusoid | [`TransferFunction`] |
 //!
+//! Read `finite_horizon` first, then `infinite_horizon`; filters (`kalman`) are their duals. Under the first, and
+//! under trajectory optimisation, is the recursion `lq`. A tangent space makes the same problem one on the
+//! manifold of the constraints: `coordinates` has the maps between both.
+//!
 //! Everything here allocates and may take milliseconds to seconds: it belongs on a worker, never
 //! on a control path. Costs are given in flops of `n` states and `m` inputs.
 

@@ -45,7 +45,7 @@
 //! out its second derivative (Gauss-Newton), Newton has it.
 //!
 //! **Projected momentum.** With constraints the momentum of the state holds a part that depends on the
-//! step. With [`Momentum::Projected`] the cost weighs `p̃` in its place
+//! step. With [`Momentum::Projected`](crate::control::Momentum::Projected) the cost weighs `p̃` in its place
 //! ([`Plant::projected_momentum`](crate::Plant::projected_momentum)):
 //!
 //! ```text
@@ -108,6 +108,8 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+// In the order of an iteration: `search`, `problem` (the cost), `derivatives` of it, `linearizer` (of the map),
+// `projection`, `direction`, `trials`, and `search/ending`.
 mod bounds;
 mod chart;
 mod derivatives;

@@ -115,7 +115,7 @@ pub enum ReferenceError {
 }
 
 /// How a configuration trajectory compares with the motions of the plant.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Assessment {
     /// Largest violation `|h(q[k])|` of a constraint, in its unit. Inputs that prescribe other positions
     /// than `q` has count as well.
@@ -275,32 +275,29 @@ impl<'a> Assess<'a> {
         u
     }
 
-    fn linearize(
+    /// Has the plant evaluate step `k`, with multipliers.
+    fn evaluate(
         &mut self,
         k: usize,
         multipliers: &[f64],
-        out: &mut Linearization,
+        evaluate: impl FnOnce(&mut Plant, &KnownStep<'_>) -> Result<(), StepError>,
     ) -> Result<(), ReferenceError> {
         let (q0, q1, u) = (row(self.q, k), row(self.q, k + 1), self.input(k));
         let index = self.first_step + k as u64;
         let step = KnownStep { index, q0: &q0, p0: None, q1: &q1, multipliers, u: &u };
-        self.plant
-            .linearize_known(&step, out)
+        evaluate(&mut self.plant, &step)
             .map_err(|error| ReferenceError::Linearization { step: k, error })
     }
 
     fn terms(&mut self, k: usize, out: &mut Linearization) -> Result<StepTerms, ReferenceError> {
         let d = self.plant.model().dimensions();
         let none = vec![0.0; d.constraints];
-        self.linearize(k, &none, out)?;
-        let [at_start, at_end] = out.input_impulses();
-        let (q0, q1, u) = (row(self.q, k), row(self.q, k + 1), self.input(k));
-        let index = self.first_step + k as u64;
-        let step = KnownStep { index, q0: &q0, p0: None, q1: &q1, multipliers: &none, u: &u };
         let (mut leaves, mut arrives) = (DVector::zeros(d.dynamic), DVector::zeros(d.dynamic));
-        self.plant
-            .momenta_of_known(&step, leaves.as_mut_slice(), arrives.as_mut_slice())
-            .map_err(|error| ReferenceError::Linearization { step: k, error })?;
+        self.evaluate(k, &none, |plant, step| {
+            plant.linearize_known(step, out)?;
+            plant.momenta_of_known(step, leaves.as_mut_slice(), arrives.as_mut_slice())
+        })?;
+        let [at_start, at_end] = out.input_impulses();
         Ok(StepTerms { leaves, arrives, at_start, at_end })
     }
 
@@ -353,18 +350,10 @@ impl<'a> Assess<'a> {
             }
         }
         let mut assessment = Assessment {
-            constraint_violation: 0.0,
-            constraint_violation_step: 0,
-            constraint: String::new(),
-            unexplained_force: 0.0,
-            unexplained_force_step: 0,
-            unexplained_force_coordinate: String::new(),
-            unexplained_acceleration: 0.0,
-            unexplained_step: 0,
-            unexplained_coordinate: String::new(),
             inputs: self.inputs.clone(),
             states: DMatrix::zeros(steps + 1, d.state()),
             multipliers: DMatrix::zeros(steps, d.constraints),
+            ..Assessment::default()
         };
         self.explain(&terms, &nodes, &mut assessment);
         self.find_states(&terms, &mut assessment);
@@ -550,7 +539,8 @@ pub fn project(
     let mut out = Linearization::new(&model);
     let (mut samples, mut tangents) = (Vec::with_capacity(steps), Vec::new());
     for k in 0..steps {
-        assess.linearize(k, &row(&assessment.multipliers, k), &mut out)?;
+        let multipliers = row(&assessment.multipliers, k);
+        assess.evaluate(k, &multipliers, |plant, step| plant.linearize_known(step, &mut out))?;
         samples.push(Sample { a: out.a(), b: out.b() });
     }
     let gains = if on_manifold && d.constraints > 0 {

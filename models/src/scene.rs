@@ -31,7 +31,7 @@ use crate::scene::point::{is_zero, is_zero3, one};
 pub use crate::math::spline::Knot;
 
 /// A mechanism: a tree of frames with joints and bodies, what acts on it, and what constrains it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Scene {
     /// Version of the scene format; 1.
@@ -83,7 +83,7 @@ fn default_time_step() -> f64 {
 /// A frame, placed in its parent; its joint moves it away from there.
 ///
 /// `pose = parent pose * translation * rotation * joint(coordinate)`
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Frame {
     /// Name, unique in the scene; `world` is taken.
@@ -205,7 +205,7 @@ impl Motion {
 }
 
 /// A rigid body.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Body {
     /// Mass, kg; zero is allowed where there is inertia elsewhere.
@@ -440,19 +440,9 @@ pub enum Length {
     Coordinate(String),
 }
 
-impl From<f64> for Length {
-    fn from(length: f64) -> Self {
-        Self::Fixed(length)
-    }
-}
-
-impl From<String> for Length {
-    fn from(name: String) -> Self {
-        Self::Coordinate(name)
-    }
-}
-
 impl NumberOrName for Length {
+    const NUMBER: fn(f64) -> Self = Self::Fixed;
+    const NAME: fn(String) -> Self = Self::Coordinate;
     const ALLOWED: &'static str = "a number of metres or the name of a prescribed coordinate";
 }
 
@@ -495,7 +485,8 @@ pub struct OperatingPoint {
 }
 
 /// One error of a scene.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{path}{}{message}", if path.is_empty() { "" } else { ": " })]
 pub struct Problem {
     /// Where, for example `frames[3].body.mass`.
     pub path: String,
@@ -509,15 +500,6 @@ pub struct Problem {
 pub struct SceneError {
     /// At least one.
     pub problems: Vec<Problem>,
-}
-
-impl std::fmt::Display for Problem {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        if self.path.is_empty() {
-            return f.write_str(&self.message);
-        }
-        write!(f, "{}: {}", self.path, self.message)
-    }
 }
 
 impl Frame {

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::config::{Config, ConfigError, Listen, LogFormat};
-use crate::modes::Mode;
-use crate::priority::Priority;
+use crate::core::modes::Mode;
+use crate::core::priority::Priority;
 
 /// Simulated plants for real-time controllers.
 #[derive(Debug, Parser)]

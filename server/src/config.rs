@@ -9,12 +9,12 @@ use std::time::Duration;
 use plantd_proto::link::Wait;
 use serde::{Deserialize, Serialize};
 
-use crate::limits::{LimitError, Limits};
-use crate::link::LinkConfig;
-use crate::modes::Mode;
-use crate::names::{Names, is_host_name, is_origin};
-use crate::priority::{Priority, Scheduling};
-use crate::realtime::RealTimeSettings;
+use crate::core::limits::{LimitError, Limits};
+use crate::core::modes::Mode;
+use crate::core::priority::{Priority, Scheduling};
+use crate::core::realtime::settings::RealTimeSettings;
+use crate::wire::link::config::LinkConfig;
+use crate::wire::names::{Names, is_host_name, is_origin};
 
 /// Port of gRPC over TCP unless another one is given.
 pub const DEFAULT_PORT: u16 = 50051;

@@ -10,7 +10,7 @@ use tokio::sync::oneshot;
 use tracing_subscriber::EnvFilter;
 
 use crate::config::{Config, LogConfig, LogFormat};
-use crate::modes::Mode;
+use crate::core::modes::Mode;
 use crate::serve::{Addresses, Shutdown, run};
 
 /// Sets up logging to standard error.

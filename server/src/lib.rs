@@ -1,44 +1,24 @@
 //! The plantd server: plant sessions and the services of `plantd.v1`.
 //!
 //! ```text
-//!  grpc/* (requests in, messages out)        link/* (shared memory)
-//!            |                                     |
-//!            +------------ session: one plant, one lease, many watchers
-//!            |                  |
-//!         workers          watch: latest frame wins, per watcher
+//!  serve, daemon, cli, config: a process
+//!            |
+//!  wire: requests in, messages out; shared memory; recordings; saved plants
+//!            |
+//!  core: session (one plant, one lease, many watchers), channels, loops, feedback, workers
 //! ```
+//!
+//! From the ground up, each folder knows only those before it: `core` (its own files), `core/metrics`, `publish`,
+//! `workers`, `channels`, `feedback`, `plant`, `realtime`, `session`; `wire` (its own files), `wire/edge`,
+//! `message`, `link`, `record`, `shared`, `models`, `control`, `plants`; the files beside this one.
 //!
 //! [`serve::run`] is the whole server; [`daemon`] makes a process of it.
 
-pub mod admission;
-pub mod catalog;
-pub mod channels;
 pub mod cli;
 pub mod config;
-pub mod connection;
-pub mod convert;
+pub mod core;
 pub mod daemon;
-pub mod feedback;
-pub mod frame;
-pub mod grpc;
-pub mod hub;
-pub mod limits;
-pub mod link;
 pub mod listen;
 mod memory;
-pub mod metrics;
-pub mod metrics_http;
-pub mod modes;
-pub mod names;
-pub mod parameters;
-pub mod priority;
-pub mod realtime;
-pub mod record;
-pub mod regulator;
-pub mod ring;
 pub mod serve;
-pub mod session;
-pub mod state;
-pub mod status;
-pub mod watch;
-pub mod workers;
+pub mod wire;

@@ -5,13 +5,17 @@ use std::io;
 use std::net::SocketAddr;
 use std::os::unix::fs::{FileTypeExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use tokio::net::UnixStream;
 use tokio_stream::wrappers::UnixListenerStream;
 use tonic::transport::server::TcpIncoming;
 
-use crate::grpc::KEEP_ALIVE_INTERVAL;
-use crate::modes::Mode;
+use crate::core::modes::Mode;
+
+/// How often the server asks a silent client whether it is alive, and how long it may take to say so.
+pub(crate) const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(10);
+pub(crate) const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Listens on a TCP address. Small answers are sent at once: with Nagle's algorithm a call takes
 /// 40 ms.

@@ -6,8 +6,8 @@ use std::time::Duration;
 use anyhow::{Context as _, Result};
 use clap::Parser as _;
 use plantd_server::cli::{Cli, Command, Settings};
+use plantd_server::core::limits::Limits;
 use plantd_server::daemon;
-use plantd_server::limits::Limits;
 
 /// Time for computations that nobody waits for any more to notice that the server has ended.
 const LEFTOVERS_MAX: Duration = Duration::from_secs(1);

@@ -28,24 +28,24 @@ use v1::model_service_server::ModelServiceServer;
 use v1::plant_service_server::PlantServiceServer;
 use v1::recording_service_server::RecordingServiceServer;
 
-use crate::admission::Places;
 use crate::config::{Config, Listen};
-use crate::grpc::channels::ChannelService;
-use crate::grpc::control::ControlService;
-use crate::grpc::ending::ending_with;
-use crate::grpc::gate::GateLayer;
-use crate::grpc::model::ModelService;
-use crate::grpc::observe::ObserveLayer;
-use crate::grpc::plant::PlantService;
-use crate::grpc::record::RecordingService;
-use crate::grpc::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT};
-use crate::hub::Hub;
-use crate::limits::Limits;
-use crate::link::LinkHost;
-use crate::listen::{UnixSocket, bind_tcp};
-use crate::record::Recordings;
-use crate::state::StateDirectory;
-use crate::{memory, metrics_http};
+use crate::core::limits::Limits;
+use crate::listen::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT, UnixSocket, bind_tcp};
+use crate::memory;
+use crate::wire::control::service::ControlService;
+use crate::wire::edge::admission::Places;
+use crate::wire::edge::ending::ending_with;
+use crate::wire::edge::gate::GateLayer;
+use crate::wire::edge::metrics_http;
+use crate::wire::edge::observe::ObserveLayer;
+use crate::wire::link::host::LinkHost;
+use crate::wire::models::model::ModelService;
+use crate::wire::plants::channels::ChannelService;
+use crate::wire::plants::plant::PlantService;
+use crate::wire::plants::recordings::RecordingService;
+use crate::wire::record::directory::Recordings;
+use crate::wire::shared::hub::Hub;
+use crate::wire::shared::state_directory::StateDirectory;
 
 /// Longest wait at the end for plants to be saved on a disk that does not answer.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
@@ -70,7 +70,8 @@ pub struct RunningServer {
     hub: Arc<Hub>,
     config: Config,
     addresses: Addresses,
-    health: HealthReporter,
+    /// Until it was said that the server serves no more: whoever watches it hears that once.
+    health: Option<HealthReporter>,
     /// Somebody asks whether the server is healthy, and learns before its end that it is going.
     is_asked_for_health: Arc<AtomicBool>,
     listeners: JoinSet<Result<(), tonic::transport::Error>>,
@@ -168,7 +169,7 @@ impl RunningServer {
         let mut server = Self {
             is_asked_for_health,
             addresses: Addresses { link_root, pid: std::process::id(), ..Addresses::default() },
-            health,
+            health: Some(health),
             listeners: JoinSet::new(),
             closing: CancellationToken::new(),
             saver: tokio::spawn(save_plants(Arc::clone(&hub), config.state_interval())),
@@ -286,7 +287,7 @@ impl RunningServer {
 
     /// Says that it is not serving any more, and serves on for the configured time, so that balancers
     /// send nobody here who would not be let in. Nobody waits where nobody asks for its health.
-    pub async fn drain(&self, hurry: impl Future<Output = ()>) {
+    pub async fn drain(&mut self, hurry: impl Future<Output = ()>) {
         self.say_not_serving().await;
         let drain = self.config.drain();
         if drain.is_zero() || !self.is_asked_for_health.load(Ordering::Relaxed) {
@@ -299,12 +300,13 @@ impl RunningServer {
         }
     }
 
-    async fn say_not_serving(&self) {
-        self.health.set_not_serving::<ModelServiceServer<ModelService>>().await;
-        self.health.set_not_serving::<PlantServiceServer<PlantService>>().await;
-        self.health.set_not_serving::<ControlServiceServer<ControlService>>().await;
-        self.health.set_not_serving::<ChannelServiceServer<ChannelService>>().await;
-        self.health.set_not_serving::<RecordingServiceServer<RecordingService>>().await;
+    async fn say_not_serving(&mut self) {
+        let Some(health) = self.health.take() else { return };
+        health.set_not_serving::<ModelServiceServer<ModelService>>().await;
+        health.set_not_serving::<PlantServiceServer<PlantService>>().await;
+        health.set_not_serving::<ControlServiceServer<ControlService>>().await;
+        health.set_not_serving::<ChannelServiceServer<ChannelService>>().await;
+        health.set_not_serving::<RecordingServiceServer<RecordingService>>().await;
     }
 
     /// Ends: no new connections, streams end with UNAVAILABLE, calls may finish within the grace.
@@ -313,7 +315,7 @@ impl RunningServer {
         self.stop_within(future::pending()).await;
     }
 
-    /// The same, with a grace that `hurry` cuts short.
+    /// Ends, with a grace that `hurry` cuts short.
     async fn stop_within(mut self, hurry: impl Future<Output = ()>) {
         self.say_not_serving().await;
         self.closing.cancel();
@@ -402,9 +404,7 @@ fn load_scene(hub: &Hub, path: &Path) -> Result<()> {
     let scene = plantd_models::Scene::from_text(&text)?;
     let model = Model::compile(&scene)?;
     let name = model.scene().name.clone();
-    hub.catalog
-        .insert(&name, Arc::new(model))
-        .map_err(|fault| anyhow::anyhow!("{}", tonic::Status::from(fault).message()))?;
+    hub.catalog.insert(&name, Arc::new(model))?;
     tracing::info!(model = name, "scene loaded");
     Ok(())
 }

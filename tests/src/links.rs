@@ -11,10 +11,12 @@ use anyhow::{Context as _, Result, anyhow, ensure};
 use plantd_client::link::{LinkDriver, LinkError, LinkOptions, Wait};
 use plantd_models::{Model, Plant, Settings, builtin};
 use plantd_proto::link::SHARED_MEMORY_DIRECTORY;
-use plantd_server::link::{LinkConfig, LinkHost};
-use plantd_server::metrics::Metrics;
-use plantd_server::realtime::{RealTime, RealTimeSettings};
-use plantd_server::session::Session;
+use plantd_server::core::metrics::registry::Metrics;
+use plantd_server::core::realtime::loops::RealTime;
+use plantd_server::core::realtime::settings::RealTimeSettings;
+use plantd_server::core::session::shared::Session;
+use plantd_server::wire::link::config::LinkConfig;
+use plantd_server::wire::link::host::LinkHost;
 
 /// Longest wait for something that takes a fraction of a second.
 pub const PATIENCE: Duration = Duration::from_secs(10);

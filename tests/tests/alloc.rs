@@ -9,16 +9,20 @@ use plantd_models::{
     Contraction, ForceSplit, Linearization, Model, Plant, Scene, SecondOrder, Settings, builtin,
 };
 use plantd_proto::v1;
-use plantd_server::feedback::{Feedback, GuardBound, Law, Mode, Room, Stage};
-use plantd_server::limits::Limits;
-use plantd_server::metrics::Metrics;
-use plantd_server::modes;
-use plantd_server::realtime::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
-use plantd_server::realtime::{Pace, RealTime, RealTimeSettings, RunSettings};
-use plantd_server::record::Recordings;
-use plantd_server::regulator::{Constraints, Reference, Spec};
-use plantd_server::ring::Reader;
-use plantd_server::session::{DriverKind, Session};
+use plantd_server::core::driver::DriverKind;
+use plantd_server::core::feedback::active::{Feedback, GuardBound, Mode};
+use plantd_server::core::feedback::law::{Law, Stage};
+use plantd_server::core::feedback::regulator::{Constraints, Reference, Spec};
+use plantd_server::core::limits::Limits;
+use plantd_server::core::metrics::registry::Metrics;
+use plantd_server::core::modes;
+use plantd_server::core::plant::watchdog::{Quantity, Safety, Watchdog, WatchdogAction};
+use plantd_server::core::publish::ring::Reader;
+use plantd_server::core::realtime::loops::RealTime;
+use plantd_server::core::realtime::settings::{Pace, RealTimeSettings, RunSettings};
+use plantd_server::core::room::Room;
+use plantd_server::core::session::shared::Session;
+use plantd_server::wire::record::directory::Recordings;
 
 /// Counts the allocations of each thread, so that tests in other threads do not disturb.
 struct Counting;

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use plantd_server::config::{Config, Listen, LogFormat};
-use plantd_server::limits::Limits;
-use plantd_server::metrics::Metrics;
+use plantd_server::core::limits::Limits;
+use plantd_server::core::metrics::registry::Metrics;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use plantd_client::link::Wait;
-use plantd_server::realtime::{Pace, RunSettings};
+use plantd_server::core::realtime::settings::{Pace, RunSettings};
 use plantd_tests::links::{LinkFixture, new_session};
 
 /// Steps of the plant while somebody looks.

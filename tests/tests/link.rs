@@ -10,8 +10,10 @@ use plantd_proto::link::{
     Code, Domain, DomainError, Endpoint, HEADER_FIELDS, Header, Holder, Kind, LAYOUT_VERSION,
     MAGIC, SCHEMA_HASH, monotonic_ns, random_instance,
 };
-use plantd_server::link::{LinkConfig, LinkError as HostError, LinkHost};
-use plantd_server::session::{DriverKind, PlantSnapshot};
+use plantd_server::core::driver::DriverKind;
+use plantd_server::core::plant::view::PlantSnapshot;
+use plantd_server::wire::link::config::LinkConfig;
+use plantd_server::wire::link::host::{LinkError as HostError, LinkHost};
 use plantd_tests::links::{
     ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_links, new_plant, new_session,
     new_session_of, wait_until, wiggle,

@@ -13,7 +13,8 @@ use std::time::{Duration, Instant};
 use plantd_client::link::{LinkDriver, LinkError, LinkOptions};
 use plantd_client::{Client, v1};
 use plantd_proto::link::{DomainError, SHARED_MEMORY_DIRECTORY};
-use plantd_server::link::{LinkConfig, LinkError as HostError, LinkHost};
+use plantd_server::wire::link::config::LinkConfig;
+use plantd_server::wire::link::host::{LinkError as HostError, LinkHost};
 use plantd_tests::links::{ChildProcess, LinkFixture, PATIENCE, PLANT, files_of_links, wait_until};
 use plantd_tests::server::ServerProcess;
 

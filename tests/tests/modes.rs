@@ -10,8 +10,8 @@ use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use plantd_client::v1;
+use plantd_server::core::modes::Mode;
 use plantd_server::listen::UnixSocket;
-use plantd_server::modes::Mode;
 use plantd_tests::server::ServerProcess;
 use rustix::process::{Resource, Rlimit, setrlimit, umask};
 use rustix::thread::CapabilitySet;

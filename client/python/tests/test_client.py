@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import plantd
-from plantd.v1 import common_pb2, control_service_pb2
+from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
 
 SCENE = """
 format = 1
@@ -54,8 +54,11 @@ def test_every_way_to_step_gives_the_same_bits(client):
 
 def test_methods(client):
     method = {"order": 6, "substeps": 2, "halvings": 1, "precision": "fast"}
+    method |= {"singular_below": 1e-12, "newton_iterations": 30}
     plant = client.create_plant("cart-pole", **method)
     assert {name: getattr(plant, name) for name in method} == method
+    assert not plant.paper
+    assert client.create_plant("cart-pole", paper=True).paper
     with client.drive(plant.id) as driver:
         state = driver.step(0.5)
     assert (driver.report.steps, driver.report.halvings) == (2, 0)
@@ -70,6 +73,16 @@ def test_methods(client):
     assert refused.value.violations[0].field == "settings.order"
     with pytest.raises(TypeError, match="odrer"):
         client.create_plant("four-bar", odrer=4)
+
+
+def test_every_setting_and_every_field_of_a_report_has_a_name_here():
+    settings = plant_service_pb2.PlantSettings.DESCRIPTOR.fields_by_name.keys()
+    ours = {"dt": "time_step_s", "paper": "force_split", "newton_iterations": "max_iterations"}
+    keywords = {ours.get(name, name) for name in plantd.Stepping.__annotations__}
+    # `create_plant` takes a tolerance in place of order and substeps.
+    assert keywords | {"tolerance"} == set(settings)
+    report = common_pb2.StepReport.DESCRIPTOR.fields_by_name.keys()
+    assert set(plantd.StepReport.__dataclass_fields__) == set(report)
 
 
 def test_linearization_at_a_point(client):

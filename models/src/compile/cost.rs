@@ -56,7 +56,7 @@ impl Model {
         let jacobian = 71.0 * support.iter().sum::<f64>();
         // Equations along world axes share what their second derivatives are made of.
         let alone = self.constraints.iter().zip(&support);
-        let alone = alone.filter(|(c, _)| !matches!(c.kind, ConstraintKind::Axis(..)));
+        let alone = alone.filter(|(c, _)| !matches!(c.kind, ConstraintKind::Axis(_)));
         let hessians = 50.0 * alone.map(|(_, size)| size * size).sum::<f64>() + 40.0 * entries;
         let columns = (d.coordinates() + d.dynamic + d.prescribed) as f64;
         let mut linearization = 84.0 * nd * columns;

@@ -104,11 +104,11 @@ impl Model {
             "constraints   {} equations over {} joints: {} distance, {} axis, {} product, {} path, {} coupling{}",
             d.constraints,
             self.closure.joints.len(),
-            equations(|kind| matches!(kind, ConstraintKind::Distance(..))),
-            equations(|kind| matches!(kind, ConstraintKind::Axis(..))),
+            equations(|kind| matches!(kind, ConstraintKind::Distance(_))),
+            equations(|kind| matches!(kind, ConstraintKind::Axis(_))),
             equations(|kind| matches!(kind, ConstraintKind::Product(_))),
-            equations(|kind| matches!(kind, ConstraintKind::PathLength(..))),
-            equations(|kind| matches!(kind, ConstraintKind::Coupling(..))),
+            equations(|kind| matches!(kind, ConstraintKind::PathLength(_))),
+            equations(|kind| matches!(kind, ConstraintKind::Coupling(_))),
             skipped(d.constraints > 0)
         ));
     }

@@ -13,13 +13,6 @@ use crate::model::tree::{Attachment, Tree, WORLD};
 use crate::scene;
 use crate::scene::Scene;
 use crate::scene::forces::Component;
-use crate::scene::point::Point;
-
-/// The forces of a scene over the joints of a tree.
-struct Resolver<'a> {
-    places: Places<'a>,
-    inputs: BTreeMap<&'a str, usize>,
-}
 
 impl Layout {
     pub(super) fn coordinate_inputs(&self, scene: &Scene) -> Vec<CoordinateInput> {
@@ -32,34 +25,34 @@ impl Layout {
 
     /// Forces without effect are dropped; none if none is left.
     pub(super) fn forces(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Option<Forces> {
-        let inputs = scene.inputs.iter().enumerate().map(|(i, input)| (input.name.as_str(), i));
         let places = Places { layout: self, tree, index };
-        let resolver = Resolver { places, inputs: inputs.collect() };
         let mut forces = Forces::default();
         for force in &scene.forces {
-            resolver.add(force, &mut forces);
+            places.add_force(force, &mut forces);
         }
         let Forces { wrenches, point_forces, coordinate_forces, linear_dampers } = &forces;
-        let none = wrenches.is_empty()
-            && point_forces.is_empty()
-            && coordinate_forces.is_empty()
-            && linear_dampers.is_empty();
-        (!none).then_some(forces)
+        let velocity_forces = point_forces.len() + coordinate_forces.len() + linear_dampers.len();
+        (wrenches.len() + velocity_forces > 0).then_some(forces)
     }
 
     pub(super) fn signals(&self, scene: &Scene) -> Vec<Signal> {
-        let target = |name: &str| match scene.inputs.iter().position(|i| i.name == name) {
-            Some(input) => Target::Input(input),
+        let target = |name: &str| match self.inputs.get(name) {
+            Some(&input) => Target::Input(input),
             None => Target::Prescribed(self.index[name] - self.dynamic),
         };
         scene.signals.iter().map(|signal| Signal::new(target(signal.drives()), signal)).collect()
     }
 }
 
-impl Resolver<'_> {
-    fn add(&self, force: &scene::Force, forces: &mut Forces) {
-        let (layout, index) = (self.places.layout, &self.places.layout.index);
+impl Places<'_> {
+    fn add_force(&self, force: &scene::Force, forces: &mut Forces) {
+        let (layout, index) = (self.layout, &self.layout.index);
         match force {
+            scene::Force::TwoPointDamper { damping: 0.0, .. }
+            | scene::Force::LinearDamper { damping: 0.0, .. }
+            | scene::Force::Drag { coefficient: 0.0, .. }
+            | scene::Force::CoordinateDrag { coefficient: 0.0, .. }
+            | scene::Force::Friction { force: 0.0, .. } => {}
             scene::Force::BodyWrench { frame, force, torque } => {
                 forces.wrenches.push(self.wrench(WrenchKind::Body, frame, force, torque));
             }
@@ -76,53 +69,40 @@ impl Resolver<'_> {
                 forces.wrenches.push(Wrench {
                     kind: WrenchKind::Body,
                     at,
-                    path: self.places.tree.path(at.joint),
+                    path: self.tree.path(at.joint),
                     constant: Force::default(),
-                    inputs: vec![(self.inputs[input.as_str()], thrust)],
+                    inputs: vec![(self.layout.inputs[input.as_str()], thrust)],
                 });
             }
             scene::Force::TwoPointDamper { a, b, damping } => {
-                if *damping != 0.0 {
-                    let ends = self.places.between(layout.attachment(a), layout.attachment(b));
-                    let law = PointLaw::Damper(*damping);
-                    forces.point_forces.push(PointForce { ends, law });
-                }
+                let ends = self.between(layout.attachment(a), layout.attachment(b));
+                let law = PointLaw::Damper(*damping);
+                forces.point_forces.push(PointForce { ends, law });
             }
             scene::Force::Drag { frame, at, coefficient } => {
-                if *coefficient != 0.0 {
-                    let at = Point { frame: frame.clone(), at: *at };
-                    let still = Attachment { joint: WORLD, point: Vec3::ZERO };
-                    let ends = self.places.between(layout.attachment(&at), still);
-                    let law = PointLaw::Drag(*coefficient);
-                    forces.point_forces.push(PointForce { ends, law });
-                }
+                let still = Attachment { joint: WORLD, point: Vec3::ZERO };
+                let ends = self.between(layout.fixed(frame, *at), still);
+                let law = PointLaw::Drag(*coefficient);
+                forces.point_forces.push(PointForce { ends, law });
             }
             scene::Force::CoordinateDrag { coordinate, coefficient } => {
-                if *coefficient != 0.0 {
-                    let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
-                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
-                }
+                let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
+                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
             }
             scene::Force::LinearDamper { terms, damping } => {
-                if *damping != 0.0 {
-                    let terms = layout.linear(terms);
-                    forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
-                }
+                let terms = layout.linear(terms);
+                forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
             }
             scene::Force::Friction { coordinate, force, velocity } => {
-                if *force != 0.0 {
-                    let law = CoordinateLaw::Friction { force: *force, velocity: *velocity };
-                    let coordinate = index[coordinate];
-                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
-                }
+                let law = CoordinateLaw::Friction { force: *force, velocity: *velocity };
+                let coordinate = index[coordinate];
+                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
             }
         }
     }
 
     fn attachment(&self, frame: &str, at: [f64; 3]) -> Attachment {
-        let at = self.places.layout.attachment(&Point { frame: frame.to_owned(), at });
-        let joint = if at.joint == WORLD { WORLD } else { self.places.index[at.joint] };
-        Attachment { joint, ..at }
+        self.resolve(self.layout.fixed(frame, at))
     }
 
     fn wrench(
@@ -133,7 +113,7 @@ impl Resolver<'_> {
         torque: &[Component; 3],
     ) -> Wrench {
         let axes = match kind {
-            WrenchKind::Body => self.places.layout.frames[frame].rotation,
+            WrenchKind::Body => self.layout.frames[frame].rotation,
             WrenchKind::Spatial | WrenchKind::Hybrid => Mat3::IDENTITY,
         };
         let mut constant = Force::default();
@@ -146,14 +126,14 @@ impl Resolver<'_> {
                 match component {
                     Component::Constant(value) => constant = constant.add_scaled(*value, unit),
                     Component::Input(name) => {
-                        let total = inputs.entry(self.inputs[name.as_str()]).or_default();
+                        let total = inputs.entry(self.layout.inputs[name.as_str()]).or_default();
                         *total = total.add_scaled(1.0, unit);
                     }
                 }
             }
         }
         let at = self.attachment(frame, [0.0; 3]);
-        let path = self.places.tree.path(at.joint);
+        let path = self.tree.path(at.joint);
         Wrench { kind, at, path, constant, inputs: inputs.into_iter().collect() }
     }
 }

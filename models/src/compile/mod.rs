@@ -1,4 +1,9 @@
-//! From scene to model.
+//! From scene to model: what a person wrote becomes what a step computes with.
+//!
+//! Read [`scene`] first: it resolves names, merges fixed joints, lumps bodies, and puts the model together
+//! from [`springs`] and [`forces`]. [`pattern`] says which coordinates are coupled, [`loops`] in which order
+//! joints and closing equations are eliminated, [`singular`] refuses what moves without resistance.
+//! [`explain`] and [`cost`] tell people what came out.
 
 pub(crate) mod cost;
 mod explain;

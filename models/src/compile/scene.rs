@@ -12,11 +12,12 @@ use crate::math::spatial::{Mat3, Sym3, Vec3};
 use crate::math::trigonometry::sin_cos_of;
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
-    Alignment, Carries, Constraint, ConstraintKind, Coordinate, Dimensions, Length, Model,
-    OperatingPoint, PathJoint, PointPair, Polynomial, Product, Solver, Vector,
+    Alignment, AlongAxis, Carries, Constraint, ConstraintKind, Coordinate, Coupling, Dimensions,
+    Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance, PointPair, Polynomial,
+    Product, Solver, Vector,
 };
 use crate::model::planar_tree::planar;
-use crate::model::site::{Site, SiteJoint};
+use crate::model::site::Site;
 use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 use crate::scene;
 use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError};
@@ -30,6 +31,30 @@ impl Scene {
 
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.
+    ///
+    /// ```
+    /// use plantd_models::{Model, Scene};
+    ///
+    /// let text = r#"
+    ///     format = 1
+    ///     name = "swing"
+    ///     gravity = [0.0, 0.0, -9.8]
+    ///
+    ///     [[frames]]
+    ///     name = "arm"
+    ///     joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+    ///     body = { mass = 1.0, center_of_mass = [0.0, 0.0, -0.5] }
+    /// "#;
+    /// let mut scene = Scene::from_toml(text)?;
+    /// let model = Model::compile(&scene)?;
+    /// assert_eq!(model.coordinates()[0].name, "arm");
+    /// assert_eq!(model.dimensions().state(), 2);
+    ///
+    /// scene.frames[0].parent = "ceiling".to_owned();
+    /// let error = Model::compile(&scene).unwrap_err();
+    /// assert_eq!(error.to_string(), "frames[0].parent: there is no frame `ceiling`");
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
         let problems = scene.problems();
         if !problems.is_empty() {
@@ -56,9 +81,9 @@ impl Model {
 /// Compiles a scene that has been validated.
 fn compile(scene: &Scene) -> Model {
     let layout = Layout::new(scene);
-    let needs = layout.needs(scene);
-    let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &needs.dynamics);
-    let (closure, in_closure) = Tree::pruned(&layout.joints, &needs.closure);
+    let [dynamics, closure] = layout.needs(scene);
+    let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &dynamics);
+    let (closure, in_closure) = Tree::pruned(&layout.joints, &closure);
     let dynamic = layout.dynamic;
 
     let potentials = layout.potentials(scene, &dynamics, &in_dynamics);
@@ -124,13 +149,7 @@ pub(crate) fn site(scene: &Scene, frame: &str, at: [f64; 3]) -> Option<Site> {
     let mut joints = Vec::new();
     let mut index = placement.joint;
     while let Some(joint) = layout.joints.get(index) {
-        joints.push(SiteJoint {
-            kind: joint.kind,
-            coordinate: joint.coordinate,
-            orientation: joint.orientation,
-            rotation: joint.rotation,
-            translation: joint.translation,
-        });
+        joints.push(joint.clone());
         index = joint.parent;
     }
     joints.reverse();
@@ -161,20 +180,16 @@ pub(crate) struct Placement {
 }
 
 /// The scene with its names resolved.
+#[derive(Default)]
 pub(crate) struct Layout {
     pub(crate) joints: Vec<Joint>,
     pub(crate) frames: BTreeMap<String, Placement>,
     pub(crate) coordinates: Vec<Coordinate>,
     pub(crate) dynamic: usize,
     pub(crate) index: BTreeMap<String, usize>,
+    pub(crate) inputs: BTreeMap<String, usize>,
     /// First coordinate of each orientation.
     pub(crate) orientations: Vec<usize>,
-}
-
-/// Which joints which walk needs.
-struct Needs {
-    dynamics: Vec<bool>,
-    closure: Vec<bool>,
 }
 
 impl Layout {
@@ -184,14 +199,9 @@ impl Layout {
             children.entry(&frame.parent).or_default().push(frame);
         }
         let world = Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
-        let mut layout = Self {
-            joints: Vec::new(),
-            frames: BTreeMap::from([("world".to_owned(), world)]),
-            coordinates: Vec::new(),
-            dynamic: 0,
-            index: BTreeMap::new(),
-            orientations: Vec::new(),
-        };
+        let frames = BTreeMap::from([("world".to_owned(), world)]);
+        let inputs = scene.inputs.iter().enumerate().map(|(i, input)| (input.name.clone(), i));
+        let mut layout = Self { frames, inputs: inputs.collect(), ..Self::default() };
         let mut names = Vec::new();
         let mut stack: Vec<&scene::Frame> =
             children.get("world").map(|c| c.iter().rev().copied().collect()).unwrap_or_default();
@@ -247,17 +257,12 @@ impl Layout {
 
     /// Orders the coordinates: dynamic ones depth first, prescribed ones as listed.
     fn number(&mut self, scene: &Scene, joint_names: &[String]) {
-        let prescribed = |name: &str| {
-            settings(scene, name).is_some_and(|c| c.kind == CoordinateKind::Prescribed)
-        };
-        let dynamic = joint_names.iter().filter(|name| !prescribed(name)).cloned();
-        let listed = scene
-            .coordinates
-            .iter()
-            .filter(|c| c.kind == CoordinateKind::Prescribed)
-            .map(|c| c.name.clone());
-        let order: Vec<String> = dynamic.chain(listed).collect();
-        self.dynamic = joint_names.iter().filter(|name| !prescribed(name)).count();
+        let kind = |name: &str| settings(scene, name).map_or(CoordinateKind::Dynamic, |c| c.kind);
+        let is_dynamic = |name: &&String| kind(name) == CoordinateKind::Dynamic;
+        let mut order: Vec<String> = joint_names.iter().filter(is_dynamic).cloned().collect();
+        self.dynamic = order.len();
+        let listed = scene.coordinates.iter().filter(|c| c.kind == CoordinateKind::Prescribed);
+        order.extend(listed.map(|c| c.name.clone()));
         self.index = order.iter().cloned().enumerate().map(|(i, name)| (name, i)).collect();
         for (joint, name) in self.joints.iter_mut().zip(joint_names) {
             joint.coordinate = self.index[name];
@@ -270,11 +275,7 @@ impl Layout {
             .map(|name| {
                 let joint = joint_names.iter().position(|n| *n == name);
                 Coordinate {
-                    kind: if prescribed(&name) {
-                        CoordinateKind::Prescribed
-                    } else {
-                        CoordinateKind::Dynamic
-                    },
+                    kind: kind(&name),
                     is_angle: joint.is_some_and(|j| self.joints[j].kind != JointKind::Prismatic),
                     initial: initial(scene, &name),
                     name,
@@ -298,7 +299,7 @@ impl Layout {
     }
 
     /// A point fixed in a frame.
-    fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
+    pub(super) fn fixed(&self, frame: &str, at: [f64; 3]) -> Attachment {
         let frame = self.frames[frame];
         Attachment { joint: frame.joint, point: frame.translation + frame.rotation.apply(Vec3(at)) }
     }
@@ -308,40 +309,34 @@ impl Layout {
         self.frames[frame].rotation.apply(direction)
     }
 
-    /// A joint is needed where it, or a joint below it, carries what the walk evaluates.
-    fn needs(&self, scene: &Scene) -> Needs {
-        let mut needs = Needs {
-            dynamics: self
-                .joints
-                .iter()
-                .map(|j| !matches!(j.body.inertia, Rotational::None))
-                .collect(),
-            closure: vec![false; self.joints.len()],
-        };
+    /// Which joints the walks of the dynamics and of the constraints need: a joint is needed where it, or a joint below it, carries what the walk evaluates.
+    fn needs(&self, scene: &Scene) -> [Vec<bool>; 2] {
+        let has_body = |joint: &Joint| !matches!(joint.body.inertia, Rotational::None);
+        let mut dynamics: Vec<bool> = self.joints.iter().map(has_body).collect();
+        let mut closure = vec![false; self.joints.len()];
         let mark = |needed: &mut Vec<bool>, frame: &str| {
-            let joint = self.frames[frame].joint;
-            if joint != WORLD {
-                needed[joint] = true;
+            if let Some(needed) = needed.get_mut(self.frames[frame].joint) {
+                *needed = true;
             }
         };
         for point in scene.springs.iter().flat_map(scene::Spring::points) {
-            mark(&mut needs.dynamics, &point.frame);
+            mark(&mut dynamics, &point.frame);
         }
         for force in &scene.forces {
-            force.points().for_each(|point| mark(&mut needs.dynamics, &point.frame));
+            force.points().for_each(|point| mark(&mut dynamics, &point.frame));
         }
         for constraint in &scene.constraints {
             let frames = constraint.frames();
-            frames.into_iter().for_each(|frame| mark(&mut needs.closure, frame));
+            frames.into_iter().for_each(|frame| mark(&mut closure, frame));
         }
         for i in (0..self.joints.len()).rev() {
             let parent = self.joints[i].parent;
             if parent != WORLD {
-                needs.dynamics[parent] |= needs.dynamics[i];
-                needs.closure[parent] |= needs.closure[i];
+                dynamics[parent] |= dynamics[i];
+                closure[parent] |= closure[i];
             }
         }
-        needs
+        [dynamics, closure]
     }
 
     fn equations(&self, scene: &Scene, tree: &Tree, index: &[usize]) -> Equations {
@@ -352,14 +347,16 @@ impl Layout {
             match constraint {
                 scene::Constraint::Distance { a, b, length, .. } => {
                     let points = places.between(self.attachment(a), self.attachment(b));
-                    let kind = ConstraintKind::Distance(points, self.length(length));
+                    let length = self.length(length);
+                    let kind = ConstraintKind::Distance(PointDistance { points, length });
                     equations.push(name.to_owned(), kind);
                 }
                 scene::Constraint::PointToPoint { a, b, axes, .. } => {
                     let points = places.between_in_world(self.attachment(a), self.attachment(b));
                     for &axis in axes {
                         let axis = axis as usize;
-                        let kind = ConstraintKind::Axis(points.clone(), axis);
+                        let points = points.clone();
+                        let kind = ConstraintKind::Axis(AlongAxis { points, axis });
                         equations.push(format!("{name}.{}", AXES[axis]), kind);
                     }
                 }
@@ -371,7 +368,7 @@ impl Layout {
                         u: Vector::Difference,
                         w: Vector::WithA(normal),
                     };
-                    equations.push(name.to_owned(), product.into());
+                    equations.push(name.to_owned(), ConstraintKind::Product(product));
                 }
                 scene::Constraint::Orientation { a, b, .. } => {
                     equations.align(name, a, b, &places);
@@ -384,7 +381,8 @@ impl Layout {
                             u: Vector::Difference,
                             w: Vector::WithA(self.direction(a, axis)),
                         };
-                        equations.push(format!("{name}.{letter}"), product.into());
+                        let kind = ConstraintKind::Product(product);
+                        equations.push(format!("{name}.{letter}"), kind);
                     }
                     equations.align(name, a, b, &places);
                 }
@@ -393,12 +391,13 @@ impl Layout {
                         coordinate: self.index[&term.coordinate],
                         coefficients: term.coefficients.clone(),
                     });
-                    let kind = ConstraintKind::Coupling(terms.collect(), *constant);
+                    let (terms, constant) = (terms.collect(), *constant);
+                    let kind = ConstraintKind::Coupling(Coupling { terms, constant });
                     equations.push(name.to_owned(), kind);
                 }
                 scene::Constraint::PathLength { points, length, .. } => {
-                    let kind =
-                        ConstraintKind::PathLength(places.segments(points), self.length(length));
+                    let (segments, length) = (places.segments(points), self.length(length));
+                    let kind = ConstraintKind::PathLength(PathLength { segments, length });
                     equations.push(name.to_owned(), kind);
                 }
             }
@@ -444,6 +443,12 @@ pub(crate) struct Places<'a> {
 }
 
 impl Places<'_> {
+    /// A point of the layout in the tree.
+    pub(crate) fn resolve(&self, at: Attachment) -> Attachment {
+        let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
+        Attachment { joint, ..at }
+    }
+
     /// Two points; joints that carry both drop out.
     pub(crate) fn between(&self, a: Attachment, b: Attachment) -> PointPair {
         let mut pair = self.between_in_world(a, b);
@@ -453,11 +458,7 @@ impl Places<'_> {
 
     /// Two points; joints that carry both drop out if they do not turn.
     fn between_in_world(&self, a: Attachment, b: Attachment) -> PointPair {
-        let resolve = |at: Attachment| {
-            let joint = if at.joint == WORLD { WORLD } else { self.index[at.joint] };
-            Attachment { joint, ..at }
-        };
-        let (a, b) = (resolve(a), resolve(b));
+        let (a, b) = (self.resolve(a), self.resolve(b));
         let (path_a, path_b) = (self.tree.path(a.joint), self.tree.path(b.joint));
         let common = path_a.iter().zip(&path_b).take_while(|(x, y)| x == y).count();
         let entry = |carries| {
@@ -496,19 +497,12 @@ struct Equations {
 
 impl Equations {
     fn push(&mut self, name: String, kind: ConstraintKind) {
-        let all: Vec<usize> = match &kind {
-            ConstraintKind::Distance(points, _) | ConstraintKind::Axis(points, _) => {
-                points.coordinates().collect()
-            }
-            ConstraintKind::Product(product) => product.points.coordinates().collect(),
-            ConstraintKind::PathLength(segments, _) => {
-                segments.iter().flat_map(PointPair::coordinates).collect()
-            }
-            ConstraintKind::Coupling(terms, _) => terms.iter().map(|t| t.coordinate).collect(),
-        };
         let mut seen = BTreeSet::new();
-        let (mut coordinates, prescribed): (Vec<usize>, Vec<usize>) =
-            all.into_iter().filter(|c| seen.insert(*c)).partition(|c| *c < self.dynamic);
+        let (mut coordinates, prescribed): (Vec<usize>, Vec<usize>) = kind
+            .coordinates()
+            .into_iter()
+            .filter(|c| seen.insert(*c))
+            .partition(|c| *c < self.dynamic);
         let dynamic = coordinates.len();
         coordinates.extend(prescribed);
         self.constraints.push(Constraint { kind, coordinates, dynamic });
@@ -525,16 +519,10 @@ impl Equations {
             w: Vector::WithB(layout.direction(b, Mat3::IDENTITY.0[j])),
         };
         for (letter, (i, j)) in AXES.iter().zip([(1, 2), (2, 0), (0, 1)]) {
-            self.push(format!("{name}.r{letter}"), product(i, j).into());
+            self.push(format!("{name}.r{letter}"), ConstraintKind::Product(product(i, j)));
         }
         let axes = [0, 1, 2].map(|i| product(i, i));
         self.alignments.push(Alignment { name: name.to_owned(), axes });
-    }
-}
-
-impl From<Product> for ConstraintKind {
-    fn from(product: Product) -> Self {
-        Self::Product(product)
     }
 }
 
@@ -557,7 +545,7 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
         None => Mat3::IDENTITY,
         Some(scene::Rotation::Matrix(rows)) => Mat3::from_rows(*rows),
         Some(scene::Rotation::Rpy([roll, pitch, yaw])) => {
-            about_z(*yaw).times(&about_y(*pitch)).times(&about_x(*roll))
+            about(2, *yaw).times(&about(1, *pitch)).times(&about(0, *roll))
         }
         Some(scene::Rotation::Quaternion(q)) => {
             let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
@@ -566,19 +554,14 @@ fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
     }
 }
 
-fn about_x(angle: f64) -> Mat3 {
+/// A turn about an axis of the frame.
+fn about(axis: usize, angle: f64) -> Mat3 {
     let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-}
-
-fn about_y(angle: f64) -> Mat3 {
-    let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-}
-
-fn about_z(angle: f64) -> Mat3 {
-    let (s, c) = sin_cos_of(angle);
-    Mat3::from_rows([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    let (next, last) = ((axis + 1) % 3, (axis + 2) % 3);
+    let mut columns = Mat3::IDENTITY.0;
+    (columns[next].0[next], columns[next].0[last]) = (c, s);
+    (columns[last].0[next], columns[last].0[last]) = (-s, c);
+    Mat3(columns)
 }
 
 /// A body of the scene in the frame of the joint that carries it.

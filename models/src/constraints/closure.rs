@@ -1,25 +1,14 @@
 //! Constraints at one end of a step: values, Jacobian and second derivatives.
 //!
-//! ```text
-//! distance  h = |d|² − l²            h_i = 2 d·d_i          h_ij = 2 (d_i·d_j + d·d_ij)
-//! axis      h = d·e                  h_i = d_i·e            h_ij = d_ij·e
-//! product   h = u·w                  see [`ProductAt`]
-//! path      h = Σ |d_s| − l          see [`Distance`]
-//! coupling  h = Σ c_jk q_j^k + c     h_j = Σ k c_jk q_j^(k−1)
-//! ```
-//!
-//! with the vector `d` between two points, a world axis `e`, and a length `l`, fixed or a prescribed
-//! coordinate.
+//! The equations are those of [`equations`](crate::constraints::equations). Second derivatives of distances and
+//! of equations along axes are summed up as forces on what joints carry.
 
 use crate::constraints::in_plane::InPlane;
-use crate::lagrangian::kinematics::Poses;
-use crate::lagrangian::vectors::{Distance, ProductAt};
+use crate::lagrangian::kinematics::{Place, Poses};
 use crate::math::norms::larger;
 use crate::math::scalar::Scalar;
 use crate::math::spatial::{Mat3, Vec3};
-use crate::model::mechanism::{
-    Alignment, Constraint, ConstraintKind, Length, Model, PointPair, Polynomial,
-};
+use crate::model::mechanism::{AlongAxis, ConstraintKind, Length, Model, PointDistance, PointPair};
 use crate::model::tree::{JointKind, Tree};
 
 /// A configuration may violate a constraint by this fraction of the lengths involved.
@@ -112,7 +101,8 @@ impl<S: Scalar> Closure<S> {
         self.is_complete = false;
         self.poses.evaluate(&model.closure, q, orientations);
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let (value, magnitude) = constraint.value(&model.closure, &self.poses, q);
+            let (value, magnitude) =
+                constraint.value(Place { tree: &model.closure, poses: &self.poses, q });
             self.value[c] = value;
             // Not less than what the smallest numbers are rounded by: some terms may all be zero.
             self.round_off[c] =
@@ -134,7 +124,7 @@ impl<S: Scalar> Closure<S> {
             for &i in &constraint.coordinates {
                 row[i] = S::ZERO;
             }
-            constraint.differentiate(&model.closure, &self.poses, q, row);
+            constraint.differentiate(Place { tree: &model.closure, poses: &self.poses, q }, row);
             let moved: f64 =
                 constraint.coordinates.iter().map(|&i| (row[i] * q[i]).value().abs()).sum();
             self.coordinate_round_off[c] = f64::EPSILON * moved;
@@ -171,13 +161,17 @@ impl<S: Scalar> Closure<S> {
         let mut are_pulled = false;
         for (constraint, &lambda) in model.constraints.iter().zip(multipliers) {
             match &constraint.kind {
-                ConstraintKind::Axis(points, axis) if !model.closure.has_other_joints => {
+                ConstraintKind::Axis(AlongAxis { points, axis })
+                    if !model.closure.has_other_joints =>
+                {
                     let mut force = Vec3::ZERO;
                     force.0[*axis] = lambda;
                     self.pull(model, points, force);
                     are_pulled = true;
                 }
-                ConstraintKind::Distance(points, length) if points.are_apart(&model.closure) => {
+                ConstraintKind::Distance(PointDistance { points, length })
+                    if points.are_apart(&model.closure) =>
+                {
                     let twice = lambda * 2.0;
                     let force = self.add_stretch(model, points, twice, out);
                     self.pull(model, points, force);
@@ -187,8 +181,8 @@ impl<S: Scalar> Closure<S> {
                     are_pulled = true;
                 }
                 _ => {
-                    let (tree, poses) = (&model.closure, &self.poses);
-                    constraint.for_each_second_derivative(tree, poses, q, |i, j, value| {
+                    let at = Place { tree: &model.closure, poses: &self.poses, q };
+                    constraint.for_each_second_derivative(at, &mut |i, j, value| {
                         out[i * n + j] += lambda * value;
                     });
                 }
@@ -306,195 +300,6 @@ impl Closure {
             }
             _ => self.subtract_impulses(model, multipliers, out),
         }
-    }
-}
-
-impl Constraint {
-    /// Value, and the magnitude of what was added for it.
-    #[inline]
-    fn value<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S]) -> (S, f64) {
-        match &self.kind {
-            ConstraintKind::Distance(points, length) => distance(points, tree, poses, length.at(q)),
-            ConstraintKind::Axis(points, axis) => {
-                let at = points.separation(tree, poses);
-                (at.difference[*axis], at.magnitude)
-            }
-            ConstraintKind::Product(product) => {
-                let at = ProductAt::new(product, tree, poses);
-                (at.value(), at.magnitude())
-            }
-            ConstraintKind::PathLength(segments, length) => {
-                path_length(segments, tree, poses, length.at(q))
-            }
-            ConstraintKind::Coupling(terms, constant) => coupling(terms, *constant, q),
-        }
-    }
-
-    /// Writes the derivatives into a row of the Jacobian, whose other entries are zero.
-    #[inline]
-    fn differentiate<S: Scalar>(&self, tree: &Tree, poses: &Poses<S>, q: &[S], row: &mut [S]) {
-        match &self.kind {
-            ConstraintKind::Distance(points, length) => {
-                if let Length::Driven(length) = *length {
-                    row[length] = q[length] * -2.0;
-                }
-                let at = points.separation(tree, poses);
-                let weight = at.difference.scaled(2.0);
-                for joint in &points.path {
-                    row[joint.coordinate] += weight.dot(joint.gradient(tree, poses, &at));
-                }
-            }
-            ConstraintKind::Axis(points, axis) => {
-                let at = points.separation(tree, poses);
-                for joint in &points.path {
-                    row[joint.coordinate] += joint.gradient(tree, poses, &at)[*axis];
-                }
-            }
-            ConstraintKind::Product(product) => {
-                let at = ProductAt::new(product, tree, poses);
-                at.for_each_derivative(|i, slope| row[i] += slope);
-            }
-            ConstraintKind::PathLength(segments, length) => {
-                if let Length::Driven(length) = *length {
-                    row[length] = -S::ONE;
-                }
-                for segment in segments {
-                    let segment = Distance::new(segment, tree, poses);
-                    segment.for_each_derivative(|i, slope| row[i] += slope);
-                }
-            }
-            ConstraintKind::Coupling(terms, _) => {
-                for term in terms {
-                    row[term.coordinate] += term.slope(q);
-                }
-            }
-        }
-    }
-
-    /// Calls `entry(i, j, h_ij)` for ordered pairs of coordinates; a pair may come more than once, and
-    /// its values add.
-    pub(crate) fn for_each_second_derivative<S: Scalar>(
-        &self,
-        tree: &Tree,
-        poses: &Poses<S>,
-        q: &[S],
-        mut entry: impl FnMut(usize, usize, S),
-    ) {
-        match &self.kind {
-            ConstraintKind::Distance(points, length) => {
-                let at = points.separation(tree, poses);
-                let value = |[row, column]: [Vec3<S>; 2], seconds: [Vec3<S>; 2]| {
-                    let product = column.dot(row);
-                    seconds.map(|second| (product + at.difference.dot(second)) * 2.0)
-                };
-                points.for_each_pair((tree, poses, &at), value, &mut entry);
-                if let Length::Driven(length) = *length {
-                    entry(length, length, S::constant(-2.0));
-                }
-            }
-            ConstraintKind::Axis(points, axis) => {
-                let at = points.separation(tree, poses);
-                let value = |_: [Vec3<S>; 2], seconds: [Vec3<S>; 2]| seconds.map(|s| s[*axis]);
-                points.for_each_pair((tree, poses, &at), value, entry);
-            }
-            ConstraintKind::Product(product) => {
-                ProductAt::new(product, tree, poses).for_each_second_derivative(entry);
-            }
-            ConstraintKind::PathLength(segments, _) => {
-                for segment in segments {
-                    Distance::new(segment, tree, poses).for_each_second_derivative(&mut entry);
-                }
-            }
-            ConstraintKind::Coupling(terms, _) => {
-                for term in terms {
-                    entry(term.coordinate, term.coordinate, term.curvature(q));
-                }
-            }
-        }
-    }
-
-    /// Whether a segment of its path has no length, and so no direction.
-    pub(crate) fn has_empty_segment(&self, tree: &Tree, poses: &Poses) -> bool {
-        let ConstraintKind::PathLength(segments, _) = &self.kind else { return false };
-        segments.iter().any(|segment| {
-            let segment = Distance::new(segment, tree, poses);
-            segment.length <= f64::EPSILON * segment.magnitude()
-        })
-    }
-}
-
-impl Alignment {
-    /// Trace of the rotation between the frames.
-    pub(crate) fn trace(&self, tree: &Tree, poses: &Poses) -> f64 {
-        self.axes.iter().map(|axis| ProductAt::new(axis, tree, poses).value()).sum()
-    }
-}
-
-/// `|d|² − l²`, and its magnitude.
-#[inline(always)]
-fn distance<S: Scalar>(points: &PointPair, tree: &Tree, poses: &Poses<S>, length: S) -> (S, f64) {
-    let at = points.separation(tree, poses);
-    let square = at.difference.dot(at.difference);
-    let squared_length = length * length;
-    let round_off = 2.0 * square.value().sqrt() * at.magnitude + squared_length.value();
-    (square - squared_length, round_off)
-}
-
-/// `Σ |d_s| − l`, and its magnitude.
-#[inline(never)]
-fn path_length<S: Scalar>(
-    segments: &[PointPair],
-    tree: &Tree,
-    poses: &Poses<S>,
-    length: S,
-) -> (S, f64) {
-    let (mut value, mut magnitude) = (-length, length.value());
-    for segment in segments {
-        let segment = Distance::new(segment, tree, poses);
-        value += segment.length;
-        magnitude += segment.magnitude();
-    }
-    (value, magnitude)
-}
-
-/// `Σ c_jk q_j^k + c`, and its magnitude.
-#[inline(never)]
-fn coupling<S: Scalar>(terms: &[Polynomial], constant: f64, q: &[S]) -> (S, f64) {
-    let (mut value, mut magnitude) = (S::constant(constant), constant.abs());
-    for term in terms {
-        let term = term.value(q);
-        value += term;
-        magnitude += term.value().abs();
-    }
-    (value, magnitude)
-}
-
-impl Length {
-    #[inline(always)]
-    fn at<S: Scalar>(self, q: &[S]) -> S {
-        match self {
-            Self::Fixed(length) => S::constant(length),
-            Self::Driven(coordinate) => q[coordinate],
-        }
-    }
-}
-
-impl Polynomial {
-    fn value<S: Scalar>(&self, q: &[S]) -> S {
-        let q = q[self.coordinate];
-        self.coefficients.iter().rev().fold(S::ZERO, |sum, c| (sum + *c) * q)
-    }
-
-    fn slope<S: Scalar>(&self, q: &[S]) -> S {
-        let q = q[self.coordinate];
-        let terms = self.coefficients.iter().enumerate().rev();
-        terms.fold(S::ZERO, |sum, (k, c)| sum * q + c * (k + 1) as f64)
-    }
-
-    fn curvature<S: Scalar>(&self, q: &[S]) -> S {
-        let q = q[self.coordinate];
-        let terms = self.coefficients.iter().enumerate().skip(1).rev();
-        terms.fold(S::ZERO, |sum, (k, c)| sum * q + c * (k * (k + 1)) as f64)
     }
 }
 

@@ -6,7 +6,7 @@
 use crate::lagrangian::kinematics::Poses;
 use crate::math::spatial::Vec3;
 use crate::model::loop_plan::Loops;
-use crate::model::mechanism::{ConstraintKind, Model, PointPair};
+use crate::model::mechanism::{AlongAxis, ConstraintKind, Model, PointPair};
 use crate::model::planar_tree::PlanarJoint;
 use crate::model::tree::{JointKind, Tree, WORLD};
 
@@ -91,7 +91,7 @@ impl InPlane {
             let c = equation.constraint;
             let Some(points) = model.constraints[c].points_in_plane() else { continue };
             let force = match &model.constraints[c].kind {
-                ConstraintKind::Axis(_, axis) => {
+                ConstraintKind::Axis(AlongAxis { axis, .. }) => {
                     let [x, y, _] = loops.plane.0;
                     [x[*axis], y[*axis]]
                 }

@@ -6,6 +6,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::control::error::RiccatiError;
 use crate::control::manifold::Tangent;
+use crate::control::matrix::{congruent, symmetrize};
 
 /// Those of the tangent space `T` at the state; without one those of the state itself, `T = I`.
 #[derive(Clone, Copy, Debug)]
@@ -34,7 +35,7 @@ impl Coordinates<'_> {
 
     /// `Tᵀ v`.
     pub(super) fn reduce_vector<'m>(self, v: &'m DVector<f64>) -> Cow<'m, DVector<f64>> {
-        self.0.map_or(Cow::Borrowed(v), |tangent| Cow::Owned(tangent.reduce_vector(v)))
+        self.0.map_or(Cow::Borrowed(v), |tangent| Cow::Owned(&tangent.transpose * v))
     }
 
     /// `m T`.
@@ -47,7 +48,10 @@ impl Coordinates<'_> {
 
     /// `Tᵀ q T`: a weight, or a covariance.
     pub(super) fn restrict<'m>(self, q: &'m DMatrix<f64>) -> Cow<'m, DMatrix<f64>> {
-        self.0.map_or(Cow::Borrowed(q), |tangent| Cow::Owned(tangent.restrict(q)))
+        let Some(tangent) = self.0 else { return Cow::Borrowed(q) };
+        let mut restricted = tangent.restrict_map(q);
+        symmetrize(&mut restricted);
+        Cow::Owned(restricted)
     }
 
     /// `T m`.
@@ -57,16 +61,16 @@ impl Coordinates<'_> {
 
     /// `T v`.
     pub(super) fn extend_vector(self, v: &DVector<f64>) -> DVector<f64> {
-        self.0.map_or_else(|| v.clone(), |tangent| tangent.extend_vector(v))
+        self.0.map_or_else(|| v.clone(), |tangent| tangent.basis() * v)
     }
 
     /// `K Tᵀ`: a gain on the full state.
     pub(super) fn extend_gain(self, gain: &DMatrix<f64>) -> DMatrix<f64> {
-        self.0.map_or_else(|| gain.clone(), |tangent| tangent.extend_gain(gain))
+        self.0.map_or_else(|| gain.clone(), |tangent| gain * &tangent.transpose)
     }
 
     /// `T P Tᵀ`: a cost to go, or a covariance, of the full state.
     pub(super) fn extend_value(self, value: &DMatrix<f64>) -> DMatrix<f64> {
-        self.0.map_or_else(|| value.clone(), |tangent| tangent.extend_value(value))
+        self.0.map_or_else(|| value.clone(), |tangent| congruent(&tangent.transpose, value))
     }
 }

@@ -2,10 +2,11 @@
 
 use std::f64::consts::TAU;
 
-use nalgebra::linalg::{Hessenberg, balancing};
+use nalgebra::linalg::Hessenberg;
 use nalgebra::{Complex, DMatrix};
 
 use crate::control::error::AnalysisError;
+use crate::control::spectrum::balance;
 
 /// Pivot of `zI − A`, relative to its largest entry, below which `z` counts as an eigenvalue.
 const POLE: f64 = 1e-13;
@@ -48,10 +49,9 @@ impl TransferFunction {
         AnalysisError::check("D", d, (r, m))?;
         let (mut a, mut b, mut c) = (a.clone(), b.clone(), c.clone());
         if n > 1 {
-            let scales = balancing::balance_parlett_reinsch(&mut a);
-            for (i, scale) in scales.iter().enumerate() {
-                b.row_mut(i).scale_mut(1.0 / scale);
-                c.column_mut(i).scale_mut(*scale);
+            let scales = balance(&mut a, &mut b);
+            for (mut column, scale) in c.column_iter_mut().zip(scales.iter()) {
+                column *= *scale;
             }
             let (q, hessenberg) = Hessenberg::new(a).unpack();
             b = q.tr_mul(&b);

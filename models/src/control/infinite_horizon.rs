@@ -167,14 +167,11 @@ pub(super) fn solve_without_cross(
     let iterations = iterations + more_iterations;
     match regulator {
         Some(regulator) if regulator.is_good() => Ok(Regulator { iterations, ..regulator }),
-        Some(Regulator { residual, spectral_radius, .. }) => {
+        other => {
+            let found = other.map(|found| (found.residual, found.spectral_radius));
+            let (residual, spectral_radius) = found.unwrap_or((f64::INFINITY, f64::INFINITY));
             Err(RiccatiError::NotConverged { iterations, residual, spectral_radius })
         }
-        None => Err(RiccatiError::NotConverged {
-            iterations,
-            residual: f64::INFINITY,
-            spectral_radius: f64::INFINITY,
-        }),
     }
 }
 

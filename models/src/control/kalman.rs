@@ -129,8 +129,7 @@ pub fn time_varying_kalman(
     initial: &DMatrix<f64>,
     covariances: Values,
 ) -> Result<KalmanTrajectory, KalmanError> {
-    let data = FilterData::new(samples, outputs, noise, initial)?;
-    time_varying(&data, covariances, |_| Coordinates(None))
+    time_varying(samples, (outputs, noise), initial, covariances, |_| Coordinates(None))
 }
 
 /// The filters along the samples on the constraint manifold: `tangents` has the tangent space of each
@@ -143,7 +142,6 @@ pub fn time_varying_kalman_on_manifold(
     initial: &DMatrix<f64>,
     covariances: Values,
 ) -> Result<KalmanTrajectory, KalmanError> {
-    let data = FilterData::new(samples, outputs, noise, initial)?;
     if tangents.len() != samples.len() + 1 {
         let (samples, actual) = (samples.len(), tangents.len());
         return Err(RiccatiError::TangentCount { samples, actual }.into());
@@ -151,27 +149,42 @@ pub fn time_varying_kalman_on_manifold(
     for (state, tangent) in tangents.iter().enumerate() {
         tangent.check(state, initial.nrows())?;
     }
-    time_varying(&data, covariances, |state| Coordinates(tangents.get(state)))
+    let coordinates = |state: usize| Coordinates(tangents.get(state));
+    time_varying(samples, (outputs, noise), initial, covariances, coordinates)
 }
 
 /// The filters in coordinates of each state.
 fn time_varying<'a>(
-    data: &FilterData<'_>,
+    samples: &[Sample],
+    (outputs, noise): (&[DMatrix<f64>], &[NoiseCovariances]),
+    initial: &DMatrix<f64>,
     covariances: Values,
     coordinates: impl Fn(usize) -> Coordinates<'a>,
 ) -> Result<KalmanTrajectory, KalmanError> {
-    let states = data.samples.len() + 1;
+    let (n, states) = (initial.nrows(), samples.len() + 1);
+    for (list, actual) in [("outputs", outputs.len()), ("noise", noise.len())] {
+        if actual != 1 && actual != states {
+            let (samples, expected) = (samples.len(), format!("1 or {states}"));
+            return Err(KalmanError::Count { list, samples, actual, expected });
+        }
+    }
+    let initial = semidefinite("initial_covariance", initial.clone())?;
     let mut found = KalmanTrajectory {
         gains: Vec::with_capacity(states),
         covariances: (covariances == Values::Keep).then(|| Vec::with_capacity(states)),
         reciprocal_conditions: Vec::with_capacity(states),
     };
-    let mut predicted = coordinates(0).restrict(&data.initial).into_owned();
+    let mut predicted = coordinates(0).restrict(&initial).into_owned();
     for state in 0..states {
+        let c = &outputs[if outputs.len() == 1 { 0 } else { state }];
+        let noise = &noise[if noise.len() == 1 { 0 } else { state }];
+        RiccatiError::check("C", state, c, (c.nrows(), n))?;
+        let any = noise.input().map_or(0, DMatrix::nrows);
+        let nearest = samples.get(state).or(samples.last());
+        noise.check(n, nearest.map_or(any, |sample| sample.b.ncols()), c.nrows())?;
         // L = P Cᵀ (C P Cᵀ + V)⁻¹ and P⁺ = (I − L C) P (I − L C)ᵀ + L V Lᵀ.
         let space = coordinates(state);
-        let c = space.columns(Cow::Borrowed(data.output(state)?));
-        let noise = data.noise(state);
+        let c = space.columns(Cow::Borrowed(c));
         let (gain, condition) = gain(state, &c, &predicted, noise.measurement())?;
         let filtered = correct(&c, &gain, &predicted, noise.measurement());
         found.reciprocal_conditions.push(condition);
@@ -180,7 +193,8 @@ fn time_varying<'a>(
         }
         found.gains.push(space.extend(&gain));
         // P ← A P⁺ Aᵀ + W.
-        if let Some(sample) = data.sample(state)? {
+        if let Some(sample) = samples.get(state) {
+            RiccatiError::check_map(state, (&sample.a, &sample.b), (n, sample.b.ncols()))?;
             let next = coordinates(state + 1);
             let process = noise.state_noise(&sample.b);
             let (a, process) = (space.map(next, &sample.a), next.restrict(&process));
@@ -188,57 +202,6 @@ fn time_varying<'a>(
         }
     }
     Ok(found)
-}
-
-/// What filters along a trajectory are made of, with lists of the right lengths.
-struct FilterData<'a> {
-    samples: &'a [Sample],
-    outputs: &'a [DMatrix<f64>],
-    noise: &'a [NoiseCovariances],
-    initial: DMatrix<f64>,
-}
-
-impl<'a> FilterData<'a> {
-    fn new(
-        samples: &'a [Sample],
-        outputs: &'a [DMatrix<f64>],
-        noise: &'a [NoiseCovariances],
-        initial: &DMatrix<f64>,
-    ) -> Result<Self, KalmanError> {
-        let states = samples.len() + 1;
-        for (list, actual) in [("outputs", outputs.len()), ("noise", noise.len())] {
-            if actual != 1 && actual != states {
-                let (samples, expected) = (samples.len(), format!("1 or {states}"));
-                return Err(KalmanError::Count { list, samples, actual, expected });
-            }
-        }
-        let initial = semidefinite("initial_covariance", initial.clone())?;
-        Ok(Self { samples, outputs, noise, initial })
-    }
-
-    fn noise(&self, state: usize) -> &'a NoiseCovariances {
-        &self.noise[if self.noise.len() == 1 { 0 } else { state }]
-    }
-
-    /// `C` of a state, with the noise there checked too.
-    fn output(&self, state: usize) -> Result<&'a DMatrix<f64>, KalmanError> {
-        let c = &self.outputs[if self.outputs.len() == 1 { 0 } else { state }];
-        let (noise, n) = (self.noise(state), self.initial.nrows());
-        RiccatiError::check("C", state, c, (c.nrows(), n))?;
-        let nearest = self.samples.get(state).or(self.samples.last());
-        let any = noise.input().map_or(0, DMatrix::nrows);
-        let inputs = nearest.map_or(any, |sample| sample.b.ncols());
-        noise.check(n, inputs, c.nrows())?;
-        Ok(c)
-    }
-
-    /// The map from a state to the next.
-    fn sample(&self, state: usize) -> Result<Option<&'a Sample>, KalmanError> {
-        let Some(sample) = self.samples.get(state) else { return Ok(None) };
-        let sizes = (self.initial.nrows(), sample.b.ncols());
-        RiccatiError::check_map(state, (&sample.a, &sample.b), sizes)?;
-        Ok(Some(sample))
-    }
 }
 
 /// `P Cᵀ (C P Cᵀ + V)⁻¹` and the reciprocal condition of the bracket, which has to be positive definite

@@ -21,17 +21,16 @@
 //! ignores: `A = A T₀T₀ᵀ` on everything that can occur. A gain for `ξ` acts on the full state as
 //! `K = K_ξ Tᵀ`, blind to gauge and to errors off the manifold.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DMatrix;
 
 use crate::control::error::RiccatiError;
-use crate::control::matrix::{congruent, symmetrize};
 use crate::math::null_space::tangent_basis;
 
 /// The tangent space of the constraint manifold at a state, modulo momentum gauge.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tangent {
     basis: DMatrix<f64>,
-    transpose: DMatrix<f64>,
+    pub(super) transpose: DMatrix<f64>,
 }
 
 impl Tangent {
@@ -84,29 +83,6 @@ impl Tangent {
     /// `Tᵀ a T`: a map on the tangent space.
     pub fn restrict_map(&self, a: &DMatrix<f64>) -> DMatrix<f64> {
         self.reduce(a) * &self.basis
-    }
-
-    /// `Tᵀ q T`: a weight on the tangent space.
-    pub(super) fn restrict(&self, q: &DMatrix<f64>) -> DMatrix<f64> {
-        let mut restricted = self.reduce(q) * &self.basis;
-        symmetrize(&mut restricted);
-        restricted
-    }
-    /// `Tᵀ v`.
-    pub(super) fn reduce_vector(&self, v: &DVector<f64>) -> DVector<f64> {
-        &self.transpose * v
-    }
-    /// `T v`.
-    pub(super) fn extend_vector(&self, v: &DVector<f64>) -> DVector<f64> {
-        &self.basis * v
-    }
-    /// `K Tᵀ`: a gain on the full state.
-    pub(super) fn extend_gain(&self, gain: &DMatrix<f64>) -> DMatrix<f64> {
-        gain * &self.transpose
-    }
-    /// `T P Tᵀ`: a cost to go of the full state.
-    pub(super) fn extend_value(&self, value: &DMatrix<f64>) -> DMatrix<f64> {
-        congruent(&self.transpose, value)
     }
 
     pub(super) fn check(&self, sample: usize, states: usize) -> Result<(), RiccatiError> {

@@ -32,10 +32,6 @@ impl NoiseCovariances {
         Ok(Self { process, input, measurement })
     }
 
-    /// Of the state.
-    pub fn process(&self) -> Option<&DMatrix<f64>> {
-        self.process.as_ref()
-    }
     /// Of the inputs.
     pub fn input(&self) -> Option<&DMatrix<f64>> {
         self.input.as_ref()

@@ -4,6 +4,8 @@ pub(crate) mod error;
 #[cfg(test)]
 mod tests;
 
+use std::ops::Deref;
+
 use nalgebra::{DMatrix, DVector};
 
 use crate::control::lq::stage::Stage;
@@ -48,14 +50,10 @@ pub struct Weights {
 /// end.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrajectoryWeights {
-    stages: Stages,
+    /// One, or one for each step.
+    stages: Vec<StageWeights>,
+    is_constant: bool,
     q_final: DMatrix<f64>,
-}
-
-#[derive(Clone, Debug, PartialEq)]
-enum Stages {
-    Constant(StageWeights),
-    PerStep(Vec<StageWeights>),
 }
 
 /// Which momentum weights weigh.
@@ -229,26 +227,6 @@ impl Weights {
         Ok(Self { stage, q_final: congruent(t, &self.q_final) })
     }
 
-    /// Number of states.
-    pub fn states(&self) -> usize {
-        self.stage.states()
-    }
-    /// Number of inputs.
-    pub fn inputs(&self) -> usize {
-        self.stage.inputs()
-    }
-    /// State weight `Q`.
-    pub fn q(&self) -> &DMatrix<f64> {
-        &self.stage.q
-    }
-    /// Input weight `R`.
-    pub fn r(&self) -> &DMatrix<f64> {
-        &self.stage.r
-    }
-    /// Cross term `S`.
-    pub fn s(&self) -> Option<&DMatrix<f64>> {
-        self.stage.s.as_ref()
-    }
     /// Weights of each step.
     pub fn stage(&self) -> &StageWeights {
         &self.stage
@@ -256,6 +234,15 @@ impl Weights {
     /// Final weight `Q_f`.
     pub fn q_final(&self) -> &DMatrix<f64> {
         &self.q_final
+    }
+}
+
+/// The weights of each step.
+impl Deref for Weights {
+    type Target = StageWeights;
+
+    fn deref(&self) -> &StageWeights {
+        &self.stage
     }
 }
 
@@ -300,7 +287,7 @@ impl TrajectoryWeights {
     ) -> Result<Self, WeightsError> {
         let q_final = q_final.unwrap_or_else(|| stage.q.clone());
         let q_final = check_final(q_final, stage.states())?;
-        Ok(Self { stages: Stages::Constant(stage), q_final })
+        Ok(Self { stages: vec![stage], is_constant: true, q_final })
     }
 
     /// Each step its own weights, all of the same numbers of states and inputs, with a positive
@@ -317,7 +304,7 @@ impl TrajectoryWeights {
                 .map_err(|error| WeightsError::Step { step, error: Box::new(error) })?;
         }
         let q_final = check_final(q_final, states)?;
-        Ok(Self { stages: Stages::PerStep(stages), q_final })
+        Ok(Self { stages, is_constant: false, q_final })
     }
 
     /// Weights of `x` in place of those of `y`, where `dy = T[k] dx` at step `k`: [`Weights::pull_back`]
@@ -330,8 +317,8 @@ impl TrajectoryWeights {
         let n = self.states();
         check_entries("q_final", last.shape(), (n, n), last.as_slice())?;
         let stages = t.iter().enumerate().map(|(k, t)| self.stage(k).pull_back(t));
-        let stages = Stages::PerStep(stages.collect::<Result<_, _>>()?);
-        Ok(Self { stages, q_final: congruent(last, &self.q_final) })
+        let stages = stages.collect::<Result<_, _>>()?;
+        Ok(Self { stages, is_constant: false, q_final: congruent(last, &self.q_final) })
     }
 
     /// Number of states.
@@ -340,27 +327,18 @@ impl TrajectoryWeights {
     }
     /// Number of inputs.
     pub fn inputs(&self) -> usize {
-        match &self.stages {
-            Stages::Constant(stage) => stage.inputs(),
-            Stages::PerStep(stages) => stages.first().map_or(0, StageWeights::inputs),
-        }
+        self.stages.first().map_or(0, StageWeights::inputs)
     }
     /// Number of steps; none when the weights are the same at each.
     pub fn steps(&self) -> Option<usize> {
-        match &self.stages {
-            Stages::Constant(_) => None,
-            Stages::PerStep(stages) => Some(stages.len()),
-        }
+        (!self.is_constant).then_some(self.stages.len())
     }
     /// Weights of step `k`.
     ///
     /// # Panics
     /// If each step has its own and there is no step `k`.
     pub fn stage(&self, k: usize) -> &StageWeights {
-        match &self.stages {
-            Stages::Constant(stage) => stage,
-            Stages::PerStep(stages) => &stages[k],
-        }
+        &self.stages[if self.is_constant { 0 } else { k }]
     }
     /// Final weight `Q_f`.
     pub fn q_final(&self) -> &DMatrix<f64> {
@@ -370,7 +348,7 @@ impl TrajectoryWeights {
 
 impl From<Weights> for TrajectoryWeights {
     fn from(weights: Weights) -> Self {
-        Self { stages: Stages::Constant(weights.stage), q_final: weights.q_final }
+        Self { stages: vec![weights.stage], is_constant: true, q_final: weights.q_final }
     }
 }
 

@@ -1,4 +1,9 @@
-//! The integrator.
+//! The variational integrator: one step of the forced, constrained discrete Euler-Lagrange equations.
+//!
+//! Read [`residual`] first: it has the equations. [`newton`] solves them, from the guess of [`predictor`], at
+//! the [`midpoint`], with matrices that [`matrix`] fills and [`crate::kkt`] factors; [`balls`] replaces
+//! coordinates of ball joints by orientations. [`collocation`] is the method of higher orders, of which
+//! [`scheme`] has the coefficients.
 
 pub(crate) mod balls;
 pub(crate) mod blocks;

@@ -145,7 +145,8 @@ impl Past {
                 }
                 // Of the differences, as many mean something as there were increments before.
                 let known = usize::from(self.known).clamp(1, LENGTH - 1);
-                let better = |best: usize, m: usize| if errors[m] < errors[best] { m } else { best };
+                let better =
+                    |best: usize, m: usize| if errors[m] < errors[best] { m } else { best };
                 self.order = (2..=known).fold(1, better) as u8;
             }
             Kind::Trail => {

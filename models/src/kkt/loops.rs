@@ -19,7 +19,9 @@ mod column;
 use crate::constraints::in_plane::InPlane;
 use crate::kkt::loops::column::Column;
 use crate::kkt::planar::{Diagonal, MatrixKind, Method, PlanarRecursion, add_to, dot3, product};
-use crate::lagrangian::planar::{Fours, Joints, Vec2, Vec3, cross};
+use crate::lagrangian::arrangement::Fours;
+use crate::lagrangian::planar::Joints;
+use crate::lagrangian::plane::{Vec2, Vec3, cross};
 use crate::math::rows::{Block, LANES, padded};
 use crate::math::simd::widest;
 use crate::math::tree_lu::SmallestPivot;
@@ -60,12 +62,8 @@ struct Closed {
 #[derive(Clone, Debug)]
 pub(crate) struct Multifrontal {
     tree: PlanarRecursion,
-    shapes: Vec<Shape>,
     fronts: Vec<f64>,
-    pivots: Vec<Pivot>,
-    closed: Vec<Closed>,
-    /// Column and row of each pivot, one after the other; the row is divided by the pivot.
-    factors: Vec<f64>,
+    factored: Factored,
     /// What passes through the rows of fronts, and multipliers, of one right-hand side.
     flows: Vec<f64>,
     sides: Vec<f64>,
@@ -75,6 +73,16 @@ pub(crate) struct Multifrontal {
     block_sides: Vec<Block>,
     block_multipliers: Vec<Block>,
     wrenches: Vec<[Block; 3]>,
+}
+
+/// The factors, with which right-hand sides are eliminated and substituted.
+#[derive(Clone, Debug)]
+struct Factored {
+    shapes: Vec<Shape>,
+    pivots: Vec<Pivot>,
+    closed: Vec<Closed>,
+    /// Column and row of each pivot, one after the other; the row is divided by the pivot.
+    factors: Vec<f64>,
 }
 
 /// The pivots of a factorization.
@@ -242,11 +250,13 @@ impl Multifrontal {
         let factors = factors.map(|s| 2 * shapes[s.front].stride * (1 + s.closed.len())).sum();
         Self {
             tree: PlanarRecursion::new(joints),
-            shapes,
             fronts: vec![0.0; entry],
-            pivots: vec![Pivot::default(); joints],
-            closed: vec![Closed::default(); equations],
-            factors: vec![0.0; factors],
+            factored: Factored {
+                shapes,
+                pivots: vec![Pivot::default(); joints],
+                closed: vec![Closed::default(); equations],
+                factors: vec![0.0; factors],
+            },
             flows: vec![0.0; row],
             sides: vec![0.0; equations],
             multipliers: vec![0.0; equations],
@@ -274,11 +284,12 @@ impl Multifrontal {
             self.tree.step = time_step_s;
             self.fronts.fill(0.0);
             let mut pivots = Pivots { joints: SmallestPivot::NONE, equations: 1.0, steepness: 1.0 };
-            let (mut factors, mut closed) = (&mut self.factors[..], &mut self.closed[..]);
+            let Factored { shapes, pivots: eliminated, closed, factors } = &mut self.factored;
+            let (mut factors, mut closed) = (&mut factors[..], &mut closed[..]);
             for step in &loops.plan.steps {
                 let (i, place) = (step.joint, step.place);
-                absorb(&self.shapes, &mut self.fronts, step);
-                let Shape { entry, stride, .. } = self.shapes[step.front];
+                absorb(shapes, &mut self.fronts, step);
+                let Shape { entry, stride, .. } = shapes[step.front];
                 let mut front =
                     Front { entries: &mut self.fronts[entry..][..step.rows * stride], stride };
                 for opened in &step.opened {
@@ -343,7 +354,7 @@ impl Multifrontal {
 
                 let edges = [link.edge, start.edge[i], end.edge[i]];
                 front.pass_on(step, edges);
-                self.pivots[i] = Pivot { minus, plus, inverse, edges };
+                eliminated[i] = Pivot { minus, plus, inverse, edges };
             }
             pivots
         })
@@ -357,14 +368,12 @@ impl Multifrontal {
                 *side = constraints[equation.constraint];
             }
             constraints.fill(0.0);
-            let mut flows = std::mem::take(&mut self.flows);
-            let mut multipliers = std::mem::take(&mut self.multipliers);
-            self.eliminate(loops, x, &self.sides, &mut multipliers, &mut flows);
-            self.substitute(loops, x, &mut multipliers, &mut flows);
+            let Self { factored, flows, sides, multipliers, .. } = self;
+            factored.eliminate(loops, x, sides, multipliers, flows);
+            factored.substitute(loops, x, multipliers, flows);
             for (multiplier, equation) in multipliers.iter().zip(&loops.equations) {
                 constraints[equation.constraint] = *multiplier;
             }
-            (self.flows, self.multipliers) = (flows, multipliers);
         })
     }
 
@@ -404,25 +413,49 @@ impl Multifrontal {
                         side.0.iter_mut().zip(row).for_each(|(to, from)| *to = -from);
                     }
                 }
-                let mut x = std::mem::take(&mut self.tree.increment);
-                let mut flows = std::mem::take(&mut self.block_flows);
-                let mut multipliers = std::mem::take(&mut self.block_multipliers);
-                self.eliminate(loops, &mut x, &self.block_sides, &mut multipliers, &mut flows);
-                self.substitute(loops, &mut x, &mut multipliers, &mut flows);
-                (self.tree.increment, self.block_flows) = (x, flows);
+                let Self { factored, block_sides: sides, block_flows: flows, .. } = self;
+                let (x, multipliers) = (&mut self.tree.increment, &mut self.block_multipliers);
+                factored.eliminate(loops, x, sides, multipliers, flows);
+                factored.substitute(loops, x, multipliers, flows);
                 self.tree.carry_down(joints, diagonal);
                 self.tree.gather(joints);
-                self.push_back(loops, joints, start, &multipliers);
+                self.push_back(loops, joints, start);
                 self.tree.write_columns(out.increment, out.momentum, first, stride);
-                for (value, equation) in multipliers.iter().zip(&loops.equations) {
+                for (value, equation) in self.block_multipliers.iter().zip(&loops.equations) {
                     let row = &mut out.multipliers[equation.constraint * stride..][..stride];
                     row[first..][..LANES].copy_from_slice(&value.0);
                 }
-                self.block_multipliers = multipliers;
             }
         })
     }
 
+    /// From the leaves to the root: what multipliers take from the momentum.
+    #[inline(always)]
+    fn push_back(&mut self, loops: &Loops, joints: &[PlanarJoint], start: &InPlane) {
+        for ((equation, wrenches), lambda) in
+            loops.equations.iter().zip(&start.wrenches).zip(&self.block_multipliers)
+        {
+            for (body, wrench) in equation.bodies.iter().zip(wrenches) {
+                if let Some(body) = body {
+                    let [n, fx, fy] = *wrench;
+                    let push = [lambda.times(-n), lambda.times(-fx), lambda.times(-fy)];
+                    add_to(&mut self.wrenches[body + 1], push);
+                }
+            }
+        }
+        for (i, joint) in joints.iter().enumerate().rev() {
+            let [n, fx, fy] = std::mem::replace(&mut self.wrenches[i + 1], [Block::ZERO; 3]);
+            let ([dx, dy], [ex, ey]) = (start.slide[i], start.edge[i]);
+            let momentum = &mut self.tree.momentum[i];
+            *momentum = momentum.plus(product([joint.body.turn, dx, dy], [n, fx, fy]));
+            let moved = n.plus(fy.times(ex)).plus(fx.times(-ey));
+            add_to(&mut self.wrenches[joint.parent], [moved, fx, fy]);
+        }
+        self.wrenches[0] = [Block::ZERO; 3];
+    }
+}
+
+impl Factored {
     /// From the leaves to the root.
     #[inline(always)]
     fn eliminate<S: Column>(
@@ -478,7 +511,8 @@ impl Multifrontal {
         }
     }
 
-    /// From the root to the leaves.
+    /// From the root to the leaves. What elimination has left in rows that are not open is met by zeros of the
+    /// factors.
     #[inline(always)]
     fn substitute<S: Column>(
         &self,
@@ -487,7 +521,6 @@ impl Multifrontal {
         multipliers: &mut [S],
         flows: &mut [S],
     ) {
-        flows.fill(S::ZERO);
         let (mut factors, mut closed) = (&self.factors[..], &self.closed[..]);
         for step in loops.plan.steps.iter().rev() {
             let Shape { row: first, stride, .. } = self.shapes[step.front];
@@ -522,37 +555,6 @@ impl Multifrontal {
                     all[self.shapes[other.front].row + to] = all[first + from];
                 }
             }
-        }
-    }
-
-    /// From the leaves to the root: what multipliers take from the momentum.
-    #[inline(always)]
-    fn push_back(
-        &mut self,
-        loops: &Loops,
-        joints: &[PlanarJoint],
-        start: &InPlane,
-        multipliers: &[Block],
-    ) {
-        self.wrenches.fill([Block::ZERO; 3]);
-        for ((equation, wrenches), lambda) in
-            loops.equations.iter().zip(&start.wrenches).zip(multipliers)
-        {
-            for (body, wrench) in equation.bodies.iter().zip(wrenches) {
-                if let Some(body) = body {
-                    let [n, fx, fy] = *wrench;
-                    let push = [lambda.times(-n), lambda.times(-fx), lambda.times(-fy)];
-                    add_to(&mut self.wrenches[body + 1], push);
-                }
-            }
-        }
-        for (i, joint) in joints.iter().enumerate().rev() {
-            let [n, fx, fy] = self.wrenches[i + 1];
-            let ([dx, dy], [ex, ey]) = (start.slide[i], start.edge[i]);
-            let momentum = &mut self.tree.momentum[i];
-            *momentum = momentum.plus(product([joint.body.turn, dx, dy], [n, fx, fy]));
-            let moved = n.plus(fy.times(ex)).plus(fx.times(-ey));
-            add_to(&mut self.wrenches[joint.parent], [moved, fx, fy]);
         }
     }
 }

@@ -1,4 +1,8 @@
-//! The linear system of a step.
+//! The linear system of a step, `[K −A0ᵀ; A1 0]`, factored and solved.
+//!
+//! [`system`] is the one door: it factors, solves, and falls back. Behind it any scene has a tree LU of `K` with
+//! the Schur complement of its constraints ([`schur`]); [`planar`] and [`space`] eliminate trees in O(n), and
+//! [`loops`] planar mechanisms together with their constraints, front by front.
 
 pub(crate) mod loops;
 pub(crate) mod planar;

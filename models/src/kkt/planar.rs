@@ -21,7 +21,9 @@
 //! the leaves to the root are `D_j`. As each sum is about its own
 //! joint, long chains lose no digits.
 
-use crate::lagrangian::planar::{Fours, Joints, Link, Vec2, Vec3, cross, dot, linear};
+use crate::lagrangian::arrangement::Fours;
+use crate::lagrangian::planar::{Joints, Link};
+use crate::lagrangian::plane::{Vec2, Vec3, cross, dot, linear};
 use crate::math::rows::{Block, LANES};
 use crate::math::simd::{wide, widest};
 use crate::math::tree_lu::SmallestPivot;

@@ -19,6 +19,15 @@ pub(crate) struct Poses<S = f64> {
     turns: Vec<[S; 2]>,
 }
 
+/// A configuration, as far as potentials and constraints depend on it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Place<'a, S = f64> {
+    pub(crate) tree: &'a Tree,
+    pub(crate) poses: &'a Poses<S>,
+    /// All coordinates.
+    pub(crate) q: &'a [S],
+}
+
 impl<S: Scalar> Poses<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();

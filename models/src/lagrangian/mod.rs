@@ -1,5 +1,10 @@
-//! The Lagrangian.
+//! The Lagrangian `L(q, v) = T(q, v) − V(q)` of a tree of rigid bodies, and generalized forces `f(q, v, u)`.
+//!
+//! [`mechanics`] gives `L_q` and `L_v` of one model, in space from [`kinematics`], [`momenta`] and
+//! [`curvature`], in planes from [`planar`]; [`derivatives`] has the second derivatives and those of forces as
+//! matrices. Each potential is a file in [`potentials`], each force a file in [`forces`].
 
+pub(crate) mod arrangement;
 pub(crate) mod curvature;
 pub(crate) mod derivatives;
 pub(crate) mod energy;
@@ -8,6 +13,7 @@ pub(crate) mod kinematics;
 pub(crate) mod mechanics;
 pub(crate) mod momenta;
 pub(crate) mod planar;
+pub(crate) mod plane;
 pub(crate) mod potentials;
 #[cfg(test)]
 pub(crate) mod samples;

@@ -21,187 +21,18 @@
 //! [`Momenta`]: crate::lagrangian::momenta::Momenta
 //! [`Curvature`]: crate::lagrangian::curvature::Curvature
 
-use std::fmt::Debug;
-use std::marker::PhantomData;
-use std::ops::{Mul, Range};
+use std::ops::Range;
 
+use crate::lagrangian::arrangement::{Arrangement, Fours, Ones, Planar, one2, one3, put2};
 use crate::lagrangian::curvature::SecondDerivatives;
-use crate::math::scalar::{Lanes, Scalar};
+use crate::lagrangian::plane::{
+    Vec2, Vec3, add, add4, combined, cross, dot, linear, spun, times, turned,
+};
+use crate::math::scalar::Scalar;
 use crate::math::simd::wide;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Pair;
-use crate::model::planar_tree::{Body, PlanarJoint, PlanarJoints};
-
-/// A vector in the plane.
-pub(crate) type Vec2<S = f64> = [S; 2];
-/// A twist or a wrench: the angular part first.
-pub(crate) type Vec3<S = f64> = [S; 3];
-
-/// How numbers of joints lie: those of several side by side, or one after the other.
-pub(crate) trait Arrangement: Clone + Debug {
-    type Number: Scalar;
-    type Several: Scalar + Mul<Self::Constant, Output = Self::Several>;
-    type Constant: Copy;
-    /// Joints of a block.
-    const COUNT: usize;
-    /// Whether each block goes through a whole pass by itself; else all go through a part of it together.
-    const ALONE: bool;
-    /// What is fixed to the joints of a block.
-    fn body(joints: &PlanarJoints, block: usize) -> &Body<Self::Constant>;
-    fn one(several: &Self::Several, lane: usize) -> Self::Number;
-    fn put(number: Self::Number, several: &mut Self::Several, lane: usize);
-    /// The numbers of a block from a list of those of coordinates.
-    fn gather(joints: &PlanarJoints, block: usize, list: &[Self::Number]) -> Self::Several;
-    /// The way back, but for what is beyond the list.
-    fn scatter(
-        joints: &PlanarJoints,
-        block: usize,
-        several: Self::Several,
-        list: &mut [Self::Number],
-    );
-    /// The numbers of a block, those of each joint together.
-    fn spread(numbers: [Self::Several; 4], joints: &mut [[Self::Number; 4]]);
-    /// The way back.
-    fn collect(joints: &[[Self::Number; 4]]) -> [Self::Several; 4];
-}
-
-/// Four joints side by side.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Fours;
-
-impl Arrangement for Fours {
-    type Number = f64;
-    type Several = Lanes;
-    type Constant = Lanes;
-    const COUNT: usize = Lanes::COUNT;
-    const ALONE: bool = false;
-
-    #[inline(always)]
-    fn body(joints: &PlanarJoints, block: usize) -> &Body<Lanes> {
-        &joints.fours[block]
-    }
-
-    #[inline(always)]
-    fn one(several: &Lanes, lane: usize) -> f64 {
-        several.0[lane]
-    }
-
-    #[inline(always)]
-    fn put(number: f64, several: &mut Lanes, lane: usize) {
-        several.0[lane] = number;
-    }
-
-    #[inline(always)]
-    fn gather(joints: &PlanarJoints, block: usize, list: &[f64]) -> Lanes {
-        let first = Self::COUNT * block;
-        let mut lanes = Lanes::ZERO;
-        match list.get(first..first + Self::COUNT) {
-            Some(four) if joints.are_in_order => lanes.0.copy_from_slice(four),
-            _ => {
-                for (lane, joint) in lanes.0.iter_mut().zip(&joints[first..]) {
-                    *lane = list[joint.coordinate];
-                }
-            }
-        }
-        lanes
-    }
-
-    #[inline(always)]
-    fn scatter(joints: &PlanarJoints, block: usize, lanes: Lanes, list: &mut [f64]) {
-        let first = Self::COUNT * block;
-        match list.get_mut(first..first + Self::COUNT) {
-            Some(four) if joints.are_in_order => four.copy_from_slice(&lanes.0),
-            _ => {
-                for (lane, joint) in lanes.0.iter().zip(&joints[first..]) {
-                    if let Some(entry) = list.get_mut(joint.coordinate) {
-                        *entry = *lane;
-                    }
-                }
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn spread([a, b, c, d]: [Lanes; 4], joints: &mut [[f64; 4]]) {
-        for (lane, joint) in joints[..4].iter_mut().enumerate() {
-            *joint = [a.0[lane], b.0[lane], c.0[lane], d.0[lane]];
-        }
-    }
-
-    #[inline(always)]
-    fn collect(joints: &[[f64; 4]]) -> [Lanes; 4] {
-        let mut numbers = [Lanes::ZERO; 4];
-        for (lane, joint) in joints[..4].iter().enumerate() {
-            for (number, to) in joint.iter().zip(&mut numbers) {
-                to.0[lane] = *number;
-            }
-        }
-        numbers
-    }
-}
-
-/// One joint after the other.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Ones<S>(PhantomData<S>);
-
-impl<S: Scalar> Arrangement for Ones<S> {
-    type Number = S;
-    type Several = S;
-    type Constant = f64;
-    const COUNT: usize = 1;
-    const ALONE: bool = true;
-
-    #[inline(always)]
-    fn body(joints: &PlanarJoints, block: usize) -> &Body {
-        &joints[block].body
-    }
-
-    #[inline(always)]
-    fn one(several: &S, _: usize) -> S {
-        *several
-    }
-
-    #[inline(always)]
-    fn put(number: S, several: &mut S, _: usize) {
-        *several = number;
-    }
-
-    #[inline(always)]
-    fn gather(joints: &PlanarJoints, block: usize, list: &[S]) -> S {
-        list[joints[block].coordinate]
-    }
-
-    #[inline(always)]
-    fn scatter(joints: &PlanarJoints, block: usize, several: S, list: &mut [S]) {
-        if let Some(entry) = list.get_mut(joints[block].coordinate) {
-            *entry = several;
-        }
-    }
-
-    #[inline(always)]
-    fn spread(numbers: [S; 4], joints: &mut [[S; 4]]) {
-        joints[0] = numbers;
-    }
-
-    #[inline(always)]
-    fn collect(joints: &[[S; 4]]) -> [S; 4] {
-        joints[0]
-    }
-}
-
-/// Numbers of which planar trees are computed.
-pub(crate) trait Planar: Scalar {
-    /// Of many joints.
-    type Many: Arrangement<Number = Self>;
-}
-
-impl Planar for f64 {
-    type Many = Fours;
-}
-
-impl Planar for Lanes {
-    type Many = Ones<Self>;
-}
+use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 
 /// Joints up to which one after the other is faster.
 const FEW: usize = 3;
@@ -307,7 +138,7 @@ struct Links<P> {
     faster: Vec2<P>,
     /// From the parent joint to this one.
     edge: Vec2<P>,
-    /// The same times the mass of the subtree.
+    /// The edge times the mass of the subtree.
     lever: Vec2<P>,
     /// `d` of a slider; zero for a hinge.
     slide: Vec2<P>,
@@ -376,85 +207,6 @@ pub(crate) struct Link<S> {
     pub(crate) force: Vec3<S>,
     pub(crate) slope: Vec3<S>,
     pub(crate) weight: S,
-}
-
-#[inline(always)]
-pub(crate) fn cross<A, B: Copy>(a: Vec2<A>, b: Vec2<B>) -> A
-where
-    A: Scalar + Mul<B, Output = A>,
-{
-    a[0] * b[1] - a[1] * b[0]
-}
-
-#[inline(always)]
-pub(crate) fn dot<A, B: Copy>(a: Vec2<A>, b: Vec2<B>) -> A
-where
-    A: Scalar + Mul<B, Output = A>,
-{
-    a[0] * b[0] + a[1] * b[1]
-}
-
-#[inline(always)]
-fn add<S: Scalar>(a: Vec2<S>, b: Vec2<S>) -> Vec2<S> {
-    [a[0] + b[0], a[1] + b[1]]
-}
-
-#[inline(always)]
-fn times<A, B: Copy>(a: Vec2<A>, b: B) -> Vec2<A>
-where
-    A: Scalar + Mul<B, Output = A>,
-{
-    [a[0] * b, a[1] * b]
-}
-
-/// `ẑ × v`, times `w`.
-#[inline(always)]
-fn spun<A, B: Copy>(v: Vec2<A>, w: B) -> Vec2<A>
-where
-    A: Scalar + Mul<B, Output = A>,
-{
-    [-(v[1] * w), v[0] * w]
-}
-
-/// `v` turned by the angle of which sine and cosine are given.
-#[inline(always)]
-fn turned<A, B: Copy>([s, c]: Vec2<A>, v: Vec2<B>) -> Vec2<A>
-where
-    A: Scalar + Mul<B, Output = A>,
-{
-    [c * v[0] - s * v[1], s * v[0] + c * v[1]]
-}
-
-/// One turn after the other.
-#[inline(always)]
-fn combined<S: Scalar>([s, c]: Vec2<S>, [s1, c1]: Vec2<S>) -> Vec2<S> {
-    [s * c1 + c * s1, c * c1 - s * s1]
-}
-
-#[inline(always)]
-fn add4<S: Scalar>(a: [S; 4], b: [S; 4]) -> [S; 4] {
-    [a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]]
-}
-
-#[inline(always)]
-pub(crate) fn linear<S: Scalar>(v: Vec3<S>) -> Vec2<S> {
-    [v[1], v[2]]
-}
-
-#[inline(always)]
-fn one2<A: Arrangement>(v: &Vec2<A::Several>, lane: usize) -> Vec2<A::Number> {
-    [A::one(&v[0], lane), A::one(&v[1], lane)]
-}
-
-#[inline(always)]
-fn one3<A: Arrangement>(v: &Vec3<A::Several>, lane: usize) -> Vec3<A::Number> {
-    [A::one(&v[0], lane), A::one(&v[1], lane), A::one(&v[2], lane)]
-}
-
-#[inline(always)]
-fn put2<A: Arrangement>(v: Vec2<A::Number>, to: &mut Vec2<A::Several>, lane: usize) {
-    A::put(v[0], &mut to[0], lane);
-    A::put(v[1], &mut to[1], lane);
 }
 
 impl<A: Arrangement> Joints<A> {

@@ -10,19 +10,9 @@ pub(crate) mod path_spring;
 pub(crate) mod point_spring;
 pub(crate) mod spline_spring;
 
-use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::kinematics::{Place, Poses};
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::{Model, Spring};
-use crate::model::tree::Tree;
-
-/// A configuration, as far as potentials depend on it.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Place<'a, S = f64> {
-    pub(crate) tree: &'a Tree,
-    pub(crate) poses: &'a Poses<S>,
-    /// All coordinates.
-    pub(crate) q: &'a [S],
-}
 
 /// A potential `V(q)`.
 pub(crate) trait Potential {
@@ -114,33 +104,24 @@ mod tests {
     use crate::lagrangian::samples;
     use crate::lagrangian::samples::Configuration;
     use crate::math::scalar::Dual;
-    use crate::model::mechanism::Model;
 
     fn energy<S: Scalar>(model: &Model, at: &Configuration<S>) -> S {
-        potential(&model.potentials, &model.dynamics, &at.poses(&model.dynamics), &at.q)
+        model.spring_energy(&at.poses(&model.dynamics), &at.q)
     }
 
     /// `V_q` of the dynamic coordinates.
     fn gradient<S: Scalar>(model: &Model, at: &Configuration<S>) -> Vec<S> {
         let mut l_q = vec![S::ZERO; model.dimensions.dynamic];
-        let poses = at.poses(&model.dynamics);
-        add_gradient(&model.potentials, &model.dynamics, &poses, &at.q, &mut l_q);
+        model.add_spring_gradient(&at.poses(&model.dynamics), &at.q, &mut l_q);
         l_q.into_iter().map(|x| -x).collect()
     }
 
     /// `V_qq`, row-major over all coordinates.
     fn hessian<S: Scalar>(model: &Model, at: &Configuration<S>) -> Vec<S> {
-        let mut out = vec![S::ZERO; at.q.len() * at.q.len()];
+        let n = at.q.len();
+        let mut out = vec![S::ZERO; n * n];
         let poses = at.poses(&model.dynamics);
-        for_each_second_derivative(
-            &model.potentials,
-            &model.dynamics,
-            &poses,
-            &at.q,
-            |i, j, value| {
-                out[i * at.q.len() + j] += value;
-            },
-        );
+        model.for_each_spring_derivative(&poses, &at.q, |i, j, value| out[i * n + j] += value);
         out
     }
 

@@ -11,7 +11,7 @@
 //! ```
 //!
 //! where `D_a` is the derivative of a block along `W_a`: its dual part when the block is evaluated in
-//! [`Dual`] numbers seeded with `W_a`. [`SecondOrder`] holds all of it, [`Contraction`] weighted sums.
+//! [`Dual`] numbers seeded with `W_a`. [`SecondOrder`](tensors::SecondOrder) holds all of it, [`Contraction`](contraction::Contraction) weighted sums.
 
 pub(crate) mod chain;
 pub(crate) mod contraction;

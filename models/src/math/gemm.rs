@@ -217,7 +217,7 @@ fn portable(c: &mut [f64], shape: &Shape<'_>) {
     }
 }
 
-/// The same for wide registers.
+/// Products in wide registers.
 #[cfg(target_arch = "x86_64")]
 mod wide {
     use std::arch::x86_64::*;

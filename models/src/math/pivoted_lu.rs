@@ -275,7 +275,7 @@ impl PivotedLu {
         }
     }
 
-    /// The same for a row-major right-hand side; `stride` is whole blocks.
+    /// Solves for right-hand sides side by side, row-major; `stride` is whole blocks.
     pub(crate) fn solve_rows(&mut self, x: &mut [f64], stride: usize) {
         let (n, rank) = (self.order, self.rank);
         for k in 0..rank {

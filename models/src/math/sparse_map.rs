@@ -132,14 +132,14 @@ impl Map {
         })
     }
 
-    /// The same one by one: row, column, entry.
+    /// The entries of rows of few, one by one: row, column, entry.
     pub(crate) fn entries(&self) -> impl Iterator<Item = (usize, usize, f64)> {
         self.runs().flat_map(|(row, col, entries)| {
             entries.iter().enumerate().map(move |(i, entry)| (row + i, col + i, *entry))
         })
     }
 
-    /// The same map where every state is active.
+    /// This map with every state active.
     pub(crate) fn with_all_states(&self) -> Self {
         let mut all = Self::default();
         let sizes = (self.next, self.states, self.inputs);

@@ -45,7 +45,7 @@ pub(crate) fn unwound(angle: f64, more: f64, per_radian: f64) -> f64 {
     angle + (more + rest)
 }
 
-/// The same without `more`, as a sum of two numbers.
+/// An angle without its whole turns, as a sum of two numbers.
 #[inline(always)]
 pub(crate) fn without_turns(angle: f64, per_radian: f64) -> [f64; 2] {
     let turns = (angle * per_radian + TO_INTEGER) - TO_INTEGER;

@@ -20,11 +20,8 @@ impl Model {
     pub fn retract(&self, q: &[f64], change: &[f64]) -> Vec<f64> {
         let n = self.dimensions.coordinates();
         assert!(q.len() == n && change.len() == n, "a configuration has {n} coordinates");
-        let mut moved: Vec<f64> = q.iter().zip(change).map(|(q, change)| q + change).collect();
-        for &i in &self.orientations {
-            let turned = Quaternion::exp(three(q, i)).times(Quaternion::exp(three(change, i)));
-            moved[i..i + 3].copy_from_slice(&turned.log().0);
-        }
+        let mut moved = vec![0.0; n];
+        retract(&self.orientations, q, change, 1.0, &mut moved);
         moved
     }
 
@@ -51,13 +48,36 @@ impl Model {
             q.len() == n && reference.len() == n && change.len() == n,
             "a configuration has {n} coordinates"
         );
-        for (change, (q, r)) in change.iter_mut().zip(q.iter().zip(reference)) {
-            *change = q - r;
-        }
-        for &i in &self.orientations {
-            let turned =
-                Quaternion::exp(three(reference, i)).inverse().times(Quaternion::exp(three(q, i)));
-            change[i..i + 3].copy_from_slice(&turned.log().0);
-        }
+        difference(&self.orientations, reference, q, change);
+    }
+}
+
+/// `x ⊖ reference`, of configurations or whole states, as far as `out` goes; `orientations` are the first
+/// coordinates of ball joints.
+pub(crate) fn difference(orientations: &[usize], reference: &[f64], x: &[f64], out: &mut [f64]) {
+    for (out, (x, r)) in out.iter_mut().zip(x.iter().zip(reference)) {
+        *out = x - r;
+    }
+    for &i in orientations {
+        let Some(out) = out.get_mut(i..i + 3) else { continue };
+        let from = Quaternion::exp(three(reference, i)).inverse();
+        out.copy_from_slice(&from.times(Quaternion::exp(three(x, i))).log().0);
+    }
+}
+
+/// `x` moved by `length · change`, of configurations or whole states.
+pub(crate) fn retract(
+    orientations: &[usize],
+    x: &[f64],
+    change: &[f64],
+    length: f64,
+    out: &mut [f64],
+) {
+    for (out, (x, change)) in out.iter_mut().zip(x.iter().zip(change)) {
+        *out = x + length * change;
+    }
+    for &i in orientations {
+        let turn = Quaternion::exp(three(change, i) * length);
+        out[i..i + 3].copy_from_slice(&Quaternion::exp(three(x, i)).times(turn).log().0);
     }
 }

@@ -355,19 +355,43 @@ impl Constraint {
     }
 }
 
-/// What a constraint equation says.
+/// What a constraint equation says; one file each in `constraints/equations`.
 #[derive(Clone, Debug)]
 pub(crate) enum ConstraintKind {
-    /// `|d|² − length² = 0`.
-    Distance(PointPair, Length),
-    /// `d · axis = 0`; the axis is a world axis.
-    Axis(PointPair, usize),
-    /// `u · w = 0`.
+    Distance(PointDistance),
+    Axis(AlongAxis),
     Product(Product),
-    /// `Σ |d_s| − length = 0` over the segments of a path.
-    PathLength(Vec<PointPair>, Length),
-    /// `Σ_j Σ_k c_jk q_j^k + constant = 0`.
-    Coupling(Vec<Polynomial>, f64),
+    PathLength(PathLength),
+    Coupling(Coupling),
+}
+
+/// `|d|² − length² = 0`.
+#[derive(Clone, Debug)]
+pub(crate) struct PointDistance {
+    pub(crate) points: PointPair,
+    pub(crate) length: Length,
+}
+
+/// `d · axis = 0`.
+#[derive(Clone, Debug)]
+pub(crate) struct AlongAxis {
+    pub(crate) points: PointPair,
+    /// A world axis.
+    pub(crate) axis: usize,
+}
+
+/// `Σ |d_s| − length = 0` over the segments of a path.
+#[derive(Clone, Debug)]
+pub(crate) struct PathLength {
+    pub(crate) segments: Vec<PointPair>,
+    pub(crate) length: Length,
+}
+
+/// `Σ_j Σ_k c_jk q_j^k + constant = 0`.
+#[derive(Clone, Debug)]
+pub(crate) struct Coupling {
+    pub(crate) terms: Vec<Polynomial>,
+    pub(crate) constant: f64,
 }
 
 /// A length.
@@ -378,7 +402,7 @@ pub(crate) enum Length {
     Driven(usize),
 }
 
-/// The scalar product of two vectors that belong to two points and the bodies that carry them.
+/// `u · w`, two vectors that belong to two points and the bodies that carry them; as an equation it is zero.
 #[derive(Clone, Debug)]
 pub(crate) struct Product {
     pub(crate) points: PointPair,
@@ -551,16 +575,5 @@ impl Model {
     pub(crate) fn take_loops(&mut self, loops: Loops) {
         self.loops = Some(loops);
         self.solver = Solver::Loops;
-    }
-}
-
-impl Constraint {
-    /// The points that an equation of loops is about.
-    pub(crate) fn points_in_plane(&self) -> Option<&PointPair> {
-        match &self.kind {
-            ConstraintKind::Distance(points, Length::Fixed(_))
-            | ConstraintKind::Axis(points, _) => Some(points),
-            _ => None,
-        }
     }
 }

@@ -1,4 +1,9 @@
-//! The compiled mechanism: immutable data without algorithms.
+//! The compiled mechanism: immutable data, shared by all plants, without algorithms.
+//!
+//! Read [`mechanism`] first: `Model` and all that it lists, springs, forces and constraints with their
+//! formulas. Joints are in [`tree`], or in [`planar_tree`] where they move in planes, loops of these in
+//! [`loop_plan`]. [`manifold`] has sums and differences of configurations, [`conditioning`] what pivots are
+//! measured against, [`signal`] functions of time, [`site`] points of frames.
 
 pub(crate) mod conditioning;
 pub(crate) mod loop_plan;

@@ -13,7 +13,9 @@ use crate::scene::signals::Interpolation;
 #[derive(Clone, Debug)]
 pub(crate) struct Signal {
     pub(crate) target: Target,
-    shape: Shape,
+    of: scene::Signal,
+    /// Through the knots, where it has some.
+    spline: Option<Spline>,
 }
 
 /// What a signal drives.
@@ -25,110 +27,48 @@ pub(crate) enum Target {
     Prescribed(usize),
 }
 
-#[derive(Clone, Debug)]
-enum Shape {
-    Constant(f64),
-    /// Angular frequency in rad/s.
-    Sinusoid {
-        amplitude: f64,
-        frequency: f64,
-        phase: f64,
-        offset: f64,
-    },
-    /// Angular frequency at the start and its rate, until `duration`.
-    Chirp {
-        amplitude: f64,
-        frequency: f64,
-        rate: f64,
-        duration: f64,
-        offset: f64,
-    },
-    /// Stays before `first` and after `last`.
-    Spline {
-        spline: Spline,
-        first: f64,
-        last: f64,
-    },
-    Table {
-        times: Vec<f64>,
-        values: Vec<f64>,
-        linear: bool,
-        repeat: bool,
-    },
-}
-
 impl Signal {
     /// From a signal of a scene that has been validated.
     pub(crate) fn new(target: Target, signal: &scene::Signal) -> Self {
-        Self { target, shape: Shape::new(signal) }
+        let spline = match signal {
+            scene::Signal::Spline { knots, .. } => {
+                Some(Spline::new(knots).expect("validation refuses knots that make no spline"))
+            }
+            _ => None,
+        };
+        Self { target, of: signal.clone(), spline }
     }
 
     /// Value at time `t`, s.
     pub(crate) fn at(&self, t: f64) -> f64 {
-        self.shape.at(t)
+        match &self.of {
+            scene::Signal::Constant { value, .. } => *value,
+            scene::Signal::Sinusoid { amplitude, frequency_hz, phase_rad, offset, .. } => {
+                offset + amplitude * sin_cos_of(TAU * frequency_hz * t + phase_rad).0
+            }
+            scene::Signal::Chirp { amplitude, start_hz, end_hz, duration_s, offset, .. } => {
+                let rate = TAU * (end_hz - start_hz) / duration_s;
+                let swept = t.min(*duration_s);
+                let phase = TAU * start_hz * t + rate * swept * (t - 0.5 * swept);
+                offset + amplitude * sin_cos_of(phase).0
+            }
+            scene::Signal::Spline { knots, .. } => {
+                let within = t.clamp(knots[0].x, knots[knots.len() - 1].x);
+                self.spline.as_ref().map_or(f64::NAN, |spline| spline.value(within))
+            }
+            scene::Signal::Table { times_s: times, values, interpolation, repeat, .. } => {
+                let (first, last) = (times[0], times[times.len() - 1]);
+                let t = if *repeat { first + (t - first).rem_euclid(last - first) } else { t };
+                table(times, values, *interpolation == Interpolation::Linear, t)
+            }
+        }
     }
 }
 
 impl scene::Signal {
     /// Value at `t = 0` of a signal without problems.
     pub(crate) fn initial(&self) -> f64 {
-        Shape::new(self).at(0.0)
-    }
-}
-
-impl Shape {
-    fn new(signal: &scene::Signal) -> Self {
-        match signal {
-            scene::Signal::Constant { value, .. } => Self::Constant(*value),
-            scene::Signal::Sinusoid { amplitude, frequency_hz, phase_rad, offset, .. } => {
-                Self::Sinusoid {
-                    amplitude: *amplitude,
-                    frequency: TAU * frequency_hz,
-                    phase: *phase_rad,
-                    offset: *offset,
-                }
-            }
-            scene::Signal::Chirp { amplitude, start_hz, end_hz, duration_s, offset, .. } => {
-                Self::Chirp {
-                    amplitude: *amplitude,
-                    frequency: TAU * start_hz,
-                    rate: TAU * (end_hz - start_hz) / duration_s,
-                    duration: *duration_s,
-                    offset: *offset,
-                }
-            }
-            scene::Signal::Spline { knots, .. } => Self::Spline {
-                spline: Spline::new(knots).expect("validation refuses knots that make no spline"),
-                first: knots[0].x,
-                last: knots[knots.len() - 1].x,
-            },
-            scene::Signal::Table { times_s, values, interpolation, repeat, .. } => Self::Table {
-                times: times_s.clone(),
-                values: values.clone(),
-                linear: *interpolation == Interpolation::Linear,
-                repeat: *repeat,
-            },
-        }
-    }
-
-    fn at(&self, t: f64) -> f64 {
-        match self {
-            Self::Constant(value) => *value,
-            Self::Sinusoid { amplitude, frequency, phase, offset } => {
-                offset + amplitude * sin_cos_of(frequency * t + phase).0
-            }
-            Self::Chirp { amplitude, frequency, rate, duration, offset } => {
-                let swept = t.min(*duration);
-                let phase = frequency * t + rate * swept * (t - 0.5 * swept);
-                offset + amplitude * sin_cos_of(phase).0
-            }
-            Self::Spline { spline, first, last } => spline.value(t.clamp(*first, *last)),
-            Self::Table { times, values, linear, repeat } => {
-                let (first, last) = (times[0], times[times.len() - 1]);
-                let t = if *repeat { first + (t - first).rem_euclid(last - first) } else { t };
-                table(times, values, *linear, t)
-            }
-        }
+        Signal::new(Target::Input(0), self).at(0.0)
     }
 }
 
@@ -149,8 +89,9 @@ fn table(times: &[f64], values: &[f64], linear: bool, t: f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn parsed(text: &str) -> Shape {
-        Shape::new(&toml::from_str(&format!("drives = \"u\"\n{text}")).unwrap())
+    fn parsed(text: &str) -> Signal {
+        let signal = toml::from_str(&format!("drives = \"u\"\n{text}")).unwrap();
+        Signal::new(Target::Input(0), &signal)
     }
 
     #[test]

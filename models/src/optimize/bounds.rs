@@ -293,10 +293,7 @@ impl End {
 
     /// How far the number is out of bounds.
     fn violation(&self, number: f64) -> f64 {
-        match self.side {
-            Side::Equal => self.excess(number).abs(),
-            _ => self.excess(number).max(0.0),
-        }
+        self.error(number, 0.0, 1.0)
     }
 
     /// Violation, or, where the bound holds, how far from it a multiplier that is not zero stands.

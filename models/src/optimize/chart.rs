@@ -1,39 +1,9 @@
-//! States with ball joints: differences of rotation vectors, and the tangent space.
+//! States with ball joints: derivatives by rotation vectors, and by the tangent space.
 
 use nalgebra::DMatrix;
 
 use crate::math::rotation;
-use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Vec3, three};
-
-/// `x ⊖ reference`, of whole states; `orientations` are the first coordinates of ball joints.
-pub(super) fn difference(orientations: &[usize], reference: &[f64], x: &[f64], out: &mut [f64]) {
-    for (out, (x, r)) in out.iter_mut().zip(x.iter().zip(reference)) {
-        *out = x - r;
-    }
-    for &i in orientations {
-        let from = Quaternion::exp(three(reference, i)).inverse();
-        let turned = from.times(Quaternion::exp(three(x, i)));
-        out[i..i + 3].copy_from_slice(&turned.log().0);
-    }
-}
-
-/// `x` moved by `length · change`, of whole states.
-pub(super) fn retract(
-    orientations: &[usize],
-    x: &[f64],
-    change: &[f64],
-    length: f64,
-    out: &mut [f64],
-) {
-    for (out, (x, change)) in out.iter_mut().zip(x.iter().zip(change)) {
-        *out = x + length * change;
-    }
-    for &i in orientations {
-        let turn = Quaternion::exp(three(change, i) * length);
-        out[i..i + 3].copy_from_slice(&Quaternion::exp(three(x, i)).times(turn).log().0);
-    }
-}
 
 /// How the rotation vector at `e[i..]` changes with a turn of what it leads to, in its own axes.
 pub(super) fn chart(e: &[f64], i: usize) -> Mat3 {

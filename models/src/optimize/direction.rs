@@ -181,7 +181,7 @@ impl Direction {
         entries: &[bool],
         jacobian: &DMatrix<f64>,
     ) -> bool {
-        let basis = free_directions(entries, jacobian, motion.coordinates);
+        let basis = free_directions(entries, jacobian, motion.d.coordinates());
         if basis.ncols() == 0 {
             return true;
         }

@@ -1,8 +1,6 @@
 //! The linearized map along a motion, made block by block, shared among threads where that pays.
 
 use std::ops::{ControlFlow, Range};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
 
 use crate::integrator::report::StepError;
 use crate::linearization::linearize::Linearization;
@@ -55,16 +53,11 @@ pub(super) struct Linearizer {
     pub(super) maps: Vec<Map>,
     /// One per step where Newton's method contracts them, else none.
     pub(super) linearizations: Vec<Linearization>,
-    /// Block by block, whether the maps belong to the current motion, or else to the last trial.
+    /// Block by block, whether the maps belong to the current motion.
     is_current: Vec<bool>,
-    is_trial: Vec<bool>,
     /// One per thread; at least one.
     pub(super) workers: Vec<Worker>,
 }
-
-/// A roll-out that says after each step how many it took, and shows the motion.
-type RollOut<'a> =
-    &'a mut dyn FnMut(&mut dyn FnMut(usize, &Trajectory)) -> Result<bool, OptimizeError>;
 
 /// The map to write, and the linearization to keep.
 type Job<'a> = (&'a mut Map, Option<&'a mut Linearization>);
@@ -83,7 +76,6 @@ impl Linearizer {
             maps: (0..steps).map(|_| Map::default()).collect(),
             linearizations: vec![Linearization::new(model); if keeps { steps } else { 0 }],
             is_current: vec![false; blocks],
-            is_trial: vec![false; blocks],
             workers: vec![Worker::new(plant)],
         }
     }
@@ -94,19 +86,9 @@ impl Linearizer {
         self.workers.resize_with(useful, || Worker::new(plant));
     }
 
-    /// Whether trials are linearized behind, in the place of the current motion.
-    pub(super) fn looks_ahead(&self) -> bool {
-        self.workers.len() > 1
-    }
-
-    /// The last trial is the current motion.
-    pub(super) fn accept_trial(&mut self) {
-        std::mem::swap(&mut self.is_current, &mut self.is_trial);
-    }
-
-    /// The last trial comes to nothing.
-    pub(super) fn forget_trial(&mut self) {
-        self.is_trial.fill(false);
+    /// The motion is another one.
+    pub(super) fn forget(&mut self) {
+        self.is_current.fill(false);
     }
 
     /// Visits the maps of the steps from the last to the first; the step at which the visitor breaks off.
@@ -193,91 +175,6 @@ impl Linearizer {
         }
         Ok(stopped)
     }
-
-    /// Rolls a trial out, and has helpers linearize the blocks behind it meanwhile, the last first.
-    pub(super) fn roll_out(&mut self, roll_out: RollOut<'_>) -> Result<bool, OptimizeError> {
-        self.is_trial.fill(false);
-        let helpers = &mut self.workers[1..];
-        if helpers.is_empty() {
-            return roll_out(&mut |_, _| {});
-        }
-        // The maps of the trial take the place of those of the current motion.
-        self.is_current.fill(false);
-        let length = block_length(self.states);
-        let is_over = AtomicBool::new(false);
-        std::thread::scope(|scope| {
-            let mut queues = Vec::with_capacity(helpers.len());
-            let mut threads = Vec::with_capacity(helpers.len());
-            for worker in helpers {
-                let (queue, blocks) = mpsc::channel::<Block<'_>>();
-                let is_over = &is_over;
-                queues.push(queue);
-                threads.push(scope.spawn(move || linearize_blocks(worker, &blocks, is_over)));
-            }
-            let mut maps = self.maps.chunks_mut(length).enumerate();
-            let mut kept = self.linearizations.chunks_mut(length);
-            let (mut first, mut next) = (0, maps.next());
-            let rolled_out = roll_out(&mut |steps, trial| {
-                let Some((number, maps_of_block)) =
-                    next.take_if(|(_, maps)| first + maps.len() == steps)
-                else {
-                    return;
-                };
-                let motion = trial.part(first..steps);
-                let kept = kept.next().unwrap_or_default();
-                // A helper that is gone leaves its blocks to the next iteration.
-                let block = Block { number, motion, maps: maps_of_block, kept };
-                let _ = queues[number % queues.len()].send(block);
-                (first, next) = (steps, maps.next());
-            });
-            is_over.store(true, Ordering::Relaxed);
-            drop(queues);
-            for thread in threads {
-                match thread.join() {
-                    Ok(done) => done.into_iter().for_each(|number| self.is_trial[number] = true),
-                    Err(panic) => std::panic::resume_unwind(panic),
-                }
-            }
-            rolled_out
-        })
-    }
-}
-
-/// A block of a trial.
-struct Block<'a> {
-    number: usize,
-    motion: Trajectory,
-    maps: &'a mut [Map],
-    kept: &'a mut [Linearization],
-}
-
-/// Linearizes the blocks that come, the last first, until the roll-out is over; the numbers of those that
-/// are done.
-fn linearize_blocks(
-    worker: &mut Worker,
-    blocks: &mpsc::Receiver<Block<'_>>,
-    is_over: &AtomicBool,
-) -> Vec<usize> {
-    let (mut waiting, mut done) = (Vec::new(), Vec::new());
-    while !is_over.load(Ordering::Relaxed) {
-        if waiting.is_empty() {
-            match blocks.recv() {
-                Ok(block) => waiting.push(block),
-                Err(_) => break,
-            }
-        }
-        waiting.extend(blocks.try_iter());
-        let Some(Block { number, motion, maps, kept }) = waiting.pop() else { break };
-        let mut kept = kept.iter_mut();
-        let linearized = maps
-            .iter_mut()
-            .enumerate()
-            .all(|(k, map)| worker.linearize(&motion.known(k), map, kept.next()).is_ok());
-        if linearized {
-            done.push(number);
-        }
-    }
-    done
 }
 
 /// Steps of a block: enough for threads to share, few enough for caches and for questions.

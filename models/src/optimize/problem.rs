@@ -6,6 +6,7 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::control::weights::{Momentum, StageWeights, TrajectoryWeights, Weights};
 use crate::integrator::state::State;
+use crate::model::manifold::difference;
 use crate::model::mechanism::Model;
 use crate::optimize::bounds::{BoundPenalty, Quantity};
 use crate::optimize::chart;
@@ -157,7 +158,7 @@ impl Problem {
 
     /// `x ⊖ reference`, of whole states.
     pub(super) fn difference(&self, reference: &[f64], x: &[f64], out: &mut [f64]) {
-        chart::difference(self.model.orientations(), reference, x, out);
+        difference(self.model.orientations(), reference, x, out);
     }
 
     /// Change of an initial state and its weight; none where it costs nothing.

@@ -33,7 +33,7 @@ pub struct Checkpoint {
 }
 
 /// What an iteration did.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Progress {
     /// Number of the iteration, from 0.
     pub iteration: u32,
@@ -79,9 +79,10 @@ pub enum Fallback {
 }
 
 /// Whether a search goes on.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Status {
     /// It does.
+    #[default]
     Running,
     /// The directional derivative and the bounds are within their tolerances.
     Converged,

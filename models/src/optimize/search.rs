@@ -2,7 +2,7 @@
 
 mod ending;
 #[cfg(test)]
-mod probe;
+mod tests;
 
 use nalgebra::DMatrix;
 
@@ -72,7 +72,7 @@ pub struct Optimizer {
 }
 
 /// How far a search has come.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Course {
     iterations: u32,
     first_cost: f64,
@@ -148,8 +148,8 @@ impl Optimizer {
         fits(multipliers.len() == count, "the number of its multipliers")?;
         fits(multipliers.iter().all(|x| x.is_finite()), "a multiplier is not finite")?;
         let Checkpoint { iterations, backtracks, .. } = *checkpoint;
-        let status = Status::Running;
-        search.course = Course { iterations, first_cost, backtracks, last_derivative, status };
+        let course = &mut search.course;
+        *course = Course { iterations, first_cost, backtracks, last_derivative, ..*course };
         search.bounds.renewed_error = checkpoint.bound_violation;
         search.bounds.penalty = penalty;
         search.bounds.multipliers.copy_from_slice(multipliers);
@@ -191,13 +191,6 @@ impl Optimizer {
         let linearizer = Linearizer::new(&plant, steps, keeps);
         let mut trials = Trials::new(plant, &problem, &current);
         trials.simulate_guess(&problem, &mut current.trajectory)?;
-        let course = Course {
-            iterations: 0,
-            first_cost: 0.0,
-            backtracks: 0,
-            last_derivative: 0.0,
-            status: Status::Running,
-        };
         Ok(Self {
             derivatives: CostDerivatives::new(&problem),
             direction: Direction::new(&problem, keeps && projection.is_some()),
@@ -208,7 +201,7 @@ impl Optimizer {
             linearizer,
             projection,
             trials,
-            course,
+            course: Course::default(),
         })
     }
 
@@ -268,7 +261,7 @@ impl Optimizer {
 
     /// Initial state of the trajectory.
     pub fn initial_state(&self) -> State {
-        self.current.trajectory.initial(self.problem.model.dimensions())
+        self.current.trajectory.initial()
     }
 
     /// One iteration. `go_on` is asked every few steps of work; where it says no, the iteration ends
@@ -295,10 +288,7 @@ impl Optimizer {
             cost: merit,
             directional_derivative: f64::NAN,
             method: asked,
-            fallback: None,
-            step_length: 0.0,
-            backtracks: 0,
-            bound_violation: 0.0,
+            ..Progress::default()
         };
         self.step_or_end(asked, &mut progress, go_on)?;
         self.course.iterations += 1;
@@ -480,7 +470,6 @@ impl Optimizer {
             while backtracks > 0 {
                 self.trials.swap_kept();
                 if !self.try_armijo(backtracks - 1, derivative, go_on)? {
-                    self.linearizer.forget_trial();
                     self.trials.swap_kept();
                     break;
                 }
@@ -488,7 +477,7 @@ impl Optimizer {
             }
         }
         std::mem::swap(&mut self.current, &mut self.trials.last);
-        self.linearizer.accept_trial();
+        self.linearizer.forget();
         if let Some(projection) = &mut self.projection {
             projection.forget();
         }
@@ -522,19 +511,16 @@ impl Optimizer {
         enough: f64,
         go_on: Question<'_>,
     ) -> Result<bool, OptimizeError> {
-        let Self { problem, bounds, current, linearizer, projection, direction, trials, .. } = self;
+        let Self { problem, bounds, current, projection, direction, trials, .. } = self;
         let step = (&*direction, length);
         if !trials.start(problem, current, step) {
             return Ok(false);
-        }
-        if let Some(projection) = projection.as_mut().filter(|_| linearizer.looks_ahead()) {
-            projection.forget();
         }
         let gains = match projection {
             Some(projection) if !direction.is_projection => &projection.gains,
             _ => &direction.gains,
         };
         let point = Point { problem, bounds, motion: &current.trajectory };
-        trials.roll_out(point, step, gains, enough, linearizer, go_on)
+        trials.roll_out(point, step, gains, enough, go_on)
     }
 }

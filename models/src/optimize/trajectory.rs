@@ -1,7 +1,5 @@
 //! Trajectories, row by row.
 
-use std::ops::Range;
-
 use nalgebra::DMatrix;
 
 use crate::integrator::state::State;
@@ -9,14 +7,11 @@ use crate::model::mechanism::Dimensions;
 use crate::plant::known::KnownStep;
 
 /// States, inputs and constraint impulses of a motion, row-major.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(super) struct Trajectory {
     /// Index of the first step.
     pub(super) first_step: u64,
-    pub(super) coordinates: usize,
-    pub(super) states: usize,
-    pub(super) inputs: usize,
-    pub(super) constraints: usize,
+    pub(super) d: Dimensions,
     pub(super) x: Vec<f64>,
     pub(super) u: Vec<f64>,
     pub(super) multipliers: Vec<f64>,
@@ -28,38 +23,20 @@ pub(super) struct Trajectory {
 
 impl Trajectory {
     pub(super) fn new(d: Dimensions, first_step: u64, steps: usize) -> Self {
-        let (states, inputs, constraints) = (d.state(), d.input(), d.constraints);
         Self {
             first_step,
-            coordinates: d.coordinates(),
-            states,
-            inputs,
-            constraints,
-            x: vec![0.0; (steps + 1) * states],
-            u: vec![0.0; steps * inputs],
-            multipliers: vec![0.0; steps * constraints],
+            d,
+            x: vec![0.0; (steps + 1) * d.state()],
+            u: vec![0.0; steps * d.input()],
+            multipliers: vec![0.0; steps * d.constraints],
             cost: 0.0,
             merit: 0.0,
         }
     }
 
-    /// A copy of some steps.
-    pub(super) fn part(&self, steps: Range<usize>) -> Self {
-        let part = |numbers: &[f64], width: usize, rows: usize| {
-            numbers[steps.start * width..][..rows * width].to_vec()
-        };
-        Self {
-            first_step: self.first_step.saturating_add(steps.start as u64),
-            x: part(&self.x, self.states, steps.len() + 1),
-            u: part(&self.u, self.inputs, steps.len()),
-            multipliers: part(&self.multipliers, self.constraints, steps.len()),
-            ..*self
-        }
-    }
-
     /// Step `k`.
     pub(super) fn known(&self, k: usize) -> KnownStep<'_> {
-        let n = self.coordinates;
+        let n = self.d.coordinates();
         KnownStep {
             index: self.first_step.saturating_add(k as u64),
             q0: &self.x(k)[..n],
@@ -71,28 +48,28 @@ impl Trajectory {
     }
 
     /// The state that it begins with.
-    pub(super) fn initial(&self, d: Dimensions) -> State {
-        let (q, rest) = self.x(0).split_at(self.coordinates);
-        let (p, v) = rest.split_at(d.dynamic);
+    pub(super) fn initial(&self) -> State {
+        let (q, rest) = self.x(0).split_at(self.d.coordinates());
+        let (p, v) = rest.split_at(self.d.dynamic);
         let [q, p, v] = [q, p, v].map(<[f64]>::to_vec);
-        State { step: self.first_step, q, p, v, multipliers: vec![0.0; self.constraints] }
+        State { step: self.first_step, q, p, v, multipliers: vec![0.0; self.d.constraints] }
     }
 
     pub(super) fn x(&self, k: usize) -> &[f64] {
-        &self.x[k * self.states..][..self.states]
+        &self.x[k * self.d.state()..][..self.d.state()]
     }
 
     /// `u[k]`; nothing after the last step.
     pub(super) fn u(&self, k: usize) -> &[f64] {
-        self.u.get(k * self.inputs..(k + 1) * self.inputs).unwrap_or_default()
+        self.u.get(k * self.d.input()..(k + 1) * self.d.input()).unwrap_or_default()
     }
 
     pub(super) fn multipliers(&self, k: usize) -> &[f64] {
-        &self.multipliers[k * self.constraints..][..self.constraints]
+        &self.multipliers[k * self.d.constraints..][..self.d.constraints]
     }
 
     pub(super) fn set_x(&mut self, k: usize, parts: [&[f64]; 3]) {
-        let mut row = &mut self.x[k * self.states..][..self.states];
+        let mut row = &mut self.x[k * self.d.state()..][..self.d.state()];
         for part in parts {
             let (head, tail) = row.split_at_mut(part.len());
             head.copy_from_slice(part);
@@ -101,7 +78,7 @@ impl Trajectory {
     }
 
     pub(super) fn set_multipliers(&mut self, k: usize, values: &[f64]) {
-        self.multipliers[k * self.constraints..][..self.constraints].copy_from_slice(values);
+        self.multipliers[k * self.d.constraints..][..self.d.constraints].copy_from_slice(values);
     }
 }
 

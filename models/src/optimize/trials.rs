@@ -2,10 +2,9 @@
 
 use nalgebra::DMatrix;
 
-use crate::optimize::chart::retract;
+use crate::model::manifold::retract;
 use crate::optimize::direction::Direction;
 use crate::optimize::error::OptimizeError;
-use crate::optimize::linearizer::Linearizer;
 use crate::optimize::problem::{Deviation, Point, Problem};
 use crate::optimize::products::subtract_product;
 use crate::optimize::question::{Question, ask_at};
@@ -81,7 +80,6 @@ impl Trials {
         (direction, length): (&Direction, f64),
         gains: &[DMatrix<f64>],
         enough: f64,
-        linearizer: &mut Linearizer,
         go_on: Question<'_>,
     ) -> Result<bool, OptimizeError> {
         let Point { problem, bounds, motion: current } = point;
@@ -91,38 +89,34 @@ impl Trials {
         trial.set_x(0, [plant.q(), plant.p(), plant.v()]);
         let (mut cost, mut penalties) = (problem.initial_cost(trial.x(0)), 0.0);
         let may_stop_early = problem.is_nonnegative && bounds.is_empty();
-        linearizer.roll_out(&mut |behind: &mut dyn FnMut(usize, &Trajectory)| {
-            for (k, gain) in gains.iter().enumerate() {
-                ask_at(k, go_on)?;
-                // u = ū + s du − K (x ⊖ (x̄ + s dx)).
-                let dx = &direction.dx[k * states..][..states];
-                retract(problem.model.orientations(), current.x(k), dx, length, nominal);
-                problem.difference(nominal, trial.x(k), error);
-                let change = &direction.du[k * inputs..][..inputs];
-                for (u, (nominal, change)) in input.iter_mut().zip(current.u(k).iter().zip(change))
-                {
-                    *u = nominal + length * change;
-                }
-                subtract_product(gain, error, input);
-                cost += problem.evaluate(k, trial.x(k), input, deviation);
-                penalties += bounds.value(k, (trial.x(k), input));
-                // What is still to come costs nothing at least.
-                if may_stop_early && !(cost < enough) {
-                    return Ok(false);
-                }
-                trial.u[k * inputs..][..inputs].copy_from_slice(input);
-                if plant.step(input).is_err() {
-                    return Ok(false);
-                }
-                trial.set_x(k + 1, [plant.q(), plant.p(), plant.v()]);
-                trial.set_multipliers(k, plant.multipliers());
-                behind(k + 1, trial);
+        for (k, gain) in gains.iter().enumerate() {
+            ask_at(k, go_on)?;
+            // u = ū + s du − K (x ⊖ (x̄ + s dx)).
+            let dx = &direction.dx[k * states..][..states];
+            retract(problem.model.orientations(), current.x(k), dx, length, nominal);
+            problem.difference(nominal, trial.x(k), error);
+            let change = &direction.du[k * inputs..][..inputs];
+            for (u, (nominal, change)) in input.iter_mut().zip(current.u(k).iter().zip(change)) {
+                *u = nominal + length * change;
             }
-            cost += problem.evaluate(steps, trial.x(steps), &[], deviation);
-            penalties += bounds.value(steps, (trial.x(steps), &[]));
-            (trial.cost, trial.merit) = (cost, cost + penalties);
-            Ok(trial.merit.is_finite())
-        })
+            subtract_product(gain, error, input);
+            cost += problem.evaluate(k, trial.x(k), input, deviation);
+            penalties += bounds.value(k, (trial.x(k), input));
+            // What is still to come costs nothing at least.
+            if may_stop_early && !(cost < enough) {
+                return Ok(false);
+            }
+            trial.u[k * inputs..][..inputs].copy_from_slice(input);
+            if plant.step(input).is_err() {
+                return Ok(false);
+            }
+            trial.set_x(k + 1, [plant.q(), plant.p(), plant.v()]);
+            trial.set_multipliers(k, plant.multipliers());
+        }
+        cost += problem.evaluate(steps, trial.x(steps), &[], deviation);
+        penalties += bounds.value(steps, (trial.x(steps), &[]));
+        (trial.cost, trial.merit) = (cost, cost + penalties);
+        Ok(trial.merit.is_finite())
     }
 
     /// Puts the plant at the initial state of the trial; false if there is none.

@@ -13,6 +13,7 @@ use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{SUBSTEPS_MAX, Settings};
 use crate::integrator::state::State;
+use crate::math::norms::larger;
 use crate::plant::facade::Plant;
 use crate::plant::initial::{Initial, InitialError};
 
@@ -195,10 +196,7 @@ impl Probe<'_> {
 
 /// Largest difference.
 fn distance(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).fold(0.0, |largest, (a, b)| {
-        let difference = (a - b).abs();
-        if difference > largest || difference.is_nan() { difference } else { largest }
-    })
+    a.iter().zip(b).map(|(a, b)| a - b).fold(0.0, larger)
 }
 
 /// What a control period is off by.

@@ -1,12 +1,4 @@
-//! Plants: a model with a state and a workspace.
-//!
-//! The files in the order in which a step runs: [`initial`], [`predictor`], [`kinematics`], [`momenta`],
-//! [`mechanics`], [`vectors`], [`potentials`], [`forces`], [`closure`] (constraints), [`curvature`], [`tree_lu`],
-//! [`planar`] (in place of kinematics to tree LU), [`pivoted_lu`], [`newton`], [`conditioning`],
-//! [`linearize`]; [`scheme`], [`collocation`] and [`period`] (higher order, substeps); [`blocks`] and
-//! [`second_order`]; then
-//! [`choice`] (accuracy mode), [`projected`] (momentum), [`known`], [`diagnose`], [`settle`], [`site`], [`snapshot`],
-//! [`spare`] (plants made ahead).
+//! The plant itself: a model with a state and a workspace, and what is done with it.
 
 use std::sync::Arc;
 
@@ -56,6 +48,24 @@ impl Plant {
     ///
     /// Two to four residual evaluations of O(n) and one factorization for a smooth motion. Methods of
     /// higher order and substeps: see [`Settings`]. A step that fails leaves the plant as it was.
+    ///
+    /// ```
+    /// use std::sync::Arc;
+    /// use plantd_models::{Initial, Model, Plant, Settings, builtin};
+    ///
+    /// // A pendulum without damping keeps its energy.
+    /// let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap())?);
+    /// let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model))?;
+    /// plant.initialize(&Initial::Velocity { q: vec![1.0], v: vec![0.0] })?;
+    /// let total = |plant: &mut Plant| plant.energy().kinetic_j + plant.energy().potential_j;
+    /// let before = total(&mut plant);
+    /// for _ in 0..1000 {
+    ///     let report = plant.step(&[0.0])?;
+    ///     assert!(report.residual < 10.0, "in units of round-off");
+    /// }
+    /// assert!((total(&mut plant) - before).abs() < 1e-2);
+    /// # Ok::<(), Box<dyn std::error::Error>>(())
+    /// ```
     pub fn step(&mut self, u: &[f64]) -> Result<StepReport, StepError> {
         let report = self.solve(u, None)?;
         self.commit();

@@ -95,23 +95,17 @@ impl Model {
     }
 }
 
-impl Initial {
-    /// Whether it asks for the scene's initial configuration.
-    fn is_of_scene(&self) -> bool {
-        match self {
-            Self::Scene => true,
-            Self::OperatingPoint(name) => name == "initial",
-            _ => false,
-        }
-    }
-}
-
 impl Plant {
     /// Puts the plant into a state, step 0.
     pub fn initialize(&mut self, initial: &Initial) -> Result<(), InitialError> {
         let state = self.state_of(initial)?;
+        let is_of_scene = match initial {
+            Initial::Scene => true,
+            Initial::OperatingPoint(name) => name == "initial",
+            _ => false,
+        };
         self.check_constraints(&state.q).map_err(|error| match error {
-            InitialError::OffConstraint { constraint, violation } if initial.is_of_scene() => {
+            InitialError::OffConstraint { constraint, violation } if is_of_scene => {
                 InitialError::SceneIsGuess { constraint, violation }
             }
             error => error,
@@ -147,7 +141,8 @@ impl Plant {
                 let v = checked("v", v, n)?;
                 state.v.copy_from_slice(&v[nd..]);
                 state.orient(&self.model);
-                state.p = self.workspace.momentum_of(&self.model, &state, &v);
+                self.workspace.gradient_at(&self.model, &state, &v);
+                state.p.copy_from_slice(&self.workspace.mid.l_v);
             }
             Initial::TwoConfigurations { q0, q1 } => {
                 let q0 = checked("q0", q0, n)?;
@@ -163,13 +158,10 @@ impl Plant {
             }
             Initial::Projection { q, hold } => {
                 let guess = checked("q", q, n)?;
-                let mut moves: Vec<bool> = (0..n).map(|i| i < nd).collect();
-                for name in hold {
-                    let index = self.model.coordinate_index(name).ok_or_else(|| {
-                        InitialError::Unknown { kind: "coordinate", name: name.clone() }
-                    })?;
-                    moves[index] = false;
-                }
+                let moves = self
+                    .model
+                    .free_coordinates(hold)
+                    .map_err(|name| InitialError::Unknown { kind: "coordinate", name })?;
                 state.q = self.project(guess, &moves)?;
             }
         }
@@ -289,13 +281,10 @@ impl Plant {
     /// allocates nothing.
     pub fn energy(&mut self) -> Energy {
         self.workspace.find_velocity(&self.model, &self.state);
-        let mut velocity = std::mem::take(&mut self.workspace.mid.velocity);
-        let (dynamic, prescribed) = velocity.split_at_mut(self.workspace.residual.dynamics.len());
-        dynamic.copy_from_slice(&self.workspace.residual.dynamics);
-        prescribed.copy_from_slice(&self.state.v);
-        let energy = self.workspace.energy_of(&self.model, &self.state, &velocity);
-        self.workspace.mid.velocity = velocity;
-        energy
+        // Prescribed coordinates have their velocity there already.
+        let Workspace { mid, residual, .. } = &mut self.workspace;
+        mid.velocity[..residual.dynamics.len()].copy_from_slice(&residual.dynamics);
+        self.workspace.energy(&self.model, &self.state)
     }
 
     /// Takes over the state of another plant, of the same coordinates, inputs, constraints and settings, to
@@ -320,7 +309,8 @@ impl Plant {
         let mut state = PreciseState::new(&self.model, self.period.scheme);
         state.q = checked("q", q, n)?;
         state.orient(&self.model);
-        let energy = self.workspace.energy_of(&self.model, &state, &checked("v", v, n)?);
+        self.workspace.mid.velocity.copy_from_slice(&checked("v", v, n)?);
+        let energy = self.workspace.energy(&self.model, &state);
         self.workspace.forget();
         Ok(energy)
     }
@@ -337,17 +327,24 @@ fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f6
 }
 
 impl Workspace {
-    fn energy_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Energy {
-        self.gradient_at(model, state, velocity);
+    /// Energy at the configuration of a state and the velocity that is there.
+    fn energy(&mut self, model: &Model, state: &PreciseState) -> Energy {
+        self.gradient(model, state);
         let (poses, momenta) = (&self.mid.mechanics.poses, &self.mid.mechanics.momenta);
         Energy {
-            kinetic_j: 0.5 * momenta.twice_kinetic_energy(&model.dynamics, velocity),
+            kinetic_j: 0.5 * momenta.twice_kinetic_energy(&model.dynamics, &self.mid.velocity),
             potential_j: potential_energy(model, poses, momenta, &state.q),
         }
     }
 
     /// Gradient of the Lagrangian without springs at any configuration and velocity.
     pub(crate) fn gradient_at(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) {
+        self.mid.velocity.copy_from_slice(velocity);
+        self.gradient(model, state);
+    }
+
+    /// Gradient of the Lagrangian without springs at any configuration, and at the velocity that is there.
+    fn gradient(&mut self, model: &Model, state: &PreciseState) {
         for (matrix, orientation) in self.balls.start.iter_mut().zip(&state.orientations) {
             *matrix = orientation.matrix();
         }
@@ -355,17 +352,11 @@ impl Workspace {
         self.mid.mechanics.momenta.gradient(
             &model.dynamics,
             &self.mid.mechanics.poses,
-            velocity,
+            &self.mid.velocity,
             model.gravity,
             &mut self.mid.l_q,
             &mut self.mid.l_v,
         );
-    }
-
-    /// `p = M(q) q̇` on the dynamic rows.
-    fn momentum_of(&mut self, model: &Model, state: &PreciseState, velocity: &[f64]) -> Vec<f64> {
-        self.gradient_at(model, state, velocity);
-        self.mid.l_v.clone()
     }
 
     /// Finds the velocity of the dynamic coordinates that belongs to a state, into `residual`; returns
@@ -375,9 +366,7 @@ impl Workspace {
         // With only the prescribed coordinates moving, `L_v` is their share of the momentum.
         self.mid.velocity[..d.dynamic].fill(0.0);
         self.mid.velocity[d.dynamic..].copy_from_slice(&state.v);
-        let velocity = std::mem::take(&mut self.mid.velocity);
-        self.gradient_at(model, state, &velocity);
-        self.mid.velocity = velocity;
+        self.gradient(model, state);
         self.mid.mechanics.curvature.evaluate(
             &model.dynamics,
             &self.mid.mechanics.poses,

@@ -6,7 +6,7 @@ use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::workspace::StepContext;
 use crate::linearization::linearize::Linearization;
-use crate::model::manifold::orientations;
+use crate::model::manifold::{difference, orientations};
 use crate::plant::facade::Plant;
 
 /// A step that was taken before, or one that a reference asks for.
@@ -60,9 +60,14 @@ impl Plant {
     }
 
     fn place_start(&mut self, step: &KnownStep<'_>) {
-        self.state.q.copy_from_slice(step.q0);
-        self.state.q_low.fill(0.0);
+        self.place_configuration(step.q0);
         self.state.step = step.index;
+    }
+
+    /// Takes a configuration as it is.
+    pub(crate) fn place_configuration(&mut self, q: &[f64]) {
+        self.state.q.copy_from_slice(q);
+        self.state.q_low.fill(0.0);
         self.state.orient(&self.model);
         self.workspace.forget();
     }
@@ -94,9 +99,7 @@ impl Plant {
     /// Mass matrix of the dynamic coordinates, nd square (allocates).
     pub(crate) fn mass_matrix_at(&mut self, q: &[f64]) -> DMatrix<f64> {
         let nd = self.model.dimensions.dynamic;
-        self.state.q.copy_from_slice(q);
-        self.state.orient(&self.model);
-        self.workspace.forget();
+        self.place_configuration(q);
         let mut mass = DMatrix::zeros(nd, nd);
         let mut velocity = vec![0.0; q.len()];
         for j in 0..nd {
@@ -125,19 +128,9 @@ impl Plant {
         let Self { model, settings, state, workspace, period } = self;
         let u = period.input.of_step(model, state, settings.time_step_s, step.u, [0.0, 1.0])?;
         workspace.prepare(StepContext { model, settings, state, u });
-        let nd = self.model.dimensions.dynamic;
-        let increment = &mut self.workspace.step.increment;
-        for (x, (q1, q0)) in increment.iter_mut().zip(step.q1.iter().zip(step.q0)) {
-            *x = q1 - q0;
-        }
-        self.workspace.step.multipliers.copy_from_slice(step.multipliers);
-        if self.model.orientations.iter().any(|&i| i < nd) {
-            let change = self.model.difference(step.q0, step.q1);
-            for &i in self.model.orientations.iter().filter(|i| **i < nd) {
-                self.workspace.step.increment[i..i + 3].copy_from_slice(&change[i..i + 3]);
-            }
-        }
-        let residual = self.workspace.evaluate(&self.model, &self.settings, &self.state);
+        difference(&model.orientations, step.q0, step.q1, &mut workspace.step.increment);
+        workspace.step.multipliers.copy_from_slice(step.multipliers);
+        let residual = workspace.evaluate(model, settings, state);
         if residual.is_nan() { Err(StepError::NotFinite { iterations: 0 }) } else { Ok(()) }
     }
 }

@@ -1,4 +1,12 @@
-//! Plants.
+//! Plants: a state and the memory of a step, behind one facade.
+//!
+//! Read [`facade`] first: what a user of a plant calls. [`solve`] takes a control period, [`period`] says what
+//! it is a sequence of; the steps themselves are the integrator's, their derivatives the linearization's.
+//!
+//! - where a plant starts: [`initial`], [`settle`] (at rest), [`snapshot`], [`spare`] (made ahead);
+//! - what can be asked of it: [`diagnose`], [`site`] (poses and pushes), [`projected`] (momentum), [`choice`]
+//!   (accuracy);
+//! - its derivatives: [`second_order`], [`known`] (of a step whose solution is known).
 
 pub(crate) mod choice;
 pub(crate) mod diagnose;

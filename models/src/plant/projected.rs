@@ -17,6 +17,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use crate::lagrangian::derivatives::Derivatives;
+use crate::lagrangian::kinematics::Place;
 use crate::plant::facade::Plant;
 
 /// Eigenvalues of `Dh M⁻¹ Dhᵀ` below this, relative to the largest, belong to redundant equations.
@@ -25,16 +26,12 @@ const REDUNDANT: f64 = 1e-11;
 impl Plant {
     /// Takes `x = (q, p, v)` as it is, whether it satisfies the constraints or not.
     pub(crate) fn place(&mut self, x: &[f64]) {
-        let state = &mut self.state;
-        let (q, rest) = x.split_at(state.q.len());
-        let (p, v) = rest.split_at(state.p.len());
-        state.q.copy_from_slice(q);
-        state.p.copy_from_slice(p);
-        state.v.copy_from_slice(v);
-        state.q_low.fill(0.0);
-        state.p_low.fill(0.0);
-        state.orient(&self.model);
-        self.workspace.forget();
+        let (q, rest) = x.split_at(self.state.q.len());
+        let (p, v) = rest.split_at(self.state.p.len());
+        self.place_configuration(q);
+        self.state.p.copy_from_slice(p);
+        self.state.p_low.fill(0.0);
+        self.state.v.copy_from_slice(v);
     }
 
     /// The derivative of `(q, p̃, v)` by `x = (q, p, v)`, square of `2 nd + 2 nk`: what weights on the
@@ -101,8 +98,8 @@ impl Plant {
         let (mut hessian, mut rate) = (DMatrix::zeros(n, n), DMatrix::zeros(nc, n));
         let closure = &self.workspace.constraints.start;
         for (c, constraint) in model.constraints.iter().enumerate() {
-            let (tree, q) = (&model.closure, &self.state.q[..]);
-            constraint.for_each_second_derivative(tree, &closure.poses, q, |i, j, value| {
+            let at = Place { tree: &model.closure, poses: &closure.poses, q: &self.state.q };
+            constraint.for_each_second_derivative(at, &mut |i, j, value| {
                 hessian[(i, j)] += mu[c] * value;
                 rate[(c, j)] += value * velocity[i];
             });

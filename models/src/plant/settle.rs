@@ -148,6 +148,16 @@ impl Model {
     pub fn settle(&self, request: &SettleRequest) -> Result<Equilibrium, SettleError> {
         Search::new(self, request)?.run(&request.q)
     }
+
+    /// Which coordinates are dynamic and not held; the name of one to be held that is unknown.
+    pub(crate) fn free_coordinates(&self, hold: &[String]) -> Result<Vec<bool>, String> {
+        let d = self.dimensions;
+        let mut is_free: Vec<bool> = (0..d.coordinates()).map(|i| i < d.dynamic).collect();
+        for name in hold {
+            is_free[self.coordinate_index(name).ok_or(name)?] = false;
+        }
+        Ok(is_free)
+    }
 }
 
 /// The configuration an increment of the dynamic coordinates away.
@@ -187,7 +197,7 @@ struct Point {
 
 impl Point {
     fn residual(&self) -> f64 {
-        self.unbalanced.iter().fold(0.0, |a, x| a.max(x.abs()))
+        self.unbalanced.amax()
     }
 }
 
@@ -198,15 +208,9 @@ impl<'a> Search<'a> {
         let inputs =
             if request.inputs.is_empty() { vec![0.0; d.inputs] } else { request.inputs.clone() };
         check("inputs", &inputs, d.inputs)?;
-        let mut moves = vec![true; d.dynamic];
-        for name in &request.hold {
-            let index = model
-                .coordinate_index(name)
-                .ok_or_else(|| SettleError::Unknown { name: name.clone() })?;
-            if let Some(moves) = moves.get_mut(index) {
-                *moves = false;
-            }
-        }
+        let mut moves =
+            model.free_coordinates(&request.hold).map_err(|name| SettleError::Unknown { name })?;
+        moves.truncate(d.dynamic);
         let (blocks, closure) = (Derivatives::new(model), Closure::new(model));
         Ok(Self { model, blocks, closure, inputs, moves, largest: 0.0 })
     }
@@ -224,7 +228,7 @@ impl<'a> Search<'a> {
             let basis = tangent_basis(&point.rows);
             let basis = self.without_held(basis);
             let reduced = basis.transpose() * self.scaled(&stiffness) * &basis;
-            let slope = basis.transpose() * self.scaled_vector(&point.gradient);
+            let slope = basis.transpose() * scaled(&self.model.conditioning, &point.gradient);
             let residual = point.residual();
             self.largest = self.largest.max(point.gradient.amax());
             let (size, round_off) = self.magnitudes(&point, &stiffness);
@@ -243,7 +247,7 @@ impl<'a> Search<'a> {
                 if modes.eigenvalues[softest] < -FLAT * stiffest {
                     let away = &basis * modes.eigenvectors.column(softest);
                     if let Some(lower) =
-                        self.leave(&point, &unscaled(&self.model.conditioning, &away))
+                        self.leave(&point, &scaled(&self.model.conditioning, &away))
                     {
                         point = lower;
                         continue;
@@ -257,7 +261,7 @@ impl<'a> Search<'a> {
                 -along[i] / modes.eigenvalues[i].abs().max(floor)
             });
             let mut step =
-                unscaled(&self.model.conditioning, &(&basis * (&modes.eigenvectors * step)));
+                scaled(&self.model.conditioning, &(&basis * (&modes.eigenvectors * step)));
             let limited = self.limit(&mut step, radius);
             match self.descend(&point, &step, round_off) {
                 Some((next, fraction)) => {
@@ -296,7 +300,7 @@ impl<'a> Search<'a> {
         let potential = potential_energy(model, &blocks.poses, &blocks.momenta, &q);
         let mut rows = model.conditioning.rows(model, &mut self.closure, &q);
         without_columns(&mut rows, &self.moves);
-        let scaled = self.scaled_vector(&gradient);
+        let scaled = scaled(&model.conditioning, &gradient);
         let weighted = pseudo_solve(rows.transpose(), &-&scaled);
         let unbalanced = scaled + rows.transpose() * &weighted;
         let unbalanced = DVector::from_fn(nd, |i, _| {
@@ -343,7 +347,7 @@ impl<'a> Search<'a> {
             let value = DVector::from_fn(closure.value.len(), |c, _| {
                 -closure.value[c] * conditioning.weight[c]
             });
-            Some(unscaled(conditioning, &pseudo_solve(rows, &value)).as_slice().to_vec())
+            Some(scaled(conditioning, &pseudo_solve(rows, &value)).as_slice().to_vec())
         };
         match project(model, &mut self.closure, q, &PROJECTION, correction) {
             (Reached::Satisfied, total) => {
@@ -498,14 +502,10 @@ impl<'a> Search<'a> {
             matrix[(i, j)] / (conditioning.inertia_of(i) * conditioning.inertia_of(j)).sqrt()
         })
     }
-
-    fn scaled_vector(&self, gradient: &DVector<f64>) -> DVector<f64> {
-        gradient.map_with_location(|i, _, g| g / self.model.conditioning.inertia_of(i).sqrt())
-    }
 }
 
-/// An increment in the coordinates' own units.
-fn unscaled(conditioning: &Conditioning, increment: &DVector<f64>) -> DVector<f64> {
+/// A gradient in the scaled coordinates, or an increment of these in the coordinates' own units.
+fn scaled(conditioning: &Conditioning, increment: &DVector<f64>) -> DVector<f64> {
     increment.map_with_location(|i, _, x| x / conditioning.inertia_of(i).sqrt())
 }
 

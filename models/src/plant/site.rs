@@ -14,12 +14,12 @@
 use crate::integrator::report::StepError;
 use crate::math::rotation::Quaternion;
 use crate::math::spatial::{Mat3, Vec3};
-use crate::math::sums::two_sum;
 use crate::math::trigonometry::sin_cos_of;
 use crate::model::mechanism::Model;
-use crate::model::site::{Site, SiteJoint};
-use crate::model::tree::JointKind;
+use crate::model::site::Site;
+use crate::model::tree::{Joint, JointKind};
 use crate::plant::facade::Plant;
+use crate::plant::period::add;
 
 /// Where a site is, in world axes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -30,17 +30,11 @@ pub struct Pose {
     pub rotation: [f64; 3],
 }
 
-/// The axis of a joint in the world, and a point of it.
-struct Axis {
-    direction: Vec3,
-    origin: Vec3,
-}
-
 impl Plant {
     /// Where a site is at the present configuration. Costs a sine, a cosine and 60 flops for each joint
     /// above it; allocates nothing.
     pub fn pose(&self, site: &Site) -> Pose {
-        let (rotation, position) = self.walk(site, |_, _| {});
+        let (rotation, position) = self.walk(site, |_, _, _| {});
         let axes = rotation.times(&site.rotation);
         Pose { position: position.0, rotation: Quaternion::of_matrix(&axes).log().0 }
     }
@@ -55,14 +49,14 @@ impl Plant {
     pub fn add_wrench(&self, site: &Site, force: [f64; 3], torque: [f64; 3], out: &mut [f64]) {
         assert_eq!(out.len(), self.model.dimensions.dynamic, "entries of the generalized force");
         let (force, torque) = (Vec3(force), Vec3(torque));
-        let (_, point) = self.walk(site, |_, _| {});
-        self.walk(site, |joint, axis| {
+        let (_, point) = self.walk(site, |_, _, _| {});
+        self.walk(site, |joint, axis, origin| {
             let Some(out) = out.get_mut(joint.coordinate) else { return };
-            let moment = || axis.direction.dot(torque + (point - axis.origin).cross(force));
+            let moment = || axis.dot(torque + (point - origin).cross(force));
             *out += match joint.kind {
                 JointKind::Revolute | JointKind::Ball(_) => moment(),
-                JointKind::Prismatic => axis.direction.dot(force),
-                JointKind::Screw(pitch) => moment() + pitch * axis.direction.dot(force),
+                JointKind::Prismatic => axis.dot(force),
+                JointKind::Screw(pitch) => moment() + pitch * axis.dot(force),
             };
         });
     }
@@ -82,11 +76,10 @@ impl Plant {
     ) -> Result<T, StepError> {
         let (state, before) = (&mut self.state, &mut self.period.before_impulse);
         assert_eq!(impulse.len(), state.p.len(), "entries of the impulse");
-        for (i, impulse) in impulse.iter().enumerate() {
-            before[i] = [state.p[i], state.p_low[i]];
-            let (p, low) = two_sum(state.p[i], impulse + state.p_low[i]);
-            (state.p[i], state.p_low[i]) = (p, low);
+        for (before, (p, low)) in before.iter_mut().zip(state.p.iter().zip(&state.p_low)) {
+            *before = [*p, *low];
         }
+        add(&mut state.p, &mut state.p_low, impulse);
         let outcome = advance(self);
         if outcome.is_err() {
             for (i, [p, low]) in self.period.before_impulse.iter().enumerate() {
@@ -96,8 +89,9 @@ impl Plant {
         outcome
     }
 
-    /// Rotation of the last joint and position of the point; calls `visit` with the axis of each joint.
-    fn walk(&self, site: &Site, mut visit: impl FnMut(&SiteJoint, &Axis)) -> (Mat3, Vec3) {
+    /// Rotation of the last joint and position of the point; calls `visit` with each joint, its axis
+    /// and a point of that.
+    fn walk(&self, site: &Site, mut visit: impl FnMut(&Joint, Vec3, Vec3)) -> (Mat3, Vec3) {
         let (mut rotation, mut origin) = (Mat3::IDENTITY, Vec3::ZERO);
         for joint in &site.joints {
             let q = self.state.q[joint.coordinate];
@@ -119,7 +113,7 @@ impl Plant {
                     rotation = Mat3([y, z, x]);
                 }
             }
-            visit(joint, &Axis { direction: rotation.0[2], origin });
+            visit(joint, rotation.0[2], origin);
         }
         (rotation, origin + rotation.apply(site.point))
     }

@@ -10,7 +10,6 @@ use crate::integrator::predictor::Past;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, Precision, Settings};
 use crate::integrator::state::PreciseState;
 use crate::math::hash::fnv1a;
-use crate::math::rotation::Quaternion;
 use crate::plant::facade::Plant;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
@@ -68,7 +67,7 @@ impl Plant {
 }
 
 impl PreciseState {
-    /// All numbers but orientations, in the order of the encoding.
+    /// All numbers, in the order of the encoding.
     fn numbers(&mut self) -> impl Iterator<Item = &mut f64> {
         let vectors = [
             &mut self.q,
@@ -79,7 +78,8 @@ impl PreciseState {
             &mut self.multipliers,
         ];
         let turns = self.orientations_low.as_flattened_mut();
-        vectors.into_iter().flatten().chain(turns).chain(self.past.numbers())
+        let orientations = self.orientations.iter_mut().flat_map(|q| &mut q.0);
+        vectors.into_iter().flatten().chain(turns).chain(self.past.numbers()).chain(orientations)
     }
 }
 
@@ -114,9 +114,6 @@ impl Snapshot {
         bytes.extend([state.halvings, state.calm]);
         bytes.extend(state.past.code());
         bytes.extend(state.numbers().flat_map(|value| value.to_le_bytes()));
-        for Quaternion(components) in &state.orientations {
-            bytes.extend(components.iter().flat_map(|value| value.to_le_bytes()));
-        }
         bytes.extend(fnv1a(&bytes).to_le_bytes());
         bytes
     }
@@ -132,41 +129,41 @@ impl Snapshot {
         if fnv1a(body).to_le_bytes() != hash {
             return Err(malformed("checksum does not match"));
         }
-        let mut reader = Reader(&body[MAGIC.len()..]);
-        if u32::from_le_bytes(reader.take()?) != VERSION {
+        let rest = &mut &body[MAGIC.len()..];
+        if u32::from_le_bytes(take(rest)?) != VERSION {
             return Err(malformed("unknown version"));
         }
-        let model_digest = u64::from_le_bytes(reader.take()?);
+        let model_digest = u64::from_le_bytes(take(rest)?);
         let settings = Settings {
-            time_step_s: f64::from_le_bytes(reader.take()?),
-            order: u32::from_le_bytes(reader.take()?),
-            substeps: u32::from_le_bytes(reader.take()?),
-            halvings: u32::from(reader.take::<1>()?[0]),
-            precision: match reader.take::<1>()? {
+            time_step_s: f64::from_le_bytes(take(rest)?),
+            order: u32::from_le_bytes(take(rest)?),
+            substeps: u32::from_le_bytes(take(rest)?),
+            halvings: u32::from(take::<1>(rest)?[0]),
+            precision: match take::<1>(rest)? {
                 [0] => Precision::Exact,
                 [1] => Precision::Fast,
                 _ => return Err(malformed("unknown precision")),
             },
-            force_split: match reader.take::<1>()? {
+            force_split: match take::<1>(rest)? {
                 [0] => ForceSplit::Symmetric,
                 [1] => ForceSplit::Paper,
                 _ => return Err(malformed("unknown force split")),
             },
-            max_iterations: u32::from_le_bytes(reader.take()?),
-            singular_below: f64::from_le_bytes(reader.take()?),
+            max_iterations: u32::from_le_bytes(take(rest)?),
+            singular_below: f64::from_le_bytes(take(rest)?),
         };
-        let mut size = || Ok(u32::from_le_bytes(reader.take()?) as usize);
+        let mut size = || Ok(u32::from_le_bytes(take(rest)?) as usize);
         let (nd, nk, nc, no) = (size()?, size()?, size()?, size()?);
-        let step = u64::from_le_bytes(reader.take()?);
-        let time_origin_s = f64::from_le_bytes(reader.take()?);
-        let [halvings, calm] = reader.take()?;
-        let mut past = Past::from_code(reader.take()?).ok_or(malformed("unknown kind of past"))?;
+        let step = u64::from_le_bytes(take(rest)?);
+        let time_origin_s = f64::from_le_bytes(take(rest)?);
+        let [halvings, calm] = take(rest)?;
+        let mut past = Past::from_code(take(rest)?).ok_or(malformed("unknown kind of past"))?;
         if u32::from(halvings) > HALVINGS_MAX || settings.halvings > HALVINGS_MAX {
             return Err(malformed("a period was halved too often"));
         }
         let sizes = [nd, nk, nc, no];
         let numbers = [4 * nd, 2 * nk, nc, 8 * no, past.length(nd)];
-        if reader.0.len() / 8 != numbers.iter().sum::<usize>() || reader.0.len() % 8 != 0 {
+        if rest.len() / 8 != numbers.iter().sum::<usize>() || rest.len() % 8 != 0 {
             return Err(malformed("sizes do not match"));
         }
         if !time_origin_s.is_finite() {
@@ -176,26 +173,19 @@ impl Snapshot {
         let mut state = PreciseState::zeros(sizes, past);
         (state.step, state.time_origin_s) = (step, time_origin_s);
         (state.halvings, state.calm) = (halvings, calm);
-        let mut orientations = std::mem::take(&mut state.orientations);
-        for value in state.numbers().chain(orientations.iter_mut().flat_map(|q| &mut q.0)) {
-            *value = f64::from_le_bytes(reader.take()?);
+        for value in state.numbers() {
+            *value = f64::from_le_bytes(take(rest)?);
             if !value.is_finite() {
                 return Err(malformed("a number is not finite"));
             }
         }
-        state.orientations = orientations;
         Ok(Self { model_digest, settings, state })
     }
 }
 
-/// Bytes still to be read.
-struct Reader<'a>(&'a [u8]);
-
-impl Reader<'_> {
-    fn take<const N: usize>(&mut self) -> Result<[u8; N], SnapshotError> {
-        let (head, tail) =
-            self.0.split_first_chunk().ok_or(SnapshotError::Malformed("cut short"))?;
-        self.0 = tail;
-        Ok(*head)
-    }
+/// The next bytes of those that are still to be read.
+fn take<const N: usize>(rest: &mut &[u8]) -> Result<[u8; N], SnapshotError> {
+    let (head, tail) = rest.split_first_chunk().ok_or(SnapshotError::Malformed("cut short"))?;
+    *rest = tail;
+    Ok(*head)
 }

@@ -115,19 +115,9 @@ pub enum Component {
     Input(String),
 }
 
-impl From<f64> for Component {
-    fn from(constant: f64) -> Self {
-        Self::Constant(constant)
-    }
-}
-
-impl From<String> for Component {
-    fn from(input: String) -> Self {
-        Self::Input(input)
-    }
-}
-
 impl NumberOrName for Component {
+    const NUMBER: fn(f64) -> Self = Self::Constant;
+    const NAME: fn(String) -> Self = Self::Input;
     const ALLOWED: &'static str = "a number or the name of an input";
 }
 

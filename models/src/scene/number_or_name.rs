@@ -24,7 +24,11 @@ where
 }
 
 /// A number, or else the name of something.
-pub(super) trait NumberOrName: From<f64> + From<String> {
+pub(super) trait NumberOrName: Sized {
+    /// What a number makes.
+    const NUMBER: fn(f64) -> Self;
+    /// What a name makes.
+    const NAME: fn(String) -> Self;
     /// What is allowed, in words.
     const ALLOWED: &'static str;
 }
@@ -48,18 +52,18 @@ impl<T: NumberOrName> Visitor<'_> for Either<T> {
     }
 
     fn visit_f64<E: Error>(self, number: f64) -> Result<T, E> {
-        Ok(number.into())
+        Ok(T::NUMBER(number))
     }
 
     fn visit_i64<E: Error>(self, number: i64) -> Result<T, E> {
-        Ok((number as f64).into())
+        Ok(T::NUMBER(number as f64))
     }
 
     fn visit_u64<E: Error>(self, number: u64) -> Result<T, E> {
-        Ok((number as f64).into())
+        Ok(T::NUMBER(number as f64))
     }
 
     fn visit_str<E: Error>(self, name: &str) -> Result<T, E> {
-        Ok(name.to_owned().into())
+        Ok(T::NAME(name.to_owned()))
     }
 }

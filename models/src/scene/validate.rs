@@ -9,7 +9,7 @@ mod signals;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::scene::forces::Force;
 use crate::scene::limits::{
@@ -46,6 +46,7 @@ impl Scene {
 struct Check<'a> {
     scene: &'a Scene,
     problems: Vec<Problem>,
+    inputs: BTreeSet<&'a str>,
     /// Index of the first frame of each name.
     frames: BTreeMap<&'a str, usize>,
     /// Parent of each frame; none for children of the world and of unknown parents.
@@ -63,6 +64,7 @@ impl<'a> Check<'a> {
         Self {
             scene,
             problems: Vec::new(),
+            inputs: scene.inputs.iter().map(|input| input.name.as_str()).collect(),
             frames: BTreeMap::new(),
             parents: Vec::new(),
             is_tree: true,
@@ -80,24 +82,24 @@ impl<'a> Check<'a> {
         let joints: usize = scene.frames.iter().map(|f| f.motions().len()).sum();
         let signal_points: usize = scene.signals.iter().map(Signal::points).sum();
         let equations: usize = scene.constraints.iter().map(Constraint::equations).sum();
-        let spring_points = scene.springs.iter().map(|spring| match spring {
-            Spring::Path { points, .. } => points.len(),
-            _ => 0,
-        });
-        let spring_terms = scene.springs.iter().map(|spring| match spring {
-            Spring::LinearSpring { terms, .. } => terms.len(),
-            _ => 0,
-        });
+        let (mut cord_points, mut spring_terms) = (0, 0);
+        for spring in &scene.springs {
+            match spring {
+                Spring::Path { points, .. } => cord_points += points.len(),
+                Spring::LinearSpring { terms, .. } => spring_terms += terms.len(),
+                _ => {}
+            }
+        }
+        let (mut path_points, mut coupling_terms) = (0, 0);
+        for constraint in &scene.constraints {
+            match constraint {
+                Constraint::PathLength { points, .. } => path_points += points.len(),
+                Constraint::Coupling { terms, .. } => coupling_terms += terms.len(),
+                _ => {}
+            }
+        }
         let force_terms = scene.forces.iter().map(|force| match force {
             Force::LinearDamper { terms, .. } => terms.len(),
-            _ => 0,
-        });
-        let constraint_points = scene.constraints.iter().map(|constraint| match constraint {
-            Constraint::PathLength { points, .. } => points.len(),
-            _ => 0,
-        });
-        let terms = scene.constraints.iter().map(|constraint| match constraint {
-            Constraint::Coupling { terms, .. } => terms.len(),
             _ => 0,
         });
         let equations = scene.constraints.len().max(equations);
@@ -106,16 +108,16 @@ impl<'a> Check<'a> {
             ("frames", "joints", joints, MAX_COORDINATES),
             ("coordinates", "coordinates", scene.coordinates.len(), MAX_COORDINATES),
             ("springs", "springs", scene.springs.len(), MAX_SPRINGS),
-            ("springs", "points of paths", spring_points.sum(), MAX_PATH_POINTS),
-            ("springs", "terms of sums", spring_terms.sum(), MAX_LINEAR_TERMS),
+            ("springs", "points of paths", cord_points, MAX_PATH_POINTS),
+            ("springs", "terms of sums", spring_terms, MAX_LINEAR_TERMS),
             ("forces", "terms of sums", force_terms.sum(), MAX_LINEAR_TERMS),
             ("inputs", "inputs", scene.inputs.len(), MAX_INPUTS),
             ("forces", "forces", scene.forces.len(), MAX_FORCES),
             ("signals", "signals", scene.signals.len(), MAX_SIGNALS),
             ("signals", "knots and times", signal_points, MAX_SIGNAL_POINTS),
             ("constraints", "constraints", equations, MAX_CONSTRAINTS),
-            ("constraints", "points of paths", constraint_points.sum(), MAX_PATH_POINTS),
-            ("constraints", "terms of couplings", terms.sum(), MAX_COUPLING_TERMS),
+            ("constraints", "points of paths", path_points, MAX_PATH_POINTS),
+            ("constraints", "terms of couplings", coupling_terms, MAX_COUPLING_TERMS),
             (
                 "operating_points",
                 "operating_points",

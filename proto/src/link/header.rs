@@ -121,7 +121,7 @@ header! {
         pub constraint_residual: f64,
         /// Estimate of the reciprocal condition of the Newton matrix, at most 1.
         pub reciprocal_condition: f64,
-        /// The same for the constraints, without redundant ones; 1 without constraints.
+        /// Estimate of the reciprocal condition of the constraints without redundant ones; 1 without constraints.
         pub constraint_reciprocal_condition: f64,
         /// First detail of a failure, see [`Code`]. Of an `Input`: `stamp_ns` of the state that it
         /// answers, 0 if that is not known.

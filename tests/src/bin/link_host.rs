@@ -9,7 +9,8 @@ use std::time::Duration;
 use anyhow::Result;
 use clap::Parser;
 use plantd_proto::link::Wait;
-use plantd_server::link::{LinkConfig, LinkHost};
+use plantd_server::wire::link::config::LinkConfig;
+use plantd_server::wire::link::host::LinkHost;
 use plantd_tests::links::new_session;
 
 /// Hosts the shared-memory link of one plant.

@@ -10,9 +10,9 @@ use anyhow::Result;
 use clap::Parser;
 use plantd_client::v1;
 use plantd_proto::link::monotonic_ns;
-use plantd_server::priority::{Scheduling, allow_cpus, sharpen_timers};
-use plantd_server::realtime::alarm::Alarm;
-use plantd_server::realtime::histogram::{Histogram, Summary};
+use plantd_server::core::metrics::histogram::{Histogram, Summary};
+use plantd_server::core::priority::{Scheduling, allow_cpus, sharpen_timers};
+use plantd_server::core::realtime::alarm::Alarm;
 use plantd_tests::server::ServerProcess;
 
 /// Runs many paced plants on one thread, after an empty loop and beside one.

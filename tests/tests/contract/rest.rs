@@ -210,6 +210,34 @@ async fn redundant_constraints_are_reported_and_share_their_load() {
     assert!((rod - again).abs() < 1e-9, "of least norm");
 }
 
+/// A field that is added to the message does not compile here before it is set.
+#[tokio::test]
+async fn every_setting_of_a_plant_comes_back() {
+    let (_server, client) = server().await;
+    let of_order_4 = v1::PlantSettings {
+        time_step_s: 0.02,
+        force_split: v1::ForceSplit::Symmetric.into(),
+        max_iterations: 17,
+        singular_below: 1e-9,
+        order: 4,
+        substeps: 3,
+        halvings: Some(2),
+        precision: v1::Precision::Fast.into(),
+        // In place of order and substeps.
+        tolerance: 0.0,
+    };
+    let of_the_paper =
+        v1::PlantSettings { force_split: v1::ForceSplit::Paper.into(), order: 2, ..of_order_4 };
+    for settings in [of_order_4, of_the_paper].map(Some) {
+        let model = "pendulum".to_owned();
+        let request = v1::CreatePlantRequest { model, settings, ..Default::default() };
+        let created = client.create_plant(request).await.unwrap();
+        assert_eq!(created.settings, settings);
+        let plant = client.get_plant(&created.id).await.unwrap().plant.unwrap();
+        assert_eq!(plant.settings, settings);
+    }
+}
+
 /// A quarter turn in one step leaves no direction in which the rod could pull.
 #[tokio::test]
 async fn singular_constraints_are_named() {

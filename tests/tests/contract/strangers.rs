@@ -169,6 +169,101 @@ async fn messages_whose_last_byte_is_held_back_share_a_budget() {
     soon(client.create_model(large)).await.unwrap();
 }
 
+/// A body in one piece.
+struct Whole(Option<Bytes>);
+
+impl http_body::Body for Whole {
+    type Data = Bytes;
+    type Error = Infallible;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        _: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, Infallible>>> {
+        Poll::Ready(self.0.take().map(|bytes| Ok(Frame::data(bytes))))
+    }
+}
+
+/// A field of nested messages around these bytes.
+fn within(tag: u8, bytes: &[u8]) -> Vec<u8> {
+    let mut field = vec![tag];
+    let mut length = bytes.len();
+    while length > 0x7f {
+        field.push((length & 0x7f) as u8 | 0x80);
+        length >>= 7;
+    }
+    field.push(length as u8);
+    field.extend_from_slice(bytes);
+    field
+}
+
+/// Calls a method with one message; its status.
+async fn call_with(server: &ServerProcess, method: &str, message: &[u8]) -> tonic::Status {
+    let address = server.address().to_owned();
+    let path = format!("{address}/plantd.v1.{method}");
+    let mut channel = Endpoint::from_shared(address).unwrap().connect().await.unwrap();
+    std::future::poll_fn(|context| channel.poll_ready(context)).await.unwrap();
+    let length = u32::try_from(message.len()).unwrap().to_be_bytes();
+    let body = Bytes::from([&[0], &length[..], message].concat());
+    let request = grpc(&path, Body::new(Whole(Some(body))));
+    let response = soon(channel.call(request)).await.unwrap();
+    tonic::Status::from_header_map(response.headers()).expect("refused before the first answer")
+}
+
+/// Two bytes of an empty part become hundreds in memory.
+#[tokio::test(flavor = "multi_thread")]
+async fn messages_of_many_empty_parts_take_no_memory() {
+    let (server, client) = server().await;
+    let bytes = (MESSAGE_BYTES - 64) / 2;
+    let parts = |tag: u8, count: usize| [tag, 0].repeat(count);
+    let floods = [
+        ("ControlService/Rollout", parts(0x1a, bytes)),
+        ("ControlService/Analyze", parts(0x2a, bytes)),
+        ("ControlService/SolveTrajectoryLqr", parts(0x32, bytes)),
+        // TrajectoryCost.stages and TrajectoryBounds.state, inside of the request.
+        ("ControlService/OptimizeTrajectory", within(0x1a, &parts(0x22, bytes))),
+        ("ControlService/OptimizeTrajectory", within(0x32, &parts(0x0a, bytes))),
+        ("PlantService/SetParameters", parts(0x12, bytes)),
+        ("PlantService/SetSafety", parts(0x12, bytes)),
+        ("PlantService/SetFeedback", parts(0x32, bytes)),
+        ("PlantService/Watch", parts(0x22, bytes)),
+        ("ModelService/Settle", parts(0x22, bytes)),
+    ];
+    client.get_model("pendulum").await.unwrap();
+    let before = kilobytes(&server, "VmRSS");
+    for (method, message) in floods {
+        let status = call_with(&server, method, &message).await;
+        assert_eq!(status.code(), Code::ResourceExhausted, "{method}: {status}");
+        assert!(status.message().contains("`message_parts` is 131072"), "{method}: {status}");
+    }
+    // As many as are allowed, of the largest.
+    for (method, tag) in [("ControlService/Rollout", 0x1a), ("PlantService/SetFeedback", 0x32)] {
+        let status = call_with(&server, method, &parts(tag, 131_072)).await;
+        assert_ne!(status.code(), Code::Ok, "{method}");
+        assert!(!status.message().contains("`message_parts`"), "{method}: {status}");
+    }
+    let grown = (kilobytes(&server, "VmHWM") - before) >> 10;
+    assert!(grown < 128, "{grown} MiB more");
+}
+
+/// A message may be long, and have many parts, as far as somebody needs it.
+#[tokio::test(flavor = "multi_thread")]
+async fn long_trajectories_and_many_cases_are_served() {
+    let (_server, client) = server().await;
+    let case = v1::RolloutCase { hold: 1, ..Default::default() };
+    let request = v1::RolloutRequest {
+        model: "pendulum".to_owned(),
+        cases: vec![case; 10_000],
+        ..Default::default()
+    };
+    let mut cases = client.rollout(request).await.unwrap();
+    let mut count = 0;
+    while cases.next().await.unwrap().is_some() {
+        count += 1;
+    }
+    assert_eq!(count, 10_000);
+}
+
 /// GetModelRequest { name: "pendulum" } with its head.
 const GET_MODEL: &[u8] = b"\0\0\0\0\x0a\x0a\x08pendulum";
 

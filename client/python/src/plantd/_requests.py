@@ -31,6 +31,10 @@ class Stepping(TypedDict, total=False):
     halvings: int
     #: Where the solver stops: at round-off, if not given, or at about eleven digits.
     precision: Literal["exact", "fast"]
+    #: Reciprocal condition below which a step is refused as singular; 1e-14 if not given.
+    singular_below: float
+    #: Newton iterations before a step is given up; 40 if not given.
+    newton_iterations: int
 
 
 def settings(
@@ -41,6 +45,8 @@ def settings(
     substeps: int = 0,
     halvings: int | None = None,
     precision: Literal["exact", "fast"] = "exact",
+    singular_below: float = 0.0,
+    newton_iterations: int = 0,
 ) -> plant_service_pb2.PlantSettings:
     split = plant_service_pb2.FORCE_SPLIT_PAPER if paper else plant_service_pb2.FORCE_SPLIT_SYMMETRIC
     return plant_service_pb2.PlantSettings(
@@ -50,6 +56,8 @@ def settings(
         substeps=substeps,
         halvings=halvings,
         precision=plant_service_pb2.Precision.Value(f"PRECISION_{precision.upper()}"),
+        singular_below=singular_below,
+        max_iterations=newton_iterations,
     )
 
 

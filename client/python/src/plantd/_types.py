@@ -609,6 +609,12 @@ class Plant:
     accuracy: Accuracy | None = None
     #: The bounds that protect it and which of them holds it, if there are any.
     safety: realtime_pb2.SafetyInfo | None = None
+    #: Reciprocal condition below which a step is refused as singular.
+    singular_below: float = 1e-14
+    #: Newton iterations before a step is given up.
+    newton_iterations: int = 40
+    #: All forces are put at the start of a step, as the paper does.
+    paper: bool = False
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
@@ -628,6 +634,9 @@ class Plant:
             plant_service_pb2.Precision.Name(m.settings.precision)[10:].lower(),
             Accuracy._from(m.accuracy) if m.HasField("accuracy") else None,
             m.safety if m.HasField("safety") else None,
+            m.settings.singular_below,
+            m.settings.max_iterations,
+            m.settings.force_split == plant_service_pb2.FORCE_SPLIT_PAPER,
         )
 
 

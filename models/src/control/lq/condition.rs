@@ -5,7 +5,7 @@ use nalgebra::DMatrix;
 use crate::control::lq::kernels::subtract;
 
 /// Reciprocal condition, in the 1-norm, of `L Lᵀ`; at most 1.
-pub(in crate::control) fn reciprocal_condition(factor: &DMatrix<f64>) -> f64 {
+pub(crate) fn reciprocal_condition(factor: &DMatrix<f64>) -> f64 {
     let m = factor.nrows();
     // Columns of the inverse of L.
     let mut inverse = DMatrix::<f64>::zeros(m, m);

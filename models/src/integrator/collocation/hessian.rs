@@ -1,8 +1,8 @@
 //! Second derivatives at the stages.
 
 use crate::integrator::workspace::Workspace;
+use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::lagrangian::planar::Planar;
 use crate::math::scalar::Side;
 use crate::model::mechanism::Model;
 

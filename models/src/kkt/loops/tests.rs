@@ -367,7 +367,7 @@ fn wider_registers_give_the_same_bits() {
         let mut narrow = wide.clone();
         wide.factor(at, &numbers, scales, 0.01, MatrixKind::Newton);
         narrowly(|| narrow.factor(at, &numbers, scales, 0.01, MatrixKind::Newton));
-        assert_eq!(wide.factors, narrow.factors);
+        assert_eq!(wide.factored.factors, narrow.factored.factors);
         let [mut x, mut narrow_x] = [0; 2].map(|_| numbers.clone());
         let [mut lambda, mut narrow_lambda] = [0; 2].map(|_| vec![0.3; d.constraints]);
         wide.solve(loops, &mut x, &mut lambda);

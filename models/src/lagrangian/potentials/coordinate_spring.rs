@@ -4,7 +4,8 @@
 //! V = ½ k (q − rest)²    V_i = k (q − rest)    V_ii = k
 //! ```
 
-use crate::lagrangian::potentials::{Place, Potential};
+use crate::lagrangian::kinematics::Place;
+use crate::lagrangian::potentials::Potential;
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::CoordinateSpring;
 

@@ -4,7 +4,8 @@
 //! V = ½ k s²    V_i = k s c_i    V_ij = k c_i c_j    s = Σ c_i q_i − rest
 //! ```
 
-use crate::lagrangian::potentials::{Place, Potential};
+use crate::lagrangian::kinematics::Place;
+use crate::lagrangian::potentials::Potential;
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::LinearSpring;
 

@@ -6,7 +6,8 @@
 //!
 //! with `L` the sum of the lengths of the path's segments.
 
-use crate::lagrangian::potentials::{Place, Potential};
+use crate::lagrangian::kinematics::Place;
+use crate::lagrangian::potentials::Potential;
 use crate::lagrangian::vectors::Distance;
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::{PathSpring, PointPair};

@@ -4,7 +4,8 @@
 //! V = −∫ f dq    V_i = −f    V_ii = −f'
 //! ```
 
-use crate::lagrangian::potentials::{Place, Potential};
+use crate::lagrangian::kinematics::Place;
+use crate::lagrangian::potentials::Potential;
 use crate::math::scalar::Scalar;
 use crate::model::mechanism::SplineSpring;
 

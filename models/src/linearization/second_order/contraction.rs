@@ -20,6 +20,7 @@ use crate::constraints::closure::Closure;
 use crate::integrator::blocks::StepBlocks;
 use crate::integrator::report::StepError;
 use crate::kkt::schur::{fill_schur, room_for_schur};
+use crate::lagrangian::kinematics::Place;
 use crate::linearization::linearize::{Linearization, SolvedStep};
 use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::{Scratch, assert_layout, spin_change};
@@ -490,11 +491,13 @@ impl Contraction {
         end.poses.evaluate(&model.closure, q_end, &[]);
         let equations = model.constraints.iter().zip(&step.multipliers).zip(&adjoint[nd..]);
         for (c, ((constraint, lambda), mu)) in equations.enumerate() {
-            let (tree, q_start) = (&model.closure, &scratch.blocks.q_start);
-            constraint.for_each_second_derivative(tree, &start.poses, q_start, |i, j, value| {
+            let at =
+                Place { tree: &model.closure, poses: &start.poses, q: &scratch.blocks.q_start };
+            constraint.for_each_second_derivative(at, &mut |i, j, value| {
                 quadratic.add(i, j, -lambda * value.eps);
             });
-            constraint.for_each_second_derivative(tree, &end.poses, q_end, |i, j, value| {
+            let at = Place { tree: &model.closure, poses: &end.poses, q: q_end };
+            constraint.for_each_second_derivative(at, &mut |i, j, value| {
                 let value = mu * value;
                 if i < nd {
                     quadratic.add_start_next(i, j, value);

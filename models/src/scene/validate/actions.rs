@@ -141,22 +141,11 @@ impl Check<'_> {
             return None;
         }
         for (i, term) in terms.iter().enumerate() {
-            let (path, name) = (format!("{path}[{i}]"), term.coordinate.as_str());
-            match self.kinds.get(name) {
+            let path = format!("{path}[{i}]");
+            match self.coordinate_of_term(&path, &term.coordinate, &mut seen) {
                 Some(CoordinateKind::Dynamic) => motion.dynamic = true,
                 Some(CoordinateKind::Prescribed) => motion.prescribed = true,
-                None => {
-                    known = false;
-                    self.report(
-                        format!("{path}.coordinate"),
-                        format!("there is no coordinate `{name}`"),
-                    );
-                }
-            }
-            self.not_of_an_orientation(format!("{path}.coordinate"), name);
-            if !seen.insert(name) {
-                let message = format!("coordinate `{name}` has a term already");
-                self.report(format!("{path}.coordinate"), message);
+                None => known = false,
             }
             let path = format!("{path}.coefficients");
             if !self.finite_all(&path, &term.coefficients) {

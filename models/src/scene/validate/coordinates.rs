@@ -104,26 +104,32 @@ impl<'a> Check<'a> {
             self.report(format!("{path}.terms"), "is empty; must have a term or more");
         }
         for (i, term) in terms.iter().enumerate() {
-            let (path, name) = (format!("{path}.terms[{i}]"), term.coordinate.as_str());
-            let kind = self.kinds.get(name);
-            can_move |= kind != Some(&CoordinateKind::Prescribed);
-            if kind.is_none() {
-                let message = format!("there is no coordinate `{name}`");
-                self.report(format!("{path}.coordinate"), message);
-            } else if !seen.insert(name) {
-                let message = format!("coordinate `{name}` has a term already");
-                self.report(format!("{path}.coordinate"), message);
-            }
-            self.not_of_an_orientation(format!("{path}.coordinate"), name);
-            let path = format!("{path}.coefficient");
-            if self.finite(path.clone(), term.coefficient) && term.coefficient == 0.0 {
-                self.report(path, "is zero; the term would have no effect");
-            }
+            let path = format!("{path}.terms[{i}]");
+            let kind = self.coordinate_of_term(&path, &term.coordinate, &mut seen);
+            can_move |= kind != Some(CoordinateKind::Prescribed);
+            self.factor(format!("{path}.coefficient"), term.coefficient, "term");
         }
         if !can_move {
             let message = "are of prescribed coordinates alone; one must be dynamic";
             self.report(format!("{path}.terms"), message);
         }
+    }
+
+    /// That the coordinate of a term is there, means something alone, and has no term in `seen` yet; its kind.
+    pub(super) fn coordinate_of_term<'n>(
+        &mut self,
+        path: &str,
+        name: &'n str,
+        seen: &mut BTreeSet<&'n str>,
+    ) -> Option<CoordinateKind> {
+        let (path, kind) = (format!("{path}.coordinate"), self.kinds.get(name).copied());
+        if kind.is_none() {
+            self.report(path.clone(), format!("there is no coordinate `{name}`"));
+        } else if !seen.insert(name) {
+            self.report(path.clone(), format!("coordinate `{name}` has a term already"));
+        }
+        self.not_of_an_orientation(path, name);
+        kind
     }
 
     /// That a coordinate means something alone: a component of an orientation does not.
@@ -155,15 +161,12 @@ impl<'a> Check<'a> {
                 }
                 None => {}
             }
-            if self.finite(format!("{path}.gain"), input.gain) && input.gain == 0.0 {
-                self.report(format!("{path}.gain"), "is zero; the input would have no effect");
-            }
+            self.factor(format!("{path}.gain"), input.gain, "input");
         }
     }
 
     pub(super) fn operating_points(&mut self) {
         let lengths = self.length_coordinates();
-        let inputs: BTreeSet<_> = self.scene.inputs.iter().map(|i| i.name.as_str()).collect();
         let mut seen = BTreeMap::new();
         for (i, point) in self.scene.operating_points.iter().enumerate() {
             let path = format!("operating_points[{i}]");
@@ -184,9 +187,7 @@ impl<'a> Check<'a> {
             }
             for (name, &value) in &point.inputs {
                 let path = format!("{path}.inputs.{name}");
-                if !inputs.contains(name.as_str()) {
-                    self.report(path.clone(), format!("there is no input `{name}`"));
-                }
+                self.known_input(path.clone(), name);
                 self.finite(path, value);
             }
         }

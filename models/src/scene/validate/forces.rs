@@ -1,13 +1,10 @@
 //! Forces: what they act on, and what they follow.
 
-use std::collections::BTreeSet;
-
 use crate::scene::forces::{Component, Force};
 use crate::scene::validate::Check;
 
 impl Check<'_> {
     pub(super) fn forces(&mut self) {
-        let inputs: BTreeSet<_> = self.scene.inputs.iter().map(|i| i.name.as_str()).collect();
         for (i, force) in self.scene.forces.iter().enumerate() {
             let path = format!("forces[{i}]");
             match force {
@@ -15,8 +12,8 @@ impl Check<'_> {
                 | Force::SpatialWrench { frame, force, torque }
                 | Force::HybridWrench { frame, force, torque } => {
                     self.moved(&path, frame);
-                    self.components(&format!("{path}.force"), force, &inputs);
-                    self.components(&format!("{path}.torque"), torque, &inputs);
+                    self.components(&format!("{path}.force"), force);
+                    self.components(&format!("{path}.torque"), torque);
                     if force.iter().chain(torque).all(|c| *c == Component::default()) {
                         self.report(path, "is zero; it would have no effect");
                     }
@@ -25,8 +22,8 @@ impl Check<'_> {
                     self.moved(&path, frame);
                     self.finite_all(&format!("{path}.at"), at);
                     self.axis(&format!("{path}.axis"), axis);
-                    self.known_input(format!("{path}.input"), input, &inputs);
-                    self.factor(format!("{path}.gain"), *gain);
+                    self.known_input(format!("{path}.input"), input);
+                    self.factor(format!("{path}.gain"), *gain, "input");
                 }
                 Force::TwoPointDamper { a, b, damping } => {
                     self.not_negative(format!("{path}.damping"), *damping);
@@ -67,28 +64,28 @@ impl Check<'_> {
         }
     }
 
-    fn components(&mut self, path: &str, components: &[Component; 3], inputs: &BTreeSet<&str>) {
+    fn components(&mut self, path: &str, components: &[Component; 3]) {
         for (i, component) in components.iter().enumerate() {
             let path = format!("{path}[{i}]");
             match component {
                 Component::Constant(value) => {
                     self.finite(path, *value);
                 }
-                Component::Input(name) => self.known_input(path, name, inputs),
+                Component::Input(name) => self.known_input(path, name),
             }
         }
     }
 
-    fn known_input(&mut self, path: String, name: &str, inputs: &BTreeSet<&str>) {
-        if !inputs.contains(name) {
+    pub(super) fn known_input(&mut self, path: String, name: &str) {
+        if !self.inputs.contains(name) {
             self.report(path, format!("there is no input `{name}`"));
         }
     }
 
-    /// A factor of an input, without which the input would have no effect.
-    fn factor(&mut self, path: String, gain: f64) {
-        if self.finite(path.clone(), gain) && gain == 0.0 {
-            self.report(path, "is zero; the input would have no effect");
+    /// A factor of an input or a term, which would have no effect if it were zero.
+    pub(super) fn factor(&mut self, path: String, factor: f64, of: &str) {
+        if self.finite(path.clone(), factor) && factor == 0.0 {
+            self.report(path, format!("is zero; the {of} would have no effect"));
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Signals: what they drive, and their numbers.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use crate::scene::CoordinateKind;
 use crate::scene::signals::Signal;
@@ -8,7 +8,6 @@ use crate::scene::validate::Check;
 
 impl Check<'_> {
     pub(super) fn signals(&mut self) {
-        let inputs: BTreeSet<_> = self.scene.inputs.iter().map(|i| i.name.as_str()).collect();
         let lengths = self.length_coordinates();
         let mut driven = BTreeMap::new();
         for (i, signal) in self.scene.signals.iter().enumerate() {
@@ -25,7 +24,7 @@ impl Check<'_> {
                         driven.insert(name, i);
                     }
                 },
-                _ if inputs.contains(name) => {}
+                _ if self.inputs.contains(name) => {}
                 Some(CoordinateKind::Dynamic) => {
                     let message =
                         format!("coordinate `{name}` is dynamic; a signal needs an input");

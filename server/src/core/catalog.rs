@@ -1,0 +1,170 @@
+//! The models that a server knows: built-in ones, and uploaded ones.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
+
+use plantd_models::{Model, builtin};
+use prometheus_client::metrics::gauge::Gauge;
+
+use crate::core::limits::LimitExceeded;
+use crate::core::mutex::lock;
+
+/// Why a model was not found, kept or forgotten.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CatalogError {
+    /// There is no model of that name.
+    #[error("there is no model `{name}`")]
+    NotFound {
+        /// The name.
+        name: String,
+    },
+    /// The name is taken, by an uploaded or a built-in model.
+    #[error("there already is a model `{name}`")]
+    Exists {
+        /// The name.
+        name: String,
+    },
+    /// Built-in models stay.
+    #[error("model `{name}` came with the server and cannot be deleted")]
+    Builtin {
+        /// The name.
+        name: String,
+    },
+    /// There are as many uploaded models as there may be.
+    #[error(transparent)]
+    Limit(#[from] LimitExceeded),
+    /// A defect: a built-in scene does not compile.
+    #[error("the built-in scene `{name}` does not compile: {problem}")]
+    Broken {
+        /// The name.
+        name: String,
+        /// Why not.
+        problem: String,
+    },
+}
+
+/// A model by name.
+#[derive(Clone, Debug)]
+pub struct Entry {
+    /// Name.
+    pub name: String,
+    /// Came with the server.
+    pub builtin: bool,
+    /// The model.
+    pub model: Arc<Model>,
+}
+
+/// All models.
+pub struct Catalog {
+    /// The named built-in models, in the order of their names; compiled when first asked for.
+    named: BTreeMap<&'static str, OnceLock<Arc<Model>>>,
+    /// Members of the built-in families, as long as somebody uses them.
+    generated: Mutex<HashMap<String, Weak<Model>>>,
+    uploaded: Mutex<BTreeMap<String, Arc<Model>>>,
+    models_max: u64,
+    /// Shows how many are uploaded.
+    gauge: Gauge,
+}
+
+impl Catalog {
+    /// A catalog with room for `models_max` uploaded models, which the gauge counts.
+    pub fn new(models_max: u64, gauge: Gauge) -> Self {
+        Self {
+            named: builtin::NAMES.iter().map(|name| (*name, OnceLock::new())).collect(),
+            generated: Mutex::default(),
+            uploaded: Mutex::default(),
+            models_max,
+            gauge,
+        }
+    }
+
+    /// The model of that name. May compile it: call it on a worker.
+    pub fn get(&self, name: &str) -> Result<Entry, CatalogError> {
+        if let Some(model) = lock(&self.uploaded).get(name) {
+            let model = Arc::clone(model);
+            return Ok(Entry { name: name.to_owned(), builtin: false, model });
+        }
+        let model =
+            self.builtin(name)?.ok_or_else(|| CatalogError::NotFound { name: name.to_owned() })?;
+        Ok(Entry { name: name.to_owned(), builtin: true, model })
+    }
+
+    fn builtin(&self, name: &str) -> Result<Option<Arc<Model>>, CatalogError> {
+        if let Some(cell) = self.named.get(name) {
+            if let Some(model) = cell.get() {
+                return Ok(Some(Arc::clone(model)));
+            }
+            let Some(model) = compile_builtin(name)? else { return Ok(None) };
+            return Ok(Some(Arc::clone(cell.get_or_init(|| model))));
+        }
+        if let Some(model) = lock(&self.generated).get(name).and_then(Weak::upgrade) {
+            return Ok(Some(model));
+        }
+        let Some(model) = compile_builtin(name)? else { return Ok(None) };
+        let mut generated = lock(&self.generated);
+        generated.retain(|_, model| model.strong_count() > 0);
+        generated.insert(name.to_owned(), Arc::downgrade(&model));
+        Ok(Some(model))
+    }
+
+    /// Keeps an uploaded model.
+    pub fn insert(&self, name: &str, model: Arc<Model>) -> Result<Entry, CatalogError> {
+        if builtin::scene(name).is_some() {
+            return Err(CatalogError::Exists { name: name.to_owned() });
+        }
+        let mut uploaded = lock(&self.uploaded);
+        if uploaded.contains_key(name) {
+            return Err(CatalogError::Exists { name: name.to_owned() });
+        }
+        LimitExceeded::check("models", self.models_max, "uploaded models", uploaded.len() + 1)?;
+        uploaded.insert(name.to_owned(), Arc::clone(&model));
+        self.gauge.set(uploaded.len() as i64);
+        Ok(Entry { name: name.to_owned(), builtin: false, model })
+    }
+
+    /// Forgets an uploaded model.
+    pub fn remove(&self, name: &str) -> Result<(), CatalogError> {
+        let mut uploaded = lock(&self.uploaded);
+        if uploaded.remove(name).is_some() {
+            self.gauge.set(uploaded.len() as i64);
+            return Ok(());
+        }
+        if builtin::scene(name).is_some() {
+            return Err(CatalogError::Builtin { name: name.to_owned() });
+        }
+        Err(CatalogError::NotFound { name: name.to_owned() })
+    }
+
+    /// Up to `size` models after the one named `after` (none: from the start), and whether there are
+    /// more. May compile: call it on a worker.
+    pub fn page(&self, after: &str, size: usize) -> Result<(Vec<Entry>, bool), CatalogError> {
+        let builtin_names = self.named.keys().map(|name| (*name).to_owned());
+        let uploaded_names: Vec<String> = lock(&self.uploaded).keys().cloned().collect();
+        let is_uploaded = !after.is_empty() && !self.named.contains_key(after);
+        let mut names: Vec<String> = builtin_names
+            .filter(|name| !is_uploaded && name.as_str() > after)
+            .chain(uploaded_names.into_iter().filter(|name| !is_uploaded || name.as_str() > after))
+            .collect();
+        let has_more = names.len() > size;
+        names.truncate(size);
+        let mut entries = Vec::with_capacity(names.len());
+        for name in names {
+            match self.get(&name) {
+                Ok(entry) => entries.push(entry),
+                // Deleted since the names were read.
+                Err(CatalogError::NotFound { .. }) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok((entries, has_more))
+    }
+}
+
+fn compile_builtin(name: &str) -> Result<Option<Arc<Model>>, CatalogError> {
+    let Some(scene) = builtin::scene(name) else { return Ok(None) };
+    let model = Model::compile(&scene).map_err(|error| CatalogError::Broken {
+        name: name.to_owned(),
+        problem: error.to_string(),
+    })?;
+    Ok(Some(Arc::new(model)))
+}

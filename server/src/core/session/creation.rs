@@ -1,0 +1,55 @@
+//! What a session began with.
+
+use std::sync::Arc;
+
+use plantd_models::{Model, Plant, Settings, Snapshot, State};
+
+/// What was promised when the method of a plant was chosen by a tolerance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Accuracy {
+    /// The tolerance.
+    pub tolerance: f64,
+    /// The error that was estimated.
+    pub error: f64,
+    /// Over how many periods.
+    pub periods: u32,
+}
+
+/// A plant's name and origin, and the state to which a reset returns.
+pub(super) struct Creation {
+    pub(super) id: String,
+    pub(super) model_name: String,
+    /// The model at the time of creation; later ones differ from it in numbers only.
+    pub(super) model: Arc<Model>,
+    /// About how many instructions a step of order 2 takes.
+    pub(super) step_instructions: f64,
+    pub(super) snapshot: Snapshot,
+    pub(super) state: State,
+    pub(super) settings: Settings,
+    /// Why the method is as it is, if it was chosen by a tolerance.
+    pub(super) accuracy: Option<Accuracy>,
+}
+
+impl Creation {
+    pub(super) fn of(
+        plant: &Plant,
+        id: String,
+        model_name: String,
+        accuracy: Option<Accuracy>,
+    ) -> Self {
+        Self {
+            id,
+            model_name,
+            model: Arc::clone(plant.model()),
+            step_instructions: step_instructions(plant.model()),
+            snapshot: plant.snapshot(),
+            state: plant.state(),
+            settings: *plant.settings(),
+            accuracy,
+        }
+    }
+}
+
+fn step_instructions(model: &Model) -> f64 {
+    model.stage_costs().iter().map(|stage| stage.times * stage.instructions).sum()
+}

@@ -1,0 +1,10 @@
+//! The service of linearizations, regulators, filters and optimisations.
+
+pub(crate) mod analysis;
+pub(crate) mod derivatives;
+pub(crate) mod kalman;
+pub(crate) mod optimize;
+pub(crate) mod points;
+pub(crate) mod reference;
+pub(crate) mod rollout;
+pub mod service;

@@ -1,0 +1,57 @@
+//! Models and points that calls of the control service name.
+
+use std::sync::Arc;
+
+use plantd_models::{Model, Plant, Settings};
+use plantd_proto::v1;
+
+use crate::core::limits::LimitExceeded;
+use crate::wire::message::{settings, start, states};
+use crate::wire::shared::hub::Hub;
+use crate::wire::status::RpcError;
+
+/// The model and the settings of a request.
+pub(crate) fn model_and_settings(
+    hub: &Hub,
+    name: &str,
+    settings: Option<v1::PlantSettings>,
+) -> Result<(Arc<Model>, Settings), RpcError> {
+    let model = hub.catalog.get(name)?.model;
+    let settings = settings::settings(settings, &model, &hub.limits)?;
+    Ok((model, settings))
+}
+
+/// A plant at a point, and the input there.
+pub(crate) fn at_point(
+    hub: &Hub,
+    model: &str,
+    settings: Option<v1::PlantSettings>,
+    point: Option<v1::Point>,
+) -> Result<(Plant, Vec<f64>), RpcError> {
+    if let Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) = &point {
+        return Ok(hub.session(id)?.copy_plant_and_input());
+    }
+    let (model, settings) = model_and_settings(hub, model, settings)?;
+    start::point(point, &model, settings)
+}
+
+/// Name of the model that such a point is of.
+pub(crate) fn model_at(
+    hub: &Hub,
+    model: &str,
+    point: Option<&v1::Point>,
+) -> Result<String, RpcError> {
+    match point {
+        Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) => {
+            Ok(hub.session(id)?.model_name().to_owned())
+        }
+        _ => Ok(model.to_owned()),
+    }
+}
+
+/// Refuses matrices that no client would take.
+pub(crate) fn check_linearization(hub: &Hub, model: &Model) -> Result<(), RpcError> {
+    let numbers = states::linearization_numbers(model.dimensions());
+    let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
+    Ok(LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?)
+}

@@ -1,0 +1,9 @@
+//! What stands around all services: who may call, how large messages may be, the page of metrics.
+
+pub mod admission;
+pub mod ending;
+pub mod gate;
+pub mod metrics_http;
+pub mod observe;
+pub(crate) mod parts;
+pub(crate) mod unfinished;

@@ -1,0 +1,4 @@
+//! The service of models.
+
+pub mod model;
+pub(crate) mod settle;

@@ -1,0 +1,144 @@
+//! `plantd.v1.ModelService`.
+
+use std::sync::Arc;
+
+use plantd_models::{Model, Problem, SceneError};
+use plantd_proto::v1;
+use tonic::{Request, Response, Status};
+
+use crate::core::catalog::Entry;
+use crate::core::limits::{LimitExceeded, Limits};
+use crate::wire::answers::cut_page;
+use crate::wire::message::{checks, models, settings};
+use crate::wire::models::settle;
+use crate::wire::shared::hub::Hub;
+use crate::wire::status::RpcError;
+
+/// The service.
+pub struct ModelService {
+    hub: Arc<Hub>,
+}
+
+impl ModelService {
+    /// The service on a hub.
+    pub fn new(hub: Arc<Hub>) -> Self {
+        Self { hub }
+    }
+}
+
+/// Reads and compiles a scene within the limits. A faulty scene is the inner error.
+pub(crate) fn compile(
+    text: &str,
+    format: i32,
+    limits: &Limits,
+) -> Result<Result<Model, SceneError>, RpcError> {
+    let scene = settings::scene(text, format, limits)?;
+    let model = match scene.and_then(|scene| Model::compile(&scene)) {
+        Ok(model) => model,
+        Err(error) => return Ok(Err(error)),
+    };
+    let count = model.dimensions().coordinates();
+    LimitExceeded::check("coordinates", limits.coordinates, "coordinates", count)?;
+    Ok(Ok(model))
+}
+
+fn message(entry: &Entry, with_texts: bool) -> v1::Model {
+    models::model(&entry.name, entry.builtin, &entry.model, with_texts)
+}
+
+#[tonic::async_trait]
+impl v1::model_service_server::ModelService for ModelService {
+    async fn list_models(
+        &self,
+        request: Request<v1::ListModelsRequest>,
+    ) -> Result<Response<v1::ListModelsResponse>, Status> {
+        let request = request.into_inner();
+        let (size, after) = checks::page(request.page_size, &request.page_token)?;
+        let (hub, after) = (Arc::clone(&self.hub), after.to_owned());
+        let job = move |_: &_| {
+            let (entries, has_more) = hub.catalog.page(&after, size)?;
+            let mut models: Vec<_> = entries.iter().map(|entry| message(entry, false)).collect();
+            let has_more = cut_page(&mut models) || has_more;
+            let last = models.last().filter(|_| has_more);
+            let next_page_token = last.map(|model| model.name.clone()).unwrap_or_default();
+            Ok(v1::ListModelsResponse { models, next_page_token })
+        };
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn get_model(
+        &self,
+        request: Request<v1::GetModelRequest>,
+    ) -> Result<Response<v1::GetModelResponse>, Status> {
+        let name = request.into_inner().name;
+        let hub = Arc::clone(&self.hub);
+        let job = move |_: &_| Ok(message(&hub.catalog.get(&name)?, true));
+        let model = Some(self.hub.workers.run(job).await?);
+        Ok(Response::new(v1::GetModelResponse { model }))
+    }
+
+    async fn create_model(
+        &self,
+        request: Request<v1::CreateModelRequest>,
+    ) -> Result<Response<v1::CreateModelResponse>, Status> {
+        let request = request.into_inner();
+        if !request.name.is_empty() {
+            checks::check_name("name", &request.name)?;
+        }
+        let hub = Arc::clone(&self.hub);
+        let job = move |_: &_| {
+            let model = compile(&request.scene, request.format, &hub.limits)??;
+            let name = match request.name {
+                name if name.is_empty() => model.scene().name.clone(),
+                name => name,
+            };
+            checks::check_name("name", &name)?;
+            Ok(message(&hub.catalog.insert(&name, Arc::new(model))?, true))
+        };
+        let model = Some(self.hub.workers.run(job).await?);
+        Ok(Response::new(v1::CreateModelResponse { model }))
+    }
+
+    async fn validate_scene(
+        &self,
+        request: Request<v1::ValidateSceneRequest>,
+    ) -> Result<Response<v1::ValidateSceneResponse>, Status> {
+        let request = request.into_inner();
+        let hub = Arc::clone(&self.hub);
+        let job = move |_: &_| {
+            Ok(match compile(&request.scene, request.format, &hub.limits)? {
+                Ok(model) => {
+                    let model = models::model(&model.scene().name, false, &model, true);
+                    v1::ValidateSceneResponse { problems: Vec::new(), model: Some(model) }
+                }
+                Err(error) => {
+                    let problems = error.problems.into_iter().map(problem).collect();
+                    v1::ValidateSceneResponse { problems, model: None }
+                }
+            })
+        };
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn delete_model(
+        &self,
+        request: Request<v1::DeleteModelRequest>,
+    ) -> Result<Response<v1::DeleteModelResponse>, Status> {
+        let name = request.into_inner().name;
+        self.hub.catalog.remove(&name).map_err(RpcError::from)?;
+        Ok(Response::new(v1::DeleteModelResponse {}))
+    }
+
+    async fn settle(
+        &self,
+        request: Request<v1::SettleRequest>,
+    ) -> Result<Response<v1::SettleResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| settle::settle(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+}
+
+fn problem(problem: Problem) -> v1::SceneProblem {
+    v1::SceneProblem { path: problem.path, message: problem.message }
+}

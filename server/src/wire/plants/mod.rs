@@ -1,0 +1,12 @@
+//! The services of plants: steps, streams, channels, recordings; and plants that survive their server.
+
+pub(crate) mod change;
+pub mod channels;
+pub(crate) mod commands;
+pub mod drive;
+pub(crate) mod feedback;
+pub mod plant;
+pub mod recordings;
+pub(crate) mod run;
+pub mod state;
+pub mod watch;

@@ -1,0 +1,64 @@
+//! What stands in a recording, from what the plant has left.
+
+use plantd_models::Plant;
+use plantd_proto::v1;
+
+use crate::core::parameters::Parameters;
+use crate::core::plant::mark::Mark;
+use crate::core::publish::frame::Frame;
+use crate::core::session::shared::Session;
+use crate::wire::message::report::report_message;
+use crate::wire::message::run_info::run_info;
+use crate::wire::message::{models, settings, states};
+
+/// The plant at the beginning of a recording.
+pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecord {
+    let (model, plan) = (plant.model(), String::new());
+    let info = v1::PlantInfo {
+        id: session.id().to_owned(),
+        model: session.model_name().to_owned(),
+        settings: Some(settings::settings_message(plant.settings())),
+        state: Some(states::plant_state(plant)),
+        accuracy: session.accuracy().map(settings::accuracy),
+        parameters: all_parameters(&mark.announced.unchanged, &mark.parameters),
+        run: Some(run_info(session)),
+        ..Default::default()
+    };
+    v1::PlantRecord {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        plant: Some(info),
+        model_digest: model.digest(),
+        model: Some(v1::Model { plan, ..models::model(session.model_name(), false, model, true) }),
+        snapshot: mark.snapshot.to_bytes(),
+        outputs: session.channels().0.names.clone(),
+        ..Default::default()
+    }
+}
+
+/// All numbers that are or were changed.
+pub(super) fn all_parameters(unchanged: &Parameters, changed: &Parameters) -> Vec<v1::Parameter> {
+    let mut all = unchanged.clone();
+    all.extend(changed.iter().map(|(path, number)| (path.clone(), *number)));
+    settings::parameters(&all)
+}
+
+/// Puts a frame into a message, whose memory is kept.
+pub(super) fn fill(record: &mut v1::StepRecord, frame: &Frame) {
+    let state = record.state.get_or_insert_default();
+    state.step = frame.state.step;
+    state.time_s = frame.time_s;
+    for (target, source) in [
+        (&mut state.q, &frame.state.q),
+        (&mut state.p, &frame.state.p),
+        (&mut state.v, &frame.state.v),
+        (&mut state.multipliers, &frame.state.multipliers),
+        (&mut record.u, &frame.input),
+        (&mut record.driver, &frame.driver_input),
+        (&mut record.impulse, &frame.impulse),
+    ] {
+        target.clone_from(source);
+    }
+    record.outputs = states::outputs(&frame.outputs, &frame.lost);
+    record.report = Some(report_message(&frame.report));
+    record.timing = states::step_timing(&frame.timing);
+}

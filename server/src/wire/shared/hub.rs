@@ -1,0 +1,257 @@
+//! What the services share: models, plants, workers, limits, metrics and the shared-memory links.
+
+use std::collections::BTreeMap;
+use std::collections::hash_map::RandomState;
+use std::hash::{BuildHasher, Hasher};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use futures::{StreamExt, future, stream};
+use plantd_models::Plant;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio_util::sync::CancellationToken;
+use tonic::Code;
+
+use crate::core::catalog::Catalog;
+use crate::core::limits::{LimitExceeded, Limits};
+use crate::core::metrics::registry::Metrics;
+use crate::core::priority::Priority;
+use crate::core::realtime::loops::RealTime;
+use crate::core::realtime::settings::RealTimeSettings;
+use crate::core::room::Room;
+use crate::core::session::creation::Accuracy;
+use crate::core::session::shared::Session;
+use crate::core::workers::pool::Workers;
+use crate::wire::answers::Answers;
+use crate::wire::link::host::{LinkError, LinkHost, LinkInfo};
+use crate::wire::record::directory::Recordings;
+use crate::wire::shared::jobs::Jobs;
+use crate::wire::shared::state_directory::StateDirectory;
+use crate::wire::status::RpcError;
+
+/// Everything that belongs to one server.
+pub struct Hub {
+    /// Limits in force.
+    pub limits: Limits,
+    /// Metrics.
+    pub metrics: Arc<Metrics>,
+    /// Workers for long computations, at low priority.
+    pub workers: Jobs,
+    /// Workers for what belongs to the running of plants, at the usual priority: long computations do
+    /// not keep it waiting.
+    pub attendants: Jobs,
+    /// Workers for steps in lockstep that take long, alone or together: the attendants stay free for
+    /// others.
+    pub steppers: Jobs,
+    /// Models.
+    pub catalog: Catalog,
+    /// Permits to hold a trajectory's regulator, filter or optimisation in memory.
+    pub trajectory_solves: Arc<Semaphore>,
+    /// Room in memory for the laws of feedbacks.
+    pub feedback_room: Arc<Room>,
+    /// Room in memory for the queues of watchers.
+    pub watch_room: Arc<Room>,
+    /// Cancelled when the server begins to shut down: streams end.
+    pub ending: CancellationToken,
+    /// Threads of one search.
+    pub search_threads: usize,
+    /// Recordings of plants.
+    pub recordings: Option<Recordings>,
+    /// Directory in which plants survive the server.
+    pub state: Option<StateDirectory>,
+    realtime: Arc<RealTime>,
+    links: Option<Arc<LinkHost>>,
+    plants: Mutex<BTreeMap<String, Arc<Session>>>,
+}
+
+impl Hub {
+    /// A hub without plants.
+    pub fn new(
+        limits: Limits,
+        worker_count: usize,
+        priority: Priority,
+        realtime: RealTimeSettings,
+        links: Option<LinkHost>,
+    ) -> Self {
+        let metrics = Arc::new(Metrics::default());
+        let realtime = RealTime::new(realtime, &metrics);
+        let pool = |name, priority| {
+            Jobs::new(Workers::new(name, worker_count, limits.queued_jobs, priority))
+        };
+        Self {
+            workers: pool("worker", priority),
+            attendants: pool("attendant", Priority::Normal),
+            steppers: pool("stepper", Priority::Normal),
+            catalog: Catalog::new(limits.models, metrics.models.clone()),
+            trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
+            feedback_room: Room::new(
+                "feedback_numbers",
+                "numbers in the feedbacks of all plants",
+                limits.feedback_numbers,
+            ),
+            watch_room: Room::new(
+                "watch_numbers",
+                "numbers in the queues of all watchers",
+                limits.watch_numbers,
+            ),
+            ending: CancellationToken::new(),
+            search_threads: 1,
+            recordings: None,
+            state: None,
+            realtime,
+            links: links.map(Arc::new),
+            plants: Mutex::default(),
+            limits,
+            metrics,
+        }
+    }
+
+    /// The plant of that id.
+    pub fn session(&self, id: &str) -> Result<Arc<Session>, RpcError> {
+        match self.plants().get(id) {
+            Some(session) if !session.is_closed() => Ok(Arc::clone(session)),
+            _ => Err(RpcError::plant_not_found(id)),
+        }
+    }
+
+    /// Refuses a new plant that would not be kept, before work is done for it.
+    pub fn check_new_plant(&self, id: &str) -> Result<(), RpcError> {
+        self.admit(&self.plants(), id)
+    }
+
+    fn admit(&self, plants: &BTreeMap<String, Arc<Session>>, id: &str) -> Result<(), RpcError> {
+        if plants.contains_key(id) {
+            return Err(RpcError::plant_exists(id));
+        }
+        Ok(LimitExceeded::check("plants", self.limits.plants, "plants", plants.len() + 1)?)
+    }
+
+    /// Keeps a plant under an id; an empty one means that the server chooses.
+    pub fn insert(
+        &self,
+        id: String,
+        model_name: String,
+        plant: Plant,
+        accuracy: Option<Accuracy>,
+    ) -> Result<Arc<Session>, RpcError> {
+        let mut plants = self.plants();
+        let id = if id.is_empty() { free_id(&plants) } else { id };
+        self.admit(&plants, &id)?;
+        let metrics = Arc::clone(&self.metrics);
+        let realtime = Arc::clone(&self.realtime);
+        let session = Session::new(id.clone(), model_name, plant, accuracy, metrics, realtime);
+        plants.insert(id, Arc::clone(&session));
+        self.metrics.set_plants(plants.len());
+        Ok(session)
+    }
+
+    /// Ends a plant. Its id is free again when everything that belonged to it is gone.
+    pub async fn delete(self: &Arc<Self>, id: &str) -> Result<(), RpcError> {
+        let session = self.session(id)?;
+        if !session.close() {
+            return Err(RpcError::plant_not_found(id));
+        }
+        let hub = Arc::clone(self);
+        // In a task of its own, so that it is finished even if the caller goes away.
+        let end = tokio::task::spawn_blocking(move || {
+            if let Some(links) = &hub.links {
+                links.close(session.id());
+            }
+            session.pause();
+            let mut plants = hub.plants();
+            plants.remove(session.id());
+            hub.metrics.set_plants(plants.len());
+            drop(plants);
+            if let Some(state) = &hub.state {
+                state.remove(session.id());
+            }
+        });
+        end.await.map_err(|error| RpcError::internal(error.to_string()))
+    }
+
+    /// Up to `size` plants after the one with id `after`, and whether there are more.
+    pub fn page(&self, after: &str, size: usize) -> (Vec<Arc<Session>>, bool) {
+        let plants = self.plants();
+        let mut rest = plants
+            .iter()
+            .filter(|(id, session)| id.as_str() > after && !session.is_closed())
+            .map(|(_, session)| Arc::clone(session));
+        let page = rest.by_ref().take(size).collect();
+        let has_more = rest.next().is_some();
+        (page, has_more)
+    }
+
+    /// Opens the shared-memory link of a plant.
+    pub async fn open_link(&self, session: Arc<Session>) -> Result<LinkInfo, RpcError> {
+        let Some(links) = self.links.clone() else {
+            return Err(RpcError::precondition(
+                "LINK_DISABLED",
+                "server",
+                "this server runs without shared-memory links",
+            ));
+        };
+        let id = session.id().to_owned();
+        let opened = tokio::task::spawn_blocking(move || links.open(session))
+            .await
+            .map_err(|error| RpcError::internal(error.to_string()))?;
+        opened.map_err(|error| match error {
+            LinkError::Closing { .. } => RpcError::plant_deleted(&id),
+            LinkError::Domain(_) | LinkError::Thread(_) | LinkError::Failed { .. } => {
+                RpcError::new(Code::Unavailable, "LINK_FAILED", error.to_string())
+            }
+        })
+    }
+
+    /// Room in memory for one more trajectory's regulator, filter or optimisation.
+    pub fn trajectory_permit(&self) -> Result<OwnedSemaphorePermit, RpcError> {
+        let (name, limit) = ("trajectory_solves", self.limits.trajectory_solves);
+        let (what, actual) = ("regulators, filters and optimisations at a time", limit + 1);
+        Arc::clone(&self.trajectory_solves)
+            .try_acquire_owned()
+            .map_err(|_| LimitExceeded { name, limit, what, actual }.into())
+    }
+
+    /// A stream that ends, unfinished, when the server begins to shut down.
+    pub fn until_ending<T: Send + 'static>(&self, answers: Answers<T>) -> Answers<T> {
+        let ending = self.ending.clone().cancelled_owned();
+        let farewell = stream::once(async { Err(RpcError::shutting_down().into()) });
+        // `Some(None)` marks the end that came by itself.
+        let ended_by_itself = answers.map(Some).chain(stream::once(async { None }));
+        let interruptible = ended_by_itself.take_until(ending).chain(farewell.map(Some));
+        Box::pin(
+            interruptible
+                .take_while(|item| future::ready(item.is_some()))
+                .filter_map(future::ready),
+        )
+    }
+
+    /// Ends all streams, plants and links. Blocks for a fraction of a second.
+    pub fn shut_down(&self) {
+        self.ending.cancel();
+        if let Some(links) = &self.links {
+            links.shutdown();
+        }
+        if let Some(recordings) = &self.recordings {
+            recordings.stop_all();
+        }
+        let plants: Vec<Arc<Session>> = self.plants().values().cloned().collect();
+        if let Some(state) = &self.state {
+            state.note_running(&plants);
+        }
+        plants.iter().for_each(|session| session.pause());
+    }
+
+    fn plants(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Session>>> {
+        self.plants.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// An id that no plant has. Random, so that ids differ between runs of a server.
+fn free_id(plants: &BTreeMap<String, Arc<Session>>) -> String {
+    loop {
+        let random = RandomState::new().build_hasher().finish();
+        let id = format!("plant-{:08x}", random as u32);
+        if !plants.contains_key(&id) {
+            return id;
+        }
+    }
+}

@@ -1,0 +1,5 @@
+//! What the services share.
+
+pub mod hub;
+pub mod jobs;
+pub mod state_directory;
