@@ -467,17 +467,18 @@ impl Factored {
         flows: &mut [S],
     ) {
         flows.fill(S::ZERO);
+        let (shapes, pivots) = (&self.shapes[..], &self.pivots[..]);
         let (mut factors, mut closed) = (&self.factors[..], &self.closed[..]);
         for step in &loops.plan.steps {
-            let Shape { row: first, stride, .. } = self.shapes[step.front];
+            let Shape { row: first, stride, .. } = shapes[step.front];
             for other in &step.absorbed {
                 for &(from, to) in &other.rows {
-                    let part = flows[self.shapes[other.front].row + from];
+                    let part = flows[shapes[other.front].row + from];
                     flows[first + to] = flows[first + to].plus(part);
                 }
             }
             let flows = &mut flows[first..][..stride];
-            let pivot = &self.pivots[step.joint];
+            let pivot = &pivots[step.joint];
             let mut right = x[step.joint];
             for (flow, minus) in flows[step.place..][..BODY].iter().zip(pivot.minus) {
                 right = right.plus(flow.times(-minus));
@@ -521,10 +522,11 @@ impl Factored {
         multipliers: &mut [S],
         flows: &mut [S],
     ) {
+        let (shapes, pivots) = (&self.shapes[..], &self.pivots[..]);
         let (mut factors, mut closed) = (&self.factors[..], &self.closed[..]);
         for step in loops.plan.steps.iter().rev() {
-            let Shape { row: first, stride, .. } = self.shapes[step.front];
-            let (pivot, place) = (&self.pivots[step.joint], step.place);
+            let Shape { row: first, stride, .. } = shapes[step.front];
+            let (pivot, place) = (&pivots[step.joint], step.place);
             let (all, motions) = (&mut *flows, first..first + stride);
             let motions = &mut all[motions];
             match step.above {
@@ -552,7 +554,7 @@ impl Factored {
             }
             for other in &step.absorbed {
                 for &(to, from) in &other.rows {
-                    all[self.shapes[other.front].row + to] = all[first + from];
+                    all[shapes[other.front].row + to] = all[first + from];
                 }
             }
         }

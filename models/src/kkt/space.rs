@@ -189,13 +189,15 @@ impl SpatialRecursion {
     #[inline(never)]
     pub(crate) fn solve(&mut self, tree: &Tree, x: &mut [f64]) {
         wide!({
-            let Self { generators, inverse_d, places, flows, .. } = self;
+            let (generators, inverse_d) = (&self.generators[..], &self.inverse_d[..]);
+            let (places, flows) = (&self.places[..], &mut self.flows[..]);
             flows.fill(Block::ZERO);
             for (i, joint) in tree.joints.iter().enumerate().rev() {
                 let (generator, place) = (&generators[i], places[i]);
                 let flow = flows[place];
-                x[i] = (x[i] - dot(&generator.minus, &flow)) * inverse_d[i];
-                let flow = flow.plus(generator.u.times(x[i]));
+                let value = (x[i] - dot(&generator.minus, &flow)) * inverse_d[i];
+                x[i] = value;
+                let flow = flow.plus(generator.u.times(value));
                 match places.get(joint.parent) {
                     Some(&to) if to == place => flows[to] = flow,
                     to => {
@@ -208,8 +210,9 @@ impl SpatialRecursion {
             }
             for (i, joint) in tree.joints.iter().enumerate() {
                 let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
-                x[i] -= dot(&generators[i].w_over_d, &flow);
-                flows[places[i]] = flow.plus(generators[i].plus.times(x[i]));
+                let value = x[i] - dot(&generators[i].w_over_d, &flow);
+                x[i] = value;
+                flows[places[i]] = flow.plus(generators[i].plus.times(value));
             }
         })
     }

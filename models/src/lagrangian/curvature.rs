@@ -75,11 +75,13 @@ impl<S: Scalar> Curvature<S> {
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
         wide!({
+            let tensors = &mut self.tensor[..];
+            let (forces, rates) = (&mut self.force[..], &mut self.rate[..]);
             for (i, joint) in tree.joints.iter().enumerate() {
                 let rotation = &poses.rotation[i];
                 let spin = match &joint.body.inertia {
                     Rotational::None => {
-                        self.tensor[i] = Sym3::default();
+                        tensors[i] = Sym3::default();
                         continue;
                     }
                     Rotational::Point => Sym3::default(),
@@ -89,20 +91,20 @@ impl<S: Scalar> Curvature<S> {
                     Rotational::Full(tensor) => Sym3::lift(*tensor).rotated(rotation),
                 };
                 let center = poses.position[i] + rotation.apply(Vec3::lift(joint.body.center));
-                self.tensor[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
+                tensors[i] = spin.add(&Sym3::of_point(joint.body.mass, center));
             }
             for (i, joint) in tree.joints.iter().enumerate().rev() {
                 if joint.parent != WORLD {
-                    self.tensor[joint.parent] = self.tensor[joint.parent].add(&self.tensor[i]);
+                    tensors[joint.parent] = tensors[joint.parent].add(&tensors[i]);
                 }
                 let composite = Inertia {
                     mass: joint.subtree_mass,
                     moment: momenta.moment[i],
-                    tensor: self.tensor[i],
+                    tensor: tensors[i],
                 };
                 let axis = momenta.axis[i];
-                self.force[i] = composite.momentum(axis);
-                self.rate[i] = axis
+                forces[i] = composite.momentum(axis);
+                rates[i] = axis
                     .cross_force(momenta.momentum[i])
                     .add(composite.momentum(momenta.axis_rate[i]));
             }

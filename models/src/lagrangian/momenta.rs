@@ -57,17 +57,19 @@ impl<S: Scalar> Momenta<S> {
             } else {
                 self.forward::<false>(tree, poses, velocity);
             }
+            let (axes, rates) = (&self.axis[..], &self.axis_rate[..]);
+            let (momenta, moments) = (&mut self.momentum[..], &mut self.moment[..]);
             for (i, joint) in tree.joints.iter().enumerate().rev() {
-                let (momentum, moment) = (self.momentum[i], self.moment[i]);
+                let (momentum, moment) = (momenta[i], moments[i]);
                 if joint.parent != WORLD {
                     let parent = joint.parent;
-                    self.momentum[parent] = self.momentum[parent].add(momentum);
-                    self.moment[parent] += moment;
+                    momenta[parent] = momenta[parent].add(momentum);
+                    moments[parent] += moment;
                 }
                 if let Some(l_v) = l_v.get_mut(joint.coordinate) {
-                    let axis = self.axis[i];
+                    let axis = axes[i];
                     *l_v = axis.dot(momentum);
-                    l_q[joint.coordinate] = self.axis_rate[i].dot(momentum)
+                    l_q[joint.coordinate] = rates[i].dot(momentum)
                         + gravity.map_or(S::ZERO, |g| {
                             let (g, mass) = (Vec3::lift(g), joint.subtree_mass);
                             axis.dot(Force { n: moment.cross(g), f: g.scaled(mass) })
@@ -80,6 +82,9 @@ impl<S: Scalar> Momenta<S> {
     /// `OTHER`: some joint is neither revolute nor prismatic.
     #[inline(always)]
     fn forward<const OTHER: bool>(&mut self, tree: &Tree, poses: &Poses<S>, velocity: &[S]) {
+        let (axes, rates, twists) =
+            (&mut self.axis[..], &mut self.axis_rate[..], &mut self.twist[..]);
+        let (momenta, moments) = (&mut self.momentum[..], &mut self.moment[..]);
         for (i, joint) in tree.joints.iter().enumerate() {
             let direction = poses.axis(i);
             let turning = |v| Motion { w: direction, v };
@@ -91,20 +96,19 @@ impl<S: Scalar> Momenta<S> {
                 }
                 _ => Motion { w: Vec3::ZERO, v: direction },
             };
-            let twist_of =
-                |joint| if joint == WORLD { Motion::default() } else { self.twist[joint] };
+            let twist_of = |joint| if joint == WORLD { Motion::default() } else { twists[joint] };
             let parent = twist_of(joint.parent);
             let twist = parent.add_scaled(velocity[joint.coordinate], axis);
-            self.axis_rate[i] = match joint.kind {
+            rates[i] = match joint.kind {
                 // The axes of a ball are carried by what the whole joint hangs from.
                 JointKind::Ball(entry) if OTHER => {
                     twist_of(tree.joints[i - entry].parent).cross(axis)
                 }
                 _ => parent.cross(axis),
             };
-            self.axis[i] = axis;
-            self.twist[i] = twist;
-            (self.momentum[i], self.moment[i]) = body_momentum(&joint.body, poses, i, twist);
+            axes[i] = axis;
+            twists[i] = twist;
+            (momenta[i], moments[i]) = body_momentum(&joint.body, poses, i, twist);
         }
     }
 
