@@ -253,6 +253,8 @@ pub(crate) trait Side: Scalar {
 
 /// Computes the entries of lists from those of other lists of the same length, four at a time, then those
 /// that are left. Reading comes before writing, so that compilers need not know that lists do not overlap.
+/// A macro, because steps of chains took 12 % longer with a generic function for each entry, and 15 % with a
+/// trait of such functions.
 macro_rules! side_by_side {
     (for ($($x:ident in $from:expr),+ $(,)?) let $local:pat = $value:expr; {
         $($out:ident($to:expr) = $result:expr;)+
