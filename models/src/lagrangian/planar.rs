@@ -18,6 +18,11 @@
 //! Only sums along the tree need one joint after the other: directions, velocities, momenta, moments and
 //! inertia. All else is the same for each joint, and is computed for four of them side by side ([`Fours`]).
 //!
+//! A second home of the formulas of [`Momenta`] and [`Curvature`], kept because it pays: without it, and
+//! without the recursion that builds on it ([`crate::kkt::planar`]), a step takes 1.2 (two joints) to 2
+//! (chains of 16 and of 128) times as long, and a step with its derivatives 1.3 to 5 times. The price is this
+//! file and the one of the recursion, and a test that compares every entry with those in space.
+//!
 //! [`Momenta`]: crate::lagrangian::momenta::Momenta
 //! [`Curvature`]: crate::lagrangian::curvature::Curvature
 
