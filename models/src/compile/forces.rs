@@ -16,11 +16,15 @@ use crate::scene::forces::Component;
 
 impl Layout {
     pub(super) fn coordinate_inputs(&self, scene: &Scene) -> Vec<CoordinateInput> {
-        let on_coordinate = |(input, i): (usize, &scene::Input)| {
-            let coordinate = self.index[i.coordinate.as_ref()?];
-            Some(CoordinateInput { input, coordinate, gain: i.gain })
-        };
-        scene.inputs.iter().enumerate().filter_map(on_coordinate).collect()
+        let mut inputs = Vec::new();
+        for (input, i) in scene.inputs.iter().enumerate() {
+            let one = i.coordinate.iter().map(|name| (name, i.gain));
+            let terms = i.terms.iter().map(|term| (&term.coordinate, term.gain));
+            for (name, gain) in one.chain(terms) {
+                inputs.push(CoordinateInput { input, coordinate: self.index[name], gain });
+            }
+        }
+        inputs
     }
 
     /// Forces without effect are dropped; none if none is left.
@@ -53,6 +57,7 @@ impl Places<'_> {
             | scene::Force::Drag { coefficient: 0.0, .. }
             | scene::Force::CoordinateDrag { coefficient: 0.0, .. }
             | scene::Force::Friction { force: 0.0, .. } => {}
+            scene::Force::PathDamper { .. } | scene::Force::Servo { .. } => {}
             scene::Force::BodyWrench { frame, force, torque } => {
                 forces.wrenches.push(self.wrench(WrenchKind::Body, frame, force, torque));
             }
@@ -123,11 +128,11 @@ impl Places<'_> {
             for (component, unit) in
                 [(&torque[i], along(axis, Vec3::ZERO)), (&force[i], along(Vec3::ZERO, axis))]
             {
-                match component {
-                    Component::Constant(value) => constant = constant.add_scaled(*value, unit),
-                    Component::Input(name) => {
-                        let total = inputs.entry(self.layout.inputs[name.as_str()]).or_default();
-                        *total = total.add_scaled(1.0, unit);
+                match component.input() {
+                    None => constant = constant.add_scaled(component.constant(), unit),
+                    Some((name, gain)) => {
+                        let total = inputs.entry(self.layout.inputs[name]).or_default();
+                        *total = total.add_scaled(gain, unit);
                     }
                 }
             }

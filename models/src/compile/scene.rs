@@ -98,7 +98,7 @@ fn compile(scene: &Scene) -> Model {
         .iter()
         .map(|c| settings(scene, &c.name).and_then(|s| s.damping).unwrap_or(scene.damping))
         .collect();
-    let gravity = Vec3(scene.gravity);
+    let gravity = Vec3(scene.gravity.unwrap_or_default());
     let gravity = (gravity != Vec3::ZERO).then_some(gravity);
     let needs_poses = forces.is_some() || potentials.couple_branches;
     let planar = if needs_poses { None } else { planar(&dynamics, gravity) };
@@ -323,7 +323,10 @@ impl Layout {
             mark(&mut dynamics, &point.frame);
         }
         for force in &scene.forces {
-            force.points().for_each(|point| mark(&mut dynamics, &point.frame));
+            force.points().iter().for_each(|point| mark(&mut dynamics, &point.frame));
+        }
+        for point in scene.inputs.iter().flat_map(|input| &input.points) {
+            mark(&mut dynamics, &point.frame);
         }
         for constraint in &scene.constraints {
             let frames = constraint.frames();
@@ -617,8 +620,9 @@ fn classified(mass: f64, tensor: Sym3) -> Rotational {
 
 /// FNV-1a over the scene without what does not move it.
 fn digest(scene: &Scene) -> u64 {
-    let essence =
+    let mut essence =
         Scene { description: String::new(), operating_points: Vec::new(), ..scene.clone() };
+    essence.frames.iter_mut().for_each(|frame| frame.visuals.clear());
     let text = serde_json::to_string(&essence).unwrap_or_default();
     fnv1a(text.as_bytes())
 }

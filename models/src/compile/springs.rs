@@ -44,6 +44,7 @@ impl Layout {
                 coordinate: self.index[coordinate],
                 force: Spline::new(knots)?,
             }),
+            scene::Spring::Stop { .. } => return None,
             scene::Spring::Path { points, stiffness, rest_length } => Spring::Path(PathSpring {
                 segments: places.segments(points),
                 stiffness: *stiffness,

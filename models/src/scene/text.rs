@@ -132,7 +132,7 @@ mod tests {
                     "{good}[[forces]]\ntype = \"body_wrench\"\nframe = \"arm\"\ntorque = [0, \"tau\", true]"
                 ),
                 "forces[0].torque[2]",
-                "invalid type: boolean `true`, expected a number or the name of an input",
+                "invalid type: boolean `true`, expected a number, the name of an input, or a table of input and gain",
             ),
             (
                 &format!(
@@ -155,9 +155,14 @@ mod tests {
             ),
             ("format = 1\nname = \"a\"", "", "missing field `frames`"),
             (
-                "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, {}, 1]}]}",
+                "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, [], 1]}]}",
                 "forces[0].force[1]",
-                "invalid type: map, expected a number or the name of an input",
+                "invalid type: sequence, expected a number, the name of an input, or a table of input and gain",
+            ),
+            (
+                "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, {\"input\": \"u\"}, 1]}]}",
+                "forces[0].force[1]",
+                "missing field `gain`",
             ),
             ("{\"format\": 1, \"name\": 3, \"frames\": []}", "name", "line 1 column 23"),
             ("{\"format\": 1, \"name\": \"a\", \"frames\": []} x", "", "trailing characters"),
