@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use crate::integrator::state::PreciseState;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::lagrangian::{forces, potentials};
+use crate::lagrangian::{armature, forces, potentials};
 use crate::math::scalar::{Side, side_by_side};
 use crate::math::simd::wide;
 use crate::math::spatial::Mat3;
@@ -103,6 +103,7 @@ impl Midpoint {
         if model.potentials.any {
             let poses = &self.mechanics.poses;
             potentials::add_gradient(&model.potentials, &model.dynamics, poses, &self.q, l_q);
+            armature::add_momentum(&model.armature, &self.velocity, l_v);
         }
         if !model.damping.is_empty() {
             forces::add_damping(&model.damping, &self.velocity, &self.input_force, force);
@@ -111,12 +112,13 @@ impl Midpoint {
             if model.damping.is_empty() {
                 force.copy_from_slice(&self.input_force);
             }
-            forces.add(&self.mechanics.instant(model, &self.velocity, &self.inputs), force);
+            forces
+                .add(&self.mechanics.instant(model, &self.q, &self.velocity, &self.inputs), force);
         }
     }
 
     /// What forces depend on, at the last evaluation.
     pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a> {
-        self.mechanics.instant(model, &self.velocity, &self.inputs)
+        self.mechanics.instant(model, &self.q, &self.velocity, &self.inputs)
     }
 }

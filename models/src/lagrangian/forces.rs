@@ -5,6 +5,7 @@
 
 pub(crate) mod coordinate;
 pub(crate) mod linear_damper;
+pub(crate) mod path;
 pub(crate) mod point;
 #[cfg(test)]
 mod tests;
@@ -41,6 +42,8 @@ pub(crate) struct Instant<'a, S = f64> {
     /// With axes and twists of the same configuration and velocity.
     pub(crate) momenta: &'a Momenta<S>,
     /// Of all coordinates.
+    pub(crate) q: &'a [S],
+    /// Of all coordinates.
     pub(crate) velocity: &'a [S],
     pub(crate) inputs: &'a [S],
 }
@@ -76,11 +79,12 @@ pub(crate) trait GeneralizedForce {
 impl Forces {
     /// For each force, the coordinates that it couples with each other.
     pub(crate) fn couples(&self) -> Vec<Vec<usize>> {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers, path_forces } = self;
         let mut all: Vec<_> = wrenches.iter().map(GeneralizedForce::couples).collect();
         all.extend(point_forces.iter().map(GeneralizedForce::couples));
         all.extend(coordinate_forces.iter().map(GeneralizedForce::couples));
         all.extend(linear_dampers.iter().map(GeneralizedForce::couples));
+        all.extend(path_forces.iter().map(GeneralizedForce::couples));
         all
     }
 
@@ -92,11 +96,12 @@ impl Forces {
     /// Adds the generalized force to `force` (dynamic coordinates).
     #[inline(never)]
     pub(crate) fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers, path_forces } = self;
         wrenches.iter().for_each(|element| element.add(at, force));
         point_forces.iter().for_each(|element| element.add(at, force));
         coordinate_forces.iter().for_each(|element| element.add(at, force));
         linear_dampers.iter().for_each(|element| element.add(at, force));
+        path_forces.iter().for_each(|element| element.add(at, force));
     }
 
     /// [`GeneralizedForce::for_each_derivative`] of each force.
@@ -106,11 +111,12 @@ impl Forces {
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S, S),
     ) {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers, path_forces } = self;
         wrenches.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
         point_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
         coordinate_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
         linear_dampers.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
+        path_forces.iter().for_each(|force| force.for_each_derivative(at, &mut entry));
     }
 
     /// [`GeneralizedForce::for_each_input_derivative`] of each force.
@@ -120,10 +126,11 @@ impl Forces {
         at: &Instant<'_, S>,
         mut entry: impl FnMut(usize, usize, S),
     ) {
-        let Self { wrenches, point_forces, coordinate_forces, linear_dampers } = self;
+        let Self { wrenches, point_forces, coordinate_forces, linear_dampers, path_forces } = self;
         wrenches.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
         point_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
         coordinate_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
         linear_dampers.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
+        path_forces.iter().for_each(|force| force.for_each_input_derivative(at, &mut entry));
     }
 }

@@ -5,6 +5,7 @@
 //! coupled stops the first model that has one.
 
 pub(crate) mod coordinate_spring;
+pub(crate) mod coordinate_stop;
 pub(crate) mod linear_spring;
 pub(crate) mod path_spring;
 pub(crate) mod point_spring;
@@ -54,6 +55,7 @@ impl Spring {
             Self::Spline(spring) => spring.couples_branches(),
             Self::Path(spring) => spring.couples_branches(),
             Self::Linear(spring) => spring.couples_branches(),
+            Self::Stop(stop) => stop.couples_branches(),
         }
     }
 
@@ -65,6 +67,7 @@ impl Spring {
             Self::Spline(spring) => spring.couples(),
             Self::Path(spring) => spring.couples(),
             Self::Linear(spring) => spring.couples(),
+            Self::Stop(stop) => stop.couples(),
         }
     }
 
@@ -75,6 +78,7 @@ impl Spring {
             Self::Spline(spring) => spring.energy(at),
             Self::Path(spring) => spring.energy(at),
             Self::Linear(spring) => spring.energy(at),
+            Self::Stop(stop) => stop.energy(at),
         }
     }
 
@@ -86,6 +90,7 @@ impl Spring {
             Self::Spline(spring) => spring.add_gradient(at, l_q),
             Self::Path(spring) => spring.add_gradient(at, l_q),
             Self::Linear(spring) => spring.add_gradient(at, l_q),
+            Self::Stop(stop) => stop.add_gradient(at, l_q),
         }
     }
 
@@ -101,6 +106,7 @@ impl Spring {
             Self::Spline(spring) => spring.for_each_second_derivative(at, entry),
             Self::Path(spring) => spring.for_each_second_derivative(at, entry),
             Self::Linear(spring) => spring.for_each_second_derivative(at, entry),
+            Self::Stop(stop) => stop.for_each_second_derivative(at, entry),
         }
     }
 }
@@ -242,7 +248,7 @@ mod tests {
     fn springs_without_length_are_finite() {
         let text = |spring: &str| {
             format!(
-                "format = 1\nname = \"bead\"\n[[frames]]\nname = \"x\"\njoint = {{ type = \"prismatic\", axis = [1.0, 0.0, 0.0] }}\n[[frames]]\nname = \"y\"\nparent = \"x\"\njoint = {{ type = \"prismatic\", axis = [0.0, 1.0, 0.0] }}\nbody = {{ mass = 1.0 }}\n[[springs]]\nstiffness = 7.0\n{spring}\n"
+                "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"bead\"\n[[frames]]\nname = \"x\"\njoint = {{ type = \"prismatic\", axis = [1.0, 0.0, 0.0] }}\n[[frames]]\nname = \"y\"\nparent = \"x\"\njoint = {{ type = \"prismatic\", axis = [0.0, 1.0, 0.0] }}\nbody = {{ mass = 1.0 }}\n[[springs]]\nstiffness = 7.0\n{spring}\n"
             )
         };
         let two_point = "type = \"two_point\"\na = { frame = \"y\" }\nb = { frame = \"world\" }\n";

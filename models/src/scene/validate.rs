@@ -39,7 +39,6 @@ impl Scene {
         check.signals();
         check.constraints();
         check.operating_points();
-        check.unfinished();
         check.problems
     }
 }
@@ -166,8 +165,14 @@ impl<'a> Check<'a> {
             self.report("name", message);
         }
         self.positive("time_step_s".into(), scene.time_step_s);
-        if let Some(gravity) = &scene.gravity {
-            self.finite_all("gravity", gravity);
+        match &scene.gravity {
+            Some(gravity) => {
+                self.finite_all("gravity", gravity);
+            }
+            None => self.report(
+                "gravity",
+                "is not given; write `gravity = [0.0, 0.0, -9.81]` where z points up, `gravity = [0.0, 0.0, 0.0]` for none",
+            ),
         }
         self.not_negative("damping".into(), scene.damping);
     }
@@ -223,30 +228,6 @@ impl<'a> Check<'a> {
     fn interval(&mut self, path: &str, [low, high]: [f64; 2]) {
         if self.finite_all(path, &[low, high]) && low >= high {
             self.report(path, format!("is [{low}, {high}]; the second must be greater"));
-        }
-    }
-
-    fn unfinished(&mut self) {
-        let scene = self.scene;
-        for (i, coordinate) in scene.coordinates.iter().enumerate() {
-            if coordinate.armature != 0.0 {
-                self.report(format!("coordinates[{i}].armature"), "is not simulated yet");
-            }
-        }
-        for (i, spring) in scene.springs.iter().enumerate() {
-            if matches!(spring, Spring::Stop { .. }) {
-                self.report(format!("springs[{i}]"), "is not simulated yet");
-            }
-        }
-        for (i, input) in scene.inputs.iter().enumerate() {
-            if !input.points.is_empty() {
-                self.report(format!("inputs[{i}].points"), "is not simulated yet");
-            }
-        }
-        for (i, force) in scene.forces.iter().enumerate() {
-            if matches!(force, Force::PathDamper { .. } | Force::Servo { .. }) {
-                self.report(format!("forces[{i}]"), "is not simulated yet");
-            }
         }
     }
 }

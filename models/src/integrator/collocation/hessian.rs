@@ -70,7 +70,7 @@ impl Hessian {
     pub(super) fn add_forces(&mut self, model: &Model, workspace: &Workspace, stage: usize) {
         let d = model.dimensions;
         let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
-        let Self { qq, qv, qu, .. } = self;
+        let Self { qq, qv, vv, qu, .. } = self;
         if model.potentials.any {
             let (tree, poses) = (&model.dynamics, &workspace.mid.mechanics.poses);
             let q = &workspace.mid.q;
@@ -79,6 +79,9 @@ impl Hessian {
                     qq[(i * n + j) * width + stage] -= k;
                 }
             });
+            for &(i, a) in &model.armature {
+                vv[(i * n + i) * width + stage] += a;
+            }
         }
         if let Some(forces) = &model.forces {
             let instant = workspace.mid.instant(model);
