@@ -172,18 +172,19 @@ fn scene(mechanism: &Mechanism) -> Scene {
             mass: link.mass,
             center_of_mass: link.com,
             inertia: link.inertia.to_vec(),
+            ..Body::default()
         }),
+        ..Frame::default()
     });
     let coordinates = mechanism.q0.iter().zip(0..).map(|(&initial, i)| Coordinate {
         name: name(i),
-        kind: Default::default(),
         initial,
-        damping: None,
+        ..Coordinate::default()
     });
     let inputs = (0..mechanism.q0.len()).map(|i| Input {
         name: format!("torque{i}"),
         coordinate: Some(format!("b{i}")),
-        gain: 1.0,
+        ..Input::default()
     });
     let point = |body, at| Point { frame: name(body), at };
     let constraints = mechanism.loops.iter().enumerate().map(|(i, l)| Constraint::PointToPoint {
@@ -197,7 +198,7 @@ fn scene(mechanism: &Mechanism) -> Scene {
         name: mechanism.name.to_lowercase(),
         description: String::new(),
         time_step_s: 0.01,
-        gravity: [0.0, 0.0, -mechanism.gravity],
+        gravity: Some([0.0, 0.0, -mechanism.gravity]),
         damping: 0.0,
         frames: frames.collect(),
         coordinates: coordinates.collect(),

@@ -62,7 +62,7 @@ fn empty(name: String, description: String) -> Scene {
         name,
         description,
         time_step_s: 0.01,
-        gravity: [0.0, 0.0, -9.8],
+        gravity: Some([0.0, 0.0, -9.8]),
         ..Scene::default()
     }
 }
@@ -80,7 +80,7 @@ fn hinge(name: String, parent: &str, translation: [f64; 3], body: Body) -> Frame
 }
 
 fn dynamic(name: String, initial: f64) -> Coordinate {
-    Coordinate { name, kind: Default::default(), initial, damping: None }
+    Coordinate { name, initial, ..Coordinate::default() }
 }
 
 /// `n` uniform thin rods, 1 m and 1 kg together, hinged about one axis, released from horizontal.
@@ -100,6 +100,7 @@ fn chain(n: usize) -> Scene {
             mass,
             center_of_mass: [0.0, 0.0, -length / 2.0],
             inertia: vec![across, across, 0.0],
+            ..Body::default()
         };
         let (parent, z) = if i == 0 { ("world".to_owned(), 0.0) } else { (link(i - 1), -length) };
         scene.frames.push(hinge(link(i), &parent, [0.0, 0.0, z], body));
@@ -107,7 +108,11 @@ fn chain(n: usize) -> Scene {
     // Short links swing fast: their time step shrinks with them.
     scene.time_step_s = (0.08 * length).min(0.01);
     scene.coordinates.push(dynamic(link(0), FRAC_PI_6));
-    scene.inputs.push(Input { name: "torque".to_owned(), coordinate: Some(link(0)), gain: 1.0 });
+    scene.inputs.push(Input {
+        name: "torque".to_owned(),
+        coordinate: Some(link(0)),
+        ..Input::default()
+    });
     for (name, angle) in [("hanging", 0.0), ("upright", PI)] {
         scene.operating_points.push(OperatingPoint {
             name: name.to_owned(),
@@ -144,11 +149,16 @@ fn tree(n: usize) -> Scene {
                 mass: 0.96,
                 center_of_mass: [0.01, 0.005, -0.1],
                 inertia: vec![0.003712, 0.003488, 0.0008],
+                ..Body::default()
             }),
             ..Frame::default()
         });
         scene.coordinates.push(dynamic(name.clone(), 0.6 * sin_cos_of(0.7 + 1.3 * i as f64).0));
-        scene.inputs.push(Input { name: format!("torque{i}"), coordinate: Some(name), gain: 1.0 });
+        scene.inputs.push(Input {
+            name: format!("torque{i}"),
+            coordinate: Some(name),
+            ..Input::default()
+        });
     }
     scene
 }
@@ -171,6 +181,7 @@ fn scissor(n: usize) -> Scene {
         mass: 1.0,
         center_of_mass: [LENGTH / 2.0, 0.0, 0.0],
         inertia: vec![1.0, 1.0, 1.0],
+        ..Body::default()
     };
     scene.frames.push(Frame {
         name: "slider".to_owned(),
@@ -211,7 +222,7 @@ fn scissor(n: usize) -> Scene {
     scene.inputs.push(Input {
         name: "force".to_owned(),
         coordinate: Some("slider".to_owned()),
-        gain: 1.0,
+        ..Input::default()
     });
     scene
 }

@@ -4,6 +4,7 @@
 //! reports every error of a scene at once, each with its path.
 
 pub(crate) mod forces;
+mod inputs;
 pub(crate) mod limits;
 pub(crate) mod linear_term;
 mod number_or_name;
@@ -11,22 +12,25 @@ pub(crate) mod point;
 pub(crate) mod signals;
 mod text;
 mod validate;
+mod visuals;
 
-pub use crate::scene::forces::{Component, Force};
+pub use crate::scene::forces::{Component, Force, ScaledInput};
+pub use crate::scene::inputs::{Input, InputTerm};
 pub use crate::scene::limits::{
-    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES, MAX_FRAMES, MAX_INPUTS,
-    MAX_KNOTS, MAX_LINEAR_TERMS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER,
-    MAX_SIGNAL_POINTS, MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES,
+    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FILE_BYTES, MAX_FORCES, MAX_FRAMES,
+    MAX_INPUTS, MAX_KNOTS, MAX_LINEAR_TERMS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS,
+    MAX_POWER, MAX_SIGNAL_POINTS, MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES, MAX_VISUALS,
 };
 pub use crate::scene::linear_term::LinearTerm;
 pub use crate::scene::point::Point;
 pub use crate::scene::signals::{Interpolation, Signal};
+pub use crate::scene::visuals::{Shape, Visual};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::scene::number_or_name::{NumberOrName, field, number_or_name};
-use crate::scene::point::{is_zero, is_zero3, one};
+use crate::scene::point::{is_false, is_zero, is_zero3};
 
 pub use crate::math::spline::Knot;
 
@@ -44,9 +48,10 @@ pub struct Scene {
     /// Suggested time step, seconds.
     #[serde(default = "default_time_step")]
     pub time_step_s: f64,
-    /// Acceleration of gravity, world axes, m/s².
-    #[serde(default)]
-    pub gravity: [f64; 3],
+    /// Acceleration of gravity, world axes, m/s²; must be given, zero as well.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(required)]
+    pub gravity: Option<[f64; 3]>,
     /// Damping of every dynamic coordinate that does not set its own, N·s/m or N·m·s/rad.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub damping: f64,
@@ -103,6 +108,9 @@ pub struct Frame {
     /// Rigid body fixed in the frame.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub body: Option<Body>,
+    /// Shapes that show the frame; they have no effect on motion.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub visuals: Vec<Visual>,
 }
 
 fn world() -> String {
@@ -217,10 +225,13 @@ pub struct Body {
     /// `[ixx, iyy, izz]` or `[ixx, iyy, izz, ixy, ixz, iyz]`, kg·m². None means a point mass.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub inertia: Vec<f64>,
+    /// Takes principal moments that no body has (`a + b < c`), with a warning.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub any_inertia: bool,
 }
 
 /// Settings of a coordinate.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Coordinate {
     /// Name.
@@ -234,6 +245,13 @@ pub struct Coordinate {
     /// Damping, N·s/m or N·m·s/rad; not given means the scene's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub damping: Option<f64>,
+    /// Inertia of what turns or slides with the coordinate alone, such as a geared rotor:
+    /// `T += ½ armature v²` with the coordinate's velocity `v`; kg for a slide, kg·m² for an angle.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub armature: f64,
+    /// Lower and upper limit, m or rad; they inform clients, and a `stop` enforces them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub limits: Option<[f64; 2]>,
 }
 
 /// Who moves a coordinate.
@@ -301,6 +319,37 @@ pub enum Spring {
         #[serde(default)]
         rest: f64,
     },
+    /// A one-sided spring and damper where a coordinate, or the length of a path, leaves its range:
+    /// `f = −stiffness · F(x) − damping · w(x) · dx/dt` at a depth `x` beyond it, with `F' = w`, and `w`
+    /// rising smoothly from 0 at the range's end to 1 at the depth `transition`.
+    Stop {
+        /// Coordinate; or else `points`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+        /// Two or more points of a path whose length is limited, in the order of the path.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        points: Vec<Point>,
+        /// Where it does nothing, m or rad; the `limits` of the coordinate if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        range: Option<[f64; 2]>,
+        /// N/m or N·m/rad.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        stiffness: Option<f64>,
+        /// N·s/m or N·m·s/rad; 0 if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        damping: Option<f64>,
+        /// Depth from which stiffness and damping are whole, m or rad; a hundredth of the range if
+        /// neither it nor `settling_depth` is given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        transition: Option<f64>,
+        /// In place of `transition`, with `settling_time_s`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        settling_depth: Option<f64>,
+        /// In place of `stiffness` and `damping`: time in which a coordinate that is held at the stop
+        /// comes to rest, s.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        settling_time_s: Option<f64>,
+    },
 }
 
 impl Spring {
@@ -308,25 +357,10 @@ impl Spring {
     pub(crate) fn points(&self) -> Vec<&Point> {
         match self {
             Self::TwoPoint { a, b, .. } => vec![a, b],
-            Self::Path { points, .. } => points.iter().collect(),
+            Self::Path { points, .. } | Self::Stop { points, .. } => points.iter().collect(),
             Self::Coordinate { .. } | Self::Spline { .. } | Self::LinearSpring { .. } => Vec::new(),
         }
     }
-}
-
-/// A number `u` that the driver sends: a generalized force `gain · u` on a dynamic coordinate, a
-/// component of forces that name it, or both.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Input {
-    /// Name.
-    pub name: String,
-    /// Coordinate on which it acts; may be left out if a force uses the input.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub coordinate: Option<String>,
-    /// Factor of the force on the coordinate.
-    #[serde(default = "one")]
-    pub gain: f64,
 }
 
 /// A holonomic constraint `h(q) = 0`.

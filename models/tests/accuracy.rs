@@ -217,6 +217,7 @@ fn stages_side_by_side_are_stages_one_by_one() {
 fn an_oscillator_is_followed_in_every_order() {
     let text = r#"
         format = 1
+gravity = [0.0, 0.0, 0.0]
         name = "oscillator"
         [[frames]]
         name = "mass"

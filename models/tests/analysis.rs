@@ -74,7 +74,7 @@ fn scene(text: &str) -> Scene {
 /// Three masses in a row between walls, joined by four equal springs; a force on the middle one.
 fn row_of_masses(damping: f64) -> Scene {
     let mut text = format!(
-        "format = 1\nname = \"row\"\ntime_step_s = 0.02\ndamping = {damping}\n\
+        "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"row\"\ntime_step_s = 0.02\ndamping = {damping}\n\
          [[inputs]]\nname = \"push\"\ncoordinate = \"m1\"\n"
     );
     for i in 0..3 {
@@ -141,7 +141,7 @@ fn what_moves_against_the_middle_is_out_of_its_reach_and_sight() {
 #[test]
 fn an_oscillator_answers_as_the_midpoint_rule_does() {
     let (m, k, c) = (2.0, 50.0, 0.3);
-    let text = "format = 1\nname = \"oscillator\"\ntime_step_s = 0.02\ndamping = 0.3\n\
+    let text = "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"oscillator\"\ntime_step_s = 0.02\ndamping = 0.3\n\
         [[frames]]\nname = \"x\"\njoint = { type = \"prismatic\", axis = [1.0, 0.0, 0.0] }\n\
         body = { mass = 2.0 }\n\
         [[springs]]\ntype = \"coordinate\"\ncoordinate = \"x\"\nstiffness = 50.0\n\

@@ -120,6 +120,7 @@ fn multipliers_are_forces() {
 fn momenta_of_a_free_joint() {
     let text = r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "box"
 [[frames]]
 name = "box"

@@ -7,7 +7,7 @@ use plantd_models::scene::Scene;
 use plantd_models::{ForceSplit, Initial, Plant};
 
 fn scene(text: &str) -> Scene {
-    let head = "format = 1\nname = \"forces\"\ntime_step_s = 0.01\n";
+    let head = "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"forces\"\ntime_step_s = 0.01\n";
     Scene::from_toml(&format!("{head}{text}")).unwrap_or_else(|e| panic!("{e}"))
 }
 
@@ -362,7 +362,7 @@ fn derivatives_of_each_force() {
     ] {
         let input = if force.contains("\"u\"") { "[[inputs]]\nname = \"u\"\n" } else { "" };
         let mut scene = scene(&format!("{FLYING}\n{input}[[forces]]\n{force}"));
-        scene.gravity = [1.0, -3.0, -9.0];
+        scene.gravity = Some([1.0, -3.0, -9.0]);
         common::linearization::check_within(&scene, 0.02);
     }
 }

@@ -148,6 +148,7 @@ fn a_ball_joint_moves_like_three_hinges() {
             rotation: None,
             joint: Some(plantd_models::scene::Joint::Revolute { axis, coordinate: None }),
             body: if i == 2 { body.clone() } else { None },
+            ..Default::default()
         });
     }
     hinges.coordinates.clear();
@@ -490,6 +491,7 @@ fn a_spherical_pendulum_on_a_ball_joint_has_no_poles() {
 fn a_million_tumbles_keep_the_momenta() {
     let text = r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "tumbling"
 time_step_s = 0.01
 

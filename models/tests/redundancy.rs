@@ -36,6 +36,7 @@ fn out_of_plane(turned: bool) -> Scene {
                 rotation: Some(plantd_models::scene::Rotation::Rpy([0.0, 0.0, angle])),
                 joint: None,
                 body: None,
+                ..Default::default()
             };
             let name = axis.name.clone();
             for frame in scene.frames.iter_mut().filter(|f| f.parent == "world") {
@@ -303,7 +304,7 @@ fn scale_is_not_redundancy() {
         }
         let Constraint::PointToPoint { a, b, .. } = &mut scaled.constraints[0] else { panic!() };
         a.at.iter_mut().chain(&mut b.at).for_each(|x| *x *= length);
-        scaled.gravity.iter_mut().for_each(|g| *g *= length);
+        scaled.gravity.iter_mut().flatten().for_each(|g| *g *= length);
         scaled.inputs.clear();
         scene.inputs.clear();
         let (mut small, mut large) = (plant(&scaled, |_| ()), plant(&scene, |_| ()));
@@ -495,6 +496,7 @@ fn welded(join: &str) -> Scene {
     let halves = Scene::from_toml(&format!(
         r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "halves"
 [[frames]]
 name = "coupler"

@@ -312,7 +312,7 @@ fn scenes_of_elements() {
 #[test]
 fn spring_whose_ends_meet() {
     let mut scene = builtin("double-pendulum");
-    scene.gravity = [0.0; 3];
+    scene.gravity = Some([0.0; 3]);
     scene.coordinates.clear();
     scene.springs.push(Spring::TwoPoint {
         a: Point { frame: "forearm".to_owned(), at: [1.0, 0.0, 0.0] },

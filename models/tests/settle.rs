@@ -139,7 +139,7 @@ fn constant_inputs_do_work() {
     let scene = builtin("pendulum");
     let plant = plant(&scene, |_| ());
     let body = scene.frames[0].body.clone().unwrap();
-    let moment = body.mass * body.center_of_mass[1].abs() * scene.gravity[1].abs();
+    let moment = body.mass * body.center_of_mass[1].abs() * scene.gravity.unwrap()[1].abs();
     let input = 0.4 * moment / scene.inputs[0].gain;
     let request = SettleRequest { q: vec![0.0], hold: vec![], inputs: vec![input] };
     let rest = plant.model().settle(&request).unwrap();
@@ -156,7 +156,7 @@ fn constant_inputs_do_work() {
 #[test]
 fn what_falls_has_no_equilibrium() {
     let mut scene = floating();
-    scene.gravity = [0.0, 0.0, -9.8];
+    scene.gravity = Some([0.0, 0.0, -9.8]);
     let plant = plant(&scene, |_| ());
     let error = settle(&plant, plant.q(), &[]).unwrap_err();
     assert_eq!(error, SettleError::Unbounded { coordinate: "z".to_owned() });

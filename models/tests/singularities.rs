@@ -170,6 +170,7 @@ fn planar_pendulum() -> Scene {
     Scene::from_toml(&format!(
         r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "planar"
 [[frames]]
 name = "x"

@@ -97,7 +97,7 @@ enum ForceRecord {
 fn wrench(wrench: &[Component; 6]) -> ([Component; 3], [Component; 3]) {
     let [fx, fy, fz, tx, ty, tz] = wrench.clone().map(|component| match component {
         Component::Input(name) => Component::Input(plain(&name)),
-        constant @ Component::Constant(_) => constant,
+        other => other,
     });
     ([fx, fy, fz], [tx, ty, tz])
 }
@@ -289,7 +289,7 @@ impl Mechanism {
             name: self.name.replace('_', "-"),
             description: String::new(),
             time_step_s: self.dt,
-            gravity: [0.0; 3],
+            gravity: Some([0.0; 3]),
             damping: 0.0,
             frames: Vec::new(),
             coordinates: self.coordinates(),
@@ -306,7 +306,7 @@ impl Mechanism {
         }
         for potential in &self.potentials {
             match potential {
-                PotentialRecord::Gravity { gravity } => scene.gravity = *gravity,
+                PotentialRecord::Gravity { gravity } => scene.gravity = Some(*gravity),
                 PotentialRecord::LinearSpring { frame1, frame2, k, x0 } => {
                     scene.springs.push(Spring::TwoPoint {
                         a: origin(*frame1),
@@ -340,7 +340,7 @@ impl Mechanism {
                 CoordinateKind::Dynamic
             },
             initial: *initial,
-            damping: None,
+            ..Coordinate::default()
         };
         self.configs.iter().zip(self.initial.q1()).map(coordinate).collect()
     }
@@ -383,7 +383,7 @@ impl Mechanism {
             scene.inputs.push(Input {
                 name: plain(&input.name),
                 coordinate: driven.get(&input.name).map(|config| plain(config)),
-                gain: 1.0,
+                ..Input::default()
             });
         }
         Ok(())
@@ -476,14 +476,11 @@ fn frame(index: usize, record: &FrameRecord) -> Result<Frame> {
     let mut frame = Frame {
         name: frame_name(index),
         parent: frame_name(record.parent.context("no parent")?),
-        translation: [0.0; 3],
-        rotation: None,
-        joint: None,
-        body: None,
+        ..Frame::default()
     };
     if let (Some(mass), Some(inertia)) = (record.mass, record.inertia) {
         let inertia = if inertia == [0.0; 3] { Vec::new() } else { inertia.to_vec() };
-        frame.body = Some(Body { mass, center_of_mass: [0.0; 3], inertia });
+        frame.body = Some(Body { mass, inertia, ..Body::default() });
     }
     if record.kind == "CONST_SE3" {
         let rows = record.se3_rows.context("no matrix")?;

@@ -8,6 +8,7 @@ use serde_json::Value;
 
 const SCENE: &str = r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "slider"
 
 [[frames]]

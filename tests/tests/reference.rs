@@ -509,8 +509,11 @@ fn builtin_damped_pendulum_follows_the_reference() -> Result<()> {
 #[test]
 fn builtin_cart_pole_follows_the_reference() -> Result<()> {
     let mut scene = scene("cart-pole")?;
-    let torque =
-        Input { name: "torque".to_owned(), coordinate: Some("theta".to_owned()), gain: 1.0 };
+    let torque = Input {
+        name: "torque".to_owned(),
+        coordinate: Some("theta".to_owned()),
+        ..Input::default()
+    };
     scene.inputs.push(torque);
     Case::builtin("pend_on_cart", &scene, None)?.check()
 }

@@ -12,6 +12,7 @@ from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
 
 SCENE = """
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "py-slider"
 
 [[frames]]

@@ -3,7 +3,7 @@
 //! The coefficients are instructions on x86-64 with AVX2, read from callgrind on the built-in scenes; the
 //! sums are right to a factor of two, which the tests of the instruction counts hold them to.
 
-use crate::model::mechanism::{ConstraintKind, Model, Solver};
+use crate::model::mechanism::{ConstraintKind, Forces, Model, Solver};
 use crate::model::tree::{Rotational, Tree};
 
 /// A part of a step of the midpoint rule, or of its linearization.
@@ -35,11 +35,7 @@ impl Model {
             (in_space(&self.dynamics), 340.0)
         };
         let others = self.potentials.springs.len() as f64
-            + self
-                .forces
-                .as_ref()
-                .map_or(0, |f| f.wrenches.len() + f.point_forces.len() + f.linear_dampers.len())
-                as f64;
+            + self.forces.as_ref().map_or(0, Forces::coupling) as f64;
         let joints = self.dynamics.joints.len() as f64;
         // Of loops.
         let plan = self.loops.as_ref().map(|loops| &loops.plan);

@@ -16,6 +16,7 @@ impl Model {
         self.explain_structure(&mut line);
         self.explain_elements(&mut line);
         self.explain_cost(&mut line);
+        self.warnings().iter().for_each(|warning| line(format!("warning       {warning}")));
         plan
     }
 
@@ -84,11 +85,12 @@ impl Model {
         line(match &self.forces {
             None => "forces        0 (skipped)".to_owned(),
             Some(forces) => format!(
-                "forces        {} wrenches, {} between points, {} on coordinates, {} linear",
+                "forces        {} wrenches, {} between points, {} on coordinates, {} linear, {} along paths",
                 forces.wrenches.len(),
                 forces.point_forces.len(),
                 forces.coordinate_forces.len(),
-                forces.linear_dampers.len()
+                forces.linear_dampers.len(),
+                forces.path_forces.len()
             ),
         });
         let on_inputs = |s: &&Signal| matches!(s.target, Target::Input(_));

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use crate::compile::scene::{Layout, Places};
+use crate::compile::scene::{Layout, Places, settings};
 use crate::math::spatial::{Force, Mat3, Vec3};
 use crate::model::mechanism::{
-    CoordinateForce, CoordinateInput, CoordinateLaw, Forces, LinearDamper, PointForce, PointLaw,
-    Wrench, WrenchKind,
+    Coordinate, CoordinateForce, CoordinateInput, CoordinateLaw, Forces, LinearDamper, PathForce,
+    PointForce, PointLaw, Resistance, Wrench, WrenchKind,
 };
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree, WORLD};
@@ -16,11 +16,49 @@ use crate::scene::forces::Component;
 
 impl Layout {
     pub(super) fn coordinate_inputs(&self, scene: &Scene) -> Vec<CoordinateInput> {
-        let on_coordinate = |(input, i): (usize, &scene::Input)| {
-            let coordinate = self.index[i.coordinate.as_ref()?];
-            Some(CoordinateInput { input, coordinate, gain: i.gain })
-        };
-        scene.inputs.iter().enumerate().filter_map(on_coordinate).collect()
+        let mut inputs: Vec<CoordinateInput> = Vec::new();
+        for (input, i) in scene.inputs.iter().enumerate() {
+            let one = i.coordinate.iter().map(|name| (name, i.gain));
+            let terms = i.terms.iter().map(|term| (&term.coordinate, term.gain));
+            for (name, gain) in one.chain(terms) {
+                inputs.push(CoordinateInput { input, coordinate: self.index[name], gain });
+            }
+        }
+        for force in &scene.forces {
+            let scene::Force::Servo { input, gain, .. } = force else { continue };
+            let input = self.inputs[input.as_str()];
+            for (coordinate, c) in self.servo_terms(force) {
+                let same = |other: &&mut CoordinateInput| {
+                    (other.input, other.coordinate) == (input, coordinate)
+                };
+                match inputs.iter_mut().find(same) {
+                    Some(other) => other.gain += gain * c,
+                    None => inputs.push(CoordinateInput { input, coordinate, gain: gain * c }),
+                }
+            }
+        }
+        inputs
+    }
+
+    /// Dynamic coordinates and factors of the sum of a servo.
+    fn servo_terms(&self, force: &scene::Force) -> Vec<(usize, f64)> {
+        let scene::Force::Servo { coordinate, terms, .. } = force else { return Vec::new() };
+        let alone = coordinate.iter().map(|name| (self.index[name], 1.0));
+        let all = alone.chain(self.linear(terms));
+        all.filter(|(coordinate, _)| *coordinate < self.dynamic).collect()
+    }
+
+    /// Damping of the dynamic coordinates: their own, and of servos on one coordinate.
+    pub(super) fn damping(&self, scene: &Scene) -> Vec<f64> {
+        let own = |c: &Coordinate| settings(scene, &c.name).and_then(|s| s.damping);
+        let coordinates = self.coordinates[..self.dynamic].iter();
+        let mut damping: Vec<f64> = coordinates.map(|c| own(c).unwrap_or(scene.damping)).collect();
+        for force in &scene.forces {
+            if let scene::Force::Servo { coordinate: Some(name), damping: more, .. } = force {
+                damping[self.index[name]] += more;
+            }
+        }
+        if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() }
     }
 
     /// Forces without effect are dropped; none if none is left.
@@ -30,9 +68,17 @@ impl Layout {
         for force in &scene.forces {
             places.add_force(force, &mut forces);
         }
-        let Forces { wrenches, point_forces, coordinate_forces, linear_dampers } = &forces;
-        let velocity_forces = point_forces.len() + coordinate_forces.len() + linear_dampers.len();
-        (wrenches.len() + velocity_forces > 0).then_some(forces)
+        for spring in &scene.springs {
+            places.add_damper_of_stop(spring, &mut forces);
+        }
+        for input in scene.inputs.iter().filter(|input| !input.points.is_empty()) {
+            forces.path_forces.push(PathForce {
+                segments: places.segments(&input.points),
+                inputs: vec![(self.inputs[input.name.as_str()], input.gain)],
+                resistance: Resistance::Constant(0.0),
+            });
+        }
+        (forces.coupling() + forces.coordinate_forces.len() > 0).then_some(forces)
     }
 
     pub(super) fn signals(&self, scene: &Scene) -> Vec<Signal> {
@@ -50,6 +96,7 @@ impl Places<'_> {
         match force {
             scene::Force::TwoPointDamper { damping: 0.0, .. }
             | scene::Force::LinearDamper { damping: 0.0, .. }
+            | scene::Force::PathDamper { damping: 0.0, .. }
             | scene::Force::Drag { coefficient: 0.0, .. }
             | scene::Force::CoordinateDrag { coefficient: 0.0, .. }
             | scene::Force::Friction { force: 0.0, .. } => {}
@@ -93,11 +140,46 @@ impl Places<'_> {
                 let terms = layout.linear(terms);
                 forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
             }
+            scene::Force::PathDamper { points, damping } => forces.path_forces.push(PathForce {
+                segments: self.segments(points),
+                inputs: Vec::new(),
+                resistance: Resistance::Constant(*damping),
+            }),
+            scene::Force::Servo { terms, damping, constant, .. } => {
+                // Its input, its spring and the damping of one coordinate are among those of coordinates.
+                if !terms.is_empty() && *damping > 0.0 {
+                    let terms = layout.linear(terms);
+                    forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
+                }
+                if *constant != 0.0 {
+                    let terms = layout.servo_terms(force).into_iter();
+                    forces.coordinate_forces.extend(terms.map(|(coordinate, c)| CoordinateForce {
+                        coordinate,
+                        law: CoordinateLaw::Constant(c * constant),
+                    }));
+                }
+            }
             scene::Force::Friction { coordinate, force, velocity } => {
                 let law = CoordinateLaw::Friction { force: *force, velocity: *velocity };
                 let coordinate = index[coordinate];
                 forces.coordinate_forces.push(CoordinateForce { coordinate, law });
             }
+        }
+    }
+
+    fn add_damper_of_stop(&self, spring: &scene::Spring, forces: &mut Forces) {
+        let scene::Spring::Stop { coordinate, points, .. } = spring else { return };
+        let Some(stop) = self.layout.stop(spring).filter(|stop| stop.damping > 0.0) else { return };
+        match coordinate {
+            Some(name) => {
+                let (coordinate, law) = (self.layout.index[name], CoordinateLaw::Stop(stop));
+                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+            }
+            None => forces.path_forces.push(PathForce {
+                segments: self.segments(points),
+                inputs: Vec::new(),
+                resistance: Resistance::Stop(stop),
+            }),
         }
     }
 
@@ -123,11 +205,11 @@ impl Places<'_> {
             for (component, unit) in
                 [(&torque[i], along(axis, Vec3::ZERO)), (&force[i], along(Vec3::ZERO, axis))]
             {
-                match component {
-                    Component::Constant(value) => constant = constant.add_scaled(*value, unit),
-                    Component::Input(name) => {
-                        let total = inputs.entry(self.layout.inputs[name.as_str()]).or_default();
-                        *total = total.add_scaled(1.0, unit);
+                match component.input() {
+                    None => constant = constant.add_scaled(component.constant(), unit),
+                    Some((name, gain)) => {
+                        let total = inputs.entry(self.layout.inputs[name]).or_default();
+                        *total = total.add_scaled(gain, unit);
                     }
                 }
             }

@@ -96,6 +96,7 @@ pub(super) fn check(model: &Model) {
             tree,
             poses: &poses,
             momenta: &momenta,
+            q: &q,
             velocity: &velocity,
             inputs: &inputs,
         };

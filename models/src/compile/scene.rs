@@ -3,8 +3,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::compile::pattern;
 use crate::compile::pattern::{couplings, joint_pairs};
+use crate::compile::{inertia, pattern, settling};
 use crate::math::elimination::SymbolicElimination;
 use crate::math::hash::fnv1a;
 use crate::math::rotation::Quaternion;
@@ -60,7 +60,15 @@ impl Model {
         if !problems.is_empty() {
             return Err(SceneError { problems });
         }
-        let model = compile(scene);
+        let [problems, warnings] = inertia::judge(scene);
+        if !problems.is_empty() {
+            return Err(SceneError { problems });
+        }
+        let mut model = compile(scene);
+        if let Some(stated) = settling::stated(scene, &model) {
+            model = Self { scene: scene.clone(), digest: digest(scene), ..compile(&stated) };
+        }
+        model.warnings = warnings;
         match model.always_singular() {
             None => Ok(model),
             Some(coordinate) => {
@@ -86,7 +94,9 @@ fn compile(scene: &Scene) -> Model {
     let (closure, in_closure) = Tree::pruned(&layout.joints, &closure);
     let dynamic = layout.dynamic;
 
-    let potentials = layout.potentials(scene, &dynamics, &in_dynamics);
+    let mut potentials = layout.potentials(scene, &dynamics, &in_dynamics);
+    let armature = layout.armature(scene);
+    potentials.any |= !armature.is_empty();
     let equations = layout.equations(scene, &closure, &in_closure);
 
     let forces = layout.forces(scene, &dynamics, &in_dynamics);
@@ -94,11 +104,8 @@ fn compile(scene: &Scene) -> Model {
     let elimination = SymbolicElimination::new(&couplings);
     let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
 
-    let damping: Vec<f64> = layout.coordinates[..dynamic]
-        .iter()
-        .map(|c| settings(scene, &c.name).and_then(|s| s.damping).unwrap_or(scene.damping))
-        .collect();
-    let gravity = Vec3(scene.gravity);
+    let damping = layout.damping(scene);
+    let gravity = Vec3(scene.gravity.unwrap_or_default());
     let gravity = (gravity != Vec3::ZERO).then_some(gravity);
     let needs_poses = forces.is_some() || potentials.couple_branches;
     let planar = if needs_poses { None } else { planar(&dynamics, gravity) };
@@ -118,11 +125,12 @@ fn compile(scene: &Scene) -> Model {
         planar,
         loops: None,
         gravity,
-        damping: if damping.iter().any(|c| *c != 0.0) { damping } else { Vec::new() },
+        damping,
         coordinate_inputs: layout.coordinate_inputs(scene),
         forces,
         signals: layout.signals(scene),
         potentials,
+        armature,
         constraints: equations.constraints,
         constraint_names: equations.names,
         alignments: equations.alignments,
@@ -134,6 +142,7 @@ fn compile(scene: &Scene) -> Model {
         coordinates: layout.coordinates,
         orientations: layout.orientations,
         scene: scene.clone(),
+        warnings: Vec::new(),
     };
     model.initial_violations = model.violations_at_start();
     model.conditioning = Conditioning::new(&model);
@@ -157,7 +166,7 @@ pub(crate) fn site(scene: &Scene, frame: &str, at: [f64; 3]) -> Option<Site> {
     Some(Site { joints, rotation: placement.rotation, point })
 }
 
-fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {
+pub(super) fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {
     scene.coordinates.iter().find(|c| c.name == name)
 }
 
@@ -179,6 +188,12 @@ pub(crate) struct Placement {
     pub(crate) translation: Vec3,
 }
 
+impl Placement {
+    /// At the frame itself.
+    pub(super) const HERE: Self =
+        Self { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
+}
+
 /// The scene with its names resolved.
 #[derive(Default)]
 pub(crate) struct Layout {
@@ -193,13 +208,12 @@ pub(crate) struct Layout {
 }
 
 impl Layout {
-    fn new(scene: &Scene) -> Self {
+    pub(super) fn new(scene: &Scene) -> Self {
         let mut children: BTreeMap<&str, Vec<&scene::Frame>> = BTreeMap::new();
         for frame in &scene.frames {
             children.entry(&frame.parent).or_default().push(frame);
         }
-        let world = Placement { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
-        let frames = BTreeMap::from([("world".to_owned(), world)]);
+        let frames = BTreeMap::from([("world".to_owned(), Placement::HERE)]);
         let inputs = scene.inputs.iter().enumerate().map(|(i, input)| (input.name.clone(), i));
         let mut layout = Self { frames, inputs: inputs.collect(), ..Self::default() };
         let mut names = Vec::new();
@@ -278,6 +292,7 @@ impl Layout {
                     kind: kind(&name),
                     is_angle: joint.is_some_and(|j| self.joints[j].kind != JointKind::Prismatic),
                     initial: initial(scene, &name),
+                    limits: settings(scene, &name).and_then(|c| c.limits),
                     name,
                 }
             })
@@ -309,10 +324,18 @@ impl Layout {
         self.frames[frame].rotation.apply(direction)
     }
 
+    /// Coordinates with an armature.
+    fn armature(&self, scene: &Scene) -> Vec<(usize, f64)> {
+        let with = scene.coordinates.iter().filter(|coordinate| coordinate.armature > 0.0);
+        with.map(|coordinate| (self.index[&coordinate.name], coordinate.armature)).collect()
+    }
+
     /// Which joints the walks of the dynamics and of the constraints need: a joint is needed where it, or a joint below it, carries what the walk evaluates.
     fn needs(&self, scene: &Scene) -> [Vec<bool>; 2] {
         let has_body = |joint: &Joint| !matches!(joint.body.inertia, Rotational::None);
-        let mut dynamics: Vec<bool> = self.joints.iter().map(has_body).collect();
+        let armature: BTreeSet<usize> = self.armature(scene).into_iter().map(|(i, _)| i).collect();
+        let resists = |joint: &Joint| has_body(joint) || armature.contains(&joint.coordinate);
+        let mut dynamics: Vec<bool> = self.joints.iter().map(resists).collect();
         let mut closure = vec![false; self.joints.len()];
         let mark = |needed: &mut Vec<bool>, frame: &str| {
             if let Some(needed) = needed.get_mut(self.frames[frame].joint) {
@@ -323,7 +346,10 @@ impl Layout {
             mark(&mut dynamics, &point.frame);
         }
         for force in &scene.forces {
-            force.points().for_each(|point| mark(&mut dynamics, &point.frame));
+            force.points().iter().for_each(|point| mark(&mut dynamics, &point.frame));
+        }
+        for point in scene.inputs.iter().flat_map(|input| &input.points) {
+            mark(&mut dynamics, &point.frame);
         }
         for constraint in &scene.constraints {
             let frames = constraint.frames();
@@ -565,7 +591,7 @@ fn about(axis: usize, angle: f64) -> Mat3 {
 }
 
 /// A body of the scene in the frame of the joint that carries it.
-fn placed(body: &scene::Body, placement: &Placement) -> Body {
+pub(super) fn placed(body: &scene::Body, placement: &Placement) -> Body {
     let center = placement.translation + placement.rotation.apply(Vec3(body.center_of_mass));
     let inertia = match body.inertia[..] {
         [xx, yy, zz] => Sym3 { xx, yy, zz, ..Sym3::default() },
@@ -597,7 +623,7 @@ fn lumped(a: &Body, b: &Body) -> Body {
     Body { mass, center, inertia: classified(mass, about_center(a).add(&about_center(b))) }
 }
 
-fn full(inertia: &Rotational) -> Sym3 {
+pub(super) fn full(inertia: &Rotational) -> Sym3 {
     match *inertia {
         Rotational::None | Rotational::Point => Sym3::default(),
         Rotational::Isotropic(i) => Sym3 { xx: i, yy: i, zz: i, ..Sym3::default() },
@@ -617,8 +643,9 @@ fn classified(mass: f64, tensor: Sym3) -> Rotational {
 
 /// FNV-1a over the scene without what does not move it.
 fn digest(scene: &Scene) -> u64 {
-    let essence =
+    let mut essence =
         Scene { description: String::new(), operating_points: Vec::new(), ..scene.clone() };
+    essence.frames.iter_mut().for_each(|frame| frame.visuals.clear());
     let text = serde_json::to_string(&essence).unwrap_or_default();
     fnv1a(text.as_bytes())
 }

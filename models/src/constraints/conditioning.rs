@@ -177,6 +177,7 @@ pub(crate) fn sample(model: &Model, k: usize, slide: f64) -> Vec<f64> {
 /// out as far as the joints between allow.
 pub(crate) fn inertia(model: &Model) -> Vec<f64> {
     let mut inertia = vec![0.0; model.dimensions.dynamic];
+    model.armature.iter().for_each(|&(i, a)| inertia[i] = a);
     let joints = &model.dynamics.joints;
     for (b, carrier) in joints.iter().enumerate() {
         let body = &carrier.body;

@@ -80,6 +80,9 @@ impl Workspace {
     /// Factors the mass matrix by the recursion, with the constraints at the start; whether that went well.
     pub(super) fn factor_masses(&mut self, model: &Model, settings: &Settings) -> bool {
         self.kkt.diagonal.fill(0.0);
+        for &(i, a) in &model.armature {
+            self.kkt.diagonal[i] = -a / settings.time_step_s;
+        }
         let constraints = [&self.constraints.start, &self.constraints.start];
         let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
         matches!(self.kkt.factor_recursion(at, MatrixKind::Mass), Ok(true))
@@ -115,6 +118,10 @@ impl Workspace {
                     matrix.add(&model.elimination, i, j, -0.25 * h * value);
                 }
             });
+            for &(i, a) in &model.armature {
+                let slot = model.elimination.offsets[i + 1] - 1;
+                self.kkt.tree.add_to_diagonal(slot, -a / h);
+            }
         }
         for (i, c) in model.damping.iter().enumerate() {
             let slot = model.elimination.offsets[i + 1] - 1;
@@ -137,7 +144,7 @@ impl Workspace {
             .map_err(|pivot| model.singular_matrix(pivot))
     }
 
-    /// What springs and dampers of coordinates add to the diagonal of `K`.
+    /// What springs, dampers and armatures of coordinates add to the diagonal of `K`.
     fn fill_diagonal(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
         let diagonal = &mut self.kkt.diagonal;
@@ -146,6 +153,7 @@ impl Workspace {
             let poses = &self.mid.mechanics.poses;
             let add = |i: usize, _, value| diagonal[i] -= 0.25 * h * value;
             model.for_each_spring_derivative(poses, &self.mid.q, add);
+            model.armature.iter().for_each(|&(i, a)| diagonal[i] -= a / h);
         }
         let a = settings.force_split.at_start();
         for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
@@ -157,7 +165,7 @@ impl Workspace {
     fn add_forces_to_newton_matrix(&mut self, model: &Model, forces: &Forces, settings: &Settings) {
         let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
         let dynamic = model.dimensions.dynamic;
-        let instant = self.mid.mechanics.instant(model, &self.mid.velocity, &self.mid.inputs);
+        let instant = self.mid.instant(model);
         let matrix = &mut self.kkt.tree;
         forces.for_each_derivative(&instant, |i, j, by_q, by_v| {
             if i < dynamic && j < dynamic {

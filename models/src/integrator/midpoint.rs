@@ -3,9 +3,9 @@
 use std::f64::consts::TAU;
 
 use crate::integrator::state::PreciseState;
-use crate::lagrangian::forces;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::{armature, forces};
 use crate::math::scalar::{Side, side_by_side};
 use crate::math::simd::wide;
 use crate::math::spatial::Mat3;
@@ -98,6 +98,7 @@ impl Midpoint {
         );
         if model.potentials.any {
             model.add_spring_gradient(&self.mechanics.poses, &self.q, l_q);
+            armature::add_momentum(&model.armature, &self.velocity, l_v);
         }
         if !model.damping.is_empty() {
             forces::add_damping(&model.damping, &self.velocity, &self.input_force, force);
@@ -106,12 +107,13 @@ impl Midpoint {
             if model.damping.is_empty() {
                 force.copy_from_slice(&self.input_force);
             }
-            forces.add(&self.mechanics.instant(model, &self.velocity, &self.inputs), force);
+            forces
+                .add(&self.mechanics.instant(model, &self.q, &self.velocity, &self.inputs), force);
         }
     }
 
     /// What forces depend on, at the last evaluation.
     pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a> {
-        self.mechanics.instant(model, &self.velocity, &self.inputs)
+        self.mechanics.instant(model, &self.q, &self.velocity, &self.inputs)
     }
 }

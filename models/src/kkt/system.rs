@@ -30,7 +30,7 @@ pub(crate) struct KktSystem {
     pub(crate) recursion: Recursion,
     /// Which of them were factored last.
     pub(crate) valid: Factors,
-    /// What springs and dampers of coordinates add to the diagonal of `K`, for recursions.
+    /// What springs, dampers and armatures of coordinates add to the diagonal of `K`, for recursions.
     pub(crate) diagonal: Vec<f64>,
     pub(crate) estimates: Estimates,
 }

@@ -19,6 +19,7 @@
 //!
 //! [`Mechanics::for_each_second_derivative`]: crate::lagrangian::mechanics::Mechanics::for_each_second_derivative
 
+use crate::lagrangian::armature;
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
@@ -143,8 +144,9 @@ impl<S: Scalar> Derivatives<S> {
         );
         if model.potentials.any {
             model.add_spring_gradient(&self.poses, q, &mut self.l_q);
+            armature::add_momentum(&model.armature, velocity, &mut self.l_v);
         }
-        self.evaluate_forces(model, velocity, inputs);
+        self.evaluate_forces(model, q, velocity, inputs);
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         let n = model.dimensions.coordinates();
         self.l_qq.fill(S::ZERO);
@@ -168,11 +170,14 @@ impl<S: Scalar> Derivatives<S> {
             let l_qq = &mut self.l_qq;
             model
                 .for_each_spring_derivative(&self.poses, q, |i, j, value| l_qq[i * n + j] -= value);
+            for &(i, a) in &model.armature {
+                self.l_vv[i * (n + 1)] += S::constant(a);
+            }
         }
     }
 
     /// Forces and their derivatives; poses and momenta are those of the last [`Self::evaluate`].
-    fn evaluate_forces(&mut self, model: &Model, velocity: &[S], inputs: &[S]) {
+    fn evaluate_forces(&mut self, model: &Model, q: &[S], velocity: &[S], inputs: &[S]) {
         let (n, ni) = (model.dimensions.coordinates(), model.dimensions.inputs);
         self.force.fill(S::ZERO);
         if model.forces.is_some() {
@@ -193,6 +198,7 @@ impl<S: Scalar> Derivatives<S> {
             tree: &model.dynamics,
             poses: &self.poses,
             momenta: &self.momenta,
+            q,
             velocity,
             inputs,
         };

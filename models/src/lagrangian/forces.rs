@@ -5,6 +5,7 @@
 
 pub(crate) mod coordinate;
 pub(crate) mod linear_damper;
+pub(crate) mod path;
 pub(crate) mod point;
 #[cfg(test)]
 mod tests;
@@ -41,6 +42,8 @@ pub(crate) struct Instant<'a, S = f64> {
     /// With axes and twists of the same configuration and velocity.
     pub(crate) momenta: &'a Momenta<S>,
     /// Of all coordinates.
+    pub(crate) q: &'a [S],
+    /// Of all coordinates.
     pub(crate) velocity: &'a [S],
     pub(crate) inputs: &'a [S],
 }
@@ -76,11 +79,13 @@ pub(crate) trait GeneralizedForce {
 /// The same expression of each force of each kind.
 macro_rules! for_each_force {
     ($forces:expr, $force:ident => $value:expr) => {
-        let Forces { wrenches, point_forces, coordinate_forces, linear_dampers } = $forces;
+        let Forces { wrenches, point_forces, coordinate_forces, linear_dampers, path_forces } =
+            $forces;
         wrenches.iter().for_each(|$force| $value);
         point_forces.iter().for_each(|$force| $value);
         coordinate_forces.iter().for_each(|$force| $value);
         linear_dampers.iter().for_each(|$force| $value);
+        path_forces.iter().for_each(|$force| $value);
     };
 }
 

@@ -61,11 +61,12 @@ impl<S: Planar> Mechanics<S> {
     pub(crate) fn instant<'a>(
         &'a self,
         model: &'a Model,
+        q: &'a [S],
         velocity: &'a [S],
         inputs: &'a [S],
     ) -> Instant<'a, S> {
         let (poses, momenta) = (&self.poses, &self.momenta);
-        Instant { tree: &model.dynamics, poses, momenta, velocity, inputs }
+        Instant { tree: &model.dynamics, poses, momenta, q, velocity, inputs }
     }
 
     /// Second derivatives for a pair of joints on one path to the root.

@@ -4,6 +4,7 @@
 //! [`curvature`], in planes from [`planar`]; [`derivatives`] has the second derivatives and those of forces as
 //! matrices. Each potential is a file in [`potentials`], each force a file in [`forces`].
 
+pub(crate) mod armature;
 pub(crate) mod arrangement;
 pub(crate) mod curvature;
 pub(crate) mod derivatives;
@@ -17,4 +18,5 @@ pub(crate) mod plane;
 pub(crate) mod potentials;
 #[cfg(test)]
 pub(crate) mod samples;
+pub(crate) mod stop;
 pub(crate) mod vectors;

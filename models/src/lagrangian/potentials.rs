@@ -5,6 +5,7 @@
 //! coupled stops the first model that has one.
 
 pub(crate) mod coordinate_spring;
+pub(crate) mod coordinate_stop;
 pub(crate) mod linear_spring;
 pub(crate) mod path_spring;
 pub(crate) mod point_spring;
@@ -51,6 +52,7 @@ macro_rules! of_each_kind {
             Spring::Spline($spring) => $value,
             Spring::Path($spring) => $value,
             Spring::Linear($spring) => $value,
+            Spring::Stop($spring) => $value,
         }
     };
 }
@@ -168,7 +170,7 @@ mod tests {
     fn springs_without_length_are_finite() {
         let text = |spring: &str| {
             format!(
-                "format = 1\nname = \"bead\"\n[[frames]]\nname = \"x\"\njoint = {{ type = \"prismatic\", axis = [1.0, 0.0, 0.0] }}\n[[frames]]\nname = \"y\"\nparent = \"x\"\njoint = {{ type = \"prismatic\", axis = [0.0, 1.0, 0.0] }}\nbody = {{ mass = 1.0 }}\n[[springs]]\nstiffness = 7.0\n{spring}\n"
+                "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"bead\"\n[[frames]]\nname = \"x\"\njoint = {{ type = \"prismatic\", axis = [1.0, 0.0, 0.0] }}\n[[frames]]\nname = \"y\"\nparent = \"x\"\njoint = {{ type = \"prismatic\", axis = [0.0, 1.0, 0.0] }}\nbody = {{ mass = 1.0 }}\n[[springs]]\nstiffness = 7.0\n{spring}\n"
             )
         };
         let two_point = "type = \"two_point\"\na = { frame = \"y\" }\nb = { frame = \"world\" }\n";

@@ -58,7 +58,7 @@ impl Numbers {
 fn random_scene(seed: u64) -> Scene {
     const FRAMES: usize = 6;
     let mut random = Numbers(seed);
-    let mut text = format!("format = 1\nname = \"random-{seed}\"\n");
+    let mut text = format!("format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"random-{seed}\"\n");
     for i in 0..FRAMES {
         let (parent, axis) = (random.frame(i), random.vector());
         let joint = match random.below(5) {

@@ -8,12 +8,13 @@ use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, JointKind, Tree};
-use crate::scene::{CoordinateKind, Scene};
+use crate::scene::{CoordinateKind, Problem, Scene};
 
 /// A compiled scene: immutable, shared by all plants made from it.
 #[derive(Debug)]
 pub struct Model {
     pub(crate) scene: Scene,
+    pub(crate) warnings: Vec<Problem>,
     pub(crate) dimensions: Dimensions,
     pub(crate) coordinates: Vec<Coordinate>,
     /// First of the three coordinates of each orientation (ball joint).
@@ -39,6 +40,8 @@ pub struct Model {
     pub(crate) forces: Option<Forces>,
     pub(crate) signals: Vec<Signal>,
     pub(crate) potentials: Potentials,
+    /// Dynamic coordinates with an armature, kg or kg·m².
+    pub(crate) armature: Vec<(usize, f64)>,
     /// Joints that points of constraints depend on: what a step walks at its ends.
     pub(crate) closure: Tree,
     pub(crate) constraints: Vec<Constraint>,
@@ -140,7 +143,7 @@ pub(crate) struct MixedPair {
 pub(crate) struct Potentials {
     /// Ordered by kind.
     pub(crate) springs: Vec<Spring>,
-    /// There is one at all.
+    /// There is one, or an armature: something adds to the Lagrangian of the bodies.
     pub(crate) any: bool,
     /// Some spring may couple coordinates that are not on one path to the root, or prescribed ones.
     pub(crate) couple_branches: bool,
@@ -154,11 +157,13 @@ pub(crate) enum Spring {
     Spline(SplineSpring),
     Path(PathSpring),
     Linear(LinearSpring),
+    Stop(CoordinateStop),
 }
 
 impl Spring {
     /// What kinds are called, in the order in which they are evaluated.
-    const KINDS: [&'static str; 5] = ["coordinate", "two-point", "spline", "path", "linear"];
+    const KINDS: [&'static str; 6] =
+        ["coordinate", "two-point", "spline", "path", "linear", "stop"];
 
     /// Place of its kind among [`Self::KINDS`].
     pub(crate) fn kind(&self) -> usize {
@@ -168,6 +173,7 @@ impl Spring {
             Self::Spline(_) => 2,
             Self::Path(_) => 3,
             Self::Linear(_) => 4,
+            Self::Stop(_) => 5,
         }
     }
 }
@@ -196,6 +202,15 @@ pub(crate) struct Forces {
     pub(crate) point_forces: Vec<PointForce>,
     pub(crate) coordinate_forces: Vec<CoordinateForce>,
     pub(crate) linear_dampers: Vec<LinearDamper>,
+    pub(crate) path_forces: Vec<PathForce>,
+}
+
+impl Forces {
+    /// How many of them may couple coordinates.
+    pub(crate) fn coupling(&self) -> usize {
+        let Self { wrenches, point_forces, linear_dampers, path_forces, .. } = self;
+        wrenches.len() + point_forces.len() + linear_dampers.len() + path_forces.len()
+    }
 }
 
 /// A wrench on a joint that carries a body.
@@ -239,7 +254,7 @@ pub(crate) enum PointLaw {
     Drag(f64),
 }
 
-/// A force on a coordinate that follows from its velocity.
+/// A force on a coordinate that follows from its velocity, and of a stop from its position.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CoordinateForce {
     pub(crate) coordinate: usize,
@@ -253,6 +268,44 @@ pub(crate) enum CoordinateLaw {
     Drag(f64),
     /// `f = −force tanh(v / velocity)`.
     Friction { force: f64, velocity: f64 },
+    /// `f = −c(q) v`, the damper of a stop.
+    Stop(Stop),
+    /// `f` alone.
+    Constant(f64),
+}
+
+/// A one-sided spring and damper at the ends of a range.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Stop {
+    pub(crate) range: [f64; 2],
+    pub(crate) stiffness: f64,
+    pub(crate) damping: f64,
+    /// Depth at which stiffness and damping are whole.
+    pub(crate) transition: f64,
+}
+
+/// The spring of a stop of a coordinate.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct CoordinateStop {
+    pub(crate) coordinate: usize,
+    pub(crate) stop: Stop,
+}
+
+/// A force along a path: `f_i = (Σ g u − c L̇) L_i`.
+#[derive(Clone, Debug)]
+pub(crate) struct PathForce {
+    pub(crate) segments: Vec<PointPair>,
+    /// Inputs `u` and their `g`.
+    pub(crate) inputs: Vec<(usize, f64)>,
+    pub(crate) resistance: Resistance,
+}
+
+/// The resistance `c` of a path to a change of its length.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Resistance {
+    Constant(f64),
+    /// That of the damper of a stop.
+    Stop(Stop),
 }
 
 /// `V = ½ k (q − rest)²`.
@@ -278,12 +331,22 @@ pub(crate) struct SplineSpring {
     pub(crate) force: Spline,
 }
 
-/// `V = ½ k (L − rest)²`, `L` the sum of the lengths of the segments.
+/// `V(L)`, `L` the sum of the lengths of the segments.
 #[derive(Clone, Debug)]
 pub(crate) struct PathSpring {
     pub(crate) segments: Vec<PointPair>,
-    pub(crate) stiffness: f64,
-    pub(crate) rest_length: f64,
+    pub(crate) law: PathLaw,
+}
+
+/// The potential of a path of length `L`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum PathLaw {
+    /// `V = ½ k (L − rest)²`.
+    Spring {
+        stiffness: f64,
+        rest_length: f64,
+    },
+    Stop(Stop),
 }
 
 /// `V = ½ k (Σ c_i q_i − rest)²`.
@@ -480,6 +543,8 @@ pub struct Coordinate {
     pub is_angle: bool,
     /// Value in the scene's initial configuration.
     pub initial: f64,
+    /// Lower and upper limit, m or rad, if the scene gives any; nothing enforces them.
+    pub limits: Option<[f64; 2]>,
 }
 
 /// A configuration to hold, with the input that holds it.
@@ -497,6 +562,11 @@ impl Model {
     /// The scene it was compiled from.
     pub fn scene(&self) -> &Scene {
         &self.scene
+    }
+
+    /// What the scene has in it that is odd, and that it said to take all the same.
+    pub fn warnings(&self) -> &[Problem] {
+        &self.warnings
     }
 
     /// Sizes.
@@ -563,7 +633,15 @@ impl Model {
                 wrench.path.iter().map(move |&j| (self.dynamics.joints[j].coordinate, input))
             })
         });
-        let of_forces = of_forces.filter(move |(coordinate, _)| *coordinate < d.dynamic);
+        let along_paths = self.forces.iter().flat_map(|forces| &forces.path_forces);
+        let of_paths = along_paths.flat_map(|path| {
+            path.inputs.iter().flat_map(|&(input, _)| {
+                let coordinates = path.segments.iter().flat_map(PointPair::coordinates);
+                coordinates.map(move |coordinate| (coordinate, input))
+            })
+        });
+        let of_forces =
+            of_forces.chain(of_paths).filter(move |(coordinate, _)| *coordinate < d.dynamic);
         all.chain(on_coordinates.chain(of_forces).take(sparse))
     }
 

@@ -8,6 +8,7 @@ use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settin
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::system::KktSystem;
+use crate::lagrangian::armature;
 use crate::lagrangian::energy::{Energy, potential_energy};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
@@ -331,8 +332,11 @@ impl Workspace {
     fn energy(&mut self, model: &Model, state: &PreciseState) -> Energy {
         self.gradient(model, state);
         let (poses, momenta) = (&self.mid.mechanics.poses, &self.mid.mechanics.momenta);
+        let velocity = &self.mid.velocity;
         Energy {
-            kinetic_j: 0.5 * momenta.twice_kinetic_energy(&model.dynamics, &self.mid.velocity),
+            kinetic_j: 0.5
+                * (momenta.twice_kinetic_energy(&model.dynamics, velocity)
+                    + armature::twice_kinetic_energy(&model.armature, velocity)),
             potential_j: potential_energy(model, poses, momenta, &state.q),
         }
     }
@@ -357,6 +361,7 @@ impl Workspace {
             &mut self.mid.l_q,
             &mut self.mid.l_v,
         );
+        armature::add_momentum(&model.armature, &self.mid.velocity, &mut self.mid.l_v);
     }
 
     /// Finds the velocity of the dynamic coordinates that belongs to a state, into `residual`; returns
@@ -378,6 +383,10 @@ impl Workspace {
             &self.mid.mechanics.momenta,
             &mut self.kkt.tree,
         );
+        for &(i, a) in &model.armature {
+            let slot = model.elimination.offsets[i + 1] - 1;
+            self.kkt.tree.add_to_diagonal(slot, a);
+        }
         let pivot = self.kkt.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.dynamics.iter_mut().enumerate() {
             *r = state.p[i] - self.mid.l_v[i];

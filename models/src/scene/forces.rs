@@ -1,15 +1,17 @@
 //! Forces that do not come from a potential, and that are not the damping of a coordinate.
 
 use schemars::JsonSchema;
+use serde::de::MapAccess;
+use serde::de::value::MapAccessDeserializer;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::scene::linear_term::LinearTerm;
 use crate::scene::number_or_name::{NumberOrName, field, number_or_name};
-use crate::scene::point::{Point, is_zero3, one};
+use crate::scene::point::{Point, is_zero, is_zero3, one};
 
 /// A force. Forces act on dynamic coordinates; velocities include those of prescribed ones.
 ///
-/// Components of wrenches are numbers, N and N·m, or names of inputs.
+/// Components of wrenches are numbers, N and N·m, names of inputs, or inputs with a gain.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Force {
@@ -94,6 +96,38 @@ pub enum Force {
         /// N·s/m or N·m·s/rad, as the coefficients make it.
         damping: f64,
     },
+    /// `F = −damping · dL/dt` along a path of length `L` from point to point.
+    PathDamper {
+        /// Two or more points, in the order of the path.
+        points: Vec<Point>,
+        /// N·s/m.
+        damping: f64,
+    },
+    /// `f_i = c_i (gain · u − stiffness · s − damping · ds/dt + constant)` with a sum of coordinates
+    /// `s = Σ c_i q_i`. A position servo has `gain = stiffness`; a velocity servo has `stiffness = 0` and
+    /// `gain = damping`.
+    Servo {
+        /// Coordinate `s`; or else `terms`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+        /// Terms of `s`, each of another coordinate.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        terms: Vec<LinearTerm>,
+        /// Input `u`.
+        input: String,
+        /// Force for `u = 1`, N or N·m.
+        #[serde(default = "one")]
+        gain: f64,
+        /// N/m or N·m/rad.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        stiffness: f64,
+        /// N·s/m or N·m·s/rad.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        damping: f64,
+        /// N or N·m.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        constant: f64,
+    },
     /// `f = −force · tanh(v / velocity)` on a coordinate of velocity `v`: dry friction without a jump.
     Friction {
         /// Coordinate.
@@ -113,12 +147,44 @@ pub enum Component {
     Constant(f64),
     /// Name of an input.
     Input(String),
+    /// An input with a gain.
+    Scaled(ScaledInput),
+}
+
+/// An input and its factor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ScaledInput {
+    /// Input.
+    pub input: String,
+    /// Force or torque for an input of 1, N or N·m; not zero.
+    pub gain: f64,
+}
+
+impl Component {
+    /// Its constant part.
+    pub(crate) fn constant(&self) -> f64 {
+        if let Self::Constant(value) = self { *value } else { 0.0 }
+    }
+
+    /// The input that it follows, and its factor.
+    pub fn input(&self) -> Option<(&str, f64)> {
+        match self {
+            Self::Constant(_) => None,
+            Self::Input(name) => Some((name, 1.0)),
+            Self::Scaled(ScaledInput { input, gain }) => Some((input, *gain)),
+        }
+    }
 }
 
 impl NumberOrName for Component {
     const NUMBER: fn(f64) -> Self = Self::Constant;
     const NAME: fn(String) -> Self = Self::Input;
-    const ALLOWED: &'static str = "a number or the name of an input";
+    const ALLOWED: &'static str = "a number, the name of an input, or a table of input and gain";
+
+    fn table<'de, A: MapAccess<'de>>(table: A) -> Result<Self, A::Error> {
+        ScaledInput::deserialize(MapAccessDeserializer::new(table)).map(Self::Scaled)
+    }
 }
 
 impl<'de> Deserialize<'de> for Component {
@@ -147,36 +213,34 @@ fn are_zero(components: &[Component; 3]) -> bool {
 
 impl Force {
     /// Points of frames on which it acts.
-    pub fn points(&self) -> impl Iterator<Item = Point> {
-        let of = |frame: &str, at: [f64; 3]| Some(Point { frame: frame.to_owned(), at });
-        let points = match self {
+    pub fn points(&self) -> Vec<Point> {
+        let of = |frame: &str, at: [f64; 3]| vec![Point { frame: frame.to_owned(), at }];
+        match self {
             Self::BodyWrench { frame, .. }
             | Self::SpatialWrench { frame, .. }
-            | Self::HybridWrench { frame, .. } => [of(frame, [0.0; 3]), None],
-            Self::Thruster { frame, at, .. } | Self::Drag { frame, at, .. } => {
-                [of(frame, *at), None]
-            }
-            Self::TwoPointDamper { a, b, .. } => [Some(a.clone()), Some(b.clone())],
-            Self::CoordinateDrag { .. } | Self::Friction { .. } | Self::LinearDamper { .. } => {
-                [None, None]
-            }
-        };
-        points.into_iter().flatten()
+            | Self::HybridWrench { frame, .. } => of(frame, [0.0; 3]),
+            Self::Thruster { frame, at, .. } | Self::Drag { frame, at, .. } => of(frame, *at),
+            Self::TwoPointDamper { a, b, .. } => vec![a.clone(), b.clone()],
+            Self::PathDamper { points, .. } => points.clone(),
+            Self::CoordinateDrag { .. }
+            | Self::Friction { .. }
+            | Self::LinearDamper { .. }
+            | Self::Servo { .. } => Vec::new(),
+        }
     }
 
     /// Names of the inputs that it follows.
     pub fn inputs(&self) -> impl Iterator<Item = &str> {
-        let (components, thrust) = match self {
+        let (components, alone) = match self {
             Self::BodyWrench { force, torque, .. }
             | Self::SpatialWrench { force, torque, .. }
             | Self::HybridWrench { force, torque, .. } => (Some(force.iter().chain(torque)), None),
-            Self::Thruster { input, .. } => (None, Some(input.as_str())),
+            Self::Thruster { input, .. } | Self::Servo { input, .. } => {
+                (None, Some(input.as_str()))
+            }
             _ => (None, None),
         };
-        let named = components.into_iter().flatten().filter_map(|component| match component {
-            Component::Input(name) => Some(name.as_str()),
-            Component::Constant(_) => None,
-        });
-        named.chain(thrust)
+        let components = components.into_iter().flatten();
+        components.filter_map(|component| Some(component.input()?.0)).chain(alone)
     }
 }

@@ -22,13 +22,18 @@ pub const MAX_INPUTS: usize = 1024;
 pub const MAX_CONSTRAINTS: usize = 1024;
 /// Most knots of a spline.
 pub const MAX_KNOTS: usize = 4096;
-/// Most points of all paths together.
+/// Most points of all paths together: of constraints, of springs, of forces, of inputs.
 pub const MAX_PATH_POINTS: usize = 4096;
 /// Most terms of all couplings together.
 pub const MAX_COUPLING_TERMS: usize = 4096;
-/// Most terms of all springs on sums together, and of all dampers on sums together.
+/// Most terms of all springs on sums together, of all forces on sums together, and of all inputs
+/// together.
 pub const MAX_LINEAR_TERMS: usize = 4096;
 /// Highest power of a coupling.
 pub const MAX_POWER: usize = 16;
 /// Most operating points.
 pub const MAX_OPERATING_POINTS: usize = 256;
+/// Most visuals of all frames together.
+pub const MAX_VISUALS: usize = 1 << 14;
+/// Longest path of a mesh file, bytes.
+pub const MAX_FILE_BYTES: usize = 1024;

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::marker::PhantomData;
 
-use serde::de::{Deserialize, Deserializer, Error, Visitor};
+use serde::de::{Deserialize, Deserializer, Error, MapAccess, Unexpected, Visitor};
 
 /// Sets a path within an element off from what is wrong there, in the message of an error: the derived code
 /// of tagged elements reads them from a copy, and forgets where it is.
@@ -31,6 +31,12 @@ pub(super) trait NumberOrName: Sized {
     const NAME: fn(String) -> Self;
     /// What is allowed, in words.
     const ALLOWED: &'static str;
+
+    /// What a table makes, where one is allowed.
+    fn table<'de, A: MapAccess<'de>>(table: A) -> Result<Self, A::Error> {
+        let _ = table;
+        Err(A::Error::invalid_type(Unexpected::Map, &Self::ALLOWED))
+    }
 }
 
 /// Reads one or the other.
@@ -44,7 +50,7 @@ where
 
 struct Either<T>(PhantomData<T>);
 
-impl<T: NumberOrName> Visitor<'_> for Either<T> {
+impl<'de, T: NumberOrName> Visitor<'de> for Either<T> {
     type Value = T;
 
     fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -65,5 +71,9 @@ impl<T: NumberOrName> Visitor<'_> for Either<T> {
 
     fn visit_str<E: Error>(self, name: &str) -> Result<T, E> {
         Ok(T::NAME(name.to_owned()))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, table: A) -> Result<T, A::Error> {
+        T::table(table)
     }
 }

@@ -11,6 +11,10 @@ pub(crate) fn is_zero3(v: &[f64; 3]) -> bool {
     *v == [0.0; 3]
 }
 
+pub(crate) fn is_false(x: &bool) -> bool {
+    !*x
+}
+
 /// A point fixed in a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]

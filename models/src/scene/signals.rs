@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::math::spline::Knot;
-use crate::scene::point::is_zero;
+use crate::scene::point::{is_false, is_zero};
 
 /// A function of time `t`, seconds since the plant was initialised.
 ///
@@ -86,10 +86,6 @@ pub enum Interpolation {
     Hold,
     /// Straight from value to value.
     Linear,
-}
-
-fn is_false(value: &bool) -> bool {
-    !value
 }
 
 impl Signal {

@@ -110,7 +110,8 @@ mod tests {
 
     #[test]
     fn syntax_and_type_errors_carry_path_and_position() {
-        let good = "format = 1\nname = \"a\"\n[[frames]]\nname = \"arm\"\n";
+        let good =
+            "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"a\"\n[[frames]]\nname = \"arm\"\n";
         Scene::from_toml(good).unwrap();
         let cases: &[(&str, &str, &str)] = &[
             ("format = ", "", "line 1 column 10"),
@@ -132,7 +133,7 @@ mod tests {
                     "{good}[[forces]]\ntype = \"body_wrench\"\nframe = \"arm\"\ntorque = [0, \"tau\", true]"
                 ),
                 "forces[0].torque[2]",
-                "invalid type: boolean `true`, expected a number or the name of an input",
+                "invalid type: boolean `true`, expected a number, the name of an input, or a table of input and gain",
             ),
             (
                 &format!(
@@ -155,9 +156,14 @@ mod tests {
             ),
             ("format = 1\nname = \"a\"", "", "missing field `frames`"),
             (
-                "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, {}, 1]}]}",
+                "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, [], 1]}]}",
                 "forces[0].force[1]",
-                "invalid type: map, expected a number or the name of an input",
+                "invalid type: sequence, expected a number, the name of an input, or a table of input and gain",
+            ),
+            (
+                "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, {\"input\": \"u\"}, 1]}]}",
+                "forces[0].force[1]",
+                "missing field `gain`",
             ),
             ("{\"format\": 1, \"name\": 3, \"frames\": []}", "name", "line 1 column 23"),
             ("{\"format\": 1, \"name\": \"a\", \"frames\": []} x", "", "trailing characters"),

@@ -8,6 +8,7 @@ mod shapes;
 mod signals;
 #[cfg(test)]
 mod tests;
+mod visuals;
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,7 +16,7 @@ use crate::scene::forces::Force;
 use crate::scene::limits::{
     MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FORCES, MAX_FRAMES, MAX_INPUTS,
     MAX_LINEAR_TERMS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_SIGNAL_POINTS,
-    MAX_SIGNALS, MAX_SPRINGS,
+    MAX_SIGNALS, MAX_SPRINGS, MAX_VISUALS,
 };
 use crate::scene::signals::Signal;
 use crate::scene::{Constraint, CoordinateKind, Motion, Problem, Scene, Spring};
@@ -85,7 +86,9 @@ impl<'a> Check<'a> {
         let (mut cord_points, mut spring_terms) = (0, 0);
         for spring in &scene.springs {
             match spring {
-                Spring::Path { points, .. } => cord_points += points.len(),
+                Spring::Path { points, .. } | Spring::Stop { points, .. } => {
+                    cord_points += points.len();
+                }
                 Spring::LinearSpring { terms, .. } => spring_terms += terms.len(),
                 _ => {}
             }
@@ -98,10 +101,19 @@ impl<'a> Check<'a> {
                 _ => {}
             }
         }
-        let force_terms = scene.forces.iter().map(|force| match force {
-            Force::LinearDamper { terms, .. } => terms.len(),
-            _ => 0,
-        });
+        let (mut force_points, mut force_terms) = (0, 0);
+        for force in &scene.forces {
+            match force {
+                Force::LinearDamper { terms, .. } | Force::Servo { terms, .. } => {
+                    force_terms += terms.len();
+                }
+                Force::PathDamper { points, .. } => force_points += points.len(),
+                _ => {}
+            }
+        }
+        let input_terms = scene.inputs.iter().map(|input| input.terms.len()).sum();
+        let input_points = scene.inputs.iter().map(|input| input.points.len()).sum();
+        let visuals = scene.frames.iter().map(|frame| frame.visuals.len()).sum();
         let equations = scene.constraints.len().max(equations);
         for (path, what, count, most) in [
             ("frames", "frames", scene.frames.len(), MAX_FRAMES),
@@ -110,8 +122,12 @@ impl<'a> Check<'a> {
             ("springs", "springs", scene.springs.len(), MAX_SPRINGS),
             ("springs", "points of paths", cord_points, MAX_PATH_POINTS),
             ("springs", "terms of sums", spring_terms, MAX_LINEAR_TERMS),
-            ("forces", "terms of sums", force_terms.sum(), MAX_LINEAR_TERMS),
+            ("forces", "terms of sums", force_terms, MAX_LINEAR_TERMS),
+            ("forces", "points of paths", force_points, MAX_PATH_POINTS),
             ("inputs", "inputs", scene.inputs.len(), MAX_INPUTS),
+            ("inputs", "terms", input_terms, MAX_LINEAR_TERMS),
+            ("inputs", "points of paths", input_points, MAX_PATH_POINTS),
+            ("frames", "visuals", visuals, MAX_VISUALS),
             ("forces", "forces", scene.forces.len(), MAX_FORCES),
             ("signals", "signals", scene.signals.len(), MAX_SIGNALS),
             ("signals", "knots and times", signal_points, MAX_SIGNAL_POINTS),
@@ -149,7 +165,15 @@ impl<'a> Check<'a> {
             self.report("name", message);
         }
         self.positive("time_step_s".into(), scene.time_step_s);
-        self.finite_all("gravity", &scene.gravity);
+        match &scene.gravity {
+            Some(gravity) => {
+                self.finite_all("gravity", gravity);
+            }
+            None => self.report(
+                "gravity",
+                "is not given; write `gravity = [0.0, 0.0, -9.81]` where z points up, `gravity = [0.0, 0.0, 0.0]` for none",
+            ),
+        }
         self.not_negative("damping".into(), scene.damping);
     }
 
@@ -197,6 +221,13 @@ impl<'a> Check<'a> {
     fn not_negative(&mut self, path: String, x: f64) {
         if self.finite(path.clone(), x) && x < 0.0 {
             self.report(path, format!("is {x}; must not be negative"));
+        }
+    }
+
+    /// Two finite numbers, the second greater than the first.
+    fn interval(&mut self, path: &str, [low, high]: [f64; 2]) {
+        if self.finite_all(path, &[low, high]) && low >= high {
+            self.report(path, format!("is [{low}, {high}]; the second must be greater"));
         }
     }
 }

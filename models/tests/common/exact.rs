@@ -188,7 +188,7 @@ impl Mechanism {
                 _ => panic!("another constraint"),
             })
             .collect();
-        Self { links, pins, gravity: scene.gravity[2], h: scene.time_step_s }
+        Self { links, pins, gravity: scene.gravity.unwrap()[2], h: scene.time_step_s }
     }
 
     fn at<R: Real>(&self, q: &[R]) -> At<R> {

@@ -113,7 +113,7 @@ pub(crate) fn random_tree(seed: u64) -> Scene {
         name: format!("random-{seed}"),
         description: String::new(),
         time_step_s: 0.01,
-        gravity: random.vector(9.8),
+        gravity: Some(random.vector(9.8)),
         damping: random.between(0.0, 0.3),
         frames: Vec::new(),
         coordinates: Vec::new(),
@@ -132,11 +132,16 @@ pub(crate) fn random_tree(seed: u64) -> Scene {
             name: frame.name.clone(),
             kind: if prescribed { CoordinateKind::Prescribed } else { CoordinateKind::Dynamic },
             initial: random.between(-1.0, 1.0),
-            damping: None,
+            ..Coordinate::default()
         });
         if !prescribed {
             let (name, coordinate) = (format!("force{i}"), Some(frame.name.clone()));
-            scene.inputs.push(Input { name, coordinate, gain: random.between(0.5, 2.0) });
+            scene.inputs.push(Input {
+                name,
+                coordinate,
+                gain: random.between(0.5, 2.0),
+                ..Input::default()
+            });
         }
         scene.frames.push(frame);
     }
@@ -181,7 +186,9 @@ fn random_frame(random: &mut Numbers, index: usize) -> Frame {
             mass: random.between(0.5, 2.0),
             center_of_mass: random.vector(0.4),
             inertia: vec![b + c, a + c, a + b, ab, ac, bc],
+            ..Body::default()
         }),
+        ..Frame::default()
     }
 }
 
@@ -193,7 +200,7 @@ pub(crate) fn forced_tree(seed: u64) -> Scene {
     let last = scene.frames.len() - 1;
     for name in ["wx", "wy", "thrust"] {
         let name = name.to_owned();
-        scene.inputs.push(Input { name, coordinate: None, gain: 1.0 });
+        scene.inputs.push(Input { name, ..Input::default() });
     }
     let frame = |random: &mut Numbers| format!("joint{}", random.below(last + 1));
     let vector = |random: &mut Numbers| [0; 3].map(|_| random.between(-1.0, 1.0));
@@ -262,6 +269,7 @@ pub(crate) fn floating() -> Scene {
 
 const FLOATING: &str = r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "floating"
 
 [[frames]]

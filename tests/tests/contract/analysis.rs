@@ -199,7 +199,7 @@ async fn bad_requests_name_their_field() {
 
 /// A free slider answers a constant force without end.
 async fn assert_pole(client: &Client) {
-    let slider = "format = 1\nname = \"slider\"\n[[frames]]\nname = \"block\"\n\
+    let slider = "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"slider\"\n[[frames]]\nname = \"block\"\n\
         joint = { type = \"prismatic\", axis = [1, 0, 0] }\nbody = { mass = 2 }\n\
         [[inputs]]\nname = \"push\"\ncoordinate = \"block\"\n";
     client.create_model(slider).await.unwrap();

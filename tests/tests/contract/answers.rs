@@ -30,7 +30,7 @@ async fn models_are_listed_described_uploaded_and_forgotten() {
     let again = client.validate_scene(&created.scene_toml).await.unwrap();
     assert!(again.problems.is_empty(), "{:?}", again.problems);
     assert_eq!(again.model.unwrap().plan, created.plan);
-    let json = r#"{"format": 1, "name": "slider", "frames": [{"name": "block",
+    let json = r#"{"format": 1, "gravity": [0, 0, 0], "name": "slider", "frames": [{"name": "block",
         "joint": {"type": "prismatic", "axis": [1, 0, 0]}, "body": {"mass": 2}}]}"#;
     let slider = client.create_model(json).await.unwrap();
     assert_eq!(slider.coordinates[0].unit(), v1::Unit::Metre);

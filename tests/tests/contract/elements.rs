@@ -124,6 +124,7 @@ async fn signals_are_listed_and_drive_their_entries() {
     let (_server, client) = server().await;
     let scene = r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "signalled"
 time_step_s = 0.01
 

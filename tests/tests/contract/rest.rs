@@ -141,7 +141,7 @@ async fn what_cannot_settle_says_why() {
 #[tokio::test]
 async fn absurd_guesses_come_to_an_end() {
     let (_server, client) = server().await;
-    let sprung = "format = 1\nname = \"sprung\"\n[[frames]]\nname = \"block\"\n\
+    let sprung = "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"sprung\"\n[[frames]]\nname = \"block\"\n\
         joint = { type = \"prismatic\", axis = [1, 0, 0] }\nbody = { mass = 2 }\n\
         [[springs]]\ntype = \"two_point\"\na = { frame = \"world\", at = [0, 1, 0] }\n\
         b = { frame = \"block\" }\nstiffness = 1e200\nrest_length = 0.5\n";

@@ -69,7 +69,7 @@ impl Hessian {
     pub(super) fn add_forces(&mut self, model: &Model, workspace: &Workspace, stage: usize) {
         let d = model.dimensions;
         let (n, nd, width) = (d.coordinates(), d.dynamic, self.width);
-        let Self { qq, qv, qu, .. } = self;
+        let Self { qq, qv, vv, qu, .. } = self;
         if model.potentials.any {
             let (poses, q) = (&workspace.mid.mechanics.poses, &workspace.mid.q);
             model.for_each_spring_derivative(poses, q, |i, j, k| {
@@ -77,6 +77,9 @@ impl Hessian {
                     qq[(i * n + j) * width + stage] -= k;
                 }
             });
+            for &(i, a) in &model.armature {
+                vv[(i * n + i) * width + stage] += a;
+            }
         }
         if let Some(forces) = &model.forces {
             let instant = workspace.mid.instant(model);

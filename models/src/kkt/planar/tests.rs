@@ -124,7 +124,7 @@ fn gradients_and_second_derivatives_are_those_in_space() {
 fn trees_that_leave_their_planes_are_not_planar() {
     let tilted = |axis: &str| {
         let text = format!(
-            "format = 1\nname = \"t\"\n[[frames]]\nname = \"a\"\njoint = {{ type = \"revolute\", axis = [0.0, 0.0, 1.0] }}\n\
+            "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"t\"\n[[frames]]\nname = \"a\"\njoint = {{ type = \"revolute\", axis = [0.0, 0.0, 1.0] }}\n\
              body = {{ mass = 1.0, center_of_mass = [1.0, 0.0, 0.0], inertia = [0.1, 0.1, 0.1] }}\n\
              [[frames]]\nname = \"b\"\nparent = \"a\"\njoint = {{ {axis} }}\nbody = {{ mass = 1.0, center_of_mass = [1.0, 0.0, 0.5], inertia = [0.1, 0.1, 0.1] }}\n"
         );
@@ -221,8 +221,7 @@ fn a_prescribed_leaf_is_left_to_the_elimination_tree() {
     scene.coordinates.push(Coordinate {
         name: "link5".to_owned(),
         kind: CoordinateKind::Prescribed,
-        initial: 0.0,
-        damping: None,
+        ..Coordinate::default()
     });
     let model = Arc::new(Model::compile(&scene).unwrap());
     assert_eq!(model.solver, Solver::Tree);

@@ -1,4 +1,4 @@
-//! Forces on coordinates that follow from their velocities.
+//! Forces on coordinates that follow from their velocities, and of stops from their positions.
 
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::math::scalar::Scalar;
@@ -14,6 +14,8 @@ impl GeneralizedForce for CoordinateForce {
         force[self.coordinate] += match self.law {
             CoordinateLaw::Drag(c) => magnitude(v) * v * -c,
             CoordinateLaw::Friction { force, velocity } => (v * (1.0 / velocity)).tanh() * -force,
+            CoordinateLaw::Stop(stop) => -(stop.resistance(at.q[self.coordinate]).0 * v),
+            CoordinateLaw::Constant(force) => S::constant(force),
         };
     }
 
@@ -23,14 +25,21 @@ impl GeneralizedForce for CoordinateForce {
         entry: &mut impl FnMut(usize, usize, S, S),
     ) {
         let v = at.velocity[self.coordinate];
+        let mut by_q = S::ZERO;
         let by_v = match self.law {
+            CoordinateLaw::Constant(_) => S::ZERO,
+            CoordinateLaw::Stop(stop) => {
+                let (c, by_position) = stop.resistance(at.q[self.coordinate]);
+                by_q = -(by_position * v);
+                -c
+            }
             CoordinateLaw::Drag(c) => magnitude(v) * (-2.0 * c),
             CoordinateLaw::Friction { force, velocity } => {
                 let t = (v * (1.0 / velocity)).tanh();
                 (S::ONE - t * t) * (-force / velocity)
             }
         };
-        entry(self.coordinate, self.coordinate, S::ZERO, by_v);
+        entry(self.coordinate, self.coordinate, by_q, by_v);
     }
 }
 

@@ -9,6 +9,7 @@ use crate::scene::Scene;
 /// Every force, on a tree with oblique hinges and slides and a ball joint; `shaken` is prescribed.
 const EVERYTHING: &str = r#"
 format = 1
+gravity = [0.0, 0.0, 0.0]
 name = "everything"
 [[frames]]
 name = "shaken"
@@ -150,8 +151,14 @@ impl<S: Scalar> Case<S> {
         poses.evaluate(tree, &self.q, &orientations);
         let unused_v = &mut unused.clone();
         momenta.gradient(tree, &poses, &self.v, None, &mut unused, unused_v);
-        let instant =
-            Instant { tree, poses: &poses, momenta: &momenta, velocity: &self.v, inputs: &self.u };
+        let instant = Instant {
+            tree,
+            poses: &poses,
+            momenta: &momenta,
+            q: &self.q,
+            velocity: &self.v,
+            inputs: &self.u,
+        };
         see((self.model.forces.as_ref().unwrap(), &instant))
     }
 

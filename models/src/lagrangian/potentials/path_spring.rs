@@ -1,16 +1,17 @@
-//! A spring along a path of points.
+//! A spring along a path of points, or the spring of a stop of its length.
 //!
 //! ```text
-//! V = ½ k (L − rest)²    V_i = k (L − rest) L_i    V_ij = k L_i L_j + k (L − rest) L_ij
+//! V = ½ k (L − rest)²    V_i = T L_i    V_ij = k L_i L_j + T L_ij    T = k (L − rest)
 //! ```
 //!
-//! with `L` the sum of the lengths of the path's segments.
+//! with `L` the sum of the lengths of the path's segments. Of a [stop](crate::lagrangian::stop) `V(L)`,
+//! `T = V'(L)` and `k = V''(L)`.
 
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
 use crate::lagrangian::vectors::Distance;
 use crate::math::scalar::Scalar;
-use crate::model::mechanism::{PathSpring, PointPair};
+use crate::model::mechanism::{PathLaw, PathSpring, PointPair};
 
 impl PathSpring {
     /// Its segments at a configuration.
@@ -21,13 +22,31 @@ impl PathSpring {
         self.segments.iter().map(move |ends| Distance::new(ends, at.tree, at.poses))
     }
 
-    /// `L − rest`.
-    fn stretch<S: Scalar>(&self, at: Place<'_, S>) -> S {
+    /// `L`.
+    fn length<S: Scalar>(&self, at: Place<'_, S>) -> S {
         let mut length = S::ZERO;
         for segment in self.segments(at) {
             length += segment.length;
         }
-        length - self.rest_length
+        length
+    }
+}
+
+impl PathLaw {
+    /// `T` at a length.
+    fn tension<S: Scalar>(&self, length: S) -> S {
+        match self {
+            Self::Spring { stiffness, rest_length } => (length - *rest_length) * *stiffness,
+            Self::Stop(stop) => stop.slope(length),
+        }
+    }
+
+    /// Its derivative.
+    fn stiffness<S: Scalar>(&self, length: S) -> S {
+        match self {
+            Self::Spring { stiffness, .. } => S::constant(*stiffness),
+            Self::Stop(stop) => stop.curvature(length),
+        }
     }
 }
 
@@ -39,12 +58,18 @@ impl Potential for PathSpring {
     }
 
     fn energy<S: Scalar>(&self, at: Place<'_, S>) -> S {
-        let stretch = self.stretch(at);
-        stretch * stretch * (0.5 * self.stiffness)
+        let length = self.length(at);
+        match &self.law {
+            PathLaw::Spring { stiffness, rest_length } => {
+                let stretch = length - *rest_length;
+                stretch * stretch * (0.5 * *stiffness)
+            }
+            PathLaw::Stop(stop) => stop.energy(length),
+        }
     }
 
     fn add_gradient<S: Scalar>(&self, at: Place<'_, S>, l_q: &mut [S]) {
-        let tension = self.stretch(at) * self.stiffness;
+        let tension = self.law.tension(self.length(at));
         for segment in self.segments(at) {
             segment.for_each_derivative(|i, slope| {
                 if let Some(entry) = l_q.get_mut(i) {
@@ -59,13 +84,14 @@ impl Potential for PathSpring {
         at: Place<'_, S>,
         entry: &mut impl FnMut(usize, usize, S),
     ) {
-        let tension = self.stretch(at) * self.stiffness;
+        let length = self.length(at);
+        let (tension, stiffness) = (self.law.tension(length), self.law.stiffness(length));
         for segment in self.segments(at) {
             segment.for_each_second_derivative(|i, j, second| entry(i, j, tension * second));
             segment.for_each_derivative(|i, row_slope| {
                 for other in self.segments(at) {
                     other.for_each_derivative(|j, slope| {
-                        entry(i, j, row_slope * slope * self.stiffness);
+                        entry(i, j, row_slope * slope * stiffness);
                     });
                 }
             });

@@ -54,7 +54,49 @@ impl Check<'_> {
                         self.report(path, "its points do not move relative to each other");
                     }
                 }
+                Spring::Stop { .. } => self.stop(&path, spring),
             }
+        }
+    }
+
+    /// A stop acts on a coordinate or along a path, and has a range, a stiffness and a transition or what
+    /// they follow from.
+    fn stop(&mut self, path: &str, spring: &Spring) {
+        let Spring::Stop { coordinate, points, range, .. } = spring else { return };
+        let Spring::Stop { stiffness, damping, transition, .. } = spring else { return };
+        let Spring::Stop { settling_depth, settling_time_s, .. } = spring else { return };
+        match coordinate {
+            Some(name) if points.is_empty() => {
+                self.dynamic_coordinate(format!("{path}.coordinate"), name);
+                self.not_of_an_orientation(format!("{path}.coordinate"), name);
+            }
+            None if !points.is_empty() => self.moved_along(path, points),
+            _ => self.report(path, "must have either `coordinate` or `points`"),
+        }
+        let settings = self.scene.coordinates.iter().find(|c| Some(&c.name) == coordinate.as_ref());
+        match range {
+            Some(range) => self.interval(&format!("{path}.range"), *range),
+            None if settings.is_some_and(|settings| settings.limits.is_some()) => {}
+            None => self.report(format!("{path}.range"), "is not given; no `limits` stand for it"),
+        }
+        for (name, value) in [("stiffness", stiffness), ("damping", damping)] {
+            value.iter().for_each(|x| self.not_negative(format!("{path}.{name}"), *x));
+        }
+        for (name, value) in [
+            ("transition", transition),
+            ("settling_depth", settling_depth),
+            ("settling_time_s", settling_time_s),
+        ] {
+            value.iter().for_each(|x| self.positive(format!("{path}.{name}"), *x));
+        }
+        let stated = [stiffness, damping, transition].iter().any(|x| x.is_some());
+        match (stiffness, settling_depth, settling_time_s) {
+            (Some(_), None, None) => {}
+            (None, Some(_), Some(_)) if !stated && coordinate.is_some() => {}
+            _ => self.report(
+                path,
+                "must have either `stiffness`, with or without `damping` and `transition`, or on a coordinate `settling_depth` and `settling_time_s`",
+            ),
         }
     }
 
@@ -170,7 +212,7 @@ impl Check<'_> {
     }
 
     /// Checks the points of a path; tells what moves them relative to each other.
-    fn along(&mut self, path: &str, points: &[Point]) -> Option<RelativeMotion> {
+    pub(super) fn along(&mut self, path: &str, points: &[Point]) -> Option<RelativeMotion> {
         if points.len() < 2 {
             self.report(path, "must be two or more points");
             return None;

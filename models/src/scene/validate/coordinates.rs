@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::scene::forces::Force;
+use crate::scene::inputs::Input;
 use crate::scene::linear_term::LinearTerm;
+use crate::scene::point::Point;
 use crate::scene::signals::Signal;
 use crate::scene::validate::Check;
 use crate::scene::{Constraint, CoordinateKind, Motion};
@@ -33,6 +35,15 @@ impl<'a> Check<'a> {
                         "has no effect on a prescribed coordinate",
                     );
                 }
+            }
+            self.not_negative(format!("{path}.armature"), coordinate.armature);
+            if prescribed && coordinate.armature != 0.0 {
+                let message = "has no effect on a prescribed coordinate";
+                self.report(format!("{path}.armature"), message);
+            }
+            if let Some(limits) = coordinate.limits {
+                self.interval(&format!("{path}.limits"), limits);
+                self.not_of_an_orientation(format!("{path}.limits"), name);
             }
             let follows = lengths.contains(name) || coupled.contains(name);
             let used = self.movers.contains_key(name) || (prescribed && follows);
@@ -151,17 +162,52 @@ impl<'a> Check<'a> {
                 let message = format!("`{}` is also a prescribed coordinate", input.name);
                 self.report(format!("{path}.name"), message);
             }
-            match &input.coordinate {
-                Some(name) => self.dynamic_coordinate(format!("{path}.coordinate"), name),
-                None if !used.contains(input.name.as_str()) => {
-                    self.report(path.clone(), "acts on no coordinate, and no force uses it");
-                }
-                None if input.gain != 1.0 => {
-                    self.report(format!("{path}.gain"), "has no effect without a coordinate");
-                }
-                None => {}
+            self.input_on(&path, input, used.contains(input.name.as_str()));
+            if let Some(limits) = input.limits {
+                self.interval(&format!("{path}.limits"), limits);
             }
             self.factor(format!("{path}.gain"), input.gain, "input");
+        }
+    }
+
+    /// What an input acts on; `used` if a force follows it.
+    fn input_on(&mut self, path: &str, input: &Input, used: bool) {
+        let given = [input.coordinate.is_some(), !input.terms.is_empty(), !input.points.is_empty()];
+        match given.iter().filter(|given| **given).count() {
+            0 if !used => {
+                let message = "acts on no coordinate and along no path, and no force uses it";
+                self.report(path, message);
+            }
+            0 | 1 => {}
+            _ => self.report(path, "must have one of `coordinate`, `terms` and `points`"),
+        }
+        if let Some(name) = &input.coordinate {
+            self.dynamic_coordinate(format!("{path}.coordinate"), name);
+        }
+        let mut seen = BTreeSet::new();
+        for (i, term) in input.terms.iter().enumerate() {
+            let path = format!("{path}.terms[{i}]");
+            self.dynamic_coordinate(format!("{path}.coordinate"), &term.coordinate);
+            if !seen.insert(&term.coordinate) {
+                let message = format!("coordinate `{}` has a term already", term.coordinate);
+                self.report(format!("{path}.coordinate"), message);
+            }
+            self.factor(format!("{path}.gain"), term.gain, "term");
+        }
+        if !input.points.is_empty() {
+            self.moved_along(path, &input.points);
+        } else if input.coordinate.is_none() && input.gain != 1.0 {
+            let message = "has no effect without a coordinate or points";
+            self.report(format!("{path}.gain"), message);
+        }
+    }
+
+    /// That a path has a length which a dynamic coordinate changes.
+    pub(super) fn moved_along(&mut self, path: &str, points: &[Point]) {
+        let motion = self.along(&format!("{path}.points"), points);
+        if motion.is_some_and(|motion| !motion.dynamic) {
+            let message = "no dynamic coordinate moves them relative to each other";
+            self.report(format!("{path}.points"), message);
         }
     }
 

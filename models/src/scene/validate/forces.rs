@@ -1,6 +1,6 @@
 //! Forces: what they act on, and what they follow.
 
-use crate::scene::forces::{Component, Force};
+use crate::scene::forces::{Component, Force, ScaledInput};
 use crate::scene::validate::Check;
 
 impl Check<'_> {
@@ -45,6 +45,25 @@ impl Check<'_> {
                     self.linear_terms(&path, terms);
                     self.not_negative(format!("{path}.damping"), *damping);
                 }
+                Force::PathDamper { points, damping } => {
+                    self.not_negative(format!("{path}.damping"), *damping);
+                    self.moved_along(&path, points);
+                }
+                Force::Servo { coordinate, terms, input, gain, stiffness, damping, constant } => {
+                    match coordinate {
+                        Some(name) if terms.is_empty() => {
+                            self.dynamic_coordinate(format!("{path}.coordinate"), name);
+                            self.not_of_an_orientation(format!("{path}.coordinate"), name);
+                        }
+                        None if !terms.is_empty() => self.linear_terms(&path, terms),
+                        _ => self.report(&path, "must have either `coordinate` or `terms`"),
+                    }
+                    self.known_input(format!("{path}.input"), input);
+                    self.factor(format!("{path}.gain"), *gain, "input");
+                    self.not_negative(format!("{path}.stiffness"), *stiffness);
+                    self.not_negative(format!("{path}.damping"), *damping);
+                    self.finite(format!("{path}.constant"), *constant);
+                }
                 Force::Friction { coordinate, force, velocity } => {
                     self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
                     self.not_negative(format!("{path}.force"), *force);
@@ -72,6 +91,10 @@ impl Check<'_> {
                     self.finite(path, *value);
                 }
                 Component::Input(name) => self.known_input(path, name),
+                Component::Scaled(ScaledInput { input, gain }) => {
+                    self.known_input(format!("{path}.input"), input);
+                    self.factor(format!("{path}.gain"), *gain, "input");
+                }
             }
         }
     }

@@ -1,6 +1,6 @@
 //! The tree of frames: names, parents, joints, inertia.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::scene::validate::Check;
 use crate::scene::{CoordinateKind, Joint, Motion};
@@ -102,6 +102,9 @@ impl Check<'_> {
         if let Some(body) = &frame.body {
             self.body(&format!("{path}.body"), body);
         }
+        for (i, visual) in frame.visuals.iter().enumerate() {
+            self.visual(&format!("{path}.visuals[{i}]"), visual);
+        }
     }
 
     /// Finds which joint each coordinate moves; one coordinate moves one joint.
@@ -166,9 +169,14 @@ impl Check<'_> {
         let has_inertia = self.ancestors_of(|i| {
             frames[i].body.as_ref().is_some_and(|b| b.inertia.iter().any(|&x| x != 0.0))
         });
+        let coordinates = self.scene.coordinates.iter();
+        let with_armature = coordinates.filter(|coordinate| coordinate.armature > 0.0);
+        let armatures: BTreeSet<_> = with_armature.map(|c| c.name.as_str()).collect();
         for (i, frame) in frames.iter().enumerate() {
             for (name, motion) in frame.motions() {
-                if self.kinds.get(&name) != Some(&CoordinateKind::Dynamic) {
+                if self.kinds.get(&name) != Some(&CoordinateKind::Dynamic)
+                    || armatures.contains(name.as_str())
+                {
                     continue;
                 }
                 let slides = !motion.is_angle();

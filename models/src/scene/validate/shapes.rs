@@ -11,8 +11,6 @@ use crate::scene::{Body, Rotation};
 const ORTHONORMAL_TOLERANCE: f64 = 1e-6;
 /// Axes that differ by less than this angle, rad, count as parallel.
 const PARALLEL: f64 = 1e-6;
-/// How far moments of inertia may be from possible ones, relative to the largest.
-const INERTIA_TOLERANCE: f64 = 1e-9;
 /// Axes outside of this range of lengths are taken for mistakes; their squares stay normal numbers.
 const AXIS_LENGTHS: std::ops::RangeInclusive<f64> = 1e-100..=1e100;
 
@@ -80,30 +78,9 @@ impl Check<'_> {
             self.report(path, format!("has {} entries; must have none, 3 or 6", moments.len()));
             return;
         }
-        if self.finite_all(&path, moments) && !moments.is_empty() {
-            self.inertia(path, moments);
-        }
+        self.finite_all(&path, moments);
     }
 
-    fn inertia(&mut self, path: String, moments: &[f64]) {
-        let largest = moments.iter().fold(0.0_f64, |a, x| a.max(x.abs()));
-        if largest == 0.0 {
-            return;
-        }
-        let m = |i: usize| moments.get(i).map_or(0.0, |x| x / largest);
-        let tensor = Matrix3::new(m(0), m(3), m(4), m(3), m(1), m(5), m(4), m(5), m(2));
-        let mut principal: [f64; 3] = tensor.symmetric_eigenvalues().into();
-        principal.sort_by(f64::total_cmp);
-        let [a, b, c] = principal;
-        let shown = principal.map(|x| x * largest);
-        if a < -INERTIA_TOLERANCE {
-            self.report(path, format!("has a negative principal moment: {shown:?}"));
-        } else if a + b < c * (1.0 - INERTIA_TOLERANCE) {
-            let message =
-                format!("no body has these principal moments: {shown:?} violate a + b ≥ c");
-            self.report(path, message);
-        }
-    }
     /// That the knots make a spline.
     pub(super) fn knots(&mut self, path: String, knots: &[Knot]) {
         let before = self.problems.len();

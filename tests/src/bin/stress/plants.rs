@@ -21,9 +21,11 @@ pub(crate) fn undamped(name: &str) -> Scene {
     scene
 }
 
-/// A scene from TOML without its head.
+/// A scene from TOML without its head; without gravity, unless the text has one.
 pub(crate) fn parse(text: &str) -> Result<Scene> {
-    Ok(Scene::from_toml(&format!("format = 1\nname = \"stress\"\n{text}"))?)
+    let mut scene = Scene::from_toml(&format!("format = 1\nname = \"stress\"\n{text}"))?;
+    scene.gravity.get_or_insert_default();
+    Ok(scene)
 }
 
 /// How plants are stepped; a time step alone means order 2 in one step, halved where it must be.

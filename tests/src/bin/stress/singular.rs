@@ -76,7 +76,7 @@ pub(crate) fn cases() -> Vec<Case> {
         cases.push(
             Case::new(name, criterion, move |_, finding| {
                 let mut scene = plants::scene("spherical-pendulum");
-                scene.gravity = [0.0; 3];
+                scene.gravity = Some([0.0; 3]);
                 let mut plant = moving(&scene, 0.01, &[0.0, 0.0], &[miss, 1.0])?;
                 let (start, mut worst) = (energy(&mut plant), 0.0_f64);
                 let end = until_refused(&mut plant, 400, |plant| {

@@ -1,0 +1,102 @@
+//! Forces along a path: of inputs, of a damper, and of the damper of a stop.
+//!
+//! ```text
+//! f_i = T L_i,  T = Σ g_k u_k − c(L) L̇,  L̇ = Σ L_k v_k
+//! ∂f_i/∂q_j = T L_ij − L_i (c' L̇ L_j + c Σ_k L_kj v_k)    ∂f_i/∂v_j = −c L_i L_j    ∂f_i/∂u_k = g_k L_i
+//! ```
+//!
+//! with `L` the sum of the lengths of the path's segments.
+
+use crate::lagrangian::forces::{GeneralizedForce, Instant};
+use crate::lagrangian::vectors::Distance;
+use crate::math::scalar::Scalar;
+use crate::model::mechanism::{PathForce, PointPair, Resistance};
+
+/// A path in motion.
+struct Moving<S> {
+    /// `L̇`.
+    rate: S,
+    /// `c` and `c'`.
+    resistance: (S, S),
+    /// `T`.
+    tension: S,
+}
+
+impl PathForce {
+    /// Its segments.
+    fn segments<'a, S: Scalar>(
+        &'a self,
+        at: &Instant<'a, S>,
+    ) -> impl Iterator<Item = Distance<'a, S>> + use<'a, S> {
+        let (tree, poses) = (at.tree, at.poses);
+        self.segments.iter().map(move |ends| Distance::new(ends, tree, poses))
+    }
+
+    fn moving<S: Scalar>(&self, at: &Instant<'_, S>) -> Moving<S> {
+        let (mut length, mut rate) = (S::ZERO, S::ZERO);
+        for segment in self.segments(at) {
+            length += segment.length;
+            segment.for_each_derivative(|i, slope| rate += slope * at.velocity[i]);
+        }
+        let resistance = match &self.resistance {
+            Resistance::Constant(c) => (S::constant(*c), S::ZERO),
+            Resistance::Stop(stop) => stop.resistance(length),
+        };
+        let driven = self.inputs.iter().fold(S::ZERO, |sum, &(k, g)| sum + at.inputs[k] * g);
+        Moving { rate, resistance, tension: driven - resistance.0 * rate }
+    }
+}
+
+impl GeneralizedForce for PathForce {
+    fn couples(&self) -> Vec<usize> {
+        self.segments.iter().flat_map(PointPair::coordinates).collect()
+    }
+
+    fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
+        let tension = self.moving(at).tension;
+        for segment in self.segments(at) {
+            segment.for_each_derivative(|i, slope| {
+                if let Some(entry) = force.get_mut(i) {
+                    *entry += tension * slope;
+                }
+            });
+        }
+    }
+
+    fn for_each_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S, S),
+    ) {
+        let Moving { rate, resistance: (c, by_length), tension } = self.moving(at);
+        for segment in self.segments(at) {
+            segment.for_each_second_derivative(|i, j, l_ij| entry(i, j, tension * l_ij, S::ZERO));
+            if matches!(self.resistance, Resistance::Constant(0.0)) {
+                continue;
+            }
+            segment.for_each_derivative(|i, l_i| {
+                for other in self.segments(at) {
+                    other.for_each_derivative(|j, l_j| {
+                        let product = l_i * l_j;
+                        entry(i, j, -(by_length * rate * product), -(c * product));
+                    });
+                    other.for_each_second_derivative(|k, j, l_kj| {
+                        entry(i, j, -(c * l_i * l_kj * at.velocity[k]), S::ZERO);
+                    });
+                }
+            });
+        }
+    }
+
+    fn for_each_input_derivative<S: Scalar>(
+        &self,
+        at: &Instant<'_, S>,
+        entry: &mut impl FnMut(usize, usize, S),
+    ) {
+        for &(k, gain) in &self.inputs {
+            for segment in self.segments(at) {
+                segment.for_each_derivative(|i, slope| entry(i, k, slope * gain));
+            }
+        }
+    }
+}

@@ -1,0 +1,71 @@
+//! One-sided springs and dampers at the ends of a range, of a coordinate or of the length of a path.
+//!
+//! At a depth `x` beyond the range, with `t = x / transition` and `δ = transition`,
+//!
+//! ```text
+//! V = k δ² G(t)    V' = k δ F(t)    V'' = k w(t)    c = d w(t)
+//! w = t³ (10 − 15 t + 6 t²),  F = t⁴ (5/2 − 3 t + t²),   G = t⁵ (1/2 − t/2 + t²/7)     t < 1
+//! w = 1,                      F = t − 1/2,               G = t²/2 − t/2 + 1/7          t ≥ 1
+//! ```
+//!
+//! `G' = F`, `F' = w`, and `w` is twice continuously differentiable; `c` is the resistance of the damper.
+
+use crate::math::scalar::Scalar;
+use crate::model::mechanism::Stop;
+
+impl Stop {
+    /// `t`, and the sign of the way out of the range.
+    fn depth<S: Scalar>(&self, s: S) -> (S, f64) {
+        let [low, high] = self.range;
+        let inverse = 1.0 / self.transition;
+        if s.value() > high {
+            ((s - high) * inverse, 1.0)
+        } else if s.value() < low {
+            ((s - low) * -inverse, -1.0)
+        } else {
+            (S::ZERO, 1.0)
+        }
+    }
+
+    /// `V`, J.
+    pub(crate) fn energy<S: Scalar>(&self, s: S) -> S {
+        let (t, _) = self.depth(s);
+        let square = t * t;
+        let g = if t.value() < 1.0 {
+            square * square * t * (square * (1.0 / 7.0) - t * 0.5 + 0.5)
+        } else {
+            square * 0.5 - t * 0.5 + 1.0 / 7.0
+        };
+        g * (self.stiffness * self.transition * self.transition)
+    }
+
+    /// `V'` by `s`.
+    pub(crate) fn slope<S: Scalar>(&self, s: S) -> S {
+        let (t, sign) = self.depth(s);
+        let square = t * t;
+        let f = if t.value() < 1.0 { square * square * (square - t * 3.0 + 2.5) } else { t - 0.5 };
+        f * (sign * self.stiffness * self.transition)
+    }
+
+    /// `V''` by `s`.
+    pub(crate) fn curvature<S: Scalar>(&self, s: S) -> S {
+        self.share(s).0 * self.stiffness
+    }
+
+    /// `c` and its derivative by `s`.
+    pub(crate) fn resistance<S: Scalar>(&self, s: S) -> (S, S) {
+        let (w, slope) = self.share(s);
+        (w * self.damping, slope * self.damping)
+    }
+
+    /// `w`, and its derivative by `s`.
+    fn share<S: Scalar>(&self, s: S) -> (S, S) {
+        let (t, sign) = self.depth(s);
+        if t.value() >= 1.0 {
+            return (S::ONE, S::ZERO);
+        }
+        let rest = S::ONE - t;
+        let w = t * t * t * (t * t * 6.0 - t * 15.0 + 10.0);
+        (w, t * t * rest * rest * (30.0 * sign / self.transition))
+    }
+}
