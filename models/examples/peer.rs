@@ -172,6 +172,7 @@ fn scene(mechanism: &Mechanism) -> Scene {
             mass: link.mass,
             center_of_mass: link.com,
             inertia: link.inertia.to_vec(),
+            ..Body::default()
         }),
     });
     let coordinates = mechanism.q0.iter().zip(0..).map(|(&initial, i)| Coordinate {

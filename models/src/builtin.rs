@@ -100,6 +100,7 @@ fn chain(n: usize) -> Scene {
             mass,
             center_of_mass: [0.0, 0.0, -length / 2.0],
             inertia: vec![across, across, 0.0],
+            ..Body::default()
         };
         let (parent, z) = if i == 0 { ("world".to_owned(), 0.0) } else { (link(i - 1), -length) };
         scene.frames.push(hinge(link(i), &parent, [0.0, 0.0, z], body));
@@ -144,6 +145,7 @@ fn tree(n: usize) -> Scene {
                 mass: 0.96,
                 center_of_mass: [0.01, 0.005, -0.1],
                 inertia: vec![0.003712, 0.003488, 0.0008],
+                ..Body::default()
             }),
             ..Frame::default()
         });
@@ -171,6 +173,7 @@ fn scissor(n: usize) -> Scene {
         mass: 1.0,
         center_of_mass: [LENGTH / 2.0, 0.0, 0.0],
         inertia: vec![1.0, 1.0, 1.0],
+        ..Body::default()
     };
     scene.frames.push(Frame {
         name: "slider".to_owned(),

@@ -217,6 +217,9 @@ pub struct Body {
     /// `[ixx, iyy, izz]` or `[ixx, iyy, izz, ixy, ixz, iyz]`, kg·m². None means a point mass.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub inertia: Vec<f64>,
+    /// Takes an inertia that no body has, whose principal moments violate `a + b ≥ c`, as it is.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub any_inertia: bool,
 }
 
 /// Settings of a coordinate.

@@ -483,7 +483,7 @@ fn frame(index: usize, record: &FrameRecord) -> Result<Frame> {
     };
     if let (Some(mass), Some(inertia)) = (record.mass, record.inertia) {
         let inertia = if inertia == [0.0; 3] { Vec::new() } else { inertia.to_vec() };
-        frame.body = Some(Body { mass, center_of_mass: [0.0; 3], inertia });
+        frame.body = Some(Body { mass, inertia, ..Body::default() });
     }
     if record.kind == "CONST_SE3" {
         let rows = record.se3_rows.context("no matrix")?;

@@ -181,6 +181,7 @@ fn random_frame(random: &mut Numbers, index: usize) -> Frame {
             mass: random.between(0.5, 2.0),
             center_of_mass: random.vector(0.4),
             inertia: vec![b + c, a + c, a + b, ab, ac, bc],
+            ..Body::default()
         }),
     }
 }
