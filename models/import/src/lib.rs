@@ -36,7 +36,7 @@ mod urdf;
 pub use crate::options::{Base, Inputs, Options};
 pub use crate::report::{ImportError, Kind, Name, Note, Problem, Report};
 
-use plantd_models::Scene;
+use plantd_models::{Model, Scene, SceneError};
 
 /// A robot that was read.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,6 +47,17 @@ pub struct Import {
     pub report: Report,
 }
 
+impl Import {
+    /// Whether the scene compiles: that every coordinate has inertia, for one.
+    ///
+    /// # Errors
+    ///
+    /// Everything that is wrong with the scene, with paths into it.
+    pub fn check(&self) -> Result<(), SceneError> {
+        Model::compile(&self.scene).map(|_| ())
+    }
+}
+
 /// Whether a text is for [`import`] and not a scene: its first character that is not white space is `<`.
 pub fn is_xml(text: &str) -> bool {
     text.trim_start_matches('\u{feff}').trim_start().starts_with('<')
@@ -54,8 +65,7 @@ pub fn is_xml(text: &str) -> bool {
 
 /// Reads a robot in URDF, versions 1.0 to 1.2.
 ///
-/// The scene is not compiled: [`plantd_models::Model::compile`] says whether every coordinate has inertia. At
-/// most [`plantd_models::scene::MAX_TEXT_BYTES`] are read, in time and memory that grow with the text.
+/// The scene is not compiled; [`Import::check`] does that. At most [`plantd_models::scene::MAX_TEXT_BYTES`] are read, in time and memory that grow with the text.
 ///
 /// # Errors
 ///

@@ -72,7 +72,7 @@ impl fmt::Display for Report {
             write!(f, "{}:{}: {}: {}", note.line, note.column, note.kind.name(), note.message)?;
             match note.count {
                 1 => writeln!(f)?,
-                count => writeln!(f, " ({count} of them)")?,
+                count => writeln!(f, " (× {count})")?,
             }
         }
         if self.left_out > 0 {
