@@ -1,6 +1,6 @@
 //! Robots in other formats as scenes of plantd.
 //!
-//! Text in, a [`Scene`] and a [`Report`] out; nothing is read or written elsewhere. The report says of
+//! Text in, a [`Scene`](plantd_models::Scene) and a [`Report`] out; nothing is read or written elsewhere. The report says of
 //! everything in the file whether it was taken exactly, taken approximately, has no effect on the motion, or
 //! was refused. What would change the motion and cannot be expressed is an error with line and column, unless
 //! [`Options::lenient`] makes it a warning: nothing is dropped in silence.
@@ -34,29 +34,7 @@ mod table;
 mod urdf;
 
 pub use crate::options::{Base, Inputs, Options};
-pub use crate::report::{ImportError, Kind, Name, Note, Problem, Report};
-
-use plantd_models::{Model, Scene, SceneError};
-
-/// A robot that was read.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Import {
-    /// The scene.
-    pub scene: Scene,
-    /// What became of the file.
-    pub report: Report,
-}
-
-impl Import {
-    /// Whether the scene compiles: that every coordinate has inertia, for one.
-    ///
-    /// # Errors
-    ///
-    /// Everything that is wrong with the scene, with paths into it.
-    pub fn check(&self) -> Result<(), SceneError> {
-        Model::compile(&self.scene).map(|_| ())
-    }
-}
+pub use crate::report::{Import, ImportError, Kind, Name, Note, Problem, Report};
 
 /// Whether a text is for [`import`] and not a scene: its first character that is not white space is `<`.
 pub fn is_xml(text: &str) -> bool {

@@ -3,6 +3,28 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use plantd_models::{Model, Scene, SceneError};
+
+/// A robot that was read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Import {
+    /// The scene.
+    pub scene: Scene,
+    /// What became of the file.
+    pub report: Report,
+}
+
+impl Import {
+    /// Whether the scene compiles: that every coordinate has inertia, for one.
+    ///
+    /// # Errors
+    ///
+    /// Everything that is wrong with the scene, with paths into it.
+    pub fn check(&self) -> Result<(), SceneError> {
+        Model::compile(&self.scene).map(|_| ())
+    }
+}
+
 /// What became of everything in a file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {

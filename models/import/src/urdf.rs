@@ -6,10 +6,9 @@ mod table;
 
 use roxmltree::Document;
 
-use crate::Import;
 use crate::document::Reader;
 use crate::options::Options;
-use crate::report::Problem;
+use crate::report::{Import, Problem};
 
 /// The scene of a document, and what became of the rest of it.
 pub(crate) fn import(document: &Document<'_>, options: &Options) -> Result<Import, Vec<Problem>> {

@@ -139,12 +139,12 @@ fn links<'a>(
     reader: &mut Reader<'_>,
     node: Node<'a, 'a>,
 ) -> (Vec<Link<'a>>, HashMap<&'a str, usize>) {
-    let (all, places) = named(reader, node, "link");
-    if all.is_empty() || all.len() > MAX_FRAMES {
-        reader
-            .fail(node, format!("the robot has {} links; must have 1 to {MAX_FRAMES}", all.len()));
-        return (Vec::new(), places);
+    let count = node.children().filter(|child| child.has_tag_name("link")).count();
+    if count == 0 || count > MAX_FRAMES {
+        reader.fail(node, format!("the robot has {count} links; must have 1 to {MAX_FRAMES}"));
+        return Default::default();
     }
+    let (all, places) = named(reader, node, "link");
     let mut links = Vec::new();
     for (name, node) in all {
         let inertial = reader.child(node, "inertial");

@@ -96,7 +96,7 @@ impl v1::model_service_server::ModelService for ModelService {
             };
             checks::check_name("name", &name)?;
             let model = Some(message(&hub.catalog.insert(&name, Arc::new(model))?, true));
-            Ok(v1::CreateModelResponse { model, import: report.map(import) })
+            Ok(v1::CreateModelResponse { model, import_report: report.map(import_report) })
         };
         Ok(Response::new(self.hub.workers.run(job).await?))
     }
@@ -111,12 +111,12 @@ impl v1::model_service_server::ModelService for ModelService {
             Ok(match compile(&request.scene, request.format, &hub.limits)? {
                 Ok((model, report)) => {
                     let model = Some(models::model(&model.scene().name, false, &model, true));
-                    let import = report.map(import);
-                    v1::ValidateSceneResponse { problems: Vec::new(), model, import }
+                    let import_report = report.map(import_report);
+                    v1::ValidateSceneResponse { problems: Vec::new(), model, import_report }
                 }
                 Err(error) => {
                     let problems = error.problems.into_iter().map(problem).collect();
-                    v1::ValidateSceneResponse { problems, model: None, import: None }
+                    v1::ValidateSceneResponse { problems, model: None, import_report: None }
                 }
             })
         };
@@ -142,7 +142,7 @@ impl v1::model_service_server::ModelService for ModelService {
     }
 }
 
-fn import(report: Report) -> v1::ImportReport {
+fn import_report(report: Report) -> v1::ImportReport {
     let note = |note: plantd_import::Note| {
         let kind = match note.kind {
             Kind::Warning => v1::ImportKind::Warning,

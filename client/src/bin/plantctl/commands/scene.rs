@@ -47,7 +47,7 @@ impl Upload {
             ..Default::default()
         };
         let answer = client.import_model(request).await?;
-        import::tell(answer.import.as_ref());
+        import::tell(answer.import_report.as_ref());
         let model = answer.model.context("an answer without a model")?;
         context.output.message("Model", &model, || model::known(&model))
     }
@@ -57,7 +57,7 @@ impl Validate {
     pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
         let client = context.connect().await?;
         let answer = client.validate_scene(read_text(&self.scene)?).await?;
-        import::tell(answer.import.as_ref());
+        import::tell(answer.import_report.as_ref());
         context.output.message("ValidateSceneResponse", &answer, || match &answer.model {
             Some(model) if answer.problems.is_empty() => model::validated(model),
             _ => problems(&answer.problems),
