@@ -112,7 +112,7 @@ impl Client {
         answer.model.ok_or(Error::Protocol("an answer without a model"))
     }
 
-    /// Uploads a scene (TOML or JSON) under its own name.
+    /// Uploads a scene (TOML, JSON), or a robot in URDF, under its own name.
     ///
     /// # Errors
     /// A scene with errors is refused with all of them in [`Error::violations`].
@@ -123,8 +123,15 @@ impl Client {
 
     /// Uploads a scene, under another name or with its notation stated.
     pub async fn create_model_as(&self, request: v1::CreateModelRequest) -> Result<v1::Model> {
-        let answer = self.models().create_model(self.limited(request)).await?.into_inner();
-        answer.model.ok_or(Error::Protocol("an answer without a model"))
+        self.import_model(request).await?.model.ok_or(Error::Protocol("an answer without a model"))
+    }
+
+    /// Uploads a scene, and tells what became of a robot in another format.
+    pub async fn import_model(
+        &self,
+        request: v1::CreateModelRequest,
+    ) -> Result<v1::CreateModelResponse> {
+        Ok(self.models().create_model(self.limited(request)).await?.into_inner())
     }
 
     /// Checks a scene without keeping it; a good one has no problems and comes with its model.

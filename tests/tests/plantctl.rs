@@ -277,6 +277,55 @@ fn scenes_are_checked_explained_and_uploaded() {
     json(&server, &["delete", "model", "slider"]);
 }
 
+/// `import` needs no server; what it prints is a scene, and `upload` takes the robot itself.
+#[test]
+fn a_robot_becomes_a_scene() {
+    const ROBOT: &str = r#"<robot name="Rod"><link name="base"><sensor/></link>
+<joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/></joint>
+<link name="rod"><inertial><mass value="2"/><inertia ixx="0.1" iyy="0.1" izz="0.01"/></inertial></link>
+</robot>"#;
+    let server = ServerProcess::start().unwrap();
+    let file = |name: &str, text: &str| {
+        let path = server.directory().join(name);
+        std::fs::write(&path, text).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let robot = file("rod.urdf", ROBOT);
+    let arguments = ["import", &robot, "--base", "free", "--name", "flying-rod"];
+    let output = plantctl("http://127.0.0.1:1", &arguments).output().unwrap();
+    let told = stderr(&output);
+    assert!(output.status.success(), "{told}");
+    assert!(told.contains("1:38: no effect: `sensor` in `link`"), "{told}");
+    assert!(told.contains("1 × continuous joint"), "{told}");
+    let scene = file("rod.toml", std::str::from_utf8(&output.stdout).unwrap());
+    let model = json(&server, &["upload", &scene]);
+    let names: Vec<_> =
+        model["coordinates"].as_array().unwrap().iter().map(|c| &c["name"]).collect();
+    assert_eq!(names.len(), 7, "{names:?}");
+
+    let output = run(&server, &["upload", &robot]);
+    assert!(
+        output.status.success()
+            && stderr(&output)
+                == told.lines().next().unwrap().to_owned() + "\nscene `Rod` is named `rod`\n",
+        "{}",
+        stderr(&output)
+    );
+    let wrong =
+        file("wrong.urdf", &ROBOT.replace("continuous", "helical").replace("\"2\"", "\"x\""));
+    for arguments in [["import", &wrong], ["upload", &wrong]] {
+        let output = run(&server, &arguments);
+        assert_eq!(output.status.code(), Some(1));
+        let told = stderr(&output);
+        assert!(told.contains("2:1: joint `hinge` has type `helical`"), "{told}");
+        assert!(told.contains("3:28: `value` of `mass` is `x`"), "{told}");
+    }
+    let weightless =
+        file("weightless.urdf", &ROBOT.replace("<inertial>", "<!--").replace("</inertial>", "-->"));
+    let output = run(&server, &["import", &weightless]);
+    assert!(stderr(&output).contains("no mechanism that can be simulated"), "{}", stderr(&output));
+}
+
 #[test]
 fn a_watch_prints_one_object_per_step() {
     let server = ServerProcess::start().unwrap();

@@ -26,6 +26,29 @@ coordinate = "block"
 """
 
 
+ROBOT = """<robot name="py-rod"><link name="base"/>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" velocity="1" effort="0"/></joint>
+<link name="rod"><inertial><origin xyz="0 0 -0.5"/><mass value="2"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.01"/></inertial></link></robot>"""
+
+
+def test_a_robot_is_a_file_or_a_text(client, tmp_path):
+    file = tmp_path / "rod.urdf"
+    file.write_text(ROBOT)
+    for robot in [file, str(file), ROBOT]:
+        with pytest.warns(UserWarning, match="3:1: joint `hinge` moves past its limits"):
+            model = client.create_model(robot, name="py-rod-1")
+        gain = client.solve_lqr(model.name, q=[100, 1], r=[1])
+        assert gain.spectral_radius < 1
+        client.delete_model(model.name)
+    scene = tmp_path / "slider.toml"
+    scene.write_text(SCENE)
+    assert client.validate_scene(scene) == []
+    with pytest.raises(FileNotFoundError):
+        client.create_model("no-such-file.urdf")
+
+
 def test_lqr_balances_the_pendulum(client):
     gain = client.solve_lqr("pendulum", at="upright", q=[100, 1], r=[1])
     assert gain.spectral_radius < 1

@@ -9,6 +9,7 @@ mod drive;
 mod elements;
 mod fairness;
 mod feedback;
+mod import;
 mod kalman;
 mod limits;
 mod methods;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Literal
@@ -41,6 +42,7 @@ from ._requests import (
     momentum,
     noise,
     point,
+    scene_text,
     settings,
     split_outputs,
     stage_weights,
@@ -143,14 +145,30 @@ class Client:
         request = model_service_pb2.GetModelRequest(name=name)
         return self._call(self.models.GetModel, request).model
 
-    def create_model(self, scene: str, *, name: str = "") -> model_service_pb2.Model:
-        """Uploads a scene (TOML or JSON); all its errors are in the error's ``violations``."""
-        request = model_service_pb2.CreateModelRequest(scene=scene, name=name)
-        return self._call(self.models.CreateModel, request).model
+    def create_model(
+        self, scene: str | PathLike[str], *, name: str = ""
+    ) -> model_service_pb2.Model:
+        """Uploads a scene (TOML, JSON) or a robot (URDF): a text of several lines, or a file.
 
-    def validate_scene(self, scene: str) -> list[model_service_pb2.SceneProblem]:
-        """All errors of a scene; empty when it is good."""
-        request = model_service_pb2.ValidateSceneRequest(scene=scene)
+        All errors are in the error's ``violations``. What a robot says and a scene cannot is a
+        ``UserWarning`` with lines and columns; what has no effect on the motion is not mentioned.
+        """
+        request = model_service_pb2.CreateModelRequest(scene=scene_text(scene), name=name)
+        answer = self._call(self.models.CreateModel, request)
+        told = [
+            f"{note.line}:{note.column}: {note.message}"
+            for note in answer.import_report.notes
+            if note.kind != model_service_pb2.IMPORT_KIND_NO_EFFECT
+        ]
+        if told:
+            warnings.warn("\n".join([f"{answer.model.name}:", *told]), stacklevel=2)
+        return answer.model
+
+    def validate_scene(
+        self, scene: str | PathLike[str]
+    ) -> list[model_service_pb2.SceneProblem]:
+        """All errors of a scene or robot, a text of several lines or a file; none when it is good."""
+        request = model_service_pb2.ValidateSceneRequest(scene=scene_text(scene))
         return list(self._call(self.models.ValidateScene, request).problems)
 
     def settle(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
 from typing import Any, Literal, TypedDict, Union
 
 import numpy as np
@@ -35,6 +37,13 @@ class Stepping(TypedDict, total=False):
     singular_below: float
     #: Newton iterations before a step is given up; 40 if not given.
     newton_iterations: int
+
+
+def scene_text(scene: str | PathLike[str]) -> str:
+    """The text of a scene: itself if it has several lines or begins as JSON or XML, else a file's."""
+    if isinstance(scene, str) and ("\n" in scene or scene.lstrip().startswith(("{", "<"))):
+        return scene
+    return Path(scene).read_text(encoding="utf-8")
 
 
 def settings(

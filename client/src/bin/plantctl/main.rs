@@ -15,7 +15,7 @@ use anyhow::Result;
 use clap::{Parser, Subcommand};
 
 use crate::commands::{
-    analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard,
+    analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard, import,
     inventory, kalman, linearize, lqr, optimize, parameters, record, reference, replay, run, scene,
     settle, state, step, test, timing, watch,
 };
@@ -40,6 +40,7 @@ Examples:
   plantctl fault inject p1 input=tau stuck=true start_s=2 duration_s=0.5
   plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
   plantctl validate arm.toml                        all errors of a scene, with their paths
+  plantctl import arm.urdf > arm.toml               a robot as a scene, and what became of the file
   plantctl record start p1 --name trial             then `record stop trial`, `record get trial`
   plantctl replay trial.mcap                        the same steps again, compared bit for bit
   plantctl export trial.mcap --csv trial.csv
@@ -77,6 +78,7 @@ enum Command {
     List(inventory::List),
     Show(inventory::Show),
     Upload(scene::Upload),
+    Import(import::Import),
     Create(create::Create),
     Step(step::Step),
     Watch(watch::Watch),
@@ -137,6 +139,7 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::List(command) => command.run(context).await?,
         Command::Show(command) => command.run(context).await?,
         Command::Upload(command) => command.run(context).await?,
+        Command::Import(command) => command.run(context)?,
         Command::Create(command) => command.run(context).await?,
         Command::Step(command) => command.run(context).await?,
         Command::Watch(command) => command.run(context).await?,

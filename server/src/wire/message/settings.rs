@@ -1,6 +1,7 @@
 //! A plant's scene, settings and changed numbers.
 
-use plantd_models::{ForceSplit, Model, Precision, Scene, SceneError, Settings};
+use plantd_import::{ImportError, Options, Report};
+use plantd_models::{ForceSplit, Model, Precision, Problem, Scene, SceneError, Settings};
 use plantd_proto::v1;
 
 use crate::core::feedback::regulator::Constraints;
@@ -9,21 +10,26 @@ use crate::core::parameters::Parameters;
 use crate::core::session::creation::Accuracy;
 use crate::wire::status::RpcError;
 
-/// Reads a scene within the limits. A faulty scene is the inner error.
+/// A scene, and what became of the robot that it was made of.
+pub type Read = (Scene, Option<Report>);
+
+/// Reads a scene, or a robot in another format, within the limits. A faulty one is the inner error.
 pub fn scene(
     text: &str,
     format: i32,
     limits: &Limits,
-) -> Result<Result<Scene, SceneError>, RpcError> {
+) -> Result<Result<Read, SceneError>, RpcError> {
     LimitExceeded::check("scene_bytes", limits.scene_bytes, "bytes of scene", text.len())?;
-    let scene = match v1::SceneFormat::try_from(format) {
-        Ok(v1::SceneFormat::Unspecified) => Scene::from_text(text),
-        Ok(v1::SceneFormat::Toml) => Scene::from_toml(text),
-        Ok(v1::SceneFormat::Json) => Scene::from_json(text),
+    let read = match v1::SceneFormat::try_from(format) {
+        Ok(v1::SceneFormat::Unspecified) if plantd_import::is_xml(text) => robot(text),
+        Ok(v1::SceneFormat::Urdf) => robot(text),
+        Ok(v1::SceneFormat::Unspecified) => Scene::from_text(text).map(|scene| (scene, None)),
+        Ok(v1::SceneFormat::Toml) => Scene::from_toml(text).map(|scene| (scene, None)),
+        Ok(v1::SceneFormat::Json) => Scene::from_json(text).map(|scene| (scene, None)),
         Err(_) => return Err(RpcError::field("format", format!("{format} is not a format"))),
     };
-    let scene = match scene {
-        Ok(scene) => scene,
+    let (scene, report) = match read {
+        Ok(read) => read,
         Err(error) => return Ok(Err(error)),
     };
     for (what, count) in [
@@ -41,7 +47,20 @@ pub fn scene(
     // Every coordinate belongs to a joint or to a setting, so this bounds them before compilation.
     let joints = scene.frames.iter().filter(|frame| frame.joint.is_some()).count();
     LimitExceeded::check("coordinates", limits.coordinates, "joints", joints)?;
-    Ok(Ok(scene))
+    Ok(Ok((scene, report)))
+}
+
+fn robot(text: &str) -> Result<Read, SceneError> {
+    match plantd_import::import(text, &Options::default()) {
+        Ok(robot) => Ok((robot.scene, Some(robot.report))),
+        Err(ImportError { problems }) => {
+            let problem = |problem: plantd_import::Problem| {
+                let path = format!("{}:{}", problem.line, problem.column);
+                Problem { path, message: problem.message }
+            };
+            Err(SceneError { problems: problems.into_iter().map(problem).collect() })
+        }
+    }
 }
 
 /// Settings of a plant, with the model's defaults filled in.

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use plantd_import::{Kind, Report};
 use plantd_models::{Model, Problem, SceneError};
 use plantd_proto::v1;
 use tonic::{Request, Response, Status};
@@ -31,15 +32,16 @@ pub(crate) fn compile(
     text: &str,
     format: i32,
     limits: &Limits,
-) -> Result<Result<Model, SceneError>, RpcError> {
-    let scene = settings::scene(text, format, limits)?;
-    let model = match scene.and_then(|scene| Model::compile(&scene)) {
-        Ok(model) => model,
+) -> Result<Result<(Model, Option<Report>), SceneError>, RpcError> {
+    let read = settings::scene(text, format, limits)?;
+    let compiled = read.and_then(|(scene, report)| Ok((Model::compile(&scene)?, report)));
+    let (model, report) = match compiled {
+        Ok(compiled) => compiled,
         Err(error) => return Ok(Err(error)),
     };
     let count = model.dimensions().coordinates();
     LimitExceeded::check("coordinates", limits.coordinates, "coordinates", count)?;
-    Ok(Ok(model))
+    Ok(Ok((model, report)))
 }
 
 fn message(entry: &Entry, with_texts: bool) -> v1::Model {
@@ -87,16 +89,16 @@ impl v1::model_service_server::ModelService for ModelService {
         }
         let hub = Arc::clone(&self.hub);
         let job = move |_: &_| {
-            let model = compile(&request.scene, request.format, &hub.limits)??;
+            let (model, report) = compile(&request.scene, request.format, &hub.limits)??;
             let name = match request.name {
                 name if name.is_empty() => model.scene().name.clone(),
                 name => name,
             };
             checks::check_name("name", &name)?;
-            Ok(message(&hub.catalog.insert(&name, Arc::new(model))?, true))
+            let model = Some(message(&hub.catalog.insert(&name, Arc::new(model))?, true));
+            Ok(v1::CreateModelResponse { model, import_report: report.map(import_report) })
         };
-        let model = Some(self.hub.workers.run(job).await?);
-        Ok(Response::new(v1::CreateModelResponse { model }))
+        Ok(Response::new(self.hub.workers.run(job).await?))
     }
 
     async fn validate_scene(
@@ -107,13 +109,14 @@ impl v1::model_service_server::ModelService for ModelService {
         let hub = Arc::clone(&self.hub);
         let job = move |_: &_| {
             Ok(match compile(&request.scene, request.format, &hub.limits)? {
-                Ok(model) => {
-                    let model = models::model(&model.scene().name, false, &model, true);
-                    v1::ValidateSceneResponse { problems: Vec::new(), model: Some(model) }
+                Ok((model, report)) => {
+                    let model = Some(models::model(&model.scene().name, false, &model, true));
+                    let import_report = report.map(import_report);
+                    v1::ValidateSceneResponse { problems: Vec::new(), model, import_report }
                 }
                 Err(error) => {
                     let problems = error.problems.into_iter().map(problem).collect();
-                    v1::ValidateSceneResponse { problems, model: None }
+                    v1::ValidateSceneResponse { problems, model: None, import_report: None }
                 }
             })
         };
@@ -136,6 +139,34 @@ impl v1::model_service_server::ModelService for ModelService {
         let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
         let job = move |_: &_| settle::settle(&hub, request);
         Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+}
+
+fn import_report(report: Report) -> v1::ImportReport {
+    let note = |note: plantd_import::Note| {
+        let kind = match note.kind {
+            Kind::Warning => v1::ImportKind::Warning,
+            Kind::Approximated => v1::ImportKind::Approximated,
+            Kind::NoEffect => v1::ImportKind::NoEffect,
+        };
+        v1::ImportNote {
+            kind: kind.into(),
+            line: note.line,
+            column: note.column,
+            message: note.message,
+            count: note.count as u32,
+        }
+    };
+    let name = |name: plantd_import::Name| v1::ImportName {
+        of: name.of.to_owned(),
+        from: name.from,
+        to: name.to,
+    };
+    v1::ImportReport {
+        notes: report.notes.into_iter().map(note).collect(),
+        left_out: report.left_out as u32,
+        names: report.names.into_iter().map(name).collect(),
+        exact: report.exact.into_iter().map(|(what, n)| (what.to_owned(), n as u32)).collect(),
     }
 }
 

@@ -231,7 +231,7 @@ fn is_change(saved: &v1::SavedFault) -> bool {
 
 fn scene(hub: &Hub, model: &v1::Model) -> Result<Model> {
     let format = v1::SceneFormat::Toml.into();
-    Ok(compile(&model.scene_toml, format, &hub.limits).map_err(sentence)??)
+    Ok(compile(&model.scene_toml, format, &hub.limits).map_err(sentence)??.0)
 }
 
 fn decode(bytes: &[u8]) -> Result<v1::PlantRecord> {

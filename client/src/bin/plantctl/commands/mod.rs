@@ -11,6 +11,7 @@ pub(crate) mod export;
 pub(crate) mod fault;
 pub(crate) mod feedback;
 pub(crate) mod guard;
+pub(crate) mod import;
 pub(crate) mod inventory;
 pub(crate) mod kalman;
 pub(crate) mod linearize;

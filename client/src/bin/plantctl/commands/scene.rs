@@ -3,17 +3,18 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use clap::Args;
 use plantd_client::v1;
 use serde_json::json;
 
+use crate::commands::import;
 use crate::input::files::read_text;
 use crate::output::failure::FAILED;
 use crate::output::model;
 use crate::server::context::Context;
 
-/// Uploads a scene (TOML or JSON) as a model.
+/// Uploads a scene (TOML, JSON) or a robot (URDF) as a model.
 #[derive(Debug, Args)]
 pub(crate) struct Upload {
     /// File; `-` reads standard input.
@@ -23,7 +24,7 @@ pub(crate) struct Upload {
     name: Option<String>,
 }
 
-/// Checks a scene and prints all its errors.
+/// Checks a scene (TOML, JSON) or a robot (URDF) and prints all its errors.
 #[derive(Debug, Args)]
 pub(crate) struct Validate {
     /// File; `-` reads standard input.
@@ -45,7 +46,9 @@ impl Upload {
             scene: read_text(&self.scene)?,
             ..Default::default()
         };
-        let model = client.create_model_as(request).await?;
+        let answer = client.import_model(request).await?;
+        import::tell(answer.import_report.as_ref());
+        let model = answer.model.context("an answer without a model")?;
         context.output.message("Model", &model, || model::known(&model))
     }
 }
@@ -54,6 +57,7 @@ impl Validate {
     pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
         let client = context.connect().await?;
         let answer = client.validate_scene(read_text(&self.scene)?).await?;
+        import::tell(answer.import_report.as_ref());
         context.output.message("ValidateSceneResponse", &answer, || match &answer.model {
             Some(model) if answer.problems.is_empty() => model::validated(model),
             _ => problems(&answer.problems),

@@ -1,0 +1,105 @@
+//! `import`: robots in other formats as scenes.
+
+use std::path::PathBuf;
+
+use anyhow::{Context as _, Result};
+use clap::{Args, ValueEnum};
+use plantd_client::v1;
+use plantd_import::Options;
+use serde_json::json;
+
+use crate::input::files::read_text;
+use crate::input::numbers::{Numbers, numbers};
+use crate::server::context::Context;
+
+/// Turns a robot in URDF into a scene, on standard output; what became of the file goes to standard
+/// error. Needs no server.
+#[derive(Debug, Args)]
+pub(crate) struct Import {
+    /// File; `-` reads standard input.
+    robot: PathBuf,
+    /// What holds the root link: the world, or nothing.
+    #[arg(long, value_enum, default_value_t)]
+    base: Base,
+    /// Joints that get an input: those of transmissions and command interfaces (all, if there are none
+    /// of these), all that mimic no other, or none.
+    #[arg(long, value_enum, default_value_t)]
+    inputs: Inputs,
+    /// Name of the scene; the robot's if not given.
+    #[arg(long)]
+    name: Option<String>,
+    /// Acceleration of gravity, m/s².
+    #[arg(long, value_name = "X,Y,Z", value_parser = numbers, default_value = "0,0,-9.81", allow_hyphen_values = true)]
+    gravity: Numbers,
+    /// Time step that the scene suggests, s.
+    #[arg(long, value_name = "S", default_value_t = 0.001)]
+    time_step: f64,
+    /// Velocity at which 76 % of dry friction are reached, m/s or rad/s.
+    #[arg(long, value_name = "V", default_value_t = 0.01)]
+    friction_velocity: f64,
+    /// Leave out what cannot be expressed, and take inertias that no body has, with a warning.
+    #[arg(long)]
+    lenient: bool,
+}
+
+#[derive(Clone, Copy, Debug, Default, ValueEnum)]
+enum Base {
+    #[default]
+    Fixed,
+    Free,
+}
+
+#[derive(Clone, Copy, Debug, Default, ValueEnum)]
+enum Inputs {
+    #[default]
+    AsTold,
+    All,
+    None,
+}
+
+impl Import {
+    pub(crate) fn run(self, context: &Context) -> Result<()> {
+        let options = Options {
+            base: match self.base {
+                Base::Fixed => plantd_import::Base::Fixed,
+                Base::Free => plantd_import::Base::Free,
+            },
+            inputs: match self.inputs {
+                Inputs::AsTold => plantd_import::Inputs::AsTold,
+                Inputs::All => plantd_import::Inputs::All,
+                Inputs::None => plantd_import::Inputs::None,
+            },
+            gravity: self.gravity.0.try_into().ok().context("--gravity takes three numbers")?,
+            time_step_s: self.time_step,
+            friction_velocity: self.friction_velocity,
+            lenient: self.lenient,
+        };
+        let file = self.robot.display().to_string();
+        let mut robot = plantd_import::import(&read_text(&self.robot)?, &options)
+            .with_context(|| format!("{file} cannot be imported"))?;
+        if let Some(name) = self.name {
+            robot.scene.name = name;
+        }
+        eprint!("{}", robot.report);
+        robot.check().context("what the file says is no mechanism that can be simulated")?;
+        let scene = robot.scene.to_toml();
+        context.output.print(|| json!({ "scene_toml": &scene }), || scene.clone())
+    }
+}
+
+/// Says on standard error what became of a robot that the server has imported.
+pub(crate) fn tell(report: Option<&v1::ImportReport>) {
+    let Some(report) = report else { return };
+    for note in &report.notes {
+        let kind = match note.kind() {
+            v1::ImportKind::Approximated => "approximated",
+            v1::ImportKind::NoEffect => "no effect",
+            v1::ImportKind::Warning | v1::ImportKind::Unspecified => "warning",
+        };
+        let count = if note.count > 1 { format!(" (× {})", note.count) } else { String::new() };
+        eprintln!("{}:{}: {kind}: {}{count}", note.line, note.column, note.message);
+    }
+    for v1::ImportName { of, from, to } in &report.names {
+        eprintln!("{of} `{from}` is named `{to}`");
+    }
+}

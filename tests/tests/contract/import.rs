@@ -1,0 +1,84 @@
+//! Robots in other formats.
+
+use plantd_client::{Code, v1};
+
+use crate::support::*;
+
+/// A pendulum of 2 kg at half a metre, inertia 0.1 kg·m² about its centre.
+pub(crate) const PENDULUM: &str = r#"<robot name="Rod">
+  <link name="base"/>
+  <joint name="hinge" type="revolute">
+    <parent link="base"/> <child link="rod"/> <axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" effort="5" velocity="1"/>
+  </joint>
+  <link name="rod">
+    <inertial>
+      <origin xyz="0 0 -0.5"/> <mass value="2"/>
+      <inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+</robot>"#;
+
+#[tokio::test]
+async fn a_robot_is_uploaded_and_driven() {
+    let (_server, client) = server().await;
+    for format in [v1::SceneFormat::Unspecified, v1::SceneFormat::Urdf] {
+        let request = v1::CreateModelRequest {
+            scene: PENDULUM.to_owned(),
+            format: format.into(),
+            name: format!("rod-{}", format as i32),
+        };
+        let answer = client.import_model(request).await.unwrap();
+        let model = answer.model.unwrap();
+        assert_eq!((&*model.coordinates[0].name, &*model.inputs[0]), ("hinge", "hinge_drive"));
+        let report = answer.import_report.unwrap();
+        assert_eq!(report.exact["revolute joint"], 1);
+        let [limit, effort, velocity] = &report.notes[..] else { panic!("{:?}", report.notes) };
+        assert_eq!((limit.kind(), limit.line), (v1::ImportKind::Approximated, 5));
+        assert_eq!(effort.message, "the input of joint `hinge` may exceed 5: limit it by channels");
+        assert_eq!(velocity.kind(), v1::ImportKind::NoEffect);
+        assert_eq!((&*report.names[0].from, &*report.names[0].to), ("Rod", "rod"));
+        // d²q/dt² = −m g l sin q / (I + m l²) + u / (I + m l²)
+        let request = v1::EvaluateDynamicsRequest {
+            model: model.name,
+            q: vec![0.3],
+            inputs: vec![1.5],
+            ..Default::default()
+        };
+        let found = client.evaluate_dynamics(request).await.unwrap().acceleration[0];
+        let expected = (1.5 - 2.0 * 9.81 * 0.5 * 0.3_f64.sin()) / (0.1 + 2.0 * 0.25);
+        assert!((found - expected).abs() < 1e-13, "{found} instead of {expected}");
+    }
+    let scene = client.validate_scene(PENDULUM).await.unwrap();
+    assert!(scene.problems.is_empty() && scene.import_report.is_some());
+    let again = client.create_model(scene.model.unwrap().scene_toml).await.unwrap();
+    assert_eq!(again.name, "rod", "the scene of a robot is a scene");
+}
+
+#[tokio::test]
+async fn a_faulty_robot_is_refused_with_lines() {
+    let (_server, client) = server().await;
+    let faulty =
+        PENDULUM.replace("value=\"2\"", "value=\"two\"").replace("link=\"base\"", "link=\"bas\"");
+    let error = client.create_model(faulty.as_str()).await.unwrap_err();
+    assert_eq!(error.code(), Some(Code::InvalidArgument));
+    let answer = client.validate_scene(faulty).await.unwrap();
+    let found: Vec<_> = answer.problems.iter().map(|p| (&*p.path, &*p.message)).collect();
+    assert_eq!(
+        found,
+        [
+            ("4:5", "there is no link `bas`"),
+            ("9:34", "`value` of `mass` is `two`; must be a finite number"),
+        ]
+    );
+    assert!(answer.model.is_none() && answer.import_report.is_none());
+    let nested = format!("<robot name=\"r\">{}", "<a>".repeat(100_000));
+    let answer = client.validate_scene(nested).await.unwrap();
+    assert!(answer.problems[0].message.contains("stand in one another"));
+    let request = v1::CreateModelRequest {
+        scene: PENDULUM.to_owned(),
+        format: v1::SceneFormat::Toml.into(),
+        ..Default::default()
+    };
+    assert_eq!(client.import_model(request).await.unwrap_err().code(), Some(Code::InvalidArgument));
+}
