@@ -37,7 +37,7 @@ def test_a_robot_is_a_file_or_a_text(client, tmp_path):
     file = tmp_path / "rod.urdf"
     file.write_text(ROBOT)
     for robot in [file, str(file), ROBOT]:
-        with pytest.warns(UserWarning, match="3:1: joint `hinge` moves past its limits"):
+        with pytest.warns(UserWarning, match="2:1: joint `hinge` moves past its limits"):
             model = client.create_model(robot, name="py-rod-1")
         gain = client.solve_lqr(model.name, q=[100, 1], r=[1])
         assert gain.spectral_radius < 1

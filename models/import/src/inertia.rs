@@ -28,7 +28,8 @@ impl Inertia {
     }
 
     /// Of bodies that move as one: `Σ m`, `Σ m c / Σ m`, `Σ I + m (d² − d dᵀ)` with `d` from the common centre.
-    pub(crate) fn sum(bodies: &[Self]) -> Self {
+    pub(crate) fn sum(bodies: impl Iterator<Item = Self>) -> Self {
+        let bodies: Vec<Self> = bodies.collect();
         let mass: f64 = bodies.iter().map(|body| body.mass).sum();
         let moment: Vector3<f64> = bodies.iter().map(|body| body.center * body.mass).sum();
         let center = if mass > 0.0 { moment / mass } else { Vector3::zeros() };
@@ -95,7 +96,7 @@ mod tests {
         let halves = [0.2, 0.4].map(|x| box_of(3.0, [0.2, 0.2, 0.1], [x, -0.1, 0.5]));
         let rotation = nalgebra::UnitQuaternion::from_euler_angles(0.3, -0.7, 1.1);
         let pose = Isometry3::from_parts(Translation3::new(1.0, 2.0, -0.5), rotation);
-        let sum = Inertia::sum(&halves.map(|half| half.at(&pose)));
+        let sum = Inertia::sum(halves.iter().map(|half| half.at(&pose)));
         let whole = whole.at(&pose);
         assert!((sum.center - whole.center).amax() < 1e-15);
         assert!((sum.tensor - whole.tensor).amax() < 1e-15);

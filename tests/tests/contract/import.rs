@@ -33,10 +33,10 @@ async fn a_robot_is_uploaded_and_driven() {
         assert_eq!((&*model.coordinates[0].name, &*model.inputs[0]), ("hinge", "hinge_drive"));
         let report = answer.import_report.unwrap();
         assert_eq!(report.exact["revolute joint"], 1);
-        let [limit, effort, velocity] = &report.notes[..] else { panic!("{:?}", report.notes) };
-        assert_eq!((limit.kind(), limit.line), (v1::ImportKind::Approximated, 5));
-        assert_eq!(effort.message, "the input of joint `hinge` may exceed 5: limit it by channels");
+        let [limit, velocity] = &report.notes[..] else { panic!("{:?}", report.notes) };
+        assert_eq!((limit.kind(), limit.line), (v1::ImportKind::Approximated, 3));
         assert_eq!(velocity.kind(), v1::ImportKind::NoEffect);
+        assert_eq!(report.exact["effort limit of an input"], 1);
         assert_eq!((&*report.names[0].from, &*report.names[0].to), ("Rod", "rod"));
         // d²q/dt² = −m g l sin q / (I + m l²) + u / (I + m l²)
         let request = v1::EvaluateDynamicsRequest {

@@ -1,10 +1,11 @@
 //! The scene of a robot.
 
+use std::collections::HashMap;
+
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use plantd_models::Scene;
 use plantd_models::scene::{
-    Body, Constraint, Coordinate, CoordinateKind, CouplingTerm, Force, Frame, Input,
-    Joint as SceneJoint, Rotation,
+    Constraint, Coordinate, CouplingTerm, Force, Frame, Input, Joint as SceneJoint, Rotation,
 };
 
 use crate::document::Reader;
@@ -27,8 +28,10 @@ struct Builder<'r, 'a, 'd> {
     scene: Scene,
     frames: Names,
     coordinates: Names,
-    /// Name of the frame of each link.
-    frame_of: Vec<String>,
+    /// The frame of each link; none for the world.
+    frame_of: Vec<Option<usize>>,
+    /// Settings of coordinates by name, in the order in which they come up.
+    settings: HashMap<String, usize>,
     /// Names of the coordinates of each joint.
     moved: Vec<Vec<String>>,
 }
@@ -40,12 +43,13 @@ pub(super) fn scene(reader: &mut Reader<'_>, robot: &Robot<'_>, options: &Option
             format: 1,
             description: "Imported from URDF.".to_owned(),
             time_step_s: options.time_step_s,
-            gravity: options.gravity,
+            gravity: Some(options.gravity),
             ..Scene::default()
         },
         frames: Names::new("frame", &["world"]),
         coordinates: Names::new("coordinate", &[]),
-        frame_of: vec![String::new(); robot.links.len()],
+        frame_of: vec![None; robot.links.len()],
+        settings: HashMap::new(),
         moved: vec![Vec::new(); robot.joints.len()],
         reader,
         robot,
@@ -63,7 +67,6 @@ impl Builder<'_, '_, '_> {
         let robot = self.robot;
         let root = &robot.links[robot.root];
         if root.name == "world" {
-            self.frame_of[robot.root] = "world".to_owned();
             if self.options.base == Base::Free {
                 self.reader.fail(root.node, "the root is `world`: this file fixes its base itself");
             }
@@ -73,7 +76,7 @@ impl Builder<'_, '_, '_> {
                 SceneJoint::Free { coordinate: Some(stem) }
             });
             let name = self.frames.add(root.name, &[""]);
-            self.frame_of[robot.root].clone_from(&name);
+            self.frame_of[robot.root] = Some(self.scene.frames.len());
             self.scene.frames.push(Frame { name, joint, ..frame_in("world") });
         }
         let mut open: Vec<usize> = robot.leaving[robot.root].iter().rev().copied().collect();
@@ -101,7 +104,8 @@ impl Builder<'_, '_, '_> {
         };
         self.moved[j] = endings.iter().map(|ending| format!("{stem}{ending}")).collect();
         let coordinate = Some(stem.clone());
-        let mut parent = self.frame_of[joint.parent].clone();
+        let parent = self.frame_of[joint.parent].map(|frame| &self.scene.frames[frame].name);
+        let mut parent = parent.map_or_else(|| "world".to_owned(), String::clone);
         let mut origin = joint.origin;
         let moves = match joint.kind {
             JointKind::Fixed => None,
@@ -116,7 +120,7 @@ impl Builder<'_, '_, '_> {
             }
         };
         let name = self.frames.add(robot.links[joint.child].name, &[""]);
-        self.frame_of[joint.child].clone_from(&name);
+        self.frame_of[joint.child] = Some(self.scene.frames.len());
         self.scene.frames.push(Frame { name, joint: moves, ..placed(&parent, &origin) });
         self.resist(j);
     }
@@ -142,13 +146,21 @@ impl Builder<'_, '_, '_> {
         parent
     }
 
-    /// Damping and dry friction.
+    /// Damping, dry friction and limits.
     fn resist(&mut self, j: usize) {
         let joint = &self.robot.joints[j];
-        for name in &self.moved[j] {
+        for name in self.moved[j].clone() {
             if joint.damping > 0.0 {
-                self.scene.coordinates.push(setting(name, 0.0, Some(joint.damping)));
+                self.setting(&name).damping = Some(joint.damping);
                 self.reader.exact("damping of a coordinate");
+            }
+            if let Some([lower, upper]) = joint.limits {
+                self.setting(&name).limits = Some([lower, upper]);
+                let message = format!(
+                    "joint `{}` moves past its limits, {lower} and {upper}: clients know them, a `stop` enforces them",
+                    joint.name
+                );
+                self.reader.note(Kind::Approximated, joint.node, message);
             }
             if joint.friction > 0.0 {
                 let velocity = self.options.friction_velocity;
@@ -157,14 +169,23 @@ impl Builder<'_, '_, '_> {
                     joint.name, joint.friction
                 );
                 self.reader.note(Kind::Approximated, joint.node, message);
-                let (coordinate, force) = (name.clone(), joint.friction);
-                self.scene.forces.push(Force::Friction { coordinate, force, velocity });
+                let force = joint.friction;
+                self.scene.forces.push(Force::Friction { coordinate: name, force, velocity });
             }
         }
     }
 
-    /// Bodies of links; those that are fixed to one another become one where one of them could not be a body
-    /// alone.
+    /// The settings of a coordinate, which are there from now on.
+    fn setting(&mut self, name: &str) -> &mut Coordinate {
+        let coordinates = &mut self.scene.coordinates;
+        let at = *self.settings.entry(name.to_owned()).or_insert_with(|| {
+            coordinates.push(Coordinate { name: name.to_owned(), ..Coordinate::default() });
+            coordinates.len() - 1
+        });
+        &mut coordinates[at]
+    }
+
+    /// Bodies of links. Those that are fixed to one another are judged together: one body.
     fn place_bodies(&mut self) {
         let robot = self.robot;
         let is_held = self.options.base == Base::Fixed || robot.links[robot.root].name == "world";
@@ -183,47 +204,44 @@ impl Builder<'_, '_, '_> {
                     }
                 }
             }
-            group.retain(|(link, _)| robot.links[*link].inertia.is_some());
+            let bodies = group
+                .into_iter()
+                .filter_map(|(link, pose)| Some((link, pose, robot.links[link].inertia?)))
+                .collect::<Vec<_>>();
             if carrier == robot.root && is_held {
-                for (link, _) in group {
+                for (link, ..) in bodies {
                     let message = "a body that is fixed to the world: it does not move";
                     self.reader.note(Kind::NoEffect, robot.links[link].node, message);
                 }
             } else {
-                self.place_group(carrier, &group);
+                self.place_group(&bodies);
             }
         }
     }
 
-    fn place_group(&mut self, carrier: usize, group: &[(usize, Isometry3<f64>)]) {
-        let robot = self.robot;
-        let own = |link: usize| robot.links[link].inertia.expect("links without are left out");
-        if group.iter().all(|(link, _)| own(*link).is_possible()) {
-            for (link, _) in group {
-                self.place_body(*link, own(*link).body(false));
+    fn place_group(&mut self, bodies: &[(usize, Isometry3<f64>, Inertia)]) {
+        let culprit = bodies.iter().find(|(.., inertia)| !inertia.is_possible());
+        let sum = || Inertia::sum(bodies.iter().map(|(_, pose, inertia)| inertia.at(pose)));
+        let mut any_inertia = false;
+        if let Some(&(link, ..)) = culprit {
+            let sum = sum();
+            any_inertia = !sum.is_possible();
+            if any_inertia {
+                let (link, moments) = (&self.robot.links[link], sum.moments());
+                let message = format!(
+                    "no body has the inertia of link `{}` and what is fixed to it: {moments:?} kg·m² violate a + b ≥ c",
+                    link.name
+                );
+                self.reader.refuse(link.node, message);
+            } else {
+                self.reader.exact("inertia that a body has with what is fixed to it only");
             }
-            return;
         }
-        let bodies: Vec<Inertia> = group.iter().map(|(link, pose)| own(*link).at(pose)).collect();
-        let sum = Inertia::sum(&bodies);
-        let is_possible = sum.is_possible();
-        if is_possible {
-            self.reader.exact("group of fixed links that is a body although one of them is not");
-        } else {
-            let (link, moments) = (&robot.links[carrier], sum.moments());
-            let message = format!(
-                "no body has the inertia of link `{}` and what is fixed to it: {moments:?} kg·m² violate a + b ≥ c",
-                link.name
-            );
-            self.reader.refuse(link.node, message);
-        }
-        self.place_body(carrier, sum.body(!is_possible));
-    }
-
-    fn place_body(&mut self, link: usize, body: Body) {
-        let name = &self.frame_of[link];
-        if let Some(frame) = self.scene.frames.iter_mut().find(|frame| frame.name == *name) {
-            frame.body = Some(body);
+        for (link, _, inertia) in bodies {
+            if let Some(frame) = self.frame_of[*link] {
+                let allow = any_inertia && !inertia.is_possible();
+                self.scene.frames[frame].body = Some(inertia.body(allow));
+            }
         }
     }
 
@@ -232,29 +250,21 @@ impl Builder<'_, '_, '_> {
         let robot = self.robot;
         for j in 0..robot.joints.len() {
             let Some(mimic) = &robot.joints[j].mimic else { continue };
-            let (own, other) = (&self.moved[j][0], &self.moved[mimic.of][0]);
+            let [own, other] = [j, mimic.of].map(|j| self.moved[j][0].clone());
             let term = |coordinate: &String, factor: f64| CouplingTerm {
                 coordinate: coordinate.clone(),
                 coefficients: vec![factor],
             };
-            let mut terms = vec![term(own, 1.0)];
+            let mut terms = vec![term(&own, 1.0)];
             if mimic.multiplier != 0.0 {
-                terms.push(term(other, -mimic.multiplier));
+                terms.push(term(&other, -mimic.multiplier));
             }
-            let constant = -mimic.offset;
-            self.scene.constraints.push(Constraint::Coupling {
-                name: own.clone(),
-                terms,
-                constant,
-            });
+            let (name, constant) = (own.clone(), -mimic.offset);
+            self.scene.constraints.push(Constraint::Coupling { name, terms, constant });
             self.reader.exact("mimic as a coupling");
             let initial = self.initial(j);
-            if initial == 0.0 {
-                continue;
-            }
-            match self.scene.coordinates.iter_mut().find(|known| known.name == *own) {
-                Some(known) => known.initial = initial,
-                None => self.scene.coordinates.push(setting(own, initial, None)),
+            if initial != 0.0 {
+                self.setting(&own).initial = initial;
             }
         }
     }
@@ -298,7 +308,12 @@ impl Builder<'_, '_, '_> {
                 continue;
             };
             let name = names.add(&format!("{coordinate}_drive"), &[""]);
-            self.scene.inputs.push(Input { name, coordinate: Some(coordinate.clone()), gain });
+            let limits = joint.effort.map(|effort| {
+                self.reader.exact("effort limit of an input");
+                [-effort / gain.abs(), effort / gain.abs()]
+            });
+            let coordinate = Some(coordinate.clone());
+            self.scene.inputs.push(Input { name, coordinate, gain, limits, ..Input::default() });
         }
     }
 
@@ -322,8 +337,4 @@ fn placed(parent: &str, origin: &Origin) -> Frame {
         Turn::Quaternion(quaternion) => Some(Rotation::Quaternion(quaternion)),
     };
     Frame { translation: origin.xyz, rotation, ..frame_in(parent) }
-}
-
-fn setting(name: &str, initial: f64, damping: Option<f64>) -> Coordinate {
-    Coordinate { name: name.to_owned(), kind: CoordinateKind::Dynamic, initial, damping }
 }

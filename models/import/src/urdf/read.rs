@@ -42,6 +42,10 @@ pub(super) struct Joint<'a> {
     pub(super) axis: [f64; 3],
     pub(super) damping: f64,
     pub(super) friction: f64,
+    /// Of position, m or rad.
+    pub(super) limits: Option<[f64; 2]>,
+    /// Greatest force or torque, N or N·m.
+    pub(super) effort: Option<f64>,
     pub(super) mimic: Option<Mimic>,
 }
 
@@ -265,8 +269,16 @@ fn joint<'a>(
             value
         });
     }
+    let (mut limits, mut effort) = (None, None);
     if let Some(limit) = reader.child(node, "limit") {
-        note_limits(reader, name, limit, node.attribute("type"));
+        let range = ["lower", "upper"].map(|end| reader.number_or(limit, end, 0.0));
+        if range[0] > range[1] {
+            let [lower, upper] = range;
+            reader.fail(limit, format!("`lower` is {lower}, `upper` {upper}; must not be less"));
+        }
+        let is_limited = range[0] < range[1] && what != "continuous joint";
+        limits = is_limited.then_some(range);
+        effort = Some(reader.number_or(limit, "effort", 0.0)).filter(|effort| *effort > 0.0);
     }
     let mimic = reader.child(node, "mimic").and_then(|mimic| {
         let of = reader.required(mimic, "joint");
@@ -283,21 +295,19 @@ fn joint<'a>(
         Some(Mimic { of, multiplier, offset })
     });
     let origin = origin(reader, node);
-    Joint { name, node, kind, parent: 0, child: 0, origin, axis, damping, friction, mimic }
-}
-
-fn note_limits<'a>(reader: &mut Reader<'_>, name: &str, limit: Node<'a, 'a>, kind: Option<&str>) {
-    let range = ["lower", "upper"].map(|end| reader.number_or(limit, end, 0.0));
-    if range != [0.0; 2] && kind != Some("continuous") {
-        let [lower, upper] = range;
-        let message = format!("joint `{name}` moves past its limits, {lower} and {upper}");
-        reader.note(Kind::Approximated, limit, message);
-    }
-    let effort = reader.number_or(limit, "effort", 0.0);
-    if effort > 0.0 {
-        let message =
-            format!("the input of joint `{name}` may exceed {effort}: limit it by channels");
-        reader.note(Kind::Approximated, limit, message);
+    Joint {
+        name,
+        node,
+        kind,
+        parent: 0,
+        child: 0,
+        origin,
+        axis,
+        damping,
+        friction,
+        limits,
+        effort,
+        mimic,
     }
 }
 
@@ -385,10 +395,10 @@ fn actuated<'a>(
         let kind = reader.child(node, "type").and_then(|kind| kind.text());
         let kind = kind.or(node.attribute("type")).unwrap_or_default().trim();
         if !kind.contains("SimpleTransmission") {
-            reader.refuse(
-                node,
-                format!("a transmission of type `{kind}`; a SimpleTransmission is understood"),
+            let message = format!(
+                "a transmission of type `{kind}`: each of its joints has an input of its own"
             );
+            reader.note(Kind::Approximated, node, message);
         }
         let mut reductions = node.descendants().filter(|n| n.has_tag_name("mechanicalReduction"));
         let gain = match reductions.next() {
@@ -401,7 +411,10 @@ fn actuated<'a>(
         if gain == 0.0 && !reader.has_failed() {
             reader.fail(node, "`mechanicalReduction` is 0; must have a value");
         }
-        for joint in node.children().filter(|child| child.has_tag_name("joint")) {
+        let is_joint = |child: &Node<'_, '_>| {
+            ["joint", "flexJoint", "rollJoint"].iter().any(|name| child.has_tag_name(*name))
+        };
+        for joint in node.children().filter(is_joint) {
             add(reader, joint, gain);
             reader.exact("transmission");
         }

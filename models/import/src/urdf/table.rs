@@ -7,6 +7,7 @@ const NAME: (&str, Treatment) = ("name", Read);
 const LIMITS: &str = "no limit of this kind is enforced";
 const SEEN: &str = "it is only seen";
 const CONTACT: &str = "nothing touches anything: contacts are not simulated";
+const OWN: &str = "each joint of the transmission has an input of its own";
 const OTHERS: &str = "it speaks to other programs";
 
 const ORIGIN: Element =
@@ -91,7 +92,7 @@ const TRANSMISSION: Element = Element::read(
                 INTERFACE,
                 REDUCTION,
                 Element::no_effect("role", OTHERS),
-                Element::refused("offset", "an input has no offset"),
+                Element::no_effect("offset", OTHERS),
             ],
         ),
         Element::read(
@@ -106,13 +107,13 @@ const TRANSMISSION: Element = Element::read(
         ),
         REDUCTION,
         Element::no_effect("motorTorqueConstant", OTHERS),
-        Element::refused("leftActuator", "one actuator of one joint is understood"),
-        Element::refused("rightActuator", "one actuator of one joint is understood"),
-        Element::refused("flexJoint", "one actuator of one joint is understood"),
-        Element::refused("rollJoint", "one actuator of one joint is understood"),
-        Element::refused("gap_joint", "one actuator of one joint is understood"),
-        Element::refused("passive_joint", "one actuator of one joint is understood"),
-        Element::refused("use_simulated_gripper_joint", "one actuator of one joint is understood"),
+        Element::no_effect("leftActuator", OWN),
+        Element::no_effect("rightActuator", OWN),
+        Element::read("flexJoint", &[NAME, ("mechanicalReduction", NoEffect(OWN))], &[]),
+        Element::read("rollJoint", &[NAME, ("mechanicalReduction", NoEffect(OWN))], &[]),
+        Element::no_effect("gap_joint", OWN),
+        Element::no_effect("passive_joint", OWN),
+        Element::no_effect("use_simulated_gripper_joint", OWN),
     ],
 );
 
