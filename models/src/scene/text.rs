@@ -110,8 +110,7 @@ mod tests {
 
     #[test]
     fn syntax_and_type_errors_carry_path_and_position() {
-        let good =
-            "format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"a\"\n[[frames]]\nname = \"arm\"\n";
+        let good = "format = 1\nname = \"a\"\n[[frames]]\nname = \"arm\"\n";
         Scene::from_toml(good).unwrap();
         let cases: &[(&str, &str, &str)] = &[
             ("format = ", "", "line 1 column 10"),

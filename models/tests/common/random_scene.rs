@@ -163,6 +163,48 @@ impl Maker {
         }
     }
 
+    /// Stops beyond whose range the mechanism starts, with dampers where it need not be conservative.
+    fn stops(&mut self) {
+        let damping = if self.kind == Kind::Any { self.random.between(0.0, 1.0) } else { 0.0 };
+        let stiffness = self.random.between(5.0, 30.0);
+        let law = format!("stiffness = {stiffness}\ndamping = {damping}\ntransition = 0.9");
+        if self.random.below(3) == 0
+            && let Some(coordinate) = self.dynamic_scalar()
+        {
+            let start = self.initial[&coordinate];
+            self.line(&format!(
+                "[[springs]]\ntype = \"stop\"\ncoordinate = \"{coordinate}\"\nrange = [{}, {}]\n{law}",
+                start - 2.0,
+                start - 0.3
+            ));
+        }
+        if self.random.below(3) == 0 {
+            let [(a, at_a), (b, at_b), (c, at_c)] = [0; 3].map(|_| self.point());
+            let length = (at_a - at_b).norm() + (at_b - at_c).norm();
+            self.line(&format!(
+                "[[springs]]\ntype = \"stop\"\npoints = [{a}, {b}, {c}]\nrange = [-1.0, {}]\n{law}",
+                0.7 * length
+            ));
+        }
+    }
+
+    /// Servos, and an input and a damper along a path.
+    fn servos(&mut self) {
+        if let Some(coordinate) = self.dynamic_scalar() {
+            self.line(&format!(
+                "[[forces]]\ntype = \"servo\"\ncoordinate = \"{coordinate}\"\ninput = \"u1\"\ngain = 3.0\nstiffness = 2.0\ndamping = 0.2\nconstant = 0.1"
+            ));
+        }
+        if self.random.below(3) > 0 {
+            return;
+        }
+        let [a, b, c] = [0; 3].map(|_| self.point().0);
+        self.line(&format!(
+            "[[forces]]\ntype = \"path_damper\"\npoints = [{a}, {b}, {c}]\ndamping = 0.3"
+        ));
+        self.line(&format!("[[inputs]]\nname = \"u2\"\npoints = [{a}, {c}]\ngain = 0.7"));
+    }
+
     fn dynamic_scalar(&mut self) -> Option<String> {
         let floating = self.kind == Kind::Floating;
         let dynamic: Vec<_> = (self.scalars.iter())
@@ -295,10 +337,11 @@ pub(crate) fn scene(seed: u64, kind: Kind) -> String {
         dynamic: 0,
         kind,
     };
+    let mut gravity = Vector3::zeros();
     if kind != Kind::Floating && maker.random.below(4) > 0 {
-        let gravity = list(&maker.vector(9.8));
-        maker.line(&format!("gravity = {gravity}"));
+        gravity = maker.vector(9.8);
     }
+    maker.line(&format!("gravity = {}", list(&gravity)));
     if kind == Kind::Any {
         let damping = maker.random.between(0.0, 0.2);
         maker.line(&format!("damping = {damping}"));
@@ -311,11 +354,19 @@ pub(crate) fn scene(seed: u64, kind: Kind) -> String {
         maker.forces();
     }
     maker.constraints();
+    maker.stops();
+    if kind == Kind::Any {
+        maker.servos();
+    }
     let mut coordinates = String::new();
     for (name, value) in &maker.initial {
         if !maker.prescribed.contains(name) {
             let _ =
                 writeln!(coordinates, "[[coordinates]]\nname = \"{name}\"\ninitial = {value:?}");
+            if kind != Kind::Floating && maker.random.below(3) == 0 {
+                let armature = maker.random.between(0.05, 0.3);
+                let _ = writeln!(coordinates, "armature = {armature}");
+            }
         }
     }
     for name in &maker.prescribed {

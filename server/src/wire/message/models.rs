@@ -1,6 +1,6 @@
 //! Models.
 
-use plantd_models::scene::Signal;
+use plantd_models::scene::{Scene, Signal};
 use plantd_models::{Model, Violation};
 use plantd_proto::v1;
 
@@ -20,7 +20,21 @@ pub fn model(name: &str, builtin: bool, model: &Model, with_texts: bool) -> v1::
         time_step_s: scene.time_step_s,
         signals: signals(model),
         initial_violations: model.initial_violations().iter().map(violation).collect(),
+        input_limits: input_limits(scene),
+        warnings: model.warnings().iter().map(ToString::to_string).collect(),
     }
+}
+
+fn limits([low, high]: [f64; 2]) -> v1::Limits {
+    v1::Limits { low, high }
+}
+
+fn input_limits(scene: &Scene) -> Vec<v1::InputLimits> {
+    let with = |(i, input): (usize, &plantd_models::scene::Input)| {
+        let limits = limits(input.limits?);
+        Some(v1::InputLimits { u_index: i as u32, limits: Some(limits) })
+    };
+    scene.inputs.iter().enumerate().filter_map(with).collect()
 }
 
 fn violation(violation: &Violation) -> v1::ConstraintViolation {
@@ -71,5 +85,6 @@ fn coordinate(coordinate: &plantd_models::Coordinate) -> v1::Coordinate {
         unit: unit.into(),
         initial: coordinate.initial,
         rotation_group: String::new(),
+        limits: coordinate.limits.map(limits),
     }
 }
