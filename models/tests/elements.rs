@@ -368,3 +368,114 @@ fn configurations_without_direction_or_wrongly_aligned_are_refused() {
         assert!(found, "{turns:?}: {error}");
     }
 }
+
+const ARM: &str = "name = \"arm\"\njoint = { type = \"revolute\", axis = [0.0, 1.0, 0.0] }";
+
+/// An armature on the first hinge is a moment of inertia about its axis.
+#[test]
+fn an_armature_is_inertia_about_its_axis() {
+    let body = |inertia: f64| {
+        format!(
+            "{ARM}\nbody = {{ mass = 1.0, center_of_mass = [0.4, 0.0, -0.3], inertia = [0.3, {inertia}, 0.3] }}"
+        )
+    };
+    let hand = "name = \"hand\"\nparent = \"arm\"\ntranslation = [0.0, 0.1, -0.5]\njoint = { type = \"revolute\", axis = [0.0, 1.0, 0.2] }\nbody = { mass = 0.5, center_of_mass = [0.1, 0.0, -0.3] }";
+    let rotor = "[[coordinates]]\nname = \"arm\"\narmature = 0.25\n";
+    let pairs = [
+        (mechanism(&[&body(0.2)], rotor), mechanism(&[&body(0.45)], "")),
+        (mechanism(&[&body(0.2), hand], rotor), mechanism(&[&body(0.45), hand], "")),
+    ];
+    for (with_rotor, with_inertia) in pairs {
+        for order in [2, 4] {
+            let [mut a, mut b] =
+                [&with_rotor, &with_inertia].map(|scene| plant(scene, |s| s.order = order));
+            for _ in 0..300 {
+                a.step(&[]).unwrap();
+                b.step(&[]).unwrap();
+            }
+            let apart = a.q().iter().zip(b.q()).fold(0.0_f64, |m, (a, b)| m.max((a - b).abs()));
+            assert!(apart < 1e-11 && a.q()[0].abs() > 0.1, "{apart:e}");
+            let (a, b) = (a.energy(), b.energy());
+            assert!((a.kinetic_j - b.kinetic_j).abs() < 1e-10, "{a:?} {b:?}");
+        }
+    }
+}
+
+/// However a step solves, its linearization is that of its steps, and energy is kept.
+#[test]
+fn armatures_are_in_every_solver() {
+    for name in ["chain-8", "tree-7", "scissor-4", "marionette", "four-bar"] {
+        let mut scene = plantd_models::builtin::scene(name).unwrap();
+        let model = common::model(&scene);
+        for (i, c) in model.coordinates().iter().enumerate() {
+            if c.kind == CoordinateKind::Prescribed {
+                continue;
+            }
+            let armature = 0.1 + 0.05 * i as f64;
+            match scene.coordinates.iter_mut().find(|listed| listed.name == c.name) {
+                Some(listed) => listed.armature = armature,
+                None => scene.coordinates.push(plantd_models::scene::Coordinate {
+                    name: c.name.clone(),
+                    armature,
+                    ..Default::default()
+                }),
+            }
+        }
+        linearization::check(&scene);
+    }
+}
+
+/// A servo is an input, a spring and a damper.
+#[test]
+fn a_servo_is_an_input_with_a_spring_and_a_damper() {
+    let arm = format!("{ARM}\nbody = {{ mass = 1.0, center_of_mass = [0.4, 0.0, 0.0] }}");
+    let servo = "[[inputs]]\nname = \"u\"\n[[forces]]\ntype = \"servo\"\ninput = \"u\"\ngain = 9.0\nstiffness = 8.0\ndamping = 0.5\nconstant = 0.3\n";
+    let alone = mechanism(&[&arm], &format!("{servo}coordinate = \"arm\"\n"));
+    let sum = "terms = [{ coordinate = \"arm\", coefficient = -1.0 }]\n";
+    let sum = mechanism(&[&arm], &format!("{servo}{sum}"));
+    let parts = |gain: f64| {
+        mechanism(
+            &[&arm],
+            &format!(
+                "[[inputs]]\nname = \"u\"\ncoordinate = \"arm\"\ngain = {gain}\n[[coordinates]]\nname = \"arm\"\ndamping = 0.5\n[[springs]]\ntype = \"coordinate\"\ncoordinate = \"arm\"\nstiffness = 8.0\n"
+            ),
+        )
+    };
+    // A constant force is an input that is always there.
+    for (servo, parts, sign) in [(alone, parts(9.0), 1.0), (sum, parts(-9.0), -1.0)] {
+        let [mut a, mut b] = [&servo, &parts].map(|scene| plant(scene, |_| ()));
+        for k in 0..300 {
+            let u = (0.05 * f64::from(k)).sin();
+            a.step(&[u]).unwrap();
+            b.step(&[u + 0.3 / 9.0]).unwrap();
+        }
+        assert!((a.q()[0] - b.q()[0]).abs() < 1e-12 && a.q()[0].abs() > 1e-2, "{sign}");
+    }
+}
+
+/// `terms` push each coordinate by its gain; along a path the force is that of its tension.
+#[test]
+fn inputs_act_on_sums_and_along_paths() {
+    let slide = |name: &str, mass: f64| {
+        format!(
+            "name = \"{name}\"\njoint = {{ type = \"prismatic\", axis = [1.0, 0.0, 0.0] }}\nbody = {{ mass = {mass} }}"
+        )
+    };
+    let frames = [slide("one", 2.0), slide("two", 3.0)];
+    let terms = "[[inputs]]\nname = \"u\"\nterms = [{ coordinate = \"one\", gain = 0.5 }, { coordinate = \"two\", gain = -2.0 }]\n";
+    let scene = mechanism(&[&frames[0], &frames[1]], terms);
+    accelerates(&scene, &[6.0], "one", 1.5);
+    accelerates(&scene, &[6.0], "two", -4.0);
+    // From the wall to the first cart and back to a hook on it: both segments shorten as it moves on.
+    let path = "[[inputs]]\nname = \"u\"\ngain = 1.5\npoints = [{ frame = \"world\", at = [9.0, 0.0, 0.0] }, { frame = \"one\" }, { frame = \"world\", at = [8.0, 0.0, 0.0] }]\n";
+    let scene = mechanism(&[&frames[0], &frames[1]], path);
+    accelerates(&scene, &[-2.0], "one", 3.0);
+}
+
+/// A gain of a component is that of the input.
+#[test]
+fn a_component_of_a_wrench_has_a_gain() {
+    let wheel = "name = \"wheel\"\njoint = { type = \"revolute\", axis = [0.0, 1.0, 0.0] }\nbody = { mass = 1.0, inertia = [0.2, 0.2, 0.2] }";
+    let torque = "[[inputs]]\nname = \"u\"\n[[forces]]\ntype = \"body_wrench\"\nframe = \"wheel\"\ntorque = [0.0, { input = \"u\", gain = -0.03 }, 0.0]\n";
+    accelerates(&mechanism(&[wheel], torque), &[2.0], "wheel", -0.3);
+}

@@ -69,3 +69,46 @@ impl Stop {
         (w, t * t * rest * rest * (30.0 * sign / self.transition))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::scalar::Dual;
+
+    const STOP: Stop = Stop { range: [-1.0, 2.0], stiffness: 7.0, damping: 3.0, transition: 0.5 };
+
+    /// Each is the derivative of the one before, and continuous where the pieces meet.
+    #[test]
+    fn derivatives_are_those_of_the_energy_and_continuous() {
+        for s in [-2.1, -1.4, -1.001, 0.3, 2.2, 2.499, 2.6] {
+            let x = Dual::new(s, 1.0);
+            let resistance = STOP.resistance(x);
+            for (found, expected) in [
+                (STOP.energy(x).eps, STOP.slope(s)),
+                (STOP.slope(x).eps, STOP.curvature(s)),
+                (resistance.0.eps, STOP.resistance(s).1),
+            ] {
+                assert!((found - expected).abs() < 1e-13, "{s}: {found} {expected}");
+            }
+        }
+        for s in [-1.5, -1.0, 2.0, 2.5] {
+            let at = |s: f64| {
+                let [x, y] =
+                    [STOP.curvature(Dual::new(s, 1.0)), STOP.resistance(Dual::new(s, 1.0)).1];
+                [STOP.energy(s), STOP.slope(s), x.re, x.eps, y.re, y.eps]
+            };
+            for (before, behind) in at(s - 1e-9).into_iter().zip(at(s + 1e-9)) {
+                assert!((before - behind).abs() < 1e-5, "{s}: {before} {behind}");
+            }
+        }
+    }
+
+    /// Far beyond the range it is a linear spring about half the transition, which pushes back.
+    #[test]
+    fn beyond_its_transition_it_is_a_linear_spring() {
+        assert!((STOP.slope(4.0) - 7.0 * (2.0 - 0.25)).abs() < 1e-14);
+        assert!((STOP.slope(-3.0) + 7.0 * (2.0 - 0.25)).abs() < 1e-14);
+        assert_eq!((STOP.slope(0.5), STOP.energy(0.5), STOP.resistance(0.5).0), (0.0, 0.0, 0.0));
+        assert_eq!(STOP.resistance(4.0), (3.0, 0.0));
+    }
+}

@@ -112,6 +112,35 @@ type = "friction"
 coordinate = "b"
 force = 0.5
 velocity = 0.3
+[[forces]]
+type = "path_damper"
+points = [{ frame = "tool", at = [0.1, 0.2, 0.3] }, { frame = "d", at = [0.3, -0.2, 0.1] }, { frame = "world", at = [1, 2, 3] }]
+damping = 1.3
+[[inputs]]
+name = "tendon"
+points = [{ frame = "tool" }, { frame = "b", at = [0.3, -0.2, 0.1] }, { frame = "d", at = [0.1, 0.1, 0.1] }]
+gain = -0.8
+[[springs]]
+type = "stop"
+points = [{ frame = "tool", at = [0.1, 0.2, 0.3] }, { frame = "a" }, { frame = "world" }]
+range = [0, 1]
+stiffness = 1
+damping = 0.7
+transition = 50
+[[springs]]
+type = "stop"
+coordinate = "d"
+range = [-9, -3]
+stiffness = 1
+damping = 0.7
+transition = 9
+[[forces]]
+type = "servo"
+terms = [{ coordinate = "b", coefficient = 0.4 }, { coordinate = "d", coefficient = -2 }]
+input = "u"
+stiffness = 2
+damping = 0.4
+constant = 0.2
 "#;
 
 /// A mechanism somewhere in motion.

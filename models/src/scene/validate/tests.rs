@@ -611,3 +611,90 @@ fn faults_of_signals_are_found_where_they_are() {
     scene.signals.push(signal);
     assert_eq!(scene.validate()[0].path, "signals");
 }
+
+/// A scene with what real robots have.
+const ROBOT: &str = r#"
+format = 1
+name = "robot"
+gravity = [0.0, 0.0, 0.0]
+[[frames]]
+name = "arm"
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+body = { mass = 1.0, inertia = [0.1, 0.1, 0.1] }
+visuals = [{ shape = { type = "sphere", radius = 0.1 }, color = [0.1, 0.2, 0.3, 1.0] }]
+[[coordinates]]
+name = "arm"
+armature = 0.25
+limits = [-1.0, 2.0]
+[[inputs]]
+name = "torque"
+terms = [{ coordinate = "arm", gain = 0.75 }]
+limits = [-3.0, 3.0]
+[[inputs]]
+name = "tendon"
+points = [{ frame = "world" }, { frame = "arm", at = [0.5, 0.0, 0.0] }]
+[[inputs]]
+name = "target"
+[[springs]]
+type = "stop"
+coordinate = "arm"
+stiffness = 50.0
+[[forces]]
+type = "servo"
+coordinate = "arm"
+input = "target"
+stiffness = 8.0
+[[forces]]
+type = "path_damper"
+points = [{ frame = "world" }, { frame = "arm", at = [0.25, 0.0, 0.0] }]
+damping = 2.5
+"#;
+
+#[test]
+fn faults_of_elements_of_robots_are_found() {
+    assert_eq!(Scene::from_toml(ROBOT).unwrap().validate(), []);
+    let cases: &[(&str, &str, &[&str])] = &[
+        ("gravity = [0.0, 0.0, 0.0]\n", "", &["gravity"]),
+        ("armature = 0.25", "armature = -0.25", &["coordinates[0].armature"]),
+        ("limits = [-1.0, 2.0]", "limits = [2.0, -1.0]", &["coordinates[0].limits"]),
+        ("limits = [-1.0, 2.0]", "limits = [-inf, 2.0]", &["coordinates[0].limits[0]"]),
+        ("limits = [-1.0, 2.0]", "", &["springs[0].range"]),
+        ("limits = [-3.0, 3.0]", "limits = [3.0, 3.0]", &["inputs[0].limits"]),
+        ("gain = 0.75", "gain = 0.0", &["inputs[0].terms[0].gain"]),
+        (
+            "[{ coordinate = \"arm\", gain",
+            "[{ coordinate = \"leg\", gain",
+            &["inputs[0].terms[0].coordinate"],
+        ),
+        ("name = \"torque\"", "name = \"torque\"\ncoordinate = \"arm\"", &["inputs[0]"]),
+        ("name = \"torque\"", "name = \"torque\"\ngain = 2.0", &["inputs[0].gain"]),
+        ("at = [0.5, 0.0, 0.0]", "at = [0.5, nan, 0.0]", &["inputs[1].points[1].at[1]"]),
+        (
+            "{ frame = \"arm\", at = [0.5, 0.0, 0.0] }",
+            "{ frame = \"world\", at = [1, 1, 1] }",
+            &["inputs[1].points"],
+        ),
+        ("radius = 0.1", "radius = 0.0", &["frames[0].visuals[0].shape.radius"]),
+        ("[0.1, 0.2, 0.3, 1.0]", "[0.1, 0.2, 0.3, 1.5]", &["frames[0].visuals[0].color[3]"]),
+        ("stiffness = 50.0", "stiffness = -50.0", &["springs[0].stiffness"]),
+        ("stiffness = 50.0", "", &["springs[0]"]),
+        ("stiffness = 50.0", "settling_depth = 0.1", &["springs[0]"]),
+        (
+            "stiffness = 50.0",
+            "settling_depth = 0.1\nsettling_time_s = 0.0",
+            &["springs[0].settling_time_s"],
+        ),
+        ("stiffness = 50.0", "stiffness = 50.0\ntransition = 0.0", &["springs[0].transition"]),
+        ("stiffness = 50.0", "stiffness = 50.0\nrange = [1.0, nan]", &["springs[0].range[1]"]),
+        ("coordinate = \"arm\"\ninput", "input", &["forces[0]"]),
+        ("input = \"target\"", "input = \"aim\"", &["inputs[2]", "forces[0].input"]),
+        ("stiffness = 8.0", "stiffness = -8.0", &["forces[0].stiffness"]),
+        ("damping = 2.5", "damping = -2.5", &["forces[1].damping"]),
+        ("at = [0.25, 0.0, 0.0]", "at = [0.25, inf, 0.0]", &["forces[1].points[1].at[1]"]),
+    ];
+    let wrong: Vec<_> = cases
+        .iter()
+        .filter_map(|(from, to, expected)| check_in(ROBOT, from, to, expected))
+        .collect();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
