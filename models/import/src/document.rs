@@ -1,6 +1,6 @@
 //! XML with positions, and what is said about it.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use roxmltree::{Document, Node, ParsingOptions};
 
@@ -95,7 +95,7 @@ pub(crate) struct Reader<'a> {
     pub(crate) report: Report,
     problems: Vec<Problem>,
     /// Where each note stands.
-    known: HashMap<(Kind, String), usize>,
+    known: BTreeMap<(Kind, String), usize>,
 }
 
 impl<'a> Reader<'a> {
@@ -109,7 +109,7 @@ impl<'a> Reader<'a> {
             is_lenient,
             report: Report::default(),
             problems: Vec::new(),
-            known: HashMap::new(),
+            known: BTreeMap::new(),
         }
     }
 

@@ -1,6 +1,6 @@
 //! Names as scenes spell them.
 
-use std::collections::HashSet;
+use std::collections::BTreeSet;
 
 use plantd_models::scene::MAX_NAME_BYTES;
 
@@ -9,7 +9,7 @@ use crate::report::Name;
 /// Names of one kind: ASCII letters, digits, hyphens and underscores, each of them once.
 pub(crate) struct Names {
     of: &'static str,
-    taken: HashSet<String>,
+    taken: BTreeSet<String>,
     /// Those that are spelled otherwise.
     pub(crate) changed: Vec<Name>,
 }

@@ -206,7 +206,7 @@ mod tests {
         let frame = &by_name.model.scene().frames[index];
         assert_eq!(frame.body.as_ref().unwrap().mass, 0.25);
         let gravity = one(&model, "gravity[1]", -3.7).unwrap();
-        assert_eq!(gravity.model.scene().gravity[1], -3.7);
+        assert_eq!(gravity.model.scene().gravity.unwrap()[1], -3.7);
     }
 
     #[test]
@@ -227,7 +227,7 @@ mod tests {
         let second = change(&first.model, &first.parameters, &mass).unwrap();
         assert_eq!(second.parameters.len(), 2);
         let back = [
-            ("gravity[1]".to_owned(), model.scene().gravity[1]),
+            ("gravity[1]".to_owned(), model.scene().gravity.unwrap()[1]),
             (
                 "frames[pole].body.mass".to_owned(),
                 model

@@ -1,6 +1,6 @@
 //! The scene of a robot.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use plantd_models::Scene;
@@ -31,7 +31,7 @@ struct Builder<'r, 'a, 'd> {
     /// The frame of each link; none for the world.
     frame_of: Vec<Option<usize>>,
     /// Settings of coordinates by name, in the order in which they come up.
-    settings: HashMap<String, usize>,
+    settings: BTreeMap<String, usize>,
     /// Names of the coordinates of each joint.
     moved: Vec<Vec<String>>,
 }
@@ -49,7 +49,7 @@ pub(super) fn scene(reader: &mut Reader<'_>, robot: &Robot<'_>, options: &Option
         frames: Names::new("frame", &["world"]),
         coordinates: Names::new("coordinate", &[]),
         frame_of: vec![None; robot.links.len()],
-        settings: HashMap::new(),
+        settings: BTreeMap::new(),
         moved: vec![Vec::new(); robot.joints.len()],
         reader,
         robot,

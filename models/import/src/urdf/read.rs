@@ -1,6 +1,6 @@
 //! What a URDF says, with its references resolved.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, Matrix3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use roxmltree::Node;
@@ -127,8 +127,8 @@ fn named<'a>(
     reader: &mut Reader<'_>,
     node: Node<'a, 'a>,
     element: &str,
-) -> (Vec<(&'a str, Node<'a, 'a>)>, HashMap<&'a str, usize>) {
-    let (mut all, mut places) = (Vec::new(), HashMap::new());
+) -> (Vec<(&'a str, Node<'a, 'a>)>, BTreeMap<&'a str, usize>) {
+    let (mut all, mut places) = (Vec::new(), BTreeMap::new());
     for child in node.children().filter(|child| child.has_tag_name(element)) {
         let name = reader.required(child, "name");
         if places.insert(name, all.len()).is_some() {
@@ -142,7 +142,7 @@ fn named<'a>(
 fn links<'a>(
     reader: &mut Reader<'_>,
     node: Node<'a, 'a>,
-) -> (Vec<Link<'a>>, HashMap<&'a str, usize>) {
+) -> (Vec<Link<'a>>, BTreeMap<&'a str, usize>) {
     let count = node.children().filter(|child| child.has_tag_name("link")).count();
     if count == 0 || count > MAX_FRAMES {
         reader.fail(node, format!("the robot has {count} links; must have 1 to {MAX_FRAMES}"));
@@ -211,8 +211,8 @@ fn origin<'a>(reader: &mut Reader<'_>, node: Node<'a, 'a>) -> Origin {
 fn joints<'a>(
     reader: &mut Reader<'_>,
     node: Node<'a, 'a>,
-    links: &HashMap<&str, usize>,
-) -> (Vec<Joint<'a>>, HashMap<&'a str, usize>) {
+    links: &BTreeMap<&str, usize>,
+) -> (Vec<Joint<'a>>, BTreeMap<&'a str, usize>) {
     let (all, places) = named(reader, node, "joint");
     let mut joints = Vec::new();
     for (name, node) in all {
@@ -236,7 +236,7 @@ fn joint<'a>(
     reader: &mut Reader<'_>,
     name: &'a str,
     node: Node<'a, 'a>,
-    places: &HashMap<&str, usize>,
+    places: &BTreeMap<&str, usize>,
 ) -> Joint<'a> {
     let (kind, what) = match reader.required(node, "type") {
         "fixed" => (JointKind::Fixed, "fixed joint"),
@@ -379,7 +379,7 @@ fn find_cycles_of_mimics(reader: &mut Reader<'_>, robot: &Robot<'_>) {
 fn actuated<'a>(
     reader: &mut Reader<'_>,
     robot: Node<'a, 'a>,
-    joints: &HashMap<&str, usize>,
+    joints: &BTreeMap<&str, usize>,
 ) -> Vec<(usize, f64)> {
     let mut actuated: Vec<(usize, f64)> = Vec::new();
     let mut add = |reader: &mut Reader<'_>, node: Node<'a, 'a>, gain: f64| {
