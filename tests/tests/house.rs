@@ -93,7 +93,14 @@ fn floors() -> Vec<(String, Vec<String>)> {
     let roots: Vec<_> = floors.iter().map(|(root, _)| root.as_str()).collect();
     assert_eq!(
         roots,
-        ["proto/src", "models/src", "server/src", "client/src", "client/src/bin/plantctl"]
+        [
+            "proto/src",
+            "models/src",
+            "models/import/src",
+            "server/src",
+            "client/src",
+            "client/src/bin/plantctl"
+        ]
     );
     floors
 }

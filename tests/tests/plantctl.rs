@@ -280,7 +280,7 @@ fn scenes_are_checked_explained_and_uploaded() {
 /// `import` needs no server; what it prints is a scene, and `upload` takes the robot itself.
 #[test]
 fn a_robot_becomes_a_scene() {
-    const ROBOT: &str = r#"<robot name="Rod"><link name="base"><sensor/></link>
+    const ROBOT: &str = r#"<robot name="Rod"><link name="base"><sensor/><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
 <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/></joint>
 <link name="rod"><inertial><mass value="2"/><inertia ixx="0.1" iyy="0.1" izz="0.01"/></inertial></link>
 </robot>"#;
@@ -295,7 +295,7 @@ fn a_robot_becomes_a_scene() {
     let output = plantctl("http://127.0.0.1:1", &arguments).output().unwrap();
     let told = stderr(&output);
     assert!(output.status.success(), "{told}");
-    assert!(told.contains("1:38: no effect: `sensor` in `link`"), "{told}");
+    assert!(told.contains("1:37: no effect: `sensor` in `link`"), "{told}");
     assert!(told.contains("1 × continuous joint"), "{told}");
     let scene = file("rod.toml", std::str::from_utf8(&output.stdout).unwrap());
     let model = json(&server, &["upload", &scene]);
@@ -318,7 +318,7 @@ fn a_robot_becomes_a_scene() {
         assert_eq!(output.status.code(), Some(1));
         let told = stderr(&output);
         assert!(told.contains("2:1: joint `hinge` has type `helical`"), "{told}");
-        assert!(told.contains("3:28: `value` of `mass` is `x`"), "{told}");
+        assert!(told.contains("3:29: `value` of `mass` is `x`"), "{told}");
     }
     let weightless =
         file("weightless.urdf", &ROBOT.replace("<inertial>", "<!--").replace("</inertial>", "-->"));

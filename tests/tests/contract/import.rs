@@ -68,7 +68,7 @@ async fn a_faulty_robot_is_refused_with_lines() {
         found,
         [
             ("4:5", "there is no link `bas`"),
-            ("9:34", "`value` of `mass` is `two`; must be a finite number"),
+            ("9:32", "`value` of `mass` is `two`; must be a finite number"),
         ]
     );
     assert!(answer.model.is_none() && answer.import_report.is_none());

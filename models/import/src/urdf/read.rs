@@ -284,6 +284,14 @@ fn joint<'a>(
         let of = reader.required(mimic, "joint");
         let multiplier = reader.number_or(mimic, "multiplier", 1.0);
         let offset = reader.number_or(mimic, "offset", 0.0);
+        if kind == JointKind::Fixed {
+            reader.note(
+                Kind::NoEffect,
+                mimic,
+                "a fixed joint that mimics another: it does not move",
+            );
+            return None;
+        }
         if !matches!(kind, JointKind::Revolute | JointKind::Prismatic) {
             reader.fail(mimic, format!("joint `{name}` mimics; must move about or along one axis"));
             return None;
@@ -385,7 +393,7 @@ fn actuated<'a>(
     let mut add = |reader: &mut Reader<'_>, node: Node<'a, 'a>, gain: f64| {
         let name = reader.required(node, "name");
         let Some(&joint) = joints.get(name) else {
-            return reader.fail(node, format!("there is no joint `{name}`"));
+            return reader.note(Kind::NoEffect, node, "a drive of a joint that is not there");
         };
         if actuated.iter().all(|(other, _)| *other != joint) {
             actuated.push((joint, gain));
