@@ -79,7 +79,7 @@ pub struct Note {
 /// A name that a scene spells otherwise.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Name {
-    /// `frame`, `coordinate`, `input` or `scene`.
+    /// `frame`, `coordinate` or `scene`.
     pub of: &'static str,
     /// In the file.
     pub from: String,
