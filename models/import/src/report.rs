@@ -120,7 +120,7 @@ pub struct Problem {
     pub message: String,
 }
 
-/// All errors of a file; of very many the first [`PROBLEMS_MAX`].
+/// All errors of a file; of very many the first hundred.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}", problems.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n"))]
 pub struct ImportError {
