@@ -108,6 +108,8 @@ impl GainExt for v1::Gain {
     }
 
     fn control_at(&self, x: &[f64]) -> Vec<f64> {
+        let columns = self.x_reference.len();
+        assert_eq!(x.len(), columns, "a state has {columns} entries here");
         let error = difference(&self.x_reference, x, &self.rotations);
         let correction = self.k.as_ref().map(|k| k.times(&error)).unwrap_or_default();
         let mut u = self.u_reference.clone();
@@ -188,6 +190,18 @@ mod tests {
         assert_eq!(gain.control(&state), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);
         let forward = v1::Gain { feedforward: vec![0.25], ..gain };
         assert_eq!(forward.control_at(&[2.0, 0.0]), [10.25 - 2.0 * 1.0 + 3.0 * 0.5]);
+    }
+
+    #[test]
+    #[should_panic(expected = "a state has 2 entries here")]
+    fn a_state_of_another_model_is_refused() {
+        let gain = v1::Gain {
+            k: Some(v1::Matrix::from_rows(&[[2.0, 3.0]])),
+            x_reference: vec![1.0, 0.5],
+            u_reference: vec![10.0],
+            ..Default::default()
+        };
+        gain.control_at(&[2.0, 0.0, 1.0, 0.0]);
     }
 
     #[test]

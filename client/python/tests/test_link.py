@@ -56,6 +56,19 @@ def test_shared_memory_and_grpc_give_the_same_bits(client, connect, poll_s):
             assert link.report == stream.report
 
 
+def test_a_gain_of_another_time_step_is_refused(client, connect):
+    _, driver = connect("pendulum")
+    with driver() as link:
+        own = link.state.time_step
+        gain, other = (
+            client.solve_lqr("pendulum", at="upright", q=[9, 1], r=[1], dt=dt)
+            for dt in (own, own / 2)
+        )
+        assert gain(link.state).shape == (1,)
+        with pytest.raises(ValueError, match=f"whose time step is {own} s"):
+            other(link.state)
+
+
 def test_failures_come_in_band_and_move_nothing(client, connect):
     plant, driver = connect("pendulum")
     with driver() as link:

@@ -547,6 +547,7 @@ class LinkDriver:
             p=payload[nq : nq + nd],
             v=payload[nq + nd : 2 * nq],
             multipliers=payload[2 * nq : outputs],
+            time_step=header.time_step_s,
         )
         self._y = payload[outputs:flags]
         self._lost = payload[flags:] != 0.0
