@@ -52,13 +52,13 @@ impl Column for Block {
 
     #[inline(always)]
     fn sum(row: &[f64], x: &[Block]) -> Block {
-        let mut sums = [Block::ZERO; 4];
-        for (row, x) in row.as_chunks::<LANES>().0.iter().zip(x.as_chunks::<LANES>().0) {
-            for (k, (row, x)) in row.iter().zip(x).enumerate() {
-                sums[k % 4] = sums[k % 4].plus(x.times(*row));
-            }
+        let [mut a, mut b, mut c, mut d] = [Block::ZERO; 4];
+        for (row, x) in row.as_chunks::<4>().0.iter().zip(x.as_chunks::<4>().0) {
+            a = a.plus(x[0].times(row[0]));
+            b = b.plus(x[1].times(row[1]));
+            c = c.plus(x[2].times(row[2]));
+            d = d.plus(x[3].times(row[3]));
         }
-        let [a, b, c, d] = sums;
         a.plus(b).plus(c.plus(d))
     }
 }
