@@ -8,7 +8,7 @@ use plantd_proto::v1;
 use crate::core::feedback::regulator::Constraints;
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::pool::Abandoned;
-use crate::wire::control::points::{at_point, check_linearization};
+use crate::wire::control::points::at_point;
 use crate::wire::message::{checks, matrices, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
@@ -21,7 +21,6 @@ pub(crate) fn analyze(
 ) -> Result<v1::AnalyzeResponse, RpcError> {
     let constraints = Constraints::new(request.constraints)?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
-    check_linearization(hub, plant.model())?;
     let outputs = Outputs::new(
         "",
         request.outputs,

@@ -9,7 +9,7 @@ use plantd_models::{
 use plantd_proto::v1;
 
 use crate::core::limits::LimitExceeded;
-use crate::wire::control::points::{at_point, check_linearization};
+use crate::wire::control::points::at_point;
 use crate::wire::message::report::report_message;
 use crate::wire::message::{checks, matrices, states};
 use crate::wire::shared::hub::Hub;
@@ -23,7 +23,6 @@ pub(crate) fn linearize_second_order(
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     let model = Arc::clone(plant.model());
     let d = model.dimensions();
-    check_linearization(hub, &model)?;
     check_second_order(hub, d.state() + d.constraints, d.state() + d.input())?;
     let state = states::plant_state(&plant);
     let mut first = Linearization::new(&model);

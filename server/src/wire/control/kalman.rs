@@ -1,5 +1,7 @@
 //! `ControlService.SolveKalman` and `SolveTrajectoryKalman`.
 
+use std::sync::Arc;
+
 use nalgebra::{DMatrix, DVector};
 use plantd_models::control::{self, Kalman, Momentum, NoiseCovariances, Sample, Values};
 use plantd_models::{Linearization, Model, State};
@@ -11,7 +13,7 @@ use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::control::analysis::Outputs;
-use crate::wire::control::points::{at_point, check_linearization, model_and_settings};
+use crate::wire::control::points::{along_trajectory, at_point};
 use crate::wire::message::{matrices, states, weights};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
@@ -23,7 +25,6 @@ pub(crate) fn solve(
 ) -> Result<v1::SolveKalmanResponse, RpcError> {
     let constraints = Constraints::new(request.constraints)?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
-    check_linearization(hub, plant.model())?;
     let outputs = outputs(request.measurement, plant.model())?;
     let noise = noise(request.noise, &outputs, plant.model())?;
     check_equilibrium(plant.clone(), &u)?;
@@ -112,10 +113,9 @@ impl TrajectoryFilter {
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;
-        let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
-        check_linearization(hub, &model)?;
-        let (plant, inputs) =
-            matrices::trajectory(request.trajectory, &model, settings, &hub.limits)?;
+        let (name, settings) = (&request.model, request.settings);
+        let (plant, inputs) = along_trajectory(hub, name, settings, request.trajectory)?;
+        let model = Arc::clone(plant.model());
         let outputs = outputs(request.measurement, &model)?;
         let noise = [noise(request.noise, &outputs, &model)?];
         let size = model.dimensions().state();

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use plantd_models::{Model, Plant, Settings};
 use plantd_proto::v1;
 
+use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
-use crate::wire::message::{settings, start, states};
+use crate::wire::message::{matrices, settings, start, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -21,18 +22,36 @@ pub(crate) fn model_and_settings(
     Ok((model, settings))
 }
 
-/// A plant at a point, and the input there.
+/// A plant at a point, of which matrices are asked for, and the input there.
 pub(crate) fn at_point(
     hub: &Hub,
     model: &str,
     settings: Option<v1::PlantSettings>,
     point: Option<v1::Point>,
 ) -> Result<(Plant, Vec<f64>), RpcError> {
-    if let Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) = &point {
-        return Ok(hub.session(id)?.copy_plant_and_input());
-    }
+    let (plant, u) = match &point {
+        Some(v1::Point { source: Some(v1::point::Source::Plant(id)) }) => {
+            hub.session(id)?.copy_plant_and_input()
+        }
+        _ => {
+            let (model, settings) = model_and_settings(hub, model, settings)?;
+            start::point(point, &model, settings)?
+        }
+    };
+    check_linearization(hub, plant.model())?;
+    Ok((plant, u))
+}
+
+/// A plant at the start of a trajectory, of which matrices are asked for, and the inputs along it.
+pub(crate) fn along_trajectory(
+    hub: &Hub,
+    model: &str,
+    settings: Option<v1::PlantSettings>,
+    trajectory: Option<v1::Trajectory>,
+) -> Result<(Plant, Inputs), RpcError> {
     let (model, settings) = model_and_settings(hub, model, settings)?;
-    start::point(point, &model, settings)
+    check_linearization(hub, &model)?;
+    matrices::trajectory_in("trajectory", trajectory, &model, settings, &hub.limits)
 }
 
 /// Name of the model that such a point is of.
@@ -50,7 +69,7 @@ pub(crate) fn model_at(
 }
 
 /// Refuses matrices that no client would take.
-pub(crate) fn check_linearization(hub: &Hub, model: &Model) -> Result<(), RpcError> {
+fn check_linearization(hub: &Hub, model: &Model) -> Result<(), RpcError> {
     let numbers = states::linearization_numbers(model.dimensions());
     let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
     Ok(LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?)

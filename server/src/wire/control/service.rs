@@ -16,7 +16,7 @@ use crate::core::feedback::regulator::{self, Constraints, Memory, Path};
 use crate::core::inputs::Inputs;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::answers::Answers;
-use crate::wire::control::points::{at_point, check_linearization, model_and_settings, model_at};
+use crate::wire::control::points::{along_trajectory, at_point, model_at};
 use crate::wire::control::{analysis, derivatives, kalman, optimize, reference, rollout};
 use crate::wire::message::report::report_message;
 use crate::wire::message::weights::{self, WeightFields};
@@ -37,11 +37,21 @@ impl ControlService {
     pub fn new(hub: Arc<Hub>) -> Self {
         Self { hub }
     }
+
+    /// What a worker makes of a request.
+    async fn answer<Q: Send + 'static, A: Send + 'static>(
+        &self,
+        request: Request<Q>,
+        job: impl FnOnce(&Hub, Q, &Abandoned) -> Result<A, RpcError> + Send + 'static,
+    ) -> Result<Response<A>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |abandoned: &Abandoned| job(&hub, request, abandoned);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
 }
 
 fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse, RpcError> {
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
-    check_linearization(hub, plant.model())?;
     let state = states::plant_state(&plant);
     let mut linearization = Linearization::new(plant.model());
     let report = plant.step_and_linearize(&u, &mut linearization)?;
@@ -60,7 +70,6 @@ fn solve_lqr(hub: &Hub, request: v1::SolveLqrRequest) -> Result<v1::SolveLqrResp
     let constraints = Constraints::new(request.constraints)?;
     let model = model_at(hub, &request.model, request.point.as_ref())?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
-    check_linearization(hub, plant.model())?;
     let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
     let weights = weights::weights(request.weights, plant.model())?;
     let regulator = regulator::about_point(&mut plant, &u, &weights, momentum, constraints)?;
@@ -91,13 +100,11 @@ struct LinearizedTrajectory {
 
 impl LinearizedTrajectory {
     fn new(hub: &Hub, request: v1::LinearizeTrajectoryRequest) -> Result<Self, RpcError> {
-        let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
-        check_linearization(hub, &model)?;
-        let (plant, inputs) =
-            matrices::trajectory(request.trajectory, &model, settings, &hub.limits)?;
-        let numbers = states::linearization_numbers(model.dimensions()).max(1);
+        let v1::LinearizeTrajectoryRequest { model, settings, trajectory } = request;
+        let (plant, inputs) = along_trajectory(hub, &model, settings, trajectory)?;
+        let numbers = states::linearization_numbers(plant.model().dimensions()).max(1);
         let portion = (PORTION_NUMBERS / numbers).max(1);
-        let linearization = Linearization::new(&model);
+        let linearization = Linearization::new(plant.model());
         Ok(Self { plant, inputs, linearization, steps_taken: 0, portion })
     }
 
@@ -190,10 +197,9 @@ impl TrajectoryRegulator {
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;
-        let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
-        check_linearization(hub, &model)?;
-        let (plant, inputs) =
-            matrices::trajectory(request.trajectory, &model, settings, &hub.limits)?;
+        let (name, settings) = (&request.model, request.settings);
+        let (plant, inputs) = along_trajectory(hub, name, settings, request.trajectory)?;
+        let model = Arc::clone(plant.model());
         let values = if request.values { Values::Keep } else { Values::Drop };
         let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
         let (steps, stages) = (inputs.count(), request.stages.len());
@@ -201,7 +207,7 @@ impl TrajectoryRegulator {
         let fields = WeightFields::default();
         let (weights, stages) = (request.weights, request.stages);
         let weights = weights::trajectory_weights(fields, weights, stages, steps, &model)?;
-        let common = states::gain_of(&request.model, plant.model(), plant.settings());
+        let common = states::gain_of(&request.model, &model, plant.settings());
         let path = Path::follow(plant, &inputs, momentum, constraints, abandoned)?;
         let solution = path.solve(&weights, values)?;
         Ok(Self {
@@ -257,9 +263,7 @@ impl v1::control_service_server::ControlService for ControlService {
         &self,
         request: Request<v1::LinearizeRequest>,
     ) -> Result<Response<v1::LinearizeResponse>, Status> {
-        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
-        let job = move |_: &_| linearize(&hub, request);
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        self.answer(request, |hub, request, _| linearize(hub, request)).await
     }
 
     async fn linearize_trajectory(
@@ -277,9 +281,7 @@ impl v1::control_service_server::ControlService for ControlService {
         &self,
         request: Request<v1::SolveLqrRequest>,
     ) -> Result<Response<v1::SolveLqrResponse>, Status> {
-        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
-        let job = move |_: &_| solve_lqr(&hub, request);
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        self.answer(request, |hub, request, _| solve_lqr(hub, request)).await
     }
 
     async fn solve_trajectory_lqr(
@@ -311,27 +313,22 @@ impl v1::control_service_server::ControlService for ControlService {
         &self,
         request: Request<v1::LinearizeSecondOrderRequest>,
     ) -> Result<Response<v1::LinearizeSecondOrderResponse>, Status> {
-        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
-        let job = move |_: &_| derivatives::linearize_second_order(&hub, request);
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        self.answer(request, |hub, request, _| derivatives::linearize_second_order(hub, request))
+            .await
     }
 
     async fn evaluate_dynamics(
         &self,
         request: Request<v1::EvaluateDynamicsRequest>,
     ) -> Result<Response<v1::EvaluateDynamicsResponse>, Status> {
-        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
-        let job = move |_: &_| derivatives::evaluate_dynamics(&hub, request);
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        self.answer(request, |hub, request, _| derivatives::evaluate_dynamics(hub, request)).await
     }
 
     async fn analyze(
         &self,
         request: Request<v1::AnalyzeRequest>,
     ) -> Result<Response<v1::AnalyzeResponse>, Status> {
-        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
-        let job = move |abandoned: &Abandoned| analysis::analyze(&hub, request, abandoned);
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        self.answer(request, analysis::analyze).await
     }
 
     async fn optimize_trajectory(
@@ -364,9 +361,7 @@ impl v1::control_service_server::ControlService for ControlService {
         &self,
         request: Request<v1::SolveKalmanRequest>,
     ) -> Result<Response<v1::SolveKalmanResponse>, Status> {
-        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
-        let job = move |_: &_| kalman::solve(&hub, request);
-        Ok(Response::new(self.hub.workers.run(job).await?))
+        self.answer(request, |hub, request, _| kalman::solve(hub, request)).await
     }
 
     async fn solve_trajectory_kalman(

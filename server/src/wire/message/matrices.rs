@@ -12,16 +12,6 @@ use crate::wire::message::checks::check_shape;
 use crate::wire::message::start::{Start, momentum, plant};
 use crate::wire::status::RpcError;
 
-/// The initial state and the inputs of a trajectory.
-pub fn trajectory(
-    trajectory: Option<v1::Trajectory>,
-    model: &Arc<Model>,
-    settings: Settings,
-    limits: &Limits,
-) -> Result<(Plant, Inputs), RpcError> {
-    trajectory_in("trajectory", trajectory, model, settings, limits)
-}
-
 /// The initial state and the inputs of a trajectory in a field of the request.
 pub fn trajectory_in(
     field: &str,
