@@ -1,96 +1,19 @@
-//! XML with positions, and what is said about it.
+//! What is read of a document, and what is said about it.
 
 use std::collections::BTreeMap;
 
-use roxmltree::{Document, Node, ParsingOptions};
-
-use plantd_models::scene::MAX_TEXT_BYTES;
+use roxmltree::Node;
 
 use crate::report::{Kind, Note, PROBLEMS_MAX, Problem, Report};
+use crate::source::Source;
 use crate::table::{Element, Treatment};
 
-/// Elements, texts and comments that are read at most.
-const NODES_MAX: u32 = 1 << 20;
 /// Notes that are told at most.
 const NOTES_MAX: usize = 1000;
-/// Characters of a line that are told apart from bytes.
-const LINE_MAX: usize = 1 << 12;
-/// Elements in one another at most.
-const DEPTH_MAX: usize = 256;
-
-/// Reads XML without document type definitions, so that no entity can grow.
-pub(crate) fn open(text: &str) -> Result<Document<'_>, Vec<Problem>> {
-    let single = |line, column, message| vec![Problem { line, column, message }];
-    if text.len() > MAX_TEXT_BYTES {
-        let message =
-            format!("the text has {} bytes; at most {MAX_TEXT_BYTES} are read", text.len());
-        return Err(single(1, 1, message));
-    }
-    if let Some(problem) = too_deep(text) {
-        return Err(vec![problem]);
-    }
-    let options = ParsingOptions { allow_dtd: false, nodes_limit: NODES_MAX, ..Default::default() };
-    Document::parse_with_options(text, options).map_err(|error| {
-        let at = error.pos();
-        single(at.row, at.col, format!("not XML that is read here: {error}"))
-    })
-}
-
-/// The first tag within more than [`DEPTH_MAX`] others. Readers of XML call themselves for each level, and
-/// the stack has an end.
-fn too_deep(text: &str) -> Option<Problem> {
-    let (mut depth, mut rest) = (0_usize, text);
-    while let Some(start) = rest.find('<') {
-        rest = &rest[start..];
-        let skipped = [("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>")];
-        if let Some((open, close)) = skipped.iter().find(|(open, _)| rest.starts_with(open)) {
-            let from = &rest[open.len()..];
-            rest = &from[from.find(close)?..];
-            continue;
-        }
-        let end = end_of_tag(rest)?;
-        match &rest[1..end] {
-            tag if tag.starts_with('/') => depth = depth.saturating_sub(1),
-            tag if tag.ends_with('/') || tag.starts_with('!') => {}
-            _ => depth += 1,
-        }
-        if depth > DEPTH_MAX {
-            let (line, column) = position(text, text.len() - rest.len());
-            let message = format!("more than {DEPTH_MAX} elements stand in one another");
-            return Some(Problem { line, column, message });
-        }
-        rest = &rest[end..];
-    }
-    None
-}
-
-/// Where a tag that starts the text ends, its quoted values left out.
-fn end_of_tag(text: &str) -> Option<usize> {
-    let mut quote = None;
-    text.char_indices().find_map(|(i, c)| {
-        match (quote, c) {
-            (None, '>') => return Some(i),
-            (None, '"' | '\'') => quote = Some(c),
-            (Some(open), c) if open == c => quote = None,
-            _ => {}
-        }
-        None
-    })
-}
-
-/// Line and column, counted from 1, columns in characters.
-fn position(text: &str, byte: usize) -> (u32, u32) {
-    let before = &text[..byte];
-    let start = before.rfind('\n').map_or(0, |i| i + 1);
-    let line = before.bytes().filter(|b| *b == b'\n').count() + 1;
-    (line as u32, text[start..byte].chars().count() as u32 + 1)
-}
 
 /// Collects what is to be said of a document.
 pub(crate) struct Reader<'a> {
-    text: &'a str,
-    /// Where lines start.
-    lines: Vec<usize>,
+    source: &'a Source<'a>,
     is_lenient: bool,
     pub(crate) report: Report,
     problems: Vec<Problem>,
@@ -99,13 +22,9 @@ pub(crate) struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    pub(crate) fn new(document: &'a Document<'_>, is_lenient: bool) -> Self {
-        let text = document.input_text();
-        let starts = text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n');
-        let lines = std::iter::once(0).chain(starts.map(|(i, _)| i + 1)).collect();
+    pub(crate) fn new(source: &'a Source<'a>, is_lenient: bool) -> Self {
         Self {
-            text,
-            lines,
+            source,
             is_lenient,
             report: Report::default(),
             problems: Vec::new(),
@@ -124,14 +43,6 @@ impl<'a> Reader<'a> {
         !self.problems.is_empty()
     }
 
-    fn place(&self, byte: usize) -> (u32, u32) {
-        let line = self.lines.partition_point(|start| *start <= byte);
-        let start = self.lines[line - 1];
-        let far = byte - start > LINE_MAX;
-        let column = if far { byte - start } else { self.text[start..byte].chars().count() };
-        (line as u32, column as u32 + 1)
-    }
-
     /// Says what is wrong.
     pub(crate) fn fail(&mut self, node: Node<'_, '_>, message: impl Into<String>) {
         self.fail_at(node.range().start, message.into());
@@ -139,8 +50,7 @@ impl<'a> Reader<'a> {
 
     fn fail_at(&mut self, byte: usize, message: String) {
         if self.problems.len() < PROBLEMS_MAX {
-            let (line, column) = self.place(byte);
-            self.problems.push(Problem { line, column, message });
+            self.problems.push(self.source.problem_at(byte, message));
         }
     }
 
@@ -166,9 +76,9 @@ impl<'a> Reader<'a> {
         if let Some(&known) = self.known.get(&(kind, message.clone())) {
             self.report.notes[known].count += 1;
         } else if self.report.notes.len() < NOTES_MAX {
-            let (line, column) = self.place(byte);
             self.known.insert((kind, message.clone()), self.report.notes.len());
-            self.report.notes.push(Note { kind, line, column, message, count: 1 });
+            let Problem { file, line, column, message } = self.source.problem_at(byte, message);
+            self.report.notes.push(Note { kind, file, line, column, message, count: 1 });
         } else {
             self.report.left_out += 1;
         }
@@ -185,10 +95,8 @@ impl<'a> Reader<'a> {
         while let Some((node, element)) = open.pop() {
             for attribute in node.attributes() {
                 let name = attribute.name();
-                let known = element.attributes.iter().find(|(known, _)| *known == name);
                 let what = format!("attribute `{name}` of `{}`", element.name);
-                let treatment = known.map(|(_, treatment)| *treatment);
-                self.treat(treatment, attribute.range().start, &what);
+                self.treat(element.attribute(name), attribute.range().start, &what);
             }
             for child in node.children().filter(Node::is_element) {
                 let name = child.tag_name().name();
@@ -196,12 +104,9 @@ impl<'a> Reader<'a> {
                     self.fail(child, format!("`{name}` belongs to another language; if this is xacro, expand it first: `xacro FILE > robot.urdf`"));
                     continue;
                 }
-                let known = element.children.iter().find(|known| known.name == name);
                 let what = format!("`{name}` in `{}`", element.name);
-                self.treat(known.map(|known| known.treatment), child.range().start, &what);
-                if let Some(known) = known.filter(|known| known.treatment == Treatment::Read) {
-                    open.push((child, known));
-                }
+                self.treat(element.treatment(name), child.range().start, &what);
+                open.extend(element.child(name).map(|known| (child, known)));
             }
         }
     }
@@ -211,6 +116,12 @@ impl<'a> Reader<'a> {
             Some(Treatment::Read) => {}
             Some(Treatment::NoEffect(why)) => {
                 self.note_at(Kind::NoEffect, byte, format!("{what}: {why}"));
+            }
+            Some(Treatment::Contact) => {
+                let message = format!(
+                    "{what}: contacts are not simulated; bodies pass through one another and through the floor"
+                );
+                self.note_at(Kind::Contact, byte, message);
             }
             Some(Treatment::Refused(what_to_do)) => {
                 self.refuse_at(byte, format!("{what}: {what_to_do}"));
@@ -270,22 +181,77 @@ impl<'a> Reader<'a> {
         name: &str,
         text: &str,
     ) -> [f64; N] {
-        let mut numbers = [0.0; N];
-        let mut words = text.split_ascii_whitespace();
-        let mut is_good = true;
-        for number in &mut numbers {
-            match words.next().and_then(|word| word.parse::<f64>().ok()) {
-                Some(value) if value.is_finite() => *number = value,
-                _ => is_good = false,
-            }
-        }
-        if is_good && words.next().is_none() {
-            return numbers;
-        }
-        let shown: String = text.chars().take(60).collect();
-        let allowed = if N == 1 { "a finite number".into() } else { format!("{N} finite numbers") };
-        let of = node.tag_name().name();
-        self.fail(node, format!("`{name}` of `{of}` is `{shown}`; must be {allowed}"));
-        [0.0; N]
+        let numbers = list(text, N).and_then(|numbers| numbers.try_into().ok());
+        numbers.unwrap_or_else(|| {
+            let allowed = if N == 1 { "a".to_owned() } else { N.to_string() };
+            self.fail_number(node, name, text, &allowed, N);
+            [0.0; N]
+        })
     }
+
+    /// One to so many finite numbers, which take the places of the first of others.
+    pub(crate) fn first_numbers<const N: usize>(
+        &mut self,
+        node: Node<'_, '_>,
+        name: &str,
+        text: &str,
+        others: &mut [f64; N],
+    ) {
+        match list(text, N).filter(|numbers| !numbers.is_empty()) {
+            Some(numbers) => others[..numbers.len()].copy_from_slice(&numbers),
+            None => self.fail_number(node, name, text, &format!("1 to {N}"), N),
+        }
+    }
+
+    /// Any count of finite numbers.
+    pub(crate) fn all_numbers(&mut self, node: Node<'_, '_>, name: &str, text: &str) -> Vec<f64> {
+        list(text, usize::MAX).unwrap_or_else(|| {
+            self.fail_number(node, name, text, "any count of", 2);
+            Vec::new()
+        })
+    }
+
+    fn fail_number(
+        &mut self,
+        node: Node<'_, '_>,
+        name: &str,
+        text: &str,
+        how_many: &str,
+        n: usize,
+    ) {
+        let (of, shown) = (node.tag_name().name(), shown(text));
+        let plural = if n == 1 { "" } else { "s" };
+        let message =
+            format!("`{name}` of `{of}` is `{shown}`; must be {how_many} finite number{plural}");
+        self.fail(node, message);
+    }
+
+    /// One of the words that are allowed, by its place among them; the first where it is none of them.
+    pub(crate) fn keyword(
+        &mut self,
+        node: Node<'_, '_>,
+        name: &str,
+        text: &str,
+        allowed: &[&str],
+    ) -> usize {
+        allowed.iter().position(|word| *word == text.trim()).unwrap_or_else(|| {
+            let (of, shown, allowed) = (node.tag_name().name(), shown(text), allowed.join("`, `"));
+            let message = format!("`{name}` of `{of}` is `{shown}`; must be one of `{allowed}`");
+            self.fail(node, message);
+            0
+        })
+    }
+}
+
+/// Finite numbers apart by white space, at most so many.
+fn list(text: &str, most: usize) -> Option<Vec<f64>> {
+    let finite = |word: &str| word.parse::<f64>().ok().filter(|number| number.is_finite());
+    let numbers: Option<Vec<f64>> =
+        text.split_ascii_whitespace().take(most.saturating_add(1)).map(finite).collect();
+    numbers.filter(|numbers| numbers.len() <= most)
+}
+
+/// The beginning of a text.
+fn shown(text: &str) -> String {
+    text.chars().take(60).collect()
 }

@@ -1,4 +1,4 @@
-//! Robots in other formats as scenes of plantd.
+//! Robots in URDF and MJCF as scenes of plantd.
 //!
 //! Text in, a [`Scene`](plantd_models::Scene) and a [`Report`] out; nothing is read or written elsewhere. The report says of
 //! everything in the file whether it was taken exactly, taken approximately, has no effect on the motion, or
@@ -26,30 +26,87 @@
 //! ```
 
 mod document;
+mod draft;
 mod inertia;
+mod mjcf;
 mod names;
 mod options;
 mod report;
+mod source;
 mod table;
 mod urdf;
+mod xml;
 
-pub use crate::options::{Base, Inputs, Options};
+pub use crate::options::{Base, EARTH, Inputs, Options};
 pub use crate::report::{Import, ImportError, Kind, Name, Note, Problem, Report};
+pub use crate::source::Files;
+
+use crate::document::Reader;
+use crate::source::Source;
 
 /// Whether a text is for [`import`] and not a scene: its first character that is not white space is `<`.
 pub fn is_xml(text: &str) -> bool {
     text.trim_start_matches('\u{feff}').trim_start().starts_with('<')
 }
 
-/// Reads a robot in URDF, versions 1.0 to 1.2.
+/// Reads a robot in URDF, versions 1.0 to 1.2, or in MJCF, as MuJoCo 4 reads it; the root element says which.
 ///
 /// The scene is not compiled; [`Import::check`] does that. At most [`plantd_models::scene::MAX_TEXT_BYTES`] are read, in time and memory that grow with the text.
+/// An MJCF that includes files is refused; [`import_with_files`] takes it.
 ///
 /// # Errors
 ///
 /// All problems of the file at once, each with line and column.
 pub fn import(text: &str, options: &Options) -> Result<Import, ImportError> {
-    document::open(text)
-        .and_then(|document| urdf::import(&document, options))
+    read(&Source::single(text), options).map_err(|problems| ImportError { problems })
+}
+
+/// As [`import`], with the files that an MJCF includes.
+///
+/// # Errors
+///
+/// As [`import`]; and that a file cannot be read, or is included twice.
+pub fn import_with_files(
+    text: &str,
+    options: &Options,
+    files: &mut Files<'_>,
+) -> Result<Import, ImportError> {
+    source(text, files)
+        .and_then(|source| read(&source, options))
         .map_err(|problems| ImportError { problems })
+}
+
+/// A text with the files that it includes, if it is an MJCF; others are as they were.
+///
+/// # Errors
+///
+/// That a file cannot be read, is no XML, or is included twice.
+pub fn with_includes(text: &str, files: &mut Files<'_>) -> Result<String, ImportError> {
+    let whole = source(text, files).map_err(|problems| ImportError { problems })?;
+    Ok(whole.text.into_owned())
+}
+
+fn source<'t>(text: &'t str, files: &mut Files<'_>) -> Result<Source<'t>, Vec<Problem>> {
+    if is_xml(text) && text.contains("<include") && text.contains("<mujoco") {
+        Source::with_includes(text, files)
+    } else {
+        Ok(Source::single(text))
+    }
+}
+
+fn read(source: &Source<'_>, options: &Options) -> Result<Import, Vec<Problem>> {
+    let document = xml::open(&source.text)?;
+    let mut reader = Reader::new(source, options.lenient);
+    let root = document.root_element();
+    let scene = match root.tag_name().name() {
+        "robot" => urdf::scene(&mut reader, root, options),
+        "mujoco" => mjcf::scene(&mut reader, root, options),
+        name => {
+            let allowed = "must be `robot` (URDF) or `mujoco` (MJCF)";
+            reader.fail(root, format!("the root is `{name}`; {allowed}"));
+            None
+        }
+    };
+    let report = reader.finish()?;
+    Ok(Import { scene: scene.unwrap_or_default(), report })
 }

@@ -7,10 +7,10 @@ pub struct Options {
     pub base: Base,
     /// Which joints get an input.
     pub inputs: Inputs,
-    /// Acceleration of gravity, world axes, m/s².
-    pub gravity: [f64; 3],
-    /// Time step that the scene suggests, s.
-    pub time_step_s: f64,
+    /// Acceleration of gravity, world axes, m/s²; if not given that of the file, and [`EARTH`] where it has none.
+    pub gravity: Option<[f64; 3]>,
+    /// Time step that the scene suggests, s; if not given that of the file, and 0.001 where it has none.
+    pub time_step_s: Option<f64>,
     /// Velocity at which 76 % of the dry friction of a joint are reached, m/s or rad/s.
     pub friction_velocity: f64,
     /// What cannot be expressed is left out with a warning, and inertias that no body has are taken as they are.
@@ -22,15 +22,18 @@ impl Default for Options {
         Self {
             base: Base::Fixed,
             inputs: Inputs::AsTold,
-            gravity: [0.0, 0.0, -9.81],
-            time_step_s: 0.001,
+            gravity: None,
+            time_step_s: None,
             friction_velocity: 0.01,
             lenient: false,
         }
     }
 }
 
-/// What holds the root link.
+/// Acceleration of gravity where nobody says otherwise, m/s².
+pub const EARTH: [f64; 3] = [0.0, 0.0, -9.81];
+
+/// What holds the root link of a URDF. An MJCF says itself which of its bodies are free.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Base {
     /// The world.
@@ -40,13 +43,14 @@ pub enum Base {
     Free,
 }
 
-/// Which joints get an input, a force or torque along their axis.
+/// What gets an input.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Inputs {
-    /// Those of transmissions and command interfaces; all if the file has none of these.
+    /// The joints of a URDF that transmissions and command interfaces name, or all if the file has none of
+    /// these; the actuators of an MJCF.
     #[default]
     AsTold,
-    /// All that move about or along one axis and mimic no other.
+    /// All joints that move about or along one axis and mimic no other, and nothing else.
     All,
     /// None.
     None,

@@ -30,7 +30,7 @@ impl Import {
 pub struct Report {
     /// What was taken exactly: kinds of things and how many of them.
     pub exact: BTreeMap<&'static str, usize>,
-    /// What was not: warnings, approximations, then what has no effect, each in the order of the file.
+    /// What was not: contacts, warnings, approximations, then what has no effect, each in the order of the file.
     pub notes: Vec<Note>,
     /// Notes beyond the first thousand.
     pub left_out: usize,
@@ -41,6 +41,8 @@ pub struct Report {
 /// How something was treated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
+    /// What says what touches what. Nothing touches anything: contacts are not simulated.
+    Contact,
     /// Left out although it may change the motion: what the format does not have, and, where the user says so,
     /// what is refused otherwise.
     Warning,
@@ -54,6 +56,7 @@ impl Kind {
     /// In words.
     pub fn name(self) -> &'static str {
         match self {
+            Self::Contact => "contact",
             Self::Warning => "warning",
             Self::Approximated => "approximated",
             Self::NoEffect => "no effect",
@@ -66,7 +69,9 @@ impl Kind {
 pub struct Note {
     /// How it was treated.
     pub kind: Kind,
-    /// Line of the first of them, from 1.
+    /// File of the first of them; empty for the text that was given.
+    pub file: String,
+    /// Its line, from 1.
     pub line: u32,
     /// Column in characters, from 1.
     pub column: u32,
@@ -87,21 +92,36 @@ pub struct Name {
     pub to: String,
 }
 
+/// A file's name before a line.
+fn prefix(file: &str) -> String {
+    if file.is_empty() { String::new() } else { format!("{file}:") }
+}
+
+impl fmt::Display for Note {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { kind, file, line, column, message, count } = self;
+        write!(f, "{}{line}:{column}: {}: {message}", prefix(file), kind.name())?;
+        if *count > 1 { write!(f, " (× {count})") } else { Ok(()) }
+    }
+}
+
+impl fmt::Display for Name {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} `{}` is named `{}`", self.of, self.from, self.to)
+    }
+}
+
 impl fmt::Display for Report {
     /// One line for each entry.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for note in &self.notes {
-            write!(f, "{}:{}: {}: {}", note.line, note.column, note.kind.name(), note.message)?;
-            match note.count {
-                1 => writeln!(f)?,
-                count => writeln!(f, " (× {count})")?,
-            }
+            writeln!(f, "{note}")?;
         }
         if self.left_out > 0 {
             writeln!(f, "and {} notes more", self.left_out)?;
         }
-        for Name { of, from, to } in &self.names {
-            writeln!(f, "{of} `{from}` is named `{to}`")?;
+        for name in &self.names {
+            writeln!(f, "{name}")?;
         }
         let exact: Vec<_> = self.exact.iter().map(|(what, n)| format!("{n} × {what}")).collect();
         writeln!(f, "exact: {}", exact.join(", "))
@@ -110,8 +130,10 @@ impl fmt::Display for Report {
 
 /// One error of a file.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{line}:{column}: {message}")]
+#[error("{}{line}:{column}: {message}", prefix(file))]
 pub struct Problem {
+    /// File that the text includes; empty for the text itself.
+    pub file: String,
     /// Line, from 1.
     pub line: u32,
     /// Column in characters, from 1.

@@ -342,7 +342,6 @@ fn what_is_wrong_is_named_with_its_place() {
             change("<robot name=\"Arm 1\">", "<model>").replace("</robot>", "</model>"),
             "the root is `model`",
         ),
-        ("<mujoco/>".to_owned(), "1:1: MJCF is not read yet"),
         (change("Arm 1\"", "Arm 1\" version=\"2.0\""), "`version`"),
         (change("type=\"revolute\"", "type=\"helical\""), "4:3: joint `hinge` has type `helical`"),
         (change("<child link=\"rod\"/>", "<child link=\"rodd\"/>"), "there is no link `rodd`"),

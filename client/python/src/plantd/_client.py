@@ -148,7 +148,7 @@ class Client:
     def create_model(
         self, scene: str | PathLike[str], *, name: str = ""
     ) -> model_service_pb2.Model:
-        """Uploads a scene (TOML, JSON) or a robot (URDF): a text of several lines, or a file.
+        """Uploads a scene (TOML, JSON) or a robot (URDF, MJCF): a text of several lines, or a file.
 
         All errors are in the error's ``violations``. What a robot says and a scene cannot is a
         ``UserWarning`` with lines and columns; what has no effect on the motion is not mentioned.

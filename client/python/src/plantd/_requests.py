@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -43,7 +44,27 @@ def scene_text(scene: str | PathLike[str]) -> str:
     """The text of a scene: itself if it has several lines or begins as JSON or XML, else a file's."""
     if isinstance(scene, str) and ("\n" in scene or scene.lstrip().startswith(("{", "<"))):
         return scene
-    return Path(scene).read_text(encoding="utf-8")
+    path = Path(scene)
+    text = path.read_text(encoding="utf-8")
+    return _with_includes(text, path.parent, [path.name]) if "<mujoco" in text else text
+
+
+def _with_includes(text: str, folder: Path, seen: list[str]) -> str:
+    """An MJCF in which each ``include`` is replaced by what is in the root of its file."""
+    text = re.sub(r"<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text, flags=re.S)
+
+    def included(element: re.Match[str]) -> str:
+        name = element[1]
+        if name in seen:
+            raise ValueError(f"`{name}` is included twice; once is allowed")
+        seen.append(name)
+        inner = _with_includes((folder / name).read_text(encoding="utf-8"), folder, seen)
+        root = re.search(r"<mujoco[^>]*?(?:/>|>(.*)</mujoco)", inner, flags=re.S)
+        if root is None:
+            raise ValueError(f"`{name}` is no MJCF: its root must be `mujoco` or `mujocoinclude`")
+        return root[1] or ""
+
+    return re.sub(r"""<include\s+file=["']([^"']*)["']\s*(?:/>|>\s*</include>)""", included, text)
 
 
 def settings(

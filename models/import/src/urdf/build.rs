@@ -1,55 +1,38 @@
 //! The scene of a robot.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use plantd_models::Scene;
-use plantd_models::scene::{
-    Constraint, Coordinate, CouplingTerm, Force, Frame, Input, Joint as SceneJoint, Rotation,
-};
+use plantd_models::scene::{Constraint, CouplingTerm, Frame, Input, Joint as SceneJoint, Rotation};
 
 use crate::document::Reader;
+use crate::draft::{BALL, Draft, FREE};
 use crate::inertia::Inertia;
-use crate::names::{self, Names};
-use crate::options::{Base, Inputs, Options};
+use crate::names::Names;
+use crate::options::{Base, EARTH, Inputs, Options};
 use crate::report::Kind;
 use crate::urdf::read::{Joint, JointKind, Origin, Robot, Turn};
 
-/// Endings of the coordinates of joints that have several.
-const FREE: [&str; 6] = ["_x", "_y", "_z", "_rx", "_ry", "_rz"];
-const BALL: [&str; 3] = ["_rx", "_ry", "_rz"];
+/// Endings of the coordinates of a planar joint.
 const PLANAR: [&str; 3] = ["_x", "_y", "_turn"];
 
-/// A scene in the making.
+/// Makes the scene.
 struct Builder<'r, 'a, 'd> {
     reader: &'r mut Reader<'d>,
     robot: &'r Robot<'a>,
     options: &'r Options,
-    scene: Scene,
-    frames: Names,
-    coordinates: Names,
+    draft: Draft,
     /// The frame of each link; none for the world.
     frame_of: Vec<Option<usize>>,
-    /// Settings of coordinates by name, in the order in which they come up.
-    settings: BTreeMap<String, usize>,
     /// Names of the coordinates of each joint.
     moved: Vec<Vec<String>>,
 }
 
 /// Frames in the order of a walk that takes joints as they stand in the file, and what acts on them.
 pub(super) fn scene(reader: &mut Reader<'_>, robot: &Robot<'_>, options: &Options) -> Scene {
+    let gravity = options.gravity.unwrap_or(EARTH);
     let mut builder = Builder {
-        scene: Scene {
-            format: 1,
-            description: "Imported from URDF.".to_owned(),
-            time_step_s: options.time_step_s,
-            gravity: Some(options.gravity),
-            ..Scene::default()
-        },
-        frames: Names::new("frame", &["world"]),
-        coordinates: Names::new("coordinate", &[]),
+        draft: Draft::new("URDF", gravity, options.time_step_s.unwrap_or(0.001)),
         frame_of: vec![None; robot.links.len()],
-        settings: BTreeMap::new(),
         moved: vec![Vec::new(); robot.joints.len()],
         reader,
         robot,
@@ -59,7 +42,7 @@ pub(super) fn scene(reader: &mut Reader<'_>, robot: &Robot<'_>, options: &Option
     builder.place_bodies();
     builder.couple();
     builder.add_inputs();
-    builder.name()
+    builder.draft.finish(builder.reader, robot.name)
 }
 
 impl Builder<'_, '_, '_> {
@@ -72,12 +55,11 @@ impl Builder<'_, '_, '_> {
             }
         } else {
             let joint = (self.options.base == Base::Free).then(|| {
-                let stem = self.coordinates.add(root.name, &FREE);
+                let stem = self.draft.coordinates.add(root.name, &FREE);
                 SceneJoint::Free { coordinate: Some(stem) }
             });
-            let name = self.frames.add(root.name, &[""]);
-            self.frame_of[robot.root] = Some(self.scene.frames.len());
-            self.scene.frames.push(Frame { name, joint, ..frame_in("world") });
+            self.frame_of[robot.root] = Some(self.draft.scene.frames.len());
+            self.draft.frame(root.name, Frame { joint, ..frame_in("world") });
         }
         let mut open: Vec<usize> = robot.leaving[robot.root].iter().rev().copied().collect();
         while let Some(j) = open.pop() {
@@ -100,11 +82,11 @@ impl Builder<'_, '_, '_> {
         };
         let stem = match endings {
             [] => String::new(),
-            endings => self.coordinates.add(joint.name, endings),
+            endings => self.draft.coordinates.add(joint.name, endings),
         };
         self.moved[j] = endings.iter().map(|ending| format!("{stem}{ending}")).collect();
         let coordinate = Some(stem.clone());
-        let parent = self.frame_of[joint.parent].map(|frame| &self.scene.frames[frame].name);
+        let parent = self.frame_of[joint.parent].map(|frame| &self.draft.scene.frames[frame].name);
         let mut parent = parent.map_or_else(|| "world".to_owned(), String::clone);
         let mut origin = joint.origin;
         let moves = match joint.kind {
@@ -119,9 +101,9 @@ impl Builder<'_, '_, '_> {
                 Some(SceneJoint::Revolute { axis, coordinate: Some(format!("{stem}_turn")) })
             }
         };
-        let name = self.frames.add(robot.links[joint.child].name, &[""]);
-        self.frame_of[joint.child] = Some(self.scene.frames.len());
-        self.scene.frames.push(Frame { name, joint: moves, ..placed(&parent, &origin) });
+        self.frame_of[joint.child] = Some(self.draft.scene.frames.len());
+        let frame = Frame { joint: moves, ..placed(&parent, &origin) };
+        self.draft.frame(robot.links[joint.child].name, frame);
         self.resist(j);
     }
 
@@ -133,56 +115,28 @@ impl Builder<'_, '_, '_> {
         });
         let mut origin = joint.origin;
         for (along, ending) in [(Vector3::x(), "_x"), (Vector3::y(), "_y")] {
-            let name = self.frames.add(&format!("{}{ending}", joint.name), &[""]);
             let coordinate = Some(format!("{stem}{ending}"));
             let slide = SceneJoint::Prismatic { axis: (turn * along).into(), coordinate };
-            self.scene.frames.push(Frame {
-                name: name.clone(),
-                joint: Some(slide),
-                ..placed(&parent, &origin)
-            });
-            (parent, origin) = (name, Origin::default());
+            let frame = Frame { joint: Some(slide), ..placed(&parent, &origin) };
+            parent = self.draft.frame(&format!("{}{ending}", joint.name), frame);
+            origin = Origin::default();
         }
         parent
     }
 
     /// Damping, dry friction and limits.
     fn resist(&mut self, j: usize) {
-        let joint = &self.robot.joints[j];
-        for name in self.moved[j].clone() {
-            if joint.damping > 0.0 {
-                self.setting(&name).damping = Some(joint.damping);
-                self.reader.exact("damping of a coordinate");
+        let Joint { name, node, damping, limits, friction, .. } = self.robot.joints[j];
+        for coordinate in &self.moved[j] {
+            self.draft.damp(self.reader, coordinate, damping);
+            if let Some(limits) = limits {
+                self.draft.limit(self.reader, (name, node), coordinate, limits);
             }
-            if let Some([lower, upper]) = joint.limits {
-                self.setting(&name).limits = Some([lower, upper]);
-                let message = format!(
-                    "joint `{}` moves past its limits, {lower} and {upper}: clients know them, a `stop` enforces them",
-                    joint.name
-                );
-                self.reader.note(Kind::Approximated, joint.node, message);
-            }
-            if joint.friction > 0.0 {
-                let velocity = self.options.friction_velocity;
-                let message = format!(
-                    "dry friction of joint `{}` is {} tanh(v / {velocity}): it creeps under load",
-                    joint.name, joint.friction
-                );
-                self.reader.note(Kind::Approximated, joint.node, message);
-                let force = joint.friction;
-                self.scene.forces.push(Force::Friction { coordinate: name, force, velocity });
+            if friction > 0.0 {
+                let law = [friction, self.options.friction_velocity];
+                self.draft.rub(self.reader, (name, node), coordinate, law);
             }
         }
-    }
-
-    /// The settings of a coordinate, which are there from now on.
-    fn setting(&mut self, name: &str) -> &mut Coordinate {
-        let coordinates = &mut self.scene.coordinates;
-        let at = *self.settings.entry(name.to_owned()).or_insert_with(|| {
-            coordinates.push(Coordinate { name: name.to_owned(), ..Coordinate::default() });
-            coordinates.len() - 1
-        });
-        &mut coordinates[at]
     }
 
     /// Bodies of links. Those that are fixed to one another are judged together: one body.
@@ -240,7 +194,7 @@ impl Builder<'_, '_, '_> {
         for (link, _, inertia) in bodies {
             if let Some(frame) = self.frame_of[*link] {
                 let allow = any_inertia && !inertia.is_possible();
-                self.scene.frames[frame].body = Some(inertia.body(allow));
+                self.draft.scene.frames[frame].body = Some(inertia.body(allow));
             }
         }
     }
@@ -260,12 +214,10 @@ impl Builder<'_, '_, '_> {
                 terms.push(term(&other, -mimic.multiplier));
             }
             let (name, constant) = (own.clone(), -mimic.offset);
-            self.scene.constraints.push(Constraint::Coupling { name, terms, constant });
+            self.draft.scene.constraints.push(Constraint::Coupling { name, terms, constant });
             self.reader.exact("mimic as a coupling");
             let initial = self.initial(j);
-            if initial != 0.0 {
-                self.setting(&own).initial = initial;
-            }
+            self.draft.begin(&own, initial);
         }
     }
 
@@ -313,16 +265,14 @@ impl Builder<'_, '_, '_> {
                 [-effort / gain.abs(), effort / gain.abs()]
             });
             let coordinate = Some(coordinate.clone());
-            self.scene.inputs.push(Input { name, coordinate, gain, limits, ..Input::default() });
+            self.draft.scene.inputs.push(Input {
+                name,
+                coordinate,
+                gain,
+                limits,
+                ..Input::default()
+            });
         }
-    }
-
-    fn name(mut self) -> Scene {
-        let changed = &mut self.reader.report.names;
-        self.scene.name = names::of_scene(self.robot.name, changed);
-        changed.append(&mut self.frames.changed);
-        changed.append(&mut self.coordinates.changed);
-        self.scene
     }
 }
 

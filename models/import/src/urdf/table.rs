@@ -1,251 +1,154 @@
 //! Every element and attribute of URDF, and what is done with it.
 
 use crate::table::Element;
-use crate::table::Treatment::{self, NoEffect, Read};
+use crate::table::Treatment::{Contact, NoEffect, Read, Refused};
 
-const NAME: (&str, Treatment) = ("name", Read);
 const LIMITS: &str = "no limit of this kind is enforced";
 const SEEN: &str = "it is only seen";
-const CONTACT: &str = "nothing touches anything: contacts are not simulated";
 const OWN: &str = "each joint of the transmission has an input of its own";
 const OTHERS: &str = "it speaks to other programs";
 
-const ORIGIN: Element =
-    Element::read("origin", &[("xyz", Read), ("rpy", Read), ("quat_xyzw", Read)], &[]);
+const ORIGIN: Element = Element::new("origin", &[(Read, "xyz rpy quat_xyzw")], &[]);
 
-const INERTIAL: Element = Element::read(
+const INERTIAL: Element = Element::new(
     "inertial",
     &[],
     &[
-        ORIGIN,
-        Element::read("mass", &[("value", Read)], &[]),
-        Element::read(
-            "inertia",
-            &[
-                ("ixx", Read),
-                ("ixy", Read),
-                ("ixz", Read),
-                ("iyy", Read),
-                ("iyz", Read),
-                ("izz", Read),
-            ],
-            &[],
-        ),
+        &ORIGIN,
+        &Element::new("mass", &[(Read, "value")], &[]),
+        &Element::new("inertia", &[(Read, "ixx ixy ixz iyy iyz izz")], &[]),
     ],
 );
 
-const LINK: Element = Element::read(
-    "link",
-    &[NAME, ("type", NoEffect(OTHERS))],
-    &[
-        INERTIAL,
-        Element::no_effect("visual", SEEN),
-        Element::no_effect("collision", CONTACT),
-        Element::no_effect("collision_checking", CONTACT),
-        Element::no_effect("contact", CONTACT),
-        Element::no_effect("self_collision_checking", CONTACT),
-        Element::no_effect("sensor", OTHERS),
-    ],
-);
+const LINK: Element =
+    Element::new("link", &[(Read, "name"), (NoEffect(OTHERS), "type")], &[&INERTIAL]).without(&[
+        (NoEffect(SEEN), "visual"),
+        (Contact, "collision collision_checking contact self_collision_checking"),
+        (NoEffect(OTHERS), "sensor"),
+    ]);
 
-const JOINT: Element = Element::read(
+const JOINT: Element = Element::new(
     "joint",
-    &[NAME, ("type", Read)],
+    &[(Read, "name type")],
     &[
-        ORIGIN,
-        Element::read("parent", &[("link", Read)], &[]),
-        Element::read("child", &[("link", Read)], &[]),
-        Element::read("axis", &[("xyz", Read)], &[]),
-        Element::read(
+        &ORIGIN,
+        &Element::new("parent", &[(Read, "link")], &[]),
+        &Element::new("child", &[(Read, "link")], &[]),
+        &Element::new("axis", &[(Read, "xyz")], &[]),
+        &Element::new(
             "limit",
             &[
-                ("lower", Read),
-                ("upper", Read),
-                ("effort", Read),
-                ("velocity", NoEffect(LIMITS)),
-                ("acceleration", NoEffect(LIMITS)),
-                ("deceleration", NoEffect(LIMITS)),
-                ("jerk", NoEffect(LIMITS)),
+                (Read, "lower upper effort"),
+                (NoEffect(LIMITS), "velocity acceleration deceleration jerk"),
             ],
             &[],
         ),
-        Element::read("dynamics", &[("damping", Read), ("friction", Read)], &[]),
-        Element::read("mimic", &[("joint", Read), ("multiplier", Read), ("offset", Read)], &[]),
-        Element::no_effect("safety_controller", LIMITS),
-        Element::no_effect("calibration", OTHERS),
-        Element::refused("loop_joint", "write the loop as a constraint of the scene"),
+        &Element::new("dynamics", &[(Read, "damping friction")], &[]),
+        &Element::new("mimic", &[(Read, "joint multiplier offset")], &[]),
     ],
-);
+)
+.without(&[
+    (NoEffect(LIMITS), "safety_controller"),
+    (NoEffect(OTHERS), "calibration"),
+    (Refused("write the loop as a constraint of the scene"), "loop_joint"),
+]);
 
-const REDUCTION: Element = Element::read("mechanicalReduction", &[], &[]);
-const INTERFACE: Element = Element::no_effect("hardwareInterface", OTHERS);
+const REDUCTION: Element = Element::new("mechanicalReduction", &[], &[]);
+const OWN_REDUCTION: (crate::table::Treatment, &str) = (NoEffect(OWN), "mechanicalReduction");
 
-const TRANSMISSION: Element = Element::read(
+const TRANSMISSION: Element = Element::new(
     "transmission",
-    &[NAME, ("type", Read)],
+    &[(Read, "name type")],
     &[
-        Element::read("type", &[], &[]),
-        Element::read(
-            "joint",
-            &[NAME],
-            &[
-                INTERFACE,
-                REDUCTION,
-                Element::no_effect("role", OTHERS),
-                Element::no_effect("offset", OTHERS),
-            ],
-        ),
-        Element::read(
-            "actuator",
-            &[NAME],
-            &[
-                INTERFACE,
-                REDUCTION,
-                Element::no_effect("motorTorqueConstant", OTHERS),
-                Element::no_effect("role", OTHERS),
-            ],
-        ),
-        REDUCTION,
-        Element::no_effect("motorTorqueConstant", OTHERS),
-        Element::no_effect("leftActuator", OWN),
-        Element::no_effect("rightActuator", OWN),
-        Element::read("flexJoint", &[NAME, ("mechanicalReduction", NoEffect(OWN))], &[]),
-        Element::read("rollJoint", &[NAME, ("mechanicalReduction", NoEffect(OWN))], &[]),
-        Element::no_effect("gap_joint", OWN),
-        Element::no_effect("passive_joint", OWN),
-        Element::no_effect("use_simulated_gripper_joint", OWN),
+        &Element::new("type", &[], &[]),
+        &Element::new("joint", &[(Read, "name")], &[&REDUCTION])
+            .without(&[(NoEffect(OTHERS), "hardwareInterface role offset")]),
+        &Element::new("actuator", &[(Read, "name")], &[&REDUCTION])
+            .without(&[(NoEffect(OTHERS), "hardwareInterface motorTorqueConstant role")]),
+        &REDUCTION,
+        &Element::new("flexJoint", &[(Read, "name"), OWN_REDUCTION], &[]),
+        &Element::new("rollJoint", &[(Read, "name"), OWN_REDUCTION], &[]),
     ],
-);
+)
+.without(&[
+    (NoEffect(OTHERS), "motorTorqueConstant"),
+    (
+        NoEffect(OWN),
+        "leftActuator rightActuator gap_joint passive_joint use_simulated_gripper_joint",
+    ),
+]);
 
-const COMMAND: Element = Element::read(
-    "command_interface",
-    &[NAME],
-    &[Element::no_effect("param", OTHERS), Element::no_effect("limits", LIMITS)],
-);
-
-const ROS2_CONTROL: Element = Element::read(
+const ROS2_CONTROL: Element = Element::new(
     "ros2_control",
-    &[
-        NAME,
-        ("type", NoEffect(OTHERS)),
-        ("rw_rate", NoEffect(OTHERS)),
-        ("is_async", NoEffect(OTHERS)),
-    ],
-    &[
-        Element::no_effect("hardware", OTHERS),
-        Element::no_effect("sensor", OTHERS),
-        Element::no_effect("gpio", OTHERS),
-        Element::no_effect("transmission", OTHERS),
-        Element::read(
-            "joint",
-            &[NAME, ("mimic", NoEffect("the joint's own `mimic` counts"))],
-            &[
-                COMMAND,
-                Element::no_effect("state_interface", OTHERS),
-                Element::no_effect("param", OTHERS),
-                Element::no_effect("limits", LIMITS),
-            ],
-        ),
-    ],
-);
+    &[(Read, "name"), (NoEffect(OTHERS), "type rw_rate is_async")],
+    &[&Element::new(
+        "joint",
+        &[(Read, "name"), (NoEffect("the joint's own `mimic` counts"), "mimic")],
+        &[&Element::new("command_interface", &[(Read, "name")], &[])
+            .without(&[(NoEffect(OTHERS), "param"), (NoEffect(LIMITS), "limits")])],
+    )
+    .without(&[(NoEffect(OTHERS), "state_interface param"), (NoEffect(LIMITS), "limits")])],
+)
+.without(&[(NoEffect(OTHERS), "hardware sensor gpio transmission")]);
 
 /// The whole format.
-pub(super) static ROBOT: Element = Element::read(
+pub(super) static ROBOT: Element = Element::new(
     "robot",
-    &[NAME, ("version", Read), ("type", NoEffect(OTHERS))],
-    &[
-        LINK,
-        JOINT,
-        TRANSMISSION,
-        ROS2_CONTROL,
-        Element::no_effect("material", SEEN),
-        Element::no_effect("gazebo", OTHERS),
-        Element::no_effect("sensor", OTHERS),
-        Element::no_effect("disable_collisions", CONTACT),
-        Element::refused("model_state", "write the state as the scene's initial configuration"),
-        Element::refused("include", "expand the file first: `xacro FILE > robot.urdf`"),
-    ],
-);
+    &[(Read, "name version"), (NoEffect(OTHERS), "type")],
+    &[&LINK, &JOINT, &TRANSMISSION, &ROS2_CONTROL],
+)
+.without(&[
+    (NoEffect(SEEN), "material"),
+    (NoEffect(OTHERS), "gazebo sensor"),
+    (Contact, "disable_collisions"),
+    (Refused("write the state as the scene's initial configuration"), "model_state"),
+    (Refused("expand the file first: `xacro FILE > robot.urdf`"), "include"),
+]);
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::ROBOT;
+    use crate::table::tests::{everything_is_treated, nothing_is_there_twice};
 
     /// Elements and attributes of the specification of URDF 1.2 and of transmissions (wiki.ros.org/urdf/XML).
-    const SPECIFIED: &[&str] = &[
-        "robot@name",
-        "robot@version",
-        "robot/link@name",
-        "robot/link/inertial/origin@xyz",
-        "robot/link/inertial/origin@rpy",
-        "robot/link/inertial/origin@quat_xyzw",
-        "robot/link/inertial/mass@value",
-        "robot/link/inertial/inertia@ixx",
-        "robot/link/inertial/inertia@ixy",
-        "robot/link/inertial/inertia@ixz",
-        "robot/link/inertial/inertia@iyy",
-        "robot/link/inertial/inertia@iyz",
-        "robot/link/inertial/inertia@izz",
-        "robot/link/visual",
-        "robot/link/collision",
-        "robot/joint@name",
-        "robot/joint@type",
-        "robot/joint/origin@xyz",
-        "robot/joint/origin@rpy",
-        "robot/joint/parent@link",
-        "robot/joint/child@link",
-        "robot/joint/axis@xyz",
-        "robot/joint/calibration",
-        "robot/joint/dynamics@damping",
-        "robot/joint/dynamics@friction",
-        "robot/joint/limit@lower",
-        "robot/joint/limit@upper",
-        "robot/joint/limit@effort",
-        "robot/joint/limit@velocity",
-        "robot/joint/limit@acceleration",
-        "robot/joint/limit@deceleration",
-        "robot/joint/limit@jerk",
-        "robot/joint/mimic@joint",
-        "robot/joint/mimic@multiplier",
-        "robot/joint/mimic@offset",
-        "robot/joint/safety_controller",
-        "robot/transmission@name",
-        "robot/transmission/type",
-        "robot/transmission/joint@name",
-        "robot/transmission/joint/hardwareInterface",
-        "robot/transmission/actuator@name",
-        "robot/transmission/actuator/mechanicalReduction",
-        "robot/transmission/actuator/hardwareInterface",
-        "robot/gazebo",
-        "robot/sensor",
-        "robot/material",
-        "robot/model_state",
-    ];
+    const SPECIFIED: &str = "
+robot: name version
+robot/link: name
+robot/link/inertial/origin: xyz rpy quat_xyzw
+robot/link/inertial/mass: value
+robot/link/inertial/inertia: ixx ixy ixz iyy iyz izz
+robot/link/visual: *
+robot/link/collision: *
+robot/joint: name type
+robot/joint/origin: xyz rpy
+robot/joint/parent: link
+robot/joint/child: link
+robot/joint/axis: xyz
+robot/joint/calibration: *
+robot/joint/dynamics: damping friction
+robot/joint/limit: lower upper effort velocity acceleration deceleration jerk
+robot/joint/mimic: joint multiplier offset
+robot/joint/safety_controller: *
+robot/transmission: name
+robot/transmission/type:
+robot/transmission/joint: name
+robot/transmission/joint/hardwareInterface: *
+robot/transmission/actuator: name
+robot/transmission/actuator/mechanicalReduction:
+robot/transmission/actuator/hardwareInterface: *
+robot/gazebo: *
+robot/sensor: *
+robot/material: *
+robot/model_state: *
+";
 
     #[test]
     fn everything_specified_is_treated() {
-        for path in SPECIFIED {
-            let (elements, attribute) = path.split_once('@').unwrap_or((path, ""));
-            let mut element = &ROBOT;
-            for name in elements.split('/').skip(1) {
-                let found = element.children.iter().find(|child| child.name == name);
-                element = found.unwrap_or_else(|| panic!("{path}: no `{name}`"));
-            }
-            let knows = |(known, _): &(&str, Treatment)| *known == attribute;
-            assert!(attribute.is_empty() || element.attributes.iter().any(knows), "{path}");
-        }
+        everything_is_treated(&ROBOT, SPECIFIED);
     }
 
     #[test]
-    fn no_element_is_there_twice() {
-        let mut open = vec![&ROBOT];
-        while let Some(element) = open.pop() {
-            let mut names: Vec<_> = element.children.iter().map(|child| child.name).collect();
-            names.sort_unstable();
-            let count = names.len();
-            names.dedup();
-            assert_eq!(names.len(), count, "{}", element.name);
-            open.extend(element.children);
-        }
+    fn no_name_is_there_twice() {
+        nothing_is_there_twice(&ROBOT);
     }
 }

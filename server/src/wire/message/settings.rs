@@ -22,7 +22,7 @@ pub fn scene(
     LimitExceeded::check("scene_bytes", limits.scene_bytes, "bytes of scene", text.len())?;
     let read = match v1::SceneFormat::try_from(format) {
         Ok(v1::SceneFormat::Unspecified) if plantd_import::is_xml(text) => robot(text),
-        Ok(v1::SceneFormat::Urdf) => robot(text),
+        Ok(v1::SceneFormat::Urdf | v1::SceneFormat::Mjcf) => robot(text),
         Ok(v1::SceneFormat::Unspecified) => Scene::from_text(text).map(|scene| (scene, None)),
         Ok(v1::SceneFormat::Toml) => Scene::from_toml(text).map(|scene| (scene, None)),
         Ok(v1::SceneFormat::Json) => Scene::from_json(text).map(|scene| (scene, None)),

@@ -145,6 +145,7 @@ impl v1::model_service_server::ModelService for ModelService {
 fn import_report(report: Report) -> v1::ImportReport {
     let note = |note: plantd_import::Note| {
         let kind = match note.kind {
+            Kind::Contact => v1::ImportKind::Contact,
             Kind::Warning => v1::ImportKind::Warning,
             Kind::Approximated => v1::ImportKind::Approximated,
             Kind::NoEffect => v1::ImportKind::NoEffect,

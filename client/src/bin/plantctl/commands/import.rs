@@ -5,35 +5,36 @@ use std::path::PathBuf;
 use anyhow::{Context as _, Result};
 use clap::{Args, ValueEnum};
 use plantd_client::v1;
-use plantd_import::Options;
+use plantd_import::{Kind, Note, Options};
 use serde_json::json;
 
-use crate::input::files::read_text;
+use crate::input::files::{beside, read_text};
 use crate::input::numbers::{Numbers, numbers};
 use crate::server::context::Context;
 
-/// Turns a robot in URDF into a scene, on standard output; what became of the file goes to standard
-/// error. Needs no server.
+/// Turns a robot in URDF or MJCF into a scene, on standard output; what became of the file goes to
+/// standard error. Needs no server.
 #[derive(Debug, Args)]
 pub(crate) struct Import {
     /// File; `-` reads standard input.
     robot: PathBuf,
-    /// What holds the root link: the world, or nothing.
+    /// What holds the root link of a URDF: the world, or nothing.
     #[arg(long, value_enum, default_value_t)]
     base: Base,
-    /// Joints that get an input: those of transmissions and command interfaces (all, if there are none
-    /// of these), all that mimic no other, or none.
+    /// What gets an input: the joints that the transmissions and command interfaces of a URDF name (all,
+    /// if there are none of these) and the actuators of an MJCF, all joints that mimic no other, or
+    /// nothing.
     #[arg(long, value_enum, default_value_t)]
     inputs: Inputs,
     /// Name of the scene; the robot's if not given.
     #[arg(long)]
     name: Option<String>,
-    /// Acceleration of gravity, m/s².
-    #[arg(long, value_name = "X,Y,Z", value_parser = numbers, default_value = "0,0,-9.81", allow_hyphen_values = true)]
-    gravity: Numbers,
-    /// Time step that the scene suggests, s.
-    #[arg(long, value_name = "S", default_value_t = 0.001)]
-    time_step: f64,
+    /// Acceleration of gravity, m/s²; if not given that of the file, or 0,0,-9.81.
+    #[arg(long, value_name = "X,Y,Z", value_parser = numbers, allow_hyphen_values = true)]
+    gravity: Option<Numbers>,
+    /// Time step that the scene suggests, s; if not given that of the file, or 0.001.
+    #[arg(long, value_name = "S")]
+    time_step: Option<f64>,
     /// Velocity at which 76 % of dry friction are reached, m/s or rad/s.
     #[arg(long, value_name = "V", default_value_t = 0.01)]
     friction_velocity: f64,
@@ -59,6 +60,7 @@ enum Inputs {
 
 impl Import {
     pub(crate) fn run(self, context: &Context) -> Result<()> {
+        let gravity = self.gravity.map(|gravity| <[f64; 3]>::try_from(gravity.0)).transpose();
         let options = Options {
             base: match self.base {
                 Base::Fixed => plantd_import::Base::Fixed,
@@ -69,13 +71,14 @@ impl Import {
                 Inputs::All => plantd_import::Inputs::All,
                 Inputs::None => plantd_import::Inputs::None,
             },
-            gravity: self.gravity.0.try_into().ok().context("--gravity takes three numbers")?,
+            gravity: gravity.ok().context("--gravity takes three numbers")?,
             time_step_s: self.time_step,
             friction_velocity: self.friction_velocity,
             lenient: self.lenient,
         };
         let file = self.robot.display().to_string();
-        let mut robot = plantd_import::import(&read_text(&self.robot)?, &options)
+        let text = read_text(&self.robot)?;
+        let mut robot = plantd_import::import_with_files(&text, &options, &mut beside(&self.robot))
             .with_context(|| format!("{file} cannot be imported"))?;
         if let Some(name) = self.name {
             robot.scene.name = name;
@@ -92,12 +95,14 @@ pub(crate) fn tell(report: Option<&v1::ImportReport>) {
     let Some(report) = report else { return };
     for note in &report.notes {
         let kind = match note.kind() {
-            v1::ImportKind::Approximated => "approximated",
-            v1::ImportKind::NoEffect => "no effect",
-            v1::ImportKind::Warning | v1::ImportKind::Unspecified => "warning",
+            v1::ImportKind::Contact => Kind::Contact,
+            v1::ImportKind::Approximated => Kind::Approximated,
+            v1::ImportKind::NoEffect => Kind::NoEffect,
+            v1::ImportKind::Warning | v1::ImportKind::Unspecified => Kind::Warning,
         };
-        let count = if note.count > 1 { format!(" (× {})", note.count) } else { String::new() };
-        eprintln!("{}:{}: {kind}: {}{count}", note.line, note.column, note.message);
+        let v1::ImportNote { line, column, message, count, .. } = note.clone();
+        let (file, count) = (String::new(), count as usize);
+        eprintln!("{}", Note { kind, file, line, column, message, count });
     }
     for v1::ImportName { of, from, to } in &report.names {
         eprintln!("{of} `{from}` is named `{to}`");

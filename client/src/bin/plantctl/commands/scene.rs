@@ -9,7 +9,7 @@ use plantd_client::v1;
 use serde_json::json;
 
 use crate::commands::import;
-use crate::input::files::read_text;
+use crate::input::files::{read_scene, read_text};
 use crate::output::failure::FAILED;
 use crate::output::model;
 use crate::server::context::Context;
@@ -43,7 +43,7 @@ impl Upload {
         let client = context.connect().await?;
         let request = v1::CreateModelRequest {
             name: self.name.unwrap_or_default(),
-            scene: read_text(&self.scene)?,
+            scene: read_scene(&self.scene)?,
             ..Default::default()
         };
         let answer = client.import_model(request).await?;
@@ -56,7 +56,7 @@ impl Upload {
 impl Validate {
     pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
         let client = context.connect().await?;
-        let answer = client.validate_scene(read_text(&self.scene)?).await?;
+        let answer = client.validate_scene(read_scene(&self.scene)?).await?;
         import::tell(answer.import_report.as_ref());
         context.output.message("ValidateSceneResponse", &answer, || match &answer.model {
             Some(model) if answer.problems.is_empty() => model::validated(model),

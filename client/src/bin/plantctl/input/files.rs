@@ -18,6 +18,18 @@ pub(crate) fn read_text(path: &Path) -> Result<String> {
     std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
+/// The text of a scene or robot, with the files that it includes.
+pub(crate) fn read_scene(path: &Path) -> Result<String> {
+    let whole = plantd_import::with_includes(&read_text(path)?, &mut beside(path));
+    whole.with_context(|| format!("{} cannot be read", path.display()))
+}
+
+/// Reads files that stand where another one is.
+pub(crate) fn beside(path: &Path) -> impl FnMut(&str) -> Result<String, String> {
+    let folder = path.parent().unwrap_or(Path::new("")).to_owned();
+    move |name| std::fs::read_to_string(folder.join(name)).map_err(|error| error.to_string())
+}
+
 /// Writes a file.
 pub(crate) fn write(path: &Path, contents: impl AsRef<[u8]>) -> Result<()> {
     std::fs::write(path, contents).with_context(|| format!("cannot write {}", path.display()))

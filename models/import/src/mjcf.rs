@@ -1,0 +1,81 @@
+//! MJCF, as MuJoCo 4 reads it.
+
+mod actuators;
+mod assets;
+mod build;
+mod classes;
+mod equalities;
+mod frames;
+mod keyframes;
+mod settings;
+mod shapes;
+mod start;
+mod table;
+mod tendons;
+mod tree;
+
+use plantd_models::Scene;
+use roxmltree::Node;
+
+use crate::document::Reader;
+use crate::draft::Draft;
+use crate::mjcf::build::Build;
+use crate::mjcf::classes::Classes;
+use crate::mjcf::settings::{Compiler, Physics};
+use crate::mjcf::tendons::Tendons;
+use crate::names::Names;
+use crate::options::{Base, Inputs, Options};
+use crate::report::Kind;
+
+/// The scene of a model; none where something has failed.
+pub(crate) fn scene<'a>(
+    reader: &mut Reader<'a>,
+    root: Node<'a, 'a>,
+    options: &Options,
+) -> Option<Scene> {
+    reader.check(root, &table::MUJOCO);
+    if options.base == Base::Free {
+        let message = "an MJCF says itself which of its bodies are free";
+        reader.note(Kind::NoEffect, root, message);
+    }
+    let classes = Classes::read(reader, root);
+    let compiler = Compiler::read(reader, root);
+    let physics = Physics::read(reader, root, options);
+    let tree = tree::read(reader, root, &classes, &compiler);
+    if reader.has_failed() {
+        return None;
+    }
+    let mut build = Build {
+        root,
+        classes: &classes,
+        compiler: &compiler,
+        physics: &physics,
+        options,
+        draft: Draft::new("MJCF", physics.gravity, physics.time_step_s),
+        frames: Vec::new(),
+        coordinates: vec![Vec::new(); tree.joints.len()],
+        home: tree.poses(|joint| joint.reference),
+        tree: &tree,
+        inputs: Names::new("input", &[]),
+        mobility: None,
+        reader,
+    };
+    build.place_bodies();
+    build.adjust_springs();
+    let tendons = Tendons::read(&mut build);
+    build.stretch(&tendons);
+    build.constrain(&tendons);
+    let controls = match options.inputs {
+        Inputs::AsTold => build.actuate(&tendons),
+        Inputs::All => build.drive_all(),
+        Inputs::None => Vec::new(),
+    };
+    build.add_operating_points(&controls);
+    if let Some((node, count)) = tree.touching.filter(|_| physics.has("contact")) {
+        let message = format!(
+            "{count} shapes may touch: contacts are not simulated; bodies pass through one another and through the floor"
+        );
+        build.reader.note(Kind::Contact, node, message);
+    }
+    Some(build.draft.finish(build.reader, root.attribute("model").unwrap_or("robot")))
+}

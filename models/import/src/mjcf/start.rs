@@ -1,0 +1,72 @@
+//! Inertias in the configuration in which a model stands in the file.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use nalgebra::DMatrix;
+use plantd_models::scene::{CoordinateKind, Input};
+use plantd_models::{Continuous, ContinuousPoint, Model, Scene};
+
+/// `M⁻¹` over the dynamic coordinates, armature included.
+pub(super) struct Mobility {
+    /// Rows of coordinates.
+    rows: BTreeMap<String, usize>,
+    inverse: DMatrix<f64>,
+    /// `M_ii`.
+    inertias: Vec<f64>,
+}
+
+impl Mobility {
+    /// How accelerations answer to a force on each dynamic coordinate: a column of `M⁻¹` each.
+    pub(super) fn of(scene: &Scene) -> Option<Self> {
+        let mut bare = Scene {
+            name: "start".to_owned(),
+            format: scene.format,
+            time_step_s: scene.time_step_s,
+            gravity: Some([0.0; 3]),
+            frames: scene.frames.clone(),
+            coordinates: scene.coordinates.clone(),
+            ..Scene::default()
+        };
+        let names: Vec<String> = Model::compile(&bare)
+            .ok()?
+            .coordinates()
+            .iter()
+            .filter(|coordinate| coordinate.kind == CoordinateKind::Dynamic)
+            .map(|coordinate| coordinate.name.clone())
+            .collect();
+        let input = |name: &String| Input {
+            name: name.clone(),
+            coordinate: Some(name.clone()),
+            ..Input::default()
+        };
+        bare.inputs = names.iter().map(input).collect();
+        let model = Arc::new(Model::compile(&bare).ok()?);
+        let q: Vec<f64> = model.coordinates().iter().map(|coordinate| coordinate.initial).collect();
+        let (all, dynamic) = (q.len(), names.len());
+        let point = ContinuousPoint {
+            q,
+            v: vec![0.0; all],
+            inputs: vec![0.0; dynamic],
+            prescribed_acceleration: vec![0.0; all - dynamic],
+        };
+        let rates = Continuous::new(model).linearize(&point).ok()?.jacobian;
+        let inverse = rates.view((0, 2 * all), (dynamic, dynamic)).into_owned();
+        let inertias = inverse.clone().try_inverse()?.diagonal().as_slice().to_vec();
+        Some(Self {
+            rows: names.into_iter().enumerate().map(|(i, name)| (name, i)).collect(),
+            inverse,
+            inertias,
+        })
+    }
+
+    /// `(M⁻¹)_ii` of a coordinate.
+    pub(super) fn of_coordinate(&self, name: &str) -> Option<f64> {
+        self.rows.get(name).map(|row| self.inverse[(*row, *row)])
+    }
+
+    /// `M_ii` of a coordinate.
+    pub(super) fn inertia(&self, name: &str) -> Option<f64> {
+        self.rows.get(name).map(|row| self.inertias[*row])
+    }
+}

@@ -1,0 +1,263 @@
+//! Tendons: sums of coordinates, and paths through sites.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{Isometry3, Point3};
+use plantd_models::scene::{Force, LinearTerm, Point, Spring};
+use roxmltree::Node;
+
+use crate::mjcf::build::Build;
+use crate::mjcf::classes::{MAIN, Settings};
+use crate::mjcf::tree::{Joint, JointKind};
+use crate::report::Kind;
+
+/// Tendons by name.
+pub(super) struct Tendons<'a> {
+    all: Vec<Tendon<'a>>,
+    names: BTreeMap<&'a str, usize>,
+}
+
+pub(super) struct Tendon<'a> {
+    settings: Settings<'a>,
+    pub(super) name: &'a str,
+    /// None where it cannot be taken over.
+    pub(super) course: Option<Course>,
+    pub(super) limits: Option<[f64; 2]>,
+}
+
+/// What a tendon's length is made of.
+pub(super) enum Course {
+    /// `L = Σ coefficient q`.
+    Sum(Vec<Term>),
+    /// From point to point.
+    Path(Vec<Stop>),
+}
+
+pub(super) struct Term {
+    pub(super) joint: usize,
+    pub(super) coordinate: String,
+    pub(super) coefficient: f64,
+}
+
+/// A point of a body, none for the world.
+pub(super) struct Stop {
+    body: Option<usize>,
+    point: Point,
+}
+
+impl Course {
+    /// Its length where bodies have given poses and joints given values.
+    fn length(&self, poses: &[Isometry3<f64>], value: impl Fn(usize) -> f64) -> f64 {
+        match self {
+            Self::Sum(terms) => terms.iter().map(|term| term.coefficient * value(term.joint)).sum(),
+            Self::Path(stops) => {
+                let place = |stop: &Stop| {
+                    let pose = stop.body.map_or_else(Isometry3::identity, |body| poses[body]);
+                    pose * Point3::from(stop.point.at)
+                };
+                let points: Vec<_> = stops.iter().map(place).collect();
+                points.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum()
+            }
+        }
+    }
+}
+
+/// Terms as springs and dampers have them.
+pub(super) fn linear(terms: &[Term]) -> Vec<LinearTerm> {
+    let term = |term: &Term| LinearTerm {
+        coordinate: term.coordinate.clone(),
+        coefficient: term.coefficient,
+    };
+    terms.iter().map(term).collect()
+}
+
+pub(super) fn points(stops: &[Stop]) -> Vec<Point> {
+    stops.iter().map(|stop| stop.point.clone()).collect()
+}
+
+impl<'a> Tendons<'a> {
+    pub(super) fn read(build: &mut Build<'_, 'a, '_>) -> Self {
+        let mut all = Self { all: Vec::new(), names: BTreeMap::new() };
+        for node in Build::section(build.root, "tendon") {
+            let name = node.attribute("name").unwrap_or_default();
+            if !name.is_empty() && all.names.insert(name, all.all.len()).is_some() {
+                build.reader.fail(node, format!("there are two tendons `{name}`"));
+            }
+            let settings = build.classes.settings(build.reader, node, MAIN, "tendon");
+            let course = match node.tag_name().name() {
+                "fixed" => build.sum(node),
+                "spatial" => build.path(node),
+                _ => continue,
+            };
+            let by_range = build.compiler.limits_by_range;
+            let limits = settings.range(build.reader, "range", "limited", by_range);
+            all.all.push(Tendon { settings, name, course, limits });
+        }
+        all
+    }
+
+    pub(super) fn named(&self, name: &str) -> Option<&Tendon<'a>> {
+        self.names.get(name).map(|tendon| &self.all[*tendon])
+    }
+}
+
+impl<'a> Build<'_, 'a, '_> {
+    fn sum(&mut self, node: Node<'a, 'a>) -> Option<Course> {
+        let mut terms: Vec<Term> = Vec::new();
+        for child in node.children().filter(|child| child.has_tag_name("joint")) {
+            let coefficient = self.reader.number(child, "coef");
+            let joint = self.find(child, "joint", "joint", |build, name| build.tree.joint(name))?;
+            if !matches!(self.tree.joints[joint].kind, JointKind::Hinge | JointKind::Slide) {
+                let message = "a tendon over a joint that does not move about or along one axis";
+                self.reader.refuse(child, message);
+                return None;
+            }
+            match terms.iter_mut().find(|term| term.joint == joint) {
+                Some(term) => term.coefficient += coefficient,
+                None => {
+                    let coordinate = self.coordinates[joint][0].clone();
+                    terms.push(Term { joint, coordinate, coefficient });
+                }
+            }
+        }
+        terms.retain(|term| term.coefficient != 0.0);
+        if terms.is_empty() {
+            self.reader.fail(node, "`fixed` has no joint with a `coef`");
+            return None;
+        }
+        self.reader.exact("fixed tendon");
+        Some(Course::Sum(terms))
+    }
+
+    fn path(&mut self, node: Node<'a, 'a>) -> Option<Course> {
+        let mut stops = Vec::new();
+        for child in node.children().filter(Node::is_element) {
+            match child.tag_name().name() {
+                "site" => {
+                    let found = |build: &Self, name: &str| {
+                        build.tree.site(name).map(|site| (site.body, site.pose.translation.vector))
+                    };
+                    let (body, at) = self.find(child, "site", "site", found)?;
+                    stops.push(Stop { body, point: self.point(body, at.into()) });
+                }
+                "geom" => {
+                    let message = "a tendon that wraps around a shape: lead it through sites";
+                    self.reader.refuse(child, message);
+                    return None;
+                }
+                "pulley" => {
+                    let message = "a tendon with a pulley that divides its force: write a tendon for each branch";
+                    self.reader.refuse(child, message);
+                    return None;
+                }
+                _ => {}
+            }
+        }
+        if stops.len() < 2 {
+            self.reader.fail(node, "`spatial` must lead through two sites or more");
+            return None;
+        }
+        self.reader.exact("spatial tendon");
+        Some(Course::Path(stops))
+    }
+
+    /// Its length where joints are at their references.
+    pub(super) fn length_at_home(&self, course: &Course) -> f64 {
+        course.length(&self.home, |joint| self.tree.joints[joint].reference)
+    }
+
+    /// Springs and dampers of tendons.
+    pub(super) fn stretch(&mut self, tendons: &Tendons<'a>) {
+        let rest = |joint: &Joint<'_>| joint.rest;
+        let at_rest = self.tree.poses(rest);
+        for Tendon { settings, name, course, limits } in &tendons.all {
+            let Some(course) = course else { continue };
+            let node = settings.node();
+            if limits.is_some() && self.physics.has("limit") {
+                let message =
+                    format!("tendon `{name}` moves past its limits, which nothing enforces");
+                self.reader.note(Kind::Approximated, node, message);
+            }
+            for (what, part) in [("frictionloss", "frictionloss"), ("armature", "")] {
+                if settings.amount(self.reader, what) > 0.0
+                    && (part.is_empty() || self.physics.has(part))
+                {
+                    let message = format!("`{what}` of tendon `{name}`: write it of joints");
+                    self.reader.refuse(node, message);
+                }
+            }
+            let [stiffness, damping] = ["stiffness", "damping"].map(|what| {
+                let all: [f64; 3] = settings.first_numbers(self.reader, what);
+                if all[0] < 0.0 || all[1..] != [0.0; 2] {
+                    let message =
+                        format!("`{what}` of tendon `{name}` must be one number, not negative");
+                    self.reader.refuse(node, message);
+                    return 0.0;
+                }
+                all[0]
+            });
+            if damping > 0.0 && self.physics.has("damper") {
+                self.reader.exact("damper of a tendon");
+                self.draft.scene.forces.push(match course {
+                    Course::Sum(terms) => Force::LinearDamper { terms: linear(terms), damping },
+                    Course::Path(stops) => Force::PathDamper { points: points(stops), damping },
+                });
+            }
+            if stiffness > 0.0 && self.physics.has("spring") {
+                let natural = course.length(&at_rest, |joint| self.tree.joints[joint].rest);
+                let range = self.spring_range(settings).unwrap_or([natural; 2]);
+                self.add_spring(settings, course, stiffness, range);
+            }
+        }
+    }
+
+    /// Lengths between which a tendon's spring is slack, if they are given.
+    fn spring_range(&mut self, settings: &Settings<'a>) -> Option<[f64; 2]> {
+        let text = settings.text("springlength")?;
+        let [low, mut high] = settings.first_numbers(self.reader, "springlength");
+        if text.split_ascii_whitespace().count() == 1 {
+            high = low;
+        }
+        if low > high {
+            self.reader.fail(settings.node(), "`springlength` must not decrease");
+        }
+        ([low, high] != [-1.0; 2]).then_some([low, high])
+    }
+
+    fn add_spring(
+        &mut self,
+        settings: &Settings<'a>,
+        course: &Course,
+        stiffness: f64,
+        [low, high]: [f64; 2],
+    ) {
+        let spring = match course {
+            Course::Sum(_) if low < high => {
+                let message = "`springlength` with two lengths: a sum of joints has no stop";
+                return self.reader.refuse(settings.node(), message);
+            }
+            Course::Sum(terms) => {
+                Spring::LinearSpring { terms: linear(terms), stiffness, rest: low }
+            }
+            Course::Path(stops) if low < high => {
+                let message = "`springlength` with two lengths: a `stop`, which comes in over a hundredth of the range";
+                self.reader.note(Kind::Approximated, settings.node(), message);
+                Spring::Stop {
+                    coordinate: None,
+                    points: points(stops),
+                    range: Some([low, high]),
+                    stiffness: Some(stiffness),
+                    damping: None,
+                    transition: None,
+                    settling_depth: None,
+                    settling_time_s: None,
+                }
+            }
+            Course::Path(stops) => {
+                Spring::Path { points: points(stops), stiffness, rest_length: low }
+            }
+        };
+        self.reader.exact("spring of a tendon");
+        self.draft.scene.springs.push(spring);
+    }
+}

@@ -1,0 +1,598 @@
+//! Bodies of an MJCF with what they carry, frames and replications unfolded.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{Isometry3, Matrix3, Translation3, Unit, UnitQuaternion, Vector3};
+use plantd_models::scene::{self, MAX_FRAMES, MAX_VISUALS, Rotation, Visual};
+use roxmltree::Node;
+
+use crate::document::Reader;
+use crate::inertia::Inertia;
+use crate::mjcf::assets::Meshes;
+use crate::mjcf::classes::{Classes, MAIN, Settings};
+use crate::mjcf::settings::{Compiler, FromGeoms, from_z};
+use crate::mjcf::shapes::Shape;
+use crate::report::Kind;
+
+/// Geoms and sites that are read at most, after replication.
+const ITEMS_MAX: usize = 1 << 17;
+/// Masses, kg, and volumes, m³, that count as none.
+const TINY: f64 = 1e-14;
+
+/// All that a model is made of; parents come before children, in the order of the file.
+#[derive(Default)]
+pub(super) struct Tree<'a> {
+    pub(super) bodies: Vec<Body<'a>>,
+    pub(super) joints: Vec<Joint<'a>>,
+    pub(super) sites: Vec<Site>,
+    /// Geoms that touch others, and the first of them.
+    pub(super) touching: Option<(Node<'a, 'a>, usize)>,
+    /// Bodies, joints and sites by name.
+    names: [BTreeMap<String, usize>; 3],
+}
+
+pub(super) struct Body<'a> {
+    pub(super) node: Node<'a, 'a>,
+    pub(super) name: String,
+    /// None for the world.
+    pub(super) parent: Option<usize>,
+    /// In the parent, where all joints are at their references.
+    pub(super) pose: Isometry3<f64>,
+    pub(super) joints: Vec<usize>,
+    pub(super) inertia: Option<Inertia>,
+    /// Part of the weight that is taken off.
+    pub(super) lift: f64,
+    pub(super) is_mocap: bool,
+    pub(super) visuals: Vec<Visual>,
+    inertial: Option<Node<'a, 'a>>,
+    /// Whether its geoms give its inertia, and what they give.
+    is_weighed: bool,
+    geoms: Vec<Inertia>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum JointKind {
+    Free,
+    Ball,
+    Slide,
+    Hinge,
+}
+
+pub(super) struct Joint<'a> {
+    pub(super) node: Node<'a, 'a>,
+    /// Empty if it has none.
+    pub(super) name: String,
+    pub(super) kind: JointKind,
+    pub(super) body: usize,
+    /// Anchor and axis in the body.
+    pub(super) anchor: Vector3<f64>,
+    pub(super) axis: Unit<Vector3<f64>>,
+    /// Value in the configuration in which the model stands in the file.
+    pub(super) reference: f64,
+    /// Value at which its spring, and those of tendons, are at rest.
+    pub(super) rest: f64,
+    pub(super) limits: Option<[f64; 2]>,
+    /// Of powers of the distance from rest, from 1; of damping those of `|v|`.
+    pub(super) stiffness: [f64; 3],
+    pub(super) damping: [f64; 3],
+    /// Time constant and damping ratio, in place of these two.
+    pub(super) spring_damper: Option<[f64; 2]>,
+    pub(super) armature: f64,
+    pub(super) friction: f64,
+}
+
+pub(super) struct Site {
+    /// None for the world.
+    pub(super) body: Option<usize>,
+    pub(super) pose: Isometry3<f64>,
+}
+
+impl Tree<'_> {
+    pub(super) fn body(&self, name: &str) -> Option<usize> {
+        self.names[0].get(name).copied()
+    }
+
+    pub(super) fn joint(&self, name: &str) -> Option<usize> {
+        self.names[1].get(name).copied()
+    }
+
+    pub(super) fn site(&self, name: &str) -> Option<&Site> {
+        self.names[2].get(name).map(|site| &self.sites[*site])
+    }
+
+    /// Whether a joint moves a body.
+    pub(super) fn is_moved(&self, body: Option<usize>) -> bool {
+        let up = |body: &usize| self.bodies[*body].parent;
+        std::iter::successors(body, up).any(|body| !self.bodies[body].joints.is_empty())
+    }
+
+    /// Where bodies stand in the world while hinges and slides have given values and all other joints are where they
+    /// are in the file.
+    pub(super) fn poses(&self, value: impl Fn(&Joint<'_>) -> f64) -> Vec<Isometry3<f64>> {
+        let mut poses: Vec<Isometry3<f64>> = Vec::new();
+        for body in &self.bodies {
+            let parent = body.parent.map_or_else(Isometry3::identity, |parent| poses[parent]);
+            let joints = body.joints.iter().map(|j| &self.joints[*j]);
+            poses.push(joints.fold(parent * body.pose, |pose, joint| {
+                let by = value(joint) - joint.reference;
+                pose * match joint.kind {
+                    JointKind::Slide => Isometry3::from(Translation3::from(joint.axis.scale(by))),
+                    JointKind::Hinge => {
+                        let turn = UnitQuaternion::from_axis_angle(&joint.axis, by);
+                        let anchor = Translation3::from(joint.anchor);
+                        anchor * turn * anchor.inverse()
+                    }
+                    JointKind::Free | JointKind::Ball => Isometry3::identity(),
+                }
+            }));
+        }
+        poses
+    }
+}
+
+/// Reads the bodies.
+pub(super) fn read<'a>(
+    reader: &mut Reader<'_>,
+    root: Node<'a, 'a>,
+    classes: &Classes<'a>,
+    compiler: &Compiler,
+) -> Tree<'a> {
+    let meshes = Meshes::read(reader, root, classes, &compiler.meshes);
+    let mut walk = Walk { reader, classes, compiler, meshes, tree: Tree::default(), items: 0 };
+    for world in root.children().filter(|node| node.has_tag_name("worldbody")) {
+        let place =
+            Place { body: None, class: MAIN, frame: Isometry3::identity(), ending: String::new() };
+        walk.fill(world, &place);
+    }
+    let mut tree = walk.tree;
+    if let Some(total) = compiler.total_mass {
+        let mass: f64 = tree.bodies.iter().filter_map(|body| body.inertia).map(|i| i.mass).sum();
+        if mass > 0.0 {
+            for inertia in tree.bodies.iter_mut().filter_map(|body| body.inertia.as_mut()) {
+                inertia.mass *= total / mass;
+                inertia.tensor *= total / mass;
+            }
+        }
+    }
+    tree
+}
+
+/// Where an element stands.
+#[derive(Clone)]
+struct Place {
+    body: Option<usize>,
+    class: usize,
+    /// In the body.
+    frame: Isometry3<f64>,
+    /// What replications append to names.
+    ending: String,
+}
+
+struct Walk<'r, 'a, 'd> {
+    reader: &'r mut Reader<'d>,
+    classes: &'r Classes<'a>,
+    compiler: &'r Compiler,
+    meshes: Meshes<'a>,
+    tree: Tree<'a>,
+    items: usize,
+}
+
+impl<'a> Walk<'_, 'a, '_> {
+    /// Reads what is in a body, a frame or a replication.
+    fn fill(&mut self, node: Node<'a, 'a>, place: &Place) {
+        for child in node.children().filter(Node::is_element) {
+            if self.items > ITEMS_MAX || self.tree.bodies.len() > MAX_FRAMES {
+                return;
+            }
+            match (child.tag_name().name(), place.body) {
+                ("inertial", Some(body)) => self.inertial(body, child),
+                ("joint" | "freejoint", Some(body)) => self.joint(body, child, place),
+                ("inertial" | "joint" | "freejoint", None) => {
+                    self.reader.fail(child, "the world has no inertia and no joints");
+                }
+                ("geom", _) => self.geom(child, place),
+                ("site", _) => self.site(child, place),
+                ("frame", _) => {
+                    let settings = Settings::alone(child);
+                    let pose = self.compiler.pose(self.reader, &settings);
+                    let class = self.class_in(child, place);
+                    self.fill(child, &Place { class, frame: place.frame * pose, ..place.clone() });
+                }
+                ("replicate", _) => self.replicate(child, place),
+                ("body", _) => self.body(child, place),
+                _ => {}
+            }
+        }
+    }
+
+    fn class_in(&mut self, node: Node<'a, 'a>, place: &Place) -> usize {
+        self.classes.named(self.reader, node, "childclass").unwrap_or(place.class)
+    }
+
+    fn replicate(&mut self, node: Node<'a, 'a>, place: &Place) {
+        let count = self.reader.number(node, "count");
+        if !(count >= 1.0 && count.fract() == 0.0 && count <= MAX_FRAMES as f64) {
+            let message = format!("`count` of `replicate` is {count}; must be 1 to {MAX_FRAMES}");
+            return self.reader.fail(node, message);
+        }
+        let offset = Translation3::from(self.reader.vector_or(node, "offset", [0.0; 3]));
+        let euler = self.reader.vector_or::<3>(node, "euler", [0.0; 3]);
+        let separator = node.attribute("sep").unwrap_or_default();
+        let class = self.class_in(node, place);
+        let (digits, mut position) = (count.to_string().len(), Translation3::identity());
+        for i in 0..count as usize {
+            let turn = self.compiler.euler(euler.map(|angle| angle * i as f64));
+            let pose = position * turn;
+            let ending = format!("{separator}{i:0digits$}{}", place.ending);
+            let frame = place.frame * pose;
+            self.fill(node, &Place { class, frame, ending, ..place.clone() });
+            position = (pose * offset).translation;
+        }
+    }
+
+    fn body(&mut self, node: Node<'a, 'a>, place: &Place) {
+        let body = self.tree.bodies.len();
+        if body == MAX_FRAMES {
+            let message = format!("more than {MAX_FRAMES} bodies, the replicated ones counted");
+            self.reader.fail(node, message);
+        }
+        let settings = Settings::alone(node);
+        let own = self.compiler.pose(self.reader, &settings);
+        let name = node.attribute("name").unwrap_or_default();
+        self.tree.bodies.push(Body {
+            node,
+            name: named(name, place),
+            parent: place.body,
+            pose: place.frame * own,
+            joints: Vec::new(),
+            inertia: None,
+            lift: self.reader.number_or(node, "gravcomp", 0.0),
+            is_mocap: settings.is_true(self.reader, "mocap"),
+            visuals: Vec::new(),
+            inertial: None,
+            is_weighed: match self.compiler.inertia_from_geoms {
+                FromGeoms::Never => false,
+                FromGeoms::Always => true,
+                FromGeoms::Else => !has_inertial(node),
+            },
+            geoms: Vec::new(),
+        });
+        self.register(0, node, &named(name, place), body);
+        let class = self.class_in(node, place);
+        let frame = Isometry3::identity();
+        self.fill(node, &Place { body: Some(body), class, frame, ending: place.ending.clone() });
+        self.settle(body, own);
+        let Body { is_mocap, joints, parent, .. } = &self.tree.bodies[body];
+        if *is_mocap && !(joints.is_empty() && parent.is_none()) {
+            self.reader.fail(node, "a mocap body has no joints, and the world for a parent");
+        }
+    }
+
+    fn inertial(&mut self, body: usize, node: Node<'a, 'a>) {
+        if self.tree.bodies[body].inertial.replace(node).is_some() {
+            self.reader.fail(node, "a second `inertial` in `body`; there may be one");
+        }
+    }
+
+    /// The inertia of a body all of whose parts are known.
+    fn settle(&mut self, body: usize, own: Isometry3<f64>) {
+        let Body { inertial, geoms, node, .. } = &mut self.tree.bodies[body];
+        let (inertial, geoms, node) = (*inertial, std::mem::take(geoms), *node);
+        let inertia = if !geoms.is_empty() {
+            self.reader.exact("inertia from shapes");
+            Some(Inertia::sum(geoms.into_iter()))
+        } else if let Some(node) = inertial {
+            self.reader.exact("inertia as it is given");
+            Some(self.given_inertia(node))
+        } else if self.compiler.least != [0.0; 2] {
+            // MuJoCo takes the body's own place in its parent for its centre of mass then.
+            let center = own.translation.vector;
+            Some(Inertia { mass: 0.0, center, tensor: Matrix3::zeros() })
+        } else {
+            None
+        };
+        let inertia = inertia.map(|inertia| self.compiler.bounded(inertia));
+        if let Some(bad) = inertia.filter(|inertia| !inertia.is_possible()) {
+            let message = format!(
+                "no body has the inertia of `{}`: {:?} kg·m² violate a + b ≥ c; `balanceinertia` mends it",
+                self.tree.bodies[body].name,
+                bad.moments()
+            );
+            self.reader.refuse(inertial.unwrap_or(node), message);
+        }
+        self.tree.bodies[body].inertia = inertia;
+    }
+
+    fn given_inertia(&mut self, node: Node<'a, 'a>) -> Inertia {
+        let settings = Settings::alone(node);
+        self.reader.required(node, "pos");
+        let pose = self.compiler.pose(self.reader, &settings);
+        let mass = self.reader.number(node, "mass");
+        if mass < 0.0 {
+            self.reader.fail(node, format!("the mass is {mass} kg; must not be negative"));
+        }
+        let diagonal = settings.numbers::<3>(self.reader, "diaginertia");
+        let full = settings.numbers::<6>(self.reader, "fullinertia");
+        if full.is_some() && diagonal.is_some() {
+            self.reader.fail(node, "`diaginertia` and `fullinertia`; one of them is allowed");
+        }
+        let tensor = match full {
+            Some([xx, yy, zz, xy, xz, yz]) => Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, zz),
+            None => Matrix3::from_diagonal(&diagonal.unwrap_or_default().into()),
+        };
+        Inertia { mass, center: Vector3::zeros(), tensor }.at(&pose)
+    }
+
+    fn joint(&mut self, body: usize, node: Node<'a, 'a>, place: &Place) {
+        let is_free = node.has_tag_name("freejoint");
+        let settings = if is_free {
+            Settings::alone(node)
+        } else {
+            self.classes.settings(self.reader, node, place.class, "joint")
+        };
+        let (reader, compiler) = (&mut *self.reader, self.compiler);
+        const KINDS: [&str; 4] = ["free", "ball", "slide", "hinge"];
+        let kind = match settings.keyword(reader, "type", &KINDS) {
+            _ if is_free => JointKind::Free,
+            Some(0) => JointKind::Free,
+            Some(1) => JointKind::Ball,
+            Some(2) => JointKind::Slide,
+            _ => JointKind::Hinge,
+        };
+        let first = self.tree.bodies[body].joints.iter().map(|j| self.tree.joints[*j].kind).next();
+        if kind == JointKind::Free
+            && place.body.is_some_and(|b| self.tree.bodies[b].parent.is_some())
+        {
+            reader.fail(node, "a free joint in a body whose parent is not the world");
+        }
+        if first == Some(JointKind::Free) || (first.is_some() && kind == JointKind::Free) {
+            reader.fail(node, "a free joint beside another joint of the body");
+        }
+        let align = settings.keyword(reader, "align", &["false", "true", "auto"]).unwrap_or(2);
+        if kind == JointKind::Free && (align == 1 || (align == 2 && compiler.aligns)) {
+            let message = "`align`: the body's frame would become that of its principal axes; write it so, or switch it off";
+            reader.refuse(node, message);
+        }
+        let single = matches!(kind, JointKind::Hinge | JointKind::Slide);
+        let angle =
+            |angle: f64| if kind == JointKind::Slide { angle } else { compiler.radians(angle) };
+        let axis = settings.numbers::<3>(reader, "axis").filter(|_| single);
+        let axis = place.frame.rotation * Vector3::from(axis.unwrap_or([0.0, 0.0, 1.0]));
+        let axis = Unit::try_new(axis, TINY).unwrap_or_else(|| {
+            reader.fail(node, "`axis` of `joint` has no direction");
+            Vector3::z_axis()
+        });
+        let anchor = settings.numbers::<3>(reader, "pos").unwrap_or_default();
+        let anchor = (place.frame * nalgebra::Point3::from(anchor)).coords;
+        let value = |reader: &mut Reader<'_>, name: &str| {
+            settings.number(reader, name).filter(|_| single).map_or(0.0, angle)
+        };
+        let limits = if single {
+            settings.range(reader, "range", "limited", compiler.limits_by_range)
+        } else {
+            let range = settings.numbers::<2>(reader, "range").unwrap_or_default();
+            let is_limited =
+                settings.keyword(reader, "limited", &["false", "true", "auto"]) != Some(0);
+            if kind == JointKind::Ball && is_limited && range != [0.0; 2] {
+                let message = "`range` of a ball joint: an orientation has no limits here";
+                reader.note(Kind::Approximated, node, message);
+            }
+            None
+        };
+        if settings
+            .range(reader, "actuatorfrcrange", "actuatorfrclimited", compiler.limits_by_range)
+            .is_some()
+        {
+            let message = "`actuatorfrcrange`: forces of actuators are not cut off; clients keep to the limits of inputs";
+            reader.note(Kind::Approximated, node, message);
+        }
+        if settings.is_true(reader, "actuatorgravcomp") {
+            reader.note(
+                Kind::NoEffect,
+                node,
+                "`actuatorgravcomp`: what lifts a body counts as work from outside",
+            );
+        }
+        let spring_damper =
+            settings.numbers::<2>(reader, "springdamper").filter(|pair| *pair != [0.0; 2]);
+        if spring_damper.is_some_and(|pair| pair.iter().any(|x| *x <= 0.0)) {
+            reader.fail(node, "`springdamper` of `joint` must be two numbers greater than 0");
+        }
+        let joint = Joint {
+            node,
+            name: named(settings.node().attribute("name").unwrap_or_default(), place),
+            kind,
+            body,
+            anchor: if kind == JointKind::Free { Vector3::zeros() } else { anchor },
+            axis,
+            reference: value(reader, "ref"),
+            rest: value(reader, "springref"),
+            limits: limits.map(|limits| limits.map(angle)),
+            stiffness: settings.first_numbers(reader, "stiffness"),
+            damping: settings.first_numbers(reader, "damping"),
+            spring_damper,
+            armature: settings.amount(reader, "armature"),
+            friction: settings.amount(reader, "frictionloss"),
+        };
+        let index = self.tree.joints.len();
+        self.register(1, node, &joint.name, index);
+        self.tree.bodies[body].joints.push(index);
+        self.tree.joints.push(joint);
+    }
+
+    fn site(&mut self, node: Node<'a, 'a>, place: &Place) {
+        let settings = self.classes.settings(self.reader, node, place.class, "site");
+        let mut pose = self.compiler.pose(self.reader, &settings);
+        if let Some(ends) = settings.numbers::<6>(self.reader, "fromto") {
+            pose = self.between(node, ends).0;
+        }
+        let name = named(node.attribute("name").unwrap_or_default(), place);
+        self.register(2, node, &name, self.tree.sites.len());
+        self.tree.sites.push(Site { body: place.body, pose: place.frame * pose });
+        self.count(node);
+    }
+
+    /// Keeps a name, which may be there once among those of a kind.
+    fn register(&mut self, kind: usize, node: Node<'a, 'a>, name: &str, index: usize) {
+        let is_new =
+            name.is_empty() || self.tree.names[kind].insert(name.to_owned(), index).is_none();
+        if !is_new {
+            let kind = ["bodies", "joints", "sites"][kind];
+            self.reader.fail(node, format!("there are two {kind} `{name}`"));
+        }
+    }
+
+    /// Midway between two points, z from the second to the first, and half their distance.
+    fn between(&mut self, node: Node<'a, 'a>, ends: [f64; 6]) -> (Isometry3<f64>, f64) {
+        let [a, b, c, d, e, f] = ends;
+        let (from, to) = (Vector3::new(a, b, c), Vector3::new(d, e, f));
+        let along = from - to;
+        let direction = Unit::try_new(along, TINY).unwrap_or_else(|| {
+            self.reader.fail(node, "the two points of `fromto` are one");
+            Vector3::z_axis()
+        });
+        let middle = Translation3::from((from + to) / 2.0);
+        (Isometry3::from_parts(middle, from_z(direction)), along.norm() / 2.0)
+    }
+
+    fn count(&mut self, node: Node<'a, 'a>) {
+        self.items += 1;
+        if self.items == ITEMS_MAX {
+            let message =
+                format!("more than {ITEMS_MAX} geoms and sites, the replicated ones counted");
+            self.reader.fail(node, message);
+        }
+    }
+
+    fn geom(&mut self, node: Node<'a, 'a>, place: &Place) {
+        self.count(node);
+        let settings = self.classes.settings(self.reader, node, place.class, "geom");
+        let bit = |reader: &mut Reader<'_>, name| settings.number(reader, name).unwrap_or(1.0);
+        if ["contype", "conaffinity"].iter().any(|name| bit(self.reader, name) != 0.0) {
+            self.tree.touching.get_or_insert((node, 0)).1 += 1;
+        }
+        let mut pose = self.compiler.pose(self.reader, &settings);
+        let mut size: [f64; 3] = settings.first_numbers(self.reader, "size");
+        const KINDS: [&str; 9] =
+            ["sphere", "capsule", "cylinder", "ellipsoid", "box", "mesh", "plane", "hfield", "sdf"];
+        let kind = settings.keyword(self.reader, "type", &KINDS).unwrap_or(0);
+        if let Some(ends) = settings.numbers::<6>(self.reader, "fromto")
+            && (1..5).contains(&kind)
+        {
+            let (middle, half) = self.between(node, ends);
+            pose = middle;
+            size = if kind < 3 { [size[0], half, size[2]] } else { [size[0], size[0], half] };
+        }
+        let pose = place.frame * pose;
+        let [radius, half, _] = size;
+        let shape = match (kind, settings.text("mesh")) {
+            (0, None) => Some(Shape::Sphere { radius }),
+            (1, None) => Some(Shape::Capsule { radius, half }),
+            (2, None) => Some(Shape::Cylinder { radius, half }),
+            (3, None) => Some(Shape::Ellipsoid { radii: size.into() }),
+            (4, None) => Some(Shape::Box { halves: size.into() }),
+            _ => None,
+        };
+        let lengths = match kind {
+            0 => 1,
+            1 | 2 => 2,
+            _ => 3,
+        };
+        if shape.is_some() && size[..lengths].iter().any(|length| *length <= 0.0) {
+            let (name, words) = (KINDS[kind], ["one number", "two numbers", "three numbers"]);
+            let message =
+                format!("`size` of a {name} must be {} greater than 0", words[lengths - 1]);
+            self.reader.fail(node, message);
+        }
+        let Some(body) = place.body else { return };
+        self.weigh(body, &settings, shape, &pose);
+        self.show(body, &settings, shape, &pose);
+    }
+
+    /// Adds the inertia of a geom to those of its body, if it counts.
+    fn weigh(
+        &mut self,
+        body: usize,
+        settings: &Settings<'a>,
+        shape: Option<Shape>,
+        pose: &Isometry3<f64>,
+    ) {
+        let group = settings.number(self.reader, "group").unwrap_or_default();
+        let [least, most] = self.compiler.inertia_groups;
+        let mass = settings.number(self.reader, "mass");
+        let density = settings.number(self.reader, "density").unwrap_or(1000.0);
+        let is_shell = settings.is_true(self.reader, "shellinertia");
+        if mass.unwrap_or(density) < 0.0 {
+            self.reader.fail(settings.node(), "`mass` and `density` must not be negative");
+        }
+        let counts = self.tree.bodies[body].is_weighed;
+        if !counts || !(least..=most).contains(&group) || mass.unwrap_or(density) == 0.0 {
+            return;
+        }
+        let Some(shape) = shape else {
+            if !matches!(settings.text("type"), Some("plane" | "hfield")) {
+                let message = "the inertia of a mesh: give its body an `inertial`";
+                self.reader.refuse(settings.node(), message);
+            }
+            return;
+        };
+        let volume = shape.volume(is_shell);
+        let mass = mass.unwrap_or(density * volume);
+        if volume > TINY && mass > TINY {
+            let tensor = Matrix3::from_diagonal(&shape.moments(mass, is_shell));
+            let own = Inertia { mass, center: Vector3::zeros(), tensor };
+            self.tree.bodies[body].geoms.push(own.at(pose));
+        }
+    }
+
+    /// Adds a geom to what shows its body.
+    fn show(
+        &mut self,
+        body: usize,
+        settings: &Settings<'a>,
+        shape: Option<Shape>,
+        pose: &Isometry3<f64>,
+    ) {
+        let mesh = settings.text("mesh").and_then(|name| self.meshes.shape(name));
+        let Some(shape) = shape.map(drawn).or(mesh) else { return };
+        if self.items >= MAX_VISUALS {
+            return;
+        }
+        let color = settings.numbers::<4>(self.reader, "rgba");
+        self.tree.bodies[body].visuals.push(Visual {
+            shape,
+            translation: pose.translation.vector.into(),
+            rotation: rotation(&pose.rotation),
+            color: color.map(|color| color.map(|part| part.clamp(0.0, 1.0))),
+        });
+    }
+}
+
+/// Whether a body says what its inertia is, in a frame of it too.
+fn has_inertial(body: Node<'_, '_>) -> bool {
+    body.children().any(|child| {
+        child.has_tag_name("inertial")
+            || (["frame", "replicate"].iter().any(|name| child.has_tag_name(*name))
+                && has_inertial(child))
+    })
+}
+
+fn named(name: &str, place: &Place) -> String {
+    if name.is_empty() { String::new() } else { format!("{name}{}", place.ending) }
+}
+
+fn drawn(shape: Shape) -> scene::Shape {
+    match shape {
+        Shape::Sphere { radius } => scene::Shape::Sphere { radius },
+        Shape::Capsule { radius, half } => scene::Shape::Capsule { radius, length: 2.0 * half },
+        Shape::Cylinder { radius, half } => scene::Shape::Cylinder { radius, length: 2.0 * half },
+        Shape::Ellipsoid { radii } => scene::Shape::Ellipsoid { radii: radii.into() },
+        Shape::Box { halves } => scene::Shape::Box { size: (halves * 2.0).into() },
+    }
+}
+
+/// An orientation as a scene writes it.
+pub(super) fn rotation(turn: &UnitQuaternion<f64>) -> Option<Rotation> {
+    let is_none = turn.imag().amax() < 1e-15;
+    (!is_none).then(|| Rotation::Quaternion([turn.w, turn.i, turn.j, turn.k]))
+}
