@@ -14,7 +14,7 @@ use crate::mjcf::settings::{Compiler, FromGeoms, from_z};
 use crate::mjcf::shapes::Shape;
 use crate::report::Kind;
 
-/// Geoms and sites that are read at most, after replication.
+/// Geoms, sites and copies of replications that are made at most.
 const ITEMS_MAX: usize = 1 << 17;
 /// Masses, kg, and volumes, m³, that count as none.
 const TINY: f64 = 1e-14;
@@ -181,7 +181,7 @@ impl<'a> Walk<'_, 'a, '_> {
     /// Reads what is in a body, a frame or a replication.
     fn fill(&mut self, node: Node<'a, 'a>, place: &Place) {
         for child in node.children().filter(Node::is_element) {
-            if self.items > ITEMS_MAX || self.tree.bodies.len() > MAX_FRAMES {
+            if self.is_full() {
                 return;
             }
             match (child.tag_name().name(), place.body) {
@@ -205,6 +205,10 @@ impl<'a> Walk<'_, 'a, '_> {
         }
     }
 
+    fn is_full(&self) -> bool {
+        self.items > ITEMS_MAX || self.tree.bodies.len() > MAX_FRAMES
+    }
+
     fn class_in(&mut self, node: Node<'a, 'a>, place: &Place) -> usize {
         self.classes.named(self.reader, node, "childclass").unwrap_or(place.class)
     }
@@ -221,6 +225,10 @@ impl<'a> Walk<'_, 'a, '_> {
         let class = self.class_in(node, place);
         let (digits, mut position) = (count.to_string().len(), Translation3::identity());
         for i in 0..count as usize {
+            self.count(node);
+            if self.is_full() {
+                return;
+            }
             let turn = self.compiler.euler(euler.map(|angle| angle * i as f64));
             let pose = position * turn;
             let ending = format!("{separator}{i:0digits$}{}", place.ending);
@@ -458,8 +466,9 @@ impl<'a> Walk<'_, 'a, '_> {
     fn count(&mut self, node: Node<'a, 'a>) {
         self.items += 1;
         if self.items == ITEMS_MAX {
-            let message =
-                format!("more than {ITEMS_MAX} geoms and sites, the replicated ones counted");
+            let message = format!(
+                "more than {ITEMS_MAX} geoms, sites and copies, the replicated ones counted"
+            );
             self.reader.fail(node, message);
         }
     }

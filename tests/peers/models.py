@@ -1,0 +1,171 @@
+"""Compares MJCFs of dm_control's suite and of gymnasium, imported, with MuJoCo; writes models/import/MODELS.md
+
+  pip install mujoco dm_control gymnasium ./client/python
+  cargo build --release -p plantd-server -p plantd-client
+  python3 tests/peers/models.py [--server http://127.0.0.1:50051] [MODEL.xml ...]
+
+Each model is imported with `plantctl import`, its scene uploaded to a running server, and looked at in three
+random states: the mass matrix by the momenta of unit velocities, and the accelerations with springs, dampers,
+armature and actuators under random controls. Contacts, limits, dry friction, equalities and force ranges are
+switched off in MuJoCo, and friction and constraints taken out of the scene: they are softer there, or not there.
+"""
+
+import argparse
+import importlib.metadata
+import importlib.util
+import json
+import pathlib
+import subprocess
+import sys
+import tomllib
+import warnings
+
+import mujoco
+import numpy as np
+
+import plantd
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+BINARIES = ROOT / "target" / "release"
+FOLDERS = {"dm_control": "suite", "gymnasium": "envs/mujoco/assets"}
+
+
+def published():
+    """Models by name; the suite's common files are parts of others."""
+    for package, folder in FOLDERS.items():
+        home = pathlib.Path(importlib.util.find_spec(package).origin).parent / folder
+        for file in sorted(home.glob("*.xml")):
+            yield f"{package}/{file.name}", file
+
+
+def imported(plantctl, file):
+    """The scene without constraints and friction, or the first reason against it."""
+    done = subprocess.run(
+        [plantctl, "import", "--json", file], capture_output=True, text=True, timeout=60
+    )
+    if done.returncode != 0:
+        told = json.loads(done.stderr.splitlines()[-1])["error"]["message"]
+        return None, told.removeprefix(f"{file} cannot be imported: ").splitlines()[0]
+    scene = tomllib.loads(json.loads(done.stdout)["scene_toml"])
+    for what in ("constraints", "operating_points"):
+        scene.pop(what, None)
+    scene["forces"] = [force for force in scene.get("forces", []) if force["type"] != "friction"]
+    return scene, None
+
+
+def peer(file):
+    """The model in MuJoCo with smooth forces only."""
+    model = mujoco.MjModel.from_xml_path(str(file))
+    off = mujoco.mjtDisableBit
+    model.opt.disableflags |= int(
+        off.mjDSBL_CONTACT | off.mjDSBL_LIMIT | off.mjDSBL_FRICTIONLOSS | off.mjDSBL_EQUALITY
+    )
+    model.opt.density = model.opt.viscosity = 0
+    model.actuator_forcelimited[:] = 0
+    model.actuator_ctrllimited[:] = 0
+    model.jnt_actfrclimited[:] = 0
+    model.tendon_actfrclimited[:] = 0
+    return model
+
+
+def state(model, rng):
+    """A random configuration in MuJoCo's numbers and in the scene's."""
+    data, own = mujoco.MjData(model), []
+    for joint in range(model.njnt):
+        kind, at = mujoco.mjtJoint(model.jnt_type[joint]), model.jnt_qposadr[joint]
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            turn = rng.normal(size=4)
+            turn *= np.sign(turn[0]) / np.linalg.norm(turn)
+            if kind == mujoco.mjtJoint.mjJNT_FREE:
+                data.qpos[at : at + 3] = rng.uniform(-1, 1, 3)
+                own += [*data.qpos[at : at + 3]]
+                at += 3
+            data.qpos[at : at + 4] = turn
+            angle = 2 * np.arctan2(np.linalg.norm(turn[1:]), turn[0])
+            own += [*(turn[1:] / np.linalg.norm(turn[1:]) * angle)]
+        else:
+            reach = 1.5 if kind == mujoco.mjtJoint.mjJNT_HINGE else 0.2
+            data.qpos[at] = rng.uniform(-reach, reach)
+            own.append(data.qpos[at])
+    data.qvel[:] = rng.normal(size=model.nv)
+    data.ctrl[:] = rng.uniform(-1, 1, size=model.nu)
+    mujoco.mj_forward(model, data)
+    return data, np.array(own)
+
+
+def compared(client, scene, file):
+    """Freedoms, and the largest differences of mass matrix and accelerations over their largest entries."""
+    model = peer(file)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        made = client.create_model(json.dumps(scene), name="model-under-test")
+    try:
+        names = [coordinate.name for coordinate in made.coordinates]
+        held = len(names) - model.nv
+        if held != 6 * model.nmocap or len(made.inputs) != model.nu:
+            raise ValueError(
+                f"{len(names)} coordinates and {len(made.inputs)} inputs instead of {model.nv} and {model.nu}"
+            )
+        initial = {c["name"]: c.get("initial", 0.0) for c in scene.get("coordinates", [])}
+        tail = np.array([initial.get(name, 0.0) for name in names[model.nv :]])
+        plant, worst = client.create_plant(made.name), np.zeros(2)
+        rng = np.random.default_rng(1)
+        for _ in range(3):
+            data, own = state(model, rng)
+            own = np.concatenate([own, tail])
+            mass = np.zeros((model.nv, model.nv))
+            mujoco.mj_fullM(model, data, mass)
+            unit = np.eye(model.nv, len(names))
+            found = [client.reset(plant.id, q=own, v=unit[j]).p for j in range(model.nv)]
+            worst[0] = max(worst[0], abs(np.array(found).T - mass).max() / abs(mass).max())
+            v = np.concatenate([data.qvel, np.zeros(held)])
+            # An actuator that moves nothing has no input; the others keep their order.
+            acceleration = client.evaluate_dynamics(made.name, own, v, inputs=data.ctrl).acceleration
+            scale = max(abs(data.qacc).max(), 1e-300)
+            worst[1] = max(worst[1], abs(acceleration - data.qacc).max() / scale)
+        client.delete_plant(plant.id)
+        return len(names), worst
+    finally:
+        client.delete_model(made.name)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--server", default="http://127.0.0.1:50051")
+    parser.add_argument("--binaries", type=pathlib.Path, default=BINARIES)
+    parser.add_argument("models", nargs="*", type=pathlib.Path)
+    options = parser.parse_args()
+    rows, is_good = [], True
+    with plantd.connect(options.server) as client:
+        for name, file in [(file.name, file) for file in options.models] or published():
+            scene, refusal = imported(options.binaries / "plantctl", file)
+            if scene is None:
+                cell = f"refused: {refusal}"
+            else:
+                try:
+                    count, worst = compared(client, scene, file)
+                    is_good &= bool(worst[0] < 1e-9 and worst[1] < 1e-7)
+                    cell = f"{count}: {worst[0]:.0e}, {worst[1]:.0e}"
+                except (plantd.PlantdError, ValueError) as error:
+                    is_good = False
+                    cell = f"not compared: {error}".replace("\n", " ")
+            rows.append(f"| {name} | {cell} |")
+            print(rows[-1], flush=True)
+    if not options.models:
+        versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in FOLDERS)
+        lines = [
+            "# Models in MJCF beside MuJoCo",
+            "",
+            f"The MJCFs of {versions}, imported, and MuJoCo {mujoco.__version__}: the number of coordinates, and the largest differences of the mass matrix and of the accelerations (springs, dampers, armature and actuators included) over their largest entries, in three random states.",
+            "Made by `python3 tests/peers/models.py`.",
+            "",
+            "| model | |",
+            "| --- | --- |",
+            *rows,
+        ]
+        (ROOT / "models/import/MODELS.md").write_text("\n".join(lines) + "\n")
+    sys.exit(0 if is_good else 1)
+
+
+if __name__ == "__main__":
+    main()
