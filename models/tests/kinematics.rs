@@ -8,8 +8,8 @@ use std::sync::Arc;
 use common::{Numbers, builtin, floating, forced_tree, model, plant, random_tree, slope, wave};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::{
-    Continuous, ContinuousError, ContinuousPoint, FrameMotion, Initial, Kinematics, Model, Plant,
-    Scene, Settings, Terms,
+    Continuous, ContinuousError, ContinuousPoint, Diagnostics, FrameMotion, Initial, Kinematics,
+    Model, Plant, Scene, Settings, Terms,
 };
 
 fn elements() -> Vec<Scene> {
@@ -450,4 +450,68 @@ fn a_singular_mass_matrix_has_terms() {
     let lacking: Vec<f64> =
         (0..2).map(|i| expected[i] + found.bias[i] - found.passive[i] - found.input[i]).collect();
     close(&inverse.force, &lacking, 1e-13, "inverse");
+}
+
+const TUMBLING: &str = r#"
+format = 1
+name = "tumbling"
+gravity = [0, 0, 0]
+[[frames]]
+name = "hull"
+joint = { type = "free" }
+body = { mass = 2, inertia = [0.3, 0.4, 0.5] }
+"#;
+
+const ARM: &str = r#"
+[[frames]]
+name = "arm"
+parent = "hull"
+translation = [0.4, 0.1, 0.0]
+joint = { type = "revolute", axis = [0.3, 1.0, 0.2] }
+body = { mass = 0.7, center_of_mass = [0.3, 0.1, -0.2], inertia = [0.02, 0.03, 0.04] }
+[[frames]]
+name = "hand"
+parent = "arm"
+translation = [0.5, 0.0, 0.0]
+joint = { type = "ball" }
+body = { mass = 0.4, center_of_mass = [0.2, 0.0, 0.1], inertia = [0.01, 0.02, 0.015] }
+"#;
+
+/// Euler's equations, in the body's axes: `I α + ω × I ω = τ`.
+#[test]
+fn a_tumbling_body_in_closed_form() {
+    let model = model(&Scene::from_toml(TUMBLING).unwrap());
+    let (at, acceleration) = point(&model, 17);
+    let ball = model.orientations()[0];
+    let (w, i) = (&at.v[ball..ball + 3], [0.3, 0.4, 0.5]);
+    let expected: Vec<f64> = (0..3)
+        .map(|a| (a, (a + 1) % 3, (a + 2) % 3))
+        .map(|(_, b, c)| (i[c] - i[b]) * w[b] * w[c])
+        .collect();
+    let mut continuous = Continuous::new(model);
+    close(&continuous.terms(&at).unwrap().bias[ball..ball + 3], &expected, 1e-14, "bias");
+    let force = continuous.inverse(&at, &acceleration).unwrap().force;
+    let turned = (0..3).map(|a| i[a] * acceleration[ball + a] + expected[a]);
+    close(&force[ball..ball + 3], &turned.collect::<Vec<_>>(), 1e-14, "torque");
+}
+
+/// Nothing pushes from outside: along the accelerations of zero forces the momenta stay as they are.
+#[test]
+fn free_bodies_with_ball_joints_keep_their_momenta() {
+    let model = model(&Scene::from_toml(&format!("{TUMBLING}{ARM}")).unwrap());
+    let (at, _) = point(&model, 17);
+    let found = terms(&model, &at);
+    let bias = DVector::from_column_slice(&found.bias);
+    let acceleration = -found.mass_matrix.cholesky().unwrap().solve(&bias);
+    let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+    let rate = slope(1e-3, |t| {
+        let motion = at.v.iter().zip(&acceleration);
+        let change: Vec<f64> = motion.map(|(v, a)| t * (v + 0.5 * t * a)).collect();
+        let v = at.v.iter().zip(&acceleration).map(|(v, a)| v + t * a).collect();
+        let q = model.retract(&at.q, &change);
+        plant.initialize(&Initial::Velocity { q, v }).unwrap();
+        let Diagnostics { linear_momentum, angular_momentum, .. } = plant.diagnose();
+        [linear_momentum, angular_momentum].concat()
+    });
+    close(&rate, &[0.0; 6], 1e-9, "rates of momenta");
 }
