@@ -252,8 +252,13 @@ class FrameMotion:
 
     @classmethod
     def _from(cls, m: control_service_pb2.FrameMotion) -> FrameMotion:
-        vectors = (m.position, m.orientation, m.linear_velocity, m.angular_velocity)
-        return cls(*map(array, vectors), optional_matrix(m, "jacobian"))
+        return cls(
+            array(m.position),
+            array(m.orientation),
+            array(m.linear_velocity),
+            array(m.angular_velocity),
+            optional_matrix(m, "jacobian"),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,8 +292,8 @@ class CenterOfMass:
 
     @classmethod
     def _from(cls, m: control_service_pb2.CenterOfMass) -> CenterOfMass:
-        vectors = array(m.position), array(m.velocity)
-        return cls(*vectors, m.mass_kg, optional_matrix(m, "jacobian"))
+        jacobian = optional_matrix(m, "jacobian")
+        return cls(array(m.position), array(m.velocity), m.mass_kg, jacobian)
 
 
 @dataclass(frozen=True, eq=False)
