@@ -130,7 +130,8 @@ fn frames_and_mass_are_those_of_a_plant() {
         let mut plant = plant(&scene, |_| ());
         wave(&mut plant, 5);
         let mut kinematics = Kinematics::new(plant.model().clone());
-        kinematics.place(&plant.q().to_vec(), &plant.velocity()).unwrap();
+        let velocity = plant.velocity();
+        kinematics.place(plant.q(), &velocity).unwrap();
         for frame in kinematics.frames() {
             let at = [0.1, 0.2, -0.3];
             let site = plant.model().site(frame, at).unwrap();

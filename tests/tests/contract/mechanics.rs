@@ -152,10 +152,10 @@ async fn plants_are_looked_at_and_stay() {
     let forward = answer.forward.unwrap();
     let dh = answer.constraint_jacobian.unwrap();
     let inertial = answer.mass_matrix.unwrap().times(&forward.acceleration);
-    for i in 0..3 {
+    for (i, inertial) in inertial.iter().enumerate() {
         let taken: f64 = (0..2).map(|c| dh.at(c, i) * forward.multipliers[c]).sum();
         let right = answer.passive[i] + answer.input[i] - taken;
-        close(&[inertial[i] + answer.bias[i]], &[right], 1e-10);
+        close(&[inertial + answer.bias[i]], &[right], 1e-10);
     }
     let back =
         v1::DynamicsRequest { acceleration: forward.acceleration.clone(), ..terms(of_plant(&id)) };
