@@ -97,7 +97,7 @@ impl Continuous {
         let terms = Terms {
             mass_matrix: DMatrix::from_row_slice(n, n, l_vv),
             bias,
-            gravity: l_q.iter().map(|l_q| -l_q).collect(),
+            gravity: l_q.iter().map(|l_q| 0.0 - l_q).collect(),
             passive,
             input,
             constraint_jacobian: DMatrix::from_row_slice(nc, n, &equations.closure.jacobian),
