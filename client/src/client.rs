@@ -359,6 +359,19 @@ impl Client {
         Ok(self.control().evaluate_dynamics(self.limited(request)).await?.into_inner())
     }
 
+    /// Poses, velocities and Jacobians of frames and points, and the centre of mass, at any state.
+    pub async fn kinematics(
+        &self,
+        request: v1::KinematicsRequest,
+    ) -> Result<v1::KinematicsResponse> {
+        Ok(self.control().kinematics(self.limited(request)).await?.into_inner())
+    }
+
+    /// Mass matrix, bias and forces at any state; forward and inverse dynamics, if asked for.
+    pub async fn dynamics(&self, request: v1::DynamicsRequest) -> Result<v1::DynamicsResponse> {
+        Ok(self.control().dynamics(self.limited(request)).await?.into_inner())
+    }
+
     /// Controllability, observability, modes and frequency response of the linearized map.
     pub async fn analyze(&self, request: v1::AnalyzeRequest) -> Result<v1::AnalyzeResponse> {
         Ok(self.control().analyze(self.limited(request)).await?.into_inner())

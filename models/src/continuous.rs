@@ -21,13 +21,19 @@
 //!
 //! and second derivatives are the dual parts of these along the tangent of each parameter.
 
+pub(crate) mod kinematics;
+pub(crate) mod terms;
+
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
 
 use crate::constraints::closure::Closure;
 use crate::kkt::schur::SchurComplement;
+use crate::lagrangian::armature;
 use crate::lagrangian::derivatives::Derivatives;
+use crate::lagrangian::kinematics::Poses;
+use crate::lagrangian::momenta::Momenta;
 use crate::math::rotation;
 use crate::math::rows::padded;
 use crate::math::scalar::{Dual, Scalar};
@@ -99,7 +105,7 @@ pub enum ContinuousError {
         value: f64,
     },
     /// The numbers given are too large to compute with.
-    #[error("the accelerations leave the finite numbers")]
+    #[error("what follows leaves the finite numbers")]
     Overflow,
     /// The mass matrix is singular.
     #[error(
@@ -439,12 +445,11 @@ impl<S: Scalar> Equations<S> {
     fn evaluate(&mut self, model: &Model) {
         let (along_q, along_v) = (along(&self.q, &self.v), along(&self.v, &self.acceleration));
         let constant = along(&self.inputs, &vec![S::ZERO; self.inputs.len()]);
-        let (mut turned, mut turned_twice) = (Vec::new(), Vec::new());
+        let turned = self.turned(model);
+        let mut turned_twice = Vec::new();
         for (still, &i) in self.orientations.iter().zip(&model.orientations) {
             let (spin, change) = (three(&self.v, i), three(&self.acceleration, i));
-            let turn = pairs(Vec3::ZERO, spin);
-            turned.push(at_rest(still).times(&rotation::exp(turn)));
-            let twice = pairs(turn, pairs(spin, change));
+            let twice = pairs(pairs(Vec3::ZERO, spin), pairs(spin, change));
             turned_twice.push(at_rest(&at_rest(still)).times(&rotation::exp(twice)));
         }
         self.blocks.evaluate(model, (&along_q, &turned), &along_v, &constant);
@@ -455,14 +460,23 @@ impl<S: Scalar> Equations<S> {
             self.closure.evaluate(model, &self.q, &self.orientations);
             self.closure.hessian(model, &self.q, &self.multipliers, &mut self.hessian);
         }
-        self.fill_dynamics();
+        self.fill_dynamics(model);
         self.fill_constraints();
         if !model.orientations.is_empty() {
             self.turn(model);
         }
     }
 
-    /// What ball joints add. Their momenta `m` are in turning axes, and derivatives along their axes do
+    /// Orientations of ball joints along the motion.
+    fn turned(&self, model: &Model) -> Vec<Mat3<Dual<S>>> {
+        let balls = self.orientations.iter().zip(&model.orientations);
+        let turned = balls.map(|(still, &i)| {
+            at_rest(still).times(&rotation::exp(pairs(Vec3::ZERO, three(&self.v, i))))
+        });
+        turned.collect()
+    }
+
+    /// What ball joints add to the derivatives. Their momenta `m` are in turning axes, and derivatives along their axes do
     /// not commute: with the axes `X_a`, the angular velocity `ω` and the angular acceleration `α`,
     ///
     /// ```text
@@ -499,10 +513,6 @@ impl<S: Scalar> Equations<S> {
             }
             let rows = |values: [S; 3]| spin.cross(Vec3(values));
             let momentum = [0, 1, 2].map(|a| self.blocks.l_v[i + a].re);
-            let carried = rows(momentum);
-            for a in 0..3 {
-                self.residual[i + a] += carried[a];
-            }
             for j in 0..n {
                 let by_q = rows([0, 1, 2].map(|a| self.blocks.l_qv[j * n + i + a].re));
                 let mut by_v = rows([0, 1, 2].map(|a| self.blocks.l_vv[j * n + i + a].re));
@@ -520,9 +530,10 @@ impl<S: Scalar> Equations<S> {
     }
 
     /// Rows of the dynamic coordinates.
-    fn fill_dynamics(&mut self) {
+    fn fill_dynamics(&mut self, model: &Model) {
         let (d, blocks) = (self.d, &self.blocks);
         let (n, nd, ni, nc) = (d.coordinates(), d.dynamic, d.inputs, d.constraints);
+        write_rates(model, &self.v, [&blocks.l_q, &blocks.l_v], &mut self.residual[..nd]);
         for i in 0..nd {
             let row = &mut self.jacobian[i * d.columns()..][..d.columns()];
             for j in 0..n {
@@ -539,7 +550,7 @@ impl<S: Scalar> Equations<S> {
             for j in 0..ni {
                 row[2 * n + j] = -blocks.f_u[i * ni + j].re;
             }
-            let mut residual = blocks.l_v[i].eps - blocks.l_q[i].re - blocks.force[i].re;
+            let mut residual = self.residual[i] - blocks.force[i].re;
             for c in 0..nc {
                 let entry = self.motion.jacobian[c * n + i].re.re;
                 row[d.parameters() + nd + c] = entry;
@@ -567,6 +578,21 @@ impl<S: Scalar> Equations<S> {
 }
 
 impl Equations<f64> {
+    /// `M a + bias` of all coordinates: the rate of their momenta less what bodies and gravity make of it.
+    /// Costs O(n).
+    fn inertial_forces(&self, model: &Model) -> Vec<f64> {
+        let (tree, n) = (&model.dynamics, self.d.coordinates());
+        let (along_q, along_v) = (along(&self.q, &self.v), along(&self.v, &self.acceleration));
+        let (mut poses, mut momenta) = (Poses::new(tree), Momenta::new(tree));
+        let (mut l_q, mut l_v) = (vec![Dual::ZERO; n], vec![Dual::ZERO; n]);
+        poses.evaluate(tree, &along_q, &self.turned(model));
+        momenta.gradient(tree, &poses, &along_v, model.gravity, &mut l_q, &mut l_v);
+        armature::add_momentum(&model.armature, &along_v, &mut l_v);
+        let mut forces = vec![0.0; n];
+        write_rates(model, &self.v, [&l_q, &l_v], &mut forces);
+        forces
+    }
+
     /// Takes a point over, with unknowns zero.
     fn place(&mut self, model: &Model, point: &ContinuousPoint) -> Result<(), ContinuousError> {
         let (dynamic, prescribed) = self.acceleration.split_at_mut(self.d.dynamic);
@@ -604,6 +630,25 @@ impl Equations<Dual> {
             let moved = tangent[(d.dynamic + c) * stride + a];
             self.multipliers[c] = Dual::new(at.multipliers[c], moved);
         }
+    }
+}
+
+/// Writes `D L_v − L_q` from `L_q` and `L_v` along the motion, for as many coordinates as `out` has. Momenta
+/// `m` of ball joints are in axes that turn with `ω`: theirs change by `ω × m`, too.
+fn write_rates<S: Scalar>(
+    model: &Model,
+    velocity: &[S],
+    [l_q, l_v]: [&[Dual<S>]; 2],
+    out: &mut [S],
+) {
+    for (out, (l_q, l_v)) in out.iter_mut().zip(l_q.iter().zip(l_v)) {
+        *out = l_v.eps - l_q.re;
+    }
+    for &i in &model.orientations {
+        let Some(out) = out.get_mut(i..i + 3) else { continue };
+        let momentum = three(l_v, i).0.map(|m| m.re);
+        let carried = three(velocity, i).cross(Vec3(momentum));
+        (0..3).for_each(|a| out[a] += carried[a]);
     }
 }
 

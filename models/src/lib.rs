@@ -33,6 +33,8 @@ pub mod reference;
 pub mod scene;
 
 pub use crate::compile::cost::StageCost;
+pub use crate::continuous::kinematics::{CenterOfMass, FrameMotion, FramePoint, Kinematics};
+pub use crate::continuous::terms::{InverseDynamics, Terms};
 pub use crate::continuous::{
     Accelerations, Continuous, ContinuousError, ContinuousLinearization, ContinuousPoint,
 };

@@ -156,6 +156,40 @@ fn second_derivatives_and_dynamics_are_printed() {
 }
 
 #[test]
+fn frames_and_forces_are_printed() {
+    let server = ServerProcess::start().unwrap();
+    let arguments = ["kinematics", "double-pendulum", "--q", "0,0.5", "--v", "1,-1"];
+    let answer = json(&server, &arguments);
+    assert_eq!(answer["frames"][1]["frame"], "forearm");
+    assert_eq!(answer["frames"][1]["position"][2], -1.0);
+    assert_eq!(answer["center_of_mass"]["mass_kg"], 2.0);
+    let point = [&arguments[..], &["--point", "forearm=0,0,-1", "--jacobians"]].concat();
+    let answer = json(&server, &point);
+    assert_eq!(answer["points"][0]["jacobian"]["rows"], 3);
+    let shown = text(&server, &point);
+    for part in ["velocity/m/s", "forearm(0, 0, -1", "Jacobian of centre of 2", "shoulder"] {
+        assert!(shown.contains(part), "no `{part}` in\n{shown}");
+    }
+
+    json(&server, &["create", "four-bar", "--id", "f"]);
+    json(&server, &["step", "f", "--count", "3"]);
+    let arguments = ["forces", "--plant", "f", "--forward", "--acceleration", "0,0,0"];
+    let answer = json(&server, &arguments);
+    assert_eq!(answer["mass_matrix"]["rows"], 3);
+    assert_eq!(answer["forward"]["multipliers"].as_array().unwrap().len(), 2);
+    assert_eq!(answer["inverse"]["force"].as_array().unwrap().len(), 3);
+    let shown = text(&server, &arguments);
+    for part in ["mass matrix (3 × 3)", "tau", "λ with tau = 0", "pin.x", "J kinetic"] {
+        assert!(shown.contains(part), "no `{part}` in\n{shown}");
+    }
+    assert_eq!(json(&server, &["show", "plant", "f"])["plant"]["state"]["step"], 3);
+    assert_eq!(
+        run(&server, &["kinematics", "pendulum", "--point", "theta"]).status.code(),
+        Some(2)
+    );
+}
+
+#[test]
 fn modes_and_responses_are_printed() {
     let server = ServerProcess::start().unwrap();
     let arguments = ["analyze", "cart-pole", "--at", "hanging", "--outputs", "theta,p(x)"];

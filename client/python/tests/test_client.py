@@ -366,6 +366,64 @@ def test_continuous_dynamics(client):
     assert client.evaluate_dynamics("pendulum").jacobian is None
 
 
+def test_kinematics(client):
+    q, v = np.array([0.4, -1.1]), np.array([0.9, -1.7])
+    point = ("forearm", [0.0, 0.0, -1.0])
+    found = client.kinematics("double-pendulum", q=q, v=v, points=[point], jacobians=True)
+    assert found.coordinates == ["shoulder", "elbow"] and found.frames == {}
+    tip = found.points[0]
+    angles = q.cumsum()
+    assert tip.position == pytest.approx([-np.sin(angles).sum(), 0, -np.cos(angles).sum()])
+    assert tip.jacobian.shape == (3, 2) and tip.jacobian @ v == pytest.approx(tip.velocity)
+    for i, unit in enumerate(1e-5 * np.eye(2)):
+        moved = [client.kinematics("double-pendulum", q=q + d, points=[point]) for d in (unit, -unit)]
+        ahead, behind = (kinematics.points[0].position for kinematics in moved)
+        assert (ahead - behind) / 2e-5 == pytest.approx(tip.jacobian[:, i], abs=1e-9)
+    assert found.center_of_mass.mass == 2.0
+    assert found.center_of_mass.jacobian @ v == pytest.approx(found.center_of_mass.velocity)
+
+    plant = client.create_plant("double-pendulum", q=q, v=v).id
+    state = client.step(plant, [[0.1, 0.2]] * 3)[-1]
+    here = client.kinematics(plant=plant, jacobians=True)
+    assert list(here.frames) == ["upper_arm", "forearm"] and here.q.tolist() == state.q.tolist()
+    forearm = here.frames["forearm"]
+    motion = np.concatenate((forearm.linear_velocity, forearm.angular_velocity))
+    assert forearm.jacobian @ here.v == pytest.approx(motion)
+    assert np.linalg.norm(forearm.orientation) == pytest.approx(1)
+    assert client.get_plant(plant).state.step == state.step
+    with pytest.raises(plantd.PlantdError) as caught:
+        client.kinematics("double-pendulum", frames=["tail"])
+    assert caught.value.violations[0].field == "frames[0]"
+
+
+def test_dynamics(client):
+    plant = client.create_plant("four-bar").id
+    client.step(plant, [[0.4]] * 8)
+    found = client.dynamics(plant=plant, forward=True)
+    forward, dh = found.forward, found.constraint_jacobian
+    assert found.inputs.tolist() == [0.4] and dh.shape == (2, 3) and len(found.constraints) == 2
+    left = found.mass_matrix @ forward.acceleration + found.bias
+    right = found.passive + found.input - dh.T @ forward.multipliers
+    assert left == pytest.approx(right, abs=1e-10)
+    energy = client.get_plant(plant).energy
+    assert found.energy.total == pytest.approx(energy.total)
+    assert found.v @ found.mass_matrix @ found.v / 2 == pytest.approx(energy.kinetic)
+    known = client.evaluate_dynamics("four-bar", found.q, found.v, found.inputs)
+    assert forward.acceleration == pytest.approx(known.acceleration)
+    assert forward.multipliers == pytest.approx(known.multipliers)
+
+    # Along the constraints' null space: tau is M times the change, lambda stays.
+    change = np.linalg.svd(dh)[2][-1]
+    inverse = client.dynamics(plant=plant, acceleration=forward.acceleration + change).inverse
+    assert inverse.force == pytest.approx(found.mass_matrix @ change)
+    assert inverse.multipliers == pytest.approx(forward.multipliers)
+    assert inverse.constraint_acceleration == pytest.approx(np.zeros(2), abs=1e-9)
+    assert found.inverse is None
+    with pytest.raises(plantd.PlantdError) as caught:
+        client.dynamics("pendulum", q=[0.1, 0.2])
+    assert caught.value.violations[0].field == "state.q"
+
+
 def test_settle_and_diagnose(client):
     rest = client.settle("pendulum", guess={"theta": 0.9}, inputs={"tau": 4.9})
     assert rest.q == pytest.approx([math.pi / 6]) and rest.u.tolist() == [4.9] and rest.stable

@@ -166,6 +166,14 @@ pub(crate) fn site(scene: &Scene, frame: &str, at: [f64; 3]) -> Option<Site> {
     Some(Site { joints, rotation: placement.rotation, point })
 }
 
+/// All joints of a scene that compiles, and its frames, in its order, as they are fixed to them.
+pub(crate) fn frames(scene: &Scene) -> (Tree, Vec<(String, Placement)>) {
+    let layout = Layout::new(scene);
+    let (tree, _) = Tree::pruned(&layout.joints, &vec![true; layout.joints.len()]);
+    let frames = scene.frames.iter().map(|f| (f.name.clone(), layout.frames[&f.name])).collect();
+    (tree, frames)
+}
+
 pub(super) fn settings<'a>(scene: &'a Scene, name: &str) -> Option<&'a scene::Coordinate> {
     scene.coordinates.iter().find(|c| c.name == name)
 }
@@ -181,7 +189,7 @@ fn initial(scene: &Scene, name: &str) -> f64 {
 }
 
 /// Where a frame is: fixed in the frame of a joint (or the world).
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub(crate) struct Placement {
     pub(crate) joint: usize,
     pub(crate) rotation: Mat3,
@@ -190,7 +198,7 @@ pub(crate) struct Placement {
 
 impl Placement {
     /// At the frame itself.
-    pub(super) const HERE: Self =
+    pub(crate) const HERE: Self =
         Self { joint: WORLD, rotation: Mat3::IDENTITY, translation: Vec3::ZERO };
 }
 

@@ -1,8 +1,24 @@
 //! Kinetic and potential energy.
 
+use crate::lagrangian::armature;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::mechanism::Model;
+
+/// Kinetic and potential energy, with poses and momenta evaluated at `q` and `velocity`.
+pub(crate) fn energy(
+    model: &Model,
+    (poses, momenta): (&Poses, &Momenta),
+    q: &[f64],
+    velocity: &[f64],
+) -> Energy {
+    let twice_kinetic = momenta.twice_kinetic_energy(&model.dynamics, velocity)
+        + armature::twice_kinetic_energy(&model.armature, velocity);
+    Energy {
+        kinetic_j: 0.5 * twice_kinetic,
+        potential_j: potential_energy(model, poses, momenta, q),
+    }
+}
 
 /// Potential energy of gravity and springs, with poses and momenta evaluated at `q`.
 pub(crate) fn potential_energy(model: &Model, poses: &Poses, momenta: &Momenta, q: &[f64]) -> f64 {

@@ -122,6 +122,38 @@ impl<S: Scalar> Momenta<S> {
     }
 }
 
+/// Sums over all bodies that move, about the world's origin.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Totals {
+    /// kg.
+    pub(crate) mass: f64,
+    /// First moment of mass, kg·m.
+    pub(crate) moment: Vec3,
+    /// Linear and angular momentum.
+    pub(crate) momentum: Force,
+}
+
+impl Totals {
+    /// The centre of mass, m; the origin if nothing has mass.
+    pub(crate) fn center(&self) -> Vec3 {
+        if self.mass > 0.0 { self.moment * (1.0 / self.mass) } else { Vec3::ZERO }
+    }
+}
+
+impl Momenta {
+    /// The sums of the last [`Momenta::gradient`].
+    pub(crate) fn totals(&self, tree: &Tree, poses: &Poses) -> Totals {
+        let mut totals = Totals::default();
+        for (i, joint) in tree.joints.iter().enumerate().filter(|(i, j)| j.root == *i) {
+            let (Force { n, f }, origin) = (self.momentum[i], poses.origin[i]);
+            totals.momentum = totals.momentum.add(Force { n: n + origin.cross(f), f });
+            totals.moment += self.moment[i] + origin * joint.subtree_mass;
+            totals.mass += joint.subtree_mass;
+        }
+        totals
+    }
+}
+
 /// Momentum and first moment of mass of one body.
 #[inline(always)]
 fn body_momentum<S: Scalar>(

@@ -3,7 +3,6 @@
 use nalgebra::DMatrix;
 
 use crate::lagrangian::energy::Energy;
-use crate::math::spatial::Vec3;
 use crate::plant::facade::Plant;
 
 /// What can be said of a plant at its state. Momenta are those of the velocity that belongs to the
@@ -50,25 +49,17 @@ impl Plant {
         let energy = self.energy();
         let (poses, momenta) =
             (&self.workspace.mid.mechanics.poses, &self.workspace.mid.mechanics.momenta);
-        let (mut linear, mut angular) = (Vec3::ZERO, Vec3::ZERO);
-        let (mut moment, mut mass) = (Vec3::ZERO, 0.0);
-        for (i, joint) in model.dynamics.joints.iter().enumerate().filter(|(i, j)| j.root == *i) {
-            let (momentum, origin) = (momenta.momentum[i], poses.origin[i]);
-            linear += momentum.f;
-            angular += momentum.n + origin.cross(momentum.f);
-            moment += momenta.moment[i] + origin * joint.subtree_mass;
-            mass += joint.subtree_mass;
-        }
+        let totals = momenta.totals(&model.dynamics, poses);
         let h = self.settings.time_step_s;
         Diagnostics {
             degrees_of_freedom: d.dynamic.saturating_sub(constraint_rank),
             constraint_rank,
             redundant_constraints,
             energy,
-            linear_momentum: linear.0,
-            angular_momentum: angular.0,
-            center_of_mass: if mass > 0.0 { (moment * (1.0 / mass)).0 } else { [0.0; 3] },
-            mass_kg: mass,
+            linear_momentum: totals.momentum.f.0,
+            angular_momentum: totals.momentum.n.0,
+            center_of_mass: totals.center().0,
+            mass_kg: totals.mass,
             constraint_forces: self.state.multipliers.iter().map(|lambda| lambda / h).collect(),
             mass_matrix_reciprocal_condition,
             constraint_reciprocal_condition,

@@ -9,7 +9,7 @@ use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::armature;
-use crate::lagrangian::energy::{Energy, potential_energy};
+use crate::lagrangian::energy::{Energy, energy};
 use crate::math::pivoted_lu::PivotedLu;
 use crate::math::rotation;
 use crate::math::rotation::Quaternion;
@@ -331,14 +331,8 @@ impl Workspace {
     /// Energy at the configuration of a state and the velocity that is there.
     fn energy(&mut self, model: &Model, state: &PreciseState) -> Energy {
         self.gradient(model, state);
-        let (poses, momenta) = (&self.mid.mechanics.poses, &self.mid.mechanics.momenta);
-        let velocity = &self.mid.velocity;
-        Energy {
-            kinetic_j: 0.5
-                * (momenta.twice_kinetic_energy(&model.dynamics, velocity)
-                    + armature::twice_kinetic_energy(&model.armature, velocity)),
-            potential_j: potential_energy(model, poses, momenta, &state.q),
-        }
+        let at = (&self.mid.mechanics.poses, &self.mid.mechanics.momenta);
+        energy(model, at, &state.q, &self.mid.velocity)
     }
 
     /// Gradient of the Lagrangian without springs at any configuration and velocity.

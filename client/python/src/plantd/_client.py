@@ -39,6 +39,7 @@ from ._requests import (
     constraints,
     initial_state,
     measurement,
+    mechanical_state,
     momentum,
     noise,
     point,
@@ -57,9 +58,11 @@ from ._types import (
     Diagnostics,
     Dynamics,
     Energy,
+    EquationOfMotion,
     Event,
     Feedback,
     Gain,
+    Kinematics,
     Linearization,
     Plant,
     Recording,
@@ -716,6 +719,64 @@ class Client:
             order=order,
         )
         return Dynamics._from(self._call(self.control.EvaluateDynamics, request))
+
+    def kinematics(
+        self,
+        model: str = "",
+        *,
+        q: Vector = (),
+        v: Vector = (),
+        frames: Sequence[str] = (),
+        points: Iterable[tuple[str, Vector]] = (),
+        jacobians: bool = False,
+        at: str = "",
+        plant: str = "",
+    ) -> Kinematics:
+        """Poses, velocities and Jacobians of frames and points, and the centre of mass.
+
+        At the configuration ``q`` with the velocity ``v``, by default zero, or at the operating point
+        ``at`` of a model; of a ``plant`` where neither is given at its present state. It stays there.
+        ``frames`` are names, all if neither frames nor points are given; ``points`` are pairs of a frame
+        and a position in its axes, m.
+        """
+        request = control_service_pb2.KinematicsRequest(
+            state=mechanical_state(model, plant, at, q, v),
+            frames=frames,
+            points=[
+                channel_service_pb2.FramePoint(frame=frame, at=vector(position))
+                for frame, position in points
+            ],
+            jacobians=jacobians,
+        )
+        return Kinematics._from(self._call(self.control.Kinematics, request))
+
+    def dynamics(
+        self,
+        model: str = "",
+        *,
+        q: Vector = (),
+        v: Vector = (),
+        inputs: Vector = (),
+        acceleration: Vector = (),
+        prescribed_acceleration: Vector = (),
+        forward: bool = False,
+        at: str = "",
+        plant: str = "",
+    ) -> EquationOfMotion:
+        """Mass matrix, bias, forces and energy at such a state.
+
+        With ``acceleration`` of the dynamic coordinates the forces that it takes, with ``forward`` the
+        accelerations that follow from ``inputs``: by default those of the operating point, or those last
+        given to the plant. Prescribed coordinates have the acceleration zero if it is not given.
+        """
+        request = control_service_pb2.DynamicsRequest(
+            state=mechanical_state(model, plant, at, q, v),
+            inputs=vector(inputs),
+            acceleration=vector(acceleration),
+            prescribed_acceleration=vector(prescribed_acceleration),
+            forward=forward,
+        )
+        return EquationOfMotion._from(self._call(self.control.Dynamics, request))
 
     def analyze(
         self,

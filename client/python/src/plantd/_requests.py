@@ -130,6 +130,14 @@ def point(at: str | None, state: State | None, u: Vector, plant: str = "") -> co
     return common_pb2.Point(state_and_input=here)
 
 
+def mechanical_state(
+    model: str, plant: str, at: str, q: Vector, v: Vector
+) -> control_service_pb2.MechanicalState:
+    return control_service_pb2.MechanicalState(
+        model=model, plant=plant, operating_point=at, q=vector(q), v=vector(v)
+    )
+
+
 def trajectory(initial: State | Trajectory, u: npt.ArrayLike | None) -> common_pb2.Trajectory:
     if isinstance(initial, Trajectory):
         if u is not None:

@@ -230,8 +230,177 @@ class Dynamics:
         return cls(
             array(m.acceleration),
             array(m.multipliers),
-            matrix(m.jacobian) if m.HasField("jacobian") else None,
+            optional_matrix(m, "jacobian"),
             tensor(m.hessian) if m.HasField("hessian") else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMotion:
+    """Where a frame is and how it moves, in world axes."""
+
+    #: Position of its origin, 3, m.
+    position: Array
+    #: Unit quaternion (w, x, y, z), its largest component positive.
+    orientation: Array
+    #: Velocity of its origin, 3, m/s.
+    linear_velocity: Array
+    #: Angular velocity, 3, rad/s.
+    angular_velocity: Array
+    #: 6 by nd + nk: linear, then angular velocity is ``jacobian @ v``; None if it was not asked for.
+    jacobian: Array | None
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.FrameMotion) -> FrameMotion:
+        return cls(
+            array(m.position),
+            array(m.orientation),
+            array(m.linear_velocity),
+            array(m.angular_velocity),
+            optional_matrix(m, "jacobian"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PointMotion:
+    """Where a point is and how it moves, in world axes."""
+
+    #: 3, m.
+    position: Array
+    #: 3, m/s.
+    velocity: Array
+    #: 3 by nd + nk: the velocity is ``jacobian @ v``; None if it was not asked for.
+    jacobian: Array | None
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.PointMotion) -> PointMotion:
+        return cls(array(m.position), array(m.velocity), optional_matrix(m, "jacobian"))
+
+
+@dataclass(frozen=True, eq=False)
+class CenterOfMass:
+    """The centre of mass of all bodies that joints carry, in world axes."""
+
+    #: 3, m.
+    position: Array
+    #: 3, m/s.
+    velocity: Array
+    #: Mass that moves, kg.
+    mass: float
+    #: 3 by nd + nk: the velocity is ``jacobian @ v``; None if it was not asked for.
+    jacobian: Array | None
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.CenterOfMass) -> CenterOfMass:
+        jacobian = optional_matrix(m, "jacobian")
+        return cls(array(m.position), array(m.velocity), m.mass_kg, jacobian)
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """Frames and points of a mechanism at a configuration and a velocity."""
+
+    #: Names of the coordinates, dynamic ones first: the columns of Jacobians.
+    coordinates: list[str]
+    q: Array
+    v: Array
+    #: By name, in the order in which they were asked for, or of the scene.
+    frames: dict[str, FrameMotion]
+    #: In the order in which they were asked for.
+    points: list[PointMotion]
+    center_of_mass: CenterOfMass
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.KinematicsResponse) -> Kinematics:
+        return cls(
+            list(m.coordinates),
+            array(m.q),
+            array(m.v),
+            {frame.frame: FrameMotion._from(frame) for frame in m.frames},
+            [PointMotion._from(point) for point in m.points],
+            CenterOfMass._from(m.center_of_mass),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ForwardDynamics:
+    """The accelerations that follow from the inputs."""
+
+    #: Of all coordinates; those of prescribed ones are the given ones.
+    acceleration: Array
+    #: Constraint forces.
+    multipliers: Array
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.ForwardDynamics) -> ForwardDynamics:
+        return cls(array(m.acceleration), array(m.multipliers))
+
+
+@dataclass(frozen=True, eq=False)
+class InverseDynamics:
+    """The forces that an acceleration takes; they do not push against constraints."""
+
+    #: tau, of all coordinates.
+    force: Array
+    #: Constraint forces.
+    multipliers: Array
+    #: Second time derivative of the constraints: zero where they allow the acceleration.
+    constraint_acceleration: Array
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.InverseDynamics) -> InverseDynamics:
+        return cls(array(m.force), array(m.multipliers), array(m.constraint_acceleration))
+
+
+@dataclass(frozen=True, eq=False)
+class EquationOfMotion:
+    """The terms of ``mass_matrix @ a + bias = passive + input + tau - constraint_jacobian.T @ lambda``.
+
+    A row for each coordinate, dynamic ones first. tau is what nothing in the scene exerts: the forces
+    of drives on prescribed coordinates, and on dynamic ones zero unless other accelerations are asked for.
+    """
+
+    #: Names of the coordinates.
+    coordinates: list[str]
+    #: Names of the constraint equations.
+    constraints: list[str]
+    q: Array
+    v: Array
+    inputs: Array
+    #: Of bodies and armature.
+    mass_matrix: Array
+    #: Coriolis, centrifugal and gyroscopic forces and gravity; no springs, no dampers.
+    bias: Array
+    #: The part of ``bias`` that is there at rest.
+    gravity: Array
+    #: Forces of all elements that follow no input: springs, stops, damping, drag, friction, ...
+    passive: Array
+    #: Forces of the inputs.
+    input: Array
+    constraint_jacobian: Array
+    energy: Energy
+    #: None if it was not asked for.
+    forward: ForwardDynamics | None
+    #: None if no acceleration was given.
+    inverse: InverseDynamics | None
+
+    @classmethod
+    def _from(cls, m: control_service_pb2.DynamicsResponse) -> EquationOfMotion:
+        return cls(
+            list(m.coordinates),
+            list(m.constraints),
+            array(m.q),
+            array(m.v),
+            array(m.inputs),
+            matrix(m.mass_matrix),
+            array(m.bias),
+            array(m.gravity),
+            array(m.passive),
+            array(m.input),
+            matrix(m.constraint_jacobian),
+            Energy._from(m.energy),
+            ForwardDynamics._from(m.forward) if m.HasField("forward") else None,
+            InverseDynamics._from(m.inverse) if m.HasField("inverse") else None,
         )
 
 
@@ -859,6 +1028,11 @@ def vector(values: Vector) -> Array:
 def matrix(m: common_pb2.Matrix) -> Array:
     """A matrix message as an array."""
     return array(m.data).reshape(m.rows, m.cols)
+
+
+def optional_matrix(m: Any, field: str) -> Array | None:
+    """A field as an array; None where it is not set."""
+    return matrix(getattr(m, field)) if m.HasField(field) else None
 
 
 def tensor(m: common_pb2.Tensor) -> Array:

@@ -16,8 +16,8 @@ use clap::{Parser, Subcommand};
 
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard, import,
-    inventory, kalman, linearize, lqr, optimize, parameters, record, reference, replay, run, scene,
-    settle, state, step, test, timing, watch,
+    inventory, kalman, linearize, lqr, mechanics, optimize, parameters, record, reference, replay,
+    run, scene, settle, state, step, test, timing, watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
@@ -30,6 +30,8 @@ Examples:
   plantctl step p1 --u 0.1 --count 100              100 steps with the input 0.1
   plantctl watch p1 --fields state,energy --json    one JSON object per step
   plantctl linearize cart-pole --at upright         A and B of x[k+1] = f(x[k], u[k])
+  plantctl kinematics cart-pole --q 0,0.3 --frames pole
+  plantctl forces cart-pole --at upright --acceleration 1,0
   plantctl lqr cart-pole --at upright --q 100,1,1,1 --r 0.1
   plantctl analyze cart-pole --at hanging --outputs theta --frequencies 0.1,0.5,1
   plantctl optimize swing-up.toml --save best.json  one line per iteration, then the result
@@ -86,6 +88,8 @@ enum Command {
     Lqr(lqr::Lqr),
     SecondOrder(linearize::SecondOrder),
     Dynamics(dynamics::Dynamics),
+    Forces(mechanics::Forces),
+    Kinematics(mechanics::Kinematics),
     Analyze(analyze::Analyze),
     Optimize(optimize::Optimize),
     ProjectReference(reference::ProjectReference),
@@ -147,6 +151,8 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Lqr(command) => command.run(context).await?,
         Command::SecondOrder(command) => command.run(context).await?,
         Command::Dynamics(command) => command.run(context).await?,
+        Command::Forces(command) => command.run(context).await?,
+        Command::Kinematics(command) => command.run(context).await?,
         Command::Analyze(command) => command.run(context).await?,
         Command::Optimize(command) => command.run(context).await?,
         Command::ProjectReference(command) => command.run(context).await?,

@@ -9,7 +9,7 @@ use plantd_models::{
 use plantd_proto::v1;
 
 use crate::core::limits::LimitExceeded;
-use crate::wire::control::points::at_point;
+use crate::wire::control::points::{at_point, given, operating_point};
 use crate::wire::message::report::report_message;
 use crate::wire::message::{checks, matrices, states};
 use crate::wire::shared::hub::Hub;
@@ -66,20 +66,8 @@ pub(crate) fn evaluate_dynamics(
     let n = d.coordinates();
     let parameters = 2 * n + d.input();
     let outputs = d.dynamic + d.constraints;
-    let name =
-        if request.operating_point.is_empty() { "initial" } else { &request.operating_point };
-    let point = model.operating_points().iter().find(|point| point.name == name);
-    let point = point.ok_or_else(|| {
-        RpcError::field("operating_point", format!("there is no operating point `{name}`"))
-    })?;
+    let point = operating_point(&model, "operating_point", &request.operating_point)?;
     let zeros = |count| vec![0.0; count];
-    let given = |field, given: Vec<f64>, default: Vec<f64>| -> Result<Vec<f64>, RpcError> {
-        if given.is_empty() {
-            return Ok(default);
-        }
-        checks::check_numbers(field, &given, default.len())?;
-        Ok(given)
-    };
     let at = ContinuousPoint {
         q: given("q", request.q, point.q.clone())?,
         v: given("v", request.v, zeros(n))?,

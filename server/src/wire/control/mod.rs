@@ -3,6 +3,7 @@
 pub(crate) mod analysis;
 pub(crate) mod derivatives;
 pub(crate) mod kalman;
+pub(crate) mod mechanics;
 pub(crate) mod optimize;
 pub(crate) mod points;
 pub(crate) mod reference;

@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
-use plantd_models::{Model, Plant, Settings};
+use plantd_models::{Model, OperatingPoint, Plant, Settings};
 use plantd_proto::v1;
 
 use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
-use crate::wire::message::{matrices, settings, start, states};
+use crate::wire::message::{checks, matrices, settings, start, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -66,6 +66,26 @@ pub(crate) fn model_at(
         }
         _ => Ok(model.to_owned()),
     }
+}
+
+/// The operating point of that name in a field of the request; empty means `initial`.
+pub(crate) fn operating_point<'a>(
+    model: &'a Model,
+    field: &str,
+    name: &str,
+) -> Result<&'a OperatingPoint, RpcError> {
+    let name = if name.is_empty() { "initial" } else { name };
+    let point = model.operating_points().iter().find(|point| point.name == name);
+    point.ok_or_else(|| RpcError::field(field, format!("there is no operating point `{name}`")))
+}
+
+/// The vector in a field of the request; empty means the other one.
+pub(crate) fn given(field: &str, given: Vec<f64>, default: Vec<f64>) -> Result<Vec<f64>, RpcError> {
+    if given.is_empty() {
+        return Ok(default);
+    }
+    checks::check_numbers(field, &given, default.len())?;
+    Ok(given)
 }
 
 /// Refuses matrices that no client would take.

@@ -17,7 +17,9 @@ use crate::core::inputs::Inputs;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::answers::Answers;
 use crate::wire::control::points::{along_trajectory, at_point, model_at};
-use crate::wire::control::{analysis, derivatives, kalman, optimize, reference, rollout};
+use crate::wire::control::{
+    analysis, derivatives, kalman, mechanics, optimize, reference, rollout,
+};
 use crate::wire::message::report::report_message;
 use crate::wire::message::weights::{self, WeightFields};
 use crate::wire::message::{matrices, states};
@@ -322,6 +324,20 @@ impl v1::control_service_server::ControlService for ControlService {
         request: Request<v1::EvaluateDynamicsRequest>,
     ) -> Result<Response<v1::EvaluateDynamicsResponse>, Status> {
         self.answer(request, |hub, request, _| derivatives::evaluate_dynamics(hub, request)).await
+    }
+
+    async fn kinematics(
+        &self,
+        request: Request<v1::KinematicsRequest>,
+    ) -> Result<Response<v1::KinematicsResponse>, Status> {
+        self.answer(request, mechanics::kinematics).await
+    }
+
+    async fn dynamics(
+        &self,
+        request: Request<v1::DynamicsRequest>,
+    ) -> Result<Response<v1::DynamicsResponse>, Status> {
+        self.answer(request, |hub, request, _| mechanics::dynamics(hub, request)).await
     }
 
     async fn analyze(

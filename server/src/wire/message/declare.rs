@@ -123,7 +123,8 @@ fn is_prescribed(model: &Model, entry: usize) -> bool {
     entry >= model.dimensions().inputs
 }
 
-fn vector(field: String, given: &[f64]) -> Result<[f64; 3], RpcError> {
+/// A vector in space; empty means zero.
+pub(crate) fn vector(field: String, given: &[f64]) -> Result<[f64; 3], RpcError> {
     match *given {
         [] => Ok([0.0; 3]),
         [x, y, z] if given.iter().all(|value| value.is_finite()) => Ok([x, y, z]),

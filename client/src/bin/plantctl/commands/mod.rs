@@ -16,6 +16,7 @@ pub(crate) mod inventory;
 pub(crate) mod kalman;
 pub(crate) mod linearize;
 pub(crate) mod lqr;
+pub(crate) mod mechanics;
 pub(crate) mod optimize;
 pub(crate) mod parameters;
 pub(crate) mod record;
