@@ -232,7 +232,7 @@ async fn shared_memory_and_grpc_compete_for_one_lease() {
     let client = server.client().await;
     create_plant(&client, "one", "pendulum", false).await;
     let opened = client.open_link("one").await.unwrap();
-    assert_eq!((opened.service.as_str(), opened.layout_version), ("plantd/4/one", 4));
+    assert_eq!((opened.service.as_str(), opened.layout_version), ("plantd/5/one", 5));
     assert_eq!(Path::new(&opened.root_path), root);
     assert_eq!(client.open_link("one").await.unwrap(), opened);
 
