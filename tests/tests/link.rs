@@ -57,6 +57,7 @@ fn assert_same_motion(model: &str, wait: Wait, steps: u64) {
             "step {k} of {model}"
         );
         assert_eq!((view.q, view.p, view.v), (&state.q[..], &state.p[..], &state.v[..]));
+        assert_eq!(view.velocity, plant.velocity());
         assert_eq!(view.iterations, report.iterations);
         assert_eq!(view.residual.to_bits(), report.residual.to_bits());
     }

@@ -24,4 +24,5 @@ mod strangers;
 mod support;
 mod transport;
 mod usage;
+mod velocity;
 mod watch;

@@ -114,8 +114,7 @@ impl Published<'_> {
         ];
         let Self { q, p, v, multipliers, velocity, .. } = *self;
         let Self { input, driver_input, impulse, outputs, lost, .. } = *self;
-        let vectors =
-            [q, p, v, multipliers, velocity, input, driver_input, impulse, outputs, lost];
+        let vectors = [q, p, v, multipliers, velocity, input, driver_input, impulse, outputs, lost];
         let sizes = vectors.map(|vector| vector.len() as u64);
         let numbers = vectors.into_iter().flatten().map(|number| number.to_bits());
         fixed.into_iter().chain(to_words(&self.report)).chain(sizes).chain(numbers)
