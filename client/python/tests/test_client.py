@@ -81,7 +81,7 @@ def test_states_have_the_velocity_of_their_momentum(client):
         with pytest.raises(ValueError, match="give one of `velocity`, `v` and `p`"):
             client.reset(plant.id, q=last.q, velocity=last.velocity, **given)
 
-    # A guess that leaves the constraints is projected; prescribed coordinates come last.
+    # Those of prescribed coordinates come last.
     state = client.step(client.create_plant("marionette").id, hold=5)[-1]
     assert state.velocity.shape == state.q.shape
     assert state.velocity[len(state.p) :].tolist() == state.v.tolist()

@@ -47,7 +47,7 @@ class State:
     model: str = ""
     #: Time step of that plant, s; 0 where it is not known.
     time_step: float = 0.0
-    #: Velocity of all coordinates, nd + nk, m/s or rad/s: that of the momentum projected onto the constraints,
+    #: Velocity of all coordinates, nd + nk, m/s or rad/s: of the momentum projected onto the constraints,
     #: and `v`. Empty where the state is not that of a plant.
     velocity: Array = field(default_factory=lambda: np.zeros(0))
 

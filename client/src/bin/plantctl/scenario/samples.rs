@@ -7,7 +7,8 @@ use plantd_client::v1;
 use crate::contract::names;
 
 /// Columns of equal length: `q(theta)`, `p(theta)`, `v(lift)`, `velocity(theta)`, `u(tau)`,
-/// `force(pin.x)`, `kinetic`, `potential`, `y(tip.x)`; with a reference also `ref.q(theta)` and `error.q(theta)`, and so on.
+/// `force(pin.x)`, `kinetic`, `potential`, `y(tip.x)`; with a reference also `ref.q(theta)` and
+/// `error.q(theta)`, and so on.
 ///
 /// A column of inputs holds at each sample the input of the step that led there.
 #[derive(Clone, Debug, Default)]
