@@ -214,7 +214,7 @@ fn the_velocity_is_the_slope_of_the_configuration() {
     let mut scenes: Vec<_> = names.into_iter().map(builtin).collect();
     scenes.extend([7, 8].map(random_tree));
     for scene in scenes {
-        let h = 1e-4;
+        let h = 1e-5;
         let mut plant = plant(&scene, |s| s.time_step_s = h);
         let d = plant.model().dimensions();
         let q = plant.q().to_vec();
@@ -236,7 +236,7 @@ fn the_velocity_is_the_slope_of_the_configuration() {
         let size = velocity.iter().fold(1.0, |size: f64, v| size.max(v.abs()));
         for (i, v) in velocity.iter().enumerate() {
             let slope = (after[i] - before[i]) / (2.0 * h);
-            assert!((v - slope).abs() < 1e-5 * size, "{} {i}: {v} {slope}", scene.name);
+            assert!((v - slope).abs() < 1e-6 * size, "{} {i}: {v} {slope}", scene.name);
         }
     }
 }
