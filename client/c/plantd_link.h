@@ -1,11 +1,11 @@
 /*
- * plantd_link.h: layout of the shared-memory link of plantd, version 4.
+ * plantd_link.h: layout of the shared-memory link of plantd, version 5.
  *
  * A message is one plantd_link_header (the user header of an iceoryx2 sample) and a slice of
  * double. Each open plant has, in an iceoryx2 domain of the server,
  *
- *     plantd/4/<plant>/input   publish-subscribe and event, drivers to server
- *     plantd/4/<plant>/state   publish-subscribe and event, server to drivers
+ *     plantd/5/<plant>/input   publish-subscribe and event, drivers to server
+ *     plantd/5/<plant>/state   publish-subscribe and event, server to drivers
  *
  * Each start of a server has a domain of its own under the server's root path. The file
  * <root>/<plant>.link says in which one a plant's link is: its first line is the name <domain>, six
@@ -21,7 +21,7 @@
  * - makes sure that the segments in the link file are its own user's, closed to others (mode 0600), and
  *   of the sizes given there;
  * - opens the services with an iceoryx2 0.10 configuration with the root path <root>/<domain> and the
- *   prefix plantd4_<domain>_, without clean-up of dead nodes: the server does it.
+ *   prefix plantd5_<domain>_, without clean-up of dead nodes: the server does it.
  *
  * Who leaves a domain that has neither server nor members any more may remove its segments and then its
  * directory, under an exclusive flock of the root; the next server does so in any case. When the file
@@ -29,7 +29,7 @@
  *
  * The publish-subscribe services have the payload type
  * "f64" (dynamic), the user header type PLANTD_LINK_TYPE_NAME, and the attributes
- * plantd.layout = "4" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
+ * plantd.layout = "5" and plantd.schema = PLANTD_LINK_SCHEMA_HASH as sixteen hexadecimal digits.
  *
  * Conversation:
  *
@@ -63,10 +63,10 @@
 extern "C" {
 #endif
 
-#define PLANTD_LINK_LAYOUT_VERSION 4u
+#define PLANTD_LINK_LAYOUT_VERSION 5u
 #define PLANTD_LINK_MAGIC 0x746e6c70u /* "plnt" */
 #define PLANTD_LINK_SCHEMA_HASH UINT64_C(0x8e73cfd450056052)
-#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader4"
+#define PLANTD_LINK_TYPE_NAME "PlantdLinkHeader5"
 #define PLANTD_LINK_POLL_FOREVER_NS UINT64_MAX
 
 /* What a message is. */
@@ -76,8 +76,11 @@ enum plantd_link_kind {
     PLANTD_LINK_DETACH = 3,    /* driver: gives the lease back; no payload, no answer */
     PLANTD_LINK_ATTACHED = 16, /* server: the lease is the driver's; payload as in STATE */
     PLANTD_LINK_STATE = 17,    /* server: a step was taken; payload q (nd + nk), p (nd), v (nk),
-                                  multipliers (nc), outputs (ny), and for each output channel
-                                  1 where its numbers stand for lost ones, else 0 */
+                                  multipliers (nc), velocity (nd + nk), outputs (ny), and for
+                                  each output channel 1 where its numbers stand for lost ones,
+                                  else 0; v is that of the prescribed coordinates alone, over the
+                                  last step, and velocity that of all coordinates, m/s or rad/s,
+                                  which belongs to the momentum projected onto the constraints */
     PLANTD_LINK_FAILURE = 18,  /* server: refused or failed, see code; the plant is as it was */
     PLANTD_LINK_CLOSED = 19    /* server: the link ends, see code */
 };

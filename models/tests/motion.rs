@@ -206,10 +206,46 @@ fn snapshots_continue_bit_for_bit() {
     }
 }
 
+/// The velocity of a state is that of the motion, by whichever factorization it is found.
+#[test]
+fn the_velocity_is_the_slope_of_the_configuration() {
+    const RATE: f64 = 0.05;
+    let names = ["pendulum", "cart-pole", "chain-12", "scissor-4", "four-bar", "marionette"];
+    let mut scenes: Vec<_> = names.into_iter().map(builtin).collect();
+    scenes.extend([7, 8].map(random_tree));
+    for scene in scenes {
+        let h = 1e-5;
+        let mut plant = plant(&scene, |s| s.time_step_s = h);
+        let d = plant.model().dimensions();
+        let q = plant.q().to_vec();
+        let v =
+            (0..d.coordinates()).map(|i| if i < d.dynamic { (1.0 + i as f64).sin() } else { RATE });
+        plant.initialize(&Initial::Velocity { q: q.clone(), v: v.collect() }).unwrap();
+        let take = |plant: &mut Plant| {
+            let way = RATE * h * (plant.step_index() + 1) as f64;
+            let prescribed = q[d.dynamic..].iter().map(|start| start + way);
+            let u: Vec<_> = std::iter::repeat_n(0.2, d.inputs).chain(prescribed).collect();
+            plant.step(&u).unwrap();
+            plant.q().to_vec()
+        };
+        (0..20).for_each(|_| drop(take(&mut plant)));
+        let before = take(&mut plant);
+        take(&mut plant);
+        let velocity = plant.velocity();
+        let after = take(&mut plant);
+        let size = velocity.iter().fold(1.0, |size: f64, v| size.max(v.abs()));
+        for (i, v) in velocity.iter().enumerate() {
+            let slope = (after[i] - before[i]) / (2.0 * h);
+            assert!((v - slope).abs() < 1e-6 * size, "{} {i}: {v} {slope}", scene.name);
+        }
+    }
+}
+
 /// Linearizing on the way leaves no trace in the motion.
 #[test]
 fn linearizing_does_not_disturb_the_motion() {
-    for scene in [builtin("marionette"), builtin("chain-4"), random_tree(7)] {
+    let builtins = ["marionette", "chain-4", "four-bar", "scissor-4"].map(builtin);
+    for scene in builtins.into_iter().chain([random_tree(7)]) {
         let (mut plain, mut watched) = (plant(&scene, |_| ()), plant(&scene, |_| ()));
         let mut out = Linearization::new(&watched.model().clone());
         for k in 0..30 {
@@ -244,6 +280,7 @@ fn at_rest_too_the_motion_follows_from_the_state_alone() {
                 for step in 0..20 {
                     reference.step(&u).unwrap();
                     restored.step(&u).unwrap();
+                    watched.velocity();
                     watched.step_and_linearize(&u, &mut out).unwrap();
                     let expected = reference.snapshot().to_bytes();
                     assert!(restored.snapshot().to_bytes() == expected, "{name} {k} {step}");

@@ -5,13 +5,13 @@
 //!
 //! | name | pattern | from | to |
 //! | --- | --- | --- | --- |
-//! | `plantd/4/<plant>/input` | publish-subscribe | drivers | server |
-//! | `plantd/4/<plant>/input` | event | drivers | server |
-//! | `plantd/4/<plant>/state` | publish-subscribe | server | drivers |
-//! | `plantd/4/<plant>/state` | event | server | drivers |
+//! | `plantd/5/<plant>/input` | publish-subscribe | drivers | server |
+//! | `plantd/5/<plant>/input` | event | drivers | server |
+//! | `plantd/5/<plant>/state` | publish-subscribe | server | drivers |
+//! | `plantd/5/<plant>/state` | event | server | drivers |
 //!
-//! The `4` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
-//! slice of `f64`: the input `u` one way, `(q, p, v, multipliers, outputs, lost)` the other way.
+//! The `5` is [`LAYOUT_VERSION`]. A message is one [`Header`] (the user header of the sample) and a
+//! slice of `f64`: the input `u` one way, `(q, p, v, multipliers, velocity, outputs, lost)` the other way.
 //!
 //! # Conversation
 //!
@@ -35,7 +35,7 @@
 //! # Where a link is
 //!
 //! The file `<root>/<plant>.link` names the domain: six hexadecimal digits, a directory of that name under
-//! the root, and the prefix `plantd4_<domain>_` of the segments in shared memory. Further lines give the
+//! the root, and the prefix `plantd5_<domain>_` of the segments in shared memory. Further lines give the
 //! sizes of the segments that the server has made for it. The root belongs to one user and is closed to
 //! others, and so are the segments; both is looked at before a segment is mapped. What other users put
 //! into shared memory under names of the domain is not used: they cannot know the names that will be.

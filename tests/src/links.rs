@@ -123,7 +123,7 @@ pub fn files_of_links(root: &Path) -> Result<Vec<PathBuf>> {
         }
     }
     let own = seen.iter().filter(|(under, _)| under == root);
-    let prefixes: Vec<_> = own.map(|(_, domain)| format!("plantd4_{domain}_")).collect();
+    let prefixes: Vec<_> = own.map(|(_, domain)| format!("plantd5_{domain}_")).collect();
     for entry in std::fs::read_dir(SHARED_MEMORY_DIRECTORY)? {
         let entry = entry?;
         let name = entry.file_name().to_string_lossy().into_owned();

@@ -57,6 +57,7 @@ fn assert_same_motion(model: &str, wait: Wait, steps: u64) {
             "step {k} of {model}"
         );
         assert_eq!((view.q, view.p, view.v), (&state.q[..], &state.p[..], &state.v[..]));
+        assert_eq!(view.velocity, plant.velocity());
         assert_eq!(view.iterations, report.iterations);
         assert_eq!(view.residual.to_bits(), report.residual.to_bits());
     }
@@ -334,7 +335,7 @@ fn a_driver_is_told_that_the_link_was_closed_and_can_connect_when_it_is_open_aga
 
     let info = fixture.host.open(fixture.session.clone()).unwrap();
     assert_eq!(fixture.host.open(fixture.session.clone()).unwrap(), info);
-    assert_eq!((info.service.as_str(), info.layout_version), ("plantd/4/plant", 4));
+    assert_eq!((info.service.as_str(), info.layout_version), ("plantd/5/plant", 5));
     // Without reconnecting it speaks to a link that is no more.
     let error = driver.step(&[0.0]).unwrap_err();
     assert!(matches!(error, LinkError::ServerRestarted), "{error}");

@@ -68,20 +68,21 @@ fn connect(plant: &str, root: &Path) -> Result<LinkDriver, LinkError> {
 
 type Bits = (u64, Vec<u64>);
 
-fn bits<'a>(step: u64, parts: [&'a [f64]; 4]) -> Bits {
+fn bits<'a>(step: u64, parts: [&'a [f64]; 5]) -> Bits {
     (step, parts.into_iter().flatten().map(|value: &'a f64| value.to_bits()).collect())
 }
 
-fn bits_of_plant(plant: &Plant) -> Bits {
-    bits(plant.step_index(), [plant.q(), plant.p(), plant.v(), plant.multipliers()])
+fn bits_of_plant(plant: &mut Plant) -> Bits {
+    let velocity = plant.velocity();
+    bits(plant.step_index(), [plant.q(), plant.p(), plant.v(), plant.multipliers(), &velocity])
 }
 
 fn bits_of_view(view: StateView<'_>) -> Bits {
-    bits(view.step, [view.q, view.p, view.v, view.multipliers])
+    bits(view.step, [view.q, view.p, view.v, view.multipliers, view.velocity])
 }
 
 fn bits_of_message(state: &v1::State) -> Bits {
-    bits(state.step, [&state.q, &state.p, &state.v, &state.multipliers])
+    bits(state.step, [&state.q, &state.p, &state.v, &state.multipliers, &state.velocity])
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -101,7 +102,7 @@ async fn in_process_over_shared_memory_and_over_grpc_the_motion_is_the_same_bit_
         for k in 0..60 {
             wiggle(&plant, k, &mut u);
             plant.step(&u).unwrap();
-            let expected = bits_of_plant(&plant);
+            let expected = bits_of_plant(&mut plant);
             assert_eq!(
                 bits_of_view(link.step(&u).unwrap()),
                 expected,
@@ -133,15 +134,15 @@ async fn in_process_over_shared_memory_and_over_grpc_the_motion_is_the_same_bit_
         let restored = format!("{model}-{order}-restored");
         create_plant_of_order(&client, &restored, (model, order), true).await;
         let state = client.restore(&restored, snapshot.clone()).await.unwrap();
-        assert_eq!(bits_of_message(&state), bits_of_plant(&plant));
+        assert_eq!(bits_of_message(&state), bits_of_plant(&mut plant));
         when_free(|| client.restore(&ids[1], snapshot.clone())).await;
         let mut link = connect(&restored, &root).unwrap();
-        assert_eq!(bits_of_view(link.state()), bits_of_plant(&plant));
+        assert_eq!(bits_of_view(link.state()), bits_of_plant(&mut plant));
         let mut stream = client.drive(&ids[1]).await.unwrap();
         for k in 60..90 {
             wiggle(&plant, k, &mut u);
             plant.step(&u).unwrap();
-            let expected = bits_of_plant(&plant);
+            let expected = bits_of_plant(&mut plant);
             assert_eq!(
                 bits_of_view(link.step(&u).unwrap()),
                 expected,
@@ -232,7 +233,7 @@ async fn shared_memory_and_grpc_compete_for_one_lease() {
     let client = server.client().await;
     create_plant(&client, "one", "pendulum", false).await;
     let opened = client.open_link("one").await.unwrap();
-    assert_eq!((opened.service.as_str(), opened.layout_version), ("plantd/4/one", 4));
+    assert_eq!((opened.service.as_str(), opened.layout_version), ("plantd/5/one", 5));
     assert_eq!(Path::new(&opened.root_path), root);
     assert_eq!(client.open_link("one").await.unwrap(), opened);
 

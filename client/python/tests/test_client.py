@@ -62,6 +62,31 @@ def test_lqr_balances_the_pendulum(client):
     assert abs(state.q[0] - math.pi) < 1e-9
 
 
+def test_states_have_the_velocity_of_their_momentum(client):
+    plant = client.create_plant("cart-pole", q=[0.1, 0.7], velocity=[0.3, -2.0])
+    np.testing.assert_allclose(plant.state.velocity, [0.3, -2.0], atol=1e-14)
+    assert plant.state.v.size == 0
+    states = client.step(plant.id, np.zeros((20, 1)))
+    for state in states:
+        mass = [[11.0, math.cos(state.q[1])], [math.cos(state.q[1]), 1.0]]
+        np.testing.assert_allclose(state.velocity, np.linalg.solve(mass, state.p), atol=1e-13)
+    last = states[-1]
+    assert last.velocity.dtype == np.float64 and "velocity=array([" in repr(last)
+    # What came out goes in again, under either name.
+    for given in [{"velocity": last.velocity}, {"v": last.velocity}]:
+        again = client.reset(plant.id, q=last.q, **given)
+        np.testing.assert_allclose(again.p, last.p, atol=1e-13)
+        np.testing.assert_allclose(again.velocity, last.velocity, atol=1e-13)
+    for given in [{"v": [0, 0]}, {"p": [0, 0]}]:
+        with pytest.raises(ValueError, match="give one of `velocity`, `v` and `p`"):
+            client.reset(plant.id, q=last.q, velocity=last.velocity, **given)
+
+    # Those of prescribed coordinates come last.
+    state = client.step(client.create_plant("marionette").id, hold=5)[-1]
+    assert state.velocity.shape == state.q.shape
+    assert state.velocity[len(state.p) :].tolist() == state.v.tolist()
+
+
 def test_every_way_to_step_gives_the_same_bits(client):
     inputs = np.sin(0.1 * np.arange(50)).reshape(-1, 1)
     driven = client.create_plant("cart-pole").id

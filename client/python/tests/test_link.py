@@ -46,6 +46,7 @@ def test_shared_memory_and_grpc_give_the_same_bits(client, connect, poll_s):
         start = client.get_plant(plant).state
         with driver() as link, client.drive(client.create_plant(model).id) as stream:
             assert link.state.x.tobytes() == start.x.tobytes()
+            assert link.state.velocity.tobytes() == start.velocity.tobytes()
             inputs = link.input_len - len(start.v)
             for k in range(20):
                 u = np.concatenate((0.1 * np.sin(k + np.arange(inputs)), start.q[len(start.p) :]))
@@ -53,6 +54,8 @@ def test_shared_memory_and_grpc_give_the_same_bits(client, connect, poll_s):
                 assert (a.step, a.time) == (b.step, b.time)
                 assert a.x.tobytes() == b.x.tobytes()
                 assert a.multipliers.tobytes() == b.multipliers.tobytes()
+                assert a.velocity.shape == a.q.shape
+                assert a.velocity.tobytes() == b.velocity.tobytes()
             assert link.report == stream.report
 
 

@@ -49,6 +49,7 @@ def test_a_recording_is_read_with_the_schemas_in_it(client, tmp_path):
         # To the last bit.
         assert list(step.state.q) == state.q.tolist()
         assert list(step.state.p) == state.p.tolist()
+        assert list(step.state.velocity) == state.velocity.tolist()
         assert list(step.u) == list(step.driver) == row
         assert step.report.iterations > 0
         assert published == pytest.approx(1e9 * step.state.time_s, abs=1)

@@ -73,10 +73,13 @@ pub struct StateView<'a> {
     pub q: &'a [f64],
     /// Momentum, nd.
     pub p: &'a [f64],
-    /// Velocity of prescribed coordinates, nk.
+    /// Velocity of prescribed coordinates over the last step, nk.
     pub v: &'a [f64],
     /// Constraint impulses, nc.
     pub multipliers: &'a [f64],
+    /// Velocity of all coordinates, from the momentum projected onto the constraints, nd + nk, m/s or
+    /// rad/s.
+    pub velocity: &'a [f64],
     /// `x = (q, p, v)`, 2 nd + 2 nk.
     pub x: &'a [f64],
     /// What the output channels deliver; empty without channels.
@@ -196,6 +199,7 @@ impl LinkDriver {
         let coordinates = dynamic + prescribed;
         let (x, rest) = self.state.split_at(2 * coordinates);
         let (multipliers, rest) = rest.split_at(constraints);
+        let (velocity, rest) = rest.split_at(coordinates);
         let (outputs, lost) = rest.split_at(self.last.outputs as usize);
         let (q, momenta) = x.split_at(coordinates);
         let (p, v) = momenta.split_at(dynamic);
@@ -206,6 +210,7 @@ impl LinkDriver {
             p,
             v,
             multipliers,
+            velocity,
             x,
             outputs,
             lost,

@@ -7,7 +7,7 @@
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::{StepContext, Workspace};
+use crate::integrator::workspace::{Residual, StepContext, Workspace};
 use crate::math::norms::{larger, largest};
 use crate::model::mechanism::Model;
 
@@ -159,6 +159,20 @@ impl Workspace {
 
     /// Guesses by the recursion, where there is one and its pivots are sound.
     fn coast(&mut self, model: &Model, settings: &Settings, state: &PreciseState) -> bool {
+        if !self.glide(model, settings, state) {
+            return false;
+        }
+        self.step.multipliers.copy_from_slice(&state.multipliers);
+        for (x, glided) in self.step.increment.iter_mut().zip(&self.residual.dynamics) {
+            // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
+            *x = if glided.is_finite() { *glided } else { 0.0 };
+        }
+        true
+    }
+
+    /// The velocity that belongs to the momentum, times the time step, into `residual`: by the recursion,
+    /// where there is one and its pivots are sound. Needs the constraints at the start in their places.
+    fn glide(&mut self, model: &Model, settings: &Settings, state: &PreciseState) -> bool {
         if !self.kkt.has_recursion() {
             return false;
         }
@@ -169,18 +183,31 @@ impl Workspace {
         if !self.factor_masses(model, settings) {
             return false;
         }
-        for (x, p) in self.step.increment.iter_mut().zip(&state.p) {
+        let Residual { dynamics: x, constraints, .. } = &mut self.residual;
+        for (x, p) in x.iter_mut().zip(&state.p) {
             *x = -p;
         }
-        self.residual.constraints.fill(0.0);
-        let x = &mut self.step.increment;
-        self.kkt.solve(model, &self.constraints.start, x, &mut self.residual.constraints);
-        self.step.multipliers.copy_from_slice(&state.multipliers);
-        // A singular mass matrix has no velocity; the Newton matrix will name the coordinate.
-        for x in self.step.increment.iter_mut().filter(|x| !x.is_finite()) {
-            *x = 0.0;
-        }
+        constraints.fill(0.0);
+        self.kkt.solve(model, &self.constraints.start, x, constraints);
         true
+    }
+
+    /// Finds the velocity of the dynamic coordinates as [`Workspace::find_velocity`], by the recursion where
+    /// that is faster and sound; false where it is not.
+    pub(crate) fn find_velocity_by_recursion(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        state: &PreciseState,
+    ) -> bool {
+        if model.dimensions.constraints > 0 {
+            self.place_start(model, state);
+        }
+        let is_found = self.glide(model, settings, state);
+        if is_found {
+            self.residual.dynamics.iter_mut().for_each(|x| *x /= settings.time_step_s);
+        }
+        is_found
     }
 
     /// Corrects the guess until the residual is at round-off.

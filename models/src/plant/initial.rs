@@ -270,9 +270,13 @@ impl Plant {
         velocity
     }
 
-    /// Writes the velocity that belongs to the projected momentum, nd + nk entries; allocates nothing.
+    /// Writes the velocity that belongs to the projected momentum, nd + nk entries; allocates nothing. Costs
+    /// the factorization of a mass matrix, which is O(n) where that of a step is.
     pub fn write_velocity(&mut self, out: &mut [f64]) {
-        self.workspace.find_velocity(&self.model, &self.state);
+        let Self { workspace, model, settings, state, .. } = self;
+        if !workspace.find_velocity_by_recursion(model, settings, state) {
+            workspace.find_velocity(model, state);
+        }
         let (dynamic, prescribed) = out.split_at_mut(self.workspace.residual.dynamics.len());
         dynamic.copy_from_slice(&self.workspace.residual.dynamics);
         prescribed.copy_from_slice(&self.state.v);

@@ -3,7 +3,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 /// Version of the layout and of the conversation. Part of the services' names.
-pub const LAYOUT_VERSION: u32 = 4;
+pub const LAYOUT_VERSION: u32 = 5;
 
 /// First field of every header: `plnt` in ASCII, little-endian.
 pub const MAGIC: u32 = u32::from_le_bytes(*b"plnt");
@@ -53,7 +53,7 @@ header! {
     /// Fields that a kind of message does not use are zero.
     #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
     #[repr(C)]
-    #[type_name("PlantdLinkHeader4")]
+    #[type_name("PlantdLinkHeader5")]
     pub struct Header {
         /// [`MAGIC`].
         pub magic: u32,
@@ -210,8 +210,8 @@ numbered! {
         /// Server: the lease is the driver's; the payload is the current state.
         Attached = 16,
         /// Server: a step was taken; the payload is the state after it: `q` (nd + nk), `p` (nd),
-        /// `v` (nk), `multipliers` (nc), what the output channels deliver (ny), and for each of these
-        /// channels 1 where its numbers stand for lost ones, else 0.
+        /// `v` (nk), `multipliers` (nc), `velocity` of all coordinates (nd + nk), what the output channels
+        /// deliver (ny), and for each of these channels 1 where its numbers stand for lost ones, else 0.
         State = 17,
         /// Server: refused or failed, `code` says why; the plant is as it was. No payload.
         Failure = 18,
@@ -303,11 +303,11 @@ impl Header {
         self.inputs as usize + self.prescribed as usize
     }
 
-    /// Entries of a state message: `q`, `p`, `v`, the multipliers, the outputs and their flags.
+    /// Entries of a state message: `q`, `p`, `v`, the multipliers, the velocity, the outputs and their flags.
     pub fn state_len(&self) -> usize {
         let coordinates = self.dynamic as usize + self.prescribed as usize;
         let outputs = self.outputs as usize + self.output_channels as usize;
-        2 * coordinates + self.constraints as usize + outputs
+        3 * coordinates + self.constraints as usize + outputs
     }
 
     /// When the sender stops polling, ns on the system's monotonic clock.
@@ -322,10 +322,14 @@ mod tests {
 
     /// Bindings in other languages repeat the layout; this pins it. A change needs a new version.
     #[test]
-    fn the_layout_of_version_4_is_pinned() {
-        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (4, 208));
+    fn the_layout_of_version_5_is_pinned() {
+        assert_eq!((LAYOUT_VERSION, size_of::<Header>()), (5, 208));
         assert_eq!(align_of::<Header>(), 8);
         assert_eq!(SCHEMA_HASH, 0x8e73_cfd4_5005_6052);
+        let (dynamic, prescribed, constraints) = (5, 2, 3);
+        let header = Header { dynamic, prescribed, constraints, ..Header::new(Kind::State) };
+        let header = Header { outputs: 4, output_channels: 1, ..header };
+        assert_eq!(header.state_len(), (7 + 5 + 2) + 3 + 7 + 4 + 1);
     }
 
     #[test]

@@ -22,7 +22,7 @@ pub(super) fn prefix(domain: &str) -> String {
 
 /// Length of [`prefix`].
 pub(super) const fn prefix_length(domain: usize) -> usize {
-    "plantd4_".len() + domain + 1
+    "plantd5_".len() + domain + 1
 }
 
 /// The segments of a domain.

@@ -25,4 +25,5 @@ mod strangers;
 mod support;
 mod transport;
 mod usage;
+mod velocity;
 mod watch;

@@ -85,6 +85,7 @@ async fn steps_and_coordinates_can_be_thinned_out() {
         assert_eq!(message.step, k);
         let watched = message.state.unwrap();
         assert_eq!((watched.q.as_slice(), watched.p.as_slice()), (&state.q[1..], &state.p[1..]));
+        assert_eq!(watched.velocity, state.velocity[1..]);
         seen += 1;
     }
     assert_eq!(seen, 4);

@@ -214,6 +214,7 @@ class Client:
         id: str = "",
         at: str | None = None,
         q: Vector | None = None,
+        velocity: Vector | None = None,
         v: Vector | None = None,
         p: Vector | None = None,
         initial: common_pb2.InitialState | None = None,
@@ -221,8 +222,9 @@ class Client:
         tolerance: float = 0.0,
         **stepping: Unpack[Stepping],
     ) -> Plant:
-        """Creates a plant: at an operating point (``at``), at a configuration ``q`` with velocity
-        ``v`` or momentum ``p``, in any other ``initial`` state, or where the scene says.
+        """Creates a plant: at an operating point (``at``), at a configuration ``q`` with ``velocity``,
+        of all coordinates as in `State.velocity` (``v`` is short for it here), or momentum ``p``, in any other
+        ``initial`` state, or where the scene says.
 
         The keywords of `Stepping` say how it is stepped. ``tolerance``, rad or m, chooses ``order`` and
         ``substeps`` in their place, so that no coordinate is off by more over the next 50 steps;
@@ -232,7 +234,7 @@ class Client:
             id=id,
             model=model,
             settings=settings(**stepping),
-            initial=initial_state(at, q, v, p, initial),
+            initial=initial_state(at, q, velocity, v, p, initial),
             open_link=open_link,
         )
         request.settings.tolerance = tolerance
@@ -335,12 +337,13 @@ class Client:
         *,
         at: str | None = None,
         q: Vector | None = None,
+        velocity: Vector | None = None,
         v: Vector | None = None,
         p: Vector | None = None,
         initial: common_pb2.InitialState | None = None,
     ) -> State:
         """Puts a plant back to step 0, where it was created or where the arguments say."""
-        state = initial_state(at, q, v, p, initial)
+        state = initial_state(at, q, velocity, v, p, initial)
         request = plant_service_pb2.ResetRequest(id=id, initial=state)
         return State._from(self._call(self.plants.Reset, request).state)
 

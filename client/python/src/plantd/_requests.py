@@ -94,16 +94,18 @@ def settings(
 def initial_state(
     at: str | None,
     q: Vector | None,
+    velocity: Vector | None,
     v: Vector | None,
     p: Vector | None,
     initial: common_pb2.InitialState | None,
 ) -> common_pb2.InitialState | None:
     if sum(given is not None for given in (at, q, initial)) > 1:
         raise ValueError("give one of `at`, `q` and `initial`")
-    if q is None and (v is not None or p is not None):
-        raise ValueError("`v` and `p` need `q`")
-    if v is not None and p is not None:
-        raise ValueError("give `v` or `p`")
+    rates = [given for given in (velocity, v, p) if given is not None]
+    if q is None and rates:
+        raise ValueError("`velocity`, `v` and `p` need `q`")
+    if len(rates) > 1:
+        raise ValueError("give one of `velocity`, `v` and `p`")
     if at is not None:
         return common_pb2.InitialState(operating_point=at)
     if q is None:
@@ -112,9 +114,9 @@ def initial_state(
     if p is not None:
         momentum = common_pb2.InitialState.Momentum(q=configuration, p=vector(p))
         return common_pb2.InitialState(momentum=momentum)
-    rate: Array = np.zeros_like(configuration) if v is None else vector(v)
-    velocity = common_pb2.InitialState.Velocity(q=configuration, v=rate)
-    return common_pb2.InitialState(velocity=velocity)
+    rate: Array = vector(rates[0]) if rates else np.zeros_like(configuration)
+    moving = common_pb2.InitialState.Velocity(q=configuration, v=rate)
+    return common_pb2.InitialState(velocity=moving)
 
 
 def point(at: str | None, state: State | None, u: Vector, plant: str = "") -> common_pb2.Point:

@@ -39,7 +39,7 @@ class State:
     q: Array
     #: Discrete momentum of the dynamic coordinates, nd.
     p: Array
-    #: Velocity of the prescribed coordinates over the last step, nk.
+    #: Velocity of the prescribed coordinates alone, over the last step, nk.
     v: Array
     #: Constraint impulses of the last step; divide by the time step for forces.
     multipliers: Array
@@ -47,6 +47,9 @@ class State:
     model: str = ""
     #: Time step of that plant, s; 0 where it is not known.
     time_step: float = 0.0
+    #: Velocity of all coordinates, nd + nk, m/s or rad/s: of the momentum projected onto the constraints,
+    #: and `v`. Empty where the state is not that of a plant.
+    velocity: Array = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def x(self) -> Array:
@@ -56,7 +59,8 @@ class State:
     @classmethod
     def _from(cls, m: common_pb2.State, model: str = "", time_step: float = 0.0) -> State:
         arrays = map(array, (m.q, m.p, m.v, m.multipliers))
-        return cls(m.step, m.time_s, *arrays, model=model, time_step=time_step)
+        velocity = array(m.velocity)
+        return cls(m.step, m.time_s, *arrays, model=model, time_step=time_step, velocity=velocity)
 
     def _message(self) -> common_pb2.State:
         return common_pb2.State(q=self.q, p=self.p, v=self.v)

@@ -31,7 +31,7 @@ import numpy.typing as npt
 from ._errors import PlantdError, StepError
 from ._types import Array, State, StepReport, Vector, vector
 
-LAYOUT_VERSION = 4
+LAYOUT_VERSION = 5
 MAGIC = int.from_bytes(b"plnt", "little")
 POLL_FOREVER_NS = 2**64 - 1
 
@@ -171,7 +171,7 @@ class Header(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the service knows the type."""
-        return "PlantdLinkHeader4"
+        return "PlantdLinkHeader5"
 
 
 def _fnv1a(data: bytes) -> int:
@@ -534,7 +534,8 @@ class LinkDriver:
 
     def _note_state(self, header: Header, payload: Array) -> State:
         nd, nq = header.dynamic, header.dynamic + header.prescribed
-        outputs = 2 * nq + header.constraints
+        velocity = 2 * nq + header.constraints
+        outputs = velocity + nq
         flags = outputs + header.outputs
         if len(payload) != flags + header.output_channels:
             raise LinkError("INTERNAL", "the server sent a state of the wrong length")
@@ -546,8 +547,9 @@ class LinkDriver:
             q=payload[:nq],
             p=payload[nq : nq + nd],
             v=payload[nq + nd : 2 * nq],
-            multipliers=payload[2 * nq : outputs],
+            multipliers=payload[2 * nq : velocity],
             time_step=header.time_step_s,
+            velocity=payload[velocity:outputs],
         )
         self._y = payload[outputs:flags]
         self._lost = payload[flags:] != 0.0

@@ -17,7 +17,7 @@ use crate::core::plant::mark::{Mark, MarkReason};
 use crate::core::plant::records::Records;
 use crate::core::plant::view::{Mechanics, PlantSnapshot, View};
 use crate::core::plant::watchdog::{Guard, Protection, Safety, Trip, WatchdogAction};
-use crate::core::publish::frame::{Published, Timing};
+use crate::core::publish::frame::{Frame, Published, Timing};
 
 /// A plant with what its steps need. One owner at a time: whoever holds the session's lock, or the loop
 /// that runs the plant.
@@ -26,6 +26,8 @@ pub struct Core {
     pub(crate) last: LastStep,
     /// Room for an input that is not the driver's alone.
     applied: Vec<f64>,
+    /// Room for the velocity of a state that is shown.
+    velocity: Vec<f64>,
     pub(crate) feedback: Option<Box<Feedback>>,
     /// Counts the computations of laws.
     pub(crate) revision: u64,
@@ -61,6 +63,7 @@ impl Core {
     pub(crate) fn new(plant: Plant, events: Arc<Events>) -> Self {
         let last = LastStep::none(&plant);
         Self {
+            velocity: vec![0.0; plant.q().len()],
             plant,
             applied: last.input.clone(),
             last,
@@ -309,8 +312,8 @@ impl Core {
     }
 
     /// Writes the last step into the ring, if somebody reads it.
-    pub(crate) fn write_ring(&self) {
-        if let Some(ring) = &self.records.ring {
+    pub(crate) fn write_ring(&mut self) {
+        if let Some(ring) = self.records.ring.clone() {
             ring.write(self.published().record());
         }
     }
@@ -331,11 +334,9 @@ impl Core {
     }
 
     /// The plant as it is, to be shown.
-    pub(crate) fn view(&self) -> View {
-        let (state, time_s) = self.state();
+    pub(crate) fn view(&mut self) -> View {
         View {
-            state,
-            time_s,
+            frame: self.frame(),
             settings: *self.plant.settings(),
             feedback: self.feedback.as_ref().map(|feedback| feedback.info()),
             parameters: Arc::clone(&self.changed.parameters),
@@ -349,8 +350,11 @@ impl Core {
         }
     }
 
-    pub(crate) fn state(&self) -> (State, f64) {
-        (self.plant.state(), self.plant.time_s())
+    /// The plant as it is, with its last step.
+    pub(crate) fn frame(&mut self) -> Frame {
+        let mut frame = Frame::default();
+        frame.copy_from(&self.published());
+        frame
     }
 
     pub(crate) fn mechanics(&self) -> Mechanics {
@@ -358,7 +362,16 @@ impl Core {
         Mechanics { model, settings, generation: self.changed.generation }
     }
 
-    pub(crate) fn published(&self) -> Published<'_> {
+    /// What the output channels deliver, and for each of them 1 where it stands for a lost number, else 0.
+    pub(crate) fn outputs(&self) -> (&[f64], &[f64]) {
+        self.channels.as_ref().map_or((&[], &[]), |channels| (channels.output(), channels.lost()))
+    }
+
+    /// The plant as it is, with its last step. Finds the velocity, which costs part of a step; allocates
+    /// nothing.
+    pub(crate) fn published(&mut self) -> Published<'_> {
+        self.plant.write_velocity(&mut self.velocity);
+        let (outputs, lost) = self.outputs();
         Published {
             step: self.plant.step_index(),
             time_s: self.plant.time_s(),
@@ -366,11 +379,12 @@ impl Core {
             p: self.plant.p(),
             v: self.plant.v(),
             multipliers: self.plant.multipliers(),
+            velocity: &self.velocity,
             input: &self.last.input,
             driver_input: &self.last.driver_input,
             impulse: &self.last.impulse,
-            outputs: self.channels.as_ref().map_or(&[], |channels| channels.output()),
-            lost: self.channels.as_ref().map_or(&[], |channels| channels.lost()),
+            outputs,
+            lost,
             report: self.last.report,
             generation: self.changed.generation,
             time_step_s: self.plant.settings().time_step_s,
@@ -416,7 +430,8 @@ impl Core {
         let plant = if settings == *self.plant.settings() {
             spare.go_on_from(&self.plant)?
         } else {
-            let (State { step, q, p, v, .. }, time_s) = self.state();
+            let State { step, q, p, v, .. } = self.plant.state();
+            let time_s = self.plant.time_s();
             let mut plant = spare.start(&Initial::Momentum { q, p, v })?;
             plant.set_step_index(step);
             plant.set_time_s(time_s);

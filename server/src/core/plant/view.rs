@@ -2,12 +2,13 @@
 
 use std::sync::Arc;
 
-use plantd_models::{Model, Settings, Snapshot, State};
+use plantd_models::{Model, Settings, Snapshot};
 
 use crate::core::channels::pipeline::ChannelMemory;
 use crate::core::feedback::active::FeedbackInfo;
 use crate::core::parameters::Parameters;
 use crate::core::plant::watchdog::{Safety, Trip};
+use crate::core::publish::frame::Frame;
 
 /// Everything that a session's plant needs to go on bit for bit.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,10 +32,8 @@ pub struct Mechanics {
 
 /// A plant as it is, to be shown.
 pub struct View {
-    /// State.
-    pub state: State,
-    /// Its time, s.
-    pub time_s: f64,
+    /// State and last step.
+    pub frame: Frame,
     /// Settings in force.
     pub settings: Settings,
     /// Feedback.

@@ -43,6 +43,8 @@ pub struct Frame {
     pub state: State,
     /// Its time, s.
     pub time_s: f64,
+    /// Velocity that belongs to it: of all coordinates, from the projected momentum.
+    pub velocity: Vec<f64>,
     /// Number of changes of the plant's parameters and time step so far.
     pub generation: u64,
     /// Report of the step.
@@ -74,6 +76,7 @@ pub(crate) struct Published<'a> {
     pub(crate) p: &'a [f64],
     pub(crate) v: &'a [f64],
     pub(crate) multipliers: &'a [f64],
+    pub(crate) velocity: &'a [f64],
     pub(crate) input: &'a [f64],
     pub(crate) driver_input: &'a [f64],
     pub(crate) impulse: &'a [f64],
@@ -88,7 +91,8 @@ pub(crate) struct Published<'a> {
 
 /// Words of a record of a plant of these sizes.
 pub fn record_words(d: Dimensions) -> usize {
-    FIXED_WORDS + d.state() + d.constraints + 2 * d.input() + d.dynamic + OUTPUTS_MAX
+    let state = d.state() + d.constraints + d.coordinates();
+    FIXED_WORDS + state + 2 * d.input() + d.dynamic + OUTPUTS_MAX
 }
 
 impl Published<'_> {
@@ -108,8 +112,9 @@ impl Published<'_> {
             timing.input_age_ns,
             timing.flags,
         ];
-        let Self { q, p, v, multipliers, input, driver_input, impulse, outputs, lost, .. } = *self;
-        let vectors = [q, p, v, multipliers, input, driver_input, impulse, outputs, lost];
+        let Self { q, p, v, multipliers, velocity, .. } = *self;
+        let Self { input, driver_input, impulse, outputs, lost, .. } = *self;
+        let vectors = [q, p, v, multipliers, velocity, input, driver_input, impulse, outputs, lost];
         let sizes = vectors.map(|vector| vector.len() as u64);
         let numbers = vectors.into_iter().flatten().map(|number| number.to_bits());
         fixed.into_iter().chain(to_words(&self.report)).chain(sizes).chain(numbers)
@@ -131,6 +136,7 @@ impl Frame {
             (&mut self.state.p, published.p),
             (&mut self.state.v, published.v),
             (&mut self.state.multipliers, published.multipliers),
+            (&mut self.velocity, published.velocity),
             (&mut self.input, published.input),
             (&mut self.driver_input, published.driver_input),
             (&mut self.impulse, published.impulse),
@@ -161,12 +167,13 @@ impl Frame {
             flags: next(),
         };
         self.report = from_words(&mut next);
-        let sizes: [usize; 9] = std::array::from_fn(|_| next() as usize);
+        let sizes: [usize; 10] = std::array::from_fn(|_| next() as usize);
         let vectors = [
             &mut self.state.q,
             &mut self.state.p,
             &mut self.state.v,
             &mut self.state.multipliers,
+            &mut self.velocity,
             &mut self.input,
             &mut self.driver_input,
             &mut self.impulse,
@@ -188,6 +195,7 @@ impl Frame {
             p: &self.state.p,
             v: &self.state.v,
             multipliers: &self.state.multipliers,
+            velocity: &self.velocity,
             input: &self.input,
             driver_input: &self.driver_input,
             impulse: &self.impulse,
@@ -250,6 +258,7 @@ mod tests {
                 multipliers: vec![5.0],
             },
             time_s: 0.07,
+            velocity: vec![11.0, -12.0, 4.0],
             generation: 3,
             report: StepReport {
                 iterations: 1,

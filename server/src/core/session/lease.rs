@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use plantd_models::{Initial, InitialError, Linearization, SnapshotError, State, StepReport};
+use plantd_models::{Initial, InitialError, Linearization, SnapshotError, StepReport};
 use plantd_proto::link::monotonic_ns;
 
 use crate::core::driver::DriverKind;
@@ -15,6 +15,7 @@ use crate::core::plant::error::DriveError;
 use crate::core::plant::event::EventKind;
 use crate::core::plant::view::PlantSnapshot;
 use crate::core::plant::watchdog::WatchdogAction;
+use crate::core::publish::frame::Frame;
 use crate::core::realtime::slot::Arrival;
 use crate::core::session::place::Place;
 use crate::core::session::shared::Session;
@@ -101,7 +102,7 @@ impl Lease {
         &mut self,
         u: &[f64],
         linearization: Option<&mut Linearization>,
-        look: impl FnOnce(&Core) -> R,
+        look: impl FnOnce(&mut Core) -> R,
     ) -> Result<R, DriveError> {
         self.step_pushed_and(u, &[], linearization, look)
     }
@@ -112,7 +113,7 @@ impl Lease {
         u: &[f64],
         impulse: &[f64],
         linearization: Option<&mut Linearization>,
-        look: impl FnOnce(&Core) -> R,
+        look: impl FnOnce(&mut Core) -> R,
     ) -> Result<R, DriveError> {
         if self.session.is_closed() {
             return Err(DriveError::Closed);
@@ -202,21 +203,21 @@ impl Lease {
     }
 
     /// Puts the plant back into the state in which the session began, and tells it. Changed parameters stay changed.
-    pub fn reset(&mut self) -> Result<(State, f64), InitialError> {
+    pub fn reset(&mut self) -> Result<Frame, InitialError> {
         let _replacing = self.session.replacing();
         let plant = self.session.plant_at_start()?;
         Ok(self.session.replace_plant(plant, None))
     }
 
     /// Puts the plant into a state, step 0, and tells it.
-    pub fn initialize(&mut self, initial: &Initial) -> Result<(State, f64), InitialError> {
+    pub fn initialize(&mut self, initial: &Initial) -> Result<Frame, InitialError> {
         let _replacing = self.session.replacing();
         let plant = self.session.copy_plants().swap_remove(0).start(initial)?;
         Ok(self.session.replace_plant(plant, None))
     }
 
     /// Puts the plant into the state of a snapshot: one of the same parameters and time step.
-    pub fn restore(&mut self, snapshot: PlantSnapshot) -> Result<(State, f64), SnapshotError> {
+    pub fn restore(&mut self, snapshot: PlantSnapshot) -> Result<Frame, SnapshotError> {
         self.session.restore(snapshot)
     }
 

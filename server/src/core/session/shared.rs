@@ -152,11 +152,7 @@ impl Session {
 
     /// The last step.
     pub fn frame(&self) -> Frame {
-        self.with_core(|core| {
-            let mut frame = Frame::default();
-            frame.copy_from(&core.published());
-            frame
-        })
+        self.with_core(|core| core.frame())
     }
 
     /// The present step.
@@ -302,13 +298,13 @@ impl Session {
         lock(&self.replacing)
     }
 
-    /// Replaces the plant by a copy of it that was put into another state, which comes back with its
-    /// time. The caller holds `replacing`.
+    /// Replaces the plant by a copy of it that was put into another state, which comes back. The caller
+    /// holds `replacing`.
     pub(super) fn replace_plant(
         self: &Arc<Self>,
         plant: Plant,
         memory: Option<ChannelMemory>,
-    ) -> (State, f64) {
+    ) -> Frame {
         let session = Arc::clone(self);
         // The former plant is dropped here, not in the core's hands.
         let (put, _former) = self.with_core(move |core| {
@@ -320,7 +316,7 @@ impl Session {
             } else {
                 session.publish(core);
             }
-            (core.state(), (former, memory))
+            (core.frame(), (former, memory))
         });
         put
     }
@@ -330,14 +326,14 @@ impl Session {
     pub(crate) fn restore(
         self: &Arc<Self>,
         snapshot: PlantSnapshot,
-    ) -> Result<(State, f64), SnapshotError> {
+    ) -> Result<Frame, SnapshotError> {
         let _replacing = lock(&self.replacing);
         let plant = self.plant_of(&snapshot.plant)?;
         Ok(self.replace_plant(plant, snapshot.channels))
     }
 
     /// Tells watchers of a core at rest.
-    pub(super) fn publish(&self, core: &Core) {
+    pub(super) fn publish(&self, core: &mut Core) {
         if self.feed.watchers.count() > 0 {
             self.feed.publish(&core.published());
         }

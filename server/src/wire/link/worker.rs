@@ -479,8 +479,8 @@ fn send_state(
         ..common
     };
     let header = if kind == Kind::State { with_report(header, &published.report) } else { header };
-    let Published { q, p, v, multipliers, outputs, lost, .. } = *published;
-    let parts = [q, p, v, multipliers, outputs, lost];
+    let Published { q, p, v, multipliers, velocity, outputs, lost, .. } = *published;
+    let parts = [q, p, v, multipliers, velocity, outputs, lost];
     endpoint.send(header, &parts, poll_end_ns)
 }
 

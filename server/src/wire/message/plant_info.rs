@@ -27,7 +27,7 @@ pub(crate) fn info(session: &Session, view: View) -> v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
         settings: Some(settings::settings_message(&view.settings)),
-        state: Some(states::state(&view.state, view.time_s)),
+        state: Some(states::shown(&view.frame.published())),
         driver: session.driver().map_or("", DriverKind::as_str).to_owned(),
         link_open: session.link_open(),
         feedback: view.feedback.map(feedback_info),

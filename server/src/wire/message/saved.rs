@@ -92,7 +92,7 @@ impl Session {
             id: self.id().to_owned(),
             model: self.model_name().to_owned(),
             settings: Some(settings::settings_message(&base.settings)),
-            state: Some(states::state(&view.state, view.time_s)),
+            state: Some(states::shown(&view.frame.published())),
             link_open: self.keeps_link(),
             feedback: feedback_info,
             accuracy: self.accuracy().map(settings::accuracy),

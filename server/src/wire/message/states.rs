@@ -7,7 +7,7 @@ use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
 
 use crate::core::plant::core::Core;
-use crate::core::publish::frame::Timing;
+use crate::core::publish::frame::{Published, Timing};
 use crate::core::realtime::clock::utc_ns;
 use crate::wire::message::matrices::matrix;
 use crate::wire::status::RpcError;
@@ -22,8 +22,8 @@ pub fn outputs(y: &[f64], lost: &[f64]) -> Option<v1::Outputs> {
 
 /// What the output channels of a plant deliver, if there are any.
 pub fn core_outputs(core: &Core) -> Option<v1::Outputs> {
-    let published = core.published();
-    outputs(published.outputs, published.lost)
+    let (y, lost) = core.outputs();
+    outputs(y, lost)
 }
 
 /// When a state was there; `monotonic_ns` 0 means now.
@@ -45,7 +45,21 @@ pub fn step_timing(timing: &Timing) -> Option<v1::StepTiming> {
     })
 }
 
-/// The state of a plant as a message.
+/// A state that a plant shows, as a message.
+pub(crate) fn shown(published: &Published<'_>) -> v1::State {
+    let Published { step, time_s, q, p, v, velocity, .. } = *published;
+    v1::State {
+        step,
+        time_s,
+        q: q.to_vec(),
+        p: p.to_vec(),
+        v: v.to_vec(),
+        multipliers: multipliers(step, published.multipliers),
+        velocity: velocity.to_vec(),
+    }
+}
+
+/// The state of a plant that nobody else sees, as a message without velocity.
 pub fn plant_state(plant: &Plant) -> v1::State {
     let step = plant.step_index();
     v1::State {
@@ -55,10 +69,11 @@ pub fn plant_state(plant: &Plant) -> v1::State {
         p: plant.p().to_vec(),
         v: plant.v().to_vec(),
         multipliers: multipliers(step, plant.multipliers()),
+        velocity: Vec::new(),
     }
 }
 
-/// A state at a time as a message.
+/// A state at a time as a message without velocity.
 pub fn state(state: &State, time_s: f64) -> v1::State {
     v1::State {
         step: state.step,
@@ -67,6 +82,7 @@ pub fn state(state: &State, time_s: f64) -> v1::State {
         p: state.p.clone(),
         v: state.v.clone(),
         multipliers: multipliers(state.step, &state.multipliers),
+        velocity: Vec::new(),
     }
 }
 
@@ -140,7 +156,7 @@ pub fn linearization_numbers(d: Dimensions) -> usize {
     (d.state() + d.constraints) * (d.state() + d.input())
 }
 
-/// Numbers in the message of a state.
+/// Numbers in the message of a state without velocity.
 pub fn state_numbers(d: Dimensions) -> usize {
     d.state() + d.constraints
 }

@@ -326,7 +326,7 @@ impl Driving {
         let (frame, dropped) = std::task::ready!(states.poll_next(context));
         Poll::Ready(Ok(Answer::Step(v1::DriveStep {
             sequence: frame.timing.input_sequence,
-            state: Some(states::state(&frame.state, frame.time_s)),
+            state: Some(states::shown(&frame.published())),
             report: Some(report_message(&frame.report)),
             linearization: None,
             u: frame.input.clone(),
@@ -342,7 +342,7 @@ impl Driving {
         let (lease, linearization) = (&mut self.lease, &mut self.linearization);
         let began = Instant::now();
         let step = lease.step_and(u, linearization.as_mut(), |core| {
-            let state = states::plant_state(core.plant());
+            let state = states::shown(&core.published());
             v1::DriveStep {
                 sequence,
                 clocks: Some(states::clocks(state.time_s, 0)),

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use plantd_models::{Dimensions, Initial, State};
+use plantd_models::{Dimensions, Initial};
 use plantd_proto::v1;
 use tonic::{Request, Response, Status, Streaming};
 
@@ -12,6 +12,7 @@ use crate::core::inputs::{Inputs, hold_input};
 use crate::core::limits::LimitExceeded;
 use crate::core::plant::core::Core;
 use crate::core::plant::view::PlantSnapshot;
+use crate::core::publish::frame::Frame;
 use crate::core::session::lease::Lease;
 use crate::core::session::shared::Session;
 use crate::core::workers::pool::Abandoned;
@@ -101,7 +102,8 @@ impl PlantService {
         let limits = &self.hub.limits;
         LimitExceeded::check("steps_per_call", limits.steps_per_call, "steps", plan.steps)?;
         if plan.all_states {
-            let numbers = plan.steps.saturating_mul(states::state_numbers(dimensions));
+            let numbers = states::state_numbers(dimensions) + dimensions.coordinates();
+            let numbers = plan.steps.saturating_mul(numbers);
             let (name, limit) = ("reply_numbers", limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in all states", numbers)?;
         }
@@ -125,12 +127,12 @@ impl PlantService {
     async fn put(
         &self,
         id: &str,
-        change: impl FnOnce(&mut Lease) -> Result<(State, f64), RpcError> + Send + 'static,
+        change: impl FnOnce(&mut Lease) -> Result<Frame, RpcError> + Send + 'static,
     ) -> Result<v1::State, RpcError> {
         let mut lease = self.hub.session(id)?.acquire(DriverKind::Step)?;
         let job = move |_: &_| {
-            let (state, time_s) = change(&mut lease)?;
-            Ok(states::state(&state, time_s))
+            let frame = change(&mut lease)?;
+            Ok(states::shown(&frame.published()))
         };
         self.hub.attendants.run(job).await
     }
@@ -195,9 +197,9 @@ impl Steps {
         let k = *taken;
         let u = if k < plan.inputs.count() { plan.inputs.get(k) } else { held };
         let is_last = k + 1 == plan.steps;
-        let look = |core: &Core| {
+        let look = |core: &mut Core| {
             if plan.all_states || is_last {
-                response.states.push(states::plant_state(core.plant()));
+                response.states.push(states::shown(&core.published()));
             }
             if is_last {
                 response.report = Some(report_message(core.report()));
@@ -443,6 +445,6 @@ impl v1::plant_service_server::PlantService for PlantService {
     }
 }
 
-fn initialize(lease: &mut Lease, initial: &Initial) -> Result<(State, f64), RpcError> {
+fn initialize(lease: &mut Lease, initial: &Initial) -> Result<Frame, RpcError> {
     lease.initialize(initial).map_err(|error| RpcError::from_initial(error, "initial"))
 }

@@ -65,7 +65,7 @@ pub(crate) async fn run_and_wait(
 pub(crate) fn pause(hub: &Hub, id: &str) -> Result<v1::PauseResponse, RpcError> {
     let session = hub.session(id)?;
     session.pause();
-    let state = session.with_core(|core| states::plant_state(core.plant()));
+    let state = session.with_core(|core| states::shown(&core.published()));
     Ok(v1::PauseResponse { run: Some(run_info(&session)), state: Some(state) })
 }
 

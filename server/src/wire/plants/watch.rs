@@ -137,7 +137,7 @@ impl Messages for Watcher {
             response.report = Some(report_message(&frame.report));
         }
         if self.wanted.state {
-            let mut state = states::state(&frame.state, frame.time_s);
+            let mut state = states::shown(&frame.published());
             if let Some(mask) = &self.mask {
                 mask.apply(&mut state);
             }
@@ -239,7 +239,7 @@ impl Analysis {
     }
 }
 
-/// The coordinates that a watcher wants, as indices into `q`, `p` and `v`.
+/// The coordinates that a watcher wants, as indices into `q` and the velocity, `p` and `v`.
 struct Mask {
     q: Vec<usize>,
     p: Vec<usize>,
@@ -278,5 +278,6 @@ impl Mask {
         pick(&mut state.q, &self.q);
         pick(&mut state.p, &self.p);
         pick(&mut state.v, &self.v);
+        pick(&mut state.velocity, &self.q);
     }
 }

@@ -12,13 +12,14 @@ use crate::wire::message::run_info::run_info;
 use crate::wire::message::{models, settings, states};
 
 /// The plant at the beginning of a recording.
-pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &Plant) -> v1::PlantRecord {
+pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &mut Plant) -> v1::PlantRecord {
+    let velocity = plant.velocity();
     let (model, plan) = (plant.model(), String::new());
     let info = v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
         settings: Some(settings::settings_message(plant.settings())),
-        state: Some(states::plant_state(plant)),
+        state: Some(v1::State { velocity, ..states::plant_state(plant) }),
         accuracy: session.accuracy().map(settings::accuracy),
         parameters: all_parameters(&mark.announced.unchanged, &mark.parameters),
         run: Some(run_info(session)),
@@ -52,6 +53,7 @@ pub(super) fn fill(record: &mut v1::StepRecord, frame: &Frame) {
         (&mut state.p, &frame.state.p),
         (&mut state.v, &frame.state.v),
         (&mut state.multipliers, &frame.state.multipliers),
+        (&mut state.velocity, &frame.velocity),
         (&mut record.u, &frame.input),
         (&mut record.driver, &frame.driver_input),
         (&mut record.impulse, &frame.impulse),

@@ -45,8 +45,8 @@ impl Recorder {
         file: File,
         options: Options,
     ) -> Result<Self, StartError> {
-        let (tap, mark, plant) = session.open_tap().ok_or(StartError::Active)?;
-        let first = plant_record(session, &mark, &plant);
+        let (tap, mark, mut plant) = session.open_tap().ok_or(StartError::Active)?;
+        let first = plant_record(session, &mark, &mut plant);
         let started = SystemTime::now();
         let info = v1::Recording {
             name: options.name.clone(),

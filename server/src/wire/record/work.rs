@@ -375,8 +375,8 @@ pub(super) mod tests {
 
     /// A recorder whose thread is this one.
     fn recorder(session: &Arc<Session>, file: &File) -> Work {
-        let (tap, mark, plant) = session.open_tap().unwrap();
-        let first = plant_record(session, &mark, &plant);
+        let (tap, mark, mut plant) = session.open_tap().unwrap();
+        let first = plant_record(session, &mark, &mut plant);
         let info = Mutex::new(v1::Recording::default());
         let shared = Shared { is_ending: AtomicBool::new(true), bytes: Arc::default(), info };
         let file = file.try_clone().unwrap();

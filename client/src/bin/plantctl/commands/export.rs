@@ -39,13 +39,17 @@ impl Export {
         let inputs = inputs.iter().map(|name| format!("u({name})"));
         let outputs = record.outputs.iter().map(|name| format!("y({name})"));
         let names = ["step", "time_s"].into_iter().map(str::to_owned).chain(states.clone());
-        let names = names.chain(inputs.clone()).chain(outputs.clone());
+        let velocity = names::velocity(&model);
+        let names = names.chain(inputs.clone()).chain(outputs.clone()).chain(velocity);
         let head: Vec<_> = names.map(|name| quoted(&name)).collect();
         writeln!(sink, "{}", head.join(",")).with_context(cannot_write)?;
         let mut line = |state: &v1::State, u: &[f64], y: &[f64]| {
             write!(sink, "{},{:?}", state.step, state.time_s)?;
             let (u, y) = (padded(u.to_vec(), inputs.len()), padded(y.to_vec(), outputs.len()));
-            for cell in padded(names::recorded_numbers(state), states.len()).chain(u).chain(y) {
+            let x = padded(names::recorded_numbers(state), states.len());
+            // Older recordings have none.
+            let velocity = padded(state.velocity.clone(), model.coordinates.len());
+            for cell in x.chain(u).chain(y).chain(velocity) {
                 match cell {
                     // Rust prints as many digits as bring the number back.
                     Some(number) => write!(sink, ",{number:?}")?,

@@ -24,6 +24,11 @@ pub(crate) fn input(model: &v1::Model) -> Vec<String> {
     model.inputs.iter().chain(prescribed(model)).cloned().collect()
 }
 
+/// Names of the velocities of all coordinates.
+pub(crate) fn velocity(model: &v1::Model) -> impl Iterator<Item = String> {
+    model.coordinates.iter().map(|c| format!("velocity({})", c.name))
+}
+
 /// Names of the numbers of a recorded state: of the entries of `x`, then of the constraint impulses.
 pub(crate) fn recorded(model: &v1::Model) -> Vec<String> {
     let impulses = model.constraints.iter().map(|name| format!("impulse({name})"));

@@ -12,14 +12,14 @@ use crate::server::context::plant;
 #[derive(Debug, Args)]
 pub(crate) struct Initial {
     /// Operating point of the scene, at rest.
-    #[arg(long, value_name = "POINT", conflicts_with_all = ["q", "v", "p"])]
+    #[arg(long, value_name = "POINT", conflicts_with_all = ["q", "velocity", "p"])]
     at: Option<String>,
     /// Configuration, comma-separated, dynamic coordinates first.
     #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
     q: Option<Numbers>,
-    /// Velocity, comma-separated; zero if only `--q` is given.
-    #[arg(long, requires = "q", conflicts_with = "p", value_parser = numbers, allow_hyphen_values = true)]
-    v: Option<Numbers>,
+    /// Velocity of all coordinates, comma-separated; zero if only `--q` is given.
+    #[arg(long, visible_alias = "v", requires = "q", conflicts_with = "p", value_parser = numbers, allow_hyphen_values = true)]
+    velocity: Option<Numbers>,
     /// Discrete momentum of the dynamic coordinates, comma-separated.
     #[arg(long, requires = "q", value_parser = numbers, allow_hyphen_values = true)]
     p: Option<Numbers>,
@@ -33,9 +33,9 @@ impl From<Initial> for Option<v1::InitialState> {
             Initial { q: Some(q), p: Some(p), .. } => {
                 Form::Momentum(Momentum { q: q.0, p: p.0, v: Vec::new() })
             }
-            Initial { q: Some(q), v, .. } => {
+            Initial { q: Some(q), velocity, .. } => {
                 let rest = || vec![0.0; q.0.len()];
-                let v = v.map_or_else(rest, |v| v.0);
+                let v = velocity.map_or_else(rest, |v| v.0);
                 Form::Velocity(Velocity { q: q.0, v })
             }
             _ => return None,

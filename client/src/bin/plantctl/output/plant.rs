@@ -43,9 +43,13 @@ pub(crate) fn stepping(plant: &v1::PlantInfo) -> String {
 /// A state; vectors that the model does not have are left out.
 pub(crate) fn state(state: &v1::State) -> String {
     let mut text = format!("step {}, time {} s\n", state.step, number(state.time_s));
-    for (name, values) in
-        [("q", &state.q), ("p", &state.p), ("v", &state.v), ("multipliers", &state.multipliers)]
-    {
+    for (name, values) in [
+        ("q", &state.q),
+        ("p", &state.p),
+        ("v", &state.v),
+        ("velocity", &state.velocity),
+        ("multipliers", &state.multipliers),
+    ] {
         if !values.is_empty() {
             let _ = writeln!(text, "  {name}: {}", numbers(values));
         }

@@ -6,8 +6,9 @@ use plantd_client::v1;
 
 use crate::contract::names;
 
-/// Columns of equal length: `q(theta)`, `p(theta)`, `v(lift)`, `u(tau)`, `force(pin.x)`, `kinetic`,
-/// `potential`, `y(tip.x)`; with a reference also `ref.q(theta)` and `error.q(theta)`, and so on.
+/// Columns of equal length: `q(theta)`, `p(theta)`, `v(lift)`, `velocity(theta)`, `u(tau)`,
+/// `force(pin.x)`, `kinetic`, `potential`, `y(tip.x)`; with a reference also `ref.q(theta)` and
+/// `error.q(theta)`, and so on.
 ///
 /// A column of inputs holds at each sample the input of the step that led there.
 #[derive(Clone, Debug, Default)]
@@ -84,6 +85,7 @@ pub(crate) struct Columns {
     q: Vec<String>,
     p: Vec<String>,
     v: Vec<String>,
+    velocity: Vec<String>,
     u: Vec<String>,
     force: Vec<String>,
     y: Vec<String>,
@@ -117,11 +119,13 @@ impl Columns {
         fn named<'a>(quantity: &str, names: impl IntoIterator<Item = &'a String>) -> Vec<String> {
             names.into_iter().map(|name| format!("{quantity}({name})")).collect()
         }
+        let coordinates = || model.coordinates.iter().map(|c| &c.name);
         let prescribed = || names::prescribed(model);
         Self {
-            q: named("q", model.coordinates.iter().map(|c| &c.name)),
+            q: named("q", coordinates()),
             p: named("p", names::dynamic(model)),
             v: named("v", prescribed()),
+            velocity: named("velocity", coordinates()),
             u: named("u", model.inputs.iter().chain(prescribed())),
             force: named("force", &model.constraints),
             y: named("y", outputs),
@@ -138,7 +142,8 @@ impl Columns {
     /// Samples that have all columns and no rows.
     pub(crate) fn empty(&self) -> Samples {
         let mut samples = Samples::default();
-        for name in self.x().chain(&self.u).chain(&self.force).chain(&self.y) {
+        let others = [&self.velocity, &self.u, &self.force, &self.y];
+        for name in self.x().chain(others.into_iter().flatten()) {
             samples.put(name, Vec::new());
         }
         if self.has_energy {
@@ -165,6 +170,9 @@ impl Columns {
         let x = [state.q.as_slice(), &state.p, &state.v].concat();
         for (i, name) in self.x().enumerate() {
             samples.push(name, entry(&x, i));
+        }
+        for (i, name) in self.velocity.iter().enumerate() {
+            samples.push(name, entry(&state.velocity, i));
         }
         for (i, name) in self.u.iter().enumerate() {
             samples.push(name, entry(u, i));
@@ -228,6 +236,7 @@ mod tests {
             p: vec![3.0],
             v: vec![4.0],
             multipliers: vec![5.0],
+            velocity: vec![3.5, 4.0],
             ..Default::default()
         };
         let energy = v1::Energy { kinetic_j: 6.0, potential_j: 7.0 };
@@ -246,6 +255,7 @@ mod tests {
             ("q(lift)", 2.0),
             ("p(theta)", 3.0),
             ("v(lift)", 4.0),
+            ("velocity(theta)", 3.5),
             ("force(pin.x)", 50.0),
             ("pin.x", 50.0),
             ("tau", 8.0),
