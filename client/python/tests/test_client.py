@@ -49,6 +49,28 @@ def test_a_robot_is_a_file_or_a_text(client, tmp_path):
         client.create_model("no-such-file.urdf")
 
 
+def test_a_model_in_mjcf_comes_with_what_it_includes(client, tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "rod.xml").write_text(
+        """<?xml version="1.0"?><!-- <mujoco/> --><mujocoinclude>
+        <inertial pos="0 0 -0.5" mass="2" diaginertia="0.1 0.1 0.01"/></mujocoinclude>"""
+    )
+    text = """<mujoco model="py-mjcf"><!-- <include file="none.xml"/> --><worldbody>
+      <body name="rod"><joint name="hinge" axis="0 1 0"/><include file="parts/rod.xml"/></body>
+    </worldbody><actuator><motor name="drive" joint="hinge"/></actuator></mujoco>"""
+    file = tmp_path / "rod.xml"
+    file.write_text(text)
+    model = client.create_model(file)
+    force = client.dynamics(model=model.name, q=[0.3], v=[0.0]).gravity
+    np.testing.assert_allclose(force, [2 * 9.81 * 0.5 * np.sin(0.3)], rtol=1e-12)
+    client.delete_model(model.name)
+    file.write_text(text.replace("parts/rod.xml", "rod.xml"))
+    with pytest.raises(ValueError, match="included twice"):
+        client.create_model(file)
+    with pytest.raises(plantd.PlantdError, match="plantctl import"):
+        client.create_model(text)
+
+
 def test_lqr_balances_the_pendulum(client):
     gain = client.solve_lqr("pendulum", at="upright", q=[100, 1], r=[1])
     assert gain.spectral_radius < 1

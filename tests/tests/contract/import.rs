@@ -56,6 +56,39 @@ async fn a_robot_is_uploaded_and_driven() {
 }
 
 #[tokio::test]
+async fn a_model_in_mjcf_is_uploaded_and_driven() {
+    let (_server, client) = server().await;
+    let text = r#"<mujoco model="Rod"><worldbody><geom type="plane" size="1 1 1"/>
+      <body name="rod"><joint name="hinge" axis="0 1 0" range="-60 60"/>
+        <inertial pos="0 0 -0.5" mass="2" diaginertia="0.1 0.1 0.01"/></body></worldbody>
+      <actuator><motor name="drive" joint="hinge" gear="3" ctrlrange="-1 1"/></actuator></mujoco>"#;
+    for format in [v1::SceneFormat::Unspecified, v1::SceneFormat::Mjcf] {
+        let request = v1::CreateModelRequest {
+            scene: text.to_owned(),
+            format: format.into(),
+            name: format!("rod-{}", format as i32),
+        };
+        let answer = client.import_model(request).await.unwrap();
+        let (model, report) = (answer.model.unwrap(), answer.import_report.unwrap());
+        assert_eq!((&*model.coordinates[0].name, &*model.inputs[0]), ("hinge", "drive"));
+        let kinds: Vec<_> = report.notes.iter().map(v1::ImportNote::kind).collect();
+        assert_eq!(kinds, [v1::ImportKind::Contact, v1::ImportKind::Approximated]);
+        let request = v1::EvaluateDynamicsRequest {
+            model: model.name,
+            q: vec![0.3],
+            inputs: vec![0.5],
+            ..Default::default()
+        };
+        let found = client.evaluate_dynamics(request).await.unwrap().acceleration[0];
+        let expected = (3.0 * 0.5 - 2.0 * 9.81 * 0.5 * 0.3_f64.sin()) / (0.1 + 2.0 * 0.25);
+        assert!((found - expected).abs() < 1e-13, "{found} instead of {expected}");
+    }
+    let answer = client.validate_scene("<mujoco><include file=\"a.xml\"/></mujoco>").await.unwrap();
+    assert_eq!(answer.problems[0].path, "1:9");
+    assert!(answer.problems[0].message.contains("plantctl import"), "{:?}", answer.problems);
+}
+
+#[tokio::test]
 async fn a_faulty_robot_is_refused_with_lines() {
     let (_server, client) = server().await;
     let faulty =
