@@ -486,6 +486,24 @@ fn files_are_included() {
     assert!(alone.contains("1:9: `include` in `mujoco`"), "{alone}");
 }
 
+/// The inertia behind a damping ratio is that of the other coordinates let go, `1 / (c M⁻¹ cᵀ)`.
+#[test]
+fn damping_ratios_take_the_inertia_of_what_moves() {
+    let text = r#"<mujoco><option gravity="0 0 0"/><worldbody><body>
+      <joint name="a" type="slide" axis="1 0 0"/><inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/>
+      <body><joint name="b" type="slide" axis="1 0 0"/><inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/></body>
+    </body></worldbody><tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="2"/></fixed></tendon>
+    <actuator><position joint="a" kp="8" dampratio="0.5"/><position tendon="t" kp="8" dampratio="0.5"/></actuator></mujoco>"#;
+    let scene = import(text, &Options::default()).unwrap().scene;
+    // M = [5 3; 3 3], M⁻¹ = [1/2 −1/2; −1/2 5/6].
+    let along = [0.5, 0.5 - 2.0 + 4.0 * 5.0 / 6.0];
+    for (force, rate) in scene.forces.iter().zip(along) {
+        let Force::Servo { damping, .. } = force else { panic!("{force:?}") };
+        let expected = 2.0 * 0.5 * (8.0_f64 / rate).sqrt();
+        assert!((damping - expected).abs() < 1e-12, "{damping} instead of {expected}");
+    }
+}
+
 fn problems(text: &str) -> Vec<String> {
     let error = import(text, &Options::default()).expect_err(text);
     error.problems.iter().map(ToString::to_string).collect()
@@ -541,6 +559,11 @@ fn what_is_wrong_is_named_with_its_place() {
         ),
         (with("<equality><weld body1='weel'/></equality>"), "there is no body `weel`"),
         (with("<equality><flex flex='f'/></equality>"), "`flex` in `equality`"),
+        (
+            change("<frame ", "<replicate count=\"2\"><site name=\"s\"/></replicate><frame ")
+                .replace("</mujoco>", "<actuator><motor site=\"s\"/></actuator></mujoco>"),
+            "`s` is replicated",
+        ),
         (with("<deformable/>"), "`deformable` in `mujoco`"),
         (with("<keyframe><key qpos='1 2 3'/></keyframe>"), "`qpos` has 3 numbers; must have 2"),
         (change("<frame ", "<composite type=\"cable\"/><frame "), "`composite` in `body`"),

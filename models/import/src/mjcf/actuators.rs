@@ -403,7 +403,8 @@ impl<'a> Build<'_, 'a, '_> {
         None
     }
 
-    /// The law of an actuator; none if it never has a force. A damping ratio needs the inertia of what it acts on.
+    /// The law of an actuator; none if it never has a force. A damping ratio `ζ` means `2 ζ √(kp I)` with the inertia
+    /// `I = 1 / (c M⁻¹ cᵀ)` of what it acts on, in the configuration of the file.
     fn law(&mut self, node: Node<'a, 'a>, actuator: &Actuator, terms: &[Term]) -> Option<Law> {
         let [constant, stiffness, mut damping] = match actuator.bias {
             [constant, by_length, by_rate, ..] if actuator.is_affine => {
@@ -415,18 +416,14 @@ impl<'a> Build<'_, 'a, '_> {
         let is_position = actuator.is_affine && gain == stiffness;
         if is_position && damping < 0.0 {
             let ratio = -damping;
-            let mut inertia = 0.0;
-            for term in terms {
-                let lever = actuator.gear[0] * term.coefficient;
-                let own = self.mobility().and_then(|mobility| mobility.inertia(&term.coordinate));
-                let Some(own) = own else {
-                    let message =
-                        "`dampratio`: the mass matrix at the start is not positive definite";
-                    self.reader.fail(node, message);
-                    return None;
-                };
-                inertia += own / (lever * lever);
-            }
+            let Some(mobility) = self.mobility() else {
+                let message = "`dampratio`: the mass matrix at the start is not positive definite";
+                self.reader.fail(node, message);
+                return None;
+            };
+            let gear = actuator.gear[0];
+            let terms = terms.iter().map(|term| (&*term.coordinate, gear * term.coefficient));
+            let inertia = mobility.along(terms).recip();
             damping = 2.0 * ratio * (gain * inertia).sqrt();
         }
         if gain == 0.0 || actuator.gear == [0.0; 6] {

@@ -65,7 +65,12 @@ impl Build<'_, '_, '_> {
     ) -> Option<T> {
         let name = self.reader.required(node, attribute);
         let found = found(self, name);
-        if found.is_none() && !name.is_empty() {
+        if found.is_none() && self.tree.is_copied(name) {
+            let message = format!(
+                "`{name}` is replicated, and what refers to it is not copied along: write the copies out"
+            );
+            self.reader.refuse(node, message);
+        } else if found.is_none() && !name.is_empty() {
             self.reader.fail(node, format!("there is no {what} `{name}`"));
         }
         found

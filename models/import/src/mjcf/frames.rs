@@ -229,9 +229,8 @@ impl Build<'_, '_, '_> {
                     "`springdamper`: the mass matrix at the start is not positive definite";
                 return self.reader.fail(joint.node, message);
             };
-            let rates: Vec<f64> =
-                coordinates.iter().filter_map(|name| mobility.of_coordinate(name)).collect();
-            let inertia = rates.len() as f64 / rates.iter().sum::<f64>();
+            let rate = |name: &String| mobility.along(std::iter::once((name.as_str(), 1.0)));
+            let inertia = coordinates.len() as f64 / coordinates.iter().map(rate).sum::<f64>();
             for coordinate in &coordinates {
                 self.draft.damp(self.reader, coordinate, 2.0 * inertia / time);
             }

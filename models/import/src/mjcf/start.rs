@@ -12,8 +12,6 @@ pub(super) struct Mobility {
     /// Rows of coordinates.
     rows: BTreeMap<String, usize>,
     inverse: DMatrix<f64>,
-    /// `M_ii`.
-    inertias: Vec<f64>,
 }
 
 impl Mobility {
@@ -52,21 +50,17 @@ impl Mobility {
         };
         let rates = Continuous::new(model).linearize(&point).ok()?.jacobian;
         let inverse = rates.view((0, 2 * all), (dynamic, dynamic)).into_owned();
-        let inertias = inverse.clone().try_inverse()?.diagonal().as_slice().to_vec();
         Some(Self {
             rows: names.into_iter().enumerate().map(|(i, name)| (name, i)).collect(),
             inverse,
-            inertias,
         })
     }
 
-    /// `(M⁻¹)_ii` of a coordinate.
-    pub(super) fn of_coordinate(&self, name: &str) -> Option<f64> {
-        self.rows.get(name).map(|row| self.inverse[(*row, *row)])
-    }
-
-    /// `M_ii` of a coordinate.
-    pub(super) fn inertia(&self, name: &str) -> Option<f64> {
-        self.rows.get(name).map(|row| self.inertias[*row])
+    /// How fast a sum of coordinates answers to a force along it, `c M⁻¹ cᵀ`: the inverse of its inertia.
+    pub(super) fn along<'n>(&self, terms: impl Iterator<Item = (&'n str, f64)>) -> f64 {
+        let rows = terms.filter_map(|(name, factor)| Some((*self.rows.get(name)?, factor)));
+        let rows: Vec<_> = rows.collect();
+        let pairs = rows.iter().flat_map(|a| rows.iter().map(move |b| (a, b)));
+        pairs.map(|(&(i, a), &(j, b))| a * b * self.inverse[(i, j)]).sum()
     }
 }

@@ -11,6 +11,7 @@ const USER: &str = "it speaks to other programs";
 const STATES: &str = "clients read the state, and what follows from it, of the plant itself";
 const SOLVER: &str = "it sets MuJoCo's own solver";
 const SOFT: &str = "it softens what is hard here, or is not enforced";
+const TOUCH: &str = "nothing touches anything";
 const MEDIUM: &str = "there is no medium";
 const NO_STATE: &str = "actuators here have no state of their own";
 const SAVED: &str = "save the model from MuJoCo with `mj_saveLastXML`, which writes it out";
@@ -87,7 +88,7 @@ const GEOM: Element = Element::new(
         ),
         ORIENTATION,
         (
-            Contact,
+            NoEffect(TOUCH),
             "condim priority friction solmix solref solimp margin gap surfacevel adhesion",
         ),
         (NoEffect(SEEN), "material hfield fitscale"),
@@ -230,7 +231,7 @@ pub(super) static MUJOCO: Element = Element::new(
         ]),
         &WORLD,
         &Element::new("contact", &[], &[])
-            .without(&[(Contact, "pair"), (NoEffect("nothing touches anything"), "exclude")]),
+            .without(&[(Contact, "pair"), (NoEffect(TOUCH), "exclude")]),
         &Element::new(
             "tendon",
             &[],

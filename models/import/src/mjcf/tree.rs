@@ -1,6 +1,6 @@
 //! Bodies of an MJCF with what they carry, frames and replications unfolded.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Isometry3, Matrix3, Translation3, Unit, UnitQuaternion, Vector3};
 use plantd_models::scene::{self, MAX_FRAMES, MAX_VISUALS, Rotation, Visual};
@@ -29,6 +29,8 @@ pub(super) struct Tree<'a> {
     pub(super) touching: Option<(Node<'a, 'a>, usize)>,
     /// Bodies, joints and sites by name.
     names: [BTreeMap<String, usize>; 3],
+    /// Names of what is replicated, without what that appends.
+    copied: BTreeSet<&'a str>,
 }
 
 pub(super) struct Body<'a> {
@@ -98,6 +100,11 @@ impl Tree<'_> {
 
     pub(super) fn site(&self, name: &str) -> Option<&Site> {
         self.names[2].get(name).map(|site| &self.sites[*site])
+    }
+
+    /// Whether a name is that of several copies.
+    pub(super) fn is_copied(&self, name: &str) -> bool {
+        self.copied.contains(name)
     }
 
     /// Whether a joint moves a body.
@@ -444,6 +451,7 @@ impl<'a> Walk<'_, 'a, '_> {
     fn register(&mut self, kind: usize, node: Node<'a, 'a>, name: &str, index: usize) {
         let is_new =
             name.is_empty() || self.tree.names[kind].insert(name.to_owned(), index).is_none();
+        self.tree.copied.extend(node.attribute("name").filter(|own| *own != name));
         if !is_new {
             let kind = ["bodies", "joints", "sites"][kind];
             self.reader.fail(node, format!("there are two {kind} `{name}`"));
