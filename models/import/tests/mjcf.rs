@@ -588,6 +588,44 @@ fn what_is_refused_is_left_out_by_those_who_want_that() {
     assert!(robot.report.notes.iter().any(|note| note.kind == Kind::Warning));
 }
 
+/// Whatever is torn off, left out or written in place of a value is an error or a scene.
+#[test]
+fn nothing_panics() {
+    let rest = with(
+        "<default><position kp='20' kv='1'/></default>
+        <tendon><fixed name='t' stiffness='3' range='-1 1'><joint joint='hinge' coef='2'/></fixed>
+          <spatial name='rope' springlength='0 1' stiffness='4'><site site='hook'/><site site='post'/></spatial></tendon>
+        <equality><joint joint1='hinge' joint2='slide' polycoef='0 1 2'/><weld body1='sled' relpose='0 0 0 1 0 0 0'/>
+          <connect body1='wheel' anchor='0 0 1'/><tendon tendon1='t' tendon2='rope'/></equality>
+        <actuator><motor tendon='rope' gear='2'/><position joint='hinge' forcerange='-1 1' dampratio='1'/>
+          <general site='rim' gear='1 2 3 4 5 6' ctrlrange='0 1'/></actuator>
+        <keyframe><key qpos='1 2' ctrl='1 2 3'/></keyframe>",
+    );
+    let lenient = Options { lenient: true, ..Options::default() };
+    let read = |text: &str| {
+        if let Ok(robot) = import(text, &lenient) {
+            let _ = robot.check();
+        }
+    };
+    for text in [ARM, &rest] {
+        read(text);
+        (0..text.len())
+            .filter(|end| text.is_char_boundary(*end))
+            .for_each(|end| read(&text[..end]));
+        let quotes: Vec<_> = text.match_indices(['"', '\'']).map(|(at, _)| at).collect();
+        let long = "1 ".repeat(1000);
+        let values = [
+            "", "0", "-1", "1e308", "-1e308", "5e-324", "nan", "0 0 0 0", "1 1", &long, "wheel",
+            "true",
+        ];
+        for ends in quotes.chunks_exact(2) {
+            for value in values {
+                read(&format!("{}{value}{}", &text[..=ends[0]], &text[ends[1]..]));
+            }
+        }
+    }
+}
+
 /// Files that would grow end soon, with an error.
 #[test]
 fn nothing_grows_without_bound() {
