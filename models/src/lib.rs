@@ -57,4 +57,5 @@ pub use crate::plant::settle::{Equilibrium, SettleError, SettleRequest};
 pub use crate::plant::site::Pose;
 pub use crate::plant::snapshot::{Snapshot, SnapshotError};
 pub use crate::plant::spare::Spare;
+pub use crate::plant::targets::Target;
 pub use crate::scene::{Problem, Scene, SceneError};

@@ -3,10 +3,15 @@
 mod common;
 
 use std::f64::consts::PI;
+use std::sync::Arc;
 
 use common::{Numbers, builtin, floating, plant, random_tree};
+use nalgebra::DVector;
 use plantd_models::scene::{Constraint, Coordinate, CoordinateKind, Spring};
-use plantd_models::{Equilibrium, Initial, InitialError, Plant, Scene, SettleError, SettleRequest};
+use plantd_models::{
+    Continuous, ContinuousPoint, Equilibrium, Initial, InitialError, Kinematics, Model, Plant,
+    Scene, Settings, SettleError, SettleRequest, Target,
+};
 
 fn settle(plant: &Plant, q: &[f64], hold: &[&str]) -> Result<Equilibrium, SettleError> {
     let hold = hold.iter().map(|name| (*name).to_owned()).collect();
@@ -366,4 +371,119 @@ fn scenes_of_all_elements() {
         }
     }
     assert!(settled > 5, "{settled}");
+}
+
+/// An arm of six hinges, a hand at its end.
+const ARM: &str = r#"
+format = 1
+name = "arm"
+gravity = [0.0, 0.0, -9.81]
+[[frames]]
+name = "base"
+joint = { type = "revolute", axis = [0.0, 0.0, 1.0] }
+body = { mass = 2.0, inertia = [0.1, 0.1, 0.1] }
+[[frames]]
+name = "shoulder"
+parent = "base"
+translation = [0.0, 0.0, 0.3]
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+body = { mass = 2.0, center_of_mass = [0.25, 0.0, 0.0], inertia = [0.1, 0.1, 0.1] }
+[[frames]]
+name = "elbow"
+parent = "shoulder"
+translation = [0.5, 0.0, 0.0]
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+body = { mass = 1.0, center_of_mass = [0.2, 0.0, 0.0], inertia = [0.1, 0.1, 0.1] }
+[[frames]]
+name = "roll"
+parent = "elbow"
+translation = [0.4, 0.0, 0.0]
+joint = { type = "revolute", axis = [1.0, 0.0, 0.0] }
+body = { mass = 0.5, inertia = [0.1, 0.1, 0.1] }
+[[frames]]
+name = "pitch"
+parent = "roll"
+joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
+body = { mass = 0.5, inertia = [0.1, 0.1, 0.1] }
+[[frames]]
+name = "yaw"
+parent = "pitch"
+joint = { type = "revolute", axis = [1.0, 0.0, 0.0] }
+body = { mass = 0.5, inertia = [0.1, 0.1, 0.1] }
+[[frames]]
+name = "hand"
+parent = "yaw"
+translation = [0.1, 0.0, 0.0]
+"#;
+
+/// The pose of the hand is that of a configuration nearby, which is found again.
+#[test]
+fn an_arm_reaches_a_pose() {
+    let arm = Arc::new(Model::compile(&Scene::from_toml(ARM).unwrap()).unwrap());
+    let pose = |q: &[f64], at: [f64; 3]| {
+        let mut kinematics = Kinematics::new(Arc::clone(&arm));
+        kinematics.place(q, &[0.0; 6]).unwrap();
+        kinematics.motion(&kinematics.point("hand", at).unwrap())
+    };
+    let (there, at) = ([0.4, -0.5, 0.9, 0.3, 0.6, -0.2], [0.0, 0.05, 0.02]);
+    let wanted = pose(&there, at);
+    let target = Target {
+        frame: "hand".to_owned(),
+        at,
+        position: Some(wanted.position),
+        orientation: Some(wanted.orientation),
+    };
+    let held = Arc::new(arm.held_at(&[target]).unwrap());
+    let q = there.map(|x| x + 0.15);
+    let projection = Initial::Projection { q: q.to_vec(), hold: vec![] };
+    let reached = Plant::at(Arc::clone(&held), Settings::new(&held), &projection).unwrap();
+    for (found, there) in reached.q().iter().zip(there) {
+        assert!((found - there).abs() < 1e-9, "{:?} instead of {there:?}", reached.q());
+    }
+}
+
+/// With a position alone three freedoms are left: the arm rests where its energy is least, and virtual work of
+/// the force at the hand balances gravity, `g(q) = Jᵀ F`.
+#[test]
+fn an_arm_hangs_from_a_point() {
+    let arm = Arc::new(Model::compile(&Scene::from_toml(ARM).unwrap()).unwrap());
+    let position = [0.5, 0.2, 0.4];
+    let target = Target { frame: "hand".to_owned(), position: Some(position), ..Target::default() };
+    let held = arm.held_at(&[target]).unwrap();
+    let q = vec![0.3, -0.6, 1.2, 0.1, 0.3, 0.0];
+    let rest = held.settle(&SettleRequest { q, ..SettleRequest::default() }).unwrap();
+    let mut kinematics = Kinematics::new(Arc::clone(&arm));
+    kinematics.place(&rest.q, &[0.0; 6]).unwrap();
+    let hand = kinematics.point("hand", [0.0; 3]).unwrap();
+    for (found, wanted) in kinematics.motion(&hand).position.iter().zip(position) {
+        assert!((found - wanted).abs() < 1e-9);
+    }
+    let point = ContinuousPoint { q: rest.q, v: vec![0.0; 6], ..ContinuousPoint::default() };
+    let weight = DVector::from_vec(Continuous::new(arm).terms(&point).unwrap().gravity);
+    let jacobian = kinematics.jacobian(&hand).rows(0, 3).transpose();
+    let force = jacobian.clone().svd(true, true).solve(&weight, 1e-9).unwrap();
+    let left = (jacobian * force - &weight).amax();
+    assert!(left < 1e-6 && weight.amax() > 1.0, "{left} of {weight}");
+}
+
+#[test]
+fn targets_that_cannot_be_are_named() {
+    let arm = Model::compile(&Scene::from_toml(ARM).unwrap()).unwrap();
+    let hand = Target {
+        frame: "hand".to_owned(),
+        position: Some([0.4, 0.0, 0.3]),
+        orientation: Some([1.0, 0.0, 0.0, 0.0]),
+        ..Target::default()
+    };
+    let cases = [
+        (Target { frame: "foot".to_owned(), ..hand.clone() }, "foot"),
+        (Target { position: Some([f64::NAN, 0.0, 0.0]), ..hand.clone() }, "finite"),
+        (Target { frame: "world".to_owned(), ..hand.clone() }, ""),
+    ];
+    for (target, message) in cases {
+        let error = arm.held_at(&[hand.clone(), target]).unwrap_err();
+        let named = error.problems.iter().all(|problem| problem.path.starts_with("targets[1]"));
+        assert!(named && error.to_string().contains(message), "{error}");
+    }
+    assert_eq!(arm.held_at(&[hand.clone(), hand]).unwrap().dimensions().constraints, 12);
 }

@@ -3,7 +3,8 @@
 //! Read [`facade`] first: what a user of a plant calls. [`solve`] takes a control period, [`period`] says what
 //! it is a sequence of; the steps themselves are the integrator's, their derivatives the linearization's.
 //!
-//! - where a plant starts: [`initial`], [`settle`] (at rest), [`snapshot`], [`spare`] (made ahead);
+//! - where a plant starts: [`initial`], [`settle`] (at rest), [`targets`] (of frames), [`snapshot`], [`spare`]
+//!   (made ahead);
 //! - what can be asked of it: [`diagnose`], [`site`] (poses and pushes), [`projected`] (momentum), [`choice`]
 //!   (accuracy);
 //! - its derivatives: [`second_order`], [`known`] (of a step whose solution is known).
@@ -21,3 +22,4 @@ pub(crate) mod site;
 pub(crate) mod snapshot;
 pub(crate) mod solve;
 pub(crate) mod spare;
+pub(crate) mod targets;

@@ -4,6 +4,7 @@ use std::collections::HashMap;
 use std::f64::consts::PI;
 
 use plantd_client::{Code, MatrixExt as _, v1};
+use plantd_models::Scene;
 
 use crate::support::*;
 
@@ -48,6 +49,53 @@ fn settle(model: &str) -> v1::SettleRequest {
 
 fn named<const N: usize>(values: [(&str, f64); N]) -> HashMap<String, f64> {
     values.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+}
+
+#[tokio::test]
+async fn frames_reach_their_targets() {
+    let (_server, client) = server().await;
+    let frame = client.get_model("double-pendulum").await.unwrap();
+    let frame = Scene::from_toml(&frame.scene_toml).unwrap().frames.pop().unwrap();
+    let tip = frame.body.unwrap().center_of_mass;
+    let point = v1::FramePoint { frame: frame.name, at: tip.to_vec() };
+    let at = |position: &[f64]| v1::SettleTarget {
+        point: Some(point.clone()),
+        position: position.to_vec(),
+        orientation: Vec::new(),
+    };
+    let request = |target: v1::SettleTarget| v1::SettleRequest {
+        q: vec![0.3, 0.5],
+        goal: v1::SettleGoal::Constraints.into(),
+        targets: vec![target],
+        ..settle("double-pendulum")
+    };
+    let kinematics = |q: Vec<f64>| {
+        let state = v1::MechanicalState {
+            model: "double-pendulum".to_owned(),
+            q,
+            ..Default::default()
+        };
+        v1::KinematicsRequest {
+            state: Some(state),
+            points: vec![point.clone()],
+            ..Default::default()
+        }
+    };
+    let there = client.kinematics(kinematics(vec![0.5, 0.9])).await.unwrap();
+    let wanted = there.points[0].position.clone();
+    let answer = client.settle(request(at(&wanted))).await.unwrap();
+    for (found, there) in answer.q.iter().zip([0.5, 0.9]) {
+        assert!((found - there).abs() < 1e-9, "{:?}", answer.q);
+    }
+    for (target, field) in [
+        (at(&[9.0, 9.0, 0.0]), "guess"),
+        (at(&[0.1, 0.2]), "targets[0].position"),
+        (at(&[]), "targets[0]"),
+        (v1::SettleTarget { point: None, ..at(&wanted) }, "targets[0]"),
+    ] {
+        let error = client.settle(request(target)).await.unwrap_err().to_string();
+        assert!(error.contains(field), "{field}: {error}");
+    }
 }
 
 #[tokio::test]

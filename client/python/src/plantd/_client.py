@@ -182,6 +182,7 @@ class Client:
         guess: Mapping[str, float] | None = None,
         hold: Sequence[str] = (),
         inputs: Mapping[str, float] | None = None,
+        targets: Mapping[str, Vector] | None = None,
         constraints_only: bool = False,
     ) -> Settled:
         """Finds a configuration in which the model rests, from a guess.
@@ -189,6 +190,8 @@ class Client:
         The guess is ``q``, or the scene's initial configuration, with the values of ``guess`` put in;
         coordinates in ``hold`` keep their value of it. ``inputs`` are the forces that act.
         ``constraints_only`` finds a configuration close to the guess that satisfies the constraints.
+        ``targets`` say where the origins of frames shall be in the world, three numbers each, or seven with
+        the orientation as a unit quaternion w, x, y, z: inverse kinematics.
         """
         goal = "SETTLE_GOAL_CONSTRAINTS" if constraints_only else "SETTLE_GOAL_EQUILIBRIUM"
         request = model_service_pb2.SettleRequest(
@@ -199,6 +202,11 @@ class Client:
             inputs=dict(inputs or {}),
             goal=model_service_pb2.SettleGoal.Value(goal),
         )
+        for frame, target in (targets or {}).items():
+            numbers = vector(target)
+            request.targets.add(
+                point={"frame": frame}, position=numbers[:3], orientation=numbers[3:]
+            )
         return Settled._from(self._call(self.models.Settle, request))
 
     def delete_model(self, name: str) -> None:

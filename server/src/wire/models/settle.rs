@@ -3,12 +3,15 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use plantd_models::{Initial, Model, Plant, Settings, SettleRequest};
+use plantd_models::{Initial, Model, Plant, Problem, Settings, SettleRequest, Target};
 use plantd_proto::v1;
 
 use crate::wire::message::{checks, start};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
+
+/// Targets of frames in a request at most.
+const TARGETS_MAX: usize = 64;
 
 /// Answers a Settle call.
 pub(crate) fn settle(
@@ -19,6 +22,8 @@ pub(crate) fn settle(
     let goal = v1::SettleGoal::try_from(request.goal)
         .map_err(|_| RpcError::field("goal", format!("{} is no such goal", request.goal)))?;
     let guess = guess(&model, request.q, &request.guess)?;
+    let constraints = model.dimensions().constraints;
+    let model = held(model, request.targets)?;
     let inputs = inputs(&model, &request.inputs)?;
     if goal == v1::SettleGoal::Constraints {
         let projection = Initial::Projection { q: guess, hold: request.hold };
@@ -37,12 +42,60 @@ pub(crate) fn settle(
         equilibrium: Some(v1::Equilibrium {
             potential_j: rest.potential_j,
             residual: rest.residual,
-            constraint_forces: rest.constraint_forces,
+            constraint_forces: rest.constraint_forces[..constraints].to_vec(),
             stable: rest.stable,
             smallest_stiffness: rest.smallest_stiffness,
             iterations: rest.iterations,
         }),
     })
+}
+
+/// The model held at targets of frames.
+fn held(model: Arc<Model>, targets: Vec<v1::SettleTarget>) -> Result<Arc<Model>, RpcError> {
+    if targets.is_empty() {
+        return Ok(model);
+    }
+    let count = targets.len();
+    if count > TARGETS_MAX {
+        let message = format!("{count} targets; at most {TARGETS_MAX} are allowed");
+        return Err(RpcError::field("targets", message));
+    }
+    let targets = targets.into_iter().enumerate().map(|(i, target)| self::target(i, target));
+    let held = model.held_at(&targets.collect::<Result<Vec<_>, _>>()?).map_err(|error| {
+        let Problem { path, message } = error.problems.into_iter().next().unwrap_or_else(|| {
+            Problem { path: "targets".to_owned(), message: "cannot be held".to_owned() }
+        });
+        RpcError::field(path, message)
+    })?;
+    Ok(Arc::new(held))
+}
+
+fn target(i: usize, target: v1::SettleTarget) -> Result<Target, RpcError> {
+    let v1::SettleTarget { point, position, orientation } = target;
+    let point = point.unwrap_or_default();
+    let field = |name: &str| format!("targets[{i}].{name}");
+    if position.is_empty() && orientation.is_empty() {
+        let message = "a target has a position, an orientation, or both";
+        return Err(RpcError::field(format!("targets[{i}]"), message));
+    }
+    Ok(Target {
+        frame: point.frame,
+        at: numbers(field("point.at"), point.at)?.unwrap_or_default(),
+        position: numbers(field("position"), position)?,
+        orientation: numbers(field("orientation"), orientation)?,
+    })
+}
+
+/// So many numbers, or none.
+fn numbers<const N: usize>(field: String, values: Vec<f64>) -> Result<Option<[f64; N]>, RpcError> {
+    if values.is_empty() {
+        return Ok(None);
+    }
+    let count = values.len();
+    let numbers = values.try_into();
+    numbers
+        .map(Some)
+        .map_err(|_| RpcError::field(field, format!("has {count} entries; must have {N}, or none")))
 }
 
 /// The initial configuration, or `q`, with single values put in.

@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
-use crate::input::numbers::{Assignment, assignment, by_name};
+use crate::input::numbers::{Assignment, assignment, by_name, numbers};
 use crate::output::plant;
 use crate::output::text::{number, table};
 use crate::server::context::Context;
@@ -25,7 +25,10 @@ pub(crate) struct Settle {
     /// Input forces that act.
     #[arg(long, num_args = 1.., value_name = "NAME=VALUE", value_parser = assignment)]
     inputs: Vec<Assignment>,
-    /// Only satisfy the constraints.
+    /// Where the origin of a frame shall be in the world, with its orientation w, x, y, z if that matters.
+    #[arg(long, value_name = "FRAME=X,Y,Z[,W,X,Y,Z]", value_parser = target, allow_hyphen_values = true)]
+    target: Vec<v1::SettleTarget>,
+    /// Only satisfy the constraints, and reach the targets.
     #[arg(long)]
     constraints: bool,
     /// Print an operating point in the notation of a scene.
@@ -47,6 +50,7 @@ impl Settle {
             guess: by_name(self.guess),
             inputs: by_name(self.inputs),
             goal: goal.into(),
+            targets: self.target,
             ..Default::default()
         };
         let answer = client.settle(request).await?;
@@ -55,6 +59,21 @@ impl Settle {
             false => settled(&answer, &model),
         })
     }
+}
+
+/// A target of a frame.
+fn target(text: &str) -> Result<v1::SettleTarget, String> {
+    let (frame, values) = text.split_once('=').ok_or("a frame and numbers with `=` are needed")?;
+    let values = numbers(values)?.0;
+    if ![3, 7].contains(&values.len()) {
+        return Err(format!("{} numbers; three or seven are needed", values.len()));
+    }
+    let (position, orientation) = values.split_at(3);
+    Ok(v1::SettleTarget {
+        point: Some(v1::FramePoint { frame: frame.to_owned(), at: Vec::new() }),
+        position: position.to_vec(),
+        orientation: orientation.to_vec(),
+    })
 }
 
 /// A settled configuration.
