@@ -33,6 +33,11 @@ pub(crate) fn scene<'a>(
     root: Node<'a, 'a>,
     options: &Options,
 ) -> Option<Scene> {
+    // Wherever it stands; those whose files are at hand are not here any more.
+    for include in root.descendants().filter(|node| node.has_tag_name("include")) {
+        let message = "`include`: read the file with `plantctl import`, where the other files are";
+        reader.fail(include, message);
+    }
     reader.check(root, &table::MUJOCO);
     if options.base == Base::Free {
         let message = "an MJCF says itself which of its bodies are free";

@@ -70,11 +70,8 @@ async fn frames_reach_their_targets() {
         ..settle("double-pendulum")
     };
     let kinematics = |q: Vec<f64>| {
-        let state = v1::MechanicalState {
-            model: "double-pendulum".to_owned(),
-            q,
-            ..Default::default()
-        };
+        let state =
+            v1::MechanicalState { model: "double-pendulum".to_owned(), q, ..Default::default() };
         v1::KinematicsRequest {
             state: Some(state),
             points: vec![point.clone()],

@@ -308,7 +308,6 @@ pub(super) static MUJOCO: Element = Element::new(
     (NoEffect(STATES), "sensor"),
     (NoEffect("what uses a plugin is refused itself"), "extension"),
     (Refused(DEFORMABLE), "deformable"),
-    (Refused("read the file with `plantctl import`, where the other files are"), "include"),
 ]);
 
 #[cfg(test)]
