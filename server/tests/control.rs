@@ -67,9 +67,7 @@ async fn rollouts_take_the_very_steps_of_a_plant() {
         all_states: true,
         ..Default::default()
     };
-    let mut stepped = plants.step(request).await.unwrap().into_inner().states;
-    // Only states of plants have one.
-    stepped.iter_mut().for_each(|state| state.velocity.clear());
+    let stepped = plants.step(request).await.unwrap().into_inner().states;
 
     let case = v1::RolloutCase { initial: None, u: Some(torques(STEPS)), hold: 10 };
     let cases = vec![case; 5];

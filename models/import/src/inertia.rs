@@ -68,10 +68,12 @@ impl Inertia {
         let i = &self.tensor;
         let [xx, yy, zz] = [i[(0, 0)], i[(1, 1)], i[(2, 2)]];
         let [xy, xz, yz] = [i[(0, 1)], i[(0, 2)], i[(1, 2)]];
-        let inertia = match () {
-            () if *i == Matrix3::zeros() => Vec::new(),
-            () if [xy, xz, yz] == [0.0; 3] => vec![xx, yy, zz],
-            () => vec![xx, yy, zz, xy, xz, yz],
+        let inertia = if *i == Matrix3::zeros() {
+            Vec::new()
+        } else if [xy, xz, yz] == [0.0; 3] {
+            vec![xx, yy, zz]
+        } else {
+            vec![xx, yy, zz, xy, xz, yz]
         };
         Body { mass: self.mass, center_of_mass: self.center.into(), inertia, any_inertia }
     }

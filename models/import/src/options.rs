@@ -1,5 +1,7 @@
 //! What a file of a robot leaves open.
 
+use std::collections::BTreeMap;
+
 /// What a user decides.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
@@ -13,6 +15,8 @@ pub struct Options {
     pub time_step_s: Option<f64>,
     /// Velocity at which 76 % of the dry friction of a joint are reached, m/s or rad/s.
     pub friction_velocity: f64,
+    /// Folders of packages by name, which take the place of `package://NAME` in paths of meshes.
+    pub packages: BTreeMap<String, String>,
     /// What cannot be expressed is left out with a warning, and inertias that no body has are taken as they are.
     pub lenient: bool,
 }
@@ -25,8 +29,20 @@ impl Default for Options {
             gravity: None,
             time_step_s: None,
             friction_velocity: 0.01,
+            packages: BTreeMap::new(),
             lenient: false,
         }
+    }
+}
+
+impl Options {
+    /// A path with its package's folder, if that is given.
+    pub(crate) fn path(&self, path: &str) -> String {
+        let parts = path.strip_prefix("package://").and_then(|rest| rest.split_once('/'));
+        let found = parts.and_then(|(name, rest)| Some((self.packages.get(name)?, rest)));
+        let in_folder =
+            found.map(|(folder, rest)| format!("{}/{rest}", folder.trim_end_matches('/')));
+        in_folder.unwrap_or_else(|| path.to_owned())
     }
 }
 

@@ -3,6 +3,7 @@
 mod build;
 mod read;
 mod table;
+mod visuals;
 
 use plantd_models::Scene;
 use roxmltree::Node;

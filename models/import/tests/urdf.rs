@@ -4,13 +4,13 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, Matrix3, Rotation3, Unit, Vector3};
 use plantd_import::{Base, ImportError, Inputs, Kind, Note, Options, import};
-use plantd_models::scene::{Constraint, Force};
+use plantd_models::scene::{Constraint, Force, Rotation, Shape};
 use plantd_models::{Initial, Model, Plant, Scene, Settings};
 
 /// An arm of a hinge, a bracket, a slide along a slanted axis and a wheel; the tensor of the slide's body
 /// stands in turned axes.
 const ARM: &str = r#"<?xml version="1.0"?>
-<robot name="Arm 1">
+<robot name="Arm 1"><material name="red"><color rgba="1 0 0 1"/></material>
   <link name="post"><inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
   <joint name="hinge" type="revolute">
     <parent link="post"/> <child link="upper/arm"/>
@@ -19,7 +19,7 @@ const ARM: &str = r#"<?xml version="1.0"?>
     <dynamics damping="0.5" friction="0.2"/>
   </joint>
   <link name="upper/arm">
-    <visual><geometry><box size="1 1 1"/></geometry></visual>
+    <visual><origin xyz="0 0 -0.1" rpy="0 0 1"/><geometry><box size="1 2 3"/></geometry><material name="red"/></visual>
     <inertial>
       <origin xyz="0.05 0.02 -0.1"/> <mass value="1.5"/>
       <inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0.001" ixz="-0.002" iyz="0.003"/>
@@ -178,7 +178,6 @@ fn what_is_not_mechanics_is_told() {
         (Kind::Approximated, 4, "dry friction of joint `hinge`"),
         (Kind::NoEffect, 3, "a body that is fixed to the world"),
         (Kind::NoEffect, 7, "attribute `velocity` of `limit`"),
-        (Kind::NoEffect, 11, "`visual` in `link`"),
     ];
     assert_eq!(told.len(), expected.len(), "{told:?}");
     for ((kind, line, message), (is_kind, at, start)) in told.iter().zip(expected) {
@@ -187,6 +186,26 @@ fn what_is_not_mechanics_is_told() {
     let names: Vec<_> = robot.report.names.iter().map(|name| (&*name.from, &*name.to)).collect();
     assert_eq!(names, [("Arm 1", "arm-1"), ("upper/arm", "upper_arm")]);
     assert_eq!(robot.report.exact["prismatic joint"], 1);
+}
+
+#[test]
+fn links_are_shown() {
+    let mesh = "<visual><geometry><mesh filename=\"package://arm/m/rod.stl\" scale=\"2 2 2\"/></geometry></visual>";
+    let text =
+        ARM.replace("<link name=\"bracket\"/>", &format!("<link name=\"bracket\">{mesh}</link>"));
+    let packages = [("arm".to_owned(), "/robots/arm/".to_owned())].into();
+    let scene = import(&text, &Options { packages, ..Options::default() }).unwrap().scene;
+    let shown = |name: &str| {
+        let frame = scene.frames.iter().find(|frame| frame.name == name).unwrap();
+        frame.visuals[0].clone()
+    };
+    let upper = shown("upper_arm");
+    assert_eq!(upper.shape, Shape::Box { size: [1.0, 2.0, 3.0] });
+    assert_eq!((upper.translation, upper.color), ([0.0, 0.0, -0.1], Some([1.0, 0.0, 0.0, 1.0])));
+    assert_eq!(upper.rotation, Some(Rotation::Rpy([0.0, 0.0, 1.0])));
+    let file = "/robots/arm/m/rod.stl".to_owned();
+    assert_eq!(shown("bracket").shape, Shape::Mesh { file, scale: [2.0; 3] });
+    Model::compile(&scene).unwrap();
 }
 
 /// A free body falls, and turns as it did.

@@ -211,6 +211,30 @@ async fn a_limit_of_a_force_is_met_with_default_options_and_whatever_the_toleran
     assert!(failure.message.contains("bound_tolerance 1e-6"), "{}", failure.message);
 }
 
+/// Limits of the model are bounds, unless others are given.
+#[tokio::test]
+async fn limits_of_a_model_bound_its_motions() {
+    let (_server, client) = server().await;
+    let model = client.get_model("cart-pole").await.unwrap();
+    let limited = model
+        .scene_toml
+        .replace("name = \"cart-pole\"", "name = \"limited\"")
+        .replace("name = \"force\"", "name = \"force\"\nlimits = [-11.0, 11.0]");
+    client.create_model(limited).await.unwrap();
+    let (_, by_hand) = run(&client, home()).await;
+    let with = |input: Vec<v1::Bound>| v1::OptimizeTrajectoryRequest {
+        model: "limited".to_owned(),
+        bounds: Some(v1::TrajectoryBounds { input, model_limits: true, ..Default::default() }),
+        ..home()
+    };
+    let (_, by_limits) = run(&client, with(Vec::new())).await;
+    assert_eq!((by_limits.u, by_limits.cost), (by_hand.u, by_hand.cost));
+    let wide = v1::Bound { entry: "force".to_owned(), min: Some(-15.0), max: Some(15.0) };
+    let (_, given) = run(&client, with(vec![wide])).await;
+    let largest = given.u.unwrap().data.iter().fold(0.0, |most: f64, u| most.max(u.abs()));
+    assert!((largest - 15.0).abs() < 1e-5, "{largest}");
+}
+
 #[tokio::test]
 async fn bounds_and_a_free_initial_state_are_named_like_the_plants_entries() {
     let (_server, client) = server().await;

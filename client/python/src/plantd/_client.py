@@ -919,6 +919,7 @@ class Client:
         state_bounds: Bounds | None = None,
         input_bounds: Bounds | None = None,
         final_state: Bounds | None = None,
+        model_limits: bool = False,
         free_initial: bool | Sequence[str] = False,
         initial_weight: npt.ArrayLike | None = None,
         method: Method = "newton",
@@ -941,7 +942,8 @@ class Client:
         motion) and inputs ``u`` (n rows; zero if not given), with weights as in
         `solve_trajectory_lqr`. ``guess`` is where the search begins: a trajectory, or a former result;
         or ``resume`` is where it left off. Bounds are by the name of an entry, ``{"force": (-5, 5)}``;
-        ``final_state={"theta": math.pi}`` fixes an entry of the last state. ``free_initial`` frees all
+        ``final_state={"theta": math.pi}`` fixes an entry of the last state; ``model_limits`` adds the limits
+        that the model has of coordinates and inputs. ``free_initial`` frees all
         entries of the initial state, or those that are named; ``initial_weight`` weighs their
         distance from the guess. ``projection`` is the pair of weights (q, r) of a regulator that
         projects onto motions of the plant, in place of the law of the descent. The other options are
@@ -971,6 +973,7 @@ class Client:
                 state=bounds(state_bounds),
                 input=bounds(input_bounds),
                 final_state=bounds(final_state),
+                model_limits=model_limits,
             ),
             free_initial=free,
             options=control_service_pb2.OptimizationOptions(

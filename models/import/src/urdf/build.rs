@@ -2,7 +2,9 @@
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use plantd_models::Scene;
-use plantd_models::scene::{Constraint, CouplingTerm, Frame, Input, Joint as SceneJoint, Rotation};
+use plantd_models::scene::{
+    Constraint, CouplingTerm, Frame, Input, Joint as SceneJoint, MAX_VISUALS,
+};
 
 use crate::document::Reader;
 use crate::draft::{BALL, Draft, FREE};
@@ -10,7 +12,8 @@ use crate::inertia::Inertia;
 use crate::names::Names;
 use crate::options::{Base, EARTH, Inputs, Options};
 use crate::report::Kind;
-use crate::urdf::read::{Joint, JointKind, Origin, Robot, Turn};
+use crate::urdf::read::{Joint, JointKind, Origin, Robot, rotation};
+use crate::urdf::visuals::{Colors, visuals};
 
 /// Endings of the coordinates of a planar joint.
 const PLANAR: [&str; 3] = ["_x", "_y", "_turn"];
@@ -40,6 +43,7 @@ pub(super) fn scene(reader: &mut Reader<'_>, robot: &Robot<'_>, options: &Option
     };
     builder.place_links();
     builder.place_bodies();
+    builder.show_links();
     builder.couple();
     builder.add_inputs();
     builder.draft.finish(builder.reader, robot.name)
@@ -199,6 +203,20 @@ impl Builder<'_, '_, '_> {
         }
     }
 
+    /// What shows the links, as far as scenes have room for it.
+    fn show_links(&mut self) {
+        let colors = Colors::read(self.robot.node);
+        let mut room = MAX_VISUALS;
+        for (link, frame) in self.robot.links.iter().zip(&self.frame_of) {
+            let mut shapes = visuals(self.reader, link.node, &colors, self.options);
+            shapes.truncate(room);
+            room -= shapes.len();
+            if let Some(frame) = *frame {
+                self.draft.scene.frames[frame].visuals = shapes;
+            }
+        }
+    }
+
     /// Joints that mimic others: `q − multiplier q_of − offset = 0`, satisfied by the initial configuration.
     fn couple(&mut self) {
         let robot = self.robot;
@@ -281,10 +299,5 @@ fn frame_in(parent: &str) -> Frame {
 }
 
 fn placed(parent: &str, origin: &Origin) -> Frame {
-    let rotation = match origin.rotation {
-        Turn::Rpy([0.0, 0.0, 0.0]) => None,
-        Turn::Rpy(angles) => Some(Rotation::Rpy(angles)),
-        Turn::Quaternion(quaternion) => Some(Rotation::Quaternion(quaternion)),
-    };
-    Frame { translation: origin.xyz, rotation, ..frame_in(parent) }
+    Frame { translation: origin.xyz, rotation: rotation(origin), ..frame_in(parent) }
 }

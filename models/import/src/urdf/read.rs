@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use nalgebra::{Isometry3, Matrix3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use roxmltree::Node;
 
-use plantd_models::scene::MAX_FRAMES;
+use plantd_models::scene::{MAX_FRAMES, Rotation};
 
 use crate::document::Reader;
 use crate::inertia::Inertia;
@@ -98,6 +98,15 @@ impl Origin {
     }
 }
 
+/// How an origin is turned, as a scene writes it.
+pub(super) fn rotation(origin: &Origin) -> Option<Rotation> {
+    match origin.rotation {
+        Turn::Rpy([0.0, 0.0, 0.0]) => None,
+        Turn::Rpy(angles) => Some(Rotation::Rpy(angles)),
+        Turn::Quaternion(quaternion) => Some(Rotation::Quaternion(quaternion)),
+    }
+}
+
 /// Reads a robot. Where something fails, the result is good for finding more failures only.
 pub(super) fn robot<'a>(reader: &mut Reader<'_>, node: Node<'a, 'a>) -> Robot<'a> {
     if !matches!(node.attribute("version"), None | Some("1.0" | "1.1" | "1.2")) {
@@ -187,7 +196,8 @@ fn inertia<'a>(reader: &mut Reader<'_>, node: Node<'a, 'a>) -> Option<Inertia> {
     (mass != 0.0 || tensor != Matrix3::zeros()).then(|| own.at(&pose))
 }
 
-fn origin<'a>(reader: &mut Reader<'_>, node: Node<'a, 'a>) -> Origin {
+/// The pose that an element has in what it belongs to.
+pub(super) fn origin<'a>(reader: &mut Reader<'_>, node: Node<'a, 'a>) -> Origin {
     let Some(origin) = reader.child(node, "origin") else { return Origin::default() };
     let xyz = reader.vector_or(origin, "xyz", [0.0; 3]);
     let rpy = reader.vector_or(origin, "rpy", [0.0; 3]);

@@ -20,12 +20,36 @@ const INERTIAL: Element = Element::new(
     ],
 );
 
+const MATERIAL: Element =
+    Element::new("material", &[(Read, "name")], &[&Element::new("color", &[(Read, "rgba")], &[])])
+        .without(&[(NoEffect(SEEN), "texture")]);
+
+const VISUAL: Element = Element::new(
+    "visual",
+    &[(NoEffect(SEEN), "name")],
+    &[
+        &ORIGIN,
+        &MATERIAL,
+        &Element::new(
+            "geometry",
+            &[],
+            &[
+                &Element::new("box", &[(Read, "size")], &[]),
+                &Element::new("sphere", &[(Read, "radius")], &[]),
+                &Element::new("cylinder", &[(Read, "radius length")], &[]),
+                &Element::new("capsule", &[(Read, "radius length")], &[]),
+                &Element::new("mesh", &[(Read, "filename scale")], &[]),
+            ],
+        ),
+    ],
+);
+
 const LINK: Element =
-    Element::new("link", &[(Read, "name"), (NoEffect(OTHERS), "type")], &[&INERTIAL]).without(&[
-        (NoEffect(SEEN), "visual"),
-        (Contact, "collision collision_checking contact self_collision_checking"),
-        (NoEffect(OTHERS), "sensor"),
-    ]);
+    Element::new("link", &[(Read, "name"), (NoEffect(OTHERS), "type")], &[&INERTIAL, &VISUAL])
+        .without(&[
+            (Contact, "collision collision_checking contact self_collision_checking"),
+            (NoEffect(OTHERS), "sensor"),
+        ]);
 
 const JOINT: Element = Element::new(
     "joint",
@@ -95,10 +119,9 @@ const ROS2_CONTROL: Element = Element::new(
 pub(super) static ROBOT: Element = Element::new(
     "robot",
     &[(Read, "name version"), (NoEffect(OTHERS), "type")],
-    &[&LINK, &JOINT, &TRANSMISSION, &ROS2_CONTROL],
+    &[&LINK, &JOINT, &TRANSMISSION, &ROS2_CONTROL, &MATERIAL],
 )
 .without(&[
-    (NoEffect(SEEN), "material"),
     (NoEffect(OTHERS), "gazebo sensor"),
     (Contact, "disable_collisions"),
     (Refused("write the state as the scene's initial configuration"), "model_state"),
@@ -117,7 +140,16 @@ robot/link: name
 robot/link/inertial/origin: xyz rpy quat_xyzw
 robot/link/inertial/mass: value
 robot/link/inertial/inertia: ixx ixy ixz iyy iyz izz
-robot/link/visual: *
+robot/link/visual: name
+robot/link/visual/origin: xyz rpy
+robot/link/visual/geometry/box: size
+robot/link/visual/geometry/sphere: radius
+robot/link/visual/geometry/cylinder: radius length
+robot/link/visual/geometry/capsule: radius length
+robot/link/visual/geometry/mesh: filename scale
+robot/link/visual/material: name
+robot/link/visual/material/color: rgba
+robot/link/visual/material/texture: *
 robot/link/collision: *
 robot/joint: name type
 robot/joint/origin: xyz rpy
@@ -138,7 +170,8 @@ robot/transmission/actuator/mechanicalReduction:
 robot/transmission/actuator/hardwareInterface: *
 robot/gazebo: *
 robot/sensor: *
-robot/material: *
+robot/material: name
+robot/material/color: rgba
 robot/model_state: *
 ";
 

@@ -49,7 +49,7 @@ pub(crate) fn analyze(
         modes: modes.into_iter().map(mode).collect(),
         responses,
         outputs: outputs.names,
-        state: Some(states::plant_state(&plant)),
+        state: Some(states::plant_state(&mut plant)),
         u,
     })
 }

@@ -24,7 +24,7 @@ pub(crate) fn linearize_second_order(
     let model = Arc::clone(plant.model());
     let d = model.dimensions();
     check_second_order(hub, d.state() + d.constraints, d.state() + d.input())?;
-    let state = states::plant_state(&plant);
+    let state = states::plant_state(&mut plant);
     let mut first = Linearization::new(&model);
     let (report, tensors, contraction) = match request.weights {
         None => {
@@ -47,7 +47,7 @@ pub(crate) fn linearize_second_order(
     plant.step(&u)?;
     Ok(v1::LinearizeSecondOrderResponse {
         linearization: Some(states::linearization(state.step, &first)),
-        next: Some(states::plant_state(&plant)),
+        next: Some(states::plant_state(&mut plant)),
         state: Some(state),
         u,
         tensors,

@@ -1,7 +1,7 @@
 //! `ControlService.OptimizeTrajectory`: a search on the workers, one iteration after the other. Between
 //! two of them, and now and then within one, others have their turn. Ending the call ends the search.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use futures::stream;
@@ -311,11 +311,28 @@ fn bounds(given: v1::TrajectoryBounds, model: &Model) -> Result<Bounds, RpcError
         given.into_iter().enumerate().map(bound).collect::<Result<Vec<_>, RpcError>>()
     };
     let states = states::state_names(model);
-    Ok(Bounds {
+    let mut bounds = Bounds {
         states: list("state", given.state, &states)?,
         inputs: list("input", given.input, &states::input_names(model))?,
         final_state: list("final_state", given.final_state, &states)?,
-    })
+    };
+    if given.model_limits {
+        let (dynamic, prescribed) = model.coordinates().split_at(model.dimensions().dynamic);
+        let inputs = model.scene().inputs.iter().map(|input| input.limits);
+        add_limits(&mut bounds.states, dynamic.iter().map(|c| c.limits));
+        add_limits(&mut bounds.inputs, inputs.chain(prescribed.iter().map(|c| c.limits)));
+    }
+    Ok(bounds)
+}
+
+/// Adds the limits of entries that have no bound yet.
+fn add_limits(bounds: &mut Vec<Bound>, limits: impl Iterator<Item = Option<[f64; 2]>>) {
+    let known: BTreeSet<usize> = bounds.iter().map(|bound| bound.index).collect();
+    let limits = limits.enumerate().filter(|(index, _)| !known.contains(index));
+    bounds.extend(limits.filter_map(|(index, limits)| {
+        let [min, max] = limits?;
+        Some(Bound { index, min: Some(min), max: Some(max) })
+    }));
 }
 
 fn free_initial(given: v1::FreeInitialState, model: &Model) -> Result<FreeInitialState, RpcError> {

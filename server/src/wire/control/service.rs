@@ -54,13 +54,13 @@ impl ControlService {
 
 fn linearize(hub: &Hub, request: v1::LinearizeRequest) -> Result<v1::LinearizeResponse, RpcError> {
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
-    let state = states::plant_state(&plant);
+    let state = states::plant_state(&mut plant);
     let mut linearization = Linearization::new(plant.model());
     let report = plant.step_and_linearize(&u, &mut linearization)?;
     let rank = control::controllability_rank(&linearization.a(), &linearization.b());
     Ok(v1::LinearizeResponse {
         linearization: Some(states::linearization(state.step, &linearization)),
-        next: Some(states::plant_state(&plant)),
+        next: Some(states::plant_state(&mut plant)),
         controllability_rank: u32::try_from(rank).unwrap_or(u32::MAX),
         state: Some(state),
         u,
@@ -115,7 +115,7 @@ impl LinearizedTrajectory {
         let mut portion = VecDeque::new();
         while portion.len() < self.portion && self.steps_taken < self.inputs.count() {
             abandoned.check()?;
-            let state = states::plant_state(&self.plant);
+            let state = states::plant_state(&mut self.plant);
             let u = self.inputs.get(self.steps_taken);
             let report = match self.plant.step_and_linearize(u, &mut self.linearization) {
                 Ok(report) => report_message(&report),

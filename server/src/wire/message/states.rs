@@ -59,9 +59,9 @@ pub(crate) fn shown(published: &Published<'_>) -> v1::State {
     }
 }
 
-/// The state of a plant that nobody else sees, as a message without velocity.
-pub fn plant_state(plant: &Plant) -> v1::State {
-    let step = plant.step_index();
+/// The state of a plant that nobody else sees, as a message.
+pub fn plant_state(plant: &mut Plant) -> v1::State {
+    let (step, velocity) = (plant.step_index(), plant.velocity());
     v1::State {
         step,
         time_s: plant.time_s(),
@@ -69,7 +69,7 @@ pub fn plant_state(plant: &Plant) -> v1::State {
         p: plant.p().to_vec(),
         v: plant.v().to_vec(),
         multipliers: multipliers(step, plant.multipliers()),
-        velocity: Vec::new(),
+        velocity,
     }
 }
 

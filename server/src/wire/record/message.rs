@@ -13,13 +13,13 @@ use crate::wire::message::{models, settings, states};
 
 /// The plant at the beginning of a recording.
 pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &mut Plant) -> v1::PlantRecord {
-    let velocity = plant.velocity();
+    let state = states::plant_state(plant);
     let (model, plan) = (plant.model(), String::new());
     let info = v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
         settings: Some(settings::settings_message(plant.settings())),
-        state: Some(v1::State { velocity, ..states::plant_state(plant) }),
+        state: Some(state),
         accuracy: session.accuracy().map(settings::accuracy),
         parameters: all_parameters(&mark.announced.unchanged, &mark.parameters),
         run: Some(run_info(session)),

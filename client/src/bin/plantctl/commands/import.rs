@@ -38,6 +38,9 @@ pub(crate) struct Import {
     /// Velocity at which 76 % of dry friction are reached, m/s or rad/s.
     #[arg(long, value_name = "V", default_value_t = 0.01)]
     friction_velocity: f64,
+    /// Folder of a package, for paths of meshes that begin with `package://NAME`.
+    #[arg(long, value_name = "NAME=FOLDER", value_parser = package)]
+    package: Vec<(String, String)>,
     /// Leave out what cannot be expressed, and take inertias that no body has, with a warning.
     #[arg(long)]
     lenient: bool,
@@ -74,6 +77,7 @@ impl Import {
             gravity: gravity.ok().context("--gravity takes three numbers")?,
             time_step_s: self.time_step,
             friction_velocity: self.friction_velocity,
+            packages: self.package.into_iter().collect(),
             lenient: self.lenient,
         };
         let file = self.robot.display().to_string();
@@ -88,6 +92,11 @@ impl Import {
         let scene = robot.scene.to_toml();
         context.output.print(|| json!({ "scene_toml": &scene }), || scene.clone())
     }
+}
+
+fn package(text: &str) -> Result<(String, String), &'static str> {
+    let (name, folder) = text.split_once('=').ok_or("a name and a folder with `=` are needed")?;
+    Ok((name.to_owned(), folder.to_owned()))
 }
 
 /// Says on standard error what became of a robot that the server has imported.

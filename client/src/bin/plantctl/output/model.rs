@@ -19,10 +19,18 @@ pub(crate) fn validated(model: &v1::Model) -> String {
 fn described(model: &v1::Model, origin: &str) -> String {
     let mut text = format!("{}: {}\n", model.name, model.description);
     let _ = writeln!(text, "{origin}, time step {} s", number(model.time_step_s));
-    let rows: Vec<_> = model.coordinates.iter().map(coordinate).collect();
-    let _ = write!(text, "\n{}", table(&["coordinate", "kind", "unit", "initial"], &rows));
+    let has_limits = model.coordinates.iter().any(|c| c.limits.is_some());
+    let columns = if has_limits { 5 } else { 4 };
+    let row = |c| coordinate(c).into_iter().take(columns).collect();
+    let rows: Vec<_> = model.coordinates.iter().map(row).collect();
+    let titles = ["coordinate", "kind", "unit", "initial", "limits"];
+    let _ = write!(text, "\n{}", table(&titles[..columns], &rows));
+    let inputs = (0..).zip(&model.inputs).map(|(index, name)| {
+        let own = model.input_limits.iter().find(|own| own.u_index == index);
+        own.map_or_else(|| name.clone(), |own| format!("{name} ({})", limits(own.limits.as_ref())))
+    });
     for (title, names) in [
-        ("inputs", &model.inputs),
+        ("inputs", &inputs.collect()),
         ("constraints", &model.constraints),
         ("operating points", &model.operating_points),
     ] {
@@ -69,7 +77,11 @@ fn coordinate(c: &v1::Coordinate) -> Vec<String> {
         "" => unit.to_owned(),
         joint => format!("{unit}, rotation vector of {joint}"),
     };
-    vec![c.name.clone(), kind.to_owned(), unit, number(c.initial)]
+    vec![c.name.clone(), kind.to_owned(), unit, number(c.initial), limits(c.limits.as_ref())]
+}
+
+fn limits(limits: Option<&v1::Limits>) -> String {
+    limits.map_or_else(String::new, |l| format!("{} to {}", number(l.low), number(l.high)))
 }
 
 /// Models, one per row.

@@ -41,6 +41,7 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
   state = { theta = [-4.0, 4.0] }   # inf and -inf for no bound
   input = { tau = [-5.0, 5.0] }
   final_state = { theta = [3.14, 3.15] }
+  model_limits = true               # also the limits of the model, where none are given here
 
   [free_initial]
   entries = [\"theta\"]
@@ -126,6 +127,7 @@ struct Bounds {
     state: BTreeMap<String, [f64; 2]>,
     input: BTreeMap<String, [f64; 2]>,
     final_state: BTreeMap<String, [f64; 2]>,
+    model_limits: bool,
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -338,6 +340,7 @@ impl Problem {
                 state: bounds(&self.bounds.state),
                 input: bounds(&self.bounds.input),
                 final_state: bounds(&self.bounds.final_state),
+                model_limits: self.bounds.model_limits,
             }),
             free_initial,
             options: Some(self.options()?),
