@@ -413,11 +413,11 @@ impl BareGrpc {
 
 /// The other end: answers each input with a step that is not taken. Is killed.
 async fn serve_echo(socket: &Path, model: &str) -> Result<()> {
-    let plant = new_plant(model)?;
+    let mut plant = new_plant(model)?;
     let report = v1::StepReport { iterations: 2, residual: 0.5, ..Default::default() };
     let step = v1::DriveStep {
         sequence: 1,
-        state: Some(plant_state(&plant)),
+        state: Some(plant_state(&mut plant)),
         report: Some(report),
         clocks: Some(clocks(0.1, 1 << 50)),
         ..Default::default()

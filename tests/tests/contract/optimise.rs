@@ -228,10 +228,11 @@ async fn limits_of_a_model_bound_its_motions() {
         ..home()
     };
     let (_, by_limits) = run(&client, with(Vec::new())).await;
-    assert_eq!((by_limits.u, by_limits.cost), (by_hand.u, by_hand.cost));
+    assert_eq!((by_limits.x, by_limits.cost), (by_hand.x, by_hand.cost));
     let wide = v1::Bound { entry: "force".to_owned(), min: Some(-15.0), max: Some(15.0) };
     let (_, given) = run(&client, with(vec![wide])).await;
-    let largest = given.u.unwrap().data.iter().fold(0.0, |most: f64, u| most.max(u.abs()));
+    let u = given.checkpoint.unwrap().trajectory.unwrap().u.unwrap();
+    let largest = u.data.iter().fold(0.0, |most: f64, u| most.max(u.abs()));
     assert!((largest - 15.0).abs() < 1e-5, "{largest}");
 }
 
@@ -247,6 +248,7 @@ async fn bounds_and_a_free_initial_state_are_named_like_the_plants_entries() {
             bound("theta", Some(PI), Some(PI)),
             bound("p(theta)", Some(0.0), Some(0.0)),
         ],
+        ..Default::default()
     });
     request.free_initial = Some(v1::FreeInitialState {
         entries: vec!["p(theta)".to_owned()],
