@@ -245,6 +245,7 @@ impl Physics {
     pub(super) fn has(&self, part: &str) -> bool {
         let off = |part: &str| self.off.contains(&part);
         let is_constraint = ["equality", "frictionloss", "limit", "contact"].contains(&part);
-        !off(part) && !(is_constraint && off("constraint"))
+        let is_off = off(part) || (is_constraint && off("constraint"));
+        !is_off
     }
 }
