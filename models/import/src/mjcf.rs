@@ -6,6 +6,8 @@ mod build;
 mod classes;
 mod equalities;
 mod frames;
+mod geoms;
+mod joints;
 mod keyframes;
 mod settings;
 mod shapes;

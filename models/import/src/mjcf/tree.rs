@@ -3,21 +3,19 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Isometry3, Matrix3, Translation3, Unit, UnitQuaternion, Vector3};
-use plantd_models::scene::{self, MAX_FRAMES, MAX_VISUALS, Rotation, Visual};
+use plantd_models::scene::{MAX_FRAMES, Rotation, Visual};
 use roxmltree::Node;
 
 use crate::document::Reader;
 use crate::inertia::Inertia;
 use crate::mjcf::assets::Meshes;
 use crate::mjcf::classes::{Classes, MAIN, Settings};
-use crate::mjcf::settings::{Compiler, FromGeoms, from_z};
-use crate::mjcf::shapes::Shape;
-use crate::report::Kind;
+use crate::mjcf::settings::{Compiler, FromGeoms};
 
 /// Geoms, sites and copies of replications that are made at most.
 const ITEMS_MAX: usize = 1 << 17;
 /// Masses, kg, and volumes, m³, that count as none.
-const TINY: f64 = 1e-14;
+pub(super) const TINY: f64 = 1e-14;
 
 /// All that a model is made of; parents come before children, in the order of the file.
 #[derive(Default)]
@@ -48,8 +46,8 @@ pub(super) struct Body<'a> {
     pub(super) visuals: Vec<Visual>,
     inertial: Option<Node<'a, 'a>>,
     /// Whether its geoms give its inertia, and what they give.
-    is_weighed: bool,
-    geoms: Vec<Inertia>,
+    pub(super) is_weighed: bool,
+    pub(super) geoms: Vec<Inertia>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -166,22 +164,24 @@ pub(super) fn read<'a>(
 
 /// Where an element stands.
 #[derive(Clone)]
-struct Place {
-    body: Option<usize>,
-    class: usize,
+pub(super) struct Place {
+    pub(super) body: Option<usize>,
+    pub(super) class: usize,
     /// In the body.
-    frame: Isometry3<f64>,
+    pub(super) frame: Isometry3<f64>,
     /// What replications append to names.
     ending: String,
 }
 
-struct Walk<'r, 'a, 'd> {
-    reader: &'r mut Reader<'d>,
-    classes: &'r Classes<'a>,
-    compiler: &'r Compiler,
-    meshes: Meshes<'a>,
-    tree: Tree<'a>,
-    items: usize,
+/// A walk over the bodies.
+pub(super) struct Walk<'r, 'a, 'd> {
+    pub(super) reader: &'r mut Reader<'d>,
+    pub(super) classes: &'r Classes<'a>,
+    pub(super) compiler: &'r Compiler,
+    pub(super) meshes: Meshes<'a>,
+    pub(super) tree: Tree<'a>,
+    /// Geoms, sites and copies so far.
+    pub(super) items: usize,
 }
 
 impl<'a> Walk<'_, 'a, '_> {
@@ -338,117 +338,8 @@ impl<'a> Walk<'_, 'a, '_> {
         Inertia { mass, center: Vector3::zeros(), tensor }.at(&pose)
     }
 
-    fn joint(&mut self, body: usize, node: Node<'a, 'a>, place: &Place) {
-        let is_free = node.has_tag_name("freejoint");
-        let settings = if is_free {
-            Settings::alone(node)
-        } else {
-            self.classes.settings(self.reader, node, place.class, "joint")
-        };
-        let (reader, compiler) = (&mut *self.reader, self.compiler);
-        const KINDS: [&str; 4] = ["free", "ball", "slide", "hinge"];
-        let kind = match settings.keyword(reader, "type", &KINDS) {
-            _ if is_free => JointKind::Free,
-            Some(0) => JointKind::Free,
-            Some(1) => JointKind::Ball,
-            Some(2) => JointKind::Slide,
-            _ => JointKind::Hinge,
-        };
-        let first = self.tree.bodies[body].joints.iter().map(|j| self.tree.joints[*j].kind).next();
-        if kind == JointKind::Free
-            && place.body.is_some_and(|b| self.tree.bodies[b].parent.is_some())
-        {
-            reader.fail(node, "a free joint in a body whose parent is not the world");
-        }
-        if first == Some(JointKind::Free) || (first.is_some() && kind == JointKind::Free) {
-            reader.fail(node, "a free joint beside another joint of the body");
-        }
-        let align = settings.keyword(reader, "align", &["false", "true", "auto"]).unwrap_or(2);
-        if kind == JointKind::Free && (align == 1 || (align == 2 && compiler.aligns)) {
-            let message = "`align`: the body's frame would become that of its principal axes; write it so, or switch it off";
-            reader.refuse(node, message);
-        }
-        let single = matches!(kind, JointKind::Hinge | JointKind::Slide);
-        let angle =
-            |angle: f64| if kind == JointKind::Slide { angle } else { compiler.radians(angle) };
-        let axis = settings.numbers::<3>(reader, "axis").filter(|_| single);
-        let axis = place.frame.rotation * Vector3::from(axis.unwrap_or([0.0, 0.0, 1.0]));
-        let axis = Unit::try_new(axis, TINY).unwrap_or_else(|| {
-            reader.fail(node, "`axis` of `joint` has no direction");
-            Vector3::z_axis()
-        });
-        let anchor = settings.numbers::<3>(reader, "pos").unwrap_or_default();
-        let anchor = (place.frame * nalgebra::Point3::from(anchor)).coords;
-        let value = |reader: &mut Reader<'_>, name: &str| {
-            settings.number(reader, name).filter(|_| single).map_or(0.0, angle)
-        };
-        let limits = if single {
-            settings.range(reader, "range", "limited", compiler.limits_by_range)
-        } else {
-            let range = settings.numbers::<2>(reader, "range").unwrap_or_default();
-            let is_limited =
-                settings.keyword(reader, "limited", &["false", "true", "auto"]) != Some(0);
-            if kind == JointKind::Ball && is_limited && range != [0.0; 2] {
-                let message = "`range` of a ball joint: an orientation has no limits here";
-                reader.note(Kind::Approximated, node, message);
-            }
-            None
-        };
-        if settings
-            .range(reader, "actuatorfrcrange", "actuatorfrclimited", compiler.limits_by_range)
-            .is_some()
-        {
-            let message = "`actuatorfrcrange`: forces of actuators are not cut off; clients keep to the limits of inputs";
-            reader.note(Kind::Approximated, node, message);
-        }
-        if settings.is_true(reader, "actuatorgravcomp") {
-            reader.note(
-                Kind::NoEffect,
-                node,
-                "`actuatorgravcomp`: what lifts a body counts as work from outside",
-            );
-        }
-        let spring_damper =
-            settings.numbers::<2>(reader, "springdamper").filter(|pair| *pair != [0.0; 2]);
-        if spring_damper.is_some_and(|pair| pair.iter().any(|x| *x <= 0.0)) {
-            reader.fail(node, "`springdamper` of `joint` must be two numbers greater than 0");
-        }
-        let joint = Joint {
-            node,
-            name: named(settings.node().attribute("name").unwrap_or_default(), place),
-            kind,
-            body,
-            anchor: if kind == JointKind::Free { Vector3::zeros() } else { anchor },
-            axis,
-            reference: value(reader, "ref"),
-            rest: value(reader, "springref"),
-            limits: limits.map(|limits| limits.map(angle)),
-            stiffness: settings.first_numbers(reader, "stiffness"),
-            damping: settings.first_numbers(reader, "damping"),
-            spring_damper,
-            armature: settings.amount(reader, "armature"),
-            friction: settings.amount(reader, "frictionloss"),
-        };
-        let index = self.tree.joints.len();
-        self.register(1, node, &joint.name, index);
-        self.tree.bodies[body].joints.push(index);
-        self.tree.joints.push(joint);
-    }
-
-    fn site(&mut self, node: Node<'a, 'a>, place: &Place) {
-        let settings = self.classes.settings(self.reader, node, place.class, "site");
-        let mut pose = self.compiler.pose(self.reader, &settings);
-        if let Some(ends) = settings.numbers::<6>(self.reader, "fromto") {
-            pose = self.between(node, ends).0;
-        }
-        let name = named(node.attribute("name").unwrap_or_default(), place);
-        self.register(2, node, &name, self.tree.sites.len());
-        self.tree.sites.push(Site { body: place.body, pose: place.frame * pose });
-        self.count(node);
-    }
-
     /// Keeps a name, which may be there once among those of a kind.
-    fn register(&mut self, kind: usize, node: Node<'a, 'a>, name: &str, index: usize) {
+    pub(super) fn register(&mut self, kind: usize, node: Node<'a, 'a>, name: &str, index: usize) {
         let is_new =
             name.is_empty() || self.tree.names[kind].insert(name.to_owned(), index).is_none();
         self.tree.copied.extend(node.attribute("name").filter(|own| *own != name));
@@ -458,20 +349,8 @@ impl<'a> Walk<'_, 'a, '_> {
         }
     }
 
-    /// Midway between two points, z from the second to the first, and half their distance.
-    fn between(&mut self, node: Node<'a, 'a>, ends: [f64; 6]) -> (Isometry3<f64>, f64) {
-        let [a, b, c, d, e, f] = ends;
-        let (from, to) = (Vector3::new(a, b, c), Vector3::new(d, e, f));
-        let along = from - to;
-        let direction = Unit::try_new(along, TINY).unwrap_or_else(|| {
-            self.reader.fail(node, "the two points of `fromto` are one");
-            Vector3::z_axis()
-        });
-        let middle = Translation3::from((from + to) / 2.0);
-        (Isometry3::from_parts(middle, from_z(direction)), along.norm() / 2.0)
-    }
-
-    fn count(&mut self, node: Node<'a, 'a>) {
+    /// Counts what is made, up to the most that may be.
+    pub(super) fn count(&mut self, node: Node<'a, 'a>) {
         self.items += 1;
         if self.items == ITEMS_MAX {
             let message = format!(
@@ -479,109 +358,6 @@ impl<'a> Walk<'_, 'a, '_> {
             );
             self.reader.fail(node, message);
         }
-    }
-
-    fn geom(&mut self, node: Node<'a, 'a>, place: &Place) {
-        self.count(node);
-        let settings = self.classes.settings(self.reader, node, place.class, "geom");
-        let bit = |reader: &mut Reader<'_>, name| settings.number(reader, name).unwrap_or(1.0);
-        if ["contype", "conaffinity"].iter().any(|name| bit(self.reader, name) != 0.0) {
-            self.tree.touching.get_or_insert((node, 0)).1 += 1;
-        }
-        let mut pose = self.compiler.pose(self.reader, &settings);
-        let mut size: [f64; 3] = settings.first_numbers(self.reader, "size");
-        const KINDS: [&str; 9] =
-            ["sphere", "capsule", "cylinder", "ellipsoid", "box", "mesh", "plane", "hfield", "sdf"];
-        let kind = settings.keyword(self.reader, "type", &KINDS).unwrap_or(0);
-        if let Some(ends) = settings.numbers::<6>(self.reader, "fromto")
-            && (1..5).contains(&kind)
-        {
-            let (middle, half) = self.between(node, ends);
-            pose = middle;
-            size = if kind < 3 { [size[0], half, size[2]] } else { [size[0], size[0], half] };
-        }
-        let pose = place.frame * pose;
-        let [radius, half, _] = size;
-        let shape = match (kind, settings.text("mesh")) {
-            (0, None) => Some(Shape::Sphere { radius }),
-            (1, None) => Some(Shape::Capsule { radius, half }),
-            (2, None) => Some(Shape::Cylinder { radius, half }),
-            (3, None) => Some(Shape::Ellipsoid { radii: size.into() }),
-            (4, None) => Some(Shape::Box { halves: size.into() }),
-            _ => None,
-        };
-        let lengths = match kind {
-            0 => 1,
-            1 | 2 => 2,
-            _ => 3,
-        };
-        if shape.is_some() && size[..lengths].iter().any(|length| *length <= 0.0) {
-            let (name, words) = (KINDS[kind], ["one number", "two numbers", "three numbers"]);
-            let message =
-                format!("`size` of a {name} must be {} greater than 0", words[lengths - 1]);
-            self.reader.fail(node, message);
-        }
-        let Some(body) = place.body else { return };
-        self.weigh(body, &settings, shape, &pose);
-        self.show(body, &settings, shape, &pose);
-    }
-
-    /// Adds the inertia of a geom to those of its body, if it counts.
-    fn weigh(
-        &mut self,
-        body: usize,
-        settings: &Settings<'a>,
-        shape: Option<Shape>,
-        pose: &Isometry3<f64>,
-    ) {
-        let group = settings.number(self.reader, "group").unwrap_or_default();
-        let [least, most] = self.compiler.inertia_groups;
-        let mass = settings.number(self.reader, "mass");
-        let density = settings.number(self.reader, "density").unwrap_or(1000.0);
-        let is_shell = settings.is_true(self.reader, "shellinertia");
-        if mass.unwrap_or(density) < 0.0 {
-            self.reader.fail(settings.node(), "`mass` and `density` must not be negative");
-        }
-        let counts = self.tree.bodies[body].is_weighed;
-        if !counts || !(least..=most).contains(&group) || mass.unwrap_or(density) == 0.0 {
-            return;
-        }
-        let Some(shape) = shape else {
-            if !matches!(settings.text("type"), Some("plane" | "hfield")) {
-                let message = "the inertia of a mesh: give its body an `inertial`";
-                self.reader.refuse(settings.node(), message);
-            }
-            return;
-        };
-        let volume = shape.volume(is_shell);
-        let mass = mass.unwrap_or(density * volume);
-        if volume > TINY && mass > TINY {
-            let tensor = Matrix3::from_diagonal(&shape.moments(mass, is_shell));
-            let own = Inertia { mass, center: Vector3::zeros(), tensor };
-            self.tree.bodies[body].geoms.push(own.at(pose));
-        }
-    }
-
-    /// Adds a geom to what shows its body.
-    fn show(
-        &mut self,
-        body: usize,
-        settings: &Settings<'a>,
-        shape: Option<Shape>,
-        pose: &Isometry3<f64>,
-    ) {
-        let mesh = settings.text("mesh").and_then(|name| self.meshes.shape(name));
-        let Some(shape) = shape.map(drawn).or(mesh) else { return };
-        if self.items >= MAX_VISUALS {
-            return;
-        }
-        let color = settings.numbers::<4>(self.reader, "rgba");
-        self.tree.bodies[body].visuals.push(Visual {
-            shape,
-            translation: pose.translation.vector.into(),
-            rotation: rotation(&pose.rotation),
-            color: color.map(|color| color.map(|part| part.clamp(0.0, 1.0))),
-        });
     }
 }
 
@@ -594,18 +370,9 @@ fn has_inertial(body: Node<'_, '_>) -> bool {
     })
 }
 
-fn named(name: &str, place: &Place) -> String {
+/// A name with what replications append.
+pub(super) fn named(name: &str, place: &Place) -> String {
     if name.is_empty() { String::new() } else { format!("{name}{}", place.ending) }
-}
-
-fn drawn(shape: Shape) -> scene::Shape {
-    match shape {
-        Shape::Sphere { radius } => scene::Shape::Sphere { radius },
-        Shape::Capsule { radius, half } => scene::Shape::Capsule { radius, length: 2.0 * half },
-        Shape::Cylinder { radius, half } => scene::Shape::Cylinder { radius, length: 2.0 * half },
-        Shape::Ellipsoid { radii } => scene::Shape::Ellipsoid { radii: radii.into() },
-        Shape::Box { halves } => scene::Shape::Box { size: (halves * 2.0).into() },
-    }
 }
 
 /// An orientation as a scene writes it.
