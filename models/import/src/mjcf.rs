@@ -9,6 +9,7 @@ mod frames;
 mod geoms;
 mod joints;
 mod keyframes;
+mod rope;
 mod settings;
 mod shapes;
 mod start;

@@ -367,6 +367,49 @@ fn joints_and_tendons_resist() {
     assert!(matches!(&slack.scene.springs[..], [Spring::Stop { range: Some([0.0, 1.5]), .. }]));
 }
 
+/// A tackle halves the force of its second branch: `L = (2 − x) + |rim − post| / 2`.
+#[test]
+fn pulleys_divide() {
+    let tackle = |attributes: &str| {
+        format!(
+            "<tendon><spatial name='t' {attributes}><site site='hook'/><site site='post'/><pulley divisor='2'/>
+             <site site='beam'/><site site='rim'/></spatial></tendon>"
+        )
+    };
+    let text = |inner: &str| {
+        with(inner).replace(
+            "<site name=\"post\"",
+            "<site name=\"beam\" pos=\"3 0 0\"/><site name=\"post\"",
+        )
+    };
+    // The rim turns about y by hinge − 0.1 from (0, 0, 1).
+    let far = |hinge: f64| {
+        let (sin, cos) = (hinge - 0.1).sin_cos();
+        (3.0 - sin).hypot(cos)
+    };
+    let (q, v, u) = ([0.4, -0.3], [0.7, 0.9], 1.3);
+    let slope = (far(q[0] + 1e-6) - far(q[0] - 1e-6)) / 2e-6;
+    let (length, rate) = (2.0 - q[1] + far(q[0]) / 2.0, -v[1] + slope * v[0] / 2.0);
+    let cases = [
+        (tackle("stiffness='7' springlength='1.2'"), vec![], -7.0 * (length - 1.2)),
+        (tackle("damping='0.8'"), vec![], -0.8 * rate),
+        (tackle("") + "<actuator><motor tendon='t' gear='2'/></actuator>", vec![u], 2.0 * u),
+        (
+            tackle("") + "<actuator><position tendon='t' kp='5'/></actuator>",
+            vec![u],
+            5.0 * (u - length),
+        ),
+    ];
+    for (inner, inputs, force) in cases {
+        let scene = import(&text(&inner), &Options::default()).unwrap().scene;
+        let a = accelerations(&scene, &q, &v, &inputs);
+        let found = [2.0 * a[0], 3.0 * a[1]];
+        let expected = [force * slope / 2.0, -force];
+        let error = (found[0] - expected[0]).abs().max((found[1] - expected[1]).abs());
+        assert!(error < 1e-8, "{inner}: {found:?} instead of {expected:?}");
+    }
+}
+
 /// What holds by an equality: the value of the constraint there.
 #[test]
 fn equalities_hold() {

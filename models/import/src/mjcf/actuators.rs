@@ -8,7 +8,8 @@ use crate::document::Reader;
 use crate::mjcf::build::Build;
 use crate::mjcf::classes::MAIN;
 use crate::mjcf::frames::frame_at;
-use crate::mjcf::tendons::{Course, Stop, Tendons, Term, linear, points};
+use crate::mjcf::rope::Rope;
+use crate::mjcf::tendons::{Course, Tendons, Term, linear};
 use crate::mjcf::tree::JointKind;
 use crate::report::Kind;
 
@@ -247,7 +248,7 @@ impl<'a> Build<'_, 'a, '_> {
                 let (course, limits) = self.find(node, target, "tendon", found)?;
                 match course.as_ref()? {
                     Course::Sum(terms) => self.act_on_sum(node, actuator, terms, limits),
-                    Course::Path(stops) => self.act_along(node, &actuator, stops, limits),
+                    Course::Path(rope) => self.act_along(node, &actuator, rope, limits),
                 }
             }
             "site" => self.act_at_site(node, &actuator),
@@ -340,12 +341,14 @@ impl<'a> Build<'_, 'a, '_> {
         &mut self,
         node: Node<'a, 'a>,
         actuator: &Actuator,
-        stops: &[Stop],
+        rope: &Rope,
         limits: Option<[f64; 2]>,
     ) -> Option<String> {
-        let law = self.law(node, actuator, &[])?.geared(actuator.gear[0]);
+        // Along the path, which is so many times as long as the tendon.
+        let law = self.law(node, actuator, &[])?.geared(actuator.gear[0] / rope.times);
         let Law { gain, constant, stiffness, damping } = law;
-        let rest_length = if stiffness == 0.0 { 0.0 } else { constant / stiffness };
+        let rest_length =
+            if stiffness == 0.0 { 0.0 } else { constant / stiffness + rope.path_length(0.0) };
         let is_spring = constant == 0.0 || stiffness > 0.0;
         if stiffness < 0.0 || damping < 0.0 || rest_length < 0.0 || !is_spring {
             self.reader.refuse(
@@ -354,14 +357,14 @@ impl<'a> Build<'_, 'a, '_> {
             );
             return None;
         }
-        let input = Input { points: points(stops), gain, ..Input::default() };
+        let input = Input { points: rope.points(), gain, ..Input::default() };
         let name = self.add_input(node, actuator, input, limits);
         if stiffness > 0.0 {
-            let spring = Spring::Path { points: points(stops), stiffness, rest_length };
+            let spring = Spring::Path { points: rope.points(), stiffness, rest_length };
             self.draft.scene.springs.push(spring);
         }
         if damping > 0.0 {
-            let damper = Force::PathDamper { points: points(stops), damping };
+            let damper = Force::PathDamper { points: rope.points(), damping };
             self.draft.scene.forces.push(damper);
         }
         Some(name)

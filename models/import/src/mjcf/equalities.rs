@@ -7,7 +7,7 @@ use roxmltree::Node;
 use crate::mjcf::build::Build;
 use crate::mjcf::classes::MAIN;
 use crate::mjcf::frames::frame_at;
-use crate::mjcf::tendons::{Course, Tendons, points};
+use crate::mjcf::tendons::{Course, Tendons};
 use crate::mjcf::tree::JointKind;
 use crate::names::Names;
 use crate::report::Kind;
@@ -188,9 +188,9 @@ impl<'a> Build<'_, 'a, '_> {
             coefficients: vec![term.coefficient * factor],
         };
         match (first, second) {
-            (Course::Path(stops), None) => {
-                let length = Length::Fixed(start + polynomial[0]);
-                Some(Constraint::PathLength { name, points: points(stops), length })
+            (Course::Path(rope), None) => {
+                let length = Length::Fixed(rope.path_length(start + polynomial[0]));
+                Some(Constraint::PathLength { name, points: rope.points(), length })
             }
             (Course::Sum(terms), None) => {
                 let terms = terms.iter().map(|term| coupling(term, 1.0)).collect();

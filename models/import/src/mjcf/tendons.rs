@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Isometry3, Point3};
-use plantd_models::scene::{Force, LinearTerm, Point, Spring};
+use nalgebra::Isometry3;
+use plantd_models::scene::{Force, LinearTerm, Spring};
 use roxmltree::Node;
 
 use crate::mjcf::build::Build;
 use crate::mjcf::classes::{MAIN, Settings};
+use crate::mjcf::rope::{Branch, Rope, Stop};
 use crate::mjcf::tree::{Joint, JointKind};
 use crate::report::Kind;
 
@@ -30,7 +31,7 @@ pub(super) enum Course {
     /// `L = Σ coefficient q`.
     Sum(Vec<Term>),
     /// From point to point.
-    Path(Vec<Stop>),
+    Path(Rope),
 }
 
 pub(super) struct Term {
@@ -39,25 +40,12 @@ pub(super) struct Term {
     pub(super) coefficient: f64,
 }
 
-/// A point of a body, none for the world.
-pub(super) struct Stop {
-    body: Option<usize>,
-    point: Point,
-}
-
 impl Course {
     /// Its length where bodies have given poses and joints given values.
     fn length(&self, poses: &[Isometry3<f64>], value: impl Fn(usize) -> f64) -> f64 {
         match self {
             Self::Sum(terms) => terms.iter().map(|term| term.coefficient * value(term.joint)).sum(),
-            Self::Path(stops) => {
-                let place = |stop: &Stop| {
-                    let pose = stop.body.map_or_else(Isometry3::identity, |body| poses[body]);
-                    pose * Point3::from(stop.point.at)
-                };
-                let points: Vec<_> = stops.iter().map(place).collect();
-                points.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum()
-            }
+            Self::Path(rope) => rope.length(poses),
         }
     }
 }
@@ -69,10 +57,6 @@ pub(super) fn linear(terms: &[Term]) -> Vec<LinearTerm> {
         coefficient: term.coefficient,
     };
     terms.iter().map(term).collect()
-}
-
-pub(super) fn points(stops: &[Stop]) -> Vec<Point> {
-    stops.iter().map(|stop| stop.point.clone()).collect()
 }
 
 impl<'a> Tendons<'a> {
@@ -130,7 +114,7 @@ impl<'a> Build<'_, 'a, '_> {
     }
 
     fn path(&mut self, node: Node<'a, 'a>) -> Option<Course> {
-        let mut stops = Vec::new();
+        let mut branches = vec![Branch { divisor: 1.0, stops: Vec::new() }];
         for child in node.children().filter(Node::is_element) {
             match child.tag_name().name() {
                 "site" => {
@@ -138,7 +122,8 @@ impl<'a> Build<'_, 'a, '_> {
                         build.tree.site(name).map(|site| (site.body, site.pose.translation.vector))
                     };
                     let (body, at) = self.find(child, "site", "site", found)?;
-                    stops.push(Stop { body, point: self.point(body, at.into()) });
+                    let point = self.point(body, at.into());
+                    branches.last_mut()?.stops.push(Stop { body, point });
                 }
                 "geom" => {
                     let message = "a tendon that wraps around a shape: lead it through sites";
@@ -146,19 +131,25 @@ impl<'a> Build<'_, 'a, '_> {
                     return None;
                 }
                 "pulley" => {
-                    let message = "a tendon with a pulley that divides its force: write a tendon for each branch";
-                    self.reader.refuse(child, message);
-                    return None;
+                    let divisor = self.reader.number(child, "divisor");
+                    branches.push(Branch { divisor, stops: Vec::new() });
                 }
                 _ => {}
             }
         }
-        if stops.len() < 2 {
-            self.reader.fail(node, "`spatial` must lead through two sites or more");
+        // One that begins with a pulley has nothing before it.
+        branches.retain(|branch| branch.divisor != 1.0 || !branch.stops.is_empty());
+        if branches.is_empty() || branches.iter().any(|branch| branch.stops.len() < 2) {
+            self.reader.fail(node, "each branch of `spatial` must lead through two sites or more");
             return None;
         }
+        let Some(rope) = Rope::of(&branches) else {
+            let message = "a tendon whose pulleys divide by other than whole numbers up to 64, or stand on other bodies than the ends of its branches: write a tendon for each branch";
+            self.reader.refuse(node, message);
+            return None;
+        };
         self.reader.exact("spatial tendon");
-        Some(Course::Path(stops))
+        Some(Course::Path(rope))
     }
 
     /// Its length where joints are at their references.
@@ -200,7 +191,10 @@ impl<'a> Build<'_, 'a, '_> {
                 self.reader.exact("damper of a tendon");
                 self.draft.scene.forces.push(match course {
                     Course::Sum(terms) => Force::LinearDamper { terms: linear(terms), damping },
-                    Course::Path(stops) => Force::PathDamper { points: points(stops), damping },
+                    Course::Path(rope) => Force::PathDamper {
+                        points: rope.points(),
+                        damping: damping / (rope.times * rope.times),
+                    },
                 });
             }
             if stiffness > 0.0 && self.physics.has("spring") {
@@ -239,23 +233,25 @@ impl<'a> Build<'_, 'a, '_> {
             Course::Sum(terms) => {
                 Spring::LinearSpring { terms: linear(terms), stiffness, rest: low }
             }
-            Course::Path(stops) if low < high => {
+            Course::Path(rope) if low < high => {
                 let message = "`springlength` with two lengths: a `stop`, which comes in over a hundredth of the range";
                 self.reader.note(Kind::Approximated, settings.node(), message);
                 Spring::Stop {
                     coordinate: None,
-                    points: points(stops),
-                    range: Some([low, high]),
-                    stiffness: Some(stiffness),
+                    points: rope.points(),
+                    range: Some([low, high].map(|length| rope.path_length(length))),
+                    stiffness: Some(stiffness / (rope.times * rope.times)),
                     damping: None,
                     transition: None,
                     settling_depth: None,
                     settling_time_s: None,
                 }
             }
-            Course::Path(stops) => {
-                Spring::Path { points: points(stops), stiffness, rest_length: low }
-            }
+            Course::Path(rope) => Spring::Path {
+                points: rope.points(),
+                stiffness: stiffness / (rope.times * rope.times),
+                rest_length: rope.path_length(low),
+            },
         };
         self.reader.exact("spring of a tendon");
         self.draft.scene.springs.push(spring);
