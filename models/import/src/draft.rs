@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use plantd_models::Scene;
-use plantd_models::scene::{Coordinate, Force, Frame};
+use plantd_models::scene::{Coordinate, Force, Frame, Spring};
 use roxmltree::Node;
 
 use crate::document::Reader;
@@ -22,10 +22,17 @@ pub(crate) struct Draft {
     pub(crate) coordinates: Names,
     /// Settings of coordinates by name, in the order in which they come up.
     settings: BTreeMap<String, usize>,
+    /// What stops joints at their limits.
+    stops: Option<[f64; 2]>,
 }
 
 impl Draft {
-    pub(crate) fn new(format: &str, gravity: [f64; 3], time_step_s: f64) -> Self {
+    pub(crate) fn new(
+        format: &str,
+        gravity: [f64; 3],
+        time_step_s: f64,
+        stops: Option<[f64; 2]>,
+    ) -> Self {
         let scene = Scene {
             format: 1,
             description: format!("Imported from {format}."),
@@ -35,7 +42,7 @@ impl Draft {
         };
         let (frames, coordinates) =
             (Names::new("frame", &["world"]), Names::new("coordinate", &[]));
-        Self { scene, frames, coordinates, settings: BTreeMap::new() }
+        Self { scene, frames, coordinates, settings: BTreeMap::new(), stops }
     }
 
     /// Adds a frame of a name that is free.
@@ -69,7 +76,7 @@ impl Draft {
         }
     }
 
-    /// Limits of a coordinate of a joint, which clients know.
+    /// Limits of a coordinate of a joint, which clients know, and a stop there if that is wanted.
     pub(crate) fn limit(
         &mut self,
         reader: &mut Reader<'_>,
@@ -78,6 +85,19 @@ impl Draft {
         limits: [f64; 2],
     ) {
         self.setting(name).limits = Some(limits);
+        if let Some([depth, time]) = self.stops {
+            reader.exact("limits of a joint with a stop");
+            return self.scene.springs.push(Spring::Stop {
+                coordinate: Some(name.to_owned()),
+                points: Vec::new(),
+                range: None,
+                stiffness: None,
+                damping: None,
+                transition: None,
+                settling_depth: Some(depth),
+                settling_time_s: Some(time),
+            });
+        }
         let [lower, upper] = limits;
         let message = format!(
             "joint `{joint}` moves past its limits, {lower} and {upper}: clients know them, a `stop` enforces them"

@@ -59,7 +59,7 @@ pub(crate) fn scene<'a>(
         compiler: &compiler,
         physics: &physics,
         options,
-        draft: Draft::new("MJCF", physics.gravity, physics.time_step_s),
+        draft: Draft::new("MJCF", physics.gravity, physics.time_step_s, options.stops),
         frames: Vec::new(),
         coordinates: vec![Vec::new(); tree.joints.len()],
         home: tree.poses(|joint| joint.reference),

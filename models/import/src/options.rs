@@ -15,6 +15,9 @@ pub struct Options {
     pub time_step_s: Option<f64>,
     /// Velocity at which 76 % of the dry friction of a joint are reached, m/s or rad/s.
     pub friction_velocity: f64,
+    /// Stops at the limits of joints: depth, m or rad, and time, s, in which a joint settles that is held there
+    /// (`settling_depth` and `settling_time_s` of a `stop`). Without it limits are only known to clients.
+    pub stops: Option<[f64; 2]>,
     /// Folders of packages by name, which take the place of `package://NAME` in paths of meshes.
     pub packages: BTreeMap<String, String>,
     /// What cannot be expressed is left out with a warning, and inertias that no body has are taken as they are.
@@ -29,6 +32,7 @@ impl Default for Options {
             gravity: None,
             time_step_s: None,
             friction_velocity: 0.01,
+            stops: None,
             packages: BTreeMap::new(),
             lenient: false,
         }

@@ -188,6 +188,30 @@ fn what_is_not_mechanics_is_told() {
     assert_eq!(robot.report.exact["prismatic joint"], 1);
 }
 
+/// A joint that falls onto its stop rests where the stop carries the weight, `k (x − δ / 2) = m g l cos q`.
+#[test]
+fn joints_stop_at_their_limits() {
+    let text = r#"<robot name="flap"><link name="base"/><joint name="hinge" type="revolute">
+      <parent link="base"/><child link="flap"/><axis xyz="0 1 0"/><limit lower="-1" upper="0.3" effort="0" velocity="1"/></joint>
+      <link name="flap"><inertial><origin xyz="0.2 0 0"/><mass value="1"/>
+        <inertia ixx="0.01" iyy="0.01" izz="0.01"/></inertial></link></robot>"#;
+    let options = Options { stops: Some([0.02, 0.1]), inputs: Inputs::None, ..Options::default() };
+    let robot = import(text, &options).unwrap();
+    assert!(
+        robot.report.notes.is_empty()
+            || robot.report.notes.iter().all(|n| n.kind == Kind::NoEffect)
+    );
+    let mut plant = plant(&robot.scene);
+    for _ in 0..5000 {
+        plant.step(&[]).unwrap();
+    }
+    // A positive turn about y leads down. The inertia about the hinge is 0.05 kg m².
+    let (q, stiffness) = (plant.q()[0], 0.05 * (5.834_f64 / 0.1).powi(2));
+    let (carried, weight) = (stiffness * (q - 0.3 - 0.01), 9.81 * 0.2 * q.cos());
+    assert!((carried / weight - 1.0).abs() < 1e-3, "{carried} for {weight}");
+    assert!(plant.velocity()[0].abs() < 1e-6);
+}
+
 #[test]
 fn links_are_shown() {
     let mesh = "<visual><geometry><mesh filename=\"package://arm/m/rod.stl\" scale=\"2 2 2\"/></geometry></visual>";

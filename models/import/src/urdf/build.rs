@@ -34,7 +34,7 @@ struct Builder<'r, 'a, 'd> {
 pub(super) fn scene(reader: &mut Reader<'_>, robot: &Robot<'_>, options: &Options) -> Scene {
     let gravity = options.gravity.unwrap_or(EARTH);
     let mut builder = Builder {
-        draft: Draft::new("URDF", gravity, options.time_step_s.unwrap_or(0.001)),
+        draft: Draft::new("URDF", gravity, options.time_step_s.unwrap_or(0.001), options.stops),
         frame_of: vec![None; robot.links.len()],
         moved: vec![Vec::new(); robot.joints.len()],
         reader,

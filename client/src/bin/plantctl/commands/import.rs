@@ -38,6 +38,9 @@ pub(crate) struct Import {
     /// Velocity at which 76 % of dry friction are reached, m/s or rad/s.
     #[arg(long, value_name = "V", default_value_t = 0.01)]
     friction_velocity: f64,
+    /// Stop joints at their limits: depth and time in which one that is held there settles, m or rad and s.
+    #[arg(long, value_name = "DEPTH,TIME", value_parser = numbers)]
+    stops: Option<Numbers>,
     /// Folder of a package, for paths of meshes that begin with `package://NAME`.
     #[arg(long, value_name = "NAME=FOLDER", value_parser = package)]
     package: Vec<(String, String)>,
@@ -64,6 +67,7 @@ enum Inputs {
 impl Import {
     pub(crate) fn run(self, context: &Context) -> Result<()> {
         let gravity = self.gravity.map(|gravity| <[f64; 3]>::try_from(gravity.0)).transpose();
+        let stops = self.stops.map(|stops| <[f64; 2]>::try_from(stops.0)).transpose();
         let options = Options {
             base: match self.base {
                 Base::Fixed => plantd_import::Base::Fixed,
@@ -77,6 +81,7 @@ impl Import {
             gravity: gravity.ok().context("--gravity takes three numbers")?,
             time_step_s: self.time_step,
             friction_velocity: self.friction_velocity,
+            stops: stops.ok().context("--stops takes two numbers")?,
             packages: self.package.into_iter().collect(),
             lenient: self.lenient,
         };
