@@ -6,7 +6,7 @@ use roxmltree::Node;
 
 use crate::report::{Kind, Note, PROBLEMS_MAX, Problem, Report};
 use crate::source::Source;
-use crate::table::{Element, Treatment};
+use crate::table::{Element, NO_CONTACT, Treatment};
 
 /// Notes that are told at most.
 const NOTES_MAX: usize = 1000;
@@ -118,10 +118,7 @@ impl<'a> Reader<'a> {
                 self.note_at(Kind::NoEffect, byte, format!("{what}: {why}"));
             }
             Some(Treatment::Contact) => {
-                let message = format!(
-                    "{what}: contacts are not simulated; bodies pass through one another and through the floor"
-                );
-                self.note_at(Kind::Contact, byte, message);
+                self.note_at(Kind::Contact, byte, format!("{what}: {NO_CONTACT}"));
             }
             Some(Treatment::Refused(what_to_do)) => {
                 self.refuse_at(byte, format!("{what}: {what_to_do}"));
@@ -244,7 +241,7 @@ impl<'a> Reader<'a> {
 }
 
 /// Finite numbers apart by white space, at most so many.
-fn list(text: &str, most: usize) -> Option<Vec<f64>> {
+pub(crate) fn list(text: &str, most: usize) -> Option<Vec<f64>> {
     let finite = |word: &str| word.parse::<f64>().ok().filter(|number| number.is_finite());
     let numbers: Option<Vec<f64>> =
         text.split_ascii_whitespace().take(most.saturating_add(1)).map(finite).collect();

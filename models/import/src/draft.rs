@@ -8,7 +8,7 @@ use roxmltree::Node;
 
 use crate::document::Reader;
 use crate::names::{self, Names};
-use crate::report::Kind;
+use crate::report::{Kind, Name};
 
 /// Endings of the coordinates of a free joint.
 pub(crate) const FREE: [&str; 6] = ["_x", "_y", "_z", "_rx", "_ry", "_rz"];
@@ -20,6 +20,8 @@ pub(crate) struct Draft {
     pub(crate) scene: Scene,
     pub(crate) frames: Names,
     pub(crate) coordinates: Names,
+    /// Names of other kinds that are spelled otherwise.
+    pub(crate) changed: Vec<Name>,
     /// Settings of coordinates by name, in the order in which they come up.
     settings: BTreeMap<String, usize>,
     /// What stops joints at their limits.
@@ -42,7 +44,7 @@ impl Draft {
         };
         let (frames, coordinates) =
             (Names::new("frame", &["world"]), Names::new("coordinate", &[]));
-        Self { scene, frames, coordinates, settings: BTreeMap::new(), stops }
+        Self { scene, frames, coordinates, changed: Vec::new(), settings: BTreeMap::new(), stops }
     }
 
     /// Adds a frame of a name that is free.
@@ -126,6 +128,7 @@ impl Draft {
         self.scene.name = names::of_scene(name, changed);
         changed.append(&mut self.frames.changed);
         changed.append(&mut self.coordinates.changed);
+        changed.append(&mut self.changed);
         self.scene
     }
 }

@@ -29,6 +29,7 @@ use crate::mjcf::tendons::Tendons;
 use crate::names::Names;
 use crate::options::{Base, Inputs, Options};
 use crate::report::Kind;
+use crate::table::NO_CONTACT;
 
 /// The scene of a model; none where something has failed.
 pub(crate) fn scene<'a>(
@@ -75,14 +76,15 @@ pub(crate) fn scene<'a>(
     build.constrain(&tendons);
     let controls = match options.inputs {
         Inputs::AsTold => build.actuate(&tendons),
-        Inputs::All => build.drive_all(),
+        Inputs::All => {
+            build.drive_all();
+            Vec::new()
+        }
         Inputs::None => Vec::new(),
     };
     build.add_operating_points(&controls);
     if let Some((node, count)) = tree.touching.filter(|_| physics.has("contact")) {
-        let message = format!(
-            "{count} shapes may touch: contacts are not simulated; bodies pass through one another and through the floor"
-        );
+        let message = format!("{count} shapes may touch: {NO_CONTACT}");
         build.reader.note(Kind::Contact, node, message);
     }
     Some(build.draft.finish(build.reader, root.attribute("model").unwrap_or("robot")))

@@ -13,6 +13,10 @@ pub(crate) enum Treatment {
     Refused(&'static str),
 }
 
+/// What becomes of contacts.
+pub(crate) const NO_CONTACT: &str =
+    "contacts are not simulated; bodies pass through one another and through the floor";
+
 /// Treatments, each with the names that it is for, apart by spaces.
 pub(crate) type Treatments = &'static [(Treatment, &'static str)];
 

@@ -41,17 +41,12 @@ const ARM: &str = r#"<mujoco model="Arm 2">
 
 fn turn(axis: [f64; 3], degrees: f64) -> Isometry3<f64> {
     let axis = nalgebra::Unit::new_normalize(Vector3::from(axis));
-    UnitQuaternion::from_axis_angle(&axis, degrees.to_radians()).into_isometry()
+    still(UnitQuaternion::from_axis_angle(&axis, degrees.to_radians()))
 }
 
-trait IntoIsometry {
-    fn into_isometry(self) -> Isometry3<f64>;
-}
-
-impl IntoIsometry for UnitQuaternion<f64> {
-    fn into_isometry(self) -> Isometry3<f64> {
-        Isometry3::from_parts(Default::default(), self)
-    }
+/// A turn without a shift.
+fn still(turn: UnitQuaternion<f64>) -> Isometry3<f64> {
+    Isometry3::from_parts(Default::default(), turn)
 }
 
 fn shift(by: [f64; 3]) -> Isometry3<f64> {
@@ -78,8 +73,7 @@ fn poses(q: &[f64], wrist: UnitQuaternion<f64>) -> [Isometry3<f64>; 3] {
     // The shortest way from z to (1, 1, 1) is a turn about (−1, 1, 0).
     let tilt = turn([-1.0, 1.0, 0.0], (1.0 / 3.0_f64.sqrt()).acos().to_degrees());
     let spin = wrist * UnitQuaternion::from_scaled_axis(Vector3::from_column_slice(&q[3..6]));
-    let tip =
-        forearm * shift([0.2, 0.1, 0.0]) * tilt * about([0.0, 0.0, 0.02], spin.into_isometry());
+    let tip = forearm * shift([0.2, 0.1, 0.0]) * tilt * about([0.0, 0.0, 0.02], still(spin));
     [base, forearm, tip]
 }
 

@@ -6,11 +6,10 @@ use roxmltree::Node;
 
 use crate::document::Reader;
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::MAIN;
+use crate::mjcf::classes::{MAIN, SWITCH, is_on};
 use crate::mjcf::frames::frame_at;
 use crate::mjcf::rope::Rope;
 use crate::mjcf::tendons::{Course, Tendons, Term, linear};
-use crate::mjcf::tree::JointKind;
 use crate::report::Kind;
 
 /// Kinds of actuators that are taken, all of the same law.
@@ -68,7 +67,7 @@ struct Actuator {
 #[derive(Clone, Copy, Debug, Default)]
 struct Range {
     ends: [f64; 2],
-    /// `false`, `true`, `auto`
+    /// Its place in [`SWITCH`].
     switch: Option<usize>,
 }
 
@@ -76,16 +75,12 @@ impl Range {
     fn take(&mut self, reader: &mut Reader<'_>, node: Node<'_, '_>, range: &str, switch: &str) {
         self.ends = reader.vector_or(node, range, self.ends);
         if let Some(text) = node.attribute(switch) {
-            self.switch = Some(reader.keyword(node, switch, text, &["false", "true", "auto"]));
+            self.switch = Some(reader.keyword(node, switch, text, &SWITCH));
         }
     }
 
     fn limits(&self, by_range: bool) -> Option<[f64; 2]> {
-        let counts = match self.switch {
-            Some(0) => false,
-            Some(1) => true,
-            _ => by_range && self.ends != [0.0; 2],
-        };
+        let counts = is_on(self.switch, by_range, self.ends);
         (counts && self.ends[0] < self.ends[1]).then_some(self.ends)
     }
 }
@@ -184,15 +179,13 @@ impl Actuator {
 
 impl<'a> Build<'_, 'a, '_> {
     /// An input for each hinge and slide.
-    pub(super) fn drive_all(&mut self) -> Vec<Option<String>> {
+    pub(super) fn drive_all(&mut self) {
         let joints = self.tree.joints.iter().zip(&self.coordinates);
-        let single = |kind| matches!(kind, JointKind::Hinge | JointKind::Slide);
-        for (_, coordinates) in joints.filter(|(joint, _)| single(joint.kind)) {
+        for (_, coordinates) in joints.filter(|(joint, _)| joint.kind.is_single()) {
             let name = self.inputs.add(&format!("{}_drive", coordinates[0]), &[""]);
             let coordinate = Some(coordinates[0].clone());
             self.draft.scene.inputs.push(Input { name, coordinate, ..Input::default() });
         }
-        Vec::new()
     }
 
     /// Inputs of the actuators in the order of the file; none for those that are left out.
@@ -207,8 +200,7 @@ impl<'a> Build<'_, 'a, '_> {
             let is_taken = TAKEN.contains(&node.tag_name().name());
             controls.push(if is_taken { self.add_actuator(node, tendons) } else { None });
         }
-        let changed = std::mem::take(&mut self.inputs.changed);
-        self.draft.coordinates.changed.extend(changed);
+        self.draft.changed.append(&mut self.inputs.changed);
         controls
     }
 
@@ -271,7 +263,7 @@ impl<'a> Build<'_, 'a, '_> {
         let j = self.find(node, target, "joint", |build, name| build.tree.joint(name))?;
         let joint = &self.tree.joints[j];
         let coordinates = self.coordinates[j].clone();
-        if matches!(joint.kind, JointKind::Hinge | JointKind::Slide) {
+        if joint.kind.is_single() {
             let term = Term { joint: j, coordinate: coordinates[0].clone(), coefficient: 1.0 };
             return self.act_on_sum(node, actuator, &[term], joint.limits);
         }

@@ -12,6 +12,18 @@ const SECTIONS_MAX: usize = 64;
 /// The class that has no parent.
 pub(super) const MAIN: usize = 0;
 
+/// What a range can be switched by.
+pub(super) const SWITCH: [&str; 3] = ["false", "true", "auto"];
+
+/// Whether a range counts: by its switch, or else where it is given.
+pub(super) fn is_on(switch: Option<usize>, is_automatic: bool, range: [f64; 2]) -> bool {
+    match switch {
+        Some(0) => false,
+        Some(1) => true,
+        _ => is_automatic && range != [0.0; 2],
+    }
+}
+
 /// Classes, parents before children; the first is `main`.
 pub(super) struct Classes<'a> {
     classes: Vec<Class<'a>>,
@@ -210,11 +222,7 @@ impl<'a> Settings<'a> {
         is_automatic: bool,
     ) -> Option<[f64; 2]> {
         let range = self.numbers::<2>(reader, name).unwrap_or_default();
-        let counts = match self.keyword(reader, switch, &["false", "true", "auto"]) {
-            Some(0) => false,
-            Some(1) => true,
-            _ => is_automatic && range != [0.0; 2],
-        };
+        let counts = is_on(self.keyword(reader, switch, &SWITCH), is_automatic, range);
         if counts && range[0] >= range[1] {
             let of = self.node().tag_name().name();
             let [low, high] = range;

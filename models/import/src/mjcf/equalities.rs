@@ -7,8 +7,8 @@ use roxmltree::Node;
 use crate::mjcf::build::Build;
 use crate::mjcf::classes::MAIN;
 use crate::mjcf::frames::frame_at;
+use crate::mjcf::settings::TINY;
 use crate::mjcf::tendons::{Course, Tendons};
-use crate::mjcf::tree::JointKind;
 use crate::names::Names;
 use crate::report::Kind;
 
@@ -56,7 +56,7 @@ impl<'a> Build<'_, 'a, '_> {
                 self.draft.scene.constraints.push(constraint);
             }
         }
-        self.draft.coordinates.changed.append(&mut names.changed);
+        self.draft.changed.append(&mut names.changed);
     }
 
     fn connect(&mut self, node: Node<'a, 'a>) -> Option<(Point, Point)> {
@@ -98,7 +98,7 @@ impl<'a> Build<'_, 'a, '_> {
             let anchor = Translation3::from(self.reader.vector_or(node, "anchor", [0.0; 3]));
             let given = self.reader.vector_or::<7>(node, "relpose", [0.0; 7]);
             let [x, y, z, w, i, j, k] = given;
-            let turn = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), 1e-14);
+            let turn = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), TINY);
             let anchored = Isometry3::from(anchor);
             let first = match turn {
                 Some(turn) => Isometry3::from_parts(Vector3::new(x, y, z).into(), turn),
@@ -158,7 +158,7 @@ impl<'a> Build<'_, 'a, '_> {
 
     fn single(&mut self, node: Node<'a, 'a>, which: &str) -> Option<usize> {
         let joint = self.find(node, which, "joint", |build, name| build.tree.joint(name))?;
-        let is_single = matches!(self.tree.joints[joint].kind, JointKind::Hinge | JointKind::Slide);
+        let is_single = self.tree.joints[joint].kind.is_single();
         if !is_single {
             self.reader.fail(node, format!("`{which}` of `joint` must be a hinge or a slide"));
         }

@@ -135,7 +135,7 @@ impl Build<'_, '_, '_> {
                 (place * anchor * turn, SceneJoint::Revolute { axis, coordinate }, back)
             }
         };
-        if matches!(joint.kind, JointKind::Slide | JointKind::Hinge) {
+        if joint.kind.is_single() {
             self.draft.begin(&stem, joint.reference);
         }
         self.resist(j);
@@ -184,7 +184,7 @@ impl Build<'_, '_, '_> {
         if is_none || !self.physics.has("spring") {
             return;
         }
-        if !matches!(kind, JointKind::Hinge | JointKind::Slide) {
+        if !kind.is_single() {
             let message = format!(
                 "`stiffness` of joint `{name}`: an orientation has no spring here; write one between points"
             );
@@ -218,11 +218,8 @@ impl Build<'_, '_, '_> {
     /// `I = 1 / (M⁻¹)_ii` in the configuration of the file `k = I / (τ ζ)²`, `d = 2 I / τ`.
     pub(super) fn adjust_springs(&mut self) {
         let tree = self.tree;
-        let asked = |j: &usize| tree.joints[*j].spring_damper.is_some();
-        let joints: Vec<_> = (0..tree.joints.len()).filter(asked).collect();
-        for j in joints {
-            let joint = &tree.joints[j];
-            let [time, ratio] = joint.spring_damper.unwrap_or_default();
+        for (j, joint) in tree.joints.iter().enumerate() {
+            let Some([time, ratio]) = joint.spring_damper else { continue };
             let coordinates = self.coordinates[j].clone();
             let Some(mobility) = self.mobility() else {
                 let message =

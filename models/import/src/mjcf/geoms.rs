@@ -7,9 +7,9 @@ use roxmltree::Node;
 use crate::document::Reader;
 use crate::inertia::Inertia;
 use crate::mjcf::classes::Settings;
-use crate::mjcf::settings::from_z;
+use crate::mjcf::settings::{TINY, from_z};
 use crate::mjcf::shapes::Shape;
-use crate::mjcf::tree::{Place, Site, TINY, Walk, named, rotation};
+use crate::mjcf::tree::{Place, Site, Walk, named, rotation};
 
 impl<'a> Walk<'_, 'a, '_> {
     /// Reads a site.

@@ -4,8 +4,9 @@ use nalgebra::{Unit, Vector3};
 use roxmltree::Node;
 
 use crate::document::Reader;
-use crate::mjcf::classes::Settings;
-use crate::mjcf::tree::{Joint, JointKind, Place, TINY, Walk, named};
+use crate::mjcf::classes::{SWITCH, Settings};
+use crate::mjcf::settings::TINY;
+use crate::mjcf::tree::{Joint, JointKind, Place, Walk, named};
 use crate::report::Kind;
 
 impl<'a> Walk<'_, 'a, '_> {
@@ -26,21 +27,19 @@ impl<'a> Walk<'_, 'a, '_> {
             Some(2) => JointKind::Slide,
             _ => JointKind::Hinge,
         };
-        let first = self.tree.bodies[body].joints.iter().map(|j| self.tree.joints[*j].kind).next();
-        if kind == JointKind::Free
-            && place.body.is_some_and(|b| self.tree.bodies[b].parent.is_some())
-        {
+        let first = self.tree.bodies[body].joints.first().map(|j| self.tree.joints[*j].kind);
+        if kind == JointKind::Free && self.tree.bodies[body].parent.is_some() {
             reader.fail(node, "a free joint in a body whose parent is not the world");
         }
         if first == Some(JointKind::Free) || (first.is_some() && kind == JointKind::Free) {
             reader.fail(node, "a free joint beside another joint of the body");
         }
-        let align = settings.keyword(reader, "align", &["false", "true", "auto"]).unwrap_or(2);
+        let align = settings.keyword(reader, "align", &SWITCH).unwrap_or(2);
         if kind == JointKind::Free && (align == 1 || (align == 2 && compiler.aligns)) {
             let message = "`align`: the body's frame would become that of its principal axes; write it so, or switch it off";
             reader.refuse(node, message);
         }
-        let single = matches!(kind, JointKind::Hinge | JointKind::Slide);
+        let single = kind.is_single();
         let angle =
             |angle: f64| if kind == JointKind::Slide { angle } else { compiler.radians(angle) };
         let axis = settings.numbers::<3>(reader, "axis").filter(|_| single);
@@ -58,8 +57,7 @@ impl<'a> Walk<'_, 'a, '_> {
             settings.range(reader, "range", "limited", compiler.limits_by_range)
         } else {
             let range = settings.numbers::<2>(reader, "range").unwrap_or_default();
-            let is_limited =
-                settings.keyword(reader, "limited", &["false", "true", "auto"]) != Some(0);
+            let is_limited = settings.keyword(reader, "limited", &SWITCH) != Some(0);
             if kind == JointKind::Ball && is_limited && range != [0.0; 2] {
                 let message = "`range` of a ball joint: an orientation has no limits here";
                 reader.note(Kind::Approximated, node, message);

@@ -6,6 +6,7 @@ use roxmltree::Node;
 
 use crate::mjcf::build::Build;
 use crate::mjcf::frames::as_coordinates;
+use crate::mjcf::settings::TINY;
 use crate::mjcf::tree::JointKind;
 use crate::names::Names;
 
@@ -43,7 +44,7 @@ impl<'a> Build<'_, 'a, '_> {
             self.reader.exact("keyframe as an operating point");
             self.draft.scene.operating_points.push(point);
         }
-        self.draft.coordinates.changed.append(&mut names.changed);
+        self.draft.changed.append(&mut names.changed);
     }
 
     fn configure(&mut self, node: Node<'a, 'a>, point: &mut OperatingPoint) {
@@ -64,7 +65,7 @@ impl<'a> Build<'_, 'a, '_> {
             let (own, next) = rest.split_at(size(joint.kind));
             rest = next;
             let turn = |q: &[f64]| {
-                let turn = UnitQuaternion::try_new(Quaternion::new(q[0], q[1], q[2], q[3]), 1e-14);
+                let turn = UnitQuaternion::try_new(Quaternion::new(q[0], q[1], q[2], q[3]), TINY);
                 turn.unwrap_or_default()
             };
             let values = match own {

@@ -11,6 +11,9 @@ use crate::mjcf::classes::Settings;
 use crate::options::{EARTH, Options};
 use crate::report::Kind;
 
+/// Lengths, m, masses, kg, and volumes, m³, that count as none.
+pub(super) const TINY: f64 = 1e-14;
+
 /// How a file is meant.
 #[derive(Clone, Debug)]
 pub(super) struct Compiler {
@@ -121,18 +124,18 @@ impl Compiler {
         let found = match form {
             "quat" => {
                 let [w, x, y, z] = reader.numbers(node, form, text);
-                UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-14)
+                UnitQuaternion::try_new(Quaternion::new(w, x, y, z), TINY)
             }
             "axisangle" => {
                 let [x, y, z, angle] = reader.numbers(node, form, text);
-                let axis = Unit::try_new(Vector3::new(x, y, z), 1e-14);
+                let axis = Unit::try_new(Vector3::new(x, y, z), TINY);
                 axis.map(|axis| UnitQuaternion::from_axis_angle(&axis, self.radians(angle)))
             }
             "xyaxes" => {
                 let [a, b, c, d, e, f] = reader.numbers(node, form, text);
                 axes(Vector3::new(a, b, c), Vector3::new(d, e, f))
             }
-            "zaxis" => Unit::try_new(Vector3::from(reader.numbers::<3>(node, form, text)), 1e-14)
+            "zaxis" => Unit::try_new(Vector3::from(reader.numbers::<3>(node, form, text)), TINY)
                 .map(from_z),
             _ => Some(self.euler(reader.numbers(node, form, text))),
         };
@@ -175,8 +178,8 @@ impl Compiler {
 
 /// Axes x and y, the latter made square to the former.
 fn axes(x: Vector3<f64>, y: Vector3<f64>) -> Option<UnitQuaternion<f64>> {
-    let x = x.try_normalize(1e-14)?;
-    let y = (y - x * x.dot(&y)).try_normalize(1e-14)?;
+    let x = x.try_normalize(TINY)?;
+    let y = (y - x * x.dot(&y)).try_normalize(TINY)?;
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
     Some(UnitQuaternion::from_rotation_matrix(&rotation))
 }

@@ -1,10 +1,10 @@
 //! Inertias in the configuration in which a model stands in the file.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
-use plantd_models::scene::{CoordinateKind, Input};
+use plantd_models::scene::{CoordinateKind, Frame, Input};
 use plantd_models::{Continuous, ContinuousPoint, Model, Scene};
 
 /// `M⁻¹` over the dynamic coordinates, armature included.
@@ -26,13 +26,10 @@ impl Mobility {
             coordinates: scene.coordinates.clone(),
             ..Scene::default()
         };
-        let names: Vec<String> = Model::compile(&bare)
-            .ok()?
-            .coordinates()
-            .iter()
-            .filter(|coordinate| coordinate.kind == CoordinateKind::Dynamic)
-            .map(|coordinate| coordinate.name.clone())
-            .collect();
+        let prescribed = scene.coordinates.iter().filter(|c| c.kind == CoordinateKind::Prescribed);
+        let prescribed: BTreeSet<&str> = prescribed.map(|c| c.name.as_str()).collect();
+        let names = scene.frames.iter().flat_map(Frame::motions).map(|(name, _)| name);
+        let names: Vec<String> = names.filter(|name| !prescribed.contains(&**name)).collect();
         let input = |name: &String| Input {
             name: name.clone(),
             coordinate: Some(name.clone()),
@@ -48,8 +45,11 @@ impl Mobility {
             inputs: vec![0.0; dynamic],
             prescribed_acceleration: vec![0.0; all - dynamic],
         };
+        let order: Option<Vec<usize>> =
+            names.iter().map(|name| model.coordinate_index(name)).collect();
+        let order = order?;
         let rates = Continuous::new(model).linearize(&point).ok()?.jacobian;
-        let inverse = rates.view((0, 2 * all), (dynamic, dynamic)).into_owned();
+        let inverse = DMatrix::from_fn(dynamic, dynamic, |i, j| rates[(order[i], 2 * all + j)]);
         Some(Self {
             rows: names.into_iter().enumerate().map(|(i, name)| (name, i)).collect(),
             inverse,

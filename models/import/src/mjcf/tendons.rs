@@ -9,7 +9,7 @@ use roxmltree::Node;
 use crate::mjcf::build::Build;
 use crate::mjcf::classes::{MAIN, Settings};
 use crate::mjcf::rope::{Branch, Rope, Stop};
-use crate::mjcf::tree::{Joint, JointKind};
+use crate::mjcf::tree::Joint;
 use crate::report::Kind;
 
 /// Tendons by name.
@@ -91,7 +91,7 @@ impl<'a> Build<'_, 'a, '_> {
         for child in node.children().filter(|child| child.has_tag_name("joint")) {
             let coefficient = self.reader.number(child, "coef");
             let joint = self.find(child, "joint", "joint", |build, name| build.tree.joint(name))?;
-            if !matches!(self.tree.joints[joint].kind, JointKind::Hinge | JointKind::Slide) {
+            if !self.tree.joints[joint].kind.is_single() {
                 let message = "a tendon over a joint that does not move about or along one axis";
                 self.reader.refuse(child, message);
                 return None;

@@ -14,8 +14,6 @@ use crate::mjcf::settings::{Compiler, FromGeoms};
 
 /// Geoms, sites and copies of replications that are made at most.
 const ITEMS_MAX: usize = 1 << 17;
-/// Masses, kg, and volumes, m³, that count as none.
-pub(super) const TINY: f64 = 1e-14;
 
 /// All that a model is made of; parents come before children, in the order of the file.
 #[derive(Default)]
@@ -56,6 +54,13 @@ pub(super) enum JointKind {
     Ball,
     Slide,
     Hinge,
+}
+
+impl JointKind {
+    /// Whether it moves about or along one axis.
+    pub(super) fn is_single(self) -> bool {
+        matches!(self, Self::Slide | Self::Hinge)
+    }
 }
 
 pub(super) struct Joint<'a> {
@@ -253,10 +258,11 @@ impl<'a> Walk<'_, 'a, '_> {
         }
         let settings = Settings::alone(node);
         let own = self.compiler.pose(self.reader, &settings);
-        let name = node.attribute("name").unwrap_or_default();
+        let name = named(node.attribute("name").unwrap_or_default(), place);
+        self.register(0, node, &name, body);
         self.tree.bodies.push(Body {
             node,
-            name: named(name, place),
+            name,
             parent: place.body,
             pose: place.frame * own,
             joints: Vec::new(),
@@ -272,7 +278,6 @@ impl<'a> Walk<'_, 'a, '_> {
             },
             geoms: Vec::new(),
         });
-        self.register(0, node, &named(name, place), body);
         let class = self.class_in(node, place);
         let frame = Isometry3::identity();
         self.fill(node, &Place { body: Some(body), class, frame, ending: place.ending.clone() });

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use plantd_models::scene::{MAX_FILE_BYTES, Shape, Visual};
 use roxmltree::Node;
 
-use crate::document::Reader;
+use crate::document::{Reader, list};
 use crate::options::Options;
 use crate::report::Kind;
 use crate::urdf::read::{origin, rotation};
@@ -33,10 +33,7 @@ fn color(material: Node<'_, '_>) -> Option<[f64; 4]> {
 
 /// Numbers that are good, or none.
 fn numbers<const N: usize>(node: Node<'_, '_>, name: &str) -> Option<[f64; N]> {
-    let words = node.attribute(name)?.split_ascii_whitespace();
-    let numbers: Vec<f64> = words.map(str::parse).collect::<Result<_, _>>().ok()?;
-    let numbers: [f64; N] = numbers.try_into().ok()?;
-    numbers.iter().all(|number| number.is_finite()).then_some(numbers)
+    list(node.attribute(name)?, N)?.try_into().ok()
 }
 
 /// The shapes of a link. What cannot be shown is no error: it does not move anything.
