@@ -10,23 +10,19 @@ armature and actuators under random controls. Contacts, limits, dry friction, eq
 switched off in MuJoCo, and friction and constraints taken out of the scene: they are softer there, or not there.
 """
 
-import argparse
 import importlib.metadata
 import importlib.util
 import json
 import pathlib
-import subprocess
 import sys
-import tomllib
 import warnings
 
 import mujoco
 import numpy as np
 
 import plantd
+from importing import arguments, cell, imported, write
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-BINARIES = ROOT / "target" / "release"
 FOLDERS = {"dm_control": "suite", "gymnasium": "envs/mujoco/assets"}
 
 
@@ -38,19 +34,13 @@ def published():
             yield f"{package}/{file.name}", file
 
 
-def imported(plantctl, file):
+def smooth(plantctl, file):
     """The scene without constraints and friction, or the first reason against it."""
-    done = subprocess.run(
-        [plantctl, "import", "--json", file], capture_output=True, text=True, timeout=60
-    )
-    if done.returncode != 0:
-        told = json.loads(done.stderr.splitlines()[-1])["error"]["message"]
-        return None, told.removeprefix(f"{file} cannot be imported: ").splitlines()[0]
-    scene = tomllib.loads(json.loads(done.stdout)["scene_toml"])
-    for what in ("constraints", "operating_points"):
-        scene.pop(what, None)
-    scene["forces"] = [force for force in scene.get("forces", []) if force["type"] != "friction"]
-    return scene, None
+    scene, refusal = imported(plantctl, file, without=("constraints", "operating_points"))
+    if scene is not None:
+        forces = scene.get("forces", [])
+        scene["forces"] = [force for force in forces if force["type"] != "friction"]
+    return scene, refusal
 
 
 def peer(file):
@@ -131,40 +121,21 @@ def compared(client, scene, file):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--server", default="http://127.0.0.1:50051")
-    parser.add_argument("--binaries", type=pathlib.Path, default=BINARIES)
-    parser.add_argument("models", nargs="*", type=pathlib.Path)
-    options = parser.parse_args()
+    options = arguments(__doc__, "models")
     rows, is_good = [], True
     with plantd.connect(options.server) as client:
         for name, file in [(file.name, file) for file in options.models] or published():
-            scene, refusal = imported(options.binaries / "plantctl", file)
-            if scene is None:
-                cell = f"refused: {refusal}"
-            else:
-                try:
-                    count, worst = compared(client, scene, file)
-                    is_good &= count == 0 or bool(worst[0] < 1e-9 and worst[1] < 1e-7)
-                    cell = f"{count}: {worst[0]:.0e}, {worst[1]:.0e}" if count else "nothing moves"
-                except (plantd.PlantdError, ValueError) as error:
-                    is_good = False
-                    cell = f"not compared: {error}".replace("\n", " ")
-            rows.append(f"| {name} | {cell} |")
+            scene = smooth(options.binaries / "plantctl", file)
+            compare = lambda scene: compared(client, scene, file)
+            text, is_close = cell(*scene, compare, (1e-9, 1e-7))
+            is_good &= is_close
+            rows.append(f"| {name} | {text} |")
             print(rows[-1], flush=True)
     if not options.models:
         versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in FOLDERS)
-        lines = [
-            "# Models in MJCF beside MuJoCo",
-            "",
-            f"The MJCFs of {versions}, imported, and MuJoCo {mujoco.__version__}: the number of coordinates, and the largest differences of the mass matrix and of the accelerations (springs, dampers, armature and actuators included) over their largest entries, in three random states.",
-            "Made by `python3 tests/peers/models.py`.",
-            "",
-            "| model | |",
-            "| --- | --- |",
-            *rows,
-        ]
-        (ROOT / "models/import/MODELS.md").write_text("\n".join(lines) + "\n")
+        text = f"The MJCFs of {versions}, imported, and MuJoCo {mujoco.__version__}: the number of coordinates, and the largest differences of the mass matrix and of the accelerations (springs, dampers, armature and actuators included) over their largest entries, in three random states."
+        title = "Models in MJCF beside MuJoCo"
+        write("MODELS.md", title, text, "models.py", ("model", ""), rows)
     sys.exit(0 if is_good else 1)
 
 

@@ -10,40 +10,23 @@ velocities, the bias forces by the accelerations that follow. Couplings, damping
 before: Pinocchio has none of them.
 """
 
-import argparse
 import json
 import pathlib
 import re
-import subprocess
 import sys
-import tomllib
 
 import numpy as np
 import pinocchio as pin
 
 import plantd
+from importing import arguments, cell, imported, write
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-BINARIES = ROOT / "target" / "release"
 SHARE = pathlib.Path(pin.__file__).parents[4] / "share/example-robot-data/robots"
 BASES = {"fixed": None, "free": "root_joint"}
 
 
 def plain(name):
     return re.sub(r"[^A-Za-z0-9_-]", "_", name)
-
-
-def imported(plantctl, file, base):
-    """The scene without what Pinocchio does not have, or the first reason against it."""
-    run = [plantctl, "import", "--json", "--base", base, "--inputs", "none", file]
-    done = subprocess.run(run, capture_output=True, text=True, timeout=60)
-    if done.returncode != 0:
-        told = json.loads(done.stderr.splitlines()[-1])["error"]["message"]
-        return None, told.removeprefix(f"{file} cannot be imported: ").splitlines()[0]
-    scene = tomllib.loads(json.loads(done.stdout)["scene_toml"])
-    for what in ("constraints", "forces", "coordinates"):
-        scene.pop(what, None)
-    return scene, done.stderr
 
 
 def columns(model, robot_names, root):
@@ -114,46 +97,28 @@ def compared(client, scene, file, base):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--server", default="http://127.0.0.1:50051")
-    parser.add_argument("--binaries", type=pathlib.Path, default=BINARIES)
-    parser.add_argument("robots", nargs="*", type=pathlib.Path)
-    options = parser.parse_args()
+    options = arguments(__doc__, "robots")
     files = options.robots or sorted(SHARE.rglob("*.urdf"))
     rows, is_good = [], True
+    # What Pinocchio does not have.
+    without = ("constraints", "forces", "coordinates")
     with plantd.connect(options.server) as client:
         for file in files:
             cells = []
             for base in BASES:
-                scene, told = imported(options.binaries / "plantctl", file, base)
-                if scene is None:
-                    cells.append(f"refused: {told}")
-                    continue
-                try:
-                    count, worst = compared(client, scene, file, base)
-                    if worst is None:
-                        cells.append("nothing moves")
-                        continue
-                    is_good &= bool(worst.max() < 1e-9)
-                    cells.append(f"{count}: {worst[0]:.0e}, {worst[1]:.0e}")
-                except (plantd.PlantdError, ValueError, NotImplementedError) as error:
-                    is_good = False
-                    cells.append(f"not compared: {error}".replace("\n", " "))
+                flags = ("--base", base, "--inputs", "none")
+                scene = imported(options.binaries / "plantctl", file, *flags, without=without)
+                compare = lambda scene: compared(client, scene, file, base)
+                text, is_close = cell(*scene, compare, (1e-9, 1e-9))
+                cells.append(text)
+                is_good &= is_close
             name = file.relative_to(SHARE) if file.is_relative_to(SHARE) else file.name
             rows.append(f"| {name} | {' | '.join(cells)} |")
             print(rows[-1], flush=True)
     if not options.robots:
-        lines = [
-            "# Robots in URDF beside Pinocchio",
-            "",
-            f"Every URDF of example-robot-data 6.0.0, imported, and Pinocchio {pin.__version__}: the number of coordinates, and the largest differences of the mass matrix and of the bias forces over their largest entries, in three random states; held by the world, and with a free base.",
-            "Made by `python3 tests/peers/robots.py`.",
-            "",
-            "| robot | held | free |",
-            "| --- | --- | --- |",
-            *rows,
-        ]
-        (ROOT / "models/import/ROBOTS.md").write_text("\n".join(lines) + "\n")
+        text = f"Every URDF of example-robot-data 6.0.0, imported, and Pinocchio {pin.__version__}: the number of coordinates, and the largest differences of the mass matrix and of the bias forces over their largest entries, in three random states; held by the world, and with a free base."
+        columns = ("robot", "held", "free")
+        write("ROBOTS.md", "Robots in URDF beside Pinocchio", text, "robots.py", columns, rows)
     sys.exit(0 if is_good else 1)
 
 
