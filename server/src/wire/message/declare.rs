@@ -125,10 +125,19 @@ fn is_prescribed(model: &Model, entry: usize) -> bool {
 
 /// A vector in space; empty means zero.
 pub(crate) fn vector(field: String, given: &[f64]) -> Result<[f64; 3], RpcError> {
-    match *given {
-        [] => Ok([0.0; 3]),
-        [x, y, z] if given.iter().all(|value| value.is_finite()) => Ok([x, y, z]),
-        _ => Err(RpcError::field(field, "must have three finite entries, or none")),
+    Ok(optional(field, given, "three")?.unwrap_or_default())
+}
+
+/// So many finite numbers, in words for errors, or none.
+pub(crate) fn optional<const N: usize>(
+    field: String,
+    given: &[f64],
+    count: &str,
+) -> Result<Option<[f64; N]>, RpcError> {
+    match <[f64; N]>::try_from(given) {
+        _ if given.is_empty() => Ok(None),
+        Ok(numbers) if numbers.iter().all(|value| value.is_finite()) => Ok(Some(numbers)),
+        _ => Err(RpcError::field(field, format!("must have {count} finite entries, or none"))),
     }
 }
 

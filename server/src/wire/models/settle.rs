@@ -6,7 +6,7 @@ use std::sync::Arc;
 use plantd_models::{Initial, Model, Plant, Problem, Settings, SettleRequest, Target};
 use plantd_proto::v1;
 
-use crate::wire::message::{checks, start};
+use crate::wire::message::{checks, declare, start};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -80,22 +80,10 @@ fn target(i: usize, target: v1::SettleTarget) -> Result<Target, RpcError> {
     }
     Ok(Target {
         frame: point.frame,
-        at: numbers(field("point.at"), point.at)?.unwrap_or_default(),
-        position: numbers(field("position"), position)?,
-        orientation: numbers(field("orientation"), orientation)?,
+        at: declare::vector(field("point.at"), &point.at)?,
+        position: declare::optional(field("position"), &position, "three")?,
+        orientation: declare::optional(field("orientation"), &orientation, "four")?,
     })
-}
-
-/// So many numbers, or none.
-fn numbers<const N: usize>(field: String, values: Vec<f64>) -> Result<Option<[f64; N]>, RpcError> {
-    if values.is_empty() {
-        return Ok(None);
-    }
-    let count = values.len();
-    let numbers = values.try_into();
-    numbers
-        .map(Some)
-        .map_err(|_| RpcError::field(field, format!("has {count} entries; must have {N}, or none")))
 }
 
 /// The initial configuration, or `q`, with single values put in.
