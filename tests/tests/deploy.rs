@@ -67,11 +67,11 @@ fn the_annotated_configuration_differs_from_the_defaults_only_where_it_says_so()
 }
 
 #[test]
-fn the_readme_states_the_limits_in_force() {
-    let readme = read("README.md");
+fn the_document_states_the_limits_in_force() {
+    let document = read("docs/limits.md");
     for limit in Limits::default().table() {
         let row = format!("| `{}` | {} | {} |", limit.name, limit.value, limit.meaning);
-        assert!(readme.contains(&row), "README.md lacks the row\n{row}");
+        assert!(document.contains(&row), "docs/limits.md lacks the row\n{row}");
     }
 }
 

@@ -8,6 +8,11 @@ const DOCUMENTS: &[&str] = &[
     "ARCHITECTURE.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
+    "docs/control.md",
+    "docs/figures.md",
+    "docs/limits.md",
+    "docs/recording.md",
+    "docs/robots.md",
     "client/python/README.md",
     "client/TESTING.md",
     "models/ACCURACY.md",
@@ -27,16 +32,19 @@ fn read(path: &str) -> String {
 }
 
 #[test]
-fn examples_in_the_readme_are_files_that_are_tested() {
-    let readme = read("README.md");
-    for (language, file) in [
-        ("python", "client/python/examples/pendulum_lqr.py"),
-        ("python", "client/python/examples/swing_up.py"),
-        ("toml", "models/scenes/cart-pole.toml"),
+fn examples_in_documents_are_files_that_are_tested() {
+    for (document, language, file) in [
+        ("README.md", "python", "client/python/examples/pendulum_lqr.py"),
+        ("docs/control.md", "python", "client/python/examples/swing_up.py"),
     ] {
         let block = format!("```{language}\n{}\n```", read(file).trim());
-        assert!(readme.contains(&block), "README.md does not show {file} as it is");
+        assert!(read(document).contains(&block), "{document} does not show {file} as it is");
     }
+}
+
+#[test]
+fn the_readme_is_one_page() {
+    assert!(read("README.md").lines().count() <= 130, "README.md has more than 130 lines");
 }
 
 #[test]
