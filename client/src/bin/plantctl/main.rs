@@ -12,16 +12,18 @@ mod trial;
 use std::process::ExitCode;
 
 use anyhow::Result;
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, Parser, Subcommand};
+use clap_complete::CompleteEnv;
 
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard, import,
     inventory, kalman, linearize, lqr, mechanics, optimize, parameters, record, reference, replay,
-    run, scene, settle, state, step, test, timing, watch,
+    run, scene, settle, shell, state, step, test, timing, top, watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
 use crate::server::context::Context;
+use crate::server::names;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -46,6 +48,7 @@ Examples:
   plantctl record start p1 --name trial             then `record stop trial`, `record get trial`
   plantctl replay trial.mcap                        the same steps again, compared bit for bit
   plantctl export trial.mcap --csv trial.csv
+  plantctl top                                      rates, drivers and lateness of all plants
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
@@ -116,11 +119,20 @@ enum Command {
     Restore(state::Restore),
     Test(test::Test),
     Delete(inventory::Delete),
+    Top(top::Top),
+    Completions(shell::Completions),
+    Man(shell::Man),
+}
+
+fn main() -> ExitCode {
+    // A shell that asks for completions gets them, and nothing else happens.
+    let command_line = || names::completed(Args::command());
+    CompleteEnv::with_factory(command_line).var(shell::ASKED_BY).complete();
+    answer(Args::parse())
 }
 
 #[tokio::main(flavor = "current_thread")]
-async fn main() -> ExitCode {
-    let args = Args::parse();
+async fn answer(args: Args) -> ExitCode {
     let context = Context { address: args.address, output: Output { json: args.json } };
     match run(args.command, &context).await {
         Ok(code) => code,
@@ -179,14 +191,15 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Restore(command) => command.run(context).await?,
         Command::Test(command) => return command.run(context).await,
         Command::Delete(command) => command.run(context).await?,
+        Command::Top(command) => command.run(context).await?,
+        Command::Completions(command) => command.run()?,
+        Command::Man(command) => command.run(Args::command(), context.output)?,
     }
     Ok(ExitCode::SUCCESS)
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory as _;
-
     use super::*;
 
     #[test]

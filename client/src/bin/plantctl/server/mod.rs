@@ -1,4 +1,5 @@
 //! The server that a command speaks to.
 
 pub(crate) mod context;
+pub(crate) mod names;
 pub(crate) mod own;

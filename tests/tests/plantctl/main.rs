@@ -1,5 +1,7 @@
 //! The `plantctl` command against a real server: output, exit codes, and where messages go.
 
+mod shell;
+
 use std::io::Write as _;
 use std::process::{Command, Output, Stdio};
 
