@@ -13,6 +13,7 @@ const DOCUMENTS: &[&str] = &[
     "docs/limits.md",
     "docs/recording.md",
     "docs/robots.md",
+    "docs/view.md",
     "client/python/README.md",
     "client/TESTING.md",
     "models/ACCURACY.md",
