@@ -2,6 +2,7 @@
 
 pub mod checks;
 pub(crate) mod declare;
+pub mod drawing;
 pub mod matrices;
 pub mod models;
 pub(crate) mod plant_info;

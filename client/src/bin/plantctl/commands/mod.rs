@@ -19,6 +19,7 @@ pub(crate) mod lqr;
 pub(crate) mod mechanics;
 pub(crate) mod optimize;
 pub(crate) mod parameters;
+pub(crate) mod plot;
 pub(crate) mod record;
 pub(crate) mod reference;
 pub(crate) mod replay;

@@ -73,6 +73,7 @@ impl Watch {
             every,
             coordinates,
             queue,
+            ..Default::default()
         };
         for_each(client.watch(request).await?, count, |message| {
             context.output.message("WatchResponse", &message, || watched(&message, &model))

@@ -1,0 +1,5 @@
+//! Signals over time as pictures: of characters, and SVG.
+
+pub(crate) mod axis;
+pub(crate) mod chart;
+pub(crate) mod terminal;
