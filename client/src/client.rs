@@ -143,6 +143,20 @@ impl Client {
         Ok(self.models().validate_scene(self.limited(request)).await?.into_inner())
     }
 
+    /// What a viewer draws of a model or a plant.
+    pub async fn get_drawing(
+        &self,
+        request: v1::GetDrawingRequest,
+    ) -> Result<v1::GetDrawingResponse> {
+        Ok(self.models().get_drawing(self.limited(request)).await?.into_inner())
+    }
+
+    /// Gives an uploaded model a file that its visuals name; answers with the path on the server's address where
+    /// browsers find it.
+    pub async fn put_model_file(&self, request: v1::PutModelFileRequest) -> Result<String> {
+        Ok(self.models().put_model_file(self.limited(request)).await?.into_inner().url)
+    }
+
     /// Finds a configuration in which a model rests, or one that satisfies its constraints.
     pub async fn settle(&self, request: v1::SettleRequest) -> Result<v1::SettleResponse> {
         Ok(self.models().settle(self.limited(request)).await?.into_inner())
@@ -220,7 +234,8 @@ impl Client {
         Driver::open(self.plants(), open, self.options.request_timeout).await
     }
 
-    /// Watches a plant. Latest wins: who reads slowly loses messages, which `dropped` counts.
+    /// Watches a plant. Latest wins: who reads slowly loses messages, which `dropped` counts. `at_most_hz` of the
+    /// request bounds how many come.
     pub async fn watch(&self, request: v1::WatchRequest) -> Result<Answers<v1::WatchResponse>> {
         self.open(self.plants().watch(request)).await
     }

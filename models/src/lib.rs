@@ -21,6 +21,7 @@ mod compile;
 mod constraints;
 mod continuous;
 pub mod control;
+pub mod drawing;
 mod integrator;
 mod kkt;
 mod lagrangian;

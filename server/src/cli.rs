@@ -69,6 +69,9 @@ pub struct Settings {
         value_delimiter = ','
     )]
     pub allowed_hosts: Vec<String>,
+    /// The page that shows the plants, on the port of gRPC.
+    #[arg(long, env = "PLANTD_VIEW")]
+    pub view: Option<Switch>,
     /// Shared-memory links.
     #[arg(long, env = "PLANTD_LINK")]
     pub link: Option<Switch>,
@@ -166,6 +169,7 @@ impl Settings {
         replace(&mut config.state_interval_s, self.state_interval_s);
         replace(&mut config.log.filter, self.log);
         replace(&mut config.log.format, self.log_format);
+        replace(&mut config.view, self.view.map(|switch| switch == Switch::On));
         replace(&mut config.link.enabled, self.link.map(|switch| switch == Switch::On));
         config.unix = self.unix.or(config.unix);
         config.link.root = self.link_root.or(config.link.root);

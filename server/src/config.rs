@@ -42,7 +42,9 @@ pub struct Config {
     pub allowed_origins: Vec<String>,
     /// Host names under which it may be called, besides `localhost` and IP addresses.
     pub allowed_hosts: Vec<String>,
-    /// Directory of scenes (`*.toml`, `*.json`) to load as models at the start.
+    /// The page that shows the plants, at the address of gRPC over TCP.
+    pub view: bool,
+    /// Directory of scenes (`*.toml`, `*.json`) to load as models at the start, with their meshes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scenes: Option<PathBuf>,
     /// Directory in which plants survive the server; not given means none.
@@ -90,6 +92,7 @@ impl Default for Config {
             metrics: Listen::Off,
             allowed_origins: Vec::new(),
             allowed_hosts: Vec::new(),
+            view: true,
             scenes: None,
             state_directory: None,
             state_interval_s: 2.0,

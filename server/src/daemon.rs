@@ -57,6 +57,10 @@ pub async fn serve(config: Config, until_stdin_ends: bool) -> Result<()> {
         {
             tracing::error!(path = %path.display(), %error, "ready file not written");
         }
+        if let Some(view) = &addresses.view {
+            // For people; nothing is lost where nobody reads it.
+            let _ = writeln!(std::io::stdout(), "See the plants: {view}");
+        }
         notify(&[NotifyState::Ready]);
     };
     let watchdog = tokio::spawn(feed_watchdog());

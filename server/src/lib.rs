@@ -20,5 +20,6 @@ pub mod core;
 pub mod daemon;
 pub mod listen;
 mod memory;
+mod scenes;
 pub mod serve;
 pub mod wire;

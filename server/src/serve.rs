@@ -1,15 +1,13 @@
 //! Starts a server, keeps it, and ends it.
 
-use std::io;
-use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use futures::{FutureExt as _, future};
-use plantd_models::Model;
 use plantd_proto::{FILE_DESCRIPTOR_SET, v1};
 use serde::Serialize;
 use tokio::net::TcpListener;
@@ -32,12 +30,14 @@ use crate::config::{Config, Listen};
 use crate::core::limits::Limits;
 use crate::listen::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT, UnixSocket, bind_tcp};
 use crate::memory;
+use crate::scenes;
 use crate::wire::control::service::ControlService;
 use crate::wire::edge::admission::Places;
 use crate::wire::edge::ending::ending_with;
 use crate::wire::edge::gate::GateLayer;
 use crate::wire::edge::metrics_http;
 use crate::wire::edge::observe::ObserveLayer;
+use crate::wire::edge::page::{FindFile, PageLayer};
 use crate::wire::link::host::LinkHost;
 use crate::wire::models::model::ModelService;
 use crate::wire::plants::channels::ChannelService;
@@ -55,6 +55,8 @@ const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
 pub struct Addresses {
     /// gRPC over TCP, `http://address:port`.
     pub grpc: Option<String>,
+    /// The page that shows the plants, for a browser on this machine: `http://address:port/`.
+    pub view: Option<String>,
     /// gRPC over a unix-domain socket, `unix:/path`.
     pub unix: Option<String>,
     /// Metrics, `http://address:port/metrics`.
@@ -148,7 +150,7 @@ impl RunningServer {
         }
         let hub = Arc::new(hub);
         if let Some(directory) = &config.scenes {
-            load_scenes(&hub, directory)?;
+            scenes::load(&hub.catalog, directory)?;
         }
         if let Some(state) = &hub.state {
             state.load(&hub).await.context("saved plants")?;
@@ -213,6 +215,7 @@ impl RunningServer {
             .http2_keepalive_interval(Some(KEEP_ALIVE_INTERVAL))
             .http2_keepalive_timeout(Some(KEEP_ALIVE_TIMEOUT))
             .layer(GateLayer::new(self.config.names()))
+            .layer(PageLayer::new(self.config.view.then(|| find_file(hub()))))
             .layer(GrpcWebLayer::new())
             .layer(ObserveLayer::new(Arc::clone(&self.hub.metrics), limits.clone()))
             .add_service(
@@ -246,7 +249,9 @@ impl RunningServer {
         if let Listen::At(address) = self.config.grpc {
             let incoming = bind_tcp(address).with_context(|| format!("gRPC on {address}"))?;
             warn_beyond_loopback("gRPC", address);
-            self.addresses.grpc = Some(format!("http://{}", incoming.local_addr()?));
+            let address = incoming.local_addr()?;
+            self.addresses.grpc = Some(format!("http://{address}"));
+            self.addresses.view = self.config.view.then(|| format!("http://{}/", within(address)));
             let incoming = Arc::clone(&places).admit(incoming);
             let closing = self.closing.clone().cancelled_owned();
             self.listeners.spawn(router.clone().serve_with_incoming_shutdown(incoming, closing));
@@ -383,28 +388,20 @@ async fn save_once(hub: &Arc<Hub>) {
     }
 }
 
-type Layers = Stack<ObserveLayer, Stack<GrpcWebLayer, Stack<GateLayer, Identity>>>;
+type Layers =
+    Stack<ObserveLayer, Stack<GrpcWebLayer, Stack<PageLayer, Stack<GateLayer, Identity>>>>;
 
-/// Loads every scene of a directory as a model under the scene's own name.
-fn load_scenes(hub: &Hub, directory: &Path) -> Result<()> {
-    let in_directory = || format!("scenes in {}", directory.display());
-    let mut paths = std::fs::read_dir(directory)
-        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>())
-        .with_context(in_directory)?;
-    paths.retain(|path| path.extension().is_some_and(|kind| kind == "toml" || kind == "json"));
-    paths.sort();
-    for path in paths {
-        load_scene(hub, &path).with_context(|| format!("scene {}", path.display()))?;
-    }
-    Ok(())
+/// An address under which this machine reaches what listens at one.
+fn within(address: SocketAddr) -> SocketAddr {
+    let ip = match address.ip() {
+        IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+        ip => ip,
+    };
+    SocketAddr::new(ip, address.port())
 }
 
-fn load_scene(hub: &Hub, path: &Path) -> Result<()> {
-    let text = std::fs::read_to_string(path)?;
-    let scene = plantd_models::Scene::from_text(&text)?;
-    let model = Model::compile(&scene)?;
-    let name = model.scene().name.clone();
-    hub.catalog.insert(&name, Arc::new(model))?;
-    tracing::info!(model = name, "scene loaded");
-    Ok(())
+/// Finds the files of models for the page.
+fn find_file(hub: Arc<Hub>) -> FindFile {
+    Arc::new(move |model, path| hub.catalog.files(model)?.get(path))
 }

@@ -28,6 +28,7 @@
 mod document;
 mod draft;
 mod inertia;
+pub mod meshes;
 mod mjcf;
 mod names;
 mod options;

@@ -574,7 +574,7 @@ fn joint(motion: &Motion) -> (JointKind, Mat3) {
     }
 }
 
-fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
+pub(crate) fn rotation(rotation: Option<&scene::Rotation>) -> Mat3 {
     match rotation {
         None => Mat3::IDENTITY,
         Some(scene::Rotation::Matrix(rows)) => Mat3::from_rows(*rows),
@@ -599,7 +599,7 @@ fn about(axis: usize, angle: f64) -> Mat3 {
 }
 
 /// A body of the scene in the frame of the joint that carries it.
-pub(super) fn placed(body: &scene::Body, placement: &Placement) -> Body {
+pub(crate) fn placed(body: &scene::Body, placement: &Placement) -> Body {
     let center = placement.translation + placement.rotation.apply(Vec3(body.center_of_mass));
     let inertia = match body.inertia[..] {
         [xx, yy, zz] => Sym3 { xx, yy, zz, ..Sym3::default() },
@@ -631,7 +631,7 @@ fn lumped(a: &Body, b: &Body) -> Body {
     Body { mass, center, inertia: classified(mass, about_center(a).add(&about_center(b))) }
 }
 
-pub(super) fn full(inertia: &Rotational) -> Sym3 {
+pub(crate) fn full(inertia: &Rotational) -> Sym3 {
     match *inertia {
         Rotational::None | Rotational::Point => Sym3::default(),
         Rotational::Isotropic(i) => Sym3 { xx: i, yy: i, zz: i, ..Sym3::default() },

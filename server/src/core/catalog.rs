@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex, OnceLock, Weak};
 use plantd_models::{Model, builtin};
 use prometheus_client::metrics::gauge::Gauge;
 
-use crate::core::limits::LimitExceeded;
+use crate::core::files::{File, FileNameError, FileRoom, Files, path_of};
+use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::mutex::lock;
 
 /// Why a model was not found, kept or forgotten.
@@ -30,7 +31,16 @@ pub enum CatalogError {
         /// The name.
         name: String,
     },
-    /// There are as many uploaded models as there may be.
+    /// Built-in models have no files.
+    #[error("model `{name}` came with the server and takes no files")]
+    BuiltinFile {
+        /// The name.
+        name: String,
+    },
+    /// No file of a model has that name.
+    #[error(transparent)]
+    FileName(#[from] FileNameError),
+    /// There are as many uploaded models, or files of them, as there may be.
     #[error(transparent)]
     Limit(#[from] LimitExceeded),
     /// A defect: a built-in scene does not compile.
@@ -52,6 +62,22 @@ pub struct Entry {
     pub builtin: bool,
     /// The model.
     pub model: Arc<Model>,
+    /// Files that show it; none of a built-in one.
+    pub files: Arc<Files>,
+}
+
+/// An uploaded model.
+struct Uploaded {
+    model: Arc<Model>,
+    files: Arc<Files>,
+}
+
+impl Uploaded {
+    fn entry(&self, name: &str) -> Entry {
+        let Self { model, files } = self;
+        let (model, files) = (Arc::clone(model), Arc::clone(files));
+        Entry { name: name.to_owned(), builtin: false, model, files }
+    }
 }
 
 /// All models.
@@ -60,33 +86,34 @@ pub struct Catalog {
     named: BTreeMap<&'static str, OnceLock<Arc<Model>>>,
     /// Members of the built-in families, as long as somebody uses them.
     generated: Mutex<HashMap<String, Weak<Model>>>,
-    uploaded: Mutex<BTreeMap<String, Arc<Model>>>,
+    uploaded: Mutex<BTreeMap<String, Uploaded>>,
     models_max: u64,
+    file_room: FileRoom,
     /// Shows how many are uploaded.
     gauge: Gauge,
 }
 
 impl Catalog {
-    /// A catalog with room for `models_max` uploaded models, which the gauge counts.
-    pub fn new(models_max: u64, gauge: Gauge) -> Self {
+    /// A catalog with room for so many uploaded models and files as the limits say; the gauge counts the models.
+    pub fn new(limits: &Limits, gauge: Gauge) -> Self {
         Self {
             named: builtin::NAMES.iter().map(|name| (*name, OnceLock::new())).collect(),
             generated: Mutex::default(),
             uploaded: Mutex::default(),
-            models_max,
+            models_max: limits.models,
+            file_room: FileRoom::new(limits),
             gauge,
         }
     }
 
     /// The model of that name. May compile it: call it on a worker.
     pub fn get(&self, name: &str) -> Result<Entry, CatalogError> {
-        if let Some(model) = lock(&self.uploaded).get(name) {
-            let model = Arc::clone(model);
-            return Ok(Entry { name: name.to_owned(), builtin: false, model });
+        if let Some(uploaded) = lock(&self.uploaded).get(name) {
+            return Ok(uploaded.entry(name));
         }
         let model =
             self.builtin(name)?.ok_or_else(|| CatalogError::NotFound { name: name.to_owned() })?;
-        Ok(Entry { name: name.to_owned(), builtin: true, model })
+        Ok(Entry { name: name.to_owned(), builtin: true, model, files: Arc::default() })
     }
 
     fn builtin(&self, name: &str) -> Result<Option<Arc<Model>>, CatalogError> {
@@ -117,9 +144,41 @@ impl Catalog {
             return Err(CatalogError::Exists { name: name.to_owned() });
         }
         LimitExceeded::check("models", self.models_max, "uploaded models", uploaded.len() + 1)?;
-        uploaded.insert(name.to_owned(), Arc::clone(&model));
+        let new = Uploaded { model, files: Arc::default() };
+        let entry = new.entry(name);
+        uploaded.insert(name.to_owned(), new);
         self.gauge.set(uploaded.len() as i64);
-        Ok(Entry { name: name.to_owned(), builtin: false, model })
+        Ok(entry)
+    }
+
+    /// Gives an uploaded model a file under the name that its scene has for it. Answers with the path under
+    /// which it is found, and the file.
+    pub fn put_file(
+        &self,
+        model: &str,
+        name: &str,
+        bytes: Vec<u8>,
+    ) -> Result<(String, Arc<File>), CatalogError> {
+        let path = path_of(name)?;
+        let Some(files) = self.files(model) else {
+            let name = model.to_owned();
+            return Err(match builtin::scene(model) {
+                Some(_) => CatalogError::BuiltinFile { name },
+                None => CatalogError::NotFound { name },
+            });
+        };
+        let file = self.file_room.put(&files, &path, bytes)?;
+        Ok((path, file))
+    }
+
+    /// Refuses a file of a size before it is read.
+    pub fn check_file_size(&self, bytes: u64) -> Result<(), CatalogError> {
+        Ok(self.file_room.check_size(usize::try_from(bytes).unwrap_or(usize::MAX))?)
+    }
+
+    /// The files of an uploaded model.
+    pub fn files(&self, model: &str) -> Option<Arc<Files>> {
+        lock(&self.uploaded).get(model).map(|uploaded| Arc::clone(&uploaded.files))
     }
 
     /// Forgets an uploaded model.

@@ -72,6 +72,12 @@ limits! {
     coordinates = 1024 in 1..=65_536;
     /// Uploaded models.
     models = 256 in 0..=1_000_000;
+    /// Bytes of a file that shows a model; one message brings it.
+    model_file_bytes = 16_777_216 in 0..=1_073_741_824;
+    /// Files that show one model.
+    model_files = 1024 in 0..=1_000_000;
+    /// Bytes of the files that show models, of all of them together.
+    model_files_bytes = 536_870_912 in 0..=1_000_000_000_000;
     /// Plants.
     plants = 1024 in 0..=1_000_000;
     /// Plants that run by themselves at a time.

@@ -8,6 +8,7 @@ pub mod connection;
 pub mod driver;
 pub mod failure;
 pub mod feedback;
+pub mod files;
 pub mod inputs;
 pub mod limits;
 pub mod metrics;

@@ -11,7 +11,7 @@
 //! | --- | --- |
 //! | with `Origin` | the origin is listed, or is the server's own under a host that it knows |
 //! | without | it knows the host; or listens beyond the loopback interface, where programs call it by names that it cannot know. A page's gRPC-Web call is never of this kind. |
-//! | without, for metrics | it knows the host: a plain GET is what a page can send without `Origin` |
+//! | without, for metrics and the page | it knows the host: a plain GET is what a page can send without `Origin` |
 //! | over a unix-domain socket | as above, with any host: no browser gets there, and programs send many |
 //!
 //! It knows `localhost`, names under it, IP addresses, and `allowed_hosts`. No CORS header is sent.

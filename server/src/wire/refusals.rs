@@ -31,9 +31,10 @@ impl From<CatalogError> for RpcError {
         match error {
             CatalogError::NotFound { name } => Self::model_not_found(&name),
             CatalogError::Exists { name } => Self::model_exists(&name),
-            CatalogError::Builtin { name } => {
+            CatalogError::Builtin { name } | CatalogError::BuiltinFile { name } => {
                 Self::precondition("BUILTIN_MODEL", format!("model:{name}"), problem)
             }
+            CatalogError::FileName(error) => Self::field("file", error.to_string()),
             CatalogError::Limit(error) => error.into(),
             CatalogError::Broken { .. } => Self::internal(problem),
         }

@@ -193,6 +193,11 @@ pub struct InForce {
 }
 
 impl InForce {
+    /// The gain at a step of the plant: rows of as many entries as `x` has, one after the other.
+    pub fn gain_at(&self, step: u64) -> &[f64] {
+        &self.law.at(step.saturating_sub(self.first_step)).0.k
+    }
+
     /// Number of messages: one about a point; one per step and the final state along a trajectory.
     pub fn count(&self) -> usize {
         if self.law.end.is_some() { self.law.stages.len() + 1 } else { 1 }

@@ -47,6 +47,16 @@ impl Subscription {
         (&self.frame, self.dropped)
     }
 
+    /// Frames lost so far, those among them of which the watcher was not told.
+    pub fn lost(&self) -> u64 {
+        lock(&self.slot.cell).dropped
+    }
+
+    /// Does not count as lost what was passed over since so many were.
+    pub fn forget_lost_since(&self, lost: u64) {
+        lock(&self.slot.cell).dropped = lost;
+    }
+
     /// The next frame, with the number of frames lost so far.
     pub fn poll_next(&mut self, context: &mut Context<'_>) -> Poll<(&Frame, u64)> {
         self.poll_taken(context).map(|()| (&self.frame, self.dropped))

@@ -89,6 +89,11 @@ impl Session {
         });
     }
 
+    /// The feedback in force. Does not touch the core.
+    pub fn feedback_in_force(&self) -> Option<InForce> {
+        self.gains.in_force.borrow().clone()
+    }
+
     /// Claims the task of computing the feedback's law anew; false when somebody is at it.
     pub fn begin_recomputing(&self) -> bool {
         !self.gains.is_recomputing.swap(true, Ordering::AcqRel)

@@ -54,6 +54,26 @@ pub(crate) fn analyze(
     })
 }
 
+/// Poles of the linearized map at a plant's state: of A, as the modes of Analyze on the constraints, and with a
+/// gain of `A − B K` in the directions in which the plant can be moved.
+pub(crate) fn poles(
+    plant: &mut Plant,
+    linearization: &Linearization,
+    gain: Option<&DMatrix<f64>>,
+) -> Result<v1::Poles, RpcError> {
+    let (a, time_step_s) = (linearization.a(), plant.settings().time_step_s);
+    let space = Space::new(plant, Constraints::Manifold);
+    let of = |map: &DMatrix<f64>| -> Result<Vec<v1::Complex>, RpcError> {
+        let modes = control::modes(map, time_step_s)?.into_iter();
+        Ok(modes.map(|Mode { real, imaginary, .. }| v1::Complex { real, imaginary }).collect())
+    };
+    let closed_loop = match gain {
+        Some(gain) => of(&space.moving_map(&(&a - linearization.b() * gain)))?,
+        None => Vec::new(),
+    };
+    Ok(v1::Poles { open_loop: of(&space.free(&a))?, closed_loop })
+}
+
 /// Outputs `y = x_matrix x + u_matrix u`.
 pub(crate) struct Outputs {
     pub(crate) names: Vec<String>,
@@ -185,6 +205,14 @@ impl Space {
         }
     }
 
+    /// A map on the directions in which it can be moved.
+    fn moving_map(&self, map: &DMatrix<f64>) -> DMatrix<f64> {
+        match self {
+            Self::Full => map.clone(),
+            Self::Manifold { moving, .. } => moving.restrict_map(map),
+        }
+    }
+
     /// A, B, C on the directions in which it can be moved.
     fn moving(
         &self,
@@ -195,7 +223,7 @@ impl Space {
         match self {
             Self::Full => (a.clone(), b.clone(), c.clone()),
             Self::Manifold { moving, .. } => {
-                (moving.restrict_map(a), moving.reduce(b), c * moving.basis())
+                (self.moving_map(a), moving.reduce(b), c * moving.basis())
             }
         }
     }

@@ -1,4 +1,4 @@
-//! A layer around all services: refuses pages of strangers, see [`crate::wire::names`].
+//! A layer around page and services: refuses pages of strangers, see [`crate::wire::names`].
 
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -18,12 +18,14 @@ use crate::wire::status::RpcError;
 #[derive(Clone)]
 pub struct GateLayer {
     names: Arc<Names>,
+    /// For what a page could ask for without saying where it comes from.
+    strict: Arc<Names>,
 }
 
 impl GateLayer {
     /// A layer that lets through what these names allow.
     pub fn new(names: Names) -> Self {
-        Self { names: Arc::new(names) }
+        Self { strict: Arc::new(names.strict()), names: Arc::new(names) }
     }
 }
 
@@ -31,7 +33,7 @@ impl<S> Layer<S> for GateLayer {
     type Service = Gate<S>;
 
     fn layer(&self, inner: S) -> Self::Service {
-        Gate { inner, names: Arc::clone(&self.names) }
+        Gate { inner, layer: self.clone() }
     }
 }
 
@@ -39,7 +41,7 @@ impl<S> Layer<S> for GateLayer {
 #[derive(Clone)]
 pub struct Gate<S> {
     inner: S,
-    names: Arc<Names>,
+    layer: GateLayer,
 }
 
 impl<S> Service<Request<Body>> for Gate<S>
@@ -55,11 +57,18 @@ where
     }
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
-        match check(&self.names, &request) {
+        let GateLayer { names, strict } = &self.layer;
+        match check(if is_grpc(&request) { names } else { strict }, &request) {
             Ok(()) => Either::Right(self.inner.call(request)),
             Err(foreign) => Either::Left(ready(Ok(refusal(&request, foreign)))),
         }
     }
+}
+
+/// Whether it is for a service, and not for the page.
+pub(super) fn is_grpc(request: &Request<Body>) -> bool {
+    let kind = request.headers().get(CONTENT_TYPE);
+    kind.is_some_and(|kind| kind.as_bytes().starts_with(b"application/grpc"))
 }
 
 fn check(names: &Names, request: &Request<Body>) -> Result<(), Foreign> {
@@ -77,9 +86,8 @@ fn check(names: &Names, request: &Request<Body>) -> Result<(), Foreign> {
 /// 403; with PERMISSION_DENIED for gRPC, and as text for others.
 fn refusal(request: &Request<Body>, foreign: Foreign) -> Response<Body> {
     tracing::debug!(path = request.uri().path(), %foreign, "refused");
-    let kind = request.headers().get(CONTENT_TYPE);
-    let grpc = kind.filter(|kind| kind.as_bytes().starts_with(b"application/grpc"));
-    let (mut response, kind) = match grpc {
+    let kind = request.headers().get(CONTENT_TYPE).filter(|_| is_grpc(request));
+    let (mut response, kind) = match kind {
         Some(kind) => (Status::from(RpcError::from(foreign)).into_http(), kind.clone()),
         None => {
             let text = Body::new(format!("{foreign}\n"));

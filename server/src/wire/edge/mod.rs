@@ -1,9 +1,10 @@
-//! What stands around all services: who may call, how large messages may be, the page of metrics.
+//! What stands around all services: who may call, how large messages may be, the pages of plants and metrics.
 
 pub mod admission;
 pub mod ending;
 pub mod gate;
 pub mod metrics_http;
 pub mod observe;
+pub mod page;
 pub(crate) mod parts;
 pub(crate) mod unfinished;

@@ -1,4 +1,5 @@
 //! The service of models.
 
+pub(crate) mod drawing;
 pub mod model;
 pub(crate) mod settle;

@@ -11,7 +11,7 @@ use crate::core::catalog::Entry;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::wire::answers::cut_page;
 use crate::wire::message::{checks, models, settings};
-use crate::wire::models::settle;
+use crate::wire::models::{drawing, settle};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -138,6 +138,24 @@ impl v1::model_service_server::ModelService for ModelService {
     ) -> Result<Response<v1::SettleResponse>, Status> {
         let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
         let job = move |_: &_| settle::settle(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn get_drawing(
+        &self,
+        request: Request<v1::GetDrawingRequest>,
+    ) -> Result<Response<v1::GetDrawingResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| drawing::get(&hub, request);
+        Ok(Response::new(self.hub.workers.run(job).await?))
+    }
+
+    async fn put_model_file(
+        &self,
+        request: Request<v1::PutModelFileRequest>,
+    ) -> Result<Response<v1::PutModelFileResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| drawing::put(&hub, request);
         Ok(Response::new(self.hub.workers.run(job).await?))
     }
 }

@@ -3,6 +3,7 @@
 pub(crate) mod change;
 pub mod channels;
 pub(crate) mod commands;
+pub(crate) mod computed;
 pub mod drive;
 pub(crate) mod feedback;
 pub mod plant;

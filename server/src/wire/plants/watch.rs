@@ -1,18 +1,17 @@
 //! The stream of `PlantService.Watch`.
 //!
 //! The stream asks for the next frame when the transport has taken the last message, so a slow reader
-//! loses frames at the plant, where they are counted, and never holds more than its queue. Energies,
-//! linearizations and gains are computed on a worker, from a plant of the watcher's own.
+//! loses frames at the plant, where they are counted, and never holds more than its queue. What is computed
+//! for a watcher is so on a worker, see [`crate::wire::plants::computed`].
 
 use std::collections::HashSet;
 use std::sync::Arc;
+use std::time::Duration;
 
 use plantd_models::control::{Momentum, Weights};
-use plantd_models::{Initial, Linearization, Plant, StepError};
 use plantd_proto::v1;
-use v1::WatchField;
+use tokio::time::Instant;
 
-use crate::core::feedback::regulator::{self, Constraints};
 use crate::core::limits::LimitExceeded;
 use crate::core::publish::frame::{Frame, record_words};
 use crate::core::publish::subscription::Subscription;
@@ -20,52 +19,10 @@ use crate::core::room::Reservation;
 use crate::core::session::shared::Session;
 use crate::wire::answers::{Answers, Messages};
 use crate::wire::message::report::report_message;
-use crate::wire::message::{matrices, states, weights};
+use crate::wire::message::{states, weights};
+use crate::wire::plants::computed::{Computer, Wanted};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
-
-/// What a watcher has asked for.
-#[derive(Clone, Copy, Debug, Default)]
-struct Wanted {
-    state: bool,
-    report: bool,
-    energy: bool,
-    linearization: bool,
-    gain: bool,
-    input: bool,
-    outputs: bool,
-    timing: bool,
-}
-
-impl Wanted {
-    fn new(fields: &[i32]) -> Result<Self, RpcError> {
-        let mut wanted = Self::default();
-        for (index, field) in fields.iter().enumerate() {
-            match WatchField::try_from(*field) {
-                Ok(WatchField::State) => wanted.state = true,
-                Ok(WatchField::Report) => wanted.report = true,
-                Ok(WatchField::Energy) => wanted.energy = true,
-                Ok(WatchField::Linearization) => wanted.linearization = true,
-                Ok(WatchField::Gain) => wanted.gain = true,
-                Ok(WatchField::Input) => wanted.input = true,
-                Ok(WatchField::Outputs) => wanted.outputs = true,
-                Ok(WatchField::Timing) => wanted.timing = true,
-                Ok(WatchField::Unspecified) | Err(_) => {
-                    let problem = format!("{field} is nothing to watch");
-                    return Err(RpcError::field(format!("fields[{index}]"), problem));
-                }
-            }
-        }
-        if fields.is_empty() {
-            return Err(RpcError::field("fields", "are missing: at least one is needed"));
-        }
-        Ok(wanted)
-    }
-
-    fn needs_analysis(self) -> bool {
-        self.energy || self.linearization || self.gain
-    }
-}
 
 /// Opens the stream.
 pub(crate) fn stream(
@@ -75,7 +32,7 @@ pub(crate) fn stream(
     let session = hub.session(&request.id)?;
     let wanted = Wanted::new(&request.fields)?;
     let mask = Mask::new(&request.coordinates, &session)?;
-    if wanted.linearization || wanted.gain {
+    if wanted.needs_linearization() {
         let numbers = states::linearization_numbers(session.model().dimensions());
         let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
         LimitExceeded::check(name, limit, "numbers in a linearization", numbers)?;
@@ -89,6 +46,7 @@ pub(crate) fn stream(
     };
     let every = u64::from(request.every.max(1));
     let queue = request.queue.max(1) as usize;
+    let pace = Pace::new(request.at_most_hz, queue)?;
     // The one frame that every watcher has is covered by the limit of watchers.
     let numbers = (queue - 1).saturating_mul(record_words(session.model().dimensions()));
     let room = hub.watch_room.reserve(numbers)?;
@@ -100,7 +58,8 @@ pub(crate) fn stream(
         wanted,
         mask,
         weights,
-        analysis: None,
+        computer: None,
+        pace,
     };
     Ok(watcher.into_answers())
 }
@@ -113,7 +72,51 @@ struct Watcher {
     wanted: Wanted,
     mask: Option<Mask>,
     weights: Option<Arc<(Weights, Momentum)>>,
-    analysis: Option<Box<Analysis>>,
+    computer: Option<Box<Computer>>,
+    pace: Pace,
+}
+
+/// Longest time between two messages, s.
+const PERIOD_MAX_S: f64 = 86_400.0;
+
+/// When the next message may be sent.
+struct Pace {
+    /// None without a bound.
+    period: Option<Duration>,
+    /// From when on; none for the first message.
+    next: Option<Instant>,
+}
+
+impl Pace {
+    fn new(at_most_hz: f64, queue: usize) -> Result<Self, RpcError> {
+        if !(at_most_hz >= 0.0 && at_most_hz.is_finite()) {
+            let problem = format!("is {at_most_hz}; a number of 0 or more is needed");
+            return Err(RpcError::field("at_most_hz", problem));
+        }
+        if at_most_hz > 0.0 && queue > 1 {
+            let problem = "keeps states back that `at_most_hz` passes over: give one of them";
+            return Err(RpcError::field("queue", problem));
+        }
+        let period_s = (at_most_hz > 0.0).then(|| at_most_hz.recip().min(PERIOD_MAX_S));
+        Ok(Self { period: period_s.map(Duration::from_secs_f64), next: None })
+    }
+
+    /// A message is sent.
+    fn restart(&mut self) {
+        self.next = self.period.map(|period| Instant::now() + period);
+    }
+}
+
+/// The latest frame, when the pace lets it through. What comes meanwhile is passed over, and not lost.
+async fn paced<'a>(subscription: &'a mut Subscription, pace: &mut Pace) -> (&'a Frame, u64) {
+    if let Some(next) = pace.next {
+        let lost = subscription.lost();
+        tokio::time::sleep_until(next).await;
+        subscription.forget_lost_since(lost);
+    }
+    let taken = subscription.next().await;
+    pace.restart();
+    taken
 }
 
 impl Messages for Watcher {
@@ -125,10 +128,14 @@ impl Messages for Watcher {
             biased;
             () = self.hub.ending.cancelled() => return Err(RpcError::shutting_down()),
             () = session.closed() => return Err(RpcError::plant_deleted(session.id())),
-            next = self.subscription.next() => next,
+            next = paced(&mut self.subscription, &mut self.pace) => next,
         };
-        let mut response =
-            v1::WatchResponse { dropped, step: frame.state.step, ..Default::default() };
+        let mut response = v1::WatchResponse {
+            dropped,
+            step: frame.state.step,
+            generation: frame.generation,
+            ..Default::default()
+        };
         response.clocks = Some(states::clocks(frame.time_s, frame.timing.ended_ns));
         if self.wanted.timing {
             response.timing = states::step_timing(&frame.timing);
@@ -149,93 +156,22 @@ impl Messages for Watcher {
         if self.wanted.outputs {
             response.outputs = states::outputs(&frame.outputs, &frame.lost);
         }
-        if !self.wanted.needs_analysis() {
+        if !self.wanted.needs_computer() {
             return Ok(response);
         }
         let (frame, wanted) = (frame.clone(), self.wanted);
-        let (analysis, weights) = (self.analysis.take(), self.weights.clone());
+        let (computer, weights) = (self.computer.take(), self.weights.clone());
         let job = move |_: &_| {
-            let mut analysis = match analysis {
-                Some(analysis) if analysis.generation == frame.generation => analysis,
-                _ => Box::new(Analysis::new(&session)),
+            let mut computer = match computer {
+                Some(computer) if computer.generation() == frame.generation => computer,
+                _ => Box::new(Computer::new(session)),
             };
-            analysis.fill(&mut response, &frame, wanted, weights.as_deref());
-            Ok((analysis, response))
+            computer.fill(&mut response, &frame, wanted, weights.as_deref());
+            Ok((computer, response))
         };
-        let (analysis, response) = self.hub.workers.resume(job).await?;
-        self.analysis = Some(analysis);
+        let (computer, response) = self.hub.workers.resume(job).await?;
+        self.computer = Some(computer);
         Ok(response)
-    }
-}
-
-/// A watcher's own plant, on which it computes.
-struct Analysis {
-    plant: Plant,
-    /// Number of changes that led to its parameters.
-    generation: u64,
-    linearization: Linearization,
-}
-
-impl Analysis {
-    fn new(session: &Session) -> Self {
-        let (plant, generation) = session.copy_plant_and_generation();
-        Self { plant, generation, linearization: Linearization::new(session.model()) }
-    }
-
-    /// Computes what is wanted; what fails is reported in the message.
-    fn fill(
-        &mut self,
-        response: &mut v1::WatchResponse,
-        frame: &Frame,
-        wanted: Wanted,
-        weights: Option<&(Weights, Momentum)>,
-    ) {
-        if let Err(fault) = self.try_fill(response, frame, wanted, weights) {
-            response.failure = Some(fault.into());
-        }
-    }
-
-    fn try_fill(
-        &mut self,
-        response: &mut v1::WatchResponse,
-        frame: &Frame,
-        wanted: Wanted,
-        weights: Option<&(Weights, Momentum)>,
-    ) -> Result<(), RpcError> {
-        let state = &frame.state;
-        let momentum =
-            Initial::Momentum { q: state.q.clone(), p: state.p.clone(), v: state.v.clone() };
-        self.plant.initialize(&momentum).map_err(|error| RpcError::from_initial(error, "state"))?;
-        self.plant.set_step_index(state.step);
-        self.plant.set_time_s(frame.time_s);
-        if wanted.energy {
-            response.energy = Some(states::energy(self.plant.energy()));
-        }
-        if wanted.linearization || wanted.gain {
-            self.linearize(&frame.input)?;
-        }
-        if wanted.linearization {
-            response.linearization = Some(states::linearization(state.step, &self.linearization));
-        }
-        if let Some((weights, momentum)) = weights {
-            let space = Constraints::Manifold;
-            let (plant, linearization) = (&mut self.plant, &self.linearization);
-            let regulator = regulator::at_state(plant, linearization, weights, *momentum, space)?;
-            response.gain = Some(v1::Gain {
-                step: state.step,
-                k: Some(matrices::matrix(&regulator.gain)),
-                x_reference: state.x(),
-                u_reference: frame.input.clone(),
-                rotations: states::rotations(self.plant.model()),
-                ..Default::default()
-            });
-        }
-        Ok(())
-    }
-
-    fn linearize(&mut self, input: &[f64]) -> Result<(), StepError> {
-        self.plant.linearize(input, &mut self.linearization)?;
-        Ok(())
     }
 }
 

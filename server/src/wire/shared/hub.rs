@@ -81,7 +81,7 @@ impl Hub {
             workers: pool("worker", priority),
             attendants: pool("attendant", Priority::Normal),
             steppers: pool("stepper", Priority::Normal),
-            catalog: Catalog::new(limits.models, metrics.models.clone()),
+            catalog: Catalog::new(&limits, metrics.models.clone()),
             trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
             feedback_room: Room::new(
                 "feedback_numbers",
