@@ -66,7 +66,7 @@ pub(crate) async fn control(client: &Client) -> Result<Report> {
     let gains = gains(client, start, &rows).await?;
     let solve_s = since.elapsed().as_secs_f64();
 
-    let mut stopwatch = Stopwatch::new();
+    let mut stopwatch = Stopwatch::default();
     let mut driver = connect_link(client, &plant.id).await?;
     let perturbed = perturb(&mut driver, &rows[0])?;
     drop(driver);

@@ -18,7 +18,7 @@ use clap::{Parser, Subcommand};
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard, import,
     inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record, reference,
-    replay, run, scene, settle, state, step, test, timing, watch,
+    replay, run, scene, settle, state, step, test, timing, view, watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
@@ -48,6 +48,7 @@ Examples:
   plantctl replay trial.mcap                        the same steps again, compared bit for bit
   plantctl export trial.mcap --csv trial.csv
   plantctl plot trial.mcap q.theta u.tau            in the terminal; --out plot.svg draws a picture
+  plantctl view trial.mcap                          in the browser; `view p1` shows a plant
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
@@ -114,6 +115,7 @@ enum Command {
     Replay(replay::Replay),
     Export(export::Export),
     Plot(plot::Plot),
+    View(view::View),
     Reset(state::Reset),
     Snapshot(state::Snapshot),
     Restore(state::Restore),
@@ -178,6 +180,7 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Replay(command) => return command.run(context).await,
         Command::Export(command) => command.run(context)?,
         Command::Plot(command) => command.run(context)?,
+        Command::View(command) => command.run(context).await?,
         Command::Reset(command) => command.run(context).await?,
         Command::Snapshot(command) => command.run(context).await?,
         Command::Restore(command) => command.run(context).await?,

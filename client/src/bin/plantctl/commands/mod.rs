@@ -30,4 +30,5 @@ pub(crate) mod state;
 pub(crate) mod step;
 pub(crate) mod test;
 pub(crate) mod timing;
+pub(crate) mod view;
 pub(crate) mod watch;

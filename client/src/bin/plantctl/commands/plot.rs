@@ -28,7 +28,8 @@ const LIKENESS_MIN: f64 = 0.6;
 /// Plots signals of a recording over time.
 ///
 /// Signals are q.NAME, p.NAME, velocity.NAME and v.NAME of coordinates, u.NAME of inputs, force.NAME of
-/// constraint equations and y.NAME of outputs; without any, those that there are are listed.
+/// constraint equations, y.NAME of outputs, and energy.kinetic, .potential and .total; without any, those that there
+/// are are listed.
 #[derive(Debug, Args)]
 pub(crate) struct Plot {
     /// Recording.
@@ -115,9 +116,19 @@ fn width() -> usize {
     if columns < 40 { COLUMNS } else { columns.min(COLUMNS_MAX) }
 }
 
+type OfEnergy = fn(&v1::Energy) -> f64;
+
+/// Signals of the energy.
+const ENERGIES: [(&str, OfEnergy); 3] = [
+    ("energy.kinetic", |energy| energy.kinetic_j),
+    ("energy.potential", |energy| energy.potential_j),
+    ("energy.total", |energy| energy.kinetic_j + energy.potential_j),
+];
+
 /// The steps of a recording as columns.
 struct Recorded {
     samples: Samples,
+    energies: Vec<(f64, v1::Energy)>,
     /// What can be plotted, with units.
     names: Vec<(String, String)>,
 }
@@ -135,6 +146,7 @@ impl Recorded {
             let sample = Sample { state, time_step_s, u, y, energy: None, reference: None };
             columns.push(&mut samples, sample);
         };
+        let mut energies = Vec::new();
         if let Some(state) = &plant.state {
             push(state, &[], &[], time_step_s);
         }
@@ -147,10 +159,15 @@ impl Recorded {
                 RecordingEntry::Mark(mark) if mark.time_step_s > 0.0 => {
                     time_step_s = mark.time_step_s;
                 }
-                _ => {}
+                RecordingEntry::Energy { time_s, energy } => energies.push((time_s, energy)),
+                RecordingEntry::Mark(_) | RecordingEntry::Event(_) => {}
             }
         }
-        Ok(Self { samples, names: signals(&model, &record.outputs) })
+        let mut names = signals(&model, &record.outputs);
+        if !energies.is_empty() {
+            names.extend(ENERGIES.map(|(name, _)| (name.to_owned(), "J".to_owned())));
+        }
+        Ok(Self { samples, energies, names })
     }
 
     /// A signal by its name: `q.theta`, `q(theta)`, or `theta` where only one can be meant.
@@ -168,13 +185,18 @@ impl Recorded {
         else {
             bail!("there is no signal `{asked}`; {}", self.suggestion(&written));
         };
+        let (name, unit) = (name.clone(), unit.clone());
+        if let Some((_, of)) = ENERGIES.iter().find(|(energy, _)| *energy == name) {
+            let (time_s, values) = self.energies.iter().map(|(t, energy)| (*t, of(energy))).unzip();
+            return Ok(Curve { name, unit, time_s, values });
+        }
         let column = match name.split_once('.') {
             Some((quantity, rest)) => format!("{quantity}({rest})"),
             None => name.clone(),
         };
         let values = self.samples.signal(&column).map_err(anyhow::Error::msg)?;
         let time_s = self.samples.time_s().to_vec();
-        Ok(Curve { name: name.clone(), unit: unit.clone(), time_s, values })
+        Ok(Curve { name, unit, time_s, values })
     }
 
     /// What may have been meant.
@@ -268,7 +290,7 @@ mod tests {
             reference: None,
         };
         columns.push(&mut samples, sample);
-        Recorded { samples, names: signals(&model, &outputs) }
+        Recorded { samples, energies: Vec::new(), names: signals(&model, &outputs) }
     }
 
     #[test]

@@ -94,15 +94,15 @@ fn draw(svg: &mut String, panel: &[&Curve], times: &Axis, is_last: bool) {
     let mut left = LEFT;
     for (curve, color) in panel.iter().zip(COLORS.iter().cycle()) {
         let mut path = String::new();
-        let mut is_down = false;
+        let mut last = None;
         for k in thinned(&curve.values) {
             let (t, v) = (curve.time_s[k], curve.values[k]);
-            // The pen is lifted where there is no number.
+            // The pen is lifted where there is no number, and where time goes back.
             if v.is_finite() {
-                let pen = if is_down { 'L' } else { 'M' };
+                let pen = if last.is_some_and(|last| last <= t) { 'L' } else { 'M' };
                 let _ = write!(path, "{pen}{:.1} {:.1}", x(t), y(v));
             }
-            is_down = v.is_finite();
+            last = v.is_finite().then_some(t);
         }
         let _ = writeln!(
             svg,

@@ -18,12 +18,12 @@ pub(crate) fn panel(curve: &Curve, times: &Axis, width: usize, rows: usize) -> S
     let mut dots = Dots::new(columns, rows);
     let (right, bottom) = ((columns * DOTS.0 - 1) as f64, (rows * DOTS.1 - 1) as f64);
     let place = |t: f64, v: f64| (times.fraction(t) * right, (1.0 - values.fraction(v)) * bottom);
-    let mut pen = None;
+    let mut pen: Option<(f64, f64)> = None;
     for (&t, &v) in curve.time_s.iter().zip(&curve.values) {
-        // The pen is lifted where there is no number.
+        // The pen is lifted where there is no number, and where time goes back.
         let to = v.is_finite().then(|| place(t, v));
         if let Some(to) = to {
-            dots.line(pen.unwrap_or(to), to);
+            dots.line(pen.filter(|from| from.0 <= to.0).unwrap_or(to), to);
         }
         pen = to;
     }
