@@ -5,6 +5,7 @@ use std::cell::Cell;
 use std::sync::Arc;
 
 use plantd_models::control::Momentum;
+use plantd_models::drawing::{Drawing, Instant};
 use plantd_models::{
     Contraction, ForceSplit, Linearization, Model, Plant, Scene, SecondOrder, Settings, builtin,
 };
@@ -114,6 +115,26 @@ fn operations_of_a_plant_allocate_nothing() {
             assert_eq!(count, 0, "allocations of `{name}`, {force_split:?}");
             assert_eq!(plant.step_index(), 2 * STEPS as u64, "`{name}` has moved");
         }
+    }
+}
+
+/// A viewer gets sixty poses a second of each plant.
+#[test]
+fn poses_allocate_nothing() {
+    for scene in scenes() {
+        let model = Arc::new(Model::compile(&scene).expect("it compiles"));
+        let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("it starts");
+        let (drawing, velocity) = (Drawing::new(&model), vec![0.1; plant.q().len()]);
+        let mut poses = drawing.poses();
+        let at = Instant {
+            q: plant.q(),
+            velocity: &velocity,
+            inputs: &vec![1.0; model.dimensions().inputs],
+            multipliers: plant.multipliers(),
+            time_step_s: TIME_STEP_S,
+        };
+        let count = allocations(|| drawing.place(&at, &mut poses));
+        assert_eq!(count, 0, "allocations of `{}`", scene.name);
     }
 }
 

@@ -227,6 +227,49 @@ def test_watch(client):
     assert all(step % 2 == 0 for step in steps) and sorted(set(steps)) == steps
 
 
+def test_a_watch_at_a_pace_shows_where_things_are_and_the_poles(client):
+    plant = client.create_plant("cart-pole", at="upright").id
+    drawing = client.get_drawing(plant).drawing
+    assert [frame.name for frame in drawing.frames] == ["cart", "pole"]
+    fields = ["state", "poses", "poles"]
+    with client.drive(plant) as driver:
+        watch = client.watch(plant, fields, at_most_hz=1000)
+        next(watch)
+        driver.step(3.0)
+        message = next(watch)
+    assert message.step == 1 and message.generation == 0 and message.dropped == 0
+    assert message.poses.frames.shape == (2, 7) and message.poses.points.shape == (2, 3)
+    np.testing.assert_allclose(message.poses.frames[0, 0], message.state.q[0], rtol=1e-12)
+    np.testing.assert_allclose(message.poses.arrows[0, 3:], [3, 0, 0])
+    assert abs(message.poles.open_loop).max() > 1 and message.poles.closed_loop.size == 0
+    assert client.get_drawing(model="cart-pole").drawing == drawing
+
+
+def test_meshes_come_with_their_model(client, tmp_path):
+    robot = tmp_path / "rod_description" / "robots" / "rod.urdf"
+    meshes = tmp_path / "rod_description" / "meshes"
+    for folder in (robot.parent, meshes):
+        folder.mkdir(parents=True)
+    visuals = "".join(
+        f'<visual><geometry><mesh filename="package://{file}"/></geometry></visual>'
+        for file in ("rod_description/meshes/rod.obj", "hand/hand.stl", "none/none.stl")
+    )
+    robot.write_text(ROBOT.replace("</link></robot>", f"{visuals}</link></robot>"))
+    (meshes / "rod.obj").write_text("mtllib rod.mtl\nv 0 0 0\n")
+    (meshes / "rod.mtl").write_text("newmtl m\nmap_Kd ../rod.png\n")
+    (meshes.parent / "rod.png").write_bytes(b"picture")
+    (tmp_path / "hand.stl").write_bytes(b"mesh")
+    with pytest.warns(UserWarning) as told:
+        model = client.create_model(robot, name="py-shown", packages={"hand": tmp_path})
+    missing = [str(w.message) for w in told if "was not" in str(w.message)]
+    assert missing == ["py-shown:\nmesh `package://none/none.stl` was not found"]
+    drawing = client.get_drawing(model=model.name).drawing
+    urls = {s.mesh.file: s.mesh.url for f in drawing.frames for s in f.shapes}
+    assert urls["package://hand/hand.stl"].startswith("/models/py-shown/files/hand/hand.stl?v=")
+    assert urls["package://rod_description/meshes/rod.obj"] and not urls["package://none/none.stl"]
+    client.delete_model(model.name)
+
+
 def test_rollout(client):
     cases = [
         control_service_pb2.RolloutCase(

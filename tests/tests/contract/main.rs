@@ -26,4 +26,5 @@ mod support;
 mod transport;
 mod usage;
 mod velocity;
+mod view;
 mod watch;

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import grpc
@@ -26,9 +27,10 @@ from plantd.v1.model_service_pb2_grpc import ModelServiceStub
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 from plantd.v1.recording_service_pb2_grpc import RecordingServiceStub
 
+from . import _meshes
 from ._connect import open_channel
 from ._drive import Driver
-from ._errors import translate, translated
+from ._errors import PlantdError, translate, translated
 from ._feedback import Follower
 from ._kalman import Kalman, TrajectoryKalman
 from ._optimize import Checkpoint, Method, Optimum, ProjectedReference, Search, method_number
@@ -38,6 +40,7 @@ from ._requests import (
     bounds,
     constraints,
     initial_state,
+    is_file,
     measurement,
     mechanical_state,
     momentum,
@@ -88,7 +91,18 @@ if TYPE_CHECKING:
 #: Where a server listens unless it is told otherwise.
 DEFAULT_ADDRESS = "http://127.0.0.1:50051"
 
-Field = Literal["state", "report", "energy", "linearization", "gain", "input", "outputs"]
+Field = Literal[
+    "state",
+    "report",
+    "energy",
+    "linearization",
+    "gain",
+    "input",
+    "outputs",
+    "timing",
+    "poses",
+    "poles",
+]
 
 
 def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
@@ -149,12 +163,19 @@ class Client:
         return self._call(self.models.GetModel, request).model
 
     def create_model(
-        self, scene: str | PathLike[str], *, name: str = ""
+        self,
+        scene: str | PathLike[str],
+        *,
+        name: str = "",
+        packages: Mapping[str, str | PathLike[str]] | None = None,
     ) -> model_service_pb2.Model:
         """Uploads a scene (TOML, JSON) or a robot (URDF, MJCF): a text of several lines, or a file.
 
         All errors are in the error's ``violations``. What a robot says and a scene cannot is a
         ``UserWarning`` with lines and columns; what has no effect on the motion is not mentioned.
+        The meshes that show what is in a file are sent along where they are found: beside it, or in
+        the folders of ``packages`` by name, or in folders of these names around it. One that is not
+        found, or not taken, is a ``UserWarning``.
         """
         request = model_service_pb2.CreateModelRequest(scene=scene_text(scene), name=name)
         answer = self._call(self.models.CreateModel, request)
@@ -165,7 +186,43 @@ class Client:
         ]
         if told:
             warnings.warn("\n".join([f"{answer.model.name}:", *told]), stacklevel=2)
+        if is_file(scene):
+            missing = self._put_meshes(answer.model.name, Path(scene).parent, packages or {})
+            if missing:
+                warnings.warn("\n".join([f"{answer.model.name}:", *missing]), stacklevel=2)
         return answer.model
+
+    def _put_meshes(
+        self, model: str, folder: Path, packages: Mapping[str, str | PathLike[str]]
+    ) -> list[str]:
+        """Sends the meshes of a model that the server has not; says which could not be sent, and why."""
+        shapes = [
+            shape for frame in self.get_drawing(model=model).drawing.frames for shape in frame.shapes
+        ]
+        files = {s.mesh.file for s in shapes if s.HasField("mesh") and not s.mesh.url}
+        missing = []
+        for file, data in _meshes.find(files, folder, packages):
+            if data is None:
+                missing.append(f"mesh `{file}` was not found")
+                continue
+            try:
+                self.put_model_file(model, file, data)
+            except PlantdError as error:
+                missing.append(f"mesh `{file}` was not taken: {error}")
+        return missing
+
+    def put_model_file(self, model: str, file: str, data: bytes) -> str:
+        """Gives an uploaded model a file that its visuals name; where browsers find it, a path on the
+        server's address."""
+        request = model_service_pb2.PutModelFileRequest(model=model, file=file, data=data)
+        return self._call(self.models.PutModelFile, request).url
+
+    def get_drawing(
+        self, plant: str | None = None, *, model: str | None = None
+    ) -> model_service_pb2.GetDrawingResponse:
+        """What a viewer draws of a plant, or of a model: frames with shapes, lines, arrows."""
+        request = model_service_pb2.GetDrawingRequest(plant=plant, model=model)
+        return self._call(self.models.GetDrawing, request)
 
     def validate_scene(
         self, scene: str | PathLike[str]
@@ -319,9 +376,11 @@ class Client:
         r: npt.ArrayLike | None = None,
         projected_momentum: bool = False,
         queue: int = 1,
+        at_most_hz: float = 0.0,
     ) -> Iterator[Watched]:
         """What a plant does while somebody drives it. A slow reader loses messages: ``queue`` of them
-        may wait, the latest ones.
+        may wait, the latest ones. With ``at_most_hz`` no more than so many come a second; the latest
+        state wins.
 
         ``q`` and ``r`` are the weights for the field ``gain``. Leaving the loop ends the watch.
         """
@@ -335,6 +394,7 @@ class Client:
             coordinates=coordinates,
             weights=_trajectory_weights(q, r, None, None, projected_momentum),
             queue=queue,
+            at_most_hz=at_most_hz,
         )
         # Asked for now rather than at the first message, so that nothing in between is missed.
         return self._messages(self.plants.Watch(request), Watched._from)

@@ -40,10 +40,17 @@ class Stepping(TypedDict, total=False):
     newton_iterations: int
 
 
+def is_file(scene: str | PathLike[str]) -> bool:
+    """Whether it is not a text: one that has several lines or begins as JSON or XML."""
+    return not isinstance(scene, str) or not (
+        "\n" in scene or scene.lstrip().startswith(("{", "<"))
+    )
+
+
 def scene_text(scene: str | PathLike[str]) -> str:
-    """The text of a scene: itself if it has several lines or begins as JSON or XML, else a file's."""
-    if isinstance(scene, str) and ("\n" in scene or scene.lstrip().startswith(("{", "<"))):
-        return scene
+    """The text of a scene: itself, or a file's."""
+    if not is_file(scene):
+        return str(scene)
     path = Path(scene)
     text = path.read_text(encoding="utf-8")
     return _with_includes(text, path.parent, [path.name]) if "<mujoco" in text else text

@@ -14,6 +14,7 @@ from plantd.v1 import (
     channel_service_pb2,
     common_pb2,
     control_service_pb2,
+    drawing_pb2,
     model_service_pb2,
     plant_service_pb2,
     realtime_pb2,
@@ -902,6 +903,38 @@ class Channels:
 
 
 @dataclass(frozen=True, eq=False)
+class Poses:
+    """Where everything in a plant's drawing is, in world axes."""
+
+    #: A row for each frame: position of its origin, m; unit quaternion w, x, y, z.
+    frames: Array
+    #: A row for each point of each line, m.
+    points: Array
+    #: A row for each arrow: where it acts, m; force or torque, N or N m.
+    arrows: Array
+
+    @classmethod
+    def _from(cls, m: drawing_pb2.Poses) -> Poses:
+        rows = (array(m.frames), 7), (array(m.points), 3), (array(m.arrows), 6)
+        return cls(*(numbers.reshape(-1, width) for numbers, width in rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Poles:
+    """Poles of the map at a state: motions decay whose pole lies inside the unit circle."""
+
+    #: Of A, on the constraints.
+    open_loop: npt.NDArray[np.complex128]
+    #: Of A - B K, with the gain of the plant's feedback; empty without one.
+    closed_loop: npt.NDArray[np.complex128]
+
+    @classmethod
+    def _from(cls, m: plant_service_pb2.Poles) -> Poles:
+        both = m.open_loop, m.closed_loop
+        return cls(*(np.array([complex(z.real, z.imaginary) for z in of], complex) for of in both))
+
+
+@dataclass(frozen=True, eq=False)
 class Watched:
     """One message of a watch; what was not asked for is None."""
 
@@ -921,6 +954,12 @@ class Watched:
     outputs: Outputs | None = None
     #: Times of the step, of a plant that runs by itself.
     timing: StepTiming | None = None
+    #: Where everything in the plant's drawing is.
+    poses: Poses | None = None
+    #: Poles of the map at the state.
+    poles: Poles | None = None
+    #: Counts the changes of the plant's parameters: with a new number its drawing may be another.
+    generation: int = 0
 
     @classmethod
     def _from(cls, m: plant_service_pb2.WatchResponse) -> Watched:
@@ -939,6 +978,9 @@ class Watched:
             array(m.u) if m.u else None,
             part("outputs", Outputs),
             part("timing", StepTiming),
+            part("poses", Poses),
+            part("poles", Poles),
+            m.generation,
         )
 
 

@@ -8,10 +8,14 @@ use v1::get_drawing_request::Of;
 
 use crate::core::catalog::Entry;
 use crate::core::files::Files;
+use crate::core::limits::LimitExceeded;
 use crate::core::session::shared::Session;
 use crate::wire::message::drawing;
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
+
+/// Numbers of a shape.
+const SHAPE_NUMBERS: usize = 14;
 
 /// Answers a GetDrawing call.
 pub(crate) fn get(
@@ -19,10 +23,11 @@ pub(crate) fn get(
     request: v1::GetDrawingRequest,
 ) -> Result<v1::GetDrawingResponse, RpcError> {
     match request.of {
-        Some(Of::Plant(id)) => Ok(of_plant(hub, &*hub.session(&id)?)),
+        Some(Of::Plant(id)) => of_plant(hub, &*hub.session(&id)?),
         Some(Of::Model(name)) => {
             let Entry { model, files, .. } = hub.catalog.get(&name)?;
             let shown = Drawing::new(&model);
+            check_size(hub, &shown)?;
             Ok(v1::GetDrawingResponse {
                 drawing: Some(drawing::drawing(&shown, |file| url(&name, &files, file))),
                 generation: 0,
@@ -33,14 +38,23 @@ pub(crate) fn get(
     }
 }
 
-fn of_plant(hub: &Hub, session: &Session) -> v1::GetDrawingResponse {
+fn of_plant(hub: &Hub, session: &Session) -> Result<v1::GetDrawingResponse, RpcError> {
     let mechanics = session.mechanics();
     let shown = Drawing::new(&mechanics.model);
-    v1::GetDrawingResponse {
+    check_size(hub, &shown)?;
+    Ok(v1::GetDrawingResponse {
         drawing: Some(message_of_plant(hub, session, &shown)),
         generation: mechanics.generation,
         poses: None,
-    }
+    })
+}
+
+/// Refuses a drawing that no client would take.
+fn check_size(hub: &Hub, shown: &Drawing) -> Result<(), RpcError> {
+    let shapes: usize = shown.frames().map(|frame| frame.shapes.len()).sum();
+    let (name, limit) = ("reply_numbers", hub.limits.reply_numbers);
+    let numbers = shown.numbers() + SHAPE_NUMBERS * shapes;
+    Ok(LimitExceeded::check(name, limit, "numbers in a drawing and its poses", numbers)?)
 }
 
 /// The drawing of a plant as a message, with the files of its model.

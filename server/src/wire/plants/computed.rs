@@ -11,6 +11,7 @@ use plantd_proto::v1;
 use v1::WatchField;
 
 use crate::core::feedback::regulator::{self, Constraints};
+use crate::core::limits::LimitExceeded;
 use crate::core::publish::frame::Frame;
 use crate::core::session::shared::Session;
 use crate::wire::control::analysis;
@@ -84,13 +85,15 @@ pub(super) struct Computer {
     linearization: Linearization,
     /// Made when first asked for.
     shown: Option<(Drawing, Poses)>,
+    /// Numbers of a message at most.
+    numbers_max: u64,
 }
 
 impl Computer {
-    pub(super) fn new(session: Arc<Session>) -> Self {
+    pub(super) fn new(session: Arc<Session>, numbers_max: u64) -> Self {
         let (plant, generation) = session.copy_plant_and_generation();
         let linearization = Linearization::new(session.model());
-        Self { session, plant, generation, linearization, shown: None }
+        Self { session, plant, generation, linearization, shown: None, numbers_max }
     }
 
     /// Number of changes that led to the plant's parameters.
@@ -106,16 +109,18 @@ impl Computer {
         wanted: Wanted,
         weights: Option<&(Weights, Momentum)>,
     ) {
-        if wanted.poses {
-            response.poses = Some(self.poses(frame));
-        }
-        if let Err(fault) = self.try_fill(response, frame, wanted, weights) {
+        let poses = if wanted.poses { self.poses(frame).map(Some) } else { Ok(None) };
+        let filled = poses.and_then(|poses| {
+            response.poses = poses;
+            self.try_fill(response, frame, wanted, weights)
+        });
+        if let Err(fault) = filled {
             response.failure = Some(fault.into());
         }
     }
 
     /// Where everything is, with the forces of the step that led there.
-    fn poses(&mut self, frame: &Frame) -> v1::Poses {
+    fn poses(&mut self, frame: &Frame) -> Result<v1::Poses, RpcError> {
         // Signals add to what the driver sends, at the time at which that step began.
         self.plant.set_step_index(frame.state.step);
         self.plant.set_time_s(frame.time_s - frame.time_step_s);
@@ -125,6 +130,8 @@ impl Computer {
             let poses = shown.poses();
             (shown, poses)
         });
+        let (name, limit) = ("reply_numbers", self.numbers_max);
+        LimitExceeded::check(name, limit, "numbers in the poses", shown.numbers())?;
         let at = Instant {
             q: &frame.state.q,
             velocity: &frame.velocity,
@@ -133,7 +140,7 @@ impl Computer {
             time_step_s: frame.time_step_s,
         };
         shown.place(&at, poses);
-        drawing::poses(poses)
+        Ok(drawing::poses(poses))
     }
 
     fn try_fill(

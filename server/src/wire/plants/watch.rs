@@ -161,10 +161,11 @@ impl Messages for Watcher {
         }
         let (frame, wanted) = (frame.clone(), self.wanted);
         let (computer, weights) = (self.computer.take(), self.weights.clone());
+        let numbers_max = self.hub.limits.reply_numbers;
         let job = move |_: &_| {
             let mut computer = match computer {
                 Some(computer) if computer.generation() == frame.generation => computer,
-                _ => Box::new(Computer::new(session)),
+                _ => Box::new(Computer::new(session, numbers_max)),
             };
             computer.fill(&mut response, &frame, wanted, weights.as_deref());
             Ok((computer, response))

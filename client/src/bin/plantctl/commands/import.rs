@@ -99,7 +99,8 @@ impl Import {
     }
 }
 
-fn package(text: &str) -> Result<(String, String), &'static str> {
+/// A name and a folder.
+pub(crate) fn package(text: &str) -> Result<(String, String), &'static str> {
     let (name, folder) = text.split_once('=').ok_or("a name and a folder with `=` are needed")?;
     Ok((name.to_owned(), folder.to_owned()))
 }

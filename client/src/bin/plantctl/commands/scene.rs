@@ -10,11 +10,15 @@ use serde_json::json;
 
 use crate::commands::import;
 use crate::input::files::{read_scene, read_text};
+use crate::input::meshes::Meshes;
 use crate::output::failure::FAILED;
 use crate::output::model;
 use crate::server::context::Context;
 
-/// Uploads a scene (TOML, JSON) or a robot (URDF) as a model.
+/// Uploads a scene (TOML, JSON) or a robot (URDF, MJCF) as a model, with the meshes that show it.
+///
+/// Meshes are looked for where the file stands; those of packages in the folder that `--package` names, or in one
+/// of that name around the file.
 #[derive(Debug, Args)]
 pub(crate) struct Upload {
     /// File; `-` reads standard input.
@@ -22,6 +26,9 @@ pub(crate) struct Upload {
     /// Name; the scene's own if not given.
     #[arg(long)]
     name: Option<String>,
+    /// Folder of a package, for meshes whose paths begin with `package://NAME`.
+    #[arg(long, value_name = "NAME=FOLDER", value_parser = import::package)]
+    package: Vec<(String, String)>,
 }
 
 /// Checks a scene (TOML, JSON) or a robot (URDF) and prints all its errors.
@@ -49,6 +56,8 @@ impl Upload {
         let answer = client.import_model(request).await?;
         import::tell(answer.import_report.as_ref());
         let model = answer.model.context("an answer without a model")?;
+        let folder = self.scene.parent().unwrap_or(Path::new(""));
+        Meshes::new(folder, self.package).send(&client, &model.name).await?;
         context.output.message("Model", &model, || model::known(&model))
     }
 }

@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 use clap::{Args, ValueEnum};
-use plantd_client::v1;
+use plantd_client::{Client, v1};
 
 use crate::input::weights::RegulatorWeights;
 use crate::output::text::numbers;
@@ -26,6 +26,9 @@ pub(crate) struct Watch {
     /// End after this many messages.
     #[arg(long, short = 'n', value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
+    /// At most this many messages a second; the latest state wins.
+    #[arg(long, value_name = "HZ", default_value_t = 0.0, hide_default_value = true)]
+    at_most_hz: f64,
     /// Messages that may wait to be printed; of more, the oldest are lost.
     #[arg(long, value_name = "N", default_value_t = 1)]
     queue: u32,
@@ -43,6 +46,8 @@ enum Field {
     Gain,
     Input,
     Outputs,
+    Poses,
+    Poles,
 }
 
 impl From<Field> for v1::WatchField {
@@ -55,6 +60,8 @@ impl From<Field> for v1::WatchField {
             Field::Gain => Self::Gain,
             Field::Input => Self::Input,
             Field::Outputs => Self::Outputs,
+            Field::Poses => Self::Poses,
+            Field::Poles => Self::Poles,
         }
     }
 }
@@ -62,7 +69,11 @@ impl From<Field> for v1::WatchField {
 impl Watch {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let Self { id, fields, every, coordinates, count, queue, weights } = self;
+        let Self { id, fields, every, coordinates, count, at_most_hz, queue, weights } = self;
+        let frames = match fields.contains(&Field::Poses) {
+            true => drawn(&client, &id).await?,
+            false => Vec::new(),
+        };
         let named = fields.iter().any(|f| matches!(f, Field::Linearization | Field::Gain));
         let model = if named { model_of(&client, &id).await? } else { v1::Model::default() };
         let has_gain = fields.contains(&Field::Gain);
@@ -73,17 +84,43 @@ impl Watch {
             every,
             coordinates,
             queue,
-            ..Default::default()
+            at_most_hz,
         };
         for_each(client.watch(request).await?, count, |message| {
-            context.output.message("WatchResponse", &message, || watched(&message, &model))
+            context.output.message("WatchResponse", &message, || watched(&message, &model, &frames))
         })
         .await
     }
 }
 
+/// Names of the frames whose poses a watch prints.
+async fn drawn(client: &Client, id: &str) -> Result<Vec<String>> {
+    let of = Some(v1::get_drawing_request::Of::Plant(id.to_owned()));
+    let drawing = client.get_drawing(v1::GetDrawingRequest { of }).await?.drawing;
+    Ok(drawing.unwrap_or_default().frames.into_iter().map(|frame| frame.name).collect())
+}
+
+/// Where frames are, and their orientations.
+fn poses(poses: &v1::Poses, frames: &[String]) -> String {
+    let each = frames.iter().zip(poses.frames.chunks_exact(7));
+    each.map(|(name, pose)| {
+        format!("  {name}: at {}  turned {}\n", numbers(&pose[..3]), numbers(&pose[3..]))
+    })
+    .collect()
+}
+
+fn poles(poles: &v1::Poles) -> String {
+    let line = |what: &str, poles: &[v1::Complex]| {
+        let pole = |z: &v1::Complex| format!("{:.6}{:+.6}i", z.real, z.imaginary);
+        let poles: Vec<String> = poles.iter().map(pole).collect();
+        (!poles.is_empty()).then(|| format!("  {what}: {}\n", poles.join("  ")))
+    };
+    let lines = [line("poles", &poles.open_loop), line("closed loop", &poles.closed_loop)];
+    lines.into_iter().flatten().collect()
+}
+
 /// A message of a watch as text.
-fn watched(message: &v1::WatchResponse, model: &v1::Model) -> String {
+fn watched(message: &v1::WatchResponse, model: &v1::Model, frames: &[String]) -> String {
     let head = match &message.state {
         Some(state) => plant::state(state),
         None => format!("step {}\n", message.step),
@@ -99,6 +136,8 @@ fn watched(message: &v1::WatchResponse, model: &v1::Model) -> String {
         message.energy.as_ref().map(plant::energy),
         message.linearization.as_ref().map(|l| derivatives::linearization(l, model)),
         message.gain.as_ref().map(|g| derivatives::gain(g, model)),
+        message.poses.as_ref().map(|p| poses(p, frames)),
+        message.poles.as_ref().map(poles),
         failure,
         lost,
     ];
