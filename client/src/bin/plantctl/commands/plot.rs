@@ -11,6 +11,7 @@ use serde_json::json;
 
 use crate::contract::names;
 use crate::figure::axis::Axis;
+use crate::figure::browser;
 use crate::figure::chart::{self, Curve};
 use crate::figure::terminal;
 use crate::output::text::table;
@@ -36,7 +37,7 @@ pub(crate) struct Plot {
     file: PathBuf,
     /// Signals.
     signals: Vec<String>,
-    /// Picture instead of characters: FILE.svg, those of one unit in one panel.
+    /// Picture instead of characters, those of one unit in one panel: FILE.svg, or FILE.png by a browser.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Begin at this time of the plant, s.
@@ -71,11 +72,12 @@ impl Plot {
             bail!("there is no step in the range of time that was asked for");
         }
         let Some(path) = self.out else { return show(&curves, context) };
-        let (_, svg) = chart::svg(&curves);
+        let (size, svg) = chart::svg(&curves);
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("svg") => std::fs::write(&path, svg)
                 .with_context(|| format!("cannot write {}", path.display()))?,
-            _ => bail!("{}: plots are written as .svg", path.display()),
+            Some("png") => browser::png_of_svg(&svg, size, &path)?,
+            _ => bail!("{}: plots are written as .svg or .png", path.display()),
         }
         context.output.done(json!({ "file": path, "signals": self.signals }))
     }
