@@ -3,3 +3,4 @@
 pub(crate) mod context;
 pub(crate) mod names;
 pub(crate) mod own;
+pub(crate) mod page;
