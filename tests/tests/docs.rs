@@ -10,6 +10,8 @@ const DOCUMENTS: &[&str] = &[
     "CONTRIBUTING.md",
     "client/python/README.md",
     "client/TESTING.md",
+    "client/FMI.md",
+    "client/c/README.md",
     "models/ACCURACY.md",
     "models/scenes/ELEMENTS.md",
     "server/REALTIME.md",

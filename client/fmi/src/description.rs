@@ -31,7 +31,7 @@ pub(crate) fn description(blueprint: &Blueprint) -> String {
     ));
     line(format!(
         "  <CoSimulation modelIdentifier=\"{}\" canHandleVariableCommunicationStepSize=\"false\" \
-         fixedInternalStepSize=\"{h}\" canGetAndSetFMUState=\"true\" canSerializeFMUState=\"true\" \
+         fixedInternalStepSize=\"{h:?}\" canGetAndSetFMUState=\"true\" canSerializeFMUState=\"true\" \
          providesDirectionalDerivatives=\"true\" providesAdjointDerivatives=\"true\"/>",
         blueprint.identifier(),
     ));
@@ -49,7 +49,7 @@ pub(crate) fn description(blueprint: &Blueprint) -> String {
     }
     line("  </LogCategories>".to_owned());
     line(format!(
-        "  <DefaultExperiment startTime=\"0\" stopTime=\"{}\" stepSize=\"{h}\"/>",
+        "  <DefaultExperiment startTime=\"0\" stopTime=\"{:?}\" stepSize=\"{h:?}\"/>",
         stop_s(h)
     ));
     line("  <ModelVariables>".to_owned());
@@ -105,10 +105,10 @@ fn element(blueprint: &Blueprint, reference: usize, variable: &Variable) -> Stri
     );
     text += &attribute("unit", variable.unit.unwrap_or_default());
     if let Some([least, most]) = variable.limits {
-        let _ = write!(text, " min=\"{least}\" max=\"{most}\"");
+        let _ = write!(text, " min=\"{least:?}\" max=\"{most:?}\"");
     }
     if let Some(start) = start {
-        let _ = write!(text, " start=\"{start}\"");
+        let _ = write!(text, " start=\"{start:?}\"");
     }
     text + &attribute("description", &variable.description) + "/>"
 }

@@ -40,6 +40,7 @@ pub(crate) struct Variable {
     pub(crate) kind: Kind,
     /// Name of a unit in [`UNITS`].
     pub(crate) unit: Option<&'static str>,
+    /// Least and greatest value, of inputs: coordinates may leave their limits.
     pub(crate) limits: Option<[f64; 2]>,
     pub(crate) description: String,
 }
@@ -139,8 +140,7 @@ fn push_outputs(model: &Model, list: &mut Vec<Variable>) {
     for (i, c) in model.coordinates().iter().enumerate() {
         let unit = Some(if c.is_angle { "rad" } else { "m" });
         let text = format!("Coordinate {}", c.name);
-        let variable = variable(&format!("q({})", c.name), Kind::Position(i), unit, &text);
-        list.push(Variable { limits: c.limits, ..variable });
+        list.push(variable(&format!("q({})", c.name), Kind::Position(i), unit, &text));
     }
     for (i, c) in model.coordinates().iter().enumerate() {
         let unit = Some(if c.is_angle { "rad/s" } else { "m/s" });
