@@ -16,6 +16,8 @@ const DOCUMENTS: &[&str] = &[
     "docs/view.md",
     "client/python/README.md",
     "client/TESTING.md",
+    "client/FMI.md",
+    "client/c/README.md",
     "models/ACCURACY.md",
     "models/scenes/ELEMENTS.md",
     "server/REALTIME.md",

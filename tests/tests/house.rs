@@ -99,7 +99,8 @@ fn floors() -> Vec<(String, Vec<String>)> {
             "models/import/src",
             "server/src",
             "client/src",
-            "client/src/bin/plantctl"
+            "client/src/bin/plantctl",
+            "client/fmi/src"
         ]
     );
     floors

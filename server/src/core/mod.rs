@@ -15,7 +15,6 @@ pub mod metrics;
 pub mod modes;
 pub(crate) mod mutex;
 pub mod origin;
-pub mod parameters;
 pub mod plant;
 pub mod priority;
 pub mod publish;

@@ -1,12 +1,12 @@
 //! Errors of the core as errors that go to a client: codes, reasons and fields stand here, and nowhere in
 //! the core.
 
+use plantd_models::parameters::ChangeError;
 use tonic::Code;
 
 use crate::core::catalog::CatalogError;
 use crate::core::channels::timeline::TimelineError;
 use crate::core::feedback::regulator::RegulatorError;
-use crate::core::parameters::ChangeError;
 use crate::core::realtime::runner::StoppedBy;
 use crate::core::session::run::RunError;
 use crate::core::session::shared::Session;

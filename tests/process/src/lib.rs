@@ -179,7 +179,8 @@ impl Drop for ServerProcess {
     }
 }
 
-/// A binary of the workspace (`plantd`, `plantctl`), built in the profile of the running program.
+/// A binary of the workspace (`plantd`, `plantctl`) or a library for other languages (`libplantd.so`,
+/// `libplantd.a`, `libplantd_fmi.so`), built in the profile of the running program.
 /// The environment variable `PLANTD_BINARY_DIR` names a directory with ready ones instead.
 pub fn binary(name: &str) -> Result<PathBuf> {
     if let Some(directory) = std::env::var_os("PLANTD_BINARY_DIR") {
@@ -212,17 +213,9 @@ fn build() -> Result<PathBuf> {
     // running program and builds none of them a second time.
     let output = Command::new(cargo)
         .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .args(["build", "--quiet", "--bins"])
-        .args([
-            "-p",
-            "plantd-server",
-            "-p",
-            "plantd-client",
-            "-p",
-            "plantd-tests",
-            "-p",
-            "plantd-demo",
-        ])
+        .args(["build", "--quiet", "--bins", "--lib"])
+        .args(["-p", "plantd-server", "-p", "plantd-client", "-p", "plantd-tests"])
+        .args(["-p", "plantd-demo", "-p", "plantd-fmi", "-p", "plantd-link-c"])
         .args(["--profile", profile, "--target-dir"])
         .arg(target)
         .output()

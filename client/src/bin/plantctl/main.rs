@@ -17,9 +17,9 @@ use clap::{CommandFactory as _, Parser, Subcommand};
 use clap_complete::CompleteEnv;
 
 use crate::commands::{
-    analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard, import,
-    inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record, reference,
-    replay, run, scene, settle, shell, state, step, test, timing, top, view, watch,
+    analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, fmu, guard,
+    import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record,
+    reference, replay, run, scene, settle, shell, state, step, test, timing, top, view, watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
@@ -46,6 +46,7 @@ Examples:
   plantctl settle four-bar --guess crank=0.3 --toml  an operating point to paste into the scene
   plantctl validate arm.toml                        all errors of a scene, with their paths
   plantctl import arm.urdf > arm.toml               a robot as a scene, and what became of the file
+  plantctl fmu arm.toml -o arm.fmu                  the plant for Simulink, Dymola, FMPy (FMI 3.0)
   plantctl record start p1 --name trial             then `record stop trial`, `record get trial`
   plantctl replay trial.mcap                        the same steps again, compared bit for bit
   plantctl export trial.mcap --csv trial.csv
@@ -87,6 +88,7 @@ enum Command {
     Show(inventory::Show),
     Upload(scene::Upload),
     Import(import::Import),
+    Fmu(fmu::Fmu),
     Create(create::Create),
     Step(step::Step),
     Watch(watch::Watch),
@@ -161,6 +163,7 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Show(command) => command.run(context).await?,
         Command::Upload(command) => command.run(context).await?,
         Command::Import(command) => command.run(context)?,
+        Command::Fmu(command) => command.run(context).await?,
         Command::Create(command) => command.run(context).await?,
         Command::Step(command) => command.run(context).await?,
         Command::Watch(command) => command.run(context).await?,

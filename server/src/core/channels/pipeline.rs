@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use plantd_models::parameters::Parameters;
 use plantd_models::{Model, Plant, Site};
 
 use crate::core::channels::actuator::Actuator;
@@ -9,7 +10,6 @@ use crate::core::channels::fault::{Effect, FaultMemory, Injected};
 use crate::core::channels::sensor::{Instant, Sensor, Source};
 use crate::core::channels::timeline::{Set, Timeline};
 use crate::core::origin::Origin;
-use crate::core::parameters::Parameters;
 
 /// What is under way in the channels and faults of a plant.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -6,11 +6,11 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use plantd_models::parameters::{self, ChangeError, Parameters};
 use plantd_models::{InitialError, Model, Plant, Settings, Site, Spare};
 
 use crate::core::channels::fault::{Pattern, Schedule};
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::core::parameters::{self, ChangeError, Parameters};
 
 /// Why changes of parameters cannot be made ready.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use plantd_models::parameters::Parameters;
 use plantd_models::{
     Initial, InitialError, Linearization, Plant, Settings, Spare, State, StepError, StepReport,
 };
@@ -9,7 +10,6 @@ use plantd_models::{
 use crate::core::channels::pipeline::{ChannelMemory, Channels};
 use crate::core::channels::timeline::{Base, Timeline};
 use crate::core::feedback::active::Feedback;
-use crate::core::parameters::Parameters;
 use crate::core::plant::error::DriveError;
 use crate::core::plant::event::{EventKind, Events};
 use crate::core::plant::last_step::LastStep;

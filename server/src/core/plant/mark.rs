@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
+use plantd_models::parameters::Parameters;
 use plantd_models::{Model, Snapshot};
 
 use crate::core::channels::timeline::Announced;
-use crate::core::parameters::Parameters;
 
 /// Why there is a mark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
+use plantd_models::parameters::Parameters;
 use plantd_models::{Model, Settings, Snapshot};
 
 use crate::core::channels::pipeline::ChannelMemory;
 use crate::core::feedback::active::FeedbackInfo;
-use crate::core::parameters::Parameters;
 use crate::core::plant::watchdog::{Safety, Trip};
 use crate::core::publish::frame::Frame;
 

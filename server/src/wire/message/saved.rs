@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use plantd_models::parameters::Parameters;
 use plantd_models::{Model, Plant, Snapshot, SnapshotError};
 use plantd_proto::v1;
 use prost::Message as _;
@@ -11,7 +12,6 @@ use crate::core::channels::fault::{FaultMemory, Injected};
 use crate::core::channels::pipeline::ChannelMemory;
 use crate::core::feedback::active::{GuardBound, InForce, Trip};
 use crate::core::feedback::regulator::Spec;
-use crate::core::parameters::Parameters;
 use crate::core::plant::view::PlantSnapshot;
 use crate::core::session::shared::Session;
 use crate::wire::message::declare::origin;

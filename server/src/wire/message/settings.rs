@@ -1,12 +1,12 @@
 //! A plant's scene, settings and changed numbers.
 
 use plantd_import::{ImportError, Options, Report};
+use plantd_models::parameters::Parameters;
 use plantd_models::{ForceSplit, Model, Precision, Problem, Scene, SceneError, Settings};
 use plantd_proto::v1;
 
 use crate::core::feedback::regulator::Constraints;
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::core::parameters::Parameters;
 use crate::core::session::creation::Accuracy;
 use crate::wire::status::RpcError;
 

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
+use plantd_models::parameters::{self, ChangeError};
 use plantd_models::{InitialError, Settings, Spare};
 
 use crate::core::limits::{LimitExceeded, Limits};
-use crate::core::parameters::{self, ChangeError};
 use crate::core::plant::mark::MarkReason;
 use crate::core::session::shared::Session;
 use crate::wire::status::RpcError;

@@ -1,9 +1,9 @@
 //! What stands in a recording, from what the plant has left.
 
+use plantd_models::parameters::Parameters;
 use plantd_models::{Plant, State};
 use plantd_proto::v1;
 
-use crate::core::parameters::Parameters;
 use crate::core::plant::mark::Mark;
 use crate::core::publish::frame::Frame;
 use crate::core::session::shared::Session;

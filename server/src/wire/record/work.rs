@@ -9,11 +9,11 @@ use std::time::{Duration, Instant, SystemTime};
 
 use mcap::McapError;
 use plantd_models::Plant;
+use plantd_models::parameters::Parameters;
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1::{self, MarkReason, RecordingStatus};
 
 use crate::core::channels::timeline::Announced;
-use crate::core::parameters::Parameters;
 use crate::core::plant::event::EventReader;
 use crate::core::plant::mark::{Mark, MarkReason as Marked};
 use crate::core::plant::tap::Tap;

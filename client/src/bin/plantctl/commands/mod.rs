@@ -10,6 +10,7 @@ pub(crate) mod events;
 pub(crate) mod export;
 pub(crate) mod fault;
 pub(crate) mod feedback;
+pub(crate) mod fmu;
 pub(crate) mod guard;
 pub(crate) mod import;
 pub(crate) mod inventory;

@@ -1,10 +1,22 @@
 //! Numbers of a scene, by the paths in which its errors are reported: `gravity[1]`,
 //! `frames[pole].body.mass`, `springs[0].stiffness`. Entries of lists go by number or by name.
+//!
+//! ```
+//! use plantd_models::parameters::{Parameters, change};
+//! use plantd_models::{Model, builtin};
+//!
+//! let model = Model::compile(&builtin::scene("cart-pole").unwrap())?;
+//! let heavier = change(&model, &Parameters::new(), &[("frames[cart].body.mass".to_owned(), 12.0)])?;
+//! assert_eq!(heavier.former["frames[cart].body.mass"], 10.0);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 use std::collections::BTreeMap;
 
-use plantd_models::{Model, Scene, SceneError};
 use serde_json::Value;
+
+use crate::model::mechanism::Model;
+use crate::scene::{Scene, SceneError};
 
 /// Numbers that differ from those of the model that a plant was made from, by path. A path has one
 /// notation here: names where entries have them.
@@ -64,6 +76,35 @@ pub fn change(
     let changed = Model::compile(&scene).map_err(ChangeError::Scene)?;
     check_structure(model, &changed).map_err(ChangeError::Structure)?;
     Ok(Changed { model: changed, parameters, former })
+}
+
+/// The numbers of a scene that [`change`] can change, by path, in the order of the text. What the text
+/// leaves out is not among them.
+pub fn numbers(scene: &Scene) -> Vec<(String, f64)> {
+    let mut found = Vec::new();
+    if let Ok(scene) = serde_json::to_value(scene) {
+        collect(&scene, String::new(), &mut found);
+    }
+    found.retain(|(path, _)| !matches!(path.as_str(), "format" | "time_step_s"));
+    found
+}
+
+fn collect(place: &Value, path: String, found: &mut Vec<(String, f64)>) {
+    match place {
+        Value::Number(number) => found.extend(number.as_f64().map(|value| (path, value))),
+        Value::Array(list) => {
+            for (index, item) in list.iter().enumerate() {
+                collect(item, path.clone() + &label(item, index), found);
+            }
+        }
+        Value::Object(table) => {
+            for (key, item) in table {
+                let dot = if path.is_empty() { "" } else { "." };
+                collect(item, format!("{path}{dot}{key}"), found);
+            }
+        }
+        Value::Null | Value::Bool(_) | Value::String(_) => {}
+    }
 }
 
 /// A change of numbers leaves everything that has a name as it was.
@@ -163,10 +204,7 @@ fn set(scene: &mut Value, path: &str, value: f64) -> Result<(String, f64), Strin
                 let item = index
                     .and_then(|index: usize| list.get_mut(index))
                     .ok_or_else(|| format!("there is no `{canonical}[{entry}]`"))?;
-                match name(item).filter(|name| name.parse::<usize>().is_err()) {
-                    Some(name) => canonical.push_str(&format!("[{name}]")),
-                    None => canonical.push_str(&format!("[{}]", index.unwrap_or_default())),
-                }
+                canonical.push_str(&label(item, index.unwrap_or_default()));
                 place = item;
             }
         }
@@ -176,15 +214,22 @@ fn set(scene: &mut Value, path: &str, value: f64) -> Result<(String, f64), Strin
     Ok((canonical, former))
 }
 
+/// An entry of a list in the one notation: by its name, unless that looks like a number.
+fn label(item: &Value, index: usize) -> String {
+    match name(item).filter(|name| name.parse::<usize>().is_err()) {
+        Some(name) => format!("[{name}]"),
+        None => format!("[{index}]"),
+    }
+}
+
 fn name(item: &Value) -> Option<&str> {
     item.get("name")?.as_str()
 }
 
 #[cfg(test)]
 mod tests {
-    use plantd_models::builtin;
-
     use super::*;
+    use crate::builtin;
 
     fn model(name: &str) -> Model {
         Model::compile(&builtin::scene(name).unwrap()).unwrap()
@@ -245,6 +290,25 @@ mod tests {
         let third = change(&second.model, &second.parameters, &back).unwrap();
         assert_eq!(third.model.scene(), model.scene());
         assert_eq!(third.model.digest(), model.digest());
+    }
+
+    #[test]
+    fn every_number_that_is_listed_can_be_changed_under_its_path() {
+        for name in ["cart-pole", "four-bar", "marionette"] {
+            let model = model(name);
+            let numbers = numbers(model.scene());
+            let paths: std::collections::BTreeSet<_> =
+                numbers.iter().map(|(path, _)| path).collect();
+            assert!(numbers.len() > 5 && paths.len() == numbers.len(), "{name}");
+            for (path, value) in &numbers {
+                let same = one(&model, path, *value).unwrap();
+                assert_eq!(same.former, Parameters::from([(path.clone(), *value)]));
+                assert_eq!(same.model.scene(), model.scene());
+            }
+        }
+        let cart_pole = numbers(model("cart-pole").scene());
+        assert!(cart_pole.contains(&("frames[pole].body.mass".to_owned(), 1.0)), "{cart_pole:?}");
+        assert!(cart_pole.contains(&("gravity[1]".to_owned(), -9.8)), "{cart_pole:?}");
     }
 
     #[test]

@@ -1,0 +1,89 @@
+//! Examples of gRPC clients in other languages, beside Python's, against a real server: the same bits as the
+//! plant in process. Those whose tools are not there are skipped.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use plantd_models::Plant;
+use plantd_tests::links::new_plant;
+use plantd_tests::server::ServerProcess;
+
+const STEPS: usize = 100;
+
+fn has(program: &str, arguments: &[&str]) -> bool {
+    let mut command = Command::new(program);
+    command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command.status().is_ok_and(|status| status.success())
+}
+
+#[track_caller]
+fn run(command: &mut Command) -> String {
+    let output = command.stdin(Stdio::null()).output().unwrap();
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{command:?}: {errors}\n{text}");
+    text
+}
+
+fn folder(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(name)
+}
+
+/// Runs an example, which takes the server's address and a number of steps.
+fn assert_same_motion(program: &mut Command) {
+    let server = ServerProcess::start().unwrap();
+    let address = server.address().trim_start_matches("http://");
+    let text = run(program.arg(address).arg(STEPS.to_string()));
+    let mut plant = new_plant("pendulum").unwrap();
+    let step = |plant: &mut Plant| {
+        let torque = -3.0 * plant.q()[0] - plant.p()[0];
+        plant.step(&[torque]).unwrap();
+        [plant.q()[0], plant.p()[0], plant.velocity()[0]].map(f64::to_bits).to_vec()
+    };
+    let expected: Vec<_> = (0..STEPS).map(|_| step(&mut plant)).collect();
+    let numbers = |line: &str| -> Vec<u64> {
+        line.split_whitespace().map(|word| word.parse::<f64>().unwrap().to_bits()).collect()
+    };
+    assert_eq!(text.lines().map(numbers).collect::<Vec<_>>(), expected);
+}
+
+#[test]
+fn node() {
+    if !has("node", &["--version"]) || !has("npm", &["--version"]) {
+        println!("skipped: there is no node");
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    for name in ["package.json", "pendulum.js"] {
+        std::fs::copy(folder("client/node").join(name), directory.path().join(name)).unwrap();
+    }
+    let mut install = Command::new("npm");
+    install.args(["install", "--silent", "--no-audit", "--no-fund", "--no-package-lock"]);
+    if !install.current_dir(directory.path()).status().is_ok_and(|status| status.success()) {
+        println!("skipped: npm cannot install what the example needs");
+        return;
+    }
+    let mut node = Command::new("node");
+    node.arg(directory.path().join("pendulum.js")).env("PLANTD_PROTO", folder("proto"));
+    assert_same_motion(&mut node);
+}
+
+#[test]
+fn cpp() {
+    let tools = [
+        ("cmake", &["--version"][..]),
+        ("protoc", &["--version"]),
+        ("grpc_cpp_plugin", &["--help"]),
+        ("pkg-config", &["--exists", "grpc++", "protobuf"]),
+    ];
+    if let Some((missing, _)) = tools.iter().find(|(tool, probe)| !has(tool, probe)) {
+        println!("skipped: there is no {missing}, or none of gRPC");
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let mut configure = Command::new("cmake");
+    configure.arg("-S").arg(folder("client/c/grpc")).arg("-B").arg(directory.path());
+    run(&mut configure);
+    run(Command::new("cmake").arg("--build").arg(directory.path()));
+    assert_same_motion(&mut Command::new(directory.path().join("pendulum")));
+}
