@@ -5,23 +5,18 @@ from __future__ import annotations
 import queue
 from typing import Any
 
-from plantd.v1 import common_pb2
+from plantd.v1 import common_pb2, plant_service_pb2
 from plantd.v1 import plant_service_pb2 as pb
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
+from ._arrays import Array, Vector, array, vector
+from ._calls import Calls
+from ._channels import Outputs
 from ._errors import PlantdError, from_failure, translate
-from ._types import (
-    Array,
-    Linearization,
-    Outputs,
-    Plant,
-    State,
-    StepReport,
-    StepTiming,
-    Vector,
-    array,
-    vector,
-)
+from ._linearize import Linearization
+from ._plants import Plant
+from ._realtime import StepTiming
+from ._states import State, StepReport
 
 
 class Driver:
@@ -128,3 +123,20 @@ class Driver:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+class DriveCalls(Calls):
+    """The call that takes the lease of a plant."""
+
+    def drive(
+        self, id: str, *, linearization: bool = False, grace: float = 0.0, resume: str = ""
+    ) -> Driver:
+        """Takes the lease of a plant, to step it or to give it inputs.
+
+        The lease is kept for ``grace`` seconds when the connection breaks; ``resume`` goes on with
+        it (`Driver.lease_token`).
+        """
+        open = plant_service_pb2.DriveOpen(
+            id=id, linearization=linearization, grace_s=grace, resume=resume
+        )
+        return Driver(self.plants, open)

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from plantd.v1 import control_service_pb2
 
-from ._errors import PlantdError
+from ._arrays import Array, Vector, array, complexes, matrix, vector, weight
+from ._calls import Calls
+from ._errors import PlantdError, translated
+from ._linearize import Linearization
+from ._requests import Stepping, constraints, measurement, noise, point, settings, trajectory
 from ._rotation import compose, difference
-from ._types import Array, Linearization, State, Vector, array, complexes, matrix, state_vector, vector
+from ._states import State, Trajectory, state_vector
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 class _Filter:
@@ -204,3 +211,70 @@ class TrajectoryKalman(_Filter):
         self.dx = here.linearization.a @ self.dx + here.linearization.b @ du
         self.k += 1
         return self.x
+
+
+class KalmanCalls(Calls):
+    """Calls that solve for filters."""
+
+    def solve_kalman(
+        self,
+        model: str = "",
+        *,
+        outputs: Sequence[str] | npt.ArrayLike = (),
+        output_u: npt.ArrayLike | None = None,
+        measurement_noise: npt.ArrayLike,
+        process_noise: npt.ArrayLike | None = None,
+        input_noise: npt.ArrayLike | None = None,
+        at: str | None = None,
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        full: bool = False,
+        **stepping: Unpack[Stepping],
+    ) -> Kalman:
+        """Steady-state Kalman filter about an equilibrium, ready to ``correct`` and ``predict``.
+
+        ``outputs`` are what is measured: names of entries of x such as ``theta`` or ``p(theta)``, or a
+        matrix. Noises are covariances per step, diagonals or matrices: of the measurement, of the
+        state and of the inputs.
+        """
+        request = control_service_pb2.SolveKalmanRequest(
+            model=model,
+            settings=settings(**stepping),
+            point=point(at, state, u, plant),
+            measurement=measurement(outputs, output_u),
+            noise=noise(process_noise, input_noise, measurement_noise),
+            constraints=constraints(full),
+        )
+        return Kalman._from(self._call(self.control.SolveKalman, request))
+
+    def solve_trajectory_kalman(
+        self,
+        model: str,
+        initial: State | Trajectory,
+        u: npt.ArrayLike | None = None,
+        *,
+        outputs: Sequence[str] | npt.ArrayLike = (),
+        output_u: npt.ArrayLike | None = None,
+        measurement_noise: npt.ArrayLike,
+        process_noise: npt.ArrayLike | None = None,
+        input_noise: npt.ArrayLike | None = None,
+        initial_covariance: npt.ArrayLike,
+        covariances: bool = False,
+        full: bool = False,
+        **stepping: Unpack[Stepping],
+    ) -> TrajectoryKalman:
+        """Time-varying Kalman filter along a trajectory, as `solve_kalman`; ``initial_covariance`` is
+        that of the error in the initial state. ``covariances`` also returns those of each step."""
+        request = control_service_pb2.SolveTrajectoryKalmanRequest(
+            model=model,
+            settings=settings(**stepping),
+            trajectory=trajectory(initial, u),
+            measurement=measurement(outputs, output_u),
+            noise=noise(process_noise, input_noise, measurement_noise),
+            initial_covariance=weight(initial_covariance),
+            constraints=constraints(full),
+            covariances=covariances,
+        )
+        with translated():
+            return TrajectoryKalman._from(self.control.SolveTrajectoryKalman(request))

@@ -1,11 +1,8 @@
-"""Parts of requests, from what a caller gives."""
+"""Parts of requests that several calls have, from what a caller gives."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
-from os import PathLike
-from pathlib import Path
 from typing import Any, Literal, TypedDict, Union
 
 import numpy as np
@@ -13,7 +10,8 @@ import numpy.typing as npt
 
 from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
 
-from ._types import Array, State, Trajectory, Vector, matrix_message, vector, weight
+from ._arrays import Array, Vector, matrix_message, vector, weight
+from ._states import State, Trajectory
 
 #: Bounds by the name of an entry: (lowest, highest), None for no bound; a number fixes the entry.
 Bounds = Mapping[str, Union[float, tuple[Union[float, None], Union[float, None]]]]
@@ -38,33 +36,6 @@ class Stepping(TypedDict, total=False):
     singular_below: float
     #: Newton iterations before a step is given up; 40 if not given.
     newton_iterations: int
-
-
-def scene_text(scene: str | PathLike[str]) -> str:
-    """The text of a scene: itself if it has several lines or begins as JSON or XML, else a file's."""
-    if isinstance(scene, str) and ("\n" in scene or scene.lstrip().startswith(("{", "<"))):
-        return scene
-    path = Path(scene)
-    text = path.read_text(encoding="utf-8")
-    return _with_includes(text, path.parent, [path.name]) if "<mujoco" in text else text
-
-
-def _with_includes(text: str, folder: Path, seen: list[str]) -> str:
-    """An MJCF in which each ``include`` is replaced by what is in the root of its file."""
-    text = re.sub(r"<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text, flags=re.S)
-
-    def included(element: re.Match[str]) -> str:
-        name = element[1]
-        if name in seen:
-            raise ValueError(f"`{name}` is included twice; once is allowed")
-        seen.append(name)
-        inner = _with_includes((folder / name).read_text(encoding="utf-8"), folder, seen)
-        root = re.search(r"<mujoco[^>]*?(?:/>|>(.*)</mujoco)", inner, flags=re.S)
-        if root is None:
-            raise ValueError(f"`{name}` is no MJCF: its root must be `mujoco` or `mujocoinclude`")
-        return root[1] or ""
-
-    return re.sub(r"""<include\s+file=["']([^"']*)["']\s*(?:/>|>\s*</include>)""", included, text)
 
 
 def settings(
@@ -132,14 +103,6 @@ def point(at: str | None, state: State | None, u: Vector, plant: str = "") -> co
     return common_pb2.Point(state_and_input=here)
 
 
-def mechanical_state(
-    model: str, plant: str, at: str, q: Vector, v: Vector
-) -> control_service_pb2.MechanicalState:
-    return control_service_pb2.MechanicalState(
-        model=model, plant=plant, operating_point=at, q=vector(q), v=vector(v)
-    )
-
-
 def trajectory(initial: State | Trajectory, u: npt.ArrayLike | None) -> common_pb2.Trajectory:
     if isinstance(initial, Trajectory):
         if u is not None:
@@ -192,6 +155,23 @@ def stage_weights(stages: Iterable[Mapping[str, npt.ArrayLike]]) -> list[Any]:
             )
         )
     return messages
+
+
+def trajectory_weights(
+    q: npt.ArrayLike | None,
+    r: npt.ArrayLike | None,
+    q_final: npt.ArrayLike | None,
+    s: npt.ArrayLike | None,
+    projected_momentum: bool,
+) -> plant_service_pb2.LqrWeights | None:
+    """The weights that go beside those of each step, or stand for them."""
+    if q is not None and r is not None:
+        return weights(q, r, q_final, s, projected_momentum)
+    if q_final is not None:
+        return plant_service_pb2.LqrWeights(
+            q_final=weight(q_final), momentum=momentum(projected_momentum)
+        )
+    return None
 
 
 def bounds(given: Bounds | None) -> list[common_pb2.Bound]:

@@ -28,8 +28,9 @@ import iceoryx2 as iox2
 import numpy as np
 import numpy.typing as npt
 
+from ._arrays import Array, Vector, vector
 from ._errors import PlantdError, StepError
-from ._types import Array, State, StepReport, Vector, vector
+from ._states import State, StepReport
 
 LAYOUT_VERSION = 5
 MAGIC = int.from_bytes(b"plnt", "little")

@@ -1,0 +1,155 @@
+"""Models: scenes and robots on the server, and where they rest."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from plantd.v1 import model_service_pb2
+
+from ._arrays import Array, Vector, array, vector
+from ._calls import Calls
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A configuration on the constraints; of an equilibrium also what holds it."""
+
+    q: Array
+    #: Input: forces, then the prescribed positions of ``q``.
+    u: Array
+    #: Potential energy, J; None if only the constraints were asked for, as all that follows.
+    potential: float | None = None
+    #: Largest force that remains on a coordinate, N or N m.
+    residual: float | None = None
+    #: Constraint forces that hold it.
+    constraint_forces: Array | None = None
+    #: A minimum of the potential energy, held coordinates apart.
+    stable: bool | None = None
+    #: Smallest eigenvalue of the stiffness on the constraints, N/m or N m/rad.
+    smallest_stiffness: float | None = None
+
+    @classmethod
+    def _from(cls, m: model_service_pb2.SettleResponse) -> Settled:
+        q, u = array(m.q), array(m.u)
+        if not m.HasField("equilibrium"):
+            return cls(q, u)
+        e = m.equilibrium
+        forces = array(e.constraint_forces)
+        return cls(q, u, e.potential_j, e.residual, forces, e.stable, e.smallest_stiffness)
+
+
+def scene_text(scene: str | PathLike[str]) -> str:
+    """The text of a scene: itself if it has several lines or begins as JSON or XML, else a file's."""
+    if isinstance(scene, str) and ("\n" in scene or scene.lstrip().startswith(("{", "<"))):
+        return scene
+    path = Path(scene)
+    text = path.read_text(encoding="utf-8")
+    return _with_includes(text, path.parent, [path.name]) if "<mujoco" in text else text
+
+
+def _with_includes(text: str, folder: Path, seen: list[str]) -> str:
+    """An MJCF in which each ``include`` is replaced by what is in the root of its file."""
+    text = re.sub(r"<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text, flags=re.S)
+
+    def included(element: re.Match[str]) -> str:
+        name = element[1]
+        if name in seen:
+            raise ValueError(f"`{name}` is included twice; once is allowed")
+        seen.append(name)
+        inner = _with_includes((folder / name).read_text(encoding="utf-8"), folder, seen)
+        root = re.search(r"<mujoco[^>]*?(?:/>|>(.*)</mujoco)", inner, flags=re.S)
+        if root is None:
+            raise ValueError(f"`{name}` is no MJCF: its root must be `mujoco` or `mujocoinclude`")
+        return root[1] or ""
+
+    return re.sub(r"""<include\s+file=["']([^"']*)["']\s*(?:/>|>\s*</include>)""", included, text)
+
+
+class ModelCalls(Calls):
+    """Calls of the service of models."""
+
+    def list_models(self) -> list[model_service_pb2.Model]:
+        """All models, built-in ones first."""
+        models, token = [], ""
+        while True:
+            request = model_service_pb2.ListModelsRequest(page_token=token)
+            page = self._call(self.models.ListModels, request)
+            models.extend(page.models)
+            token = page.next_page_token
+            if not token:
+                return models
+
+    def get_model(self, name: str) -> model_service_pb2.Model:
+        """A model: coordinates, inputs, constraints, operating points, scene and plan."""
+        request = model_service_pb2.GetModelRequest(name=name)
+        return self._call(self.models.GetModel, request).model
+
+    def create_model(
+        self, scene: str | PathLike[str], *, name: str = ""
+    ) -> model_service_pb2.Model:
+        """Uploads a scene (TOML, JSON) or a robot (URDF, MJCF): a text of several lines, or a file.
+
+        All errors are in the error's ``violations``. What a robot says and a scene cannot is a
+        ``UserWarning`` with lines and columns; what has no effect on the motion is not mentioned.
+        """
+        request = model_service_pb2.CreateModelRequest(scene=scene_text(scene), name=name)
+        answer = self._call(self.models.CreateModel, request)
+        told = [
+            f"{note.line}:{note.column}: {note.message}"
+            for note in answer.import_report.notes
+            if note.kind != model_service_pb2.IMPORT_KIND_NO_EFFECT
+        ]
+        if told:
+            warnings.warn("\n".join([f"{answer.model.name}:", *told]), stacklevel=2)
+        return answer.model
+
+    def validate_scene(
+        self, scene: str | PathLike[str]
+    ) -> list[model_service_pb2.SceneProblem]:
+        """All errors of a scene or robot, a text of several lines or a file; none when it is good."""
+        request = model_service_pb2.ValidateSceneRequest(scene=scene_text(scene))
+        return list(self._call(self.models.ValidateScene, request).problems)
+
+    def settle(
+        self,
+        model: str,
+        *,
+        q: Vector = (),
+        guess: Mapping[str, float] | None = None,
+        hold: Sequence[str] = (),
+        inputs: Mapping[str, float] | None = None,
+        targets: Mapping[str, Vector] | None = None,
+        constraints_only: bool = False,
+    ) -> Settled:
+        """Finds a configuration in which the model rests, from a guess.
+
+        The guess is ``q``, or the scene's initial configuration, with the values of ``guess`` put in;
+        coordinates in ``hold`` keep their value of it. ``inputs`` are the forces that act.
+        ``constraints_only`` finds a configuration close to the guess that satisfies the constraints.
+        ``targets`` say where the origins of frames shall be in the world, three numbers each, or seven with
+        the orientation as a unit quaternion w, x, y, z: inverse kinematics.
+        """
+        goal = "SETTLE_GOAL_CONSTRAINTS" if constraints_only else "SETTLE_GOAL_EQUILIBRIUM"
+        request = model_service_pb2.SettleRequest(
+            model=model,
+            q=vector(q),
+            guess=dict(guess or {}),
+            hold=hold,
+            inputs=dict(inputs or {}),
+            goal=model_service_pb2.SettleGoal.Value(goal),
+        )
+        for frame, target in (targets or {}).items():
+            numbers = vector(target)
+            request.targets.add(
+                point={"frame": frame}, position=numbers[:3], orientation=numbers[3:]
+            )
+        return Settled._from(self._call(self.models.Settle, request))
+
+    def delete_model(self, name: str) -> None:
+        """Forgets an uploaded model; its plants live on."""
+        self._call(self.models.DeleteModel, model_service_pb2.DeleteModelRequest(name=name))
