@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use plantd_models::scene::UnknownName;
 use plantd_models::{Model, Scene, SceneError};
 use serde_json::Value;
 
@@ -147,7 +148,10 @@ fn set(scene: &mut Value, path: &str, value: f64) -> Result<(String, f64), Strin
                         Some(Segment::Entry("0" | "1" | "2")) if depth + 2 == segments.len() => {
                             Value::from(vec![0.0; 3])
                         }
-                        Some(_) => return Err(format!("there is no `{canonical}`")),
+                        Some(_) => {
+                            let known = UnknownName::among(key, table.keys());
+                            return Err(format!("there is no `{canonical}`: no key {known}"));
+                        }
                     };
                     table.insert((*key).to_owned(), default);
                 }
@@ -160,9 +164,16 @@ fn set(scene: &mut Value, path: &str, value: f64) -> Result<(String, f64), Strin
                     Ok(index) => Some(index),
                     Err(_) => list.iter().position(|item| name(item) == Some(entry)),
                 };
+                let among = match entry.parse::<usize>() {
+                    Ok(_) => format!("it has {} entries, from 0 on", list.len()),
+                    Err(_) => {
+                        let known = list.iter().filter_map(name);
+                        format!("no entry {}", UnknownName::among(entry, known))
+                    }
+                };
                 let item = index
                     .and_then(|index: usize| list.get_mut(index))
-                    .ok_or_else(|| format!("there is no `{canonical}[{entry}]`"))?;
+                    .ok_or_else(|| format!("there is no `{canonical}[{entry}]`: {among}"))?;
                 match name(item).filter(|name| name.parse::<usize>().is_err()) {
                     Some(name) => canonical.push_str(&format!("[{name}]")),
                     None => canonical.push_str(&format!("[{}]", index.unwrap_or_default())),

@@ -14,13 +14,16 @@ Vectors and matrices are numpy arrays in SI units and radians. What the server r
 `PlantdError`, with the gRPC code, the reason and the faults of the request.
 """
 
+from ._batch import Rollout, Rollouts, Stepped
 from ._channels import Channels, Outputs
 from ._client import Client, connect
 from ._drive import Driver
 from ._errors import PlantdError, StepError, Violation
 from ._feedback import Feedback, Follower, GainSchedule, WatchedGain
 from ._gains import Gain, Regulator, TrajectoryGain
+from ._handle import PlantHandle
 from ._kalman import Kalman, KalmanStep, TrajectoryKalman
+from ._launch import Server, launch
 from ._linearize import Analysis, Contraction, Linearization, Mode, SecondOrder
 from ._mechanics import (
     CenterOfMass,
@@ -38,7 +41,6 @@ from ._plants import Accuracy, Diagnostics, Plant, Watched
 from ._realtime import Event, StepTiming
 from ._recordings import Recording
 from ._requests import Stepping
-from ._rollout import Rollout
 from ._rotation import compose, difference, rotations
 from ._states import Energy, State, StepReport, Trajectory
 
@@ -71,6 +73,7 @@ __all__ = [
     "Optimum",
     "Outputs",
     "Plant",
+    "PlantHandle",
     "PlantdError",
     "PointMotion",
     "Progress",
@@ -78,13 +81,16 @@ __all__ = [
     "Recording",
     "Regulator",
     "Rollout",
+    "Rollouts",
     "Search",
     "SecondOrder",
+    "Server",
     "Settled",
     "State",
     "StepError",
     "StepReport",
     "StepTiming",
+    "Stepped",
     "Stepping",
     "Trajectory",
     "TrajectoryGain",
@@ -95,5 +101,6 @@ __all__ = [
     "compose",
     "connect",
     "difference",
+    "launch",
     "rotations",
 ]

@@ -10,6 +10,7 @@ from plantd.v1 import channel_service_pb2, common_pb2
 
 from ._arrays import Array, array
 from ._calls import Calls
+from ._check import build
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,20 +60,21 @@ class ChannelCalls(Calls):
         ``dict(name="encoder", coordinate="theta", noise=0.001, latency_s=0.02)``,
         ``dict(input="tau", delay_s=0.01, max=5.0)``. Times become whole steps.
         """
-        channels = channel_service_pb2.Channels(
-            outputs=[channel_service_pb2.OutputChannel(**output) for output in outputs],
-            inputs=[channel_service_pb2.InputChannel(**input) for input in inputs],
+        channels = build(
+            channel_service_pb2.Channels,
+            outputs=list(outputs),
+            inputs=list(inputs),
             seed=seed,
         )
-        request = channel_service_pb2.SetChannelsRequest(id=id, channels=channels)
+        request = build(channel_service_pb2.SetChannelsRequest, id=id, channels=channels)
         answer = self._call(self.channels.SetChannels, request)
-        return Channels._from(answer.info, common_pb2.Outputs(y=answer.y))
+        return Channels._from(answer.info, build(common_pb2.Outputs, y=answer.y))
 
     def get_channels(self, id: str) -> Channels:
         """The channels of a plant, with what they deliver now."""
-        request = channel_service_pb2.GetChannelsRequest(id=id)
+        request = build(channel_service_pb2.GetChannelsRequest, id=id)
         answer = self._call(self.channels.GetChannels, request)
-        return Channels._from(answer.info, common_pb2.Outputs(y=answer.y, lost=answer.lost))
+        return Channels._from(answer.info, build(common_pb2.Outputs, y=answer.y, lost=answer.lost))
 
     def inject_fault(self, id: str, **fault: Any) -> channel_service_pb2.FaultInfo:
         """Lets something go wrong: the fields of ``FaultSpec`` of the contract.
@@ -80,16 +82,16 @@ class ChannelCalls(Calls):
             client.inject_fault("p1", input="tau", stuck=True, start_s=2.0, duration_s=0.5)
             client.inject_fault("p1", push=dict(point=dict(frame="rod"), force=[5, 0, 0]), duration_s=0.1)
         """
-        spec = channel_service_pb2.FaultSpec(**fault)
-        request = channel_service_pb2.InjectFaultRequest(id=id, fault=spec)
+        spec = build(channel_service_pb2.FaultSpec, **fault)
+        request = build(channel_service_pb2.InjectFaultRequest, id=id, fault=spec)
         return self._call(self.channels.InjectFault, request).fault
 
     def clear_fault(self, id: str, fault_id: int = 0) -> int:
         """Ends a fault, or all; how many."""
-        request = channel_service_pb2.ClearFaultRequest(id=id, fault_id=fault_id)
+        request = build(channel_service_pb2.ClearFaultRequest, id=id, fault_id=fault_id)
         return self._call(self.channels.ClearFault, request).cleared
 
     def list_faults(self, id: str) -> list[channel_service_pb2.FaultInfo]:
         """The faults of a plant, in the order in which they were injected."""
-        request = channel_service_pb2.ListFaultsRequest(id=id)
+        request = build(channel_service_pb2.ListFaultsRequest, id=id)
         return list(self._call(self.channels.ListFaults, request).faults)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from ._batch import BatchCalls
 from ._channels import ChannelCalls
 from ._drive import DriveCalls
 from ._feedback import FeedbackCalls
+from ._handle import HandleCalls
 from ._kalman import KalmanCalls
 from ._linearize import LinearizeCalls
 from ._lqr import LqrCalls
 from ._mechanics import MechanicsCalls
 from ._models import ModelCalls
 from ._optimize import OptimizeCalls
-from ._plants import PlantCalls
 from ._realtime import RealtimeCalls
 from ._recordings import RecordingCalls
-from ._rollout import RolloutCalls
+
+if TYPE_CHECKING:
+    from ._launch import Server
 
 #: Where a server listens unless it is told otherwise.
 DEFAULT_ADDRESS = "http://127.0.0.1:50051"
@@ -31,7 +36,7 @@ def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
 
 class Client(
     ModelCalls,
-    PlantCalls,
+    HandleCalls,
     DriveCalls,
     RealtimeCalls,
     ChannelCalls,
@@ -42,7 +47,7 @@ class Client(
     LqrCalls,
     KalmanCalls,
     OptimizeCalls,
-    RolloutCalls,
+    BatchCalls,
 ):
     """A connection to a server. Use it in a ``with`` statement, or call ``close``.
 
@@ -50,9 +55,14 @@ class Client(
     what is not wrapped.
     """
 
+    #: The server that `plantd.launch` has started for this client.
+    server: Server | None = None
+
     def close(self) -> None:
-        """Closes the connection; streams end."""
+        """Closes the connection; streams end, and so does the server of `plantd.launch`."""
         self._channel.close()
+        if self.server is not None:
+            self.server.stop()
 
     def __enter__(self) -> Client:
         return self

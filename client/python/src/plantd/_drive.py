@@ -12,6 +12,7 @@ from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 from ._arrays import Array, Vector, array, vector
 from ._calls import Calls
 from ._channels import Outputs
+from ._check import build
 from ._errors import PlantdError, from_failure, translate
 from ._linearize import Linearization
 from ._plants import Plant
@@ -74,7 +75,7 @@ class Driver:
     def offer(self, u: Vector) -> None:
         """Gives a plant that runs by itself an input, which acts from its next step on."""
         self._sequence += 1
-        input = pb.DriveInput(sequence=self._sequence, u=vector(u), answers_ns=self._answers_ns)
+        input = pb.DriveInput(sequence=self._sequence, u=vector(u, "u"), answers_ns=self._answers_ns)
         self._requests.put(pb.DriveRequest(input=input))
 
     def next(self) -> State:
@@ -136,7 +137,8 @@ class DriveCalls(Calls):
         The lease is kept for ``grace`` seconds when the connection breaks; ``resume`` goes on with
         it (`Driver.lease_token`).
         """
-        open = plant_service_pb2.DriveOpen(
+        open = build(
+            plant_service_pb2.DriveOpen,
             id=id, linearization=linearization, grace_s=grace, resume=resume
         )
         return Driver(self.plants, open)

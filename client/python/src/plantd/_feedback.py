@@ -16,6 +16,7 @@ from plantd.v1 import plant_service_pb2
 
 from ._arrays import Array, Vector, failure_text
 from ._calls import Calls
+from ._check import build, one_of, shown
 from ._errors import PlantdError, from_rpc_error
 from ._gains import Gain
 from ._requests import (
@@ -350,7 +351,15 @@ class FeedbackCalls(Calls):
         forms = [at is not None, state is not None, bool(plant), trajectory is not None]
         if sum([*forms, gain is not None]) != 1:
             raise ValueError("give one of `at`, `state`, `plant`, `trajectory` and `gain`")
-        request = plant_service_pb2.SetFeedbackRequest(
+        one_of("mode", mode, FEEDBACK_MODES)
+        for argument, value, kind in [
+            ("trajectory", trajectory, Trajectory),
+            ("gain", gain, Gain),
+        ]:
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"`{argument}` is {shown(value)}; a `plantd.{kind.__name__}` is needed")
+        request = build(
+            plant_service_pb2.SetFeedbackRequest,
             id=id,
             stages=stage_weights(stages),
             constraints=constraints(full),
@@ -371,15 +380,15 @@ class FeedbackCalls(Calls):
 
     def clear_feedback(self, id: str) -> None:
         """Takes the reference away; the driver's input acts alone again."""
-        self._call(self.plants.ClearFeedback, plant_service_pb2.ClearFeedbackRequest(id=id))
+        self._call(self.plants.ClearFeedback, build(plant_service_pb2.ClearFeedbackRequest, id=id))
 
     def watch_gains(self, id: str) -> Iterator[WatchedGain]:
         """The gains of a plant's feedback: along a trajectory those of every step from the present one
         on, ahead of time; about an operating point the one in force and each that replaces it."""
-        request = plant_service_pb2.WatchGainsRequest(id=id)
+        request = build(plant_service_pb2.WatchGainsRequest, id=id)
         return self._messages(self.plants.WatchGains(request), WatchedGain._from)
 
     def follow_gains(self, id: str) -> Follower:
         """Follows the gains of a plant's feedback, to apply them here: ``u = law(state)``."""
-        request = plant_service_pb2.WatchGainsRequest(id=id)
+        request = build(plant_service_pb2.WatchGainsRequest, id=id)
         return Follower(lambda: self.plants.WatchGains(request), self._timeout)

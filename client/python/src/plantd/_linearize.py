@@ -13,6 +13,7 @@ from plantd.v1 import common_pb2, control_service_pb2
 
 from ._arrays import Array, Vector, array, matrix, tensor, vector
 from ._calls import Calls
+from ._check import build
 from ._requests import Stepping, constraints, point, settings, split_outputs, trajectory
 from ._states import State, StepReport, Trajectory
 
@@ -176,7 +177,8 @@ class LinearizeCalls(Calls):
         """Linearizes the map of a model at the operating point ``at``, by default ``initial``, or at
         ``state`` with input ``u``; or that of a ``plant``, where it is. Two of them raise `ValueError`.
         """
-        request = control_service_pb2.LinearizeRequest(
+        request = build(
+            control_service_pb2.LinearizeRequest,
             model=model, settings=settings(**stepping), point=point(at, state, u, plant)
         )
         answer = self._call(self.control.Linearize, request)
@@ -197,7 +199,8 @@ class LinearizeCalls(Calls):
         **stepping: Unpack[Stepping],
     ) -> Iterator[Linearization]:
         """Linearizes the map at every step of the trajectory that ``u`` drives from ``initial``."""
-        request = control_service_pb2.LinearizeTrajectoryRequest(
+        request = build(
+            control_service_pb2.LinearizeTrajectoryRequest,
             model=model, settings=settings(**stepping), trajectory=trajectory(initial, u)
         )
         return self._messages(
@@ -218,7 +221,8 @@ class LinearizeCalls(Calls):
         **stepping: Unpack[Stepping],
     ) -> SecondOrder:
         """All second derivatives of the map at a point given as in `linearize`."""
-        request = control_service_pb2.LinearizeSecondOrderRequest(
+        request = build(
+            control_service_pb2.LinearizeSecondOrderRequest,
             model=model, settings=settings(**stepping), point=point(at, state, u, plant)
         )
         return SecondOrder._from(self._call(self.control.LinearizeSecondOrder, request))
@@ -239,12 +243,14 @@ class LinearizeCalls(Calls):
 
         The tensors are not formed: it works where they would be too large.
         """
-        request = control_service_pb2.LinearizeSecondOrderRequest(
+        request = build(
+            control_service_pb2.LinearizeSecondOrderRequest,
             model=model,
             settings=settings(**stepping),
             point=point(at, state, u, plant),
-            weights=common_pb2.ContractionWeights(
-                x=vector(weights), multipliers=vector(multiplier_weights)
+            weights=build(
+                common_pb2.ContractionWeights,
+                x=vector(weights, "weights"), multipliers=vector(multiplier_weights, "multiplier_weights")
             ),
         )
         return Contraction._from(self._call(self.control.LinearizeSecondOrder, request))
@@ -268,12 +274,13 @@ class LinearizeCalls(Calls):
         if not given. ``frequencies`` in Hz. ``full`` looks at the full state of a constrained model
         instead of at its manifold.
         """
-        request = control_service_pb2.AnalyzeRequest(
+        request = build(
+            control_service_pb2.AnalyzeRequest,
             model=model,
             settings=settings(**stepping),
             point=point(at, state, u, plant),
             constraints=constraints(full),
-            frequencies_hz=vector(frequencies),
+            frequencies_hz=vector(frequencies, "frequencies"),
         )
         names, rows = split_outputs(outputs)
         request.outputs.extend(names)

@@ -11,6 +11,7 @@ from plantd.v1 import control_service_pb2
 
 from ._arrays import Vector
 from ._calls import Calls
+from ._check import build
 from ._gains import Regulator, TrajectoryGain
 from ._requests import (
     Stepping,
@@ -51,7 +52,8 @@ class LqrCalls(Calls):
 
         ``full`` solves on the full state of a constrained model instead of on its manifold.
         """
-        request = control_service_pb2.SolveLqrRequest(
+        request = build(
+            control_service_pb2.SolveLqrRequest,
             model=model,
             settings=settings(**stepping),
             point=point(at, state, u),
@@ -83,7 +85,8 @@ class LqrCalls(Calls):
         and of ``x_linear`` and ``u_linear``. ``projected_momentum`` is as in `solve_lqr`. ``values``
         also returns the cost to go.
         """
-        request = control_service_pb2.SolveTrajectoryLqrRequest(
+        request = build(
+            control_service_pb2.SolveTrajectoryLqrRequest,
             model=model,
             settings=settings(**stepping),
             trajectory=trajectory(initial, u),

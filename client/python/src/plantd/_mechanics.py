@@ -9,6 +9,7 @@ from plantd.v1 import channel_service_pb2, control_service_pb2
 
 from ._arrays import Array, Vector, array, matrix, optional_matrix, tensor, vector
 from ._calls import Calls
+from ._check import build
 from ._states import Energy
 
 
@@ -209,8 +210,9 @@ class EquationOfMotion:
 def mechanical_state(
     model: str, plant: str, at: str, q: Vector, v: Vector
 ) -> control_service_pb2.MechanicalState:
-    return control_service_pb2.MechanicalState(
-        model=model, plant=plant, operating_point=at, q=vector(q), v=vector(v)
+    return build(
+        control_service_pb2.MechanicalState,
+        model=model, plant=plant, operating_point=at, q=vector(q, "q"), v=vector(v, "v")
     )
 
 
@@ -232,13 +234,14 @@ class MechanicsCalls(Calls):
 
         What is not given is that of the operating point ``at``, at rest.
         """
-        request = control_service_pb2.EvaluateDynamicsRequest(
+        request = build(
+            control_service_pb2.EvaluateDynamicsRequest,
             model=model,
             operating_point=at,
-            q=vector(q),
-            v=vector(v),
-            inputs=vector(inputs),
-            prescribed_acceleration=vector(prescribed_acceleration),
+            q=vector(q, "q"),
+            v=vector(v, "v"),
+            inputs=vector(inputs, "inputs"),
+            prescribed_acceleration=vector(prescribed_acceleration, "prescribed_acceleration"),
             order=order,
         )
         return Dynamics._from(self._call(self.control.EvaluateDynamics, request))
@@ -262,11 +265,12 @@ class MechanicsCalls(Calls):
         ``frames`` are names, all if neither frames nor points are given; ``points`` are pairs of a frame
         and a position in its axes, m.
         """
-        request = control_service_pb2.KinematicsRequest(
+        request = build(
+            control_service_pb2.KinematicsRequest,
             state=mechanical_state(model, plant, at, q, v),
             frames=frames,
             points=[
-                channel_service_pb2.FramePoint(frame=frame, at=vector(position))
+                build(channel_service_pb2.FramePoint, frame=frame, at=vector(position, "position"))
                 for frame, position in points
             ],
             jacobians=jacobians,
@@ -292,11 +296,12 @@ class MechanicsCalls(Calls):
         accelerations that follow from ``inputs``: by default those of the operating point, or those last
         given to the plant. Prescribed coordinates have the acceleration zero if it is not given.
         """
-        request = control_service_pb2.DynamicsRequest(
+        request = build(
+            control_service_pb2.DynamicsRequest,
             state=mechanical_state(model, plant, at, q, v),
-            inputs=vector(inputs),
-            acceleration=vector(acceleration),
-            prescribed_acceleration=vector(prescribed_acceleration),
+            inputs=vector(inputs, "inputs"),
+            acceleration=vector(acceleration, "acceleration"),
+            prescribed_acceleration=vector(prescribed_acceleration, "prescribed_acceleration"),
             forward=forward,
         )
         return EquationOfMotion._from(self._call(self.control.Dynamics, request))

@@ -13,6 +13,7 @@ from plantd.v1 import model_service_pb2
 
 from ._arrays import Array, Vector, array, vector
 from ._calls import Calls
+from ._check import build
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ class ModelCalls(Calls):
         """All models, built-in ones first."""
         models, token = [], ""
         while True:
-            request = model_service_pb2.ListModelsRequest(page_token=token)
+            request = build(model_service_pb2.ListModelsRequest, page_token=token)
             page = self._call(self.models.ListModels, request)
             models.extend(page.models)
             token = page.next_page_token
@@ -86,18 +87,19 @@ class ModelCalls(Calls):
 
     def get_model(self, name: str) -> model_service_pb2.Model:
         """A model: coordinates, inputs, constraints, operating points, scene and plan."""
-        request = model_service_pb2.GetModelRequest(name=name)
+        request = build(model_service_pb2.GetModelRequest, name=name)
         return self._call(self.models.GetModel, request).model
 
     def create_model(
-        self, scene: str | PathLike[str], *, name: str = ""
+        self, scene: str | PathLike[str], *, name: str = "", replace: bool = False
     ) -> model_service_pb2.Model:
         """Uploads a scene (TOML, JSON) or a robot (URDF, MJCF): a text of several lines, or a file.
 
         All errors are in the error's ``violations``. What a robot says and a scene cannot is a
         ``UserWarning`` with lines and columns; what has no effect on the motion is not mentioned.
+        ``replace`` puts it in the place of an uploaded model of that name, whose plants live on.
         """
-        request = model_service_pb2.CreateModelRequest(scene=scene_text(scene), name=name)
+        request = build(model_service_pb2.CreateModelRequest, scene=scene_text(scene), name=name, replace=replace)
         answer = self._call(self.models.CreateModel, request)
         told = [
             f"{note.line}:{note.column}: {note.message}"
@@ -112,7 +114,7 @@ class ModelCalls(Calls):
         self, scene: str | PathLike[str]
     ) -> list[model_service_pb2.SceneProblem]:
         """All errors of a scene or robot, a text of several lines or a file; none when it is good."""
-        request = model_service_pb2.ValidateSceneRequest(scene=scene_text(scene))
+        request = build(model_service_pb2.ValidateSceneRequest, scene=scene_text(scene))
         return list(self._call(self.models.ValidateScene, request).problems)
 
     def settle(
@@ -135,16 +137,17 @@ class ModelCalls(Calls):
         the orientation as a unit quaternion w, x, y, z: inverse kinematics.
         """
         goal = "SETTLE_GOAL_CONSTRAINTS" if constraints_only else "SETTLE_GOAL_EQUILIBRIUM"
-        request = model_service_pb2.SettleRequest(
+        request = build(
+            model_service_pb2.SettleRequest,
             model=model,
-            q=vector(q),
+            q=vector(q, "q"),
             guess=dict(guess or {}),
             hold=hold,
             inputs=dict(inputs or {}),
             goal=model_service_pb2.SettleGoal.Value(goal),
         )
         for frame, target in (targets or {}).items():
-            numbers = vector(target)
+            numbers = vector(target, "target")
             request.targets.add(
                 point={"frame": frame}, position=numbers[:3], orientation=numbers[3:]
             )
@@ -152,4 +155,4 @@ class ModelCalls(Calls):
 
     def delete_model(self, name: str) -> None:
         """Forgets an uploaded model; its plants live on."""
-        self._call(self.models.DeleteModel, model_service_pb2.DeleteModelRequest(name=name))
+        self._call(self.models.DeleteModel, build(model_service_pb2.DeleteModelRequest, name=name))

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy.typing as npt
 from google.protobuf import json_format
@@ -16,6 +16,7 @@ from plantd.v1 import control_service_pb2 as pb
 
 from ._arrays import Array, failure_text, matrix, matrix_message, weight
 from ._calls import Calls
+from ._check import build, one_of, shown
 from ._errors import PlantdError, translated
 from ._feedback import GainSchedule
 from ._gains import Gain
@@ -41,6 +42,7 @@ def method_number(name: str | None) -> Any:
     """The number of a method."""
     if name is None:
         return pb.DESCENT_METHOD_UNSPECIFIED
+    one_of("method", name, get_args(Method))
     return pb.DescentMethod.Value(f"DESCENT_METHOD_{name.upper().replace('-', '_')}")
 
 
@@ -346,31 +348,40 @@ class OptimizeCalls(Calls):
         if (guess is None) == (resume is None):
             raise ValueError("give one of `guess` and `resume`")
         start = guess.trajectory if isinstance(guess, Optimum) else guess
+        if start is not None and not isinstance(start, Trajectory):
+            raise TypeError(
+                f"`guess` is {shown(guess)}; a `plantd.Trajectory` or `plantd.Optimum` is needed"
+            )
         free = None
         if free_initial is not False:
-            free = control_service_pb2.FreeInitialState(
+            free = build(
+                control_service_pb2.FreeInitialState,
                 entries=() if free_initial is True else free_initial,
-                weight=None if initial_weight is None else weight(initial_weight),
+                weight=None if initial_weight is None else weight(initial_weight, "initial_weight"),
             )
-        request = control_service_pb2.OptimizeTrajectoryRequest(
+        request = build(
+            control_service_pb2.OptimizeTrajectoryRequest,
             model=model,
             settings=settings(**stepping),
-            cost=control_service_pb2.TrajectoryCost(
-                x=matrix_message(x),
-                u=None if u is None else matrix_message(u),
+            cost=build(
+                control_service_pb2.TrajectoryCost,
+                x=matrix_message(x, "x"),
+                u=None if u is None else matrix_message(u, "u"),
                 weights=trajectory_weights(q, r, q_final, s, projected_momentum),
                 stages=stage_weights(stages),
             ),
             guess=None if start is None else start._message(),
             resume=None if resume is None else resume.message,
-            bounds=control_service_pb2.TrajectoryBounds(
+            bounds=build(
+                control_service_pb2.TrajectoryBounds,
                 state=bounds(state_bounds),
                 input=bounds(input_bounds),
                 final_state=bounds(final_state),
                 model_limits=model_limits,
             ),
             free_initial=free,
-            options=control_service_pb2.OptimizationOptions(
+            options=build(
+                control_service_pb2.OptimizationOptions,
                 method=method_number(method),
                 first_method=method_number(first_method),
                 first_iterations=first_iterations,
@@ -412,11 +423,12 @@ class OptimizeCalls(Calls):
         ``tolerance``, with reason ``INFEASIBLE_REFERENCE``.
         """
         has_weights = q is not None and r is not None
-        request = control_service_pb2.ProjectReferenceRequest(
+        request = build(
+            control_service_pb2.ProjectReferenceRequest,
             model=model,
             settings=settings(**stepping),
-            q=matrix_message(reference),
-            u=None if u is None else matrix_message(u),
+            q=matrix_message(reference, "reference"),
+            u=None if u is None else matrix_message(u, "u"),
             projection=None if projection is None else weights(*projection),
             weights=trajectory_weights(q, r, q_final, s, projected_momentum) if has_weights else None,
             constraints=constraints(full),

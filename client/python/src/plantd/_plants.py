@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import numpy as np
 import numpy.typing as npt
 
 from plantd.v1 import common_pb2, plant_service_pb2, realtime_pb2
 
-from ._arrays import Array, Vector, array, failure_text, matrix_message
+from ._arrays import Array, Vector, array, failure_text, matrix_message, numbers
 from ._calls import Calls
 from ._channels import Outputs
+from ._check import build, one_of
 from ._feedback import Feedback
 from ._gains import Gain
 from ._linearize import Linearization
@@ -24,7 +25,10 @@ from ._states import Energy, State, StepReport
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-Field = Literal["state", "report", "energy", "linearization", "gain", "input", "outputs"]
+#: What can be watched of a plant.
+Field = Literal[
+    "state", "report", "energy", "linearization", "gain", "input", "outputs", "timing"
+]
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Plant:
     #: Feedback of the plant, if it has one.
     feedback: Feedback | None = None
     #: Numbers of the scene that were changed for this plant, by path.
-    parameters: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
     #: Order of accuracy.
     order: int = 2
     #: Steps of the method in a time step.
@@ -81,6 +85,8 @@ class Plant:
     newton_iterations: int = 40
     #: All forces are put at the start of a step, as the paper does.
     paper: bool = False
+    #: Seconds without use after which the server deletes it; 0 means never.
+    expires: float = 0.0
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
@@ -103,6 +109,7 @@ class Plant:
             m.settings.singular_below,
             m.settings.max_iterations,
             m.settings.force_split == plant_service_pb2.FORCE_SPLIT_PAPER,
+            m.expires_s,
         )
 
 
@@ -205,6 +212,7 @@ class PlantCalls(Calls):
         initial: common_pb2.InitialState | None = None,
         open_link: bool = False,
         tolerance: float = 0.0,
+        expires: float = 0.0,
         **stepping: Unpack[Stepping],
     ) -> Plant:
         """Creates a plant: at an operating point (``at``), at a configuration ``q`` with ``velocity``,
@@ -213,21 +221,24 @@ class PlantCalls(Calls):
 
         The keywords of `Stepping` say how it is stepped. ``tolerance``, rad or m, chooses ``order`` and
         ``substeps`` in their place, so that no coordinate is off by more over the next 50 steps;
-        ``accuracy`` of the plant tells by how much they are.
+        ``accuracy`` of the plant tells by how much they are. The server deletes it when nobody has used it
+        for ``expires`` seconds; 0 means never. `plant` is the same for a ``with`` statement.
         """
-        request = plant_service_pb2.CreatePlantRequest(
+        request = build(
+            plant_service_pb2.CreatePlantRequest,
             id=id,
             model=model,
             settings=settings(**stepping),
             initial=initial_state(at, q, velocity, v, p, initial),
             open_link=open_link,
+            expires_s=expires,
         )
-        request.settings.tolerance = tolerance
+        request.settings.tolerance = build(plant_service_pb2.Accuracy, tolerance=tolerance).tolerance
         return Plant._from(self._call(self.plants.CreatePlant, request).plant)
 
     def get_plant(self, id: str) -> Plant:
         """A plant, its state and its energy."""
-        answer = self._call(self.plants.GetPlant, plant_service_pb2.GetPlantRequest(id=id))
+        answer = self._call(self.plants.GetPlant, build(plant_service_pb2.GetPlantRequest, id=id))
         return Plant._from(answer.plant, Energy._from(answer.energy))
 
     def diagnose(
@@ -238,7 +249,7 @@ class PlantCalls(Calls):
         initial: common_pb2.InitialState | None = None,
     ) -> Diagnostics:
         """What can be said of a plant's present state, or of a state of a model."""
-        request = plant_service_pb2.DiagnoseRequest(id=id, model=model, initial=initial)
+        request = build(plant_service_pb2.DiagnoseRequest, id=id, model=model, initial=initial)
         return Diagnostics._from(self._call(self.plants.Diagnose, request))
 
     def list_plants(self) -> list[Plant]:
@@ -246,7 +257,7 @@ class PlantCalls(Calls):
         plants: list[Plant] = []
         token = ""
         while True:
-            request = plant_service_pb2.ListPlantsRequest(page_token=token)
+            request = build(plant_service_pb2.ListPlantsRequest, page_token=token)
             page = self._call(self.plants.ListPlants, request)
             plants.extend(map(Plant._from, page.plants))
             token = page.next_page_token
@@ -255,7 +266,7 @@ class PlantCalls(Calls):
 
     def delete_plant(self, id: str) -> None:
         """Ends a plant; whoever drives or watches it gets ``NOT_FOUND``."""
-        self._call(self.plants.DeletePlant, plant_service_pb2.DeletePlantRequest(id=id))
+        self._call(self.plants.DeletePlant, build(plant_service_pb2.DeletePlantRequest, id=id))
 
     def step(self, id: str, u: npt.ArrayLike = (), *, hold: int = 0) -> list[State]:
         """Takes one step per row of ``u`` and ``hold`` more with the last row; all their states.
@@ -263,10 +274,11 @@ class PlantCalls(Calls):
         Without rows there are no input forces and prescribed coordinates stay where they are.
         To close a loop use `drive`: it is faster and keeps others from stepping in between.
         """
-        rows = np.asarray(u, dtype=np.float64)
-        request = plant_service_pb2.StepRequest(
+        rows = numbers(u, "u")
+        request = build(
+            plant_service_pb2.StepRequest,
             id=id,
-            u=matrix_message(rows) if rows.size else None,
+            u=matrix_message(rows, "rows") if rows.size else None,
             hold=hold,
             all_states=True,
         )
@@ -289,12 +301,16 @@ class PlantCalls(Calls):
 
         ``q`` and ``r`` are the weights for the field ``gain``. Leaving the loop ends the watch.
         """
-        request = plant_service_pb2.WatchRequest(
+        if isinstance(fields, str):
+            raise TypeError(f"`fields` is the text `{fields}`; a list is needed: [\"{fields}\"]")
+        wanted = []
+        for field in fields:
+            one_of("fields", field, get_args(Field))
+            wanted.append(plant_service_pb2.WatchField.Value(f"WATCH_FIELD_{field.upper()}"))
+        request = build(
+            plant_service_pb2.WatchRequest,
             id=id,
-            fields=[
-                plant_service_pb2.WatchField.Value(f"WATCH_FIELD_{field.upper()}")
-                for field in fields
-            ],
+            fields=wanted,
             every=every,
             coordinates=coordinates,
             weights=trajectory_weights(q, r, None, None, projected_momentum),
@@ -316,16 +332,16 @@ class PlantCalls(Calls):
     ) -> State:
         """Puts a plant back to step 0, where it was created or where the arguments say."""
         state = initial_state(at, q, velocity, v, p, initial)
-        request = plant_service_pb2.ResetRequest(id=id, initial=state)
+        request = build(plant_service_pb2.ResetRequest, id=id, initial=state)
         return State._from(self._call(self.plants.Reset, request).state)
 
     def snapshot(self, id: str) -> bytes:
         """A snapshot: a plant restored from it continues bit for bit."""
-        return self._call(self.plants.Snapshot, plant_service_pb2.SnapshotRequest(id=id)).snapshot
+        return self._call(self.plants.Snapshot, build(plant_service_pb2.SnapshotRequest, id=id)).snapshot
 
     def restore(self, id: str, snapshot: bytes) -> State:
         """Restores a snapshot of a plant of the same model and settings, step count included."""
-        request = plant_service_pb2.RestoreRequest(id=id, snapshot=snapshot)
+        request = build(plant_service_pb2.RestoreRequest, id=id, snapshot=snapshot)
         return State._from(self._call(self.plants.Restore, request).state)
 
     def set_parameters(
@@ -336,10 +352,11 @@ class PlantCalls(Calls):
         ``parameters`` by where they stand, as in the errors of scenes: ``gravity[1]``,
         ``frames[pole].body.mass``. All of them take effect, or none.
         """
-        request = plant_service_pb2.SetParametersRequest(
+        request = build(
+            plant_service_pb2.SetParametersRequest,
             id=id,
             parameters=[
-                plant_service_pb2.Parameter(path=path, value=value)
+                build(plant_service_pb2.Parameter, path=path, value=value)
                 for path, value in (parameters or {}).items()
             ],
             time_step_s=dt,
@@ -348,4 +365,4 @@ class PlantCalls(Calls):
 
     def open_link(self, id: str) -> plant_service_pb2.OpenLinkResponse:
         """Opens the shared-memory link of a plant and says how to reach it."""
-        return self._call(self.plants.OpenLink, plant_service_pb2.OpenLinkRequest(id=id))
+        return self._call(self.plants.OpenLink, build(plant_service_pb2.OpenLinkRequest, id=id))

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 from plantd.v1 import realtime_pb2
 
 from ._arrays import Vector, vector
 from ._calls import Calls
+from ._check import build, one_of, shown
 from ._states import State
+
+#: How a plant is run: when its driver steps it, by the wall clock, or as fast as possible.
+Pace = Literal["lockstep", "paced", "free"]
+#: What a plant does that runs and has no valid input.
+InputAction = Literal["hold", "safe", "ramp", "stop"]
+#: What a bound of a plant does when it is left.
+WatchdogAction = Literal["freeze", "reset", "disconnect"]
 
 
 @dataclass(frozen=True)
@@ -77,13 +85,13 @@ class RealtimeCalls(Calls):
     def run(
         self,
         id: str,
-        pace: str = "",
+        pace: Pace | None = None,
         *,
         speed: float = 0.0,
         steps: int = 0,
         wait: bool = False,
         timeout: float = 0.0,
-        action: str = "hold",
+        action: InputAction = "hold",
         ramp: float = 0.0,
         safe: Vector = (),
         latch: bool = False,
@@ -97,32 +105,36 @@ class RealtimeCalls(Calls):
         within ``ramp`` seconds, ``"stop"``), ``safe`` and ``latch`` say what happens without one.
         """
         settings = None
-        if pace:
-            policy = realtime_pb2.InputPolicy(
+        one_of("action", action, get_args(InputAction))
+        if pace is not None:
+            one_of("pace", pace, get_args(Pace))
+            policy = build(
+                realtime_pb2.InputPolicy,
                 timeout_s=timeout,
                 action=realtime_pb2.InputAction.Value(f"INPUT_ACTION_{action.upper()}"),
                 ramp_s=ramp,
-                safe=vector(safe),
+                safe=vector(safe, "safe"),
                 latch=latch,
             )
-            settings = realtime_pb2.RunSettings(
+            settings = build(
+                realtime_pb2.RunSettings,
                 pace=realtime_pb2.Pace.Value(f"PACE_{pace.upper()}"),
                 speed=speed,
                 input=None if pace == "lockstep" else policy,
             )
-        request = realtime_pb2.RunRequest(id=id, settings=settings, steps=steps, wait=wait)
+        request = build(realtime_pb2.RunRequest, id=id, settings=settings, steps=steps, wait=wait)
         return self._call(self.plants.Run, request, limited=not wait).run
 
     def pause(self, id: str) -> State:
         """Pauses a plant between two steps, and returns the state in which it stands."""
-        return State._from(self._call(self.plants.Pause, realtime_pb2.PauseRequest(id=id)).state)
+        return State._from(self._call(self.plants.Pause, build(realtime_pb2.PauseRequest, id=id)).state)
 
     def set_safety(
         self,
         id: str,
         watchdogs: Iterable[Mapping[str, Any]] = (),
         *,
-        on_step_failure: str = "unspecified",
+        on_step_failure: WatchdogAction | None = None,
     ) -> None:
         """Sets bounds that protect a plant, in place of those before.
 
@@ -131,21 +143,26 @@ class RealtimeCalls(Calls):
         (the default), ``reset`` and ``disconnect``.
         """
 
-        def act(name: str) -> realtime_pb2.WatchdogAction:
+        def act(argument: str, name: str) -> realtime_pb2.WatchdogAction.ValueType:
+            one_of(argument, name, get_args(WatchdogAction))
             return realtime_pb2.WatchdogAction.Value(f"WATCHDOG_ACTION_{name.upper()}")
 
-        dogs = [
-            realtime_pb2.Watchdog(**{**dog, "action": act(dog.get("action", "freeze"))})
-            for dog in watchdogs
-        ]
-        request = realtime_pb2.SetSafetyRequest(
-            id=id, watchdogs=dogs, on_step_failure=act(on_step_failure)
+        dogs = []
+        for i, dog in enumerate(watchdogs):
+            if not isinstance(dog, Mapping):
+                raise TypeError(f"`watchdogs[{i}]` is {shown(dog)}; a dict is needed")
+            action = act(f"watchdogs[{i}]['action']", dog.get("action", "freeze"))
+            dogs.append(build(realtime_pb2.Watchdog, **{**dog, "action": action}))
+        failure = None if on_step_failure is None else act("on_step_failure", on_step_failure)
+        request = build(
+            realtime_pb2.SetSafetyRequest,
+            id=id, watchdogs=dogs, on_step_failure=failure
         )
         self._call(self.plants.SetSafety, request)
 
     def timing(self, id: str, *, clear: bool = False) -> realtime_pb2.GetTimingResponse:
         """What the loop of a plant that runs by itself has counted; ``clear`` begins anew."""
-        request = realtime_pb2.GetTimingRequest(id=id, clear=clear)
+        request = build(realtime_pb2.GetTimingRequest, id=id, clear=clear)
         return self._call(self.plants.GetTiming, request)
 
     def watch_events(self, id: str, since: int | None = None) -> Iterator[Event]:
@@ -153,5 +170,5 @@ class RealtimeCalls(Calls):
 
         Without ``since``: from now on. Leaving the loop ends the watch.
         """
-        request = realtime_pb2.WatchEventsRequest(id=id, since=since)
+        request = build(realtime_pb2.WatchEventsRequest, id=id, since=since)
         return self._messages(self.plants.WatchEvents(request), Event._from)

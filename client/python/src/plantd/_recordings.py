@@ -8,6 +8,7 @@ from os import PathLike
 from plantd.v1 import recording_service_pb2
 
 from ._calls import Calls
+from ._check import build
 from ._errors import translate
 
 
@@ -45,14 +46,15 @@ class RecordingCalls(Calls):
 
         A replay can begin every ``checkpoint_interval`` seconds; 0 means 5.
         """
-        request = recording_service_pb2.StartRecordingRequest(
+        request = build(
+            recording_service_pb2.StartRecordingRequest,
             id=id, name=name, checkpoint_interval_s=checkpoint_interval
         )
         return Recording._from(self._call(self.recordings.StartRecording, request).recording)
 
     def stop_recording(self, name: str) -> Recording:
         """Ends a recording; its file is complete then."""
-        request = recording_service_pb2.StopRecordingRequest(name=name)
+        request = build(recording_service_pb2.StopRecordingRequest, name=name)
         return Recording._from(self._call(self.recordings.StopRecording, request).recording)
 
     def list_recordings(self) -> list[Recording]:
@@ -60,7 +62,7 @@ class RecordingCalls(Calls):
         recordings: list[Recording] = []
         token = ""
         while True:
-            request = recording_service_pb2.ListRecordingsRequest(page_token=token)
+            request = build(recording_service_pb2.ListRecordingsRequest, page_token=token)
             page = self._call(self.recordings.ListRecordings, request)
             recordings.extend(map(Recording._from, page.recordings))
             token = page.next_page_token
@@ -70,12 +72,12 @@ class RecordingCalls(Calls):
     @translate
     def get_recording(self, name: str, path: str | PathLike[str]) -> None:
         """Fetches the file of a recording, which is MCAP."""
-        request = recording_service_pb2.GetRecordingRequest(name=name)
+        request = build(recording_service_pb2.GetRecordingRequest, name=name)
         with open(path, "wb") as file:
             for piece in self.recordings.GetRecording(request):
                 file.write(piece.data)
 
     def delete_recording(self, name: str) -> None:
         """Deletes a recording that has ended."""
-        request = recording_service_pb2.DeleteRecordingRequest(name=name)
+        request = build(recording_service_pb2.DeleteRecordingRequest, name=name)
         self._call(self.recordings.DeleteRecording, request)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from plantd.v1 import common_pb2
 
-from ._arrays import Array, array, matrix, matrix_message, vector
+from ._arrays import Array, array, matrix, matrix_message, numbers, vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Trajectory:
 
     def _message(self) -> common_pb2.Trajectory:
         initial = None if self.initial is None else self.initial._message()
-        return common_pb2.Trajectory(initial=initial, u=matrix_message(self.u))
+        return common_pb2.Trajectory(initial=initial, u=matrix_message(self.u, "u"))
 
 
 @dataclass(frozen=True)
@@ -127,4 +127,4 @@ class StepReport:
 
 def state_vector(state: State | npt.ArrayLike) -> Array:
     """x of a state, or a vector that is one."""
-    return state.x if isinstance(state, State) else vector(np.asarray(state))
+    return state.x if isinstance(state, State) else vector(numbers(state, "state"), "state")

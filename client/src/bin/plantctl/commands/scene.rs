@@ -22,6 +22,9 @@ pub(crate) struct Upload {
     /// Name; the scene's own if not given.
     #[arg(long)]
     name: Option<String>,
+    /// Take the place of an uploaded model of that name; its plants live on.
+    #[arg(long)]
+    replace: bool,
 }
 
 /// Checks a scene (TOML, JSON) or a robot (URDF) and prints all its errors.
@@ -44,6 +47,7 @@ impl Upload {
         let request = v1::CreateModelRequest {
             name: self.name.unwrap_or_default(),
             scene: read_scene(&self.scene)?,
+            replace: self.replace,
             ..Default::default()
         };
         let answer = client.import_model(request).await?;
