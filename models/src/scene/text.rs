@@ -127,7 +127,7 @@ mod tests {
             (
                 &format!("{good}joint = {{ type = \"bowl\" }}"),
                 "frames[0].joint.type",
-                "there is no `bowl`; did you mean `ball`?",
+                "there is no `bowl`",
             ),
             (
                 &format!(

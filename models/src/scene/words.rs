@@ -42,13 +42,13 @@ impl fmt::Display for UnknownName {
     }
 }
 
-/// The name that was probably meant: a third of its letters are wrong at most.
+/// The name that was probably meant: two fifths of its letters are wrong at most.
 fn nearest<'a, N: AsRef<str>>(name: &str, names: &'a [N]) -> Option<&'a str> {
     let lower = name.to_lowercase();
     let distance = |other: &&str| strsim::damerau_levenshtein(&lower, &other.to_lowercase());
     let all = names.iter().map(AsRef::as_ref).filter(|other| other.len() <= COMPARED_BYTES_MAX);
     let near = all.min_by_key(distance)?;
-    let bound = (lower.chars().count().max(near.chars().count()) / 3).max(1);
+    let bound = (2 * lower.chars().count().max(near.chars().count()) / 5).max(1);
     // Of names of one letter every other one is as near.
     (lower.chars().count() > 1 && distance(&near) <= bound).then_some(near)
 }
@@ -127,8 +127,8 @@ mod tests {
             ),
             ("unknown field `a`, there are no fields", "there is no key `a`; there is none"),
             (
-                "unknown variant `bowl`, expected `ball` or `free`",
-                "there is no `bowl`; did you mean `ball`?",
+                "unknown variant `bal`, expected `ball` or `free`",
+                "there is no `bal`; did you mean `ball`?",
             ),
             ("missing field `frames`", "`frames` is missing"),
             (

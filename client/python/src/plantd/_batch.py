@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any, Union, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -271,7 +271,7 @@ def _inputs(u: npt.ArrayLike | Sequence[Vector] | None, count: int) -> Array:
     if u is None:
         return np.zeros(0)
     try:
-        rows = numbers(u, "u")
+        rows = numbers(cast(npt.ArrayLike, u), "u")
     except TypeError:
         # Plants of several models have inputs of several lengths.
         if not isinstance(u, Sequence) or isinstance(u, str):

@@ -84,12 +84,15 @@ class ChannelCalls(Calls):
         """
         spec = build(channel_service_pb2.FaultSpec, **fault)
         request = build(channel_service_pb2.InjectFaultRequest, id=id, fault=spec)
-        return self._call(self.channels.InjectFault, request).fault
+        answer: channel_service_pb2.InjectFaultResponse
+        answer = self._call(self.channels.InjectFault, request)
+        return answer.fault
 
     def clear_fault(self, id: str, fault_id: int = 0) -> int:
         """Ends a fault, or all; how many."""
         request = build(channel_service_pb2.ClearFaultRequest, id=id, fault_id=fault_id)
-        return self._call(self.channels.ClearFault, request).cleared
+        answer: channel_service_pb2.ClearFaultResponse = self._call(self.channels.ClearFault, request)
+        return answer.cleared
 
     def list_faults(self, id: str) -> list[channel_service_pb2.FaultInfo]:
         """The faults of a plant, in the order in which they were injected."""

@@ -17,8 +17,6 @@ _NAMES = {
     "grace_s": "grace",
     "expires_s": "expires",
     "checkpoint_interval_s": "checkpoint_interval",
-    "max_iterations": "newton_iterations",
-    "steps": "steps",
 }
 
 _WHOLE = {
@@ -64,6 +62,24 @@ def one_of(argument: str, value: object, allowed: Iterable[str]) -> None:
         raise ValueError(f"`{argument}` is {shown(value)};{hint} allowed are {choice}")
 
 
+def texts(argument: str, value: Any) -> list[str]:
+    """A list of texts; a text alone would be one of letters."""
+    if isinstance(value, str):
+        raise TypeError(f"`{argument}` is {shown(value)}; a list is needed: [{value!r}]")
+    if not isinstance(value, Iterable):
+        raise TypeError(f"`{argument}` is {shown(value)}; a list of texts is needed")
+    return list(value)
+
+
+def mapping(argument: str, value: Any, example: str) -> dict[Any, Any]:
+    """A dict, or nothing."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise TypeError(f"`{argument}` is {shown(value)}; a dict is needed, such as {example}")
+    return dict(value)
+
+
 def build(kind: type[_Message], /, **fields: Any) -> _Message:
     """A message of the contract; what does not fit into it is named."""
     try:
@@ -81,15 +97,18 @@ def _fault(kind: type[_Message], fields: Mapping[str, Any], path: str) -> Except
         if name not in known:
             of = f" of `{path}`" if path else ""
             return TypeError(f"there is no `{name}`{of}{instead(name, known)}")
+        field: Any = known[name]
         try:
             kind(**{name: value})
         except (TypeError, ValueError, OverflowError, AttributeError):
             here = _NAMES.get(name, name)
-            return _misfit(known[name], value, f"{path}.{here}" if path else here)
+            if (kind.DESCRIPTOR.name, name) == ("PlantSettings", "max_iterations"):
+                here = "newton_iterations"
+            return _misfit(field, value, f"{path}.{here}" if path else here)
     return None
 
 
-def _misfit(field: FieldDescriptor, value: Any, path: str) -> Exception:
+def _misfit(field: Any, value: Any, path: str) -> Exception:
     """Why a value does not fit into a field."""
     message = field.message_type
     if message is not None and message.GetOptions().map_entry:
@@ -117,7 +136,7 @@ def _misfit_of_map(entry: Any, value: Any, path: str) -> Exception:
     return TypeError(f"`{path}` is {shown(value)}, which does not fit")
 
 
-def _misfit_of_one(field: FieldDescriptor, value: Any, path: str) -> Exception | None:
+def _misfit_of_one(field: Any, value: Any, path: str) -> Exception | None:
     kind = field.cpp_type
     if kind == FieldDescriptor.CPPTYPE_MESSAGE:
         inner = getattr(field.message_type, "_concrete_class")

@@ -53,7 +53,8 @@ class Driver:
     @translate
     def _next(self) -> pb.DriveResponse:
         try:
-            return next(self._answers)
+            answer: pb.DriveResponse = next(self._answers)
+            return answer
         except StopIteration:
             raise PlantdError("UNAVAILABLE", "the server closed the stream") from None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy.typing as npt
 
@@ -25,7 +25,7 @@ from ._states import Energy, State
 if TYPE_CHECKING:
     from typing_extensions import Concatenate, ParamSpec, Unpack
 
-    from plantd.v1 import common_pb2, model_service_pb2
+    from plantd.v1 import channel_service_pb2, common_pb2, model_service_pb2
 
     from ._client import Client
 
@@ -43,7 +43,7 @@ def _by_id(
     def method(self: PlantHandle, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         return call(self.client, self.id, *args, **kwargs)
 
-    return method
+    return cast("Callable[Concatenate[PlantHandle, _P], _R]", method)
 
 
 class PlantHandle:
@@ -149,9 +149,12 @@ class PlantHandle:
     follow_gains = _by_id(FeedbackCalls.follow_gains)
     set_channels = _by_id(ChannelCalls.set_channels)
     get_channels = _by_id(ChannelCalls.get_channels)
-    inject_fault = _by_id(ChannelCalls.inject_fault)
     clear_fault = _by_id(ChannelCalls.clear_fault)
     list_faults = _by_id(ChannelCalls.list_faults)
+
+    def inject_fault(self, **fault: Any) -> channel_service_pb2.FaultInfo:
+        """Lets something go wrong, as `Client.inject_fault`."""
+        return self.client.inject_fault(self.id, **fault)
 
     # The map and the mechanism, where the plant is, with the parameters that it has.
 

@@ -149,17 +149,17 @@ def _find(program: str | PathLike[str] | None) -> Path:
     """The program to start; the error names the places where there is none."""
     for given, what in [(program, "`program`"), (os.environ.get("PLANTD"), "the variable PLANTD")]:
         if given:
-            path = shutil.which(os.fspath(given))
-            if path is None:
+            found = shutil.which(os.fspath(given))
+            if found is None:
                 message = f"{what} names `{os.fspath(given)}`, which is no program"
                 raise PlantdError("UNAVAILABLE", message)
-            return Path(path)
+            return Path(found)
     for path in _places():
         if os.access(path, os.X_OK) and path.is_file():
             return path
-    found = shutil.which("plantd")
-    if found is not None:
-        return Path(found)
+    in_path = shutil.which("plantd")
+    if in_path is not None:
+        return Path(in_path)
     looked = ", ".join(f"`{place}`" for place in _places())
     raise PlantdError(
         "UNAVAILABLE",

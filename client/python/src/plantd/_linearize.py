@@ -67,7 +67,10 @@ class SecondOrder:
     def _from(cls, m: control_service_pb2.LinearizeSecondOrderResponse) -> SecondOrder:
         t = m.tensors
         blocks = (t.xx, t.xu, t.uu, t.multipliers_xx, t.multipliers_xu, t.multipliers_uu)
-        return cls(*map(tensor, blocks), _linearized(m))
+        xx, xu, uu, multipliers_xx, multipliers_xu, multipliers_uu = map(tensor, blocks)
+        return cls(
+            xx, xu, uu, multipliers_xx, multipliers_xu, multipliers_uu, _linearized(m)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from plantd.v1 import channel_service_pb2, control_service_pb2
 
 from ._arrays import Array, Vector, array, matrix, optional_matrix, tensor, vector
 from ._calls import Calls
-from ._check import build
+from ._check import build, shown, texts
 from ._states import Energy
 
 
@@ -216,6 +216,15 @@ def mechanical_state(
     )
 
 
+def _pairs(points: Iterable[tuple[str, Vector]]) -> Iterable[tuple[str, Vector]]:
+    for i, point in enumerate(points):
+        if isinstance(point, str) or not isinstance(point, Sequence) or len(point) != 2:
+            raise TypeError(
+                f"`points[{i}]` is {shown(point)}; a pair of a frame and a position is needed"
+            )
+        yield point[0], point[1]
+
+
 class MechanicsCalls(Calls):
     """Calls that evaluate the mechanism at a state."""
 
@@ -268,10 +277,10 @@ class MechanicsCalls(Calls):
         request = build(
             control_service_pb2.KinematicsRequest,
             state=mechanical_state(model, plant, at, q, v),
-            frames=frames,
+            frames=texts("frames", frames),
             points=[
                 build(channel_service_pb2.FramePoint, frame=frame, at=vector(position, "position"))
-                for frame, position in points
+                for frame, position in _pairs(points)
             ],
             jacobians=jacobians,
         )

@@ -13,7 +13,7 @@ from plantd.v1 import model_service_pb2
 
 from ._arrays import Array, Vector, array, vector
 from ._calls import Calls
-from ._check import build
+from ._check import build, mapping, shown, texts
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,8 @@ class Settled:
 
 def scene_text(scene: str | PathLike[str]) -> str:
     """The text of a scene: itself if it has several lines or begins as JSON or XML, else a file's."""
+    if not isinstance(scene, (str, PathLike)):
+        raise TypeError(f"`scene` is {shown(scene)}; a text or a path is needed")
     if isinstance(scene, str) and ("\n" in scene or scene.lstrip().startswith(("{", "<"))):
         return scene
     path = Path(scene)
@@ -88,7 +90,8 @@ class ModelCalls(Calls):
     def get_model(self, name: str) -> model_service_pb2.Model:
         """A model: coordinates, inputs, constraints, operating points, scene and plan."""
         request = build(model_service_pb2.GetModelRequest, name=name)
-        return self._call(self.models.GetModel, request).model
+        answer: model_service_pb2.GetModelResponse = self._call(self.models.GetModel, request)
+        return answer.model
 
     def create_model(
         self, scene: str | PathLike[str], *, name: str = "", replace: bool = False
@@ -100,6 +103,7 @@ class ModelCalls(Calls):
         ``replace`` puts it in the place of an uploaded model of that name, whose plants live on.
         """
         request = build(model_service_pb2.CreateModelRequest, scene=scene_text(scene), name=name, replace=replace)
+        answer: model_service_pb2.CreateModelResponse
         answer = self._call(self.models.CreateModel, request)
         told = [
             f"{note.line}:{note.column}: {note.message}"
@@ -141,12 +145,12 @@ class ModelCalls(Calls):
             model_service_pb2.SettleRequest,
             model=model,
             q=vector(q, "q"),
-            guess=dict(guess or {}),
-            hold=hold,
-            inputs=dict(inputs or {}),
+            guess=mapping("guess", guess, "{'theta': 0.5}"),
+            hold=texts("hold", hold),
+            inputs=mapping("inputs", inputs, "{'force': 1.0}"),
             goal=model_service_pb2.SettleGoal.Value(goal),
         )
-        for frame, target in (targets or {}).items():
+        for frame, target in mapping("targets", targets, "{'hand': [0.4, 0.0, 0.5]}").items():
             numbers = vector(target, "target")
             request.targets.add(
                 point={"frame": frame}, position=numbers[:3], orientation=numbers[3:]

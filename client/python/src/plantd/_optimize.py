@@ -16,7 +16,7 @@ from plantd.v1 import control_service_pb2 as pb
 
 from ._arrays import Array, failure_text, matrix, matrix_message, weight
 from ._calls import Calls
-from ._check import build, one_of, shown
+from ._check import build, one_of, shown, texts
 from ._errors import PlantdError, translated
 from ._feedback import GainSchedule
 from ._gains import Gain
@@ -356,7 +356,7 @@ class OptimizeCalls(Calls):
         if free_initial is not False:
             free = build(
                 control_service_pb2.FreeInitialState,
-                entries=() if free_initial is True else free_initial,
+                entries=() if free_initial is True else texts("free_initial", free_initial),
                 weight=None if initial_weight is None else weight(initial_weight, "initial_weight"),
             )
         request = build(

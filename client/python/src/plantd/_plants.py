@@ -14,7 +14,7 @@ from plantd.v1 import common_pb2, plant_service_pb2, realtime_pb2
 from ._arrays import Array, Vector, array, failure_text, matrix_message, numbers
 from ._calls import Calls
 from ._channels import Outputs
-from ._check import build, one_of
+from ._check import build, mapping, one_of, texts
 from ._feedback import Feedback
 from ._gains import Gain
 from ._linearize import Linearization
@@ -278,7 +278,7 @@ class PlantCalls(Calls):
         request = build(
             plant_service_pb2.StepRequest,
             id=id,
-            u=matrix_message(rows, "rows") if rows.size else None,
+            u=matrix_message(rows, "u") if rows.size else None,
             hold=hold,
             all_states=True,
         )
@@ -301,10 +301,8 @@ class PlantCalls(Calls):
 
         ``q`` and ``r`` are the weights for the field ``gain``. Leaving the loop ends the watch.
         """
-        if isinstance(fields, str):
-            raise TypeError(f"`fields` is the text `{fields}`; a list is needed: [\"{fields}\"]")
         wanted = []
-        for field in fields:
+        for field in texts("fields", fields):
             one_of("fields", field, get_args(Field))
             wanted.append(plant_service_pb2.WatchField.Value(f"WATCH_FIELD_{field.upper()}"))
         request = build(
@@ -312,7 +310,7 @@ class PlantCalls(Calls):
             id=id,
             fields=wanted,
             every=every,
-            coordinates=coordinates,
+            coordinates=texts("coordinates", coordinates),
             weights=trajectory_weights(q, r, None, None, projected_momentum),
             queue=queue,
         )
@@ -337,7 +335,9 @@ class PlantCalls(Calls):
 
     def snapshot(self, id: str) -> bytes:
         """A snapshot: a plant restored from it continues bit for bit."""
-        return self._call(self.plants.Snapshot, build(plant_service_pb2.SnapshotRequest, id=id)).snapshot
+        request = build(plant_service_pb2.SnapshotRequest, id=id)
+        answer: plant_service_pb2.SnapshotResponse = self._call(self.plants.Snapshot, request)
+        return answer.snapshot
 
     def restore(self, id: str, snapshot: bytes) -> State:
         """Restores a snapshot of a plant of the same model and settings, step count included."""
@@ -357,7 +357,7 @@ class PlantCalls(Calls):
             id=id,
             parameters=[
                 build(plant_service_pb2.Parameter, path=path, value=value)
-                for path, value in (parameters or {}).items()
+                for path, value in mapping("parameters", parameters, "{'gravity[1]': -9.81}").items()
             ],
             time_step_s=dt,
         )
@@ -365,4 +365,6 @@ class PlantCalls(Calls):
 
     def open_link(self, id: str) -> plant_service_pb2.OpenLinkResponse:
         """Opens the shared-memory link of a plant and says how to reach it."""
-        return self._call(self.plants.OpenLink, build(plant_service_pb2.OpenLinkRequest, id=id))
+        request = build(plant_service_pb2.OpenLinkRequest, id=id)
+        answer: plant_service_pb2.OpenLinkResponse = self._call(self.plants.OpenLink, request)
+        return answer

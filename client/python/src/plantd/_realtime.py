@@ -123,7 +123,8 @@ class RealtimeCalls(Calls):
                 input=None if pace == "lockstep" else policy,
             )
         request = build(realtime_pb2.RunRequest, id=id, settings=settings, steps=steps, wait=wait)
-        return self._call(self.plants.Run, request, limited=not wait).run
+        answer: realtime_pb2.RunResponse = self._call(self.plants.Run, request, limited=not wait)
+        return answer.run
 
     def pause(self, id: str) -> State:
         """Pauses a plant between two steps, and returns the state in which it stands."""
@@ -143,7 +144,7 @@ class RealtimeCalls(Calls):
         (the default), ``reset`` and ``disconnect``.
         """
 
-        def act(argument: str, name: str) -> realtime_pb2.WatchdogAction.ValueType:
+        def act(argument: str, name: str) -> Any:
             one_of(argument, name, get_args(WatchdogAction))
             return realtime_pb2.WatchdogAction.Value(f"WATCHDOG_ACTION_{name.upper()}")
 
@@ -163,7 +164,8 @@ class RealtimeCalls(Calls):
     def timing(self, id: str, *, clear: bool = False) -> realtime_pb2.GetTimingResponse:
         """What the loop of a plant that runs by itself has counted; ``clear`` begins anew."""
         request = build(realtime_pb2.GetTimingRequest, id=id, clear=clear)
-        return self._call(self.plants.GetTiming, request)
+        answer: realtime_pb2.GetTimingResponse = self._call(self.plants.GetTiming, request)
+        return answer
 
     def watch_events(self, id: str, since: int | None = None) -> Iterator[Event]:
         """What happens to a plant besides its steps, from event ``since`` on; a plant keeps 256.

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
 
 from ._arrays import Array, Vector, matrix_message, numbers, vector, weight
-from ._check import build, instead, one_of, shown
+from ._check import build, instead, one_of, shown, texts
 from ._states import State, Trajectory
 
 #: Bounds by the name of an entry: (lowest, highest), None for no bound; a number fixes the entry.
@@ -157,7 +157,7 @@ def weights(
     )
 
 
-def momentum(projected: bool) -> plant_service_pb2.Momentum.ValueType:
+def momentum(projected: bool) -> plant_service_pb2.Momentum:
     projected_momentum = plant_service_pb2.MOMENTUM_PROJECTED
     return projected_momentum if projected else plant_service_pb2.MOMENTUM_UNSPECIFIED
 
@@ -233,9 +233,9 @@ def split_outputs(
     outputs: Sequence[str] | npt.ArrayLike,
 ) -> tuple[list[str], common_pb2.Matrix | None]:
     given: Any = outputs
-    if isinstance(given, np.ndarray) or (len(given) and not isinstance(given[0], str)):
-        return [], matrix_message(given, "given")
-    return list(given), None
+    if not isinstance(given, str) and len(given) and not isinstance(given[0], str):
+        return [], matrix_message(given, "outputs")
+    return texts("outputs", given), None
 
 
 def noise(

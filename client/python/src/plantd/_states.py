@@ -44,9 +44,17 @@ class State:
 
     @classmethod
     def _from(cls, m: common_pb2.State, model: str = "", time_step: float = 0.0) -> State:
-        arrays = map(array, (m.q, m.p, m.v, m.multipliers))
-        velocity = array(m.velocity)
-        return cls(m.step, m.time_s, *arrays, model=model, time_step=time_step, velocity=velocity)
+        return cls(
+            m.step,
+            m.time_s,
+            array(m.q),
+            array(m.p),
+            array(m.v),
+            array(m.multipliers),
+            model,
+            time_step,
+            array(m.velocity),
+        )
 
     def _message(self) -> common_pb2.State:
         return common_pb2.State(q=self.q, p=self.p, v=self.v)
