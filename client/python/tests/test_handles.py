@@ -4,10 +4,8 @@ import math
 import time
 
 import numpy as np
-import pytest
-
 import plantd
-
+import pytest
 from test_client import SCENE
 
 

@@ -8,9 +8,8 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
-
 import plantd
+import pytest
 
 
 @pytest.fixture

@@ -2,9 +2,8 @@
 with words of the libraries underneath."""
 
 import numpy as np
-import pytest
-
 import plantd
+import pytest
 
 #: Words of libraries underneath, which mean nothing to the caller.
 STRANGE = [

@@ -43,6 +43,7 @@ from ._recordings import Recording
 from ._requests import Stepping
 from ._rotation import compose, difference, rotations
 from ._states import Energy, State, StepReport, Trajectory
+from ._tables import read_recording
 
 __all__ = [
     "Accuracy",
@@ -102,5 +103,6 @@ __all__ = [
     "connect",
     "difference",
     "launch",
+    "read_recording",
     "rotations",
 ]

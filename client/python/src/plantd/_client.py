@@ -13,10 +13,10 @@ from ._kalman import KalmanCalls
 from ._linearize import LinearizeCalls
 from ._lqr import LqrCalls
 from ._mechanics import MechanicsCalls
-from ._models import ModelCalls
 from ._optimize import OptimizeCalls
 from ._realtime import RealtimeCalls
 from ._recordings import RecordingCalls
+from ._tables import TableCalls
 
 if TYPE_CHECKING:
     from ._launch import Server
@@ -35,7 +35,7 @@ def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
 
 
 class Client(
-    ModelCalls,
+    TableCalls,
     HandleCalls,
     DriveCalls,
     RealtimeCalls,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy.typing as npt
 
 from plantd.v1 import common_pb2, control_service_pb2
 
-from ._arrays import Array, array, complexes, matrix, matrix_message
+from ._arrays import Array, Vector, array, complexes, matrix, matrix_message, numbers, vector
 from ._rotation import difference
 from ._states import State, state_vector
 
@@ -38,6 +39,27 @@ class Gain:
     model: str = field(default="", kw_only=True)
     #: Time step that it was computed for, s; 0 where that is not said.
     time_step: float = field(default=0.0, kw_only=True)
+
+    @classmethod
+    def from_matrix(
+        cls,
+        k: npt.ArrayLike,
+        x_reference: State | npt.ArrayLike,
+        u_reference: Vector,
+        *,
+        rotations: Sequence[int] = (),
+        model: str = "",
+        time_step: float = 0.0,
+    ) -> Gain:
+        """A law of one's own, ``u = u_reference - k (x - x_reference)``, for `Client.set_feedback` as well."""
+        matrix, x = numbers(k, "k"), state_vector(x_reference)
+        u = vector(u_reference, "u_reference")
+        if matrix.shape != (u.size, x.size):
+            raise ValueError(
+                f"`k` has the shape {matrix.shape}; {(u.size, x.size)} fits `u_reference` and `x_reference`"
+            )
+        feedforward = np.zeros_like(u)
+        return cls(0, matrix, x, u, tuple(rotations), feedforward, model=model, time_step=time_step)
 
     def __call__(self, state: State | npt.ArrayLike) -> Array:
         x = state_vector(state)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +13,21 @@ from plantd.v1 import common_pb2, control_service_pb2
 
 from ._arrays import Array, Vector, array, matrix, tensor, vector
 from ._calls import Calls
-from ._check import build
+from ._check import build, instead, texts
+from ._extras import needed
+from ._origin import Origin, null_space
+from ._plots import plot_analysis
 from ._requests import Stepping, constraints, point, settings, split_outputs, trajectory
 from ._states import State, StepReport, Trajectory
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+    from ._client import Client
+
+
+#: Velocity up to which a state is at rest, m/s or rad/s.
+_REST = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +49,119 @@ class Linearization:
     controllability_rank: int | None = None
     #: What the solver did, and how well conditioned the equations are, where the call says so.
     report: StepReport | None = None
+    #: Model or plant whose map it is, where `Client.linearize` made it.
+    origin: Origin | None = field(default=None, repr=False)
+
+    def matrices(
+        self, *, velocity: bool = False, reduced: bool = False
+    ) -> tuple[Array, Array, Array, list[str]]:
+        """The map in other states: (a, b, e, names) with x = e z and z[k+1] = a z[k] + b u[k].
+
+        With ``velocity`` the states are (q, q̇) instead of (q, p, v): p = M(q) q̇, for models without
+        constraints, at rest. ``reduced`` keeps the directions in which a model with constraints can
+        move, at an equilibrium: displacements that satisfy them, and momenta apart from what constraints
+        take up; without constraints all of them.
+        """
+        origin = self._origin()
+        names = origin.state_names
+        nd, n = origin.dynamic, len(origin.model.coordinates)
+        assert self.state is not None
+        equation = origin.equation(self.state) if velocity or reduced else None
+        e, left = np.eye(len(names)), np.eye(len(names))
+        if equation is not None and equation.constraint_jacobian.shape[0]:
+            if velocity:
+                raise ValueError(
+                    "`velocity` is for models without constraints: with them a velocity does not give the "
+                    "momentum; leave it away"
+                )
+            if reduced:
+                jacobian = equation.constraint_jacobian
+                e_q, e_p = null_space(jacobian), null_space(jacobian[:, :nd])
+                e = _blocks(e_q, e_p, np.eye(n - nd))
+                left = e.T
+                names = [f"z{i}" for i in range(e.shape[1])]
+        elif velocity and equation is not None:
+            if np.any(np.abs(self.state.velocity) > _REST):
+                raise ValueError("`velocity` is for states at rest; this one moves")
+            mass = equation.mass_matrix[:nd, :nd]
+            e = _blocks(np.eye(n), mass, np.eye(n - nd))
+            left = _blocks(np.eye(n), np.linalg.inv(mass), np.eye(n - nd))
+            coordinates = names[:n]
+            names = coordinates + [f"v({name})" for name in coordinates]
+        return left @ self.a @ e, left @ self.b, e, names
+
+    def ss(
+        self,
+        outputs: Sequence[str] | None = None,
+        *,
+        velocity: bool = False,
+        reduced: bool = False,
+    ) -> Any:
+        """The map as ``control.StateSpace``, with names and time step, in differences from its point.
+
+        ``outputs`` are names of entries of x; all of its states, or with ``reduced`` all of x, if not
+        given. ``velocity`` and ``reduced`` are as in `matrices`. Needs the package ``control``.
+        """
+        control = needed("control", "control")
+        a, b, c, d, states, names = self._system(outputs, velocity, reduced)
+        origin = self._origin()
+        return control.ss(
+            a, b, c, d, origin.time_step, states=states, inputs=origin.input_names, outputs=names
+        )
+
+    def to_scipy(
+        self,
+        outputs: Sequence[str] | None = None,
+        *,
+        velocity: bool = False,
+        reduced: bool = False,
+    ) -> Any:
+        """The map as ``scipy.signal.StateSpace`` in discrete time, as `ss`. Needs the package ``scipy``."""
+        signal = needed("scipy.signal", "control")
+        a, b, c, d, _, _ = self._system(outputs, velocity, reduced)
+        return signal.StateSpace(a, b, c, d, dt=self._origin().time_step)
+
+    def _system(
+        self, outputs: Sequence[str] | None, velocity: bool, reduced: bool
+    ) -> tuple[Array, Array, Array, Array, list[str], list[str]]:
+        a, b, e, states = self.matrices(velocity=velocity, reduced=reduced)
+        entries = self._origin().state_names
+        if outputs is None and (velocity or states == entries):
+            names, c = states, np.eye(len(states))
+        else:
+            names = entries if outputs is None else texts("outputs", outputs)
+            c = np.zeros((len(names), len(states)))
+            for row, name in enumerate(names):
+                if name in entries:
+                    c[row] = e[entries.index(name)]
+                elif name in states:
+                    c[row, states.index(name)] = 1.0
+                else:
+                    raise ValueError(f"there is no state entry `{name}`{instead(name, [*entries, *states])}")
+        return a, b, c, np.zeros((len(names), b.shape[1])), states, names
+
+    def _origin(self) -> Origin:
+        if self.origin is None:
+            raise ValueError(
+                "this linearization does not say of which model it is; `client.linearize` makes one that does"
+            )
+        return self.origin
 
     @classmethod
     def _from(cls, m: common_pb2.Linearization, **extra: Any) -> Linearization:
         c, d = matrix(m.multipliers_x), matrix(m.multipliers_u)
         return cls(m.step, matrix(m.a), matrix(m.b), c, d, **extra)
+
+
+def _blocks(*blocks: npt.NDArray[Any]) -> Array:
+    """A block diagonal matrix."""
+    out = np.zeros((sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)))
+    row = column = 0
+    for block in blocks:
+        rows, columns = block.shape
+        out[row : row + rows, column : column + columns] = block
+        row, column = row + rows, column + columns
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +261,13 @@ class Analysis:
     #: State and input at which the map was linearized.
     state: State
     u: Array
+    #: Model or plant whose map it is.
+    origin: Origin | None = field(default=None, repr=False)
+
+    def plot(self) -> Any:
+        """A figure of the poles and, where frequencies were given, the frequency responses. Needs
+        ``matplotlib``."""
+        return plot_analysis(self)
 
     @classmethod
     def _from(cls, m: control_service_pb2.AnalyzeResponse) -> Analysis:
@@ -192,6 +316,7 @@ class LinearizeCalls(Calls):
             next=State._from(answer.next),
             controllability_rank=answer.controllability_rank,
             report=StepReport._from(answer.report),
+            origin=Origin(cast("Client", self), model, plant, stepping.get("dt", 0.0)),
         )
 
     def linearize_trajectory(
@@ -289,4 +414,6 @@ class LinearizeCalls(Calls):
         request.outputs.extend(names)
         if rows is not None:
             request.output_x.CopyFrom(rows)
-        return Analysis._from(self._call(self.control.Analyze, request))
+        analysis = Analysis._from(self._call(self.control.Analyze, request))
+        origin = Origin(cast("Client", self), model, plant, stepping.get("dt", 0.0))
+        return replace(analysis, origin=origin)

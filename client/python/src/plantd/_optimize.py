@@ -20,6 +20,7 @@ from ._check import build, one_of, shown, texts
 from ._errors import PlantdError, translated
 from ._feedback import GainSchedule
 from ._gains import Gain
+from ._progress import progress_bar
 from ._requests import (
     Bounds,
     Stepping,
@@ -193,8 +194,9 @@ class Search:
     the search on the server.
     """
 
-    def __init__(self, call: Any):
+    def __init__(self, call: Any, progress: bool | None = None):
         self._call = call
+        self._progress = progress
         self._result: Optimum | None = None
 
     def __iter__(self) -> Iterator[Progress]:
@@ -213,8 +215,10 @@ class Search:
     @property
     def result(self) -> Optimum:
         """The end of the search."""
-        for _ in self:
-            pass
+        with progress_bar("search", None, self._progress) as bar:
+            for step in self:
+                bar.set_postfix_str(f"cost {step.cost:.6g}")
+                bar.update(1)
         if self._result is None:
             raise PlantdError("CANCELLED", "the search has ended without a result")
         return self._result
@@ -330,6 +334,7 @@ class OptimizeCalls(Calls):
         projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         bound_tolerance: float = 0.0,
         checkpoint_every: int = 0,
+        progress: bool | None = None,
         **stepping: Unpack[Stepping],
     ) -> Search:
         """Finds a trajectory that costs least: an iterator over the iterations, with ``result``.
@@ -343,7 +348,8 @@ class OptimizeCalls(Calls):
         entries of the initial state, or those that are named; ``initial_weight`` weighs their
         distance from the guess. ``projection`` is the pair of weights (q, r) of a regulator that
         projects onto motions of the plant, in place of the law of the descent. The other options are
-        those of `OptimizationOptions` in the contract; 0 means its default.
+        those of `OptimizationOptions` in the contract; 0 means its default. ``progress`` shows a bar while
+        ``result`` is waited for; by default on a terminal.
         """
         if (guess is None) == (resume is None):
             raise ValueError("give one of `guess` and `resume`")
@@ -396,7 +402,7 @@ class OptimizeCalls(Calls):
                 checkpoint_every=checkpoint_every,
             ),
         )
-        return Search(self.control.OptimizeTrajectory(request))
+        return Search(self.control.OptimizeTrajectory(request), progress)
 
     def project_reference(
         self,
