@@ -217,6 +217,15 @@ impl Client {
         Ok(self.plants().step(self.limited(request)).await?.into_inner())
     }
 
+    /// Steps many plants in one call, each with an input of its own. What could not be stepped says why in its
+    /// answer; the others are stepped all the same.
+    ///
+    /// # Errors
+    /// A plant that is not there or given twice, and inputs that do not fit: no plant is stepped then.
+    pub async fn step_many(&self, request: v1::StepManyRequest) -> Result<v1::StepManyResponse> {
+        Ok(self.plants().step_many(self.limited(request)).await?.into_inner())
+    }
+
     /// Takes the lease of a plant, to step it in lockstep.
     pub async fn drive(&self, id: impl Into<String>) -> Result<Driver> {
         self.drive_as(v1::DriveOpen { id: id.into(), ..Default::default() }).await

@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use crate::model::mechanism::Model;
-use crate::scene::{Scene, SceneError};
+use crate::scene::{Scene, SceneError, UnknownName};
 
 /// Numbers that differ from those of the model that a plant was made from, by path. A path has one
 /// notation here: names where entries have them.
@@ -188,7 +188,10 @@ fn set(scene: &mut Value, path: &str, value: f64) -> Result<(String, f64), Strin
                         Some(Segment::Entry("0" | "1" | "2")) if depth + 2 == segments.len() => {
                             Value::from(vec![0.0; 3])
                         }
-                        Some(_) => return Err(format!("there is no `{canonical}`")),
+                        Some(_) => {
+                            let known = UnknownName::among(key, table.keys());
+                            return Err(format!("there is no `{canonical}`: no key {known}"));
+                        }
                     };
                     table.insert((*key).to_owned(), default);
                 }
@@ -201,9 +204,16 @@ fn set(scene: &mut Value, path: &str, value: f64) -> Result<(String, f64), Strin
                     Ok(index) => Some(index),
                     Err(_) => list.iter().position(|item| name(item) == Some(entry)),
                 };
+                let among = match entry.parse::<usize>() {
+                    Ok(_) => format!("it has {} entries, from 0 on", list.len()),
+                    Err(_) => {
+                        let known = list.iter().filter_map(name);
+                        format!("no entry {}", UnknownName::among(entry, known))
+                    }
+                };
                 let item = index
                     .and_then(|index: usize| list.get_mut(index))
-                    .ok_or_else(|| format!("there is no `{canonical}[{entry}]`"))?;
+                    .ok_or_else(|| format!("there is no `{canonical}[{entry}]`: {among}"))?;
                 canonical.push_str(&label(item, index.unwrap_or_default()));
                 place = item;
             }

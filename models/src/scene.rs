@@ -13,6 +13,7 @@ pub(crate) mod signals;
 mod text;
 mod validate;
 mod visuals;
+pub(crate) mod words;
 
 pub use crate::scene::forces::{Component, Force, ScaledInput};
 pub use crate::scene::inputs::{Input, InputTerm};
@@ -25,6 +26,7 @@ pub use crate::scene::linear_term::LinearTerm;
 pub use crate::scene::point::Point;
 pub use crate::scene::signals::{Interpolation, Signal};
 pub use crate::scene::visuals::{Shape, Visual};
+pub use crate::scene::words::{UnknownName, in_plain_words};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};

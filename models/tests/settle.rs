@@ -178,7 +178,10 @@ fn requests_that_make_no_sense() {
     let error = settle(&plant, &[f64::NAN, 0.0, 0.0], &[]).unwrap_err();
     assert!(matches!(error, SettleError::NotFinite { name: "q", index: 0, .. }));
     let error = settle(&plant, &q, &["nobody"]).unwrap_err();
-    assert_eq!(error, SettleError::Unknown { name: "nobody".to_owned() });
+    assert_eq!(
+        error.to_string(),
+        "there is no coordinate `nobody`; there are `crank`, `coupler`, `rocker`"
+    );
     let request = SettleRequest { q, hold: vec![], inputs: vec![1.0, 2.0] };
     let error = plant.model().settle(&request).unwrap_err();
     assert_eq!(error, SettleError::Dimension { name: "inputs", expected: 1, actual: 2 });

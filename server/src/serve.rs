@@ -50,6 +50,9 @@ use crate::wire::shared::state_directory::StateDirectory;
 /// Longest wait at the end for plants to be saved on a disk that does not answer.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
 
+/// How often plants are looked at that are kept for a time.
+const EXPIRY_PERIOD: Duration = Duration::from_secs(1);
+
 /// Where a server can be reached.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Addresses {
@@ -83,6 +86,8 @@ pub struct RunningServer {
     saver: tokio::task::JoinHandle<()>,
     /// Gives free memory back to the system.
     memory: tokio::task::JoinHandle<()>,
+    /// Deletes plants that nobody uses any more.
+    reaper: tokio::task::JoinHandle<()>,
     metrics: Option<tokio::task::JoinHandle<()>>,
     /// Removed from the file system when dropped.
     unix: Option<UnixSocket>,
@@ -176,6 +181,7 @@ impl RunningServer {
             closing: CancellationToken::new(),
             saver: tokio::spawn(save_plants(Arc::clone(&hub), config.state_interval())),
             memory: tokio::spawn(memory::give_back()),
+            reaper: tokio::spawn(delete_expired(Arc::clone(&hub))),
             metrics: None,
             unix: None,
             hub,
@@ -348,6 +354,7 @@ impl RunningServer {
         }
         self.saver.abort();
         self.memory.abort();
+        self.reaper.abort();
         if tokio::time::timeout(SAVE_WAIT_MAX, save_once(&self.hub)).await.is_err() {
             tracing::error!("the disk does not answer: not all plants were saved");
         }
@@ -377,6 +384,14 @@ async fn save_plants(hub: Arc<Hub>, interval: Duration) {
     loop {
         tokio::time::sleep(interval).await;
         save_once(&hub).await;
+    }
+}
+
+/// Deletes plants that nobody has used for as long as they are to be kept, over and over.
+async fn delete_expired(hub: Arc<Hub>) {
+    loop {
+        tokio::time::sleep(EXPIRY_PERIOD).await;
+        hub.delete_expired().await;
     }
 }
 

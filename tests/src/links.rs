@@ -14,6 +14,7 @@ use plantd_proto::link::SHARED_MEMORY_DIRECTORY;
 use plantd_server::core::metrics::registry::Metrics;
 use plantd_server::core::realtime::loops::RealTime;
 use plantd_server::core::realtime::settings::RealTimeSettings;
+use plantd_server::core::session::creation::Origin;
 use plantd_server::core::session::shared::Session;
 use plantd_server::wire::link::config::LinkConfig;
 use plantd_server::wire::link::host::LinkHost;
@@ -78,7 +79,7 @@ pub fn new_session_of(id: &str, model: &str) -> Result<Arc<Session>> {
     let plant = new_plant(model)?;
     let metrics = Arc::new(Metrics::default());
     let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
-    Ok(Session::new(id.to_owned(), model.to_owned(), plant, None, metrics, realtime))
+    Ok(Session::new(Origin::new(id, model), plant, metrics, realtime))
 }
 
 /// A plant of a built-in model.

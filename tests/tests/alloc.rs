@@ -22,6 +22,7 @@ use plantd_server::core::publish::ring::Reader;
 use plantd_server::core::realtime::loops::RealTime;
 use plantd_server::core::realtime::settings::{Pace, RealTimeSettings, RunSettings};
 use plantd_server::core::room::Room;
+use plantd_server::core::session::creation::Origin;
 use plantd_server::core::session::shared::Session;
 use plantd_server::wire::record::directory::Recordings;
 
@@ -376,7 +377,7 @@ fn paced_steps_allocate_nothing() {
 fn new_session(plant: Plant) -> Arc<Session> {
     let metrics = Arc::new(Metrics::default());
     let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
-    Session::new("a".to_owned(), "b".to_owned(), plant, None, metrics, realtime)
+    Session::new(Origin::new("a", "b"), plant, metrics, realtime)
 }
 
 #[test]

@@ -280,7 +280,7 @@ def test_rollout(client):
         )
         for k in range(4)
     ]
-    ends = sorted(client.rollout("pendulum", cases), key=lambda end: end.case)
+    ends = sorted(client.rollout_cases("pendulum", cases), key=lambda end: end.case)
     assert [end.case for end in ends] == [0, 1, 2, 3]
     assert all(not end.failure and end.states[-1].step == 10 for end in ends)
 
@@ -293,7 +293,7 @@ def test_a_case_of_a_rollout_that_is_refused_says_so(client):
         )
 
     good, refused = sorted(
-        client.rollout("pendulum", [case(0.1), case(0.1, 0.2)]), key=lambda end: end.case
+        client.rollout_cases("pendulum", [case(0.1), case(0.1, 0.2)]), key=lambda end: end.case
     )
     assert good.error is None and good.states[-1].step == 10
     assert refused.error.code == "INVALID_ARGUMENT" and "cases[1].initial" in refused.failure

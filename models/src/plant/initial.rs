@@ -18,6 +18,7 @@ use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
 use crate::plant::facade::Plant;
 use crate::plant::settle::{SettleError, SettleRequest};
+use crate::scene::words::UnknownName;
 
 /// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
 /// half turns about an axis and for cyclic exchanges of the axes, it is −1 or 0.
@@ -125,9 +126,10 @@ impl Plant {
             Initial::OperatingPoint(name) => {
                 let model = self.model.clone();
                 let point = model.operating_points.iter().find(|point| point.name == *name);
+                let known = model.operating_points.iter().map(|point| &point.name);
                 let point = point.ok_or_else(|| InitialError::Unknown {
                     kind: "operating point",
-                    name: name.clone(),
+                    name: UnknownName::among(name, known),
                 })?;
                 state.p = self.momentum_between(&point.q, &point.q, &point.u[..d.inputs]);
                 state.q.copy_from_slice(&point.q);
@@ -436,12 +438,12 @@ pub enum InitialError {
         value: f64,
     },
     /// No operating point or coordinate of that name.
-    #[error("there is no {kind} `{name}`")]
+    #[error("there is no {kind} {name}")]
     Unknown {
         /// What was looked for.
         kind: &'static str,
         /// Its name.
-        name: String,
+        name: UnknownName,
     },
     /// The configuration violates a constraint by more than 1e-6 relative.
     #[error("constraint `{constraint}` is violated by {violation:e}")]

@@ -23,6 +23,7 @@ use crate::math::null_space::tangent_basis;
 use crate::model::conditioning::Conditioning;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
+use crate::scene::words::UnknownName;
 
 /// Iterations before the search is given up.
 const MAX_ITERATIONS: u32 = 300;
@@ -109,10 +110,10 @@ pub enum SettleError {
         value: f64,
     },
     /// No coordinate of that name.
-    #[error("there is no coordinate `{name}`")]
+    #[error("there is no coordinate {name}")]
     Unknown {
         /// The name.
-        name: String,
+        name: UnknownName,
     },
     /// No configuration near the guess satisfies the constraints.
     #[error(
@@ -150,11 +151,13 @@ impl Model {
     }
 
     /// Which coordinates are dynamic and not held; the name of one to be held that is unknown.
-    pub(crate) fn free_coordinates(&self, hold: &[String]) -> Result<Vec<bool>, String> {
+    pub(crate) fn free_coordinates(&self, hold: &[String]) -> Result<Vec<bool>, UnknownName> {
         let d = self.dimensions;
         let mut is_free: Vec<bool> = (0..d.coordinates()).map(|i| i < d.dynamic).collect();
         for name in hold {
-            is_free[self.coordinate_index(name).ok_or(name)?] = false;
+            let known = self.coordinates.iter().map(|coordinate| &coordinate.name);
+            let index = self.coordinate_index(name);
+            is_free[index.ok_or_else(|| UnknownName::among(name, known))?] = false;
         }
         Ok(is_free)
     }

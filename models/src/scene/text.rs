@@ -2,6 +2,7 @@
 
 use crate::scene::limits::MAX_TEXT_BYTES;
 use crate::scene::number_or_name::SEPARATOR;
+use crate::scene::words::in_plain_words;
 use crate::scene::{Problem, Scene, SceneError};
 
 impl Scene {
@@ -24,7 +25,8 @@ impl Scene {
             let (path, message) = (path_of(e.path()), e.inner().to_string());
             let position = format!(" at line {} column {}", e.inner().line(), e.inner().column());
             let alone = message.strip_suffix(&position).unwrap_or(&message);
-            within(&path, alone).unwrap_or_else(|| single(path, message))
+            within(&path, alone)
+                .unwrap_or_else(|| single(path, format!("{}{position}", in_plain_words(alone))))
         })?;
         deserializer.end().map_err(|e| single(String::new(), e.to_string()))?;
         Ok(scene)
@@ -71,16 +73,16 @@ fn path_of(path: &serde_path_to_error::Path) -> String {
 /// it is the element's, and is left out.
 fn within(path: &str, message: &str) -> Option<SceneError> {
     let (field, message) = message.strip_prefix(SEPARATOR)?.split_once(SEPARATOR)?;
-    Some(single(format!("{path}.{field}"), message.to_owned()))
+    Some(single(format!("{path}.{field}"), in_plain_words(message)))
 }
 
 fn toml_error(path: String, error: &toml::de::Error, text: &str) -> SceneError {
     let message = match error.span() {
         Some(span) => {
             let (line, column) = line_and_column(text, span.start);
-            format!("{} at line {line} column {column}", error.message())
+            format!("{} at line {line} column {column}", in_plain_words(error.message()))
         }
-        None => error.message().to_owned(),
+        None => in_plain_words(error.message()),
     };
     single(path, message)
 }
@@ -116,7 +118,7 @@ mod tests {
             ("format = ", "", "line 1 column 10"),
             ("format = 1\nname = 3\nframes = []", "name", "line 2 column 8"),
             ("format = -1\nname = \"a\"\nframes = []", "format", "line 1 column 10"),
-            (&format!("{good}mass = 1.0"), "frames[0].mass", "unknown field `mass`"),
+            (&format!("{good}mass = 1.0"), "frames[0].mass", "there is no key `mass`"),
             (
                 &format!("{good}body = {{ mass = \"1\" }}"),
                 "frames[0].body.mass",
@@ -125,44 +127,44 @@ mod tests {
             (
                 &format!("{good}joint = {{ type = \"bowl\" }}"),
                 "frames[0].joint.type",
-                "unknown variant",
+                "there is no `bowl`",
             ),
             (
                 &format!(
                     "{good}[[forces]]\ntype = \"body_wrench\"\nframe = \"arm\"\ntorque = [0, \"tau\", true]"
                 ),
                 "forces[0].torque[2]",
-                "invalid type: boolean `true`, expected a number, the name of an input, or a table of input and gain",
+                "boolean `true` is given; a number, the name of an input, or a table of input and gain is needed",
             ),
             (
                 &format!(
                     "{good}[[forces]]\ntype = \"hybrid_wrench\"\nframe = \"arm\"\nforce = [0, 1]"
                 ),
                 "forces[0].force",
-                "an array of length 3",
+                "a list of 3 is needed",
             ),
             (
                 &format!(
                     "{good}[[constraints]]\ntype = \"distance\"\nname = \"rod\"\na = {{ frame = \"arm\" }}\nb = {{ frame = \"world\" }}\nlength = [1.0]"
                 ),
                 "constraints[0].length",
-                "expected a number of metres or the name of a prescribed coordinate",
+                "a number of metres or the name of a prescribed coordinate is needed",
             ),
             (
                 &format!("{good}joint = {{ type = \"revolute\", axis = [1, 0] }}"),
                 "frames[0].joint",
-                "an array of length 3",
+                "a list of 3 is needed",
             ),
-            ("format = 1\nname = \"a\"", "", "missing field `frames`"),
+            ("format = 1\nname = \"a\"", "", "`frames` is missing"),
             (
                 "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, [], 1]}]}",
                 "forces[0].force[1]",
-                "invalid type: sequence, expected a number, the name of an input, or a table of input and gain",
+                "a list is given; a number, the name of an input, or a table of input and gain is needed",
             ),
             (
                 "{\"format\": 1, \"name\": \"a\", \"frames\": [], \"forces\": [\n{\"type\": \"spatial_wrench\", \"frame\": \"a\", \"force\": [0, {\"input\": \"u\"}, 1]}]}",
                 "forces[0].force[1]",
-                "missing field `gain`",
+                "`gain` is missing",
             ),
             ("{\"format\": 1, \"name\": 3, \"frames\": []}", "name", "line 1 column 23"),
             ("{\"format\": 1, \"name\": \"a\", \"frames\": []} x", "", "trailing characters"),
@@ -175,7 +177,7 @@ mod tests {
             (
                 &format!("{{\"frames\": {}", "[".repeat(100_000)),
                 "frames[0][0]",
-                "expected a string",
+                "a string is needed",
             ),
         ];
         let mut wrong = Vec::new();

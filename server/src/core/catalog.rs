@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex, OnceLock, Weak};
 
+use plantd_models::scene::UnknownName;
 use plantd_models::{Model, builtin};
 use prometheus_client::metrics::gauge::Gauge;
 
@@ -14,10 +15,10 @@ use crate::core::mutex::lock;
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum CatalogError {
     /// There is no model of that name.
-    #[error("there is no model `{name}`")]
+    #[error("there is no model {name}")]
     NotFound {
         /// The name.
-        name: String,
+        name: UnknownName,
     },
     /// The name is taken, by an uploaded or a built-in model.
     #[error("there already is a model `{name}`")]
@@ -111,9 +112,16 @@ impl Catalog {
         if let Some(uploaded) = lock(&self.uploaded).get(name) {
             return Ok(uploaded.entry(name));
         }
-        let model =
-            self.builtin(name)?.ok_or_else(|| CatalogError::NotFound { name: name.to_owned() })?;
+        let model = self.builtin(name)?.ok_or_else(|| self.not_found(name))?;
         Ok(Entry { name: name.to_owned(), builtin: true, model, files: Arc::default() })
+    }
+
+    fn not_found(&self, name: &str) -> CatalogError {
+        let families = ["chain-8", "tree-8", "scissor-8"].map(str::to_owned);
+        let uploaded: Vec<String> = lock(&self.uploaded).keys().cloned().collect();
+        let known = self.named.keys().map(|name| (*name).to_owned());
+        let known = known.chain(uploaded).chain(families);
+        CatalogError::NotFound { name: UnknownName::among(name, known) }
     }
 
     fn builtin(&self, name: &str) -> Result<Option<Arc<Model>>, CatalogError> {
@@ -134,16 +142,27 @@ impl Catalog {
         Ok(Some(model))
     }
 
-    /// Keeps an uploaded model.
+    /// Keeps an uploaded model under a name that is free.
     pub fn insert(&self, name: &str, model: Arc<Model>) -> Result<Entry, CatalogError> {
+        self.keep(name, model, false)
+    }
+
+    /// Keeps an uploaded model, if need be in the place of another uploaded one of that name.
+    pub fn replace(&self, name: &str, model: Arc<Model>) -> Result<Entry, CatalogError> {
+        self.keep(name, model, true)
+    }
+
+    fn keep(&self, name: &str, model: Arc<Model>, replace: bool) -> Result<Entry, CatalogError> {
         if builtin::scene(name).is_some() {
             return Err(CatalogError::Exists { name: name.to_owned() });
         }
         let mut uploaded = lock(&self.uploaded);
-        if uploaded.contains_key(name) {
+        let is_there = uploaded.contains_key(name);
+        if is_there && !replace {
             return Err(CatalogError::Exists { name: name.to_owned() });
         }
-        LimitExceeded::check("models", self.models_max, "uploaded models", uploaded.len() + 1)?;
+        let count = uploaded.len() + usize::from(!is_there);
+        LimitExceeded::check("models", self.models_max, "uploaded models", count)?;
         let new = Uploaded { model, files: Arc::default() };
         let entry = new.entry(name);
         uploaded.insert(name.to_owned(), new);
@@ -164,7 +183,7 @@ impl Catalog {
             let name = model.to_owned();
             return Err(match builtin::scene(model) {
                 Some(_) => CatalogError::BuiltinFile { name },
-                None => CatalogError::NotFound { name },
+                None => self.not_found(model),
             });
         };
         let file = self.file_room.put(&files, &path, bytes)?;
@@ -191,7 +210,8 @@ impl Catalog {
         if builtin::scene(name).is_some() {
             return Err(CatalogError::Builtin { name: name.to_owned() });
         }
-        Err(CatalogError::NotFound { name: name.to_owned() })
+        drop(uploaded);
+        Err(self.not_found(name))
     }
 
     /// Up to `size` models after the one named `after` (none: from the start), and whether there are

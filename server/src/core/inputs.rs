@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
+use plantd_models::scene::UnknownName;
 use plantd_models::{Initial, InitialError, Model, Plant, Settings, Spare};
 
 /// A plant at an operating point of its scene, and the input there.
@@ -12,9 +13,10 @@ pub fn at_operating_point(
     name: &str,
 ) -> Result<(Plant, Vec<f64>), InitialError> {
     let point = model.operating_points().iter().find(|point| point.name == name);
-    let input = point
-        .map(|point| point.u.clone())
-        .ok_or_else(|| InitialError::Unknown { kind: "operating point", name: name.to_owned() })?;
+    let input = point.map(|point| point.u.clone()).ok_or_else(|| {
+        let known = model.operating_points().iter().map(|point| &point.name);
+        InitialError::Unknown { kind: "operating point", name: UnknownName::among(name, known) }
+    })?;
     let start = Initial::OperatingPoint(name.to_owned());
     Ok((Spare::new(Arc::clone(model), settings)?.start(&start)?, input))
 }

@@ -3,6 +3,7 @@
 //! A request beyond a limit is refused with RESOURCE_EXHAUSTED, reason `LIMIT_EXCEEDED`, and the
 //! limit's name in the error's details. `plantd limits` prints the table with the values in force.
 
+use plantd_models::scene::UnknownName;
 use serde::{Deserialize, Serialize};
 
 macro_rules! limits {
@@ -37,7 +38,10 @@ macro_rules! limits {
             pub fn set(&mut self, name: &str, value: u64) -> Result<(), LimitError> {
                 match name {
                     $(stringify!($name) => self.$name = value,)+
-                    _ => return Err(LimitError::Unknown { name: name.to_owned() }),
+                    _ => {
+                        let name = UnknownName::among(name, [$(stringify!($name)),+]);
+                        return Err(LimitError::Unknown { name });
+                    }
                 }
                 self.check()
             }
@@ -157,10 +161,10 @@ pub struct Limit {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum LimitError {
     /// There is no limit of that name.
-    #[error("there is no limit `{name}`; `plantd limits` lists them")]
+    #[error("there is no limit {name}; `plantd limits` lists them")]
     Unknown {
         /// The name.
-        name: String,
+        name: UnknownName,
     },
     /// The value is out of range.
     #[error("limit `{name}` is {value}; it must lie between {low} and {high}")]
@@ -238,7 +242,8 @@ mod tests {
     #[test]
     fn wrong_names_and_values_are_refused() {
         let mut limits = Limits::default();
-        assert_eq!(limits.set("plant", 1), Err(LimitError::Unknown { name: "plant".to_owned() }));
+        let error = limits.set("plant", 1).unwrap_err().to_string();
+        assert!(error.starts_with("there is no limit `plant`; did you mean `plants`?"), "{error}");
         assert!(matches!(
             limits.set("connections", 0),
             Err(LimitError::OutOfRange { name: "connections", value: 0, .. })

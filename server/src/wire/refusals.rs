@@ -29,7 +29,7 @@ impl From<CatalogError> for RpcError {
     fn from(error: CatalogError) -> Self {
         let problem = error.to_string();
         match error {
-            CatalogError::NotFound { name } => Self::model_not_found(&name),
+            CatalogError::NotFound { name } => Self::model_not_found(&name.name, &problem),
             CatalogError::Exists { name } => Self::model_exists(&name),
             CatalogError::Builtin { name } | CatalogError::BuiltinFile { name } => {
                 Self::precondition("BUILTIN_MODEL", format!("model:{name}"), problem)

@@ -50,6 +50,7 @@
 use std::collections::HashMap;
 
 use plantd_models::SceneError;
+use plantd_models::scene::UnknownName;
 use plantd_proto::v1;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
@@ -113,8 +114,8 @@ impl RpcError {
     }
 
     /// There is no such model.
-    pub fn model_not_found(name: &str) -> Self {
-        Self::resource(Code::NotFound, "MODEL_NOT_FOUND", "model", name, "there is no model")
+    pub fn model_not_found(name: &str, message: &str) -> Self {
+        Self::resource_because(Code::NotFound, "MODEL_NOT_FOUND", "model", name, message)
     }
 
     /// The plant has no such fault.
@@ -124,8 +125,9 @@ impl RpcError {
     }
 
     /// There is no such plant.
-    pub fn plant_not_found(id: &str) -> Self {
-        Self::resource(Code::NotFound, "PLANT_NOT_FOUND", "plant", id, "there is no plant")
+    pub fn plant_not_found(id: &UnknownName) -> Self {
+        let message = format!("there is no plant {id}");
+        Self::resource_because(Code::NotFound, "PLANT_NOT_FOUND", "plant", &id.name, &message)
     }
 
     /// The plant was deleted while it was used.
@@ -174,8 +176,23 @@ impl RpcError {
         name: &str,
         sentence: &'static str,
     ) -> Self {
-        let name = shortened(name);
-        let message = shortened(format!("{sentence} `{name}`"));
+        Self::resource_because(
+            code,
+            reason,
+            kind,
+            name,
+            &format!("{sentence} `{}`", shortened(name)),
+        )
+    }
+
+    fn resource_because(
+        code: Code,
+        reason: &'static str,
+        kind: &'static str,
+        name: &str,
+        message: &str,
+    ) -> Self {
+        let (name, message) = (shortened(name), shortened(message));
         let mut fault = Self::new(code, reason, message.clone());
         fault.extra.details.set_resource_info(kind, name, "", message);
         fault
@@ -401,7 +418,7 @@ mod tests {
         let problem = |i| Problem { path: format!("frames[{i}]"), message: "x".repeat(1000) };
         let faults = [
             RpcError::from(SceneError { problems: (0..5000).map(problem).collect() }),
-            RpcError::model_not_found(&"ü".repeat(1_000_000)),
+            RpcError::model_not_found(&"ü".repeat(1_000_000), &"ü".repeat(1_000_000)),
             RpcError::field("f".repeat(100_000), "d".repeat(100_000)),
         ];
         for fault in faults {

@@ -12,6 +12,7 @@ mod feedback;
 mod import;
 mod kalman;
 mod limits;
+mod many;
 mod mechanics;
 mod methods;
 mod momentum;

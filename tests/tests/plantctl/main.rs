@@ -310,7 +310,18 @@ fn scenes_are_checked_explained_and_uploaded() {
         .unwrap();
     child.stdin.take().unwrap().write_all(SCENE.as_bytes()).unwrap();
     assert!(child.wait_with_output().unwrap().status.success());
-    json(&server, &["delete", "model", "slider"]);
+    assert_eq!(run(&server, &["upload", good]).status.code(), Some(1), "the name is taken");
+    json(&server, &["upload", good, "--replace"]);
+    json(&server, &["create", "slider", "--id", "a", "--expires", "60"]);
+    json(&server, &["create", "pendulum", "--id", "b"]);
+    let deleted = json(&server, &["delete", "model", "--all"]);
+    assert_eq!(deleted["deleted"]["models"], serde_json::json!(["slider"]));
+    let deleted = json(&server, &["delete", "plant", "--all"]);
+    assert_eq!(deleted["deleted"]["plants"], serde_json::json!(["a", "b"]));
+    assert_eq!(json(&server, &["list", "plants"])["plants"], Value::Array(Vec::new()));
+    for wrong in [&["delete", "plant"][..], &["delete", "plant", "a", "--all"]] {
+        assert_eq!(run(&server, wrong).status.code(), Some(2), "{wrong:?}");
+    }
 }
 
 /// `import` needs no server; what it prints is a scene, and `upload` takes the robot itself.

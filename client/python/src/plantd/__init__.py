@@ -14,51 +14,36 @@ Vectors and matrices are numpy arrays in SI units and radians. What the server r
 `PlantdError`, with the gRPC code, the reason and the faults of the request.
 """
 
+from ._batch import Rollout, Rollouts, Stepped
+from ._channels import Channels, Outputs
 from ._client import Client, connect
 from ._drive import Driver
 from ._errors import PlantdError, StepError, Violation
-from ._feedback import Follower, GainSchedule
+from ._feedback import Feedback, Follower, GainSchedule, WatchedGain
+from ._gains import Gain, Regulator, TrajectoryGain
+from ._handle import PlantHandle
 from ._kalman import Kalman, KalmanStep, TrajectoryKalman
-from ._optimize import Checkpoint, Optimum, Progress, ProjectedReference, Search
-from ._requests import Stepping
-from ._rotation import compose, difference, rotations
-from ._types import (
-    Accuracy,
-    Analysis,
+from ._launch import Server, launch
+from ._linearize import Analysis, Contraction, Linearization, Mode, SecondOrder
+from ._mechanics import (
     CenterOfMass,
-    Channels,
-    Contraction,
-    Diagnostics,
     Dynamics,
-    Energy,
     EquationOfMotion,
-    Event,
-    Feedback,
     ForwardDynamics,
     FrameMotion,
-    Gain,
     InverseDynamics,
     Kinematics,
-    Linearization,
-    Mode,
-    Outputs,
-    Plant,
     PointMotion,
-    Poles,
-    Poses,
-    Recording,
-    Regulator,
-    Rollout,
-    SecondOrder,
-    Settled,
-    State,
-    StepReport,
-    StepTiming,
-    Trajectory,
-    TrajectoryGain,
-    Watched,
-    WatchedGain,
 )
+from ._models import Settled
+from ._optimize import Checkpoint, Optimum, Progress, ProjectedReference, Search
+from ._plants import Accuracy, Diagnostics, Plant, Poles, Poses, Watched
+from ._realtime import Event, StepTiming
+from ._recordings import Recording
+from ._requests import Stepping
+from ._rotation import compose, difference, rotations
+from ._states import Energy, State, StepReport, Trajectory
+from ._tables import read_recording
 
 __all__ = [
     "Accuracy",
@@ -89,6 +74,7 @@ __all__ = [
     "Optimum",
     "Outputs",
     "Plant",
+    "PlantHandle",
     "PlantdError",
     "PointMotion",
     "Poles",
@@ -98,13 +84,16 @@ __all__ = [
     "Recording",
     "Regulator",
     "Rollout",
+    "Rollouts",
     "Search",
     "SecondOrder",
+    "Server",
     "Settled",
     "State",
     "StepError",
     "StepReport",
     "StepTiming",
+    "Stepped",
     "Stepping",
     "Trajectory",
     "TrajectoryGain",
@@ -115,5 +104,7 @@ __all__ = [
     "compose",
     "connect",
     "difference",
+    "launch",
+    "read_recording",
     "rotations",
 ]

@@ -8,6 +8,7 @@ from urllib.parse import urlsplit
 
 import grpc
 
+from ._check import shown
 from ._errors import PlantdError
 
 #: Answers hold no more than a request asked for; this only stops a runaway peer.
@@ -18,9 +19,16 @@ _CONNECT_SECONDS = 5.0
 
 _UNIX = "unix:"
 
+_HOW_TO_START = (
+    "`plantd serve` in a terminal starts a server at http://127.0.0.1:50051; `plantd.launch()` starts one "
+    "for this program alone"
+)
+
 
 def open_channel(address: str) -> grpc.Channel:
     """A connection to ``http://host:port``, ``host:port`` or ``unix:/path`` on which a server answers."""
+    if not isinstance(address, str):
+        raise TypeError(f"`address` is {shown(address)}; a text such as http://127.0.0.1:50051 is needed")
     target = _target(address)
     options: list[tuple[str, Any]] = [("grpc.max_receive_message_length", _MAX_RECEIVE_BYTES)]
     if target.startswith(_UNIX):
@@ -31,7 +39,7 @@ def open_channel(address: str) -> grpc.Channel:
         grpc.channel_ready_future(channel).result(timeout=_CONNECT_SECONDS)
     except grpc.FutureTimeoutError:
         channel.close()
-        message = f"cannot connect to {address}: {_problem(target)}"
+        message = f"cannot connect to {address}: {_problem(target)}. {_HOW_TO_START}"
         raise PlantdError("UNAVAILABLE", message) from None
     return channel
 

@@ -5,23 +5,19 @@ from __future__ import annotations
 import queue
 from typing import Any
 
-from plantd.v1 import common_pb2
+from plantd.v1 import common_pb2, plant_service_pb2
 from plantd.v1 import plant_service_pb2 as pb
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
+from ._arrays import Array, Vector, array, vector
+from ._calls import Calls
+from ._channels import Outputs
+from ._check import build
 from ._errors import PlantdError, from_failure, translate
-from ._types import (
-    Array,
-    Linearization,
-    Outputs,
-    Plant,
-    State,
-    StepReport,
-    StepTiming,
-    Vector,
-    array,
-    vector,
-)
+from ._linearize import Linearization
+from ._plants import Plant
+from ._realtime import StepTiming
+from ._states import State, StepReport
 
 
 class Driver:
@@ -57,7 +53,8 @@ class Driver:
     @translate
     def _next(self) -> pb.DriveResponse:
         try:
-            return next(self._answers)
+            answer: pb.DriveResponse = next(self._answers)
+            return answer
         except StopIteration:
             raise PlantdError("UNAVAILABLE", "the server closed the stream") from None
 
@@ -79,7 +76,7 @@ class Driver:
     def offer(self, u: Vector) -> None:
         """Gives a plant that runs by itself an input, which acts from its next step on."""
         self._sequence += 1
-        input = pb.DriveInput(sequence=self._sequence, u=vector(u), answers_ns=self._answers_ns)
+        input = pb.DriveInput(sequence=self._sequence, u=vector(u, "u"), answers_ns=self._answers_ns)
         self._requests.put(pb.DriveRequest(input=input))
 
     def next(self) -> State:
@@ -128,3 +125,21 @@ class Driver:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+class DriveCalls(Calls):
+    """The call that takes the lease of a plant."""
+
+    def drive(
+        self, id: str, *, linearization: bool = False, grace: float = 0.0, resume: str = ""
+    ) -> Driver:
+        """Takes the lease of a plant, to step it or to give it inputs.
+
+        The lease is kept for ``grace`` seconds when the connection breaks; ``resume`` goes on with
+        it (`Driver.lease_token`).
+        """
+        open = build(
+            plant_service_pb2.DriveOpen,
+            id=id, linearization=linearization, grace_s=grace, resume=resume
+        )
+        return Driver(self.plants, open)

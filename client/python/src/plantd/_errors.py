@@ -9,9 +9,17 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import grpc
-from google.rpc import error_details_pb2, status_pb2
+from google.rpc import error_details_pb2, status_pb2  # type: ignore[import-untyped]
 
 from plantd.v1 import common_pb2
+
+#: What is said where a call did not reach the server, or its answer not the client.
+_TRANSPORT = {
+    "UNAVAILABLE": "the server does not answer any more: it has ended, or the connection broke",
+    "DEADLINE_EXCEEDED": "no answer within the client's `timeout`; `plantd.connect` takes a longer one",
+    "UNIMPLEMENTED": "the server does not know this call: it is another version than this package",
+    "CANCELLED": "the call was cancelled here",
+}
 
 _DETAILS_KEY = "grpc-status-details-bin"
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -66,7 +74,12 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
     for key, value in error.trailing_metadata() or ():
         if key == _DETAILS_KEY:
             reason, violations = _details(value)
-    return PlantdError(error.code().name, error.details() or "", reason, violations)
+    code = error.code().name
+    message = error.details() or ""
+    if not reason:
+        # It did not come from the server.
+        message = _TRANSPORT.get(code, message)
+    return PlantdError(code, message, reason, violations)
 
 
 def _details(value: bytes) -> tuple[str, tuple[Violation, ...]]:
@@ -94,6 +107,10 @@ def translated() -> Iterator[None]:
         yield
     except grpc.RpcError as error:
         raise from_rpc_error(error) from None
+    except ValueError as error:
+        if "closed channel" not in str(error):
+            raise
+        raise PlantdError("CANCELLED", "the client is closed") from None
 
 
 def translate(function: _Function) -> _Function:

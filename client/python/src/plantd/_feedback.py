@@ -5,19 +5,103 @@ from __future__ import annotations
 import threading
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import grpc
+import numpy.typing as npt
 
 from plantd.v1 import plant_service_pb2
 
+from ._arrays import Array, Vector, failure_text
+from ._calls import Calls
+from ._check import build, one_of, shown
 from ._errors import PlantdError, from_rpc_error
-from ._types import Array, Gain, State, WatchedGain
+from ._gains import Gain
+from ._requests import (
+    Bounds,
+    bounds,
+    constraints,
+    point,
+    stage_weights,
+    trajectory_weights,
+)
+from ._states import State, Trajectory
 
 #: Gains of a trajectory that are kept ahead of the step asked for.
 _WINDOW = 1024
+
+
+#: What a feedback does in the plant's own loop, see `Client.set_feedback`.
+FEEDBACK_MODES = {
+    "watch": plant_service_pb2.FEEDBACK_MODE_WATCH_ONLY,
+    "replace": plant_service_pb2.FEEDBACK_MODE_REPLACE,
+    "add": plant_service_pb2.FEEDBACK_MODE_ADD,
+    "guard": plant_service_pb2.FEEDBACK_MODE_GUARD,
+}
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """A feedback of a plant."""
+
+    #: What it does in the plant's loop: ``watch``, ``replace``, ``add`` or ``guard``.
+    mode: str
+    #: Counts the computations of its gains, from 1.
+    revision: int
+    #: Step of the plant at which a trajectory begins.
+    first_step: int
+    #: Steps of the trajectory; 0 about an operating point.
+    horizon: int
+    #: Step at which the watchdog took over, and the entry of x that made it do so.
+    tripped_at_step: int | None
+    tripped_by: str
+    #: Why the gains in force are still those of the parameters before; empty if they are not.
+    failure: str
+
+    @classmethod
+    def _from(cls, m: plant_service_pb2.FeedbackInfo) -> Feedback:
+        modes = {number: name for name, number in FEEDBACK_MODES.items()}
+        return cls(
+            modes.get(m.mode, "watch"),
+            m.revision,
+            m.first_step,
+            m.horizon,
+            m.tripped_at_step if m.HasField("tripped_at_step") else None,
+            m.tripped_by,
+            failure_text(m),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class WatchedGain:
+    """One message of a watch of gains."""
+
+    #: The gain; without rows in ``k`` in the message with the final state of a trajectory. None in
+    #: a message that only reports a failure.
+    gain: Gain | None
+    #: Of which computation it is.
+    revision: int
+    #: Revisions that this watcher never saw.
+    dropped: int
+    #: Why the gains in force are still those of the parameters before; empty if they are not.
+    failure: str
+    #: Step of the plant at which the gain's trajectory begins, and its steps; 0 steps about an
+    #: operating point.
+    first_step: int
+    horizon: int
+
+    @classmethod
+    def _from(cls, m: plant_service_pb2.WatchGainsResponse) -> WatchedGain:
+        return cls(
+            Gain._from(m.gain) if m.HasField("gain") else None,
+            m.revision,
+            m.dropped,
+            failure_text(m),
+            m.first_step,
+            m.horizon,
+        )
 
 
 class GainSchedule:
@@ -224,3 +308,87 @@ class Follower:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+class FeedbackCalls(Calls):
+    """Calls that give a plant a regulator."""
+
+    def set_feedback(
+        self,
+        id: str,
+        *,
+        at: str | None = None,
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        trajectory: Trajectory | None = None,
+        gain: Gain | None = None,
+        q: npt.ArrayLike | None = None,
+        r: npt.ArrayLike | None = None,
+        q_final: npt.ArrayLike | None = None,
+        s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
+        stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
+        full: bool = False,
+        mode: Literal["watch", "replace", "add", "guard"] = "watch",
+        first_step: int | None = None,
+        guard: Bounds | None = None,
+    ) -> Feedback:
+        """Gives a plant a reference with its regulator, which the server computes, and computes anew
+        when the plant's parameters change. `follow_gains` applies it here.
+
+        The reference is one of: an equilibrium (``at``, or ``state`` with ``u``, or where ``plant``
+        is), a ``trajectory``, which begins at the plant's step ``first_step`` or at the present one,
+        or a ``gain`` as it stands, which must not say that it is for another model or time step. When
+        parameters change, the reference of a trajectory is the motion of the changed plant from the
+        same initial state under the same inputs.
+
+        ``mode`` is what the feedback does in the plant's own loop, ``law`` standing for its input:
+        ``watch`` nothing; ``replace`` u = law; ``add`` u = law + what the driver sends; ``guard``
+        u = law from the first step on at which an entry of x - x_reference leaves its bounds in
+        ``guard``.
+        """
+        forms = [at is not None, state is not None, bool(plant), trajectory is not None]
+        if sum([*forms, gain is not None]) != 1:
+            raise ValueError("give one of `at`, `state`, `plant`, `trajectory` and `gain`")
+        one_of("mode", mode, FEEDBACK_MODES)
+        for argument, value, kind in [
+            ("trajectory", trajectory, Trajectory),
+            ("gain", gain, Gain),
+        ]:
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"`{argument}` is {shown(value)}; a `plantd.{kind.__name__}` is needed")
+        request = build(
+            plant_service_pb2.SetFeedbackRequest,
+            id=id,
+            stages=stage_weights(stages),
+            constraints=constraints(full),
+            mode=FEEDBACK_MODES[mode],
+            first_step=first_step,
+            guard=bounds(guard),
+        )
+        if gain is not None:
+            request.gain.CopyFrom(gain._message())
+        elif trajectory is not None:
+            request.trajectory.CopyFrom(trajectory._message())
+        else:
+            request.point.CopyFrom(point(at, state, u, plant))
+        given = trajectory_weights(q, r, q_final, s, projected_momentum)
+        if given is not None:
+            request.weights.CopyFrom(given)
+        return Feedback._from(self._call(self.plants.SetFeedback, request).feedback)
+
+    def clear_feedback(self, id: str) -> None:
+        """Takes the reference away; the driver's input acts alone again."""
+        self._call(self.plants.ClearFeedback, build(plant_service_pb2.ClearFeedbackRequest, id=id))
+
+    def watch_gains(self, id: str) -> Iterator[WatchedGain]:
+        """The gains of a plant's feedback: along a trajectory those of every step from the present one
+        on, ahead of time; about an operating point the one in force and each that replaces it."""
+        request = build(plant_service_pb2.WatchGainsRequest, id=id)
+        return self._messages(self.plants.WatchGains(request), WatchedGain._from)
+
+    def follow_gains(self, id: str) -> Follower:
+        """Follows the gains of a plant's feedback, to apply them here: ``u = law(state)``."""
+        request = build(plant_service_pb2.WatchGainsRequest, id=id)
+        return Follower(lambda: self.plants.WatchGains(request), self._timeout)

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from plantd.v1 import control_service_pb2
 
-from ._errors import PlantdError
+from ._arrays import Array, Vector, array, complexes, matrix, vector, weight
+from ._calls import Calls
+from ._check import build
+from ._errors import PlantdError, translated
+from ._linearize import Linearization
+from ._requests import Stepping, constraints, measurement, noise, point, settings, trajectory
 from ._rotation import compose, difference
-from ._types import Array, Linearization, State, Vector, array, complexes, matrix, state_vector, vector
+from ._states import State, Trajectory, state_vector
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 class _Filter:
@@ -79,15 +87,15 @@ class Kalman(_Filter):
 
         ``u`` is the input in it, of use only where the outputs depend on it.
         """
-        innovation = vector(y) - self.y_reference - self.output_x @ self.dx
+        innovation = vector(y, "y") - self.y_reference - self.output_x @ self.dx
         if u is not None:
-            innovation = innovation - self.output_u @ (vector(u) - self.u_reference)
+            innovation = innovation - self.output_u @ (vector(u, "u") - self.u_reference)
         self.dx = self.dx + self.gain @ innovation
         return self.x
 
     def predict(self, u: Vector) -> Array:
         """Goes one step on with the input ``u``; returns the estimate."""
-        du = vector(u) - self.u_reference
+        du = vector(u, "u") - self.u_reference
         self.dx = self.linearization.a @ self.dx + self.linearization.b @ du
         return self.x
 
@@ -189,9 +197,9 @@ class TrajectoryKalman(_Filter):
     def correct(self, y: Vector, u: Vector | None = None) -> Array:
         """Takes in the measurement of the present state; returns the estimate."""
         here = self.steps[self.k]
-        innovation = vector(y) - here.y_reference - self.output_x @ self.dx
+        innovation = vector(y, "y") - here.y_reference - self.output_x @ self.dx
         if u is not None and here.u_reference.size:
-            innovation = innovation - self.output_u @ (vector(u) - here.u_reference)
+            innovation = innovation - self.output_u @ (vector(u, "u") - here.u_reference)
         self.dx = self.dx + here.gain @ innovation
         return self.x
 
@@ -200,7 +208,76 @@ class TrajectoryKalman(_Filter):
         here = self.steps[self.k]
         if here.linearization is None:
             raise IndexError(f"the trajectory ends at step {here.step}")
-        du = vector(u) - here.u_reference
+        du = vector(u, "u") - here.u_reference
         self.dx = here.linearization.a @ self.dx + here.linearization.b @ du
         self.k += 1
         return self.x
+
+
+class KalmanCalls(Calls):
+    """Calls that solve for filters."""
+
+    def solve_kalman(
+        self,
+        model: str = "",
+        *,
+        outputs: Sequence[str] | npt.ArrayLike = (),
+        output_u: npt.ArrayLike | None = None,
+        measurement_noise: npt.ArrayLike,
+        process_noise: npt.ArrayLike | None = None,
+        input_noise: npt.ArrayLike | None = None,
+        at: str | None = None,
+        state: State | None = None,
+        u: Vector = (),
+        plant: str = "",
+        full: bool = False,
+        **stepping: Unpack[Stepping],
+    ) -> Kalman:
+        """Steady-state Kalman filter about an equilibrium, ready to ``correct`` and ``predict``.
+
+        ``outputs`` are what is measured: names of entries of x such as ``theta`` or ``p(theta)``, or a
+        matrix. Noises are covariances per step, diagonals or matrices: of the measurement, of the
+        state and of the inputs.
+        """
+        request = build(
+            control_service_pb2.SolveKalmanRequest,
+            model=model,
+            settings=settings(**stepping),
+            point=point(at, state, u, plant),
+            measurement=measurement(outputs, output_u),
+            noise=noise(process_noise, input_noise, measurement_noise),
+            constraints=constraints(full),
+        )
+        return Kalman._from(self._call(self.control.SolveKalman, request))
+
+    def solve_trajectory_kalman(
+        self,
+        model: str,
+        initial: State | Trajectory,
+        u: npt.ArrayLike | None = None,
+        *,
+        outputs: Sequence[str] | npt.ArrayLike = (),
+        output_u: npt.ArrayLike | None = None,
+        measurement_noise: npt.ArrayLike,
+        process_noise: npt.ArrayLike | None = None,
+        input_noise: npt.ArrayLike | None = None,
+        initial_covariance: npt.ArrayLike,
+        covariances: bool = False,
+        full: bool = False,
+        **stepping: Unpack[Stepping],
+    ) -> TrajectoryKalman:
+        """Time-varying Kalman filter along a trajectory, as `solve_kalman`; ``initial_covariance`` is
+        that of the error in the initial state. ``covariances`` also returns those of each step."""
+        request = build(
+            control_service_pb2.SolveTrajectoryKalmanRequest,
+            model=model,
+            settings=settings(**stepping),
+            trajectory=trajectory(initial, u),
+            measurement=measurement(outputs, output_u),
+            noise=noise(process_noise, input_noise, measurement_noise),
+            initial_covariance=weight(initial_covariance, "initial_covariance"),
+            constraints=constraints(full),
+            covariances=covariances,
+        )
+        with translated():
+            return TrajectoryKalman._from(self.control.SolveTrajectoryKalman(request))

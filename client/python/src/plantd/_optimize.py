@@ -3,18 +3,38 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
+import numpy.typing as npt
 from google.protobuf import json_format
 
+from plantd.v1 import control_service_pb2
 from plantd.v1 import control_service_pb2 as pb
 
+from ._arrays import Array, failure_text, matrix, matrix_message, weight
+from ._calls import Calls
+from ._check import build, one_of, shown, texts
 from ._errors import PlantdError, translated
 from ._feedback import GainSchedule
-from ._types import Array, Gain, Trajectory, failure_text, matrix
+from ._gains import Gain
+from ._progress import progress_bar
+from ._requests import (
+    Bounds,
+    Stepping,
+    bounds,
+    constraints,
+    settings,
+    stage_weights,
+    trajectory_weights,
+    weights,
+)
+from ._states import Trajectory
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 Method = Literal["steepest", "quasi-newton", "newton"]
 
@@ -23,6 +43,7 @@ def method_number(name: str | None) -> Any:
     """The number of a method."""
     if name is None:
         return pb.DESCENT_METHOD_UNSPECIFIED
+    one_of("method", name, get_args(Method))
     return pb.DescentMethod.Value(f"DESCENT_METHOD_{name.upper().replace('-', '_')}")
 
 
@@ -173,8 +194,9 @@ class Search:
     the search on the server.
     """
 
-    def __init__(self, call: Any):
+    def __init__(self, call: Any, progress: bool | None = None):
         self._call = call
+        self._progress = progress
         self._result: Optimum | None = None
 
     def __iter__(self) -> Iterator[Progress]:
@@ -193,8 +215,10 @@ class Search:
     @property
     def result(self) -> Optimum:
         """The end of the search."""
-        for _ in self:
-            pass
+        with progress_bar("search", None, self._progress) as bar:
+            for step in self:
+                bar.set_postfix_str(f"cost {step.cost:.6g}")
+                bar.update(1)
         if self._result is None:
             raise PlantdError("CANCELLED", "the search has ended without a result")
         return self._result
@@ -273,3 +297,149 @@ class ProjectedReference:
             Trajectory._from(report.trajectory),
             steps,
         )
+
+
+class OptimizeCalls(Calls):
+    """Calls that search for trajectories."""
+
+    def optimize_trajectory(
+        self,
+        model: str,
+        guess: Trajectory | Optimum | None = None,
+        *,
+        x: npt.ArrayLike,
+        u: npt.ArrayLike | None = None,
+        q: npt.ArrayLike | None = None,
+        r: npt.ArrayLike | None = None,
+        q_final: npt.ArrayLike | None = None,
+        s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
+        stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
+        resume: Checkpoint | None = None,
+        state_bounds: Bounds | None = None,
+        input_bounds: Bounds | None = None,
+        final_state: Bounds | None = None,
+        model_limits: bool = False,
+        free_initial: bool | Sequence[str] = False,
+        initial_weight: npt.ArrayLike | None = None,
+        method: Method = "newton",
+        first_method: Method | None = None,
+        first_iterations: int = 0,
+        max_iterations: int = 0,
+        tolerance: float = 0.0,
+        alpha: float = 0.0,
+        beta: float = 0.0,
+        max_backtracks: int = 0,
+        near_last_step: bool = False,
+        projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+        bound_tolerance: float = 0.0,
+        checkpoint_every: int = 0,
+        progress: bool | None = None,
+        **stepping: Unpack[Stepping],
+    ) -> Search:
+        """Finds a trajectory that costs least: an iterator over the iterations, with ``result``.
+
+        The cost is that of the distance from the desired states ``x`` (n + 1 rows, which need not be a
+        motion) and inputs ``u`` (n rows; zero if not given), with weights as in
+        `solve_trajectory_lqr`. ``guess`` is where the search begins: a trajectory, or a former result;
+        or ``resume`` is where it left off. Bounds are by the name of an entry, ``{"force": (-5, 5)}``;
+        ``final_state={"theta": math.pi}`` fixes an entry of the last state; ``model_limits`` adds the limits
+        that the model has of coordinates and inputs. ``free_initial`` frees all
+        entries of the initial state, or those that are named; ``initial_weight`` weighs their
+        distance from the guess. ``projection`` is the pair of weights (q, r) of a regulator that
+        projects onto motions of the plant, in place of the law of the descent. The other options are
+        those of `OptimizationOptions` in the contract; 0 means its default. ``progress`` shows a bar while
+        ``result`` is waited for; by default on a terminal.
+        """
+        if (guess is None) == (resume is None):
+            raise ValueError("give one of `guess` and `resume`")
+        start = guess.trajectory if isinstance(guess, Optimum) else guess
+        if start is not None and not isinstance(start, Trajectory):
+            raise TypeError(
+                f"`guess` is {shown(guess)}; a `plantd.Trajectory` or `plantd.Optimum` is needed"
+            )
+        free = None
+        if free_initial is not False:
+            free = build(
+                control_service_pb2.FreeInitialState,
+                entries=() if free_initial is True else texts("free_initial", free_initial),
+                weight=None if initial_weight is None else weight(initial_weight, "initial_weight"),
+            )
+        request = build(
+            control_service_pb2.OptimizeTrajectoryRequest,
+            model=model,
+            settings=settings(**stepping),
+            cost=build(
+                control_service_pb2.TrajectoryCost,
+                x=matrix_message(x, "x"),
+                u=None if u is None else matrix_message(u, "u"),
+                weights=trajectory_weights(q, r, q_final, s, projected_momentum),
+                stages=stage_weights(stages),
+            ),
+            guess=None if start is None else start._message(),
+            resume=None if resume is None else resume.message,
+            bounds=build(
+                control_service_pb2.TrajectoryBounds,
+                state=bounds(state_bounds),
+                input=bounds(input_bounds),
+                final_state=bounds(final_state),
+                model_limits=model_limits,
+            ),
+            free_initial=free,
+            options=build(
+                control_service_pb2.OptimizationOptions,
+                method=method_number(method),
+                first_method=method_number(first_method),
+                first_iterations=first_iterations,
+                max_iterations=max_iterations,
+                tolerance=tolerance,
+                alpha=alpha,
+                beta=beta,
+                max_backtracks=max_backtracks,
+                near_last_step=near_last_step,
+                projection=None if projection is None else weights(*projection),
+                bound_tolerance=bound_tolerance,
+                checkpoint_every=checkpoint_every,
+            ),
+        )
+        return Search(self.control.OptimizeTrajectory(request), progress)
+
+    def project_reference(
+        self,
+        model: str,
+        reference: npt.ArrayLike,
+        u: npt.ArrayLike | None = None,
+        *,
+        q: npt.ArrayLike | None = None,
+        r: npt.ArrayLike | None = None,
+        q_final: npt.ArrayLike | None = None,
+        s: npt.ArrayLike | None = None,
+        projected_momentum: bool = False,
+        projection: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+        tolerance: float = 0.0,
+        strict: bool = False,
+        full: bool = False,
+        **stepping: Unpack[Stepping],
+    ) -> ProjectedReference:
+        """Compares configurations from any planner with the motions of the plant, and finds a motion
+        that follows them, with its regulator if the weights ``q`` and ``r`` are given.
+
+        Row k of ``reference`` is the configuration at step k. ``u`` are the planned inputs; forces
+        that fit best if not given. ``strict`` refuses a reference that is no motion, within
+        ``tolerance``, with reason ``INFEASIBLE_REFERENCE``.
+        """
+        has_weights = q is not None and r is not None
+        request = build(
+            control_service_pb2.ProjectReferenceRequest,
+            model=model,
+            settings=settings(**stepping),
+            q=matrix_message(reference, "reference"),
+            u=None if u is None else matrix_message(u, "u"),
+            projection=None if projection is None else weights(*projection),
+            weights=trajectory_weights(q, r, q_final, s, projected_momentum) if has_weights else None,
+            constraints=constraints(full),
+            tolerance=tolerance,
+            strict=strict,
+        )
+        with translated():
+            return ProjectedReference._from(self.control.ProjectReference(request))

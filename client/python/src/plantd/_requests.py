@@ -1,11 +1,9 @@
-"""Parts of requests, from what a caller gives."""
+"""Parts of requests that several calls have, from what a caller gives."""
 
 from __future__ import annotations
 
-import re
+import inspect
 from collections.abc import Iterable, Mapping, Sequence
-from os import PathLike
-from pathlib import Path
 from typing import Any, Literal, TypedDict, Union
 
 import numpy as np
@@ -13,7 +11,9 @@ import numpy.typing as npt
 
 from plantd.v1 import common_pb2, control_service_pb2, plant_service_pb2
 
-from ._types import Array, State, Trajectory, Vector, matrix_message, vector, weight
+from ._arrays import Array, Vector, matrix_message, numbers, vector, weight
+from ._check import build, instead, one_of, shown, texts
+from ._states import State, Trajectory
 
 #: Bounds by the name of an entry: (lowest, highest), None for no bound; a number fixes the entry.
 Bounds = Mapping[str, Union[float, tuple[Union[float, None], Union[float, None]]]]
@@ -40,40 +40,6 @@ class Stepping(TypedDict, total=False):
     newton_iterations: int
 
 
-def is_file(scene: str | PathLike[str]) -> bool:
-    """Whether it is not a text: one that has several lines or begins as JSON or XML."""
-    return not isinstance(scene, str) or not (
-        "\n" in scene or scene.lstrip().startswith(("{", "<"))
-    )
-
-
-def scene_text(scene: str | PathLike[str]) -> str:
-    """The text of a scene: itself, or a file's."""
-    if not is_file(scene):
-        return str(scene)
-    path = Path(scene)
-    text = path.read_text(encoding="utf-8")
-    return _with_includes(text, path.parent, [path.name]) if "<mujoco" in text else text
-
-
-def _with_includes(text: str, folder: Path, seen: list[str]) -> str:
-    """An MJCF in which each ``include`` is replaced by what is in the root of its file."""
-    text = re.sub(r"<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text, flags=re.S)
-
-    def included(element: re.Match[str]) -> str:
-        name = element[1]
-        if name in seen:
-            raise ValueError(f"`{name}` is included twice; once is allowed")
-        seen.append(name)
-        inner = _with_includes((folder / name).read_text(encoding="utf-8"), folder, seen)
-        root = re.search(r"<mujoco[^>]*?(?:/>|>(.*)</mujoco)", inner, flags=re.S)
-        if root is None:
-            raise ValueError(f"`{name}` is no MJCF: its root must be `mujoco` or `mujocoinclude`")
-        return root[1] or ""
-
-    return re.sub(r"""<include\s+file=["']([^"']*)["']\s*(?:/>|>\s*</include>)""", included, text)
-
-
 def settings(
     *,
     dt: float = 0.0,
@@ -84,9 +50,15 @@ def settings(
     precision: Literal["exact", "fast"] = "exact",
     singular_below: float = 0.0,
     newton_iterations: int = 0,
+    **unknown: object,
 ) -> plant_service_pb2.PlantSettings:
+    for argument in unknown:
+        known = [*Stepping.__annotations__, *_arguments_of_call()]
+        raise TypeError(f"there is no argument `{argument}`{instead(argument, known)}")
+    one_of("precision", precision, ("exact", "fast"))
     split = plant_service_pb2.FORCE_SPLIT_PAPER if paper else plant_service_pb2.FORCE_SPLIT_SYMMETRIC
-    return plant_service_pb2.PlantSettings(
+    return build(
+        plant_service_pb2.PlantSettings,
         time_step_s=dt,
         force_split=split,
         order=order,
@@ -96,6 +68,17 @@ def settings(
         singular_below=singular_below,
         max_iterations=newton_iterations,
     )
+
+
+def _arguments_of_call() -> list[str]:
+    """Arguments of the call that asked for settings."""
+    frame = inspect.currentframe()
+    caller = frame and frame.f_back and frame.f_back.f_back
+    if caller is None:
+        return []
+    code = caller.f_code
+    names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+    return [name for name in names if name != "self"]
 
 
 def initial_state(
@@ -114,37 +97,33 @@ def initial_state(
     if len(rates) > 1:
         raise ValueError("give one of `velocity`, `v` and `p`")
     if at is not None:
-        return common_pb2.InitialState(operating_point=at)
+        return build(common_pb2.InitialState, operating_point=at)
     if q is None:
         return initial
-    configuration = vector(q)
+    configuration = vector(q, "q")
     if p is not None:
-        momentum = common_pb2.InitialState.Momentum(q=configuration, p=vector(p))
-        return common_pb2.InitialState(momentum=momentum)
-    rate: Array = vector(rates[0]) if rates else np.zeros_like(configuration)
-    moving = common_pb2.InitialState.Velocity(q=configuration, v=rate)
-    return common_pb2.InitialState(velocity=moving)
+        momentum = build(common_pb2.InitialState.Momentum, q=configuration, p=vector(p, "p"))
+        return build(common_pb2.InitialState, momentum=momentum)
+    rate: Array = np.zeros_like(configuration)
+    if rates:
+        rate = vector(rates[0], "velocity" if velocity is not None else "v")
+    moving = build(common_pb2.InitialState.Velocity, q=configuration, v=rate)
+    return build(common_pb2.InitialState, velocity=moving)
 
 
 def point(at: str | None, state: State | None, u: Vector, plant: str = "") -> common_pb2.Point:
     if sum((at is not None, state is not None, bool(plant))) > 1:
         raise ValueError("give one of `at`, `state` and `plant`")
-    if state is None and len(vector(u)):
+    if state is not None and not isinstance(state, State):
+        raise TypeError(f"`state` is {shown(state)}; a `plantd.State` is needed")
+    if state is None and len(vector(u, "u")):
         raise ValueError("`u` needs `state`: operating points and plants have inputs of their own")
     if plant:
-        return common_pb2.Point(plant=plant)
+        return build(common_pb2.Point, plant=plant)
     if state is None:
-        return common_pb2.Point(operating_point="initial" if at is None else at)
-    here = common_pb2.StateAndInput(state=state._message(), u=vector(u))
-    return common_pb2.Point(state_and_input=here)
-
-
-def mechanical_state(
-    model: str, plant: str, at: str, q: Vector, v: Vector
-) -> control_service_pb2.MechanicalState:
-    return control_service_pb2.MechanicalState(
-        model=model, plant=plant, operating_point=at, q=vector(q), v=vector(v)
-    )
+        return build(common_pb2.Point, operating_point="initial" if at is None else at)
+    here = build(common_pb2.StateAndInput, state=state._message(), u=vector(u, "u"))
+    return build(common_pb2.Point, state_and_input=here)
 
 
 def trajectory(initial: State | Trajectory, u: npt.ArrayLike | None) -> common_pb2.Trajectory:
@@ -154,7 +133,11 @@ def trajectory(initial: State | Trajectory, u: npt.ArrayLike | None) -> common_p
         return initial._message()
     if u is None:
         raise ValueError("`u`, the inputs of the trajectory, is needed")
-    return Trajectory(initial, np.asarray(u, dtype=np.float64))._message()
+    if initial is not None and not isinstance(initial, State):
+        raise TypeError(
+            f"the initial state is {shown(initial)}; a `plantd.State` or `plantd.Trajectory` is needed"
+        )
+    return Trajectory(initial, numbers(u, "u"))._message()
 
 
 def weights(
@@ -164,16 +147,17 @@ def weights(
     s: npt.ArrayLike | None = None,
     projected_momentum: bool = False,
 ) -> plant_service_pb2.LqrWeights:
-    return plant_service_pb2.LqrWeights(
-        q=weight(q),
-        r=weight(r),
-        q_final=None if q_final is None else weight(q_final),
-        s=None if s is None else matrix_message(s),
+    return build(
+        plant_service_pb2.LqrWeights,
+        q=weight(q, "q"),
+        r=weight(r, "r"),
+        q_final=None if q_final is None else weight(q_final, "q_final"),
+        s=None if s is None else matrix_message(s, "s"),
         momentum=momentum(projected_momentum),
     )
 
 
-def momentum(projected: bool) -> plant_service_pb2.Momentum.ValueType:
+def momentum(projected: bool) -> plant_service_pb2.Momentum:
     projected_momentum = plant_service_pb2.MOMENTUM_PROJECTED
     return projected_momentum if projected else plant_service_pb2.MOMENTUM_UNSPECIFIED
 
@@ -190,7 +174,8 @@ def stage_weights(stages: Iterable[Mapping[str, npt.ArrayLike]]) -> list[Any]:
                 f"needed, not {sorted(stage)}"
             )
         messages.append(
-            plant_service_pb2.StageWeights(
+            build(
+                plant_service_pb2.StageWeights,
                 q=weight(stage["q"]),
                 r=weight(stage["r"]),
                 s=matrix_message(stage["s"]) if "s" in stage else None,
@@ -201,11 +186,33 @@ def stage_weights(stages: Iterable[Mapping[str, npt.ArrayLike]]) -> list[Any]:
     return messages
 
 
+def trajectory_weights(
+    q: npt.ArrayLike | None,
+    r: npt.ArrayLike | None,
+    q_final: npt.ArrayLike | None,
+    s: npt.ArrayLike | None,
+    projected_momentum: bool,
+) -> plant_service_pb2.LqrWeights | None:
+    """The weights that go beside those of each step, or stand for them."""
+    if q is not None and r is not None:
+        return weights(q, r, q_final, s, projected_momentum)
+    if q_final is not None:
+        return build(
+            plant_service_pb2.LqrWeights,
+            q_final=weight(q_final, "q_final"), momentum=momentum(projected_momentum)
+        )
+    return None
+
+
 def bounds(given: Bounds | None) -> list[common_pb2.Bound]:
     messages = []
+    if given is not None and not isinstance(given, Mapping):
+        raise TypeError(f"bounds are {shown(given)}; a dict is needed, such as {{'force': (-5, 5)}}")
     for entry, ends in (given or {}).items():
+        if isinstance(ends, Sequence) and (isinstance(ends, str) or len(ends) != 2):
+            raise TypeError(f"the bounds of `{entry}` are {shown(ends)}; a number or a pair is needed")
         low, high = ends if isinstance(ends, Sequence) else (ends, ends)
-        messages.append(common_pb2.Bound(entry=entry, min=low, max=high))
+        messages.append(build(common_pb2.Bound, entry=entry, min=low, max=high))
     return messages
 
 
@@ -214,10 +221,11 @@ def measurement(
 ) -> control_service_pb2.Measurement:
     """Outputs by names of entries of x, or by a matrix."""
     names, rows = split_outputs(outputs)
-    return control_service_pb2.Measurement(
+    return build(
+        control_service_pb2.Measurement,
         outputs=names,
         output_x=rows,
-        output_u=None if output_u is None else matrix_message(output_u),
+        output_u=None if output_u is None else matrix_message(output_u, "output_u"),
     )
 
 
@@ -225,18 +233,19 @@ def split_outputs(
     outputs: Sequence[str] | npt.ArrayLike,
 ) -> tuple[list[str], common_pb2.Matrix | None]:
     given: Any = outputs
-    if isinstance(given, np.ndarray) or (len(given) and not isinstance(given[0], str)):
-        return [], matrix_message(given)
-    return list(given), None
+    if not isinstance(given, str) and len(given) and not isinstance(given[0], str):
+        return [], matrix_message(given, "outputs")
+    return texts("outputs", given), None
 
 
 def noise(
     process: npt.ArrayLike | None, input: npt.ArrayLike | None, measurement: npt.ArrayLike
 ) -> control_service_pb2.NoiseCovariances:
-    return control_service_pb2.NoiseCovariances(
-        process=None if process is None else weight(process),
-        input=None if input is None else weight(input),
-        measurement=weight(measurement),
+    return build(
+        control_service_pb2.NoiseCovariances,
+        process=None if process is None else weight(process, "process"),
+        input=None if input is None else weight(input, "input"),
+        measurement=weight(measurement, "measurement"),
     )
 
 

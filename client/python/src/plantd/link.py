@@ -23,13 +23,15 @@ import shutil
 import stat
 import time
 from pathlib import Path
+from typing import Any
 
 import iceoryx2 as iox2
 import numpy as np
 import numpy.typing as npt
 
+from ._arrays import Array, Vector, vector
 from ._errors import PlantdError, StepError
-from ._types import Array, State, StepReport, Vector, vector
+from ._states import State, StepReport
 
 LAYOUT_VERSION = 5
 MAGIC = int.from_bytes(b"plnt", "little")
@@ -183,7 +185,8 @@ def _fnv1a(data: bytes) -> int:
 
 def _schema_hash() -> int:
     names = {ctypes.c_uint32: "u32", ctypes.c_uint64: "u64", ctypes.c_double: "f64"}
-    fields = (f"{n}:{names[t]}@{getattr(Header, n).offset};" for n, t in Header._fields_)
+    header: Any = Header._fields_
+    fields = (f"{n}:{names[t]}@{getattr(Header, n).offset};" for n, t in header)
     return _fnv1a("".join(fields).encode())
 
 
@@ -273,17 +276,18 @@ class LinkDriver:
     @property
     def lost(self) -> npt.NDArray[np.bool_]:
         """For each output channel, whether its numbers stand for lost ones."""
-        return self._lost
+        lost: npt.NDArray[np.bool_] = self._lost
+        return lost
 
     @property
     def input_len(self) -> int:
         """Entries of an input: inputs, then prescribed coordinates."""
-        return self._last.inputs + self._last.prescribed
+        return int(self._last.inputs + self._last.prescribed)
 
     @property
     def time_step_s(self) -> float:
         """Time step of the plant, seconds."""
-        return self._last.time_step_s
+        return float(self._last.time_step_s)
 
     def step(self, u: Vector = ()) -> State:
         """Takes one step with the input ``u`` (input forces, then next prescribed positions).
@@ -331,7 +335,7 @@ class LinkDriver:
     def _open_ports(self, room: int, deadline_ns: int) -> None:
         iox2.set_log_level_from_env_or(iox2.LogLevel.Fatal)
         while True:
-            self._member = None
+            self._member: int | None = None
             try:
                 self._enter()
                 self._node = (
@@ -395,7 +399,7 @@ class LinkDriver:
         config.global_cfg.service.cleanup_dead_nodes_on_open = False
         return config
 
-    def _open_services(self, direction: str) -> tuple:
+    def _open_services(self, direction: str) -> tuple[Any, ...]:
         name = iox2.ServiceName.new(f"plantd/{LAYOUT_VERSION}/{self._plant}/{direction}")
         demands = (
             iox2.AttributeVerifier.new()

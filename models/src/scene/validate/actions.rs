@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::scene::limits::MAX_POWER;
 use crate::scene::point::Point;
 use crate::scene::validate::Check;
+use crate::scene::words::UnknownName;
 use crate::scene::{Axis, Constraint, CoordinateKind, CouplingTerm, Length, Motion, Plane, Spring};
 
 /// A frame; the world has no index.
@@ -244,7 +245,8 @@ impl Check<'_> {
         }
         let frame = self.frames.get(name).copied();
         if frame.is_none() {
-            self.report(path, format!("there is no frame `{name}`"));
+            let name = UnknownName::among(name, self.frames.keys());
+            self.report(path, format!("there is no frame {name}"));
         }
         frame.map(Some)
     }

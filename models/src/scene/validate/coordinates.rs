@@ -8,6 +8,7 @@ use crate::scene::linear_term::LinearTerm;
 use crate::scene::point::Point;
 use crate::scene::signals::Signal;
 use crate::scene::validate::Check;
+use crate::scene::words::UnknownName;
 use crate::scene::{Constraint, CoordinateKind, Motion};
 
 impl<'a> Check<'a> {
@@ -72,11 +73,24 @@ impl<'a> Check<'a> {
         terms.flatten().map(|term| term.coordinate.as_str()).collect()
     }
 
+    /// The prescribed coordinates.
+    pub(super) fn prescribed(&self) -> impl Iterator<Item = &str> {
+        let is_prescribed = |kind: &CoordinateKind| *kind == CoordinateKind::Prescribed;
+        let kinds = self.kinds.iter().filter(move |(_, kind)| is_prescribed(kind));
+        kinds.map(|(name, _)| name.as_str())
+    }
+
+    fn no_coordinate(&mut self, path: String, name: &str) {
+        let name = UnknownName::among(name, self.kinds.keys());
+        self.report(path, format!("there is no coordinate {name}"));
+    }
+
     /// That a length names a prescribed coordinate, which is not an angle.
     pub(super) fn length_coordinate(&mut self, path: String, name: &str) {
         match self.kinds.get(name) {
             None => {
-                self.report(path, format!("there is no prescribed coordinate `{name}`"));
+                let name = UnknownName::among(name, self.prescribed());
+                self.report(path, format!("there is no prescribed coordinate {name}"));
                 return;
             }
             Some(CoordinateKind::Dynamic) => {
@@ -96,7 +110,7 @@ impl<'a> Check<'a> {
     /// That a force or spring acts on a coordinate that can give way.
     pub(super) fn dynamic_coordinate(&mut self, path: String, name: &str) {
         match self.kinds.get(name) {
-            None => self.report(path, format!("there is no coordinate `{name}`")),
+            None => self.no_coordinate(path, name),
             Some(CoordinateKind::Prescribed) => {
                 self.report(
                     path,
@@ -135,7 +149,7 @@ impl<'a> Check<'a> {
     ) -> Option<CoordinateKind> {
         let (path, kind) = (format!("{path}.coordinate"), self.kinds.get(name).copied());
         if kind.is_none() {
-            self.report(path.clone(), format!("there is no coordinate `{name}`"));
+            self.no_coordinate(path.clone(), name);
         } else if !seen.insert(name) {
             self.report(path.clone(), format!("coordinate `{name}` has a term already"));
         }
@@ -223,7 +237,7 @@ impl<'a> Check<'a> {
             for (name, &value) in &point.coordinates {
                 let path = format!("{path}.coordinates.{name}");
                 if !self.kinds.contains_key(name.as_str()) {
-                    self.report(path.clone(), format!("there is no coordinate `{name}`"));
+                    self.no_coordinate(path.clone(), name);
                 }
                 if lengths.contains(name.as_str()) {
                     self.positive(path, value);

@@ -2,6 +2,7 @@
 
 use crate::scene::forces::{Component, Force, ScaledInput};
 use crate::scene::validate::Check;
+use crate::scene::words::UnknownName;
 
 impl Check<'_> {
     pub(super) fn forces(&mut self) {
@@ -101,7 +102,8 @@ impl Check<'_> {
 
     pub(super) fn known_input(&mut self, path: String, name: &str) {
         if !self.inputs.contains(name) {
-            self.report(path, format!("there is no input `{name}`"));
+            let name = UnknownName::among(name, &self.inputs);
+            self.report(path, format!("there is no input {name}"));
         }
     }
 

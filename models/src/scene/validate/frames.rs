@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::scene::validate::Check;
+use crate::scene::words::UnknownName;
 use crate::scene::{CoordinateKind, Joint, Motion};
 
 impl Check<'_> {
@@ -42,10 +43,8 @@ impl Check<'_> {
             let parent = self.frames.get(frame.parent.as_str()).copied();
             if parent.is_none() && frame.parent != "world" {
                 self.is_tree = false;
-                self.report(
-                    format!("frames[{i}].parent"),
-                    format!("there is no frame `{}`", frame.parent),
-                );
+                let parent = UnknownName::among(&frame.parent, self.frames.keys());
+                self.report(format!("frames[{i}].parent"), format!("there is no frame {parent}"));
             }
             self.parents.push(parent);
         }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use crate::scene::CoordinateKind;
 use crate::scene::signals::Signal;
 use crate::scene::validate::Check;
+use crate::scene::words::UnknownName;
 
 impl Check<'_> {
     pub(super) fn signals(&mut self) {
@@ -31,8 +32,12 @@ impl Check<'_> {
                     self.report(drives, message);
                 }
                 None => {
-                    let message = format!("there is no input or prescribed coordinate `{name}`");
-                    self.report(drives, message);
+                    let driven = self.inputs.iter().copied().chain(self.prescribed());
+                    let name = UnknownName::among(name, driven);
+                    self.report(
+                        drives,
+                        format!("there is no input or prescribed coordinate {name}"),
+                    );
                 }
             }
             let before = self.problems.len();

@@ -1,6 +1,7 @@
 //! What a session began with.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use plantd_models::{Model, Plant, Settings, Snapshot, State};
 
@@ -13,6 +14,25 @@ pub struct Accuracy {
     pub error: f64,
     /// Over how many periods.
     pub periods: u32,
+}
+
+/// What a session is told of its plant.
+pub struct Origin {
+    /// Id.
+    pub id: String,
+    /// Name of its model.
+    pub model_name: String,
+    /// Why the method is as it is, if it was chosen by a tolerance.
+    pub accuracy: Option<Accuracy>,
+    /// How long it is kept when nobody uses it; `None` for as long as the server.
+    pub expires: Option<Duration>,
+}
+
+impl Origin {
+    /// A plant of which no more is known.
+    pub fn new(id: impl Into<String>, model_name: impl Into<String>) -> Self {
+        Self { id: id.into(), model_name: model_name.into(), accuracy: None, expires: None }
+    }
 }
 
 /// A plant's name and origin, and the state to which a reset returns.
@@ -31,12 +51,8 @@ pub(super) struct Creation {
 }
 
 impl Creation {
-    pub(super) fn of(
-        plant: &Plant,
-        id: String,
-        model_name: String,
-        accuracy: Option<Accuracy>,
-    ) -> Self {
+    pub(super) fn of(plant: &Plant, origin: Origin) -> Self {
+        let Origin { id, model_name, accuracy, expires: _ } = origin;
         Self {
             id,
             model_name,

@@ -7,6 +7,7 @@ pub mod creation;
 pub(crate) mod feedback;
 pub(crate) mod gate;
 pub mod lease;
+pub mod life;
 pub(crate) mod place;
 pub(crate) mod recording;
 pub mod run;

@@ -26,13 +26,15 @@ use crate::core::publish::frame::{Frame, record_words};
 use crate::core::publish::ring::{RING_RECORDS, Ring};
 use crate::core::publish::subscription::Subscription;
 use crate::core::realtime::loops::RealTime;
-use crate::core::session::creation::{Accuracy, Creation};
+use crate::core::session::creation::{Accuracy, Creation, Origin};
+use crate::core::session::life::Life;
 use crate::core::session::place::Place;
 use crate::core::session::run::RunControl;
 
 /// A plant with everything that belongs to it, shared by all who use it.
 pub struct Session {
     creation: Creation,
+    life: Arc<Life>,
     pub(super) place: Mutex<Place>,
     /// Held by whoever replaces the plant; taken before the core's lock.
     replacing: Mutex<()>,
@@ -64,17 +66,16 @@ struct LinkState {
 impl Session {
     /// A session around a plant in its initial state, to which a reset returns.
     pub fn new(
-        id: String,
-        model_name: String,
+        origin: Origin,
         plant: Plant,
-        accuracy: Option<Accuracy>,
         metrics: Arc<Metrics>,
         realtime: Arc<RealTime>,
     ) -> Arc<Self> {
         let events = Arc::new(Events::default());
         let in_force = watch::Sender::new(None);
         Arc::new(Self {
-            creation: Creation::of(&plant, id, model_name, accuracy),
+            life: Arc::new(Life::new(origin.expires)),
+            creation: Creation::of(&plant, origin),
             place: Mutex::new(Place::Rest(Box::new(Core::new(plant, Arc::clone(&events))))),
             replacing: Mutex::default(),
             run: RunControl::default(),
@@ -103,6 +104,19 @@ impl Session {
     /// names and sizes.
     pub fn model(&self) -> &Arc<Model> {
         &self.creation.model
+    }
+
+    /// How long it lives when nobody uses it.
+    pub fn life(&self) -> &Arc<Life> {
+        &self.life
+    }
+
+    /// Nobody has used it for as long as it is to be kept.
+    pub fn is_expired(&self) -> bool {
+        if self.driver().is_some() || self.feed.watchers.count() > 0 {
+            self.life.touch();
+        }
+        self.life.is_over()
     }
 
     /// About how many instructions a step of order 2 takes.

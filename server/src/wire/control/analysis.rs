@@ -2,6 +2,7 @@
 
 use nalgebra::DMatrix;
 use plantd_models::control::{self, Mode, Tangent, TransferFunction};
+use plantd_models::scene::UnknownName;
 use plantd_models::{Linearization, Model, Plant};
 use plantd_proto::v1;
 
@@ -133,7 +134,8 @@ impl Outputs {
         let mut x = DMatrix::zeros(names.len(), d.state());
         for (row, name) in names.iter().enumerate() {
             let column = known.iter().position(|known| known == name).ok_or_else(|| {
-                let problem = format!("there is no state entry `{name}`");
+                let name = UnknownName::among(name, &known);
+                let problem = format!("there is no state entry {name}");
                 RpcError::field(format!("{prefix}outputs[{row}]"), problem)
             })?;
             x[(row, column)] = 1.0;

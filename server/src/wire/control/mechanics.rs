@@ -74,7 +74,7 @@ pub(crate) fn kinematics(
     let of_frame = |(i, name): (usize, String)| {
         abandoned.check()?;
         let field = format!("frames[{i}]");
-        let (place, motion) = motion(&kinematics, [&field, &field], &name, [0.0; 3])?;
+        let (place, motion) = motion(&model, &kinematics, [&field, &field], &name, [0.0; 3])?;
         Ok(v1::FrameMotion {
             frame: name,
             position: motion.position.to_vec(),
@@ -88,7 +88,7 @@ pub(crate) fn kinematics(
         abandoned.check()?;
         let [frame, at] = ["frame", "at"].map(|part| format!("points[{i}].{part}"));
         let position = declare::vector(at.clone(), &point.at)?;
-        let (place, motion) = motion(&kinematics, [&frame, &at], &point.frame, position)?;
+        let (place, motion) = motion(&model, &kinematics, [&frame, &at], &point.frame, position)?;
         let linear = || kinematics.jacobian(&place).rows(0, 3).into_owned();
         Ok(v1::PointMotion {
             position: motion.position.to_vec(),
@@ -116,14 +116,14 @@ pub(crate) fn kinematics(
 
 /// A point of a frame, and how it moves; `fields` name the frame and the point in errors.
 fn motion(
+    model: &Model,
     kinematics: &Kinematics,
     [frame, at]: [&str; 2],
     name: &str,
     position: [f64; 3],
 ) -> Result<(FramePoint, FrameMotion), RpcError> {
-    let place = kinematics
-        .point(name, position)
-        .ok_or_else(|| RpcError::field(frame, format!("there is no frame `{name}`")))?;
+    let place =
+        kinematics.point(name, position).ok_or_else(|| states::no_frame(frame, name, model))?;
     let motion = kinematics.motion(&place);
     let numbers = motion.position.iter().chain(&motion.linear_velocity);
     if !numbers.copied().all(f64::is_finite) {

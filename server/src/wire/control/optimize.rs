@@ -11,6 +11,7 @@ use plantd_models::optimize::{
     Bound, Bounds, Checkpoint, FreeInitialState, Method, Optimizer, Options, Progress, Status,
     TrajectoryCost,
 };
+use plantd_models::scene::UnknownName;
 use plantd_models::{Model, Plant, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
@@ -343,7 +344,8 @@ fn free_initial(given: v1::FreeInitialState, model: &Model) -> Result<FreeInitia
     }
     let index = |(i, entry): (usize, &String)| {
         names.iter().position(|name| name == entry).ok_or_else(|| {
-            let problem = format!("there is no state entry `{entry}`");
+            let entry = UnknownName::among(entry, &names);
+            let problem = format!("there is no state entry {entry}");
             RpcError::field(format!("free_initial.entries[{i}]"), problem)
         })
     };

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use plantd_models::scene::UnknownName;
 use plantd_models::{Model, OperatingPoint, Plant, Settings};
 use plantd_proto::v1;
 
@@ -76,7 +77,11 @@ pub(crate) fn operating_point<'a>(
 ) -> Result<&'a OperatingPoint, RpcError> {
     let name = if name.is_empty() { "initial" } else { name };
     let point = model.operating_points().iter().find(|point| point.name == name);
-    point.ok_or_else(|| RpcError::field(field, format!("there is no operating point `{name}`")))
+    point.ok_or_else(|| {
+        let known = model.operating_points().iter().map(|point| &point.name);
+        let name = UnknownName::among(name, known);
+        RpcError::field(field, format!("there is no operating point {name}"))
+    })
 }
 
 /// The vector in a field of the request; empty means the other one.

@@ -242,6 +242,7 @@ mod tests {
     use crate::core::metrics::registry::Metrics;
     use crate::core::realtime::loops::RealTime;
     use crate::core::realtime::settings::RealTimeSettings;
+    use crate::core::session::creation::Origin;
     use crate::wire::link::worker::PANIC;
 
     fn new_session(id: &str) -> Arc<Session> {
@@ -250,7 +251,7 @@ mod tests {
         let plant = Plant::new(model, settings).unwrap();
         let metrics = Arc::new(Metrics::default());
         let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
-        Session::new(id.to_owned(), "pendulum".to_owned(), plant, None, metrics, realtime)
+        Session::new(Origin::new(id, "pendulum"), plant, metrics, realtime)
     }
 
     struct Driver {

@@ -4,6 +4,7 @@ use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::Arc;
 
+use plantd_models::scene::UnknownName;
 use plantd_models::{Model, Site};
 use plantd_proto::v1;
 use prost::Message as _;
@@ -105,17 +106,19 @@ fn bounds(field: &str, min: Option<f64>, max: Option<f64>) -> Result<(f64, f64),
 }
 
 fn coordinate(model: &Model, field: String, name: &str) -> Result<usize, RpcError> {
-    let index = model.coordinate_index(name);
-    index.ok_or_else(|| RpcError::field(field, format!("there is no coordinate `{name}`")))
+    model.coordinate_index(name).ok_or_else(|| states::no_coordinate(field, name, model))
 }
 
 /// The entry of `u` of an input or a prescribed coordinate.
 fn entry(model: &Model, field: String, name: &str) -> Result<usize, RpcError> {
     let d = model.dimensions();
-    let inputs = model.scene().inputs.iter().map(|input| input.name.as_str());
-    let prescribed = model.coordinates()[d.dynamic..].iter().map(|c| c.name.as_str());
-    inputs.chain(prescribed).position(|other| other == name).ok_or_else(|| {
-        RpcError::field(field, format!("there is no input or prescribed coordinate `{name}`"))
+    let inputs = || {
+        let inputs = model.scene().inputs.iter().map(|input| input.name.as_str());
+        inputs.chain(model.coordinates()[d.dynamic..].iter().map(|c| c.name.as_str()))
+    };
+    inputs().position(|other| other == name).ok_or_else(|| {
+        let name = UnknownName::among(name, inputs());
+        RpcError::field(field, format!("there is no input or prescribed coordinate {name}"))
     })
 }
 
@@ -144,9 +147,8 @@ pub(crate) fn optional<const N: usize>(
 fn site(model: &Model, field: &str, point: &v1::FramePoint) -> Result<Box<Site>, RpcError> {
     let at = vector(format!("{field}.at"), &point.at)?;
     let name = &point.frame;
-    model.site(name, at).map(Box::new).ok_or_else(|| {
-        RpcError::field(format!("{field}.frame"), format!("there is no frame `{name}`"))
-    })
+    let site = model.site(name, at).map(Box::new);
+    site.ok_or_else(|| states::no_frame(format!("{field}.frame"), name, model))
 }
 
 /// Names of the numbers of an output.
@@ -177,14 +179,15 @@ fn source(model: &Model, field: &str, given: Option<&GivenSource>) -> Result<Sou
         }
         Some(GivenSource::Orientation(frame)) => {
             let site = model.site(frame, [0.0; 3]).map(Box::new);
-            Source::Orientation(site.ok_or_else(|| {
-                RpcError::field(at("orientation"), format!("there is no frame `{frame}`"))
-            })?)
+            Source::Orientation(
+                site.ok_or_else(|| states::no_frame(at("orientation"), frame, model))?,
+            )
         }
         Some(GivenSource::ConstraintForce(name)) => {
             let index = model.constraint_names().iter().position(|other| other == name);
             Source::ConstraintForce(index.ok_or_else(|| {
-                let problem = format!("there is no constraint equation `{name}`");
+                let name = UnknownName::among(name, model.constraint_names());
+                let problem = format!("there is no constraint equation {name}");
                 RpcError::field(at("constraint_force"), problem)
             })?)
         }
@@ -442,8 +445,10 @@ fn disturbed(
         }
         Some(Target::Output(name)) => {
             let (channel, range) = output(info, name).ok_or_else(|| {
+                let known = info.channels.iter().flat_map(|channels| &channels.outputs);
+                let name = UnknownName::among(name, known.map(|output| &output.name));
                 let problem =
-                    format!("there is no output channel `{name}`; SetChannels declares it");
+                    format!("there is no output channel {name}; SetChannels declares them");
                 RpcError::field("fault.output", problem)
             })?;
             Ok(Effect::Output { line: Line::new(range, disturbance), channel })

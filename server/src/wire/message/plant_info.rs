@@ -1,6 +1,7 @@
 //! A plant and its feedback as messages.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use plantd_proto::v1;
 
@@ -15,6 +16,8 @@ use crate::wire::status::RpcError;
 
 /// Instructions of a step up to which a Step call begins at once instead of on a worker: about 0.3 ms.
 pub(crate) const INLINE_INSTRUCTIONS_MAX: f64 = 1e6;
+/// How long it goes on there: not much longer than the way to a worker and back.
+pub(crate) const INLINE_TIME_MAX: Duration = Duration::from_micros(300);
 
 /// A plant as a message. Waits for a step in progress, which is long on a large model: call it on a
 /// worker unless you hold the lease.
@@ -35,7 +38,13 @@ pub(crate) fn info(session: &Session, view: View) -> v1::PlantInfo {
         run: Some(run_info(session)),
         parameters: settings::parameters(&view.parameters),
         safety: safety_info(&view.safety, view.frozen, session.model()),
+        expires_s: expires_s(session),
     }
+}
+
+/// Seconds without use after which the plant is deleted; 0 for never.
+pub(crate) fn expires_s(session: &Session) -> f64 {
+    session.life().expires().map_or(0.0, |expires| expires.as_secs_f64())
 }
 
 /// What a client is told of a feedback.

@@ -15,7 +15,7 @@ use crate::core::feedback::regulator::Spec;
 use crate::core::plant::view::PlantSnapshot;
 use crate::core::session::shared::Session;
 use crate::wire::message::declare::origin;
-use crate::wire::message::plant_info::feedback_info;
+use crate::wire::message::plant_info::{expires_s, feedback_info};
 use crate::wire::message::run_info::safety_info;
 use crate::wire::message::{settings, states};
 
@@ -98,6 +98,7 @@ impl Session {
             accuracy: self.accuracy().map(settings::accuracy),
             parameters: settings::parameters(&base.parameters),
             safety: safety_info(&view.safety, view.frozen, self.model()),
+            expires_s: expires_s(self),
             ..Default::default()
         };
         let (declared, faults) = channels.unzip();

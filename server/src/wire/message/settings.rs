@@ -1,5 +1,7 @@
 //! A plant's scene, settings and changed numbers.
 
+use std::time::Duration;
+
 use plantd_import::{ImportError, Options, Report};
 use plantd_models::parameters::Parameters;
 use plantd_models::{ForceSplit, Model, Precision, Problem, Scene, SceneError, Settings};
@@ -9,6 +11,10 @@ use crate::core::feedback::regulator::Constraints;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::session::creation::Accuracy;
 use crate::wire::status::RpcError;
+
+/// Times for which plants are kept that nobody uses.
+const EXPIRY_MIN_S: f64 = 1.0;
+const EXPIRY_MAX_S: f64 = 31_536_000.0;
 
 /// A scene, and what became of the robot that it was made of.
 pub type Read = (Scene, Option<Report>);
@@ -59,6 +65,20 @@ fn robot(text: &str) -> Result<Read, SceneError> {
                 Problem { path, message: problem.message }
             };
             Err(SceneError { problems: problems.into_iter().map(problem).collect() })
+        }
+    }
+}
+
+/// How long a plant is kept that nobody uses; 0 means as long as the server.
+pub fn expires(seconds: f64) -> Result<Option<Duration>, RpcError> {
+    match seconds {
+        0.0 => Ok(None),
+        EXPIRY_MIN_S..=EXPIRY_MAX_S => Ok(Some(Duration::from_secs_f64(seconds))),
+        _ => {
+            let problem = format!(
+                "is {seconds}; it must be 0 or lie between {EXPIRY_MIN_S} and {EXPIRY_MAX_S}"
+            );
+            Err(RpcError::field("expires_s", problem))
         }
     }
 }

@@ -1,5 +1,6 @@
 //! States, outputs, linearizations and their names.
 
+use plantd_models::scene::UnknownName;
 use plantd_models::{
     Diagnostics, Dimensions, Energy, Linearization, Model, Plant, Settings, State,
 };
@@ -96,6 +97,20 @@ pub fn x(plant: &Plant) -> Vec<f64> {
     [plant.q(), plant.p(), plant.v()].concat()
 }
 
+/// The model has no such coordinate.
+pub(crate) fn no_coordinate(field: impl Into<String>, name: &str, model: &Model) -> RpcError {
+    let known = model.coordinates().iter().map(|coordinate| &coordinate.name);
+    let name = UnknownName::among(name, known);
+    RpcError::field(field, format!("there is no coordinate {name}"))
+}
+
+/// The model has no such frame.
+pub(crate) fn no_frame(field: impl Into<String>, name: &str, model: &Model) -> RpcError {
+    let known = model.scene().frames.iter().map(|frame| frame.name.as_str());
+    let name = UnknownName::among(name, known.chain(["world"]));
+    RpcError::field(field, format!("there is no frame {name}"))
+}
+
 /// Names of the entries of `x = (q, p, v)`: `theta`, `p(theta)`, `v(lift)`.
 pub fn state_names(model: &Model) -> Vec<String> {
     let (dynamic, prescribed) = model.coordinates().split_at(model.dimensions().dynamic);
@@ -119,7 +134,8 @@ pub fn bound(
     names: &[String],
 ) -> Result<(usize, f64, f64), RpcError> {
     let index = names.iter().position(|name| *name == bound.entry).ok_or_else(|| {
-        RpcError::field(format!("{field}.entry"), format!("there is no entry `{}`", bound.entry))
+        let entry = UnknownName::among(&bound.entry, names);
+        RpcError::field(format!("{field}.entry"), format!("there is no entry {entry}"))
     })?;
     if bound.min.is_none() && bound.max.is_none() {
         return Err(RpcError::field(field, "has neither `min` nor `max`"));

@@ -95,7 +95,12 @@ impl v1::model_service_server::ModelService for ModelService {
                 name => name,
             };
             checks::check_name("name", &name)?;
-            let model = Some(message(&hub.catalog.insert(&name, Arc::new(model))?, true));
+            let model = Arc::new(model);
+            let entry = match request.replace {
+                true => hub.catalog.replace(&name, model)?,
+                false => hub.catalog.insert(&name, model)?,
+            };
+            let model = Some(message(&entry, true));
             Ok(v1::CreateModelResponse { model, import_report: report.map(import_report) })
         };
         Ok(Response::new(self.hub.workers.run(job).await?))

@@ -20,6 +20,7 @@ use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
 use crate::core::origin::Origin;
 use crate::core::plant::view::Mechanics;
+use crate::core::session::life::Use;
 use crate::core::session::shared::Session;
 use crate::core::workers::pool::{Abandoned, WorkError};
 use crate::wire::answers::{Answers, Messages};
@@ -319,6 +320,7 @@ pub(crate) fn watch_gains(
     let watcher = Watcher {
         hub: Arc::clone(hub),
         rotations: states::rotations(session.model()),
+        _in_use: session.life().in_use(),
         session,
         in_force,
         revision: 0,
@@ -366,6 +368,7 @@ struct Watcher {
     dropped: u64,
     /// Parameters for which a failure was told.
     failure_of: Option<u64>,
+    _in_use: Use,
 }
 
 impl Messages for Watcher {

@@ -10,4 +10,5 @@ pub mod plant;
 pub mod recordings;
 pub(crate) mod run;
 pub mod state;
+pub(crate) mod step_many;
 pub mod watch;

@@ -1,7 +1,7 @@
 //! `plantd.v1.PlantService`.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use plantd_models::{Dimensions, Initial};
 use plantd_proto::v1;
@@ -18,17 +18,16 @@ use crate::core::session::shared::Session;
 use crate::core::workers::pool::Abandoned;
 use crate::core::workers::queue::Admission;
 use crate::wire::answers::{Answers, cut_page};
-use crate::wire::message::plant_info::{INLINE_INSTRUCTIONS_MAX, info, plant_info};
+use crate::wire::message::plant_info::{
+    INLINE_INSTRUCTIONS_MAX, INLINE_TIME_MAX, info, plant_info,
+};
 use crate::wire::message::report::report_message;
 use crate::wire::message::start::{self, Start};
 use crate::wire::message::{checks, settings, states};
 use crate::wire::plants::drive::DriveStream;
-use crate::wire::plants::{feedback, run, watch};
+use crate::wire::plants::{feedback, run, step_many, watch};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
-
-/// How long a Step call goes on there: not much longer than the way to a worker and back.
-const INLINE_TIME_MAX: Duration = Duration::from_micros(300);
 
 /// The service.
 pub struct PlantService {
@@ -42,7 +41,8 @@ impl PlantService {
     }
 
     async fn create(&self, request: v1::CreatePlantRequest) -> Result<Arc<Session>, RpcError> {
-        let v1::CreatePlantRequest { id, model, settings, initial, open_link } = request;
+        let v1::CreatePlantRequest { id, model, settings, initial, open_link, expires_s } = request;
+        let expires = settings::expires(expires_s)?;
         if !id.is_empty() {
             checks::check_name("id", &id)?;
         }
@@ -71,7 +71,7 @@ impl PlantService {
             } else {
                 (start::plant(model, settings, &start, "initial")?, None)
             };
-            hub.insert(id, entry.name, plant, accuracy)
+            hub.insert(id, entry.name, plant, accuracy, expires)
         };
         let workers = if is_chosen { &self.hub.workers } else { &self.hub.attendants };
         let session = workers.run(job).await?;
@@ -318,6 +318,13 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<v1::StepRequest>,
     ) -> Result<Response<v1::StepResponse>, Status> {
         Ok(Response::new(self.step(request.into_inner()).await?))
+    }
+
+    async fn step_many(
+        &self,
+        request: Request<v1::StepManyRequest>,
+    ) -> Result<Response<v1::StepManyResponse>, Status> {
+        Ok(Response::new(step_many::step_many(&self.hub, request.into_inner()).await?))
     }
 
     async fn drive(

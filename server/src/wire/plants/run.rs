@@ -14,6 +14,7 @@ use crate::core::plant::event::{Event, EventReader};
 use crate::core::plant::watchdog::{self, Safety, Watchdog, WatchdogAction};
 use crate::core::realtime::input::{InputAction, InputPolicy};
 use crate::core::realtime::settings::{Pace, RunSettings};
+use crate::core::session::life::Use;
 use crate::core::session::shared::Session;
 use crate::wire::answers::{Answers, Messages};
 use crate::wire::message::run_info::{event_message, run_info};
@@ -51,6 +52,7 @@ pub(crate) async fn run_and_wait(
     if !wait {
         return Ok(response);
     }
+    let _in_use = session.life().in_use();
     let mut status = session.run_status();
     tokio::select! {
         biased;
@@ -230,7 +232,8 @@ pub(crate) fn watch_events(
     let from = request.since.unwrap_or_else(|| session.events().next_number());
     let reader = session.events().reader(from);
     let (hub, waiting) = (Arc::clone(hub), VecDeque::new());
-    Ok(EventWatcher { hub, session, reader, waiting, _place: place }.into_answers())
+    let _in_use = session.life().in_use();
+    Ok(EventWatcher { hub, session, reader, waiting, _place: place, _in_use }.into_answers())
 }
 
 struct EventWatcher {
@@ -240,6 +243,7 @@ struct EventWatcher {
     /// Events that were read together.
     waiting: VecDeque<(u64, Event)>,
     _place: Arc<()>,
+    _in_use: Use,
 }
 
 impl Messages for EventWatcher {

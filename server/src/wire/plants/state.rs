@@ -148,7 +148,9 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
         present.restore(&snapshot.plant)?
     };
     let accuracy = info.accuracy.map(settings::accuracy_of);
-    let session = hub.insert(id.to_owned(), info.model, start, accuracy).map_err(sentence)?;
+    let expires = settings::expires(info.expires_s).map_err(sentence)?;
+    let session =
+        hub.insert(id.to_owned(), info.model, start, accuracy, expires).map_err(sentence)?;
     let changed = info.parameters.into_iter().map(|p| (p.path, p.value)).collect();
     session.resume(present, changed);
     let warn = |what: &str, fault: RpcError| {

@@ -192,8 +192,8 @@ impl Mask {
         let model = session.model();
         for (index, name) in names.iter().enumerate() {
             if model.coordinate_index(name).is_none() {
-                let problem = format!("there is no coordinate `{name}`");
-                return Err(RpcError::field(format!("coordinates[{index}]"), problem));
+                let field = format!("coordinates[{index}]");
+                return Err(states::no_coordinate(field, name, model));
             }
         }
         let names: HashSet<&str> = names.iter().map(String::as_str).collect();

@@ -384,6 +384,8 @@ pub(super) mod tests {
     use crate::core::metrics::registry::Metrics;
     use crate::core::realtime::loops::RealTime;
     use crate::core::realtime::settings::RealTimeSettings;
+    use crate::core::session::creation::Origin;
+    use crate::wire::record::message::plant_record;
 
     pub(in crate::wire::record) fn session() -> Arc<Session> {
         let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
@@ -391,7 +393,7 @@ pub(super) mod tests {
         let plant = Plant::new(model, settings).unwrap();
         let metrics = Arc::new(Metrics::default());
         let realtime = RealTime::new(RealTimeSettings::default(), &metrics);
-        Session::new("p".into(), "pendulum".into(), plant, None, metrics, realtime)
+        Session::new(Origin::new("p", "pendulum"), plant, metrics, realtime)
     }
 
     pub(in crate::wire::record) fn options() -> Options {

@@ -4,9 +4,11 @@ use std::collections::BTreeMap;
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use futures::{StreamExt, future, stream};
 use plantd_models::Plant;
+use plantd_models::scene::UnknownName;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
@@ -18,7 +20,7 @@ use crate::core::priority::Priority;
 use crate::core::realtime::loops::RealTime;
 use crate::core::realtime::settings::RealTimeSettings;
 use crate::core::room::Room;
-use crate::core::session::creation::Accuracy;
+use crate::core::session::creation::{Accuracy, Origin};
 use crate::core::session::shared::Session;
 use crate::core::workers::pool::Workers;
 use crate::wire::answers::Answers;
@@ -27,6 +29,9 @@ use crate::wire::record::directory::Recordings;
 use crate::wire::shared::jobs::Jobs;
 use crate::wire::shared::state_directory::StateDirectory;
 use crate::wire::status::RpcError;
+
+/// Ids with which an unknown one is compared, at most.
+const COMPARED_PLANTS_MAX: usize = 1000;
 
 /// Everything that belongs to one server.
 pub struct Hub {
@@ -107,9 +112,17 @@ impl Hub {
 
     /// The plant of that id.
     pub fn session(&self, id: &str) -> Result<Arc<Session>, RpcError> {
-        match self.plants().get(id) {
-            Some(session) if !session.is_closed() => Ok(Arc::clone(session)),
-            _ => Err(RpcError::plant_not_found(id)),
+        let plants = self.plants();
+        match plants.get(id) {
+            Some(session) if !session.is_closed() => {
+                session.life().touch();
+                Ok(Arc::clone(session))
+            }
+            _ => {
+                let known = plants.iter().filter(|(_, session)| !session.is_closed());
+                let known = known.map(|(id, _)| id).take(COMPARED_PLANTS_MAX);
+                Err(RpcError::plant_not_found(&UnknownName::among(id, known)))
+            }
         }
     }
 
@@ -132,13 +145,15 @@ impl Hub {
         model_name: String,
         plant: Plant,
         accuracy: Option<Accuracy>,
+        expires: Option<Duration>,
     ) -> Result<Arc<Session>, RpcError> {
         let mut plants = self.plants();
         let id = if id.is_empty() { free_id(&plants) } else { id };
         self.admit(&plants, &id)?;
         let metrics = Arc::clone(&self.metrics);
         let realtime = Arc::clone(&self.realtime);
-        let session = Session::new(id.clone(), model_name, plant, accuracy, metrics, realtime);
+        let origin = Origin { id: id.clone(), model_name, accuracy, expires };
+        let session = Session::new(origin, plant, metrics, realtime);
         plants.insert(id, Arc::clone(&session));
         self.metrics.set_plants(plants.len());
         Ok(session)
@@ -148,7 +163,7 @@ impl Hub {
     pub async fn delete(self: &Arc<Self>, id: &str) -> Result<(), RpcError> {
         let session = self.session(id)?;
         if !session.close() {
-            return Err(RpcError::plant_not_found(id));
+            return Err(RpcError::plant_deleted(id));
         }
         let hub = Arc::clone(self);
         // In a task of its own, so that it is finished even if the caller goes away.
@@ -166,6 +181,19 @@ impl Hub {
             }
         });
         end.await.map_err(|error| RpcError::internal(error.to_string()))
+    }
+
+    /// Ends the plants that nobody has used for as long as they are to be kept.
+    pub async fn delete_expired(self: &Arc<Self>) {
+        let is_expired = |(_, session): &(&String, &Arc<Session>)| session.is_expired();
+        let expired: Vec<String> =
+            self.plants().iter().filter(is_expired).map(|(id, _)| id.clone()).collect();
+        for id in expired {
+            // Whoever has deleted it meanwhile has done what was to be done.
+            if self.delete(&id).await.is_ok() {
+                tracing::info!(plant = id, "plant deleted: nobody has used it");
+            }
+        }
     }
 
     /// Up to `size` plants after the one with id `after`, and whether there are more.

@@ -27,6 +27,9 @@ pub(crate) struct Create {
     /// Open the shared-memory link at once.
     #[arg(long)]
     link: bool,
+    /// Delete it when nobody has used it for so long; 0 means never.
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0)]
+    expires: f64,
 }
 
 impl Create {
@@ -39,6 +42,7 @@ impl Create {
             settings: Some(v1::PlantSettings { tolerance, ..self.settings.into() }),
             initial: self.initial.into(),
             open_link: self.link,
+            expires_s: self.expires,
         };
         let plant = client.create_plant(request).await?;
         context.output.message("PlantInfo", &plant, || {

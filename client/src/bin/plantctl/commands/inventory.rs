@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use anyhow::Result;
 use clap::{Args, ValueEnum};
-use plantd_client::{Client, v1};
+use plantd_client::{Client, Code, v1};
 use serde_json::{Map, Value, json};
 
 use crate::contract::json;
@@ -35,13 +35,17 @@ pub(crate) struct Show {
     name: String,
 }
 
-/// Deletes a plant or an uploaded model.
+/// Deletes a plant or an uploaded model, or all of them.
 #[derive(Debug, Args)]
 pub(crate) struct Delete {
     /// What it is.
     what: Singular,
     /// Name of the model or id of the plant.
-    name: String,
+    #[arg(required_unless_present = "all", conflicts_with = "all")]
+    name: Option<String>,
+    /// All plants, or all uploaded models.
+    #[arg(long)]
+    all: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -95,17 +99,48 @@ impl Show {
 impl Delete {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
+        let Some(name) = self.name else {
+            return self.what.delete_all(&client, context.output).await;
+        };
         let kind = match self.what {
             Singular::Model => {
-                client.delete_model(&self.name).await?;
+                client.delete_model(&name).await?;
                 "model"
             }
             Singular::Plant => {
-                client.delete_plant(&self.name).await?;
+                client.delete_plant(&name).await?;
                 "plant"
             }
         };
-        context.output.done(json!({ "deleted": { kind: self.name } }))
+        context.output.done(json!({ "deleted": { kind: name } }))
+    }
+}
+
+impl Singular {
+    /// Deletes all that there are; what somebody else deletes meanwhile is gone as well.
+    async fn delete_all(self, client: &Client, output: Output) -> Result<()> {
+        let (kind, names) = match self {
+            Self::Model => {
+                let models = client.list_models().await?.into_iter();
+                let names = models.filter(|model| !model.builtin).map(|model| model.name);
+                ("models", names.collect::<Vec<_>>())
+            }
+            Self::Plant => {
+                let plants = client.list_plants().await?.into_iter();
+                ("plants", plants.map(|plant| plant.id).collect())
+            }
+        };
+        for name in &names {
+            let deleted = match self {
+                Self::Model => client.delete_model(name).await,
+                Self::Plant => client.delete_plant(name).await,
+            };
+            match deleted {
+                Err(error) if error.code() == Some(Code::NotFound) => {}
+                deleted => deleted?,
+            }
+        }
+        output.done(json!({ "deleted": { kind: names } }))
     }
 }
 

@@ -191,6 +191,7 @@ impl<'a> Twin<'a> {
             name: id.to_owned(),
             scene: model.scene_toml.clone(),
             format: v1::SceneFormat::Toml.into(),
+            replace: false,
         };
         client.create_model_as(request).await.with_context(of)?;
         let snapshot = v1::initial_state::Form::Snapshot(record.snapshot.clone());
@@ -200,6 +201,7 @@ impl<'a> Twin<'a> {
             settings: plant.settings,
             initial: Some(v1::InitialState { form: Some(snapshot) }),
             open_link: false,
+            expires_s: 0.0,
         };
         if let Err(error) = client.create_plant(request).await {
             client.delete_model(id).await?;

@@ -29,6 +29,9 @@ pub(crate) struct Upload {
     /// Folder of a package, for meshes whose paths begin with `package://NAME`.
     #[arg(long, value_name = "NAME=FOLDER", value_parser = import::package)]
     package: Vec<(String, String)>,
+    /// Take the place of an uploaded model of that name; its plants live on.
+    #[arg(long)]
+    replace: bool,
 }
 
 /// Checks a scene (TOML, JSON) or a robot (URDF) and prints all its errors.
@@ -51,6 +54,7 @@ impl Upload {
         let request = v1::CreateModelRequest {
             name: self.name.unwrap_or_default(),
             scene: read_scene(&self.scene)?,
+            replace: self.replace,
             ..Default::default()
         };
         let answer = client.import_model(request).await?;
