@@ -55,6 +55,7 @@ pub struct Drawing {
     /// First coordinate of each ball joint.
     orientations: Vec<usize>,
     size_m: f64,
+    gravity: [f64; 3],
     initial: Vec<f64>,
 }
 
@@ -83,6 +84,7 @@ impl Drawing {
             orientations: model.orientations.clone(),
             initial: model.coordinates.iter().map(|c| c.initial).collect(),
             size_m: 1.0,
+            gravity: scene.gravity.unwrap_or_default(),
             rig,
             frames,
             lines,
@@ -110,6 +112,11 @@ impl Drawing {
     /// A length of the order of the mechanism's, m: what a camera should see.
     pub fn size_m(&self) -> f64 {
         self.size_m
+    }
+
+    /// Acceleration of gravity, m/s²: what a camera takes for down.
+    pub fn gravity(&self) -> [f64; 3] {
+        self.gravity
     }
 
     /// How many numbers [`Poses`] are.

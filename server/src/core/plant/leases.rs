@@ -67,6 +67,12 @@ impl Leases {
         lock(&self.named).take_if(|(present, _)| present == name).map(|(_, lease)| lease)
     }
 
+    /// The lease in force, if it has that name.
+    pub(crate) fn named(&self, name: &str) -> Option<u64> {
+        let lease = lock(&self.named).as_ref().filter(|(present, _)| present == name)?.1;
+        (self.holder.load(Ordering::Acquire) == lease && lease > self.revoked()).then_some(lease)
+    }
+
     /// The lease under which inputs come; 0 for none.
     pub(crate) fn input(&self) -> u64 {
         self.input.load(Ordering::Acquire)

@@ -57,6 +57,36 @@ impl Session {
         Some(lease)
     }
 
+    /// Gives the plant's own loop an input under the lease of that name; none when that has ended.
+    pub fn offer_named(
+        &self,
+        token: &str,
+        sequence: u64,
+        u: &[f64],
+    ) -> Option<Result<(), DriveError>> {
+        let lease = self.leases.named(token)?;
+        Some(self.offer(lease, sequence, u, 0))
+    }
+
+    fn offer(
+        &self,
+        lease: u64,
+        sequence: u64,
+        u: &[f64],
+        answers_ns: u64,
+    ) -> Result<(), DriveError> {
+        self.model().check_input(u)?;
+        let (live, arrived_ns) = (self.live(), monotonic_ns());
+        live.slot.put(Arrival { lease, sequence, arrived_ns }, u);
+        for counts in [&live.counts, &*self.realtime.counts] {
+            counts.inputs.fetch_add(1, Ordering::Relaxed);
+            if answers_ns != 0 && answers_ns <= arrived_ns {
+                counts.round_trip.record(arrived_ns - answers_ns);
+            }
+        }
+        Ok(())
+    }
+
     fn new_lease(self: &Arc<Self>, kind: DriverKind) -> Lease {
         self.metrics.driver_started(kind);
         let number = self.leases.issue();
@@ -180,16 +210,7 @@ impl Lease {
         if self.is_revoked() {
             return Err(DriveError::Revoked);
         }
-        self.session.model().check_input(u)?;
-        let (live, arrived_ns) = (self.session.live(), monotonic_ns());
-        live.slot.put(Arrival { lease: self.number, sequence, arrived_ns }, u);
-        for counts in [&live.counts, &*self.session.realtime.counts] {
-            counts.inputs.fetch_add(1, Ordering::Relaxed);
-            if answers_ns != 0 && answers_ns <= arrived_ns {
-                counts.round_trip.record(arrived_ns - answers_ns);
-            }
-        }
-        Ok(())
+        self.session.offer(self.number, sequence, u, answers_ns)
     }
 
     /// Gives it a name, under which it can be taken over.

@@ -13,6 +13,7 @@ pub fn drawing(drawing: &Drawing, url: impl Fn(&str) -> Option<String>) -> v1::D
         lines: drawing.lines().iter().map(line).collect(),
         arrows: drawing.arrows().iter().map(arrow).collect(),
         size_m: drawing.size_m(),
+        gravity: drawing.gravity().to_vec(),
     }
 }
 

@@ -6,6 +6,7 @@ pub(crate) mod commands;
 pub(crate) mod computed;
 pub mod drive;
 pub(crate) mod feedback;
+pub(crate) mod hold;
 pub mod plant;
 pub mod recordings;
 pub(crate) mod run;

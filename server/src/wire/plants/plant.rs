@@ -25,7 +25,7 @@ use crate::wire::message::report::report_message;
 use crate::wire::message::start::{self, Start};
 use crate::wire::message::{checks, settings, states};
 use crate::wire::plants::drive::DriveStream;
-use crate::wire::plants::{feedback, run, step_many, watch};
+use crate::wire::plants::{feedback, hold, run, step_many, watch};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -220,6 +220,7 @@ impl Steps {
 #[tonic::async_trait]
 impl v1::plant_service_server::PlantService for PlantService {
     type DriveStream = DriveStream;
+    type HoldStream = Answers<v1::HoldResponse>;
     type WatchStream = Answers<v1::WatchResponse>;
     type WatchGainsStream = Answers<v1::WatchGainsResponse>;
     type WatchEventsStream = Answers<v1::WatchEventsResponse>;
@@ -332,6 +333,22 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<Streaming<v1::DriveRequest>>,
     ) -> Result<Response<Self::DriveStream>, Status> {
         Ok(Response::new(DriveStream::new(Arc::clone(&self.hub), request.into_inner())))
+    }
+
+    async fn hold(
+        &self,
+        request: Request<v1::HoldRequest>,
+    ) -> Result<Response<Self::HoldStream>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| hold::hold(&hub, &request);
+        Ok(Response::new(self.hub.attendants.run(job).await?))
+    }
+
+    async fn set_input(
+        &self,
+        request: Request<v1::SetInputRequest>,
+    ) -> Result<Response<v1::SetInputResponse>, Status> {
+        Ok(Response::new(hold::set_input(&self.hub, &request.into_inner())?))
     }
 
     async fn watch(
