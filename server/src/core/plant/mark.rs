@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use plantd_models::parameters::Parameters;
 use plantd_models::Snapshot;
+use plantd_models::parameters::Parameters;
 
 use crate::core::channels::timeline::Announced;
 

@@ -1,7 +1,7 @@
 //! What stands in a recording, from what the plant has left.
 
-use plantd_models::parameters::Parameters;
 use plantd_models::Plant;
+use plantd_models::parameters::Parameters;
 use plantd_proto::v1;
 
 use crate::core::plant::mark::Mark;
