@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::blueprint::Blueprint;
-use crate::variables::{EnergyKind, Kind, UNITS, Variable};
+use crate::variables::{Kind, UNITS, Variable};
 
 /// Names of the categories of messages.
 pub(crate) const LOG_CATEGORIES: &[(&str, &str)] = &[
@@ -88,9 +88,7 @@ fn element(blueprint: &Blueprint, reference: usize, variable: &Variable) -> Stri
         Kind::Input(i) => ("causality=\"input\"", Some(start.input[i])),
         Kind::Position(i) => ("causality=\"output\" initial=\"exact\"", Some(start.q[i])),
         Kind::Velocity(i) => ("causality=\"output\" initial=\"exact\"", Some(start.velocity[i])),
-        Kind::Energy(EnergyKind::Total | EnergyKind::Kinetic | EnergyKind::Potential) => {
-            ("causality=\"output\" initial=\"calculated\"", None)
-        }
+        Kind::Energy(_) => ("causality=\"output\" initial=\"calculated\"", None),
         Kind::Momentum(_) | Kind::Rate(_) | Kind::Force(_) | Kind::Next(_) => {
             ("causality=\"local\" initial=\"calculated\"", None)
         }

@@ -279,16 +279,9 @@ impl Simulation {
     }
 
     fn energy(&mut self) -> Result<Energy, FmuError> {
-        if let Some(energy) = self.known.energy {
-            self.plant()?;
-            // Parameters may just have been taken over.
-            if self.known.energy.is_some() {
-                return Ok(energy);
-            }
-        }
-        let energy = self.plant()?.energy();
-        self.known.energy = Some(energy);
-        Ok(energy)
+        self.plant()?;
+        let Self { plant: Some(plant), known, .. } = self else { return Err(FmuError::Lost) };
+        Ok(*known.energy.get_or_insert_with(|| plant.energy()))
     }
 
     /// The state after a step that is not taken.

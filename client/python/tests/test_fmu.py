@@ -123,11 +123,12 @@ def test_directional_derivatives_are_a_and_b(client, instantiate):
     fmu.exitInitializationMode()
     x = ["q(x)", "q(theta)", "p(x)", "p(theta)"]
     unknowns = [of[f"next({name})"] for name in x]
-    linear = client.linearize("cart-pole")
+    plant = client.create_plant("cart-pole")
+    linear, seed = client.linearize(plant=plant.id), [0.0, 0.0, 0.0, 1.0]
     for matrix, knowns in [(linear.a, x), (linear.b, ["u(force)"])]:
         for column, known in zip(matrix.T, knowns):
             assert fmu.getDirectionalDerivative(unknowns, [of[known]], [1.0]) == list(column)
-            assert fmu.getAdjointDerivative(unknowns, [of[known]], [0.0, 0.0, 0.0, 1.0]) == [column[-1]]
+            assert fmu.getAdjointDerivative(unknowns, [of[known]], seed, 1) == [column[-1]]
 
 
 def test_bad_calls_raise(instantiate):

@@ -89,6 +89,28 @@ fn an_fmu_moves_as_the_plant_itself_bit_for_bit() {
 }
 
 #[test]
+fn instances_run_in_threads_of_their_own() {
+    let fmu = Fmu::make("cart-pole", &[]);
+    let names = Names::of(new_plant("cart-pole").unwrap().model());
+    let run = || {
+        let instance = fmu.instantiate();
+        instance.initialize();
+        for k in 0..200 {
+            instance.set(&["u(force)"], &[(k as f64).sin()]);
+            instance.step(k as f64 * 0.01, 0.01);
+        }
+        bits(&instance.get(&strs(&names.seen)))
+    };
+    let alone = run();
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..4).map(|_| scope.spawn(run)).collect();
+        for thread in threads {
+            assert_eq!(thread.join().unwrap(), alone);
+        }
+    });
+}
+
+#[test]
 fn settings_and_operating_points_are_those_of_the_command() {
     let fmu = Fmu::make("pendulum", &["--at", "upright", "--dt", "0.02", "--order", "4"]);
     let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());

@@ -24,6 +24,12 @@ const TOOLS: &[Tool] = &[
         probe: ("systemd-analyze", &["--version"]),
         package: "systemd",
     },
+    Tool { purpose: "the C library in CMake", probe: ("cmake", &["--version"]), package: "cmake" },
+    Tool {
+        purpose: "the C library as users find it",
+        probe: ("pkg-config", &["--version"]),
+        package: "pkg-config",
+    },
     Tool {
         purpose: "the Python client's environment",
         probe: ("python3", &["-c", "import venv, ensurepip"]),
