@@ -29,7 +29,7 @@ use nalgebra::DMatrix;
 
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
-use crate::integrator::turning::Turning;
+use crate::lagrangian::turning::Turning;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
 use crate::kkt::system::Factors;

@@ -12,3 +12,4 @@ pub(crate) mod map;
 pub(crate) mod parameters;
 pub(crate) mod second_order;
 pub(crate) mod step;
+pub(crate) mod turned;

@@ -5,7 +5,7 @@
 //! `t = |ξ|` and `ξ^ x = ξ × x` all maps are polynomials `1 + a ξ^ + b ξ^²` whose coefficients are even
 //! functions of `t`: series near zero, so that no direction and no rate is special.
 
-use crate::math::scalar::Scalar;
+use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3};
 use crate::math::sums::two_sum;
 use crate::math::trigonometry::sin_cos_of;
@@ -224,7 +224,6 @@ pub(crate) fn exp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
 }
 
 /// `dexp₋y`: how `exp(y)` turns in its own axes as `y` changes, `exp(−y) d exp(y) = (dexp₋y dy)^`.
-#[allow(dead_code, reason = "linearizations with ball joints use it")]
 pub(crate) fn dexp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
     let [_, b, c] = exponential(y.dot(y));
     polynomial(y, -b, c)
@@ -241,10 +240,37 @@ pub(crate) fn torque_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
     polynomial(xi, midpoint_coefficient(xi.dot(xi)), S::ZERO)
 }
 
+/// A function of `s` and its derivative.
+fn with_slope<S: Scalar>(f: impl Fn(Dual<S>) -> Dual<S>, s: S) -> [S; 2] {
+    let value = f(Dual::new(s, S::ONE));
+    [value.re, value.eps]
+}
+
+/// How `N⁻ m` changes with `ξ`: `½ δ×m + c (δ×(ξ×m) + ξ×(δ×m)) + 2c' (ξ·δ) ξ×(ξ×m)` for a change `δ`, `c'`
+/// by `t²`.
+pub(crate) fn momentum_change<S: Scalar>(xi: Vec3<S>, m: Vec3<S>) -> Mat3<S> {
+    let [c, slope] = with_slope(inverse_coefficient, xi.dot(xi));
+    let (turned, along) = (xi.cross(m), xi.dot(m));
+    let twice = xi.cross(turned) * (slope + slope) - m * (c + c);
+    // δ×(ξ×m) + ξ×(δ×m) = ξ (m·δ) + δ (ξ·m) − 2 m (ξ·δ)
+    let column = |b: usize| {
+        let unit = Mat3::IDENTITY.0[b];
+        unit.cross(m).scaled(0.5) + (xi * m[b] + unit * along) * c + twice * xi[b]
+    };
+    Mat3([column(0), column(1), column(2)])
+}
+
+/// How `T⁻ τ` changes with `ξ`: `k δ×τ + 2k' (ξ·δ) ξ×τ` for a change `δ`, `k'` by `t²`.
+pub(crate) fn torque_change<S: Scalar>(xi: Vec3<S>, torque: Vec3<S>) -> Mat3<S> {
+    let [k, slope] = with_slope(midpoint_coefficient, xi.dot(xi));
+    let twice = xi.cross(torque) * (slope + slope);
+    let column = |b: usize| Mat3::IDENTITY.0[b].cross(torque) * k + twice * xi[b];
+    Mat3([column(0), column(1), column(2)])
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::scalar::Dual;
 
     fn vectors() -> impl Iterator<Item = Vec3> {
         let lengths = [0.0, 1e-9, 1e-3, 0.3, 0.99, 1.01, 2.0, 3.1];
@@ -286,6 +312,22 @@ mod tests {
             let (half, one) = (exp(v * -0.5), Mat3::IDENTITY);
             let mean = Mat3([0, 1, 2].map(|i| (half.0[i] + one.0[i]) * 0.5));
             assert!(distance(&mean.times(&torque_at_start(v)), &one) < 1e-14, "{v:?}");
+        }
+    }
+
+    #[test]
+    fn the_changes_of_the_maps_are_their_derivatives() {
+        let (v, direction) = (Vec3([0.7, -0.3, 0.5]), Vec3([0.4, 0.1, -0.8]));
+        let lifted = Vec3(v.0.map(Dual::constant));
+        for xi in vectors() {
+            let dual = Vec3([0, 1, 2].map(|i| Dual::new(xi[i], direction[i])));
+            for (map, change) in [
+                (momentum_at_start(dual), momentum_change(xi, v)),
+                (torque_at_start(dual), torque_change(xi, v)),
+            ] {
+                let rate = Vec3(map.apply(lifted).0.map(|x| x.eps));
+                assert!((rate - change.apply(direction)).norm() < 1e-14, "{xi:?}");
+            }
         }
     }
 

@@ -8,9 +8,9 @@ use crate::builtin;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::planar::MatrixKind;
 use crate::kkt::space::SpatialRecursion;
 use crate::kkt::system::{Linearized, Recursion};
+use crate::lagrangian::generators::MatrixKind;
 use crate::linearization::linearize::Linearization;
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::{Model, Solver};
@@ -122,7 +122,7 @@ fn a_solution_satisfies_the_dense_system() {
         let n = model.dimensions.dynamic;
         let settings = Settings { time_step_s: 0.02, ..Settings::new(&model) };
         let mut workspace = Workspace::new(&model);
-        let generators = SpatialRecursion::new(&model.dynamics, model.gravity);
+        let generators = SpatialRecursion::new(&model);
         workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
         for trial in 0..5 {
             for i in 0..n {
@@ -169,7 +169,7 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     let settings = Settings { order, ..Settings::new(model) };
     let mut fast = Plant::new(Arc::clone(model), settings).unwrap();
     assert!(order == 2 || model.solver == Solver::Spatial);
-    let generators = SpatialRecursion::new(&model.dynamics, model.gravity);
+    let generators = SpatialRecursion::new(&model);
     fast.workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
     let n = model.dimensions.dynamic;
     let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
