@@ -70,7 +70,12 @@ impl BallJoints {
 
     /// Calls `entry(i, factor)` for what a coordinate's row gives to the rows of its joint, by a map of theirs.
     #[inline]
-    fn for_each_row(&self, i: usize, map: impl Fn(usize) -> Mat3, mut entry: impl FnMut(usize, f64)) {
+    fn for_each_row(
+        &self,
+        i: usize,
+        map: impl Fn(usize) -> Mat3,
+        mut entry: impl FnMut(usize, f64),
+    ) {
         match self.of(i) {
             None => entry(i, 1.0),
             Some((o, axis)) => {
@@ -183,7 +188,7 @@ impl Workspace {
             for (i, joint) in model.dynamics.joints.iter().enumerate() {
                 match joint.kind {
                     JointKind::Ball(0) if joint.coordinate < nd => {
-                        let parts = [0, 1, 2].map(|a| step.parts(&mid.mechanics, i + a));
+                        let parts = step.parts_of_ball(&mid.mechanics, i);
                         let own = of_ball(&parts, &weights[joint.orientation]);
                         generators[i..i + 3].copy_from_slice(&own);
                     }
@@ -305,7 +310,7 @@ impl Tangents {
             for (i, joint) in model.dynamics.joints.iter().enumerate() {
                 match joint.kind {
                     JointKind::Ball(0) if joint.coordinate < model.dimensions.dynamic => {
-                        let parts = [0, 1, 2].map(|a| step.parts(mechanics, i + a));
+                        let parts = step.parts_of_ball(mechanics, i);
                         let o = joint.orientation;
                         let own = Flanks::of_ball(&parts, &turnings[o], &weights[o]);
                         flanks[i..i + 3].copy_from_slice(&own);

@@ -6,8 +6,8 @@
 
 use crate::constraints::closure::Closure;
 use crate::integrator::settings::Settings;
-use crate::lagrangian::turning::Turning;
 use crate::lagrangian::derivatives::Derivatives;
+use crate::lagrangian::turning::Turning;
 use crate::math::rotation;
 use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3, three};

@@ -129,7 +129,10 @@ impl Workspace {
                 constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
                 end_slopes: zeros(nd * nd),
                 stiffness: zeros(nd * nd),
-                flanks: vec![Flanks::default(); if has_balls { model.dynamics.joints.len() } else { 0 }],
+                flanks: vec![
+                    Flanks::default();
+                    if has_balls { model.dynamics.joints.len() } else { 0 }
+                ],
                 terms: Vec::with_capacity(nd.max(nc)),
             },
         }

@@ -29,7 +29,7 @@ use crate::lagrangian::generators::{
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
 use crate::math::rows::Block;
-use crate::math::simd::wide;
+use crate::math::simd::widest;
 use crate::math::spatial::{Mat3, Vec3};
 use crate::math::tree_lu::SmallestPivot;
 use crate::model::mechanism::Model;
@@ -164,43 +164,57 @@ impl SpatialRecursion {
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot {
-        wide!({
+        widest!({
             let step = Step::new(&self.vertical, step, kind);
-            let joints = &model.dynamics.joints[..];
-            let mut smallest = SmallestPivot::NONE;
-            let mut left = joints.len();
-            while let Some(row) = left.checked_sub(1) {
-                if let (true, JointKind::Ball(_)) = (!added.balls.is_empty(), joints[row].kind) {
-                    left = row - 2;
-                    self.eliminate_ball(model, mechanics, added, &step, left, &mut smallest);
-                    continue;
-                }
-                left = row;
-                let generators = step.parts(mechanics, row).generators();
-                let Generators { minus, plus, upper, lower } = generators;
-                let place = self.places[row];
-                let (sums, own) = self.sums.split_at_mut(place);
-                let own = &mut own[0];
-                // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
-                let a_plus = product(own, &plus);
-                let u = upper.plus(a_plus);
-                let w = transposed(lower, own, &minus);
-                let k_jj = dot(&minus, &upper) + added.diagonal[row];
-                let d = k_jj + dot(&minus, &a_plus);
-                let inertia = model.conditioning.inertia[row] * step.inverse.abs();
-                smallest.see(row, d, k_jj.abs().max(inertia));
-                let inverse_d = 1.0 / d;
-                let w_over_d = w.times(inverse_d);
-                // A −= U Wᵀ / D, and on to the parent.
-                for (line, u) in own.iter_mut().zip(u.0) {
-                    *line = line.plus(w_over_d.times(-u));
-                }
-                pass(own, sums, place, self.places.get(joints[row].parent));
-                self.eliminated[row] = Eliminated { minus, plus, u, w_over_d };
-                self.inverse_d[row] = inverse_d;
+            if added.balls.is_empty() {
+                self.eliminate::<false>(model, mechanics, added, &step)
+            } else {
+                self.eliminate::<true>(model, mechanics, added, &step)
             }
-            smallest
         })
+    }
+
+    /// From the leaves to the root; `BALLS`: some joint is a ball joint.
+    #[inline(always)]
+    fn eliminate<const BALLS: bool>(
+        &mut self,
+        model: &Model,
+        mechanics: &Mechanics,
+        added: Added<'_>,
+        step: &Step,
+    ) -> SmallestPivot {
+        let mut smallest = SmallestPivot::NONE;
+        for (row, joint) in model.dynamics.joints.iter().enumerate().rev() {
+            if let (true, JointKind::Ball(axis)) = (BALLS, joint.kind) {
+                if axis == 0 {
+                    self.eliminate_ball(model, mechanics, added, step, row, &mut smallest);
+                }
+                continue;
+            }
+            let generators = step.parts(mechanics, row).generators();
+            let Generators { minus, plus, upper, lower } = generators;
+            let place = self.places[row];
+            let (sums, own) = self.sums.split_at_mut(place);
+            let own = &mut own[0];
+            // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
+            let a_plus = product(own, &plus);
+            let u = upper.plus(a_plus);
+            let w = transposed(lower, own, &minus);
+            let k_jj = dot(&minus, &upper) + added.diagonal[row];
+            let d = k_jj + dot(&minus, &a_plus);
+            let inertia = model.conditioning.inertia[row] * step.inverse.abs();
+            smallest.see(row, d, k_jj.abs().max(inertia));
+            let inverse_d = 1.0 / d;
+            let w_over_d = w.times(inverse_d);
+            // A −= U Wᵀ / D, and on to the parent.
+            for (line, u) in own.iter_mut().zip(u.0) {
+                *line = line.plus(w_over_d.times(-u));
+            }
+            pass(own, sums, place, self.places.get(joint.parent));
+            self.eliminated[row] = Eliminated { minus, plus, u, w_over_d };
+            self.inverse_d[row] = inverse_d;
+        }
+        smallest
     }
 
     /// The same for the three axes of a ball joint.
@@ -216,16 +230,23 @@ impl SpatialRecursion {
     ) {
         let joint = &model.dynamics.joints[first];
         let weights = &added.balls[joint.orientation];
-        let parts = [0, 1, 2].map(|a| step.parts(mechanics, first + a));
-        let generators = of_ball(&parts, weights);
+        let generators = of_ball(&step.parts_of_ball(mechanics, first), weights);
         let place = self.places[first];
         let (sums, own) = self.sums.split_at_mut(place);
         let own = &mut own[0];
-        let a_plus = generators.map(|g| product(own, &g.plus));
-        let w = generators.map(|g| transposed(g.lower, own, &g.minus));
+        let [mut a_plus, mut w] = [[Block::ZERO; 3]; 2];
+        for (generators, (a_plus, w)) in generators.iter().zip(a_plus.iter_mut().zip(&mut w)) {
+            *a_plus = product(own, &generators.plus);
+            *w = transposed(generators.lower, own, &generators.minus);
+        }
         let k = step.within_ball(mechanics, model.gravity, first, weights);
-        let below = a_plus.map(|column| Vec3(generators.map(|g| dot(&g.minus, &column))));
-        let (inverse_d, pivots) = inverse(&k.plus(&Mat3(below)));
+        let mut d = k;
+        for (column, a_plus) in d.0.iter_mut().zip(&a_plus) {
+            for (entry, generators) in column.0.iter_mut().zip(&generators) {
+                *entry += dot(&generators.minus, a_plus);
+            }
+        }
+        let (inverse_d, pivots) = inverse(&d);
         for a in (0..3).rev() {
             let inertia = model.conditioning.inertia[first + a] * step.inverse.abs();
             smallest.see(first + a, pivots[a], k.0[a][a].abs().max(inertia));
@@ -246,55 +267,65 @@ impl SpatialRecursion {
     /// Solves `K x = b` in place, about 65 flops an axis.
     #[inline(never)]
     pub(crate) fn solve(&mut self, tree: &Tree, x: &mut [f64]) {
-        wide!({
-            let (eliminated, inverse_d) = (&self.eliminated[..], &self.inverse_d[..]);
-            let (places, flows) = (&self.places[..], &mut self.flows[..]);
-            flows.fill(Block::ZERO);
-            let mut left = tree.joints.len();
-            while let Some(last) = left.checked_sub(1) {
-                let place = places[last];
-                let mut flow = flows[place];
-                left = match tree.joints[last].kind {
-                    JointKind::Ball(_) => {
-                        let first = last - 2;
-                        let own = &eliminated[first..=last];
-                        let b = Vec3([0, 1, 2].map(|a| x[first + a] - dot(&own[a].minus, &flow)));
-                        let value = self.inverse_blocks[tree.joints[first].orientation].apply(b);
-                        for (own, value) in own.iter().zip(value.0) {
-                            flow = flow.plus(own.u.times(value));
-                        }
-                        x[first..=last].copy_from_slice(&value.0);
-                        first
-                    }
-                    _ => {
-                        let value = (x[last] - dot(&eliminated[last].minus, &flow)) * inverse_d[last];
-                        x[last] = value;
-                        flow = flow.plus(eliminated[last].u.times(value));
-                        last
-                    }
-                };
-                match places.get(tree.joints[left].parent) {
-                    Some(&to) if to == place => flows[to] = flow,
-                    to => {
-                        flows[place] = Block::ZERO;
-                        if let Some(&to) = to {
-                            flows[to] = flows[to].plus(flow);
-                        }
-                    }
-                }
-            }
-            let mut next = 0;
-            while let Some(joint) = tree.joints.get(next) {
-                let first = next;
-                next += if matches!(joint.kind, JointKind::Ball(_)) { 3 } else { 1 };
-                let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
-                let mut moved = flow;
-                for (x, own) in x[first..next].iter_mut().zip(&eliminated[first..next]) {
-                    *x -= dot(&own.w_over_d, &flow);
-                    moved = moved.plus(own.plus.times(*x));
-                }
-                flows[places[first]] = moved;
+        widest!({
+            if self.inverse_blocks.is_empty() {
+                self.substitute::<false>(tree, x);
+            } else {
+                self.substitute::<true>(tree, x);
             }
         })
+    }
+
+    /// `BALLS`: some joint is a ball joint.
+    #[inline(always)]
+    fn substitute<const BALLS: bool>(&mut self, tree: &Tree, x: &mut [f64]) {
+        let (eliminated, inverse_d) = (&self.eliminated[..], &self.inverse_d[..]);
+        let (places, flows) = (&self.places[..], &mut self.flows[..]);
+        flows.fill(Block::ZERO);
+        for (i, joint) in tree.joints.iter().enumerate().rev() {
+            let (own, place) = (&eliminated[i], places[i]);
+            let mut flow = flows[place];
+            match joint.kind {
+                JointKind::Ball(0) if BALLS => {
+                    let axes = &eliminated[i..i + 3];
+                    let b = |a: usize| x[i + a] - dot(&axes[a].minus, &flow);
+                    let b = Vec3([b(0), b(1), b(2)]);
+                    let value = self.inverse_blocks[joint.orientation].apply(b);
+                    for (own, value) in axes.iter().zip(value.0) {
+                        flow = flow.plus(own.u.times(value));
+                    }
+                    x[i..i + 3].copy_from_slice(&value.0);
+                }
+                JointKind::Ball(_) if BALLS => continue,
+                _ => {
+                    let value = (x[i] - dot(&own.minus, &flow)) * inverse_d[i];
+                    x[i] = value;
+                    flow = flow.plus(own.u.times(value));
+                }
+            }
+            match places.get(joint.parent) {
+                Some(&to) if to == place => flows[to] = flow,
+                to => {
+                    flows[place] = Block::ZERO;
+                    if let Some(&to) = to {
+                        flows[to] = flows[to].plus(flow);
+                    }
+                }
+            }
+        }
+        for (i, joint) in tree.joints.iter().enumerate() {
+            let axes = match joint.kind {
+                JointKind::Ball(0) if BALLS => i..i + 3,
+                JointKind::Ball(_) if BALLS => continue,
+                _ => i..i + 1,
+            };
+            let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
+            let mut moved = flow;
+            for (x, own) in x[axes.clone()].iter_mut().zip(&eliminated[axes]) {
+                *x -= dot(&own.w_over_d, &flow);
+                moved = moved.plus(own.plus.times(*x));
+            }
+            flows[places[i]] = moved;
+        }
     }
 }

@@ -43,6 +43,7 @@
 //!
 //! with products that are, like those of `K`, those of the residual itself.
 
+use crate::lagrangian::curvature::Within;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::{Turning, Weights};
 use crate::math::rows::Block;
@@ -112,13 +113,15 @@ fn sum([a, b, c]: &[Block; 3], weights: Vec3) -> Block {
 #[inline(always)]
 pub(crate) fn rows(m: &Mat3, vectors: &[Block; 3]) -> [Block; 3] {
     let Mat3([x, y, z]) = m;
-    [0, 1, 2].map(|a| sum(vectors, Vec3([x[a], y[a], z[a]])))
+    let row = |a: usize| sum(vectors, Vec3([x[a], y[a], z[a]]));
+    [row(0), row(1), row(2)]
 }
 
 /// `mᵀ` times three vectors, one below the other.
 #[inline(always)]
 pub(crate) fn columns(m: &Mat3, vectors: &[Block; 3]) -> [Block; 3] {
-    m.0.map(|column| sum(vectors, column))
+    let Mat3([x, y, z]) = *m;
+    [sum(vectors, x), sum(vectors, y), sum(vectors, z)]
 }
 
 impl Step {
@@ -129,6 +132,13 @@ impl Step {
         let half = h * motion;
         let weight = 0.5 * half * vertical.gravity;
         Self { horizontal: vertical.horizontal, motion, half, inverse: 1.0 / h, weight }
+    }
+
+    /// The parts of the axes of a ball joint.
+    #[inline(always)]
+    pub(crate) fn parts_of_ball(&self, mechanics: &Mechanics, first: usize) -> [Parts; 3] {
+        let of = |a: usize| self.parts(mechanics, first + a);
+        [of(0), of(1), of(2)]
     }
 
     /// The parts of a joint, at the second derivatives of `mechanics`.
@@ -159,36 +169,11 @@ impl Step {
     ) -> Mat3 {
         let Self { motion, half, inverse, .. } = *self;
         let Weights { momentum, torque, column, own } = weights;
-        let Within { tau_z, tau_v, m_v } = Within::new(mechanics, gravity, first);
+        let Mechanics { momenta, curvature, .. } = mechanics;
+        let Within { tau_z, tau_v, m_v } = curvature.within_ball(momenta, gravity, first);
         let turned = tau_z.times(column).scaled(0.5 * half).plus(&tau_v.scaled(motion));
         let moved = tau_v.transpose().times(column).scaled(motion).plus(&m_v.scaled(inverse));
         torque.times(&turned).minus(&momentum.times(&moved)).plus(own)
-    }
-}
-
-/// Derivatives of torque and momentum of a ball joint by its own turn and velocity; `m_ζ = τ_vᵀ`.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Within {
-    pub(crate) tau_z: Mat3,
-    pub(crate) tau_v: Mat3,
-    pub(crate) m_v: Mat3,
-}
-
-impl Within {
-    /// At the second derivatives of `mechanics`.
-    #[inline(always)]
-    pub(crate) fn new(mechanics: &Mechanics, gravity: Option<Vec3>, first: usize) -> Self {
-        let Mechanics { momenta, curvature, .. } = mechanics;
-        let [mut tau_z, mut tau_v, mut m_v] = [Mat3::ZERO; 3];
-        for b in 0..3 {
-            for a in 0..3 {
-                let (row, column) = (first + a, first + b);
-                let (qq, qv) = curvature.within_ball(momenta, gravity, row, column);
-                (tau_z.0[b].0[a], tau_v.0[b].0[a]) = (qq, qv);
-                m_v.0[b].0[a] = momenta.axis[row].dot(curvature.force[column]);
-            }
-        }
-        Self { tau_z, tau_v, m_v }
     }
 }
 
@@ -210,22 +195,27 @@ impl Parts {
 #[inline(always)]
 pub(crate) fn of_ball(parts: &[Parts; 3], weights: &Weights) -> [Generators; 3] {
     let Weights { momentum, torque, column, .. } = weights;
-    let (axis, rate) = (parts.map(|part| part.axis), parts.map(|part| part.rate));
-    let (force, slope) = (parts.map(|part| part.force), parts.map(|part| part.slope));
+    let [p, q, r] = parts;
+    let (axis, rate) = ([p.axis, q.axis, r.axis], [p.rate, q.rate, r.rate]);
+    let (force, slope) = ([p.force, q.force, r.force], [p.slope, q.slope, r.slope]);
     let (rates, axes) = (rows(torque, &rate), rows(momentum, &axis));
     let (slopes, forces) = (rows(torque, &slope), rows(momentum, &force));
     let (rate, slope) = (columns(column, &rate), columns(column, &slope));
-    [0, 1, 2].map(|a| Generators {
+    let of = |a: usize| Generators {
         minus: rates[a].plus(axes[a].times(-1.0)),
         plus: rate[a].plus(axis[a]),
         upper: slope[a].plus(force[a]),
         lower: slopes[a].plus(forces[a].times(-1.0)),
-    })
+    };
+    [of(0), of(1), of(2)]
 }
 
 /// What a joint gives to the linearization of a step.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Flanks {
+    pub(crate) parts: Parts,
+    /// Of a ball joint: its rows and columns are weighed.
+    pub(crate) is_turned: bool,
     pub(crate) newton: Generators,
     /// Rows of the momentum, of a joint with others below it, and below others.
     pub(crate) carry: Block,
@@ -240,26 +230,32 @@ impl Flanks {
     pub(crate) fn of(parts: &Parts) -> Self {
         let Parts { rate, slope, .. } = parts;
         let [rate, slope] = [rate.times(2.0), slope.times(2.0)];
-        Self { newton: parts.generators(), carry: rate, push: slope, above: rate, below: slope }
+        let newton = parts.generators();
+        let (parts, is_turned) = (*parts, false);
+        Self { parts, is_turned, newton, carry: rate, push: slope, above: rate, below: slope }
     }
 
     #[inline(always)]
     pub(crate) fn of_ball(parts: &[Parts; 3], turning: &Turning, weights: &Weights) -> [Self; 3] {
         let newton = of_ball(parts, weights);
-        let [rate, slope] =
-            [parts.map(|part| part.rate.times(2.0)), parts.map(|part| part.slope.times(2.0))];
+        let [p, q, r] = parts;
+        let twice = |of: fn(&Parts) -> Block| [of(p), of(q), of(r)].map(|part| part.times(2.0));
+        let [rate, slope] = [twice(|part| part.rate), twice(|part| part.slope)];
         let spin = turning.spin();
-        let axes = rows(&spin, &parts.map(|part| part.axis));
-        let forces = rows(&spin, &parts.map(|part| part.force));
+        let axes = rows(&spin, &[p.axis, q.axis, r.axis]);
+        let forces = rows(&spin, &[p.force, q.force, r.force]);
         let start = &turning.by_start.0;
         let (above, below) = (columns(start, &rate), columns(start, &slope));
-        [0, 1, 2].map(|a| Self {
+        let of = |a: usize| Self {
+            parts: parts[a],
+            is_turned: true,
             newton: newton[a],
             carry: rate[a].plus(axes[a]),
             push: slope[a].plus(forces[a]),
             above: above[a],
             below: below[a],
-        })
+        };
+        [of(0), of(1), of(2)]
     }
 }
 

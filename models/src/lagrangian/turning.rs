@@ -59,7 +59,7 @@ impl<S: Scalar> Turning<S> {
 
     /// `m ↦ m × ξ`.
     pub(crate) fn spin(&self) -> Mat3<S> {
-        Mat3(Mat3::IDENTITY.0.map(|axis: Vec3<S>| axis.cross(self.turn)))
+        rotation::crossed(self.turn)
     }
 
     /// Change of `T⁻ impulse − N⁻ momentum` with `ξ`, and of `T⁻ force`.

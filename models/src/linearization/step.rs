@@ -7,7 +7,7 @@ use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::{Kind, Linearization};
 use crate::math::rows::{add_rows, add_rows_portable, padded};
-use crate::math::simd::wide;
+use crate::math::simd::{wide, widest};
 use crate::math::spatial::three;
 
 impl Workspace {
@@ -201,7 +201,7 @@ impl Workspace {
     /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
     /// `out.momentum`.
     pub(crate) fn differentiate_momentum(&mut self, at: StepContext<'_>, out: &mut Linearization) {
-        wide!({
+        widest!({
             for x in &mut out.increment {
                 *x = -*x;
             }
@@ -216,11 +216,15 @@ impl Workspace {
             for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
                 let stiffness = &self.tangents.stiffness[i * nd..][..nd];
                 target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
-                let slopes = self.tangents.end_slopes[i * nd..][..nd].iter().enumerate();
+                let slopes = &self.tangents.end_slopes[i * nd..][..nd];
+                let elimination = &model.elimination;
+                let above = elimination.offsets[i]..elimination.offsets[i + 1];
+                let coupled = elimination.ancestors[above].iter().copied();
+                let coupled = coupled.chain(elimination.below(i).iter().map(|(j, _)| *j));
                 self.tangents.terms.clear();
                 self.tangents
                     .terms
-                    .extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
+                    .extend(coupled.map(|j| (slopes[j], j)).filter(|(slope, _)| *slope != 0.0));
                 add_rows_portable(target, &out.increment, stride, &self.tangents.terms);
             }
             for (c, constraint) in model.constraints.iter().enumerate() {

@@ -16,9 +16,12 @@
 
 use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
-use crate::lagrangian::generators::{Within, dot};
+use crate::lagrangian::curvature::Within;
+use crate::lagrangian::generators::{Parts, dot};
+use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::Linearization;
+use crate::math::rotation;
 use crate::math::simd::wide;
 use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
@@ -145,6 +148,20 @@ impl Sink<'_> {
             for pair in &model.pairs {
                 let (i, j) = (pair.row as usize, pair.column as usize);
                 let (a, d) = (&flanks[pair.ancestor as usize], &flanks[pair.descendant as usize]);
+                if !(a.is_turned || d.is_turned) {
+                    // ¼h L_qq, ½ L_vq and ½ L_qv.
+                    let Parts { axis, rate, .. } = &a.parts;
+                    let Parts { force, slope, .. } = &d.parts;
+                    let [qq, vq, qv] = [dot(rate, slope), dot(axis, slope), dot(rate, force)];
+                    let (half, vq, qv) = (2.0 * qq, 2.0 * vq, 2.0 * qv);
+                    increment[i * stride + j] = half - vq;
+                    increment[j * stride + i] = half - qv;
+                    end_slopes[i * nd + j] = half + qv;
+                    end_slopes[j * nd + i] = half + vq;
+                    stiffness[i * nd + j] = 2.0 * half;
+                    stiffness[j * nd + i] = 2.0 * half;
+                    continue;
+                }
                 increment[i * stride + j] = dot(&a.newton.minus, &d.below);
                 increment[j * stride + i] = dot(&a.above, &d.newton.lower);
                 stiffness[i * nd + j] = dot(&a.carry, &d.below);
@@ -192,7 +209,13 @@ impl Workspace {
         let balls = &*balls;
         let turns = model.orientations.iter().zip(&balls.turns);
         out.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, *turn, h)));
-        tangents.find_flanks(model, &mid.mechanics, (&out.turnings, &kkt.balls), &balls.vertical, h);
+        tangents.find_flanks(
+            model,
+            &mid.mechanics,
+            (&out.turnings, &kkt.balls),
+            &balls.vertical,
+            h,
+        );
         let split = h * out.at_start;
         let mut sink = Sink {
             balls,
@@ -215,9 +238,10 @@ impl Workspace {
                 let turning = &sink.turnings[joint.orientation];
                 let forces = turning.by_turn(Vec3::ZERO, Vec3::ZERO, three(&mid.force, i))[1];
                 let momentum = three(&mid.l_v, i);
-                let turned = Mat3(Mat3::IDENTITY.0.map(|axis| momentum.cross(axis)));
+                let turned = rotation::crossed(-momentum);
                 let turned = turned.plus(&forces.scaled(sink.skew));
-                let within = Within::new(&mid.mechanics, model.gravity, first);
+                let Mechanics { momenta, curvature, .. } = &mid.mechanics;
+                let within = curvature.within_ball(momenta, model.gravity, first);
                 sink.put_ball(turning, &within, &turned);
             }
         }
@@ -285,6 +309,187 @@ impl Workspace {
                     put(i, by_u);
                 }
             });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::integrator::blocks::StepBlocks;
+    use crate::integrator::settings::{ForceSplit, Settings};
+    use crate::lagrangian::samples::assert_close;
+    use crate::plant::facade::Plant;
+    use crate::scene::Scene;
+
+    /// A body that floats beside a base that is turned, with all that acts on ball joints.
+    const SCENE: &str = r#"
+format = 1
+name = "platform"
+time_step_s = 0.005
+gravity = [0.5, 0.0, -9.81]
+damping = 0.02
+
+[[frames]]
+name = "platform"
+translation = [0.1, 0.0, 0.0]
+joint = { type = "ball" }
+[[frames]]
+name = "mast"
+parent = "platform"
+translation = [0.0, 0.2, 0.1]
+joint = { type = "revolute", axis = [1.0, 0.2, 0.0] }
+body = { mass = 0.8, center_of_mass = [0.0, 0.1, 0.3], inertia = [0.02, 0.02, 0.01] }
+[[frames]]
+name = "bob"
+parent = "mast"
+translation = [0.0, 0.0, 0.5]
+joint = { type = "ball" }
+body = { mass = 0.5, center_of_mass = [0.1, 0.0, -0.3], inertia = [0.02, 0.03, 0.025, 1e-3, 0.0, 2e-3] }
+[[frames]]
+name = "free"
+joint = { type = "free" }
+translation = [0.6, 0.0, 0.0]
+body = { mass = 1.0, center_of_mass = [0.05, 0.0, 0.0], inertia = [0.02, 0.03, 0.025] }
+
+[[coordinates]]
+name = "platform_rx"
+kind = "prescribed"
+initial = 0.3
+[[coordinates]]
+name = "platform_ry"
+kind = "prescribed"
+initial = -0.2
+[[coordinates]]
+name = "platform_rz"
+kind = "prescribed"
+initial = 0.5
+[[coordinates]]
+name = "bob_rx"
+initial = 0.4
+armature = 0.01
+[[coordinates]]
+name = "free_rz"
+initial = -0.6
+
+[[springs]]
+type = "two_point"
+a = { frame = "bob", at = [0.0, 0.0, -0.5] }
+b = { frame = "world", at = [1.0, 0.0, 0.0] }
+stiffness = 20.0
+rest_length = 0.4
+[[springs]]
+type = "two_point"
+a = { frame = "bob", at = [0.1, 0.0, -0.5] }
+b = { frame = "free", at = [0.0, 0.2, 0.0] }
+stiffness = 10.0
+rest_length = 0.2
+
+[[inputs]]
+name = "twist"
+coordinate = "bob_ry"
+gain = 0.7
+[[inputs]]
+name = "push"
+coordinate = "free_x"
+[[inputs]]
+name = "thrust"
+[[forces]]
+type = "body_wrench"
+frame = "bob"
+force = [0.3, 0.0, "thrust"]
+torque = [0.0, "thrust", 0.1]
+[[forces]]
+type = "two_point_damper"
+a = { frame = "bob", at = [0.1, 0.0, -0.5] }
+b = { frame = "free", at = [0.0, 0.2, 0.0] }
+damping = 0.4
+[[forces]]
+type = "coordinate_drag"
+coordinate = "free_ry"
+coefficient = 0.03
+"#;
+
+    /// What is filled entry by entry and by generators is what all blocks of all coordinates are.
+    #[test]
+    fn derivatives_are_those_of_dense_blocks() {
+        let model = Arc::new(Model::compile(&Scene::from_toml(SCENE).unwrap()).unwrap());
+        let d = model.dimensions;
+        let (n, nd, ni) = (d.coordinates(), d.dynamic, d.inputs);
+        for force_split in [ForceSplit::Symmetric, ForceSplit::Paper] {
+            let settings = Settings { force_split, ..Settings::new(&model) };
+            let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+            let mut u = vec![0.0; d.input()];
+            for k in 0..30 {
+                plant.hold_input(&mut u);
+                u.iter_mut().zip(0..).for_each(|(u, i)| *u += 0.02 * f64::from(k + i).sin());
+                plant.step(&u).unwrap();
+            }
+            let mut out = Linearization::new(&model);
+            plant.linearize(&u, &mut out).unwrap();
+            let (workspace, state) = (&mut plant.workspace, &plant.state);
+            let at = StepContext { model: &model, settings: &settings, state, u: &u };
+            let mut blocks = StepBlocks::<f64>::new(&model);
+            blocks.q_start.copy_from_slice(&state.q);
+            blocks.next[..nd].copy_from_slice(&workspace.step.increment);
+            blocks.next[nd..].copy_from_slice(&workspace.step.q_end[nd..]);
+            for (o, &i) in model.orientations.iter().enumerate() {
+                blocks.next[i..i + 3].copy_from_slice(&workspace.balls.turns[o].0);
+            }
+            blocks.orientations[0].copy_from_slice(&workspace.balls.start);
+            blocks.multipliers.copy_from_slice(&workspace.step.multipliers);
+            blocks.inputs.copy_from_slice(&u[..ni]);
+            blocks.evaluate(&model, &settings);
+
+            workspace.fill_newton_matrix(&model, &settings);
+            let (mut found, mut expected) = (Vec::new(), Vec::new());
+            for row in 0..nd {
+                for slot in model.elimination.offsets[row]..model.elimination.offsets[row + 1] {
+                    let column = model.elimination.ancestors[slot];
+                    let tree = &workspace.kkt.tree;
+                    found.push(tree.upper[slot]);
+                    expected.push(blocks.residual_next[column * n + row]);
+                    if row != column {
+                        found.push(tree.lower[slot]);
+                        expected.push(blocks.residual_next[row * n + column]);
+                    }
+                }
+            }
+            assert_close("newton", &found, &expected);
+
+            workspace.fill_right_hand_sides(at, &mut out);
+            let next = out.next_columns();
+            let Linearization { increment, momentum, stride, .. } = &out;
+            for i in 0..nd {
+                let (row, from) = (i * n..(i + 1) * n, i * stride);
+                let start = &blocks.residual_start[row.clone()];
+                assert_close("residual by start", &increment[from..][..n], start);
+                let by_next = &blocks.residual_next[row.clone()][nd..];
+                assert_close("residual by next", &increment[from + next..][..n - nd], by_next);
+                let Tangents { stiffness, end_slopes, .. } = &workspace.tangents;
+                let by_start = &blocks.momentum_start[row.clone()];
+                let found: Vec<f64> = (0..n)
+                    .map(|j| {
+                        let entry = momentum[from + j];
+                        if j < nd { stiffness[i * nd + j] + entry } else { entry }
+                    })
+                    .collect();
+                assert_close("momentum by start", &found, by_start);
+                let by_next = &blocks.momentum_next[row.clone()];
+                assert_close("momentum by next", &end_slopes[i * nd..][..nd], &by_next[..nd]);
+                let found = &momentum[from + next..][..n - nd];
+                assert_close("momentum by next position", found, &by_next[nd..]);
+            }
+            let (mut residual, mut change) = (vec![0.0; nd * ni], vec![0.0; nd * ni]);
+            for place in &out.inputs {
+                let entry = place.coordinate * ni + place.input;
+                residual[entry] += place.residual;
+                change[entry] += place.momentum;
+            }
+            assert_close("residual by inputs", &residual, &blocks.residual_inputs);
+            assert_close("momentum by inputs", &change, &blocks.momentum_inputs);
         }
     }
 }
