@@ -12,30 +12,93 @@
 //! which is what the equations of the other coordinates are with `N = T = 1`. Nothing is singular but
 //! a whole turn in one step. See [`crate::math::rotation`] for the maps.
 
-use crate::integrator::blocks::StepBlocks;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
-use crate::integrator::workspace::Workspace;
+use crate::integrator::workspace::{Tangents, Workspace};
+use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, Vertical, dot, of_ball};
+use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::turning::{Turning, Weights};
 use crate::math::rotation;
 use crate::math::rotation::Quaternion;
+use crate::math::simd::wide;
 use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
+use crate::model::tree::JointKind;
 
-/// Writes where a step starts and what is next.
-fn place(
-    blocks: &mut StepBlocks,
-    model: &Model,
-    increment: &[f64],
-    q_end: &[f64],
-    (orientations, turns): (&[Mat3], &[Vec3]),
-) {
-    let nd = model.dimensions.dynamic;
-    blocks.orientations[0].copy_from_slice(orientations);
-    blocks.next[..nd].copy_from_slice(increment);
-    blocks.next[nd..].copy_from_slice(&q_end[nd..]);
-    for (&i, turn) in model.orientations.iter().zip(turns) {
-        if i >= nd {
-            blocks.next[i..i + 3].copy_from_slice(&turn.0);
+/// No ball joint has the coordinate.
+const NONE: u32 = u32::MAX;
+
+/// The ball joints of a step.
+#[derive(Clone, Debug)]
+pub(crate) struct BallJoints {
+    /// Orientations at the start and at the end.
+    pub(crate) start: Vec<Mat3>,
+    pub(crate) end: Vec<Mat3>,
+    /// How they turn over the step, in their own axes.
+    pub(crate) turns: Vec<Vec3>,
+    /// Of each coordinate the orientation that it is a component of, times four, and the axis.
+    places: Vec<u32>,
+    pub(crate) vertical: Vertical,
+    /// Of the joints at the midpoint.
+    generators: Vec<Generators>,
+}
+
+impl BallJoints {
+    pub(crate) fn new(model: &Model) -> Self {
+        let no = model.orientations.len();
+        let (joints, coordinates) = (model.dynamics.joints.len(), model.dimensions.coordinates());
+        let mut places = vec![NONE; if no > 0 { coordinates } else { 0 }];
+        for (o, &i) in model.orientations.iter().enumerate() {
+            (0..3).for_each(|axis| places[i + axis] = (4 * o + axis) as u32);
+        }
+        Self {
+            start: vec![Mat3::IDENTITY; no],
+            end: vec![Mat3::IDENTITY; no],
+            turns: vec![Vec3::ZERO; no],
+            places,
+            vertical: Vertical::new(model),
+            generators: vec![Generators::default(); if no > 0 { joints } else { 0 }],
+        }
+    }
+
+    /// The orientation that a coordinate is a component of, and the axis.
+    #[inline]
+    pub(crate) fn of(&self, coordinate: usize) -> Option<(usize, usize)> {
+        let place = *self.places.get(coordinate)?;
+        (place != NONE).then(|| (place as usize / 4, place as usize % 4))
+    }
+
+    /// Calls `entry(i, factor)` for what a coordinate's row gives to the rows of its joint, by a map of theirs.
+    #[inline]
+    fn for_each_row(
+        &self,
+        i: usize,
+        map: impl Fn(usize) -> Mat3,
+        mut entry: impl FnMut(usize, f64),
+    ) {
+        match self.of(i) {
+            None => entry(i, 1.0),
+            Some((o, axis)) => {
+                let column = map(o).0[axis];
+                (0..3).for_each(|a| entry(i - axis + a, column[a]));
+            }
+        }
+    }
+
+    /// [`Self::for_each_row`] for columns: by the transpose.
+    #[inline]
+    fn for_each_column(
+        &self,
+        j: usize,
+        map: impl Fn(usize) -> Mat3,
+        mut entry: impl FnMut(usize, f64),
+    ) {
+        match self.of(j) {
+            None => entry(j, 1.0),
+            Some((o, axis)) => {
+                let columns = map(o).0;
+                (0..3).for_each(|b| entry(j - axis + b, columns[b][axis]));
+            }
         }
     }
 }
@@ -83,50 +146,122 @@ impl Workspace {
         }
     }
 
-    /// Evaluates the derivatives of the step at the increment, with multipliers and ends.
-    pub(crate) fn evaluate_turned(
-        &mut self,
-        model: &Model,
-        settings: &Settings,
-        state: &PreciseState,
-    ) {
-        let Some(blocks) = &mut self.balls.blocks else { return };
-        blocks.q_start.copy_from_slice(&state.q);
-        blocks.multipliers.copy_from_slice(&self.step.multipliers);
-        place(
-            blocks,
-            model,
-            &self.step.increment,
-            &self.step.q_end,
-            (&self.balls.start, &self.balls.turns),
-        );
-        blocks.inputs.copy_from_slice(&self.mid.inputs);
-        blocks.evaluate(model, settings);
+    /// Finds how ball joints weigh the Newton matrix at the last evaluation.
+    pub(crate) fn weigh_balls(&mut self, model: &Model, settings: &Settings) {
+        let (h, a) = (settings.time_step_s, settings.force_split.at_start());
+        let Self { mid, kkt, balls, .. } = self;
+        for (o, &i) in model.orientations.iter().enumerate() {
+            if i >= model.dimensions.dynamic {
+                continue;
+            }
+            let turn = balls.turns[o];
+            let weights = &mut kkt.balls[o];
+            *weights = Weights::of_rows(turn);
+            weights.column = rotation::dexp(turn * 0.5);
+            let impulse = three(&mid.l_q, i) * (0.5 * h) + three(&mid.force, i) * (a * h);
+            weights.own = rotation::torque_change(turn, impulse)
+                .minus(&rotation::momentum_change(turn, three(&mid.l_v, i)));
+            if let Some(damping) = model.damping.get(i..i + 3) {
+                for (b, c) in damping.iter().enumerate() {
+                    weights.own.0[b] += weights.torque.0[b] * (-a * c);
+                }
+            }
+        }
+        for &(i, a) in &model.armature {
+            if let Some((o, axis)) = balls.of(i) {
+                let weights = &mut kkt.balls[o];
+                weights.own.0[axis] += weights.momentum.0[axis] * (-a / h);
+            }
+        }
     }
 
     /// Writes the Jacobian of the residual by the increment.
     pub(crate) fn fill_turned_newton_matrix(&mut self, model: &Model, settings: &Settings) {
-        let Some(blocks) = &mut self.balls.blocks else { return };
-        place(
-            blocks,
-            model,
-            &self.step.increment,
-            &self.step.q_end,
-            (&self.balls.start, &self.balls.turns),
-        );
-        blocks.inputs.copy_from_slice(&self.mid.inputs);
-        blocks.place_midpoint(model, settings.time_step_s);
-        blocks.q_mid.copy_from_slice(&self.mid.q);
-        blocks.velocity.copy_from_slice(&self.mid.velocity);
-        blocks.evaluate_mid(model);
-        blocks.assemble(model, settings);
-        let (n, elimination) = (model.dimensions.coordinates(), &model.elimination);
-        for row in 0..model.dimensions.dynamic {
-            for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
-                let ancestor = elimination.ancestors[slot];
-                self.kkt.tree.upper[slot] = blocks.residual_next[ancestor * n + row];
-                self.kkt.tree.lower[slot] = blocks.residual_next[row * n + ancestor];
+        let (h, nd) = (settings.time_step_s, model.dimensions.dynamic);
+        self.mid.mechanics.differentiate(model);
+        self.weigh_balls(model, settings);
+        let Self { mid, kkt, balls, .. } = self;
+        let (matrix, weights) = (&mut kkt.tree, &kkt.balls);
+        wide!({
+            let step = Step::new(&balls.vertical, h, MatrixKind::Newton);
+            let generators = &mut balls.generators[..];
+            for (i, joint) in model.dynamics.joints.iter().enumerate() {
+                match joint.kind {
+                    JointKind::Ball(0) if joint.coordinate < nd => {
+                        let parts = step.parts_of_ball(&mid.mechanics, i);
+                        let own = of_ball(&parts, &weights[joint.orientation]);
+                        generators[i..i + 3].copy_from_slice(&own);
+                    }
+                    JointKind::Ball(_) => {}
+                    _ => generators[i] = step.parts(&mid.mechanics, i).generators(),
+                }
             }
+            for pair in &model.pairs {
+                let (i, j) = (pair.ancestor as usize, pair.descendant as usize);
+                matrix.upper[pair.slot as usize] = dot(&generators[i].minus, &generators[j].upper);
+                matrix.lower[pair.slot as usize] = dot(&generators[i].plus, &generators[j].lower);
+            }
+            for (first, joint) in model.dynamics.joints.iter().enumerate() {
+                if joint.kind != JointKind::Ball(0) || joint.coordinate >= nd {
+                    continue;
+                }
+                let weights = &weights[joint.orientation];
+                let own = step.within_ball(&mid.mechanics, model.gravity, first, weights);
+                for row in 0..3 {
+                    // The axes of a joint come last among those that its rows are coupled with.
+                    let end = model.elimination.offsets[joint.coordinate + row + 1];
+                    for column in 0..=row {
+                        let slot = end - 1 - row + column;
+                        matrix.upper[slot] = own.0[row][column];
+                        matrix.lower[slot] = own.0[column][row];
+                    }
+                }
+            }
+        });
+        self.add_elements_to_turned_matrix(model, settings);
+    }
+
+    /// Springs, armatures, damping and forces, but for what is in the weights of ball joints.
+    fn add_elements_to_turned_matrix(&mut self, model: &Model, settings: &Settings) {
+        let (h, a) = (settings.time_step_s, settings.force_split.at_start());
+        let nd = model.dimensions.dynamic;
+        let Self { mid, kkt, balls, .. } = self;
+        let (matrix, weights) = (&mut kkt.tree, &kkt.balls);
+        let (torque, column) = (|o: usize| weights[o].torque, |o: usize| weights[o].column);
+        let mut add_turned = |i: usize, j: usize, value: f64| {
+            balls.for_each_row(i, torque, |row, t| {
+                balls.for_each_column(j, column, |column, c| {
+                    matrix.add(&model.elimination, row, column, t * c * value);
+                });
+            });
+        };
+        if model.potentials.any {
+            model.for_each_spring_derivative(&mid.mechanics.poses, &mid.q, |i, j, value| {
+                if i < nd && j < nd {
+                    add_turned(i, j, -0.25 * h * value);
+                }
+            });
+        }
+        let instant = mid.instant(model);
+        if let Some(forces) = &model.forces {
+            forces.for_each_derivative(&instant, |i, j, by_q, _| {
+                if i < nd && j < nd {
+                    add_turned(i, j, 0.5 * a * h * by_q);
+                }
+            });
+            forces.for_each_derivative(&instant, |i, j, _, by_v| {
+                if i < nd && j < nd && by_v != 0.0 {
+                    balls.for_each_row(i, torque, |row, t| {
+                        matrix.add(&model.elimination, row, j, a * t * by_v);
+                    });
+                }
+            });
+        }
+        let masses = model.armature.iter().map(|&(i, mass)| (i, mass / h));
+        let dampers = model.damping.iter().enumerate().map(|(i, c)| (i, a * c));
+        for (i, value) in masses.chain(dampers).filter(|(i, _)| balls.of(*i).is_none()) {
+            let slot = model.elimination.offsets[i + 1] - 1;
+            matrix.add_to_diagonal(slot, -value);
         }
     }
 
@@ -155,5 +290,35 @@ impl Workspace {
                 *orientation = Quaternion::exp(three(&self.step.q_end, i));
             }
         }
+    }
+}
+
+impl Tangents {
+    /// What joints give to the linearization, at the second derivatives of `mechanics`.
+    #[inline(never)]
+    pub(crate) fn find_flanks(
+        &mut self,
+        model: &Model,
+        mechanics: &Mechanics,
+        (turnings, weights): (&[Turning], &[Weights]),
+        vertical: &Vertical,
+        h: f64,
+    ) {
+        let flanks = &mut self.flanks[..];
+        wide!({
+            let step = Step::new(vertical, h, MatrixKind::Newton);
+            for (i, joint) in model.dynamics.joints.iter().enumerate() {
+                match joint.kind {
+                    JointKind::Ball(0) if joint.coordinate < model.dimensions.dynamic => {
+                        let parts = step.parts_of_ball(mechanics, i);
+                        let o = joint.orientation;
+                        let own = Flanks::of_ball(&parts, &turnings[o], &weights[o]);
+                        flanks[i..i + 3].copy_from_slice(&own);
+                    }
+                    JointKind::Ball(_) => {}
+                    _ => flanks[i] = Flanks::of(&step.parts(mechanics, i)),
+                }
+            }
+        });
     }
 }

@@ -6,8 +6,8 @@
 
 use crate::constraints::closure::Closure;
 use crate::integrator::settings::Settings;
-use crate::integrator::turning::Turning;
 use crate::lagrangian::derivatives::Derivatives;
+use crate::lagrangian::turning::Turning;
 use crate::math::rotation;
 use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3, three};
@@ -293,9 +293,9 @@ impl<S: Scalar> StepBlocks<S> {
             for b in 0..3 {
                 let mut axis = Vec3::ZERO;
                 axis.0[b] = S::ONE;
-                let change = momentum.cross(axis) + forces[b].scaled(skew);
+                let change = momentum.cross(axis) + forces.0[b].scaled(skew);
                 for a in 0..3 {
-                    self.residual_next[(i + a) * n + i + b] += residuals[b][a];
+                    self.residual_next[(i + a) * n + i + b] += residuals.0[b][a];
                     self.momentum_next[(i + a) * n + i + b] += change[a];
                 }
             }

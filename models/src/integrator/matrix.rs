@@ -5,10 +5,11 @@ use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::planar::MatrixKind;
 use crate::kkt::schur::{SchurComplement, fill_schur};
 use crate::kkt::system::{Factors, Linearized};
+use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::turning::Weights;
 use crate::model::mechanism::{Forces, Model};
 
 impl Workspace {
@@ -70,6 +71,9 @@ impl Workspace {
             return Ok(false);
         }
         self.fill_diagonal(model, settings);
+        if !model.orientations.is_empty() {
+            self.weigh_balls(model, settings);
+        }
         let constraints = [&self.constraints.start, &self.constraints.end];
         let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
         self.kkt
@@ -80,8 +84,13 @@ impl Workspace {
     /// Factors the mass matrix by the recursion, with the constraints at the start; whether that went well.
     pub(super) fn factor_masses(&mut self, model: &Model, settings: &Settings) -> bool {
         self.kkt.diagonal.fill(0.0);
+        self.kkt.balls.fill(Weights::REST);
         for &(i, a) in &model.armature {
-            self.kkt.diagonal[i] = -a / settings.time_step_s;
+            let added = -a / settings.time_step_s;
+            match self.balls.of(i) {
+                Some((o, axis)) => self.kkt.balls[o].own.0[axis].0[axis] = added,
+                None => self.kkt.diagonal[i] = added,
+            }
         }
         let constraints = [&self.constraints.start, &self.constraints.start];
         let at = linearized(model, settings, &mut self.mid.mechanics, constraints);
@@ -90,13 +99,13 @@ impl Workspace {
 
     /// Fills `K` at the last evaluation.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
-        if !model.orientations.is_empty() {
-            self.fill_turned_newton_matrix(model, settings);
-            return;
-        }
         let h = settings.time_step_s;
         if model.potentials.couple_branches || model.forces.is_some() {
             self.kkt.tree.clear();
+        }
+        if !model.orientations.is_empty() {
+            self.fill_turned_newton_matrix(model, settings);
+            return;
         }
         self.mid.mechanics.differentiate(model);
         if let (Some(planar), Some(joints)) = (&mut self.mid.mechanics.planar, &model.planar) {

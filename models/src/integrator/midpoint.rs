@@ -27,7 +27,7 @@ pub(crate) struct Midpoint {
     pub(crate) mechanics: Mechanics,
     pub(crate) l_q: Vec<f64>,
     pub(crate) l_v: Vec<f64>,
-    /// The inputs, where forces or ball joints need them; else empty.
+    /// The inputs, where forces need them; else empty.
     pub(crate) inputs: Vec<f64>,
     pub(crate) input_force: Vec<f64>,
     /// Inputs, damping and forces.
@@ -54,7 +54,7 @@ impl Midpoint {
             mechanics: Mechanics::new(model),
             l_q: zeros(nd),
             l_v: zeros(nd),
-            inputs: zeros(if model.forces.is_some() || no > 0 { d.inputs } else { 0 }),
+            inputs: zeros(if model.forces.is_some() { d.inputs } else { 0 }),
             input_force: zeros(nd),
             force: zeros(nd),
         }

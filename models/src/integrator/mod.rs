@@ -18,5 +18,4 @@ pub(crate) mod residual;
 pub(crate) mod scheme;
 pub(crate) mod settings;
 pub(crate) mod state;
-pub(crate) mod turning;
 pub(crate) mod workspace;

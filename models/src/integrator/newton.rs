@@ -177,8 +177,11 @@ impl Workspace {
             return false;
         }
         self.mid.velocity.fill(0.0);
+        for (matrix, orientation) in self.balls.start.iter_mut().zip(&state.orientations) {
+            *matrix = orientation.matrix();
+        }
         let (orientations, derivatives) =
-            (&self.mid.orientations, [&mut *self.mid.l_q, &mut *self.mid.l_v]);
+            (&self.balls.start, [&mut *self.mid.l_q, &mut *self.mid.l_v]);
         self.mid.mechanics.gradient(model, &state.q, orientations, &self.mid.velocity, derivatives);
         if !self.factor_masses(model, settings) {
             return false;

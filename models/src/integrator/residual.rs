@@ -130,8 +130,8 @@ impl Workspace {
             let turn = self.balls.turns[o];
             let momentum = three(&self.mid.l_v, i);
             let torque = three(&self.mid.l_q, i) * (0.5 * h) + three(&self.mid.force, i) * weight;
-            let momentum = rotation::momentum_at_start(turn).apply(momentum);
-            let torque = rotation::torque_at_start(turn).apply(torque);
+            let momentum = rotation::momentum_to_start(turn, momentum);
+            let torque = rotation::torque_to_start(turn, torque);
             for a in 0..3 {
                 self.residual.dynamics[i + a] =
                     ((state.p[i + a] - momentum[a]) + torque[a]) + state.p_low[i + a];
@@ -150,9 +150,13 @@ impl Workspace {
             let turn = self.balls.turns[o];
             let carried = three(&self.mid.l_v, i).cross(turn);
             let force = three(&self.mid.force, i);
-            let split = (rotation::torque_at_start(turn).apply(force) - force) * skew;
+            let change = if skew == 0.0 {
+                carried
+            } else {
+                carried + (rotation::torque_to_start(turn, force) - force) * skew
+            };
             for a in 0..3 {
-                self.step.impulse[i + a] += carried[a] + split[a];
+                self.step.impulse[i + a] += change[a];
             }
         }
     }

@@ -1,13 +1,13 @@
 //! The memory of a step.
 
 use crate::constraints::closure::Closure;
-use crate::integrator::blocks::StepBlocks;
+use crate::integrator::balls::BallJoints;
 use crate::integrator::midpoint::Midpoint;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::system::KktSystem;
+use crate::lagrangian::generators::Flanks;
 use crate::math::rows::{Term, padded, spread};
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 
 /// What a step is taken of.
@@ -44,18 +44,6 @@ pub(crate) struct StepIncrement {
     pub(crate) impulse: Vec<f64>,
     /// `q[k+1]`.
     pub(crate) q_end: Vec<f64>,
-}
-
-/// The ball joints of a step.
-#[derive(Clone, Debug)]
-pub(crate) struct BallJoints {
-    /// Orientations at the start and at the end.
-    pub(crate) start: Vec<Mat3>,
-    pub(crate) end: Vec<Mat3>,
-    /// How they turn over the step, in their own axes.
-    pub(crate) turns: Vec<Vec3>,
-    /// Derivatives of the step, which are found with all coordinates in one; none without ball joints.
-    pub(crate) blocks: Option<Box<StepBlocks>>,
 }
 
 /// What a step's equations leave over; a correction takes its place.
@@ -108,6 +96,8 @@ pub(crate) struct Tangents {
     pub(crate) end_slopes: Vec<f64>,
     /// `h L_qq`.
     pub(crate) stiffness: Vec<f64>,
+    /// Of joints, with ball joints.
+    pub(crate) flanks: Vec<Flanks>,
     pub(crate) terms: Vec<Term>,
 }
 
@@ -115,7 +105,7 @@ impl Workspace {
     pub(crate) fn new(model: &Model) -> Self {
         let d = model.dimensions;
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
-        let no = model.orientations.len();
+        let has_balls = !model.orientations.is_empty();
         let zeros = |len: usize| vec![0.0; len];
         Self {
             step: StepIncrement {
@@ -125,12 +115,7 @@ impl Workspace {
                 q_end: zeros(n),
             },
             mid: Midpoint::new(model),
-            balls: BallJoints {
-                start: vec![Mat3::IDENTITY; no],
-                end: vec![Mat3::IDENTITY; no],
-                turns: vec![Vec3::ZERO; no],
-                blocks: (no > 0).then(|| Box::new(StepBlocks::new(model))),
-            },
+            balls: BallJoints::new(model),
             residual: Residual {
                 dynamics: zeros(nd),
                 constraints: zeros(nc),
@@ -144,6 +129,10 @@ impl Workspace {
                 constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
                 end_slopes: zeros(nd * nd),
                 stiffness: zeros(nd * nd),
+                flanks: vec![
+                    Flanks::default();
+                    if has_balls { model.dynamics.joints.len() } else { 0 }
+                ],
                 terms: Vec::with_capacity(nd.max(nc)),
             },
         }

@@ -18,8 +18,9 @@ mod column;
 
 use crate::constraints::in_plane::InPlane;
 use crate::kkt::loops::column::Column;
-use crate::kkt::planar::{Diagonal, MatrixKind, Method, PlanarRecursion, add_to, dot3, product};
+use crate::kkt::planar::{Diagonal, Method, PlanarRecursion, add_to, dot3, product};
 use crate::lagrangian::arrangement::Fours;
+use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::Joints;
 use crate::lagrangian::plane::{Vec2, Vec3, cross};
 use crate::math::rows::{Block, LANES, padded};

@@ -22,6 +22,7 @@
 //! joint, long chains lose no digits.
 
 use crate::lagrangian::arrangement::Fours;
+use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::{Joints, Link};
 use crate::lagrangian::plane::{Vec2, Vec3, cross, dot, linear};
 use crate::math::rows::{Block, LANES};
@@ -65,15 +66,6 @@ struct Passage {
 pub(crate) struct Diagonal<'a> {
     pub(crate) residual: &'a [f64],
     pub(crate) momentum: &'a [f64],
-}
-
-/// Which matrix of the second derivatives of the Lagrangian.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum MatrixKind {
-    /// The Newton matrix `K`.
-    Newton,
-    /// The mass matrix, as `−M/h`.
-    Mass,
 }
 
 /// The matrix of a step.

@@ -1,63 +1,71 @@
 //! The Newton matrix of a tree in space as products of vectors, and its elimination in O(n).
 //!
-//! With `e1`, `e2` and gravity `g = |g| e3` along three right-handed axes, and for joint `i` on the path from
-//! `j` to the root (or `i = j`), all about the origin of the tree,
+//! For joint `i` on the path from `j` to the root (or `i = j`), all about the origin of the tree,
 //!
 //! ```text
-//! K_ij = minus_i · upper_j      minus_i = [½h J̇_i − J_i   w_i·e1   w_i·e2]      upper_j = [½P_j + F_j/h   weight_j]
-//! K_ji = plus_i · lower_j       plus_i = [½h J̇_i + J_i   w_i·e1   w_i·e2]       lower_j = [½P_j − F_j/h   weight_j]
-//!
-//! weight_j = ¼h |g| [f_j·e2   −f_j·e1]
+//! K_ij = minus_i · upper_j      K_ji = plus_i · lower_j
 //! ```
 //!
-//! with the angular part `w` of `J` and the force part `f` of `F`: eight numbers, as what turns about the
-//! vertical changes nothing of a weight. Eliminating a leaf changes the matrix of the others by a product of
-//! the same form: what is eliminated below a joint is summed in an 8 by 8 matrix `A`,
+//! with the vectors of [`generators`](crate::lagrangian::generators). Eliminating a leaf changes the matrix of
+//! the others by a product of the same form: what is eliminated below a joint is summed in an 8 by 8 matrix
+//! `A`,
 //!
 //! ```text
 //! D_j = K_jj + minus_jᵀ A_j plus_j      U_j = upper_j + A_j plus_j      W_j = lower_j + A_jᵀ minus_j
-//! A_parent += A_j − U_j W_jᵀ / D_j
+//! A_parent += A_j − U_j D_j⁻¹ W_jᵀ
 //! ```
 //!
-//! as in [`planar`](crate::kkt::planar), and `D_j` are the pivots of an elimination from the leaves to the root. As all sums are about one origin,
+//! as in [`planar`](crate::kkt::planar), and `D_j` are the pivots of an elimination from the leaves to the root.
+//! A ball joint has three of each, and `D_j` is a 3 by 3 matrix. As all sums are about one origin,
 //! the solution loses digits in long chains (up to 1e-11 of it in one of 64 hinges), which the next correction
 //! makes good.
 
 #[cfg(test)]
 mod tests;
 
-use crate::kkt::planar::MatrixKind;
+use crate::lagrangian::generators::{
+    Generators, MatrixKind, Step, Vertical, dot, of_ball, rows as times,
+};
 use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::turning::Weights;
 use crate::math::rows::Block;
-use crate::math::simd::wide;
+use crate::math::simd::widest;
 use crate::math::spatial::{Mat3, Vec3};
 use crate::math::tree_lu::SmallestPivot;
-use crate::model::tree::Tree;
+use crate::model::mechanism::Model;
+use crate::model::tree::{JointKind, Tree};
 
 /// What is left of a joint when it has been eliminated.
 #[derive(Clone, Copy, Debug, Default)]
-struct Generator {
+struct Eliminated {
     minus: Block,
     plus: Block,
     u: Block,
     w_over_d: Block,
 }
 
+/// What is added to the second derivatives of the Lagrangian.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Added<'a> {
+    /// On the diagonal, but for ball joints.
+    pub(crate) diagonal: &'a [f64],
+    pub(crate) balls: &'a [Weights],
+}
+
 /// The Newton matrix of a tree in space, factored.
 #[derive(Clone, Debug)]
 pub(crate) struct SpatialRecursion {
-    generators: Vec<Generator>,
+    eliminated: Vec<Eliminated>,
     inverse_d: Vec<f64>,
+    /// `D⁻¹` of ball joints, by their orientations.
+    inverse_blocks: Vec<Mat3>,
     /// Where the sums of each joint are.
     places: Vec<usize>,
     /// `A` by rows; zero but for joints whose elimination has begun.
     sums: Vec<[Block; 8]>,
     /// Flows of right-hand sides, and twists that belong to solutions.
     flows: Vec<Block>,
-    /// `e1` and `e2`.
-    horizontal: [Vec3; 2],
-    /// `|g|`.
-    gravity: f64,
+    vertical: Vertical,
 }
 
 /// Places of sums: an only child takes that of its parent, others the next one. As trees are walked depth
@@ -80,140 +88,244 @@ fn places(tree: &Tree) -> Vec<usize> {
     places
 }
 
+/// `A v`.
 #[inline(always)]
-fn dot(a: &Block, b: &Block) -> f64 {
-    let (a, b) = (&a.0, &b.0);
-    let pair = |k: usize| a[k] * b[k] + a[k + 4] * b[k + 4];
-    (pair(0) + pair(1)) + (pair(2) + pair(3))
+fn product(a: &[Block; 8], v: &Block) -> Block {
+    let mut out = Block::ZERO;
+    for (out, line) in out.0.iter_mut().zip(a) {
+        *out = dot(line, v);
+    }
+    out
 }
 
+/// `start + Aᵀ v`.
 #[inline(always)]
-fn lanes(a: Vec3, b: Vec3, [c, d]: [f64; 2]) -> Block {
-    Block([a[0], a[1], a[2], b[0], b[1], b[2], c, d])
+fn transposed(start: Block, a: &[Block; 8], v: &Block) -> Block {
+    let mut out = start;
+    for (two, lines) in v.0.as_chunks::<2>().0.iter().zip(a.as_chunks::<2>().0) {
+        out = out.plus(lines[0].times(two[0]).plus(lines[1].times(two[1])));
+    }
+    out
+}
+
+/// Passes what is eliminated at a place on to that of the parent.
+#[inline(always)]
+fn pass(sums: &mut [Block; 8], above: &mut [[Block; 8]], place: usize, parent: Option<&usize>) {
+    match parent {
+        Some(&to) if to == place => {}
+        to => {
+            if let Some(&to) = to {
+                for (target, line) in above[to].iter_mut().zip(&*sums) {
+                    *target = target.plus(*line);
+                }
+            }
+            *sums = [Block::ZERO; 8];
+        }
+    }
+}
+
+/// The inverse of a 3 by 3 matrix, with the pivots of its elimination from the last row to the first.
+#[inline(always)]
+fn inverse(d: &Mat3) -> (Mat3, Vec3) {
+    let Mat3([x, y, z]) = *d;
+    let [last, middle] = [x.cross(y), x.cross(z)];
+    let minor = y[1] * z[2] - z[1] * y[2];
+    let determinant = z.dot(last);
+    let scale = 1.0 / determinant;
+    let rows = [y.cross(z) * scale, middle * -scale, last * scale];
+    (Mat3(rows).transpose(), Vec3([determinant / minor, minor / z[2], z[2]]))
 }
 
 impl SpatialRecursion {
-    pub(crate) fn new(tree: &Tree, gravity: Option<Vec3>) -> Self {
-        let joints = tree.joints.len();
-        let places = places(tree);
+    pub(crate) fn new(model: &Model) -> Self {
+        let joints = model.dynamics.joints.len();
+        let places = places(&model.dynamics);
         let most = places.iter().max().map_or(0, |most| most + 1);
-        let size = gravity.map_or(0.0, Vec3::norm);
-        let [e1, e2, _] = match gravity {
-            Some(g) => Mat3::with_z_along(g * (1.0 / size)).0,
-            None => Mat3::ZERO.0,
-        };
         Self {
-            generators: vec![Generator::default(); joints],
+            eliminated: vec![Eliminated::default(); joints],
             inverse_d: vec![0.0; joints],
+            inverse_blocks: vec![Mat3::ZERO; model.orientations.len()],
             places,
             sums: vec![[Block::ZERO; 8]; most],
             flows: vec![Block::ZERO; most],
-            horizontal: [e1, e2],
-            gravity: size,
+            vertical: Vertical::new(model),
         }
     }
 
     /// Factors the matrix that belongs to the second derivatives of `mechanics`; all joints are dynamic,
     /// in the order of their coordinates. Each pivot is compared with the larger of its diagonal entry
-    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 450 flops a joint.
+    /// and the inertia of its row over the step. Of masses alone it is `−M/h`. About 450 flops an axis.
     #[inline(never)]
     pub(crate) fn factor(
         &mut self,
-        tree: &Tree,
+        model: &Model,
         mechanics: &Mechanics,
-        diagonal: &[f64],
-        inertia: &[f64],
+        added: Added<'_>,
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot {
-        wide!({
-            let Mechanics { momenta, curvature, .. } = mechanics;
-            let motion = if kind == MatrixKind::Mass { 0.0 } else { 0.5 };
-            let (half, inverse) = (step * motion, 1.0 / step);
-            let [e1, e2] = self.horizontal;
-            let weight = 0.5 * half * self.gravity;
-            let mut smallest = SmallestPivot::NONE;
-            for (row, joint) in tree.joints.iter().enumerate().rev() {
-                let (axis, rate) = (momenta.axis[row], momenta.axis_rate[row]);
-                let (force, slope) = (curvature.force[row], curvature.rate[row]);
-                let tilt = [axis.w.dot(e1), axis.w.dot(e2)];
-                let weight = [weight * force.f.dot(e2), -weight * force.f.dot(e1)];
-                let axis = lanes(axis.w, axis.v, [0.0; 2]);
-                let rate = lanes(rate.w * half, rate.v * half, tilt);
-                let force = lanes(force.n * inverse, force.f * inverse, [0.0; 2]);
-                let slope = lanes(slope.n * motion, slope.f * motion, weight);
-                let (plus, minus) = (rate.plus(axis), rate.plus(axis.times(-1.0)));
-                let (upper, lower) = (slope.plus(force), slope.plus(force.times(-1.0)));
-
-                let place = self.places[row];
-                let (sums, own) = self.sums.split_at_mut(place);
-                let own = &mut own[0];
-                // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
-                let mut a_plus = Block::ZERO;
-                for (a_plus, line) in a_plus.0.iter_mut().zip(&*own) {
-                    *a_plus = dot(line, &plus);
-                }
-                let u = upper.plus(a_plus);
-                let mut w = lower;
-                for (two, lines) in minus.0.as_chunks::<2>().0.iter().zip(own.as_chunks::<2>().0) {
-                    w = w.plus(lines[0].times(two[0]).plus(lines[1].times(two[1])));
-                }
-                let k_jj = dot(&minus, &upper) + diagonal[row];
-                let d = k_jj + dot(&minus, &a_plus);
-                smallest.see(row, d, k_jj.abs().max(inertia[row] * inverse.abs()));
-                let inverse_d = 1.0 / d;
-                let w_over_d = w.times(inverse_d);
-                // A −= U Wᵀ / D, and on to the parent.
-                for (line, u) in own.iter_mut().zip(u.0) {
-                    *line = line.plus(w_over_d.times(-u));
-                }
-                match self.places.get(joint.parent) {
-                    Some(&to) if to == place => {}
-                    to => {
-                        if let Some(&to) = to {
-                            for (target, line) in sums[to].iter_mut().zip(&*own) {
-                                *target = target.plus(*line);
-                            }
-                        }
-                        *own = [Block::ZERO; 8];
-                    }
-                }
-                self.generators[row] = Generator { minus, plus, u, w_over_d };
-                self.inverse_d[row] = inverse_d;
+        widest!({
+            let step = Step::new(&self.vertical, step, kind);
+            if added.balls.is_empty() {
+                self.eliminate::<false>(model, mechanics, added, &step)
+            } else {
+                self.eliminate::<true>(model, mechanics, added, &step)
             }
-            smallest
         })
     }
 
-    /// Solves `K x = b` in place, about 65 flops a joint.
+    /// From the leaves to the root; `BALLS`: some joint is a ball joint.
+    #[inline(always)]
+    fn eliminate<const BALLS: bool>(
+        &mut self,
+        model: &Model,
+        mechanics: &Mechanics,
+        added: Added<'_>,
+        step: &Step,
+    ) -> SmallestPivot {
+        let mut smallest = SmallestPivot::NONE;
+        for (row, joint) in model.dynamics.joints.iter().enumerate().rev() {
+            if let (true, JointKind::Ball(axis)) = (BALLS, joint.kind) {
+                if axis == 0 {
+                    self.eliminate_ball(model, mechanics, added, step, row, &mut smallest);
+                }
+                continue;
+            }
+            let generators = step.parts(mechanics, row).generators();
+            let Generators { minus, plus, upper, lower } = generators;
+            let place = self.places[row];
+            let (sums, own) = self.sums.split_at_mut(place);
+            let own = &mut own[0];
+            // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
+            let a_plus = product(own, &plus);
+            let u = upper.plus(a_plus);
+            let w = transposed(lower, own, &minus);
+            let k_jj = dot(&minus, &upper) + added.diagonal[row];
+            let d = k_jj + dot(&minus, &a_plus);
+            let inertia = model.conditioning.inertia[row] * step.inverse.abs();
+            smallest.see(row, d, k_jj.abs().max(inertia));
+            let inverse_d = 1.0 / d;
+            let w_over_d = w.times(inverse_d);
+            // A −= U Wᵀ / D, and on to the parent.
+            for (line, u) in own.iter_mut().zip(u.0) {
+                *line = line.plus(w_over_d.times(-u));
+            }
+            pass(own, sums, place, self.places.get(joint.parent));
+            self.eliminated[row] = Eliminated { minus, plus, u, w_over_d };
+            self.inverse_d[row] = inverse_d;
+        }
+        smallest
+    }
+
+    /// The same for the three axes of a ball joint.
+    #[inline(always)]
+    fn eliminate_ball(
+        &mut self,
+        model: &Model,
+        mechanics: &Mechanics,
+        added: Added<'_>,
+        step: &Step,
+        first: usize,
+        smallest: &mut SmallestPivot,
+    ) {
+        let joint = &model.dynamics.joints[first];
+        let weights = &added.balls[joint.orientation];
+        let generators = of_ball(&step.parts_of_ball(mechanics, first), weights);
+        let place = self.places[first];
+        let (sums, own) = self.sums.split_at_mut(place);
+        let own = &mut own[0];
+        let [mut a_plus, mut w] = [[Block::ZERO; 3]; 2];
+        for (generators, (a_plus, w)) in generators.iter().zip(a_plus.iter_mut().zip(&mut w)) {
+            *a_plus = product(own, &generators.plus);
+            *w = transposed(generators.lower, own, &generators.minus);
+        }
+        let k = step.within_ball(mechanics, model.gravity, first, weights);
+        let mut d = k;
+        for (column, a_plus) in d.0.iter_mut().zip(&a_plus) {
+            for (entry, generators) in column.0.iter_mut().zip(&generators) {
+                *entry += dot(&generators.minus, a_plus);
+            }
+        }
+        let (inverse_d, pivots) = inverse(&d);
+        for a in (0..3).rev() {
+            let inertia = model.conditioning.inertia[first + a] * step.inverse.abs();
+            smallest.see(first + a, pivots[a], k.0[a][a].abs().max(inertia));
+        }
+        let w_over_d = times(&inverse_d, &w);
+        for a in 0..3 {
+            let Generators { minus, plus, upper, .. } = generators[a];
+            let u = upper.plus(a_plus[a]);
+            for (line, u) in own.iter_mut().zip(u.0) {
+                *line = line.plus(w_over_d[a].times(-u));
+            }
+            self.eliminated[first + a] = Eliminated { minus, plus, u, w_over_d: w_over_d[a] };
+        }
+        pass(own, sums, place, self.places.get(joint.parent));
+        self.inverse_blocks[joint.orientation] = inverse_d;
+    }
+
+    /// Solves `K x = b` in place, about 65 flops an axis.
     #[inline(never)]
     pub(crate) fn solve(&mut self, tree: &Tree, x: &mut [f64]) {
-        wide!({
-            let (generators, inverse_d) = (&self.generators[..], &self.inverse_d[..]);
-            let (places, flows) = (&self.places[..], &mut self.flows[..]);
-            flows.fill(Block::ZERO);
-            for (i, joint) in tree.joints.iter().enumerate().rev() {
-                let (generator, place) = (&generators[i], places[i]);
-                let flow = flows[place];
-                let value = (x[i] - dot(&generator.minus, &flow)) * inverse_d[i];
-                x[i] = value;
-                let flow = flow.plus(generator.u.times(value));
-                match places.get(joint.parent) {
-                    Some(&to) if to == place => flows[to] = flow,
-                    to => {
-                        flows[place] = Block::ZERO;
-                        if let Some(&to) = to {
-                            flows[to] = flows[to].plus(flow);
-                        }
+        widest!({
+            if self.inverse_blocks.is_empty() {
+                self.substitute::<false>(tree, x);
+            } else {
+                self.substitute::<true>(tree, x);
+            }
+        })
+    }
+
+    /// `BALLS`: some joint is a ball joint.
+    #[inline(always)]
+    fn substitute<const BALLS: bool>(&mut self, tree: &Tree, x: &mut [f64]) {
+        let (eliminated, inverse_d) = (&self.eliminated[..], &self.inverse_d[..]);
+        let (places, flows) = (&self.places[..], &mut self.flows[..]);
+        flows.fill(Block::ZERO);
+        for (i, joint) in tree.joints.iter().enumerate().rev() {
+            let (own, place) = (&eliminated[i], places[i]);
+            let mut flow = flows[place];
+            match joint.kind {
+                JointKind::Ball(0) if BALLS => {
+                    let axes = &eliminated[i..i + 3];
+                    let b = |a: usize| x[i + a] - dot(&axes[a].minus, &flow);
+                    let b = Vec3([b(0), b(1), b(2)]);
+                    let value = self.inverse_blocks[joint.orientation].apply(b);
+                    for (own, value) in axes.iter().zip(value.0) {
+                        flow = flow.plus(own.u.times(value));
+                    }
+                    x[i..i + 3].copy_from_slice(&value.0);
+                }
+                JointKind::Ball(_) if BALLS => continue,
+                _ => {
+                    let value = (x[i] - dot(&own.minus, &flow)) * inverse_d[i];
+                    x[i] = value;
+                    flow = flow.plus(own.u.times(value));
+                }
+            }
+            match places.get(joint.parent) {
+                Some(&to) if to == place => flows[to] = flow,
+                to => {
+                    flows[place] = Block::ZERO;
+                    if let Some(&to) = to {
+                        flows[to] = flows[to].plus(flow);
                     }
                 }
             }
-            for (i, joint) in tree.joints.iter().enumerate() {
-                let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
-                let value = x[i] - dot(&generators[i].w_over_d, &flow);
-                x[i] = value;
-                flows[places[i]] = flow.plus(generators[i].plus.times(value));
+        }
+        for (i, joint) in tree.joints.iter().enumerate() {
+            let axes = match joint.kind {
+                JointKind::Ball(0) if BALLS => i..i + 3,
+                JointKind::Ball(_) if BALLS => continue,
+                _ => i..i + 1,
+            };
+            let flow = places.get(joint.parent).map_or(Block::ZERO, |&place| flows[place]);
+            let mut moved = flow;
+            for (x, own) in x[axes.clone()].iter_mut().zip(&eliminated[axes]) {
+                *x -= dot(&own.w_over_d, &flow);
+                moved = moved.plus(own.plus.times(*x));
             }
-        })
+            flows[places[i]] = moved;
+        }
     }
 }

@@ -10,11 +10,13 @@
 
 use crate::constraints::closure::Closure;
 use crate::kkt::loops::{Mechanism, Multifrontal, Scales};
-use crate::kkt::planar::{MatrixKind, PlanarRecursion};
+use crate::kkt::planar::PlanarRecursion;
 use crate::kkt::schur::SchurComplement;
-use crate::kkt::space::SpatialRecursion;
+use crate::kkt::space::{Added, SpatialRecursion};
+use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::PlanarTree;
+use crate::lagrangian::turning::Weights;
 use crate::math::tree_lu::{SmallestPivot, TreeLu};
 use crate::model::mechanism::{Model, Solver};
 
@@ -32,6 +34,8 @@ pub(crate) struct KktSystem {
     pub(crate) valid: Factors,
     /// What springs, dampers and armatures of coordinates add to the diagonal of `K`, for recursions.
     pub(crate) diagonal: Vec<f64>,
+    /// How ball joints weigh their rows and columns.
+    pub(crate) balls: Vec<Weights>,
     pub(crate) estimates: Estimates,
 }
 
@@ -79,7 +83,7 @@ impl KktSystem {
             (Solver::Planar, _) => Recursion::Planar(Box::new(PlanarRecursion::new(nd))),
             (Solver::Loops, Some(loops)) => Recursion::Loops(Box::new(Multifrontal::new(loops))),
             (Solver::Spatial, _) => {
-                let recursion = SpatialRecursion::new(&model.dynamics, model.gravity);
+                let recursion = SpatialRecursion::new(model);
                 Recursion::Spatial(Box::new(recursion))
             }
             (Solver::Tree | Solver::Loops, _) => Recursion::None,
@@ -90,6 +94,7 @@ impl KktSystem {
             recursion,
             valid: Factors::Tree,
             diagonal: vec![0.0; nd],
+            balls: vec![Weights::REST; model.orientations.len()],
             estimates: Estimates { matrix: 1.0, constraints: 1.0, redundant: 0 },
         }
     }
@@ -144,8 +149,8 @@ impl KktSystem {
             }
             (Recursion::Spatial(recursion), ..) => {
                 mechanics.differentiate(model);
-                let tree = &model.dynamics;
-                recursion.factor(tree, mechanics, diagonal, inertia, time_step_s, kind)
+                let added = Added { diagonal, balls: &self.balls };
+                recursion.factor(model, mechanics, added, time_step_s, kind)
             }
             (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => return Ok(false),
         };

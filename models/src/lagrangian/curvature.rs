@@ -10,7 +10,7 @@ use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::math::scalar::Scalar;
 use crate::math::simd::wide;
-use crate::math::spatial::{Force, Inertia, Motion, Sym3, Vec3};
+use crate::math::spatial::{Force, Inertia, Mat3, Motion, Sym3, Vec3};
 use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Pair;
 use crate::model::tree::{Rotational, Tree, WORLD};
@@ -34,6 +34,15 @@ pub(crate) struct SecondDerivatives<S = f64> {
     /// `∂²L/∂q_ancestor ∂v_descendant`.
     pub(crate) q_above_v_below: S,
     pub(crate) vv: S,
+}
+
+/// Derivatives of torque `τ` and momentum `m` of a ball joint by its own turn `ζ` and velocity `v`;
+/// `m_ζ = τ_vᵀ`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Within<S = f64> {
+    pub(crate) tau_z: Mat3<S>,
+    pub(crate) tau_v: Mat3<S>,
+    pub(crate) m_v: Mat3<S>,
 }
 
 /// Second derivatives of `L` by two coordinates, in their row and column of the matrices.
@@ -137,22 +146,28 @@ impl<S: Scalar> Curvature<S> {
         momenta.axis[ancestor].dot(self.force[descendant])
     }
 
-    /// For two axes of one ball joint, `∂τ_row/∂ζ_column` and `∂τ_row/∂v_column = ∂m_column/∂ζ_row`.
-    /// The axes turn with the joint: what [`Curvature::pair`] says holds for different joints only.
+    /// Derivatives between the axes of one ball joint, the first of which is `first`. They turn with the
+    /// joint: what [`Curvature::pair`] says holds for different joints only.
+    #[inline(always)]
     pub(crate) fn within_ball(
         &self,
         momenta: &Momenta<S>,
         gravity: Option<Vec3>,
-        row: usize,
-        column: usize,
-    ) -> (S, S) {
-        let weight = gravity.map_or(S::ZERO, |g| {
-            momenta.axis[column].w.dot(self.force[row].f.cross(Vec3::lift(g)))
-        });
-        (
-            momenta.axis_rate[column].dot(self.rate[row]) + weight,
-            momenta.axis_rate[row].dot(self.force[column]),
-        )
+        first: usize,
+    ) -> Within<S> {
+        let axes = [first, first + 1, first + 2];
+        let [mut tau_z, mut tau_v, mut m_v] = [Mat3::ZERO; 3];
+        for (a, &row) in axes.iter().enumerate() {
+            let (rate, slope, force) = (momenta.axis_rate[row], self.rate[row], self.force[row]);
+            let weight = gravity.map_or(Vec3::ZERO, |g| force.f.cross(Vec3::lift(g)));
+            for (b, &column) in axes.iter().enumerate() {
+                let axis = momenta.axis[column];
+                tau_z.0[b].0[a] = momenta.axis_rate[column].dot(slope) + axis.w.dot(weight);
+                tau_v.0[b].0[a] = rate.dot(self.force[column]);
+                m_v.0[b].0[a] = axis.dot(force);
+            }
+        }
+        Within { tau_z, tau_v, m_v }
     }
 }
 

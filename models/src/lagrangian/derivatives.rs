@@ -158,12 +158,11 @@ impl<S: Scalar> Derivatives<S> {
             }
         }
         for &first in &self.balls {
-            for (row, column) in (0..9).map(|entry| (first + entry / 3, first + entry % 3)) {
-                let (qq, qv) =
-                    self.curvature.within_ball(&self.momenta, model.gravity, row, column);
-                let at = |joint: usize| model.dynamics.joints[joint].coordinate;
-                self.l_qq[at(row) * n + at(column)] = qq;
-                self.l_qv[at(row) * n + at(column)] = qv;
+            let within = self.curvature.within_ball(&self.momenta, model.gravity, first);
+            let i = model.dynamics.joints[first].coordinate;
+            for (a, b) in (0..9).map(|entry| (entry / 3, entry % 3)) {
+                self.l_qq[(i + a) * n + i + b] = within.tau_z.0[b][a];
+                self.l_qv[(i + a) * n + i + b] = within.tau_v.0[b][a];
             }
         }
         if model.potentials.any {

@@ -70,6 +70,16 @@ impl<S: Scalar> Poses<S> {
         }
         S::sin_cos_of_all(&self.angles, &mut self.turns);
         for (i, joint) in tree.joints.iter().enumerate() {
+            if let (true, JointKind::Ball(1 | 2)) = (OTHER, joint.kind) {
+                // The entry before has turned already.
+                let Mat3([x, y, z]) = self.rotation[i - 1];
+                self.rotation[i] = Mat3([y, z, x]);
+                self.position[i] = self.position[i - 1];
+                if joint.anchor {
+                    self.move_origin(tree, i);
+                }
+                continue;
+            }
             // In the parent's frame, which nothing waits for.
             let own = match joint.kind {
                 JointKind::Prismatic | JointKind::Ball(_) => Mat3::lift(joint.rotation),
@@ -82,14 +92,12 @@ impl<S: Scalar> Poses<S> {
                 let parent = &self.rotation[joint.parent];
                 (parent.times(&own), parent.apply(Vec3::lift(joint.translation)))
             };
-            let Mat3([x, y, z]) = turned;
+            let z = turned.0[2];
             self.rotation[i] = match joint.kind {
                 JointKind::Ball(0) if OTHER => {
                     let Mat3([x, y, z]) = turned.times(&orientations[joint.orientation]);
                     Mat3([y, z, x])
                 }
-                // The entry before has turned already.
-                JointKind::Ball(_) if OTHER => Mat3([y, z, x]),
                 _ => turned,
             };
             match joint.kind {

@@ -10,6 +10,7 @@ pub(crate) mod curvature;
 pub(crate) mod derivatives;
 pub(crate) mod energy;
 pub(crate) mod forces;
+pub(crate) mod generators;
 pub(crate) mod kinematics;
 pub(crate) mod mechanics;
 pub(crate) mod momenta;
@@ -19,4 +20,5 @@ pub(crate) mod potentials;
 #[cfg(test)]
 pub(crate) mod samples;
 pub(crate) mod stop;
+pub(crate) mod turning;
 pub(crate) mod vectors;

@@ -29,10 +29,11 @@ use nalgebra::DMatrix;
 
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
-use crate::integrator::turning::Turning;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
 use crate::kkt::system::Factors;
+use crate::lagrangian::turning::Turning;
+use crate::linearization::matrices::Layout;
 use crate::linearization::parameters::Parameters;
 use crate::math::dense_inverse::DenseInverse;
 use crate::math::pivoted_lu::PivotedLu;
@@ -304,76 +305,15 @@ impl Linearization {
     pub fn a(&self) -> DMatrix<f64> {
         let size = 2 * (self.nd + self.nk);
         let mut a = DMatrix::zeros(size, size);
-        self.write_a(&mut a);
+        self.a_into(a.as_mut_slice(), Layout::Columns);
         a
-    }
-
-    /// Writes `A` over a matrix of its shape.
-    pub(crate) fn write_a(&self, a: &mut DMatrix<f64>) {
-        let (nd, nk) = (self.nd, self.nk);
-        let (n, state_columns) = (nd + nk, self.next_columns());
-        a.fill(0.0);
-        for i in 0..nd {
-            for j in 0..state_columns {
-                a[(i, j)] = self.increment[i * self.stride + j];
-                a[(n + i, j)] = self.momentum[i * self.stride + j];
-            }
-            a[(i, i)] += 1.0;
-        }
-        for k in 0..nk {
-            a[(n + nd + k, nd + k)] = -1.0 / self.time_step_s;
-        }
-        for t in &self.turnings {
-            let i = t.coordinate;
-            if i < nd {
-                a[(i, i)] -= 1.0;
-                a[(i + 1, i + 1)] -= 1.0;
-                a[(i + 2, i + 2)] -= 1.0;
-                turn_rows(&t.to_end, i, a);
-                add_block(&t.carried, (i, i), a);
-            } else {
-                let v = n + i;
-                a.view_mut((v, i), (3, 3)).fill(0.0);
-                add_block(&t.momentum.transpose().scaled(-1.0 / self.time_step_s), (v, i), a);
-            }
-        }
     }
 
     /// `B = ∂f/∂u`, `2 nd + 2 nk` by `ni + nk`; zero where a signal replaces the entry of `u`.
     pub fn b(&self) -> DMatrix<f64> {
         let mut b = DMatrix::zeros(2 * (self.nd + self.nk), self.ni + self.nk);
-        self.write_b(&mut b);
+        self.b_into(b.as_mut_slice(), Layout::Columns);
         b
-    }
-
-    /// Writes `B` over a matrix of its shape.
-    pub(crate) fn write_b(&self, b: &mut DMatrix<f64>) {
-        let (nd, nk, ni) = (self.nd, self.nk, self.ni);
-        let (n, mut row) = (nd + nk, vec![0.0; ni + nk]);
-        b.fill(0.0);
-        for i in 0..nd {
-            for (target, output) in [(i, Output::Increment(i)), (n + i, Output::Momentum(i))] {
-                self.write_by_input(output, &mut row);
-                b.row_mut(target).iter_mut().zip(&row).for_each(|(to, from)| *to = *from);
-            }
-        }
-        for k in 0..nk {
-            b[(nd + k, ni + k)] = 1.0;
-            b[(n + nd + k, ni + k)] = 1.0 / self.time_step_s;
-        }
-        for t in &self.turnings {
-            let i = t.coordinate;
-            if i < nd {
-                turn_rows(&t.to_end, i, b);
-            } else {
-                let at = (n + i, ni + i - nd);
-                b.view_mut(at, (3, 3)).fill(0.0);
-                add_block(&t.momentum.scaled(1.0 / self.time_step_s), at, b);
-            }
-        }
-        for &column in &self.replaced {
-            b.column_mut(column).fill(0.0);
-        }
     }
 
     /// `∂λ/∂x`, nc by `2 nd + 2 nk`.
@@ -493,24 +433,6 @@ impl Linearization {
 
     pub(crate) fn constraints(&self) -> usize {
         self.multipliers.len().checked_div(self.stride).unwrap_or_default()
-    }
-}
-
-/// Multiplies three rows, beginning at `i`, by a matrix.
-fn turn_rows(by: &Mat3, i: usize, matrix: &mut DMatrix<f64>) {
-    for column in matrix.column_iter_mut() {
-        let mut column = column;
-        let turned = by.apply(Vec3([column[i], column[i + 1], column[i + 2]]));
-        column.rows_mut(i, 3).copy_from_slice(&turned.0);
-    }
-}
-
-/// Adds a 3 by 3 block.
-fn add_block(block: &Mat3, (row, column): (usize, usize), matrix: &mut DMatrix<f64>) {
-    for (b, entries) in block.0.iter().enumerate() {
-        for a in 0..3 {
-            matrix[(row + a, column + b)] += entries[a];
-        }
     }
 }
 

@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 
 use crate::linearization::linearize::{Linearization, Output};
+use crate::linearization::matrices::Layout;
 use crate::math::sparse_map::Map;
 
 impl Linearization {
@@ -14,8 +15,8 @@ impl Linearization {
         let (n, next, inputs) = (theta.n(), theta.inputs(), ni + nk);
         if !self.turnings.is_empty() {
             let (mut a, mut b) = (DMatrix::zeros(2 * n, 2 * n), DMatrix::zeros(2 * n, inputs));
-            self.write_a(&mut a);
-            self.write_b(&mut b);
+            self.a_into(a.as_mut_slice(), Layout::Columns);
+            self.b_into(b.as_mut_slice(), Layout::Columns);
             map.set(&a, &b);
             return;
         }

@@ -2,13 +2,15 @@
 //!
 //! Everything is differentiated by one list of parameters, `θ = (q, p, u, k)` ([`parameters`]). Read
 //! [`linearize`] first: it has the equations of a step; [`mod@step`] fills their right-hand sides, [`chain`] goes on
-//! over the steps of a period, [`collocation`] over stages, [`map`] hands it to linear-quadratic problems, and
+//! over the steps of a period, [`collocation`] over stages, [`map`] hands it to linear-quadratic problems, [`matrices`] to whoever wants `A` and `B`, and
 //! [`second_order`] differentiates once more.
 
 pub(crate) mod chain;
 pub(crate) mod collocation;
 pub(crate) mod linearize;
 pub(crate) mod map;
+pub(crate) mod matrices;
 pub(crate) mod parameters;
 pub(crate) mod second_order;
 pub(crate) mod step;
+pub(crate) mod turned;

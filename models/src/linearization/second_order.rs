@@ -20,7 +20,7 @@ pub(crate) mod tensors;
 use nalgebra::DMatrix;
 
 use crate::integrator::blocks::StepBlocks;
-use crate::integrator::turning::Turning;
+use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::SolvedStep;
 use crate::linearization::parameters::Parameters;
 use crate::math::rotation;

@@ -7,39 +7,10 @@ use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::{Kind, Linearization};
 use crate::math::rows::{add_rows, add_rows_portable, padded};
-use crate::math::simd::wide;
+use crate::math::simd::{wide, widest};
+use crate::math::spatial::three;
 
 impl Workspace {
-    /// Takes the derivatives with ball joints.
-    fn take_turned(&mut self, out: &mut Linearization) {
-        let Some(blocks) = &self.balls.blocks else { return };
-        let (nd, nk, stride) = (out.nd, out.nk, out.stride);
-        let (n, next) = (nd + nk, out.next_columns());
-        out.turnings.extend_from_slice(&blocks.turnings);
-        for place in &mut out.inputs {
-            let entry = place.coordinate * out.ni + place.input;
-            place.residual = blocks.residual_inputs[entry];
-            place.momentum = blocks.momentum_inputs[entry];
-        }
-        for i in 0..nd {
-            let row = i * n..(i + 1) * n;
-            let (increment, momentum) = (
-                &mut out.increment[i * stride..][..stride],
-                &mut out.momentum[i * stride..][..stride],
-            );
-            increment[..n].copy_from_slice(&blocks.residual_start[row.clone()]);
-            increment[next..][..nk].copy_from_slice(&blocks.residual_next[row.clone()][nd..]);
-            momentum[nd..n].copy_from_slice(&blocks.momentum_start[row.clone()][nd..]);
-            momentum[next..][..nk].copy_from_slice(&blocks.momentum_next[row.clone()][nd..]);
-            increment[n + i] = 1.0;
-            momentum[n + i] = 1.0;
-            self.tangents.stiffness[i * nd..][..nd]
-                .copy_from_slice(&blocks.momentum_start[row.clone()][..nd]);
-            self.tangents.end_slopes[i * nd..][..nd]
-                .copy_from_slice(&blocks.momentum_next[row][..nd]);
-        }
-    }
-
     /// Linearizes at the solution in the workspace.
     pub(crate) fn linearize(
         &mut self,
@@ -64,8 +35,7 @@ impl Workspace {
         // Without inertia, springs or forces on prescribed joints, the columns of `k` in r1' are zero.
         let moving = !at.model.mixed_pairs.is_empty()
             || at.model.potentials.couple_branches
-            || at.model.forces.is_some()
-            || !at.model.orientations.is_empty();
+            || at.model.forces.is_some();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
         self.kkt.tree.solve_rows(&at.model.elimination, &mut out.increment, out.stride, columns);
         if d.constraints > 0 {
@@ -177,8 +147,9 @@ impl Workspace {
             out.momentum.fill(0.0);
             out.turnings.clear();
             if !model.orientations.is_empty() {
-                self.evaluate_turned(model, at.settings, at.state);
-                self.take_turned(out);
+                self.fill_turned_right_hand_sides(at, out);
+                self.add_constraint_hessian(at, out);
+                add_momenta(out);
                 return;
             }
             for (place, input) in out.inputs.iter_mut().zip(&model.coordinate_inputs) {
@@ -223,18 +194,14 @@ impl Workspace {
             self.add_springs(at, out);
             self.add_forces(at, out);
             self.add_constraint_hessian(at, out);
-            for i in 0..nd {
-                let momentum = i * stride + nd + nk + i;
-                out.increment[momentum] = 1.0;
-                out.momentum[momentum] += 1.0;
-            }
+            add_momenta(out);
         })
     }
 
     /// From `−x'` in `out.increment`: turns it round, and adds what depends on `x'` and `λ'` to
     /// `out.momentum`.
     pub(crate) fn differentiate_momentum(&mut self, at: StepContext<'_>, out: &mut Linearization) {
-        wide!({
+        widest!({
             for x in &mut out.increment {
                 *x = -*x;
             }
@@ -249,11 +216,15 @@ impl Workspace {
             for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
                 let stiffness = &self.tangents.stiffness[i * nd..][..nd];
                 target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
-                let slopes = self.tangents.end_slopes[i * nd..][..nd].iter().enumerate();
+                let slopes = &self.tangents.end_slopes[i * nd..][..nd];
+                let elimination = &model.elimination;
+                let above = elimination.offsets[i]..elimination.offsets[i + 1];
+                let coupled = elimination.ancestors[above].iter().copied();
+                let coupled = coupled.chain(elimination.below(i).iter().map(|(j, _)| *j));
                 self.tangents.terms.clear();
                 self.tangents
                     .terms
-                    .extend(slopes.filter(|(_, s)| **s != 0.0).map(|(j, s)| (*s, j)));
+                    .extend(coupled.map(|j| (slopes[j], j)).filter(|(slope, _)| *slope != 0.0));
                 add_rows_portable(target, &out.increment, stride, &self.tangents.terms);
             }
             for (c, constraint) in model.constraints.iter().enumerate() {
@@ -355,13 +326,15 @@ impl Workspace {
         let next = out.next_columns();
         for (c, constraint) in model.constraints.iter().enumerate() {
             let jacobian = &self.constraints.end.jacobian[c * n..][..n];
-            let by_start = match &self.balls.blocks {
-                None => jacobian,
-                Some(blocks) => &blocks.end_jacobians()[0][c * n..][..n],
-            };
             let target = &mut out.multipliers[c * stride..][..stride];
             target.fill(0.0);
-            target.iter_mut().zip(&by_start[..nd]).for_each(|(t, entry)| *t = -entry);
+            target.iter_mut().zip(&jacobian[..nd]).for_each(|(t, entry)| *t = -entry);
+            for turning in out.turnings.iter().filter(|turning| turning.coordinate < nd) {
+                // From the columns of `ξ`, by dexp₋ξ, to those of the start: exp(−ξ) = dexp₋ξ N⁺.
+                let i = turning.coordinate;
+                let carried = turning.momentum.apply(three(target, i));
+                target[i..i + 3].copy_from_slice(&carried.0);
+            }
             target[next..].iter_mut().zip(&jacobian[nd..]).for_each(|(t, entry)| *t = -entry);
             let dynamic = constraint.dynamic_coordinates().iter();
             self.tangents.terms.clear();
@@ -375,5 +348,15 @@ impl Workspace {
             self.tangents.terms.extend(responses.map(|(c, r)| (-r, c)));
             add_rows(target, &out.multipliers, stride, &self.tangents.terms);
         }
+    }
+}
+
+/// The momentum at the start is a part of the residual, and of the momentum at the end.
+fn add_momenta(out: &mut Linearization) {
+    let n = out.nd + out.nk;
+    for i in 0..out.nd {
+        let momentum = i * out.stride + n + i;
+        out.increment[momentum] = 1.0;
+        out.momentum[momentum] += 1.0;
     }
 }

@@ -5,7 +5,7 @@
 //! `t = |ξ|` and `ξ^ x = ξ × x` all maps are polynomials `1 + a ξ^ + b ξ^²` whose coefficients are even
 //! functions of `t`: series near zero, so that no direction and no rate is special.
 
-use crate::math::scalar::Scalar;
+use crate::math::scalar::{Dual, Scalar};
 use crate::math::spatial::{Mat3, Vec3};
 use crate::math::sums::two_sum;
 use crate::math::trigonometry::sin_cos_of;
@@ -118,13 +118,18 @@ fn product([a, b, c, d]: [f64; 4], [w, x, y, z]: [f64; 4]) -> [f64; 4] {
 /// Squares of angles below this are summed as series.
 const SERIES_BELOW: f64 = 1.0;
 
+/// Squares of angles below this are done with the first terms: of them and their slopes no digit is missing.
+const FIRST_BELOW: f64 = 1e-3;
+
 /// `Σ c_i sⁱ`.
 #[inline]
-fn series<S: Scalar>(s: S, coefficients: &[f64]) -> S {
-    coefficients.iter().rev().fold(S::ZERO, |sum, c| sum * s + *c)
+fn series<S: Scalar, const N: usize>(s: S, coefficients: &[f64; N]) -> S {
+    let sum = |coefficients: &[f64]| coefficients.iter().rev().fold(S::ZERO, |sum, c| sum * s + *c);
+    if s.value() < FIRST_BELOW { sum(&coefficients[..6]) } else { sum(coefficients) }
 }
 
 /// `sin t / t`, `(1 − cos t) / t²` and `(t − sin t) / t³` for `s = t²`.
+#[inline]
 fn exponential<S: Scalar>(s: S) -> [S; 3] {
     /// `1/n!`.
     const fn inverse_factorial(n: usize) -> f64 {
@@ -159,6 +164,7 @@ fn exponential<S: Scalar>(s: S) -> [S; 3] {
 }
 
 /// `c = (1 − (t/2) cot(t/2)) / t²` for `s = t²`.
+#[inline]
 fn inverse_coefficient<S: Scalar>(s: S) -> S {
     /// `|B_2i| / (2i)!` with the Bernoulli numbers.
     const BERNOULLI: [f64; 11] = [
@@ -183,6 +189,7 @@ fn inverse_coefficient<S: Scalar>(s: S) -> S {
 }
 
 /// `k = tan(t/4) / t` for `s = t²`.
+#[inline]
 fn midpoint_coefficient<S: Scalar>(s: S) -> S {
     /// Coefficients of `tan x = Σ c_i x^(2i+1)`.
     const TANGENT: [f64; 11] = [
@@ -207,24 +214,34 @@ fn midpoint_coefficient<S: Scalar>(s: S) -> S {
 }
 
 /// `1 + a y^ + b y^²`.
+#[inline(always)]
 fn polynomial<S: Scalar>(y: Vec3<S>, a: S, b: S) -> Mat3<S> {
-    let diagonal = S::ONE - b * y.dot(y);
-    let column = |i: usize| {
-        let mut unit = Vec3::ZERO;
-        unit.0[i] = S::ONE;
-        y.cross(unit) * a + y * (b * y[i]) + unit * diagonal
-    };
-    Mat3([column(0), column(1), column(2)])
+    let turn = y * a;
+    let (square, along) = (Vec3([y[0] * y[0], y[1] * y[1], y[2] * y[2]]), y * b);
+    let [xy, xz, yz] = [along[0] * y[1], along[0] * y[2], along[1] * y[2]];
+    let diagonal = |i: usize, j: usize| S::ONE - b * (square[i] + square[j]);
+    Mat3([
+        Vec3([diagonal(1, 2), xy + turn[2], xz - turn[1]]),
+        Vec3([xy - turn[2], diagonal(0, 2), yz + turn[0]]),
+        Vec3([xz + turn[1], yz - turn[0], diagonal(0, 1)]),
+    ])
+}
+
+/// `δ ↦ δ × v`.
+#[inline(always)]
+pub(crate) fn crossed<S: Scalar>(v: Vec3<S>) -> Mat3<S> {
+    Mat3([Vec3([S::ZERO, -v[2], v[1]]), Vec3([v[2], S::ZERO, -v[0]]), Vec3([-v[1], v[0], S::ZERO])])
 }
 
 /// `exp(y)` as a matrix.
+#[inline]
 pub(crate) fn exp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
     let [a, b, _] = exponential(y.dot(y));
     polynomial(y, a, b)
 }
 
 /// `dexp₋y`: how `exp(y)` turns in its own axes as `y` changes, `exp(−y) d exp(y) = (dexp₋y dy)^`.
-#[allow(dead_code, reason = "linearizations with ball joints use it")]
+#[inline]
 pub(crate) fn dexp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
     let [_, b, c] = exponential(y.dot(y));
     polynomial(y, -b, c)
@@ -232,19 +249,65 @@ pub(crate) fn dexp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
 
 /// `N⁻ = 1 + ½ ξ^ + c ξ^²`: takes the momentum at the midpoint to the start; the inverse of
 /// [`dexp`]. Its transpose `N⁺` takes it to the end.
+#[inline]
 pub(crate) fn momentum_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
     polynomial(xi, S::constant(0.5), inverse_coefficient(xi.dot(xi)))
 }
 
 /// `T⁻ = 1 + k ξ^`: takes a torque at the midpoint to the start. Its transpose `T⁺` takes it to the end.
+#[inline]
 pub(crate) fn torque_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
     polynomial(xi, midpoint_coefficient(xi.dot(xi)), S::ZERO)
+}
+
+/// `N⁻ m` without the matrix.
+#[inline]
+pub(crate) fn momentum_to_start(xi: Vec3, m: Vec3) -> Vec3 {
+    let turned = xi.cross(m);
+    m + turned * 0.5 + xi.cross(turned) * inverse_coefficient(xi.dot(xi))
+}
+
+/// `T⁻ τ` without the matrix.
+#[inline]
+pub(crate) fn torque_to_start(xi: Vec3, torque: Vec3) -> Vec3 {
+    torque + xi.cross(torque) * midpoint_coefficient(xi.dot(xi))
+}
+
+/// A function of `s` and its derivative.
+fn with_slope<S: Scalar>(f: impl Fn(Dual<S>) -> Dual<S>, s: S) -> [S; 2] {
+    let value = f(Dual::new(s, S::ONE));
+    [value.re, value.eps]
+}
+
+/// How `N⁻ m` changes with `ξ`: `½ δ×m + c (δ×(ξ×m) + ξ×(δ×m)) + 2c' (ξ·δ) ξ×(ξ×m)` for a change `δ`, `c'`
+/// by `t²`.
+pub(crate) fn momentum_change<S: Scalar>(xi: Vec3<S>, m: Vec3<S>) -> Mat3<S> {
+    let [c, slope] = with_slope(inverse_coefficient, xi.dot(xi));
+    let (turned, along) = (xi.cross(m), xi.dot(m));
+    let twice = xi.cross(turned) * (slope + slope) - m * (c + c);
+    // δ×(ξ×m) + ξ×(δ×m) = ξ (m·δ) + δ (ξ·m) − 2 m (ξ·δ)
+    let (mut change, weight, along) = (crossed(m.scaled(0.5)), m * c, along * c);
+    for (b, column) in change.0.iter_mut().enumerate() {
+        *column += xi * weight[b] + twice * xi[b];
+        column.0[b] += along;
+    }
+    change
+}
+
+/// How `T⁻ τ` changes with `ξ`: `k δ×τ + 2k' (ξ·δ) ξ×τ` for a change `δ`, `k'` by `t²`.
+pub(crate) fn torque_change<S: Scalar>(xi: Vec3<S>, torque: Vec3<S>) -> Mat3<S> {
+    let [k, slope] = with_slope(midpoint_coefficient, xi.dot(xi));
+    let twice = xi.cross(torque) * (slope + slope);
+    let mut change = crossed(torque * k);
+    for (b, column) in change.0.iter_mut().enumerate() {
+        *column += twice * xi[b];
+    }
+    change
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::scalar::Dual;
 
     fn vectors() -> impl Iterator<Item = Vec3> {
         let lengths = [0.0, 1e-9, 1e-3, 0.3, 0.99, 1.01, 2.0, 3.1];
@@ -286,6 +349,37 @@ mod tests {
             let (half, one) = (exp(v * -0.5), Mat3::IDENTITY);
             let mean = Mat3([0, 1, 2].map(|i| (half.0[i] + one.0[i]) * 0.5));
             assert!(distance(&mean.times(&torque_at_start(v)), &one) < 1e-14, "{v:?}");
+        }
+    }
+
+    #[test]
+    fn maps_are_the_same_without_their_matrices() {
+        let v = Vec3([0.7, -0.3, 0.5]);
+        for xi in vectors() {
+            let momentum = momentum_at_start(xi).apply(v) - momentum_to_start(xi, v);
+            let torque = torque_at_start(xi).apply(v) - torque_to_start(xi, v);
+            assert!(momentum.norm() < 1e-15 && torque.norm() < 1e-15, "{xi:?}");
+            let turned = Mat3([0, 1, 2].map(|i| xi.cross(Mat3::IDENTITY.0[i])));
+            let squared = turned.times(&turned);
+            let [_, b, c] = exponential(xi.dot(xi));
+            let dexp_of = Mat3::IDENTITY.minus(&turned.scaled(b)).plus(&squared.scaled(c));
+            assert!(distance(&dexp(xi), &dexp_of) < 1e-15, "{xi:?}");
+        }
+    }
+
+    #[test]
+    fn the_changes_of_the_maps_are_their_derivatives() {
+        let (v, direction) = (Vec3([0.7, -0.3, 0.5]), Vec3([0.4, 0.1, -0.8]));
+        let lifted = Vec3(v.0.map(Dual::constant));
+        for xi in vectors() {
+            let dual = Vec3([0, 1, 2].map(|i| Dual::new(xi[i], direction[i])));
+            for (map, change) in [
+                (momentum_at_start(dual), momentum_change(xi, v)),
+                (torque_at_start(dual), torque_change(xi, v)),
+            ] {
+                let rate = Vec3(map.apply(lifted).0.map(|x| x.eps));
+                assert!((rate - change.apply(direction)).norm() < 1e-14, "{xi:?}");
+            }
         }
     }
 

@@ -78,11 +78,19 @@ impl<S: Scalar> Mat3<S> {
     pub(crate) const ZERO: Self = Self([Vec3::ZERO; 3]);
 
     /// `self * s`.
+    #[inline(always)]
     pub(crate) fn scaled(&self, s: S) -> Self {
         Self([self.0[0] * s, self.0[1] * s, self.0[2] * s])
     }
 
+    /// `self + o`.
+    #[inline(always)]
+    pub(crate) fn plus(&self, o: &Self) -> Self {
+        Self([self.0[0] + o.0[0], self.0[1] + o.0[1], self.0[2] + o.0[2]])
+    }
+
     /// `self − o`.
+    #[inline(always)]
     pub(crate) fn minus(&self, o: &Self) -> Self {
         Self([self.0[0] - o.0[0], self.0[1] - o.0[1], self.0[2] - o.0[2]])
     }
@@ -93,10 +101,12 @@ impl<S: Scalar> Mat3<S> {
         Self([Vec3::lift(m.0[0]), Vec3::lift(m.0[1]), Vec3::lift(m.0[2])])
     }
 
+    #[inline(always)]
     pub(crate) fn from_rows(r: [[S; 3]; 3]) -> Self {
         Self([0, 1, 2].map(|j| Vec3([r[0][j], r[1][j], r[2][j]])))
     }
 
+    #[inline(always)]
     pub(crate) fn transpose(self) -> Self {
         Self::from_rows(self.0.map(|column| column.0))
     }

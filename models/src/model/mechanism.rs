@@ -7,7 +7,7 @@ use crate::model::conditioning::Conditioning;
 use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 use crate::model::signal::{Signal, Target};
-use crate::model::tree::{Attachment, JointKind, Tree};
+use crate::model::tree::{Attachment, Tree};
 use crate::scene::{CoordinateKind, Problem, Scene};
 
 /// A compiled scene: immutable, shared by all plants made from it.
@@ -106,9 +106,7 @@ impl Solver {
         if planar.is_some() {
             return if d.dynamic >= Self::MANY { Self::Planar } else { Self::Tree };
         }
-        let is_generated = !needs_poses
-            && tree.joints.iter().all(|joint| !matches!(joint.kind, JointKind::Ball(_)));
-        if is_generated && elimination.entries() > Self::DEEP * d.dynamic {
+        if !needs_poses && elimination.entries() > Self::DEEP * d.dynamic {
             Self::Spatial
         } else {
             Self::Tree
@@ -619,13 +617,10 @@ impl Model {
     }
 
     /// Dynamic coordinates and the inputs that act on them: inputs on coordinates, then inputs of
-    /// forces, in the order of [`Forces::for_each_input_derivative`]. A ball joint mixes its rows: with
-    /// one, all pairs.
+    /// forces, in the order of [`Forces::for_each_input_derivative`]; some come more than once. What acts on
+    /// one axis of a ball joint changes the rows of all three.
     pub(crate) fn input_pattern(&self) -> impl Iterator<Item = (usize, usize)> {
-        let d = self.dimensions;
-        let dense = if self.orientations.is_empty() { 0 } else { d.dynamic * d.inputs };
-        let all = (0..dense).map(move |entry| (entry / d.inputs, entry % d.inputs));
-        let sparse = if dense == 0 { usize::MAX } else { 0 };
+        let dynamic = self.dimensions.dynamic;
         let on_coordinates = self.coordinate_inputs.iter().map(|i| (i.coordinate, i.input));
         let wrenches = self.forces.iter().flat_map(|forces| &forces.wrenches);
         let of_forces = wrenches.flat_map(move |wrench| {
@@ -641,8 +636,15 @@ impl Model {
             })
         });
         let of_forces =
-            of_forces.chain(of_paths).filter(move |(coordinate, _)| *coordinate < d.dynamic);
-        all.chain(on_coordinates.chain(of_forces).take(sparse))
+            of_forces.chain(of_paths).filter(move |(coordinate, _)| *coordinate < dynamic);
+        on_coordinates.chain(of_forces).flat_map(|(coordinate, input)| {
+            let is_axis = |first: &&usize| (**first..**first + 3).contains(&coordinate);
+            let rows = match self.orientations.iter().find(is_axis) {
+                Some(&first) => first..first + 3,
+                None => coordinate..coordinate + 1,
+            };
+            rows.map(move |row| (row, input))
+        })
     }
 
     /// Equations of constraints that are independent at the scene's initial configuration.

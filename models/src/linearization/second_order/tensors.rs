@@ -3,7 +3,7 @@
 use nalgebra::DMatrix;
 
 use crate::integrator::report::StepError;
-use crate::integrator::turning::Turning;
+use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::Scratch;

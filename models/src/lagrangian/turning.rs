@@ -1,7 +1,7 @@
-//! The maps by which a ball joint weighs the derivatives of a step.
+//! The maps by which a ball joint weighs the derivatives of a step; see [`crate::math::rotation`].
 
 use crate::math::rotation;
-use crate::math::scalar::{Dual, Scalar};
+use crate::math::scalar::Scalar;
 use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 
@@ -57,24 +57,48 @@ impl<S: Scalar> Turning<S> {
         }
     }
 
-    /// Change of `T⁻ torque − N⁻ momentum` along each axis of `ξ`, and of `(T⁻ − 1) force`.
+    /// `m ↦ m × ξ`.
+    pub(crate) fn spin(&self) -> Mat3<S> {
+        rotation::crossed(self.turn)
+    }
+
+    /// Change of `T⁻ impulse − N⁻ momentum` with `ξ`, and of `T⁻ force`.
     pub(crate) fn by_turn(
         &self,
-        torque: Vec3<S>,
+        impulse: Vec3<S>,
         momentum: Vec3<S>,
         force: Vec3<S>,
-    ) -> [[Vec3<S>; 3]; 2] {
-        let lift = |v: Vec3<S>| Vec3(v.0.map(|x| Dual::new(x, S::ZERO)));
-        let change = |v: Vec3<Dual<S>>| Vec3(v.0.map(|x| x.eps));
-        let along = |axis: usize| {
-            let mut turn = lift(self.turn);
-            turn.0[axis].eps = S::ONE;
-            let weight = rotation::torque_at_start(turn);
-            let carried = rotation::momentum_at_start(turn).apply(lift(momentum));
-            let residual = weight.apply(lift(torque)) - carried;
-            (change(residual), change(weight.apply(lift(force))))
-        };
-        let axes = [along(0), along(1), along(2)];
-        [axes.map(|(residual, _)| residual), axes.map(|(_, force)| force)]
+    ) -> [Mat3<S>; 2] {
+        let carried = rotation::momentum_change(self.turn, momentum);
+        let residual = rotation::torque_change(self.turn, impulse).minus(&carried);
+        [residual, rotation::torque_change(self.turn, force)]
+    }
+}
+
+/// How one ball joint weighs its rows and columns of the Newton matrix.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Weights {
+    /// `N⁻` and `T⁻`.
+    pub(crate) momentum: Mat3,
+    pub(crate) torque: Mat3,
+    /// `dexp₋ξ/2`.
+    pub(crate) column: Mat3,
+    /// What its rows have in its columns beside the Lagrangian's second derivatives.
+    pub(crate) own: Mat3,
+}
+
+impl Weights {
+    /// Of a joint that does not turn.
+    pub(crate) const REST: Self = Self {
+        momentum: Mat3::IDENTITY,
+        torque: Mat3::IDENTITY,
+        column: Mat3::IDENTITY,
+        own: Mat3::ZERO,
+    };
+
+    /// The maps of rows, of a joint that turns by `ξ`.
+    pub(crate) fn of_rows(turn: Vec3) -> Self {
+        let momentum = rotation::momentum_at_start(turn);
+        Self { momentum, torque: rotation::torque_at_start(turn), ..Self::REST }
     }
 }

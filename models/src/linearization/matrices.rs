@@ -1,0 +1,177 @@
+//! `A` and `B` of a linearization, written into memory of the caller's.
+//!
+//! Rows of a [`Linearization`] hold the derivatives of increments; `q[k+1] = q[k] + x` adds a one on the
+//! diagonal. Ball joints turn at their ends by `dexp₋ξ ξ' + exp(−ξ) η`.
+
+use crate::linearization::linearize::{Kind, Linearization};
+use crate::math::spatial::{Mat3, Vec3};
+
+/// How the numbers of a matrix follow each other in memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layout {
+    /// Row after row, as C and NumPy have them.
+    Rows,
+    /// Column after column, as BLAS, Eigen and nalgebra have them.
+    Columns,
+}
+
+/// Rows and columns that are copied together.
+const TILE: usize = 8;
+
+/// A matrix in memory that somebody else owns.
+struct Target<'a> {
+    numbers: &'a mut [f64],
+    layout: Layout,
+    rows: usize,
+    columns: usize,
+}
+
+impl<'a> Target<'a> {
+    /// Zero everywhere.
+    fn new(numbers: &'a mut [f64], layout: Layout, [rows, columns]: [usize; 2]) -> Self {
+        assert!(
+            numbers.len() == rows * columns,
+            "the matrix has {rows} rows of {columns} numbers, not {}",
+            numbers.len()
+        );
+        numbers.fill(0.0);
+        Self { numbers, layout, rows, columns }
+    }
+
+    fn at(&mut self, row: usize, column: usize) -> &mut f64 {
+        match self.layout {
+            Layout::Rows => &mut self.numbers[row * self.columns + column],
+            Layout::Columns => &mut self.numbers[column * self.rows + row],
+        }
+    }
+
+    /// Copies `[count, width]` numbers, which are in rows `stride` apart, to a place in the matrix.
+    fn copy(
+        &mut self,
+        source: &[f64],
+        stride: usize,
+        [count, width]: [usize; 2],
+        [row, column]: [usize; 2],
+    ) {
+        if self.layout == Layout::Rows {
+            for (i, source) in source.chunks(stride.max(1)).take(count).enumerate() {
+                let to = (row + i) * self.columns + column;
+                self.numbers[to..][..width].copy_from_slice(&source[..width]);
+            }
+            return;
+        }
+        // Tile by tile, so that neither rows nor columns leave the nearest cache.
+        for top in (0..count).step_by(TILE) {
+            let height = TILE.min(count - top);
+            let lines = &source[top * stride..];
+            for left in (0..width).step_by(TILE) {
+                let end = width.min(left + TILE);
+                let whole = height == TILE;
+                for j in left..end {
+                    let to = &mut self.numbers[(column + j) * self.rows + row + top..][..height];
+                    if let (true, Some(to)) = (whole, to.first_chunk_mut::<TILE>()) {
+                        *to = std::array::from_fn(|i| lines[i * stride + j]);
+                    } else {
+                        to.iter_mut().zip(0..).for_each(|(to, i)| *to = lines[i * stride + j]);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Multiplies three rows, beginning at `row`, by a matrix.
+    fn turn_rows(&mut self, by: &Mat3, row: usize) {
+        for column in 0..self.columns {
+            let turned = by.apply(Vec3([0, 1, 2].map(|a| *self.at(row + a, column))));
+            (0..3).for_each(|a| *self.at(row + a, column) = turned[a]);
+        }
+    }
+
+    /// Adds a 3 by 3 block.
+    fn add_block(&mut self, block: &Mat3, [row, column]: [usize; 2]) {
+        for (b, entries) in block.0.iter().enumerate() {
+            (0..3).for_each(|a| *self.at(row + a, column + b) += entries[a]);
+        }
+    }
+
+    /// Puts a 3 by 3 block.
+    fn put_block(&mut self, block: &Mat3, [row, column]: [usize; 2]) {
+        for (b, entries) in block.0.iter().enumerate() {
+            (0..3).for_each(|a| *self.at(row + a, column + b) = entries[a]);
+        }
+    }
+}
+
+impl Linearization {
+    /// Writes [`Linearization::a`] over `out`, without allocation: `4 (nd + nk)²` numbers.
+    ///
+    /// # Panics
+    ///
+    /// If `out` has another length.
+    pub fn a_into(&self, out: &mut [f64], layout: Layout) {
+        let (nd, nk, stride) = (self.nd, self.nk, self.stride);
+        let (n, state_columns) = (nd + nk, self.next_columns());
+        let mut a = Target::new(out, layout, [2 * n; 2]);
+        a.copy(&self.increment, stride, [nd, state_columns], [0, 0]);
+        a.copy(&self.momentum, stride, [nd, state_columns], [n, 0]);
+        for t in self.turnings.iter().filter(|t| t.coordinate < nd) {
+            let i = t.coordinate;
+            a.turn_rows(&t.to_end, i);
+            a.add_block(&t.carried, [i, i]);
+            (i..i + 3).for_each(|i| *a.at(i, i) -= 1.0);
+        }
+        (0..nd).for_each(|i| *a.at(i, i) += 1.0);
+        for k in 0..nk {
+            *a.at(n + nd + k, nd + k) = -1.0 / self.time_step_s;
+        }
+        for t in self.turnings.iter().filter(|t| t.coordinate >= nd) {
+            let i = t.coordinate;
+            a.put_block(&t.momentum.transpose().scaled(-1.0 / self.time_step_s), [n + i, i]);
+        }
+    }
+
+    /// Writes [`Linearization::b`] over `out`, without allocation: `2 (nd + nk) (ni + nk)` numbers.
+    ///
+    /// # Panics
+    ///
+    /// If `out` has another length.
+    pub fn b_into(&self, out: &mut [f64], layout: Layout) {
+        let (nd, nk, ni, stride) = (self.nd, self.nk, self.ni, self.stride);
+        let n = nd + nk;
+        let mut b = Target::new(out, layout, [2 * n, ni + nk]);
+        if self.kind == Kind::Step {
+            for impulse in &self.inputs {
+                let (column, input) = (n + impulse.coordinate, impulse.input);
+                for (rows, first) in [(&self.increment, 0), (&self.momentum, n)] {
+                    for i in 0..nd {
+                        *b.at(first + i, input) += impulse.residual * rows[i * stride + column];
+                    }
+                }
+                *b.at(n + impulse.coordinate, input) += impulse.momentum - impulse.residual;
+            }
+        } else if ni > 0 {
+            b.copy(&self.driven, ni, [nd, ni], [0, 0]);
+            b.copy(&self.driven[(nd + self.constraints()) * ni..], ni, [nd, ni], [n, 0]);
+        }
+        if nd > 0 {
+            let next = self.next_columns();
+            b.copy(&self.increment[next..], stride, [nd, nk], [0, ni]);
+            b.copy(&self.momentum[next..], stride, [nd, nk], [n, ni]);
+        }
+        for k in 0..nk {
+            *b.at(nd + k, ni + k) = 1.0;
+            *b.at(n + nd + k, ni + k) = 1.0 / self.time_step_s;
+        }
+        for t in &self.turnings {
+            let i = t.coordinate;
+            if i < nd {
+                b.turn_rows(&t.to_end, i);
+            } else {
+                b.put_block(&t.momentum.scaled(1.0 / self.time_step_s), [n + i, ni + i - nd]);
+            }
+        }
+        for &column in &self.replaced {
+            (0..2 * n).for_each(|row| *b.at(row, column) = 0.0);
+        }
+    }
+}
