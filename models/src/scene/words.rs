@@ -56,6 +56,7 @@ fn nearest<'a, N: AsRef<str>>(name: &str, names: &'a [N]) -> Option<&'a str> {
 /// The message of a reader of text in the words of a person who writes it: a key or a kind that there is
 /// not, one that is missing, and a value of another type. What is none of these stays as it is.
 pub fn in_plain_words(message: &str) -> String {
+    let message = message.trim_end();
     in_words(message).unwrap_or_else(|| message.to_owned())
 }
 
