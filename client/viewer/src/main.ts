@@ -200,6 +200,7 @@ function followNext(): void {
 Object.defineProperty(window, "plantdView", {
   value: {
     drawn: () => view.drawn,
+    isDrawn: () => view.isDrawn,
     shown: () => ({ step: app.shown.get()?.step, q: app.shown.get()?.q, samples: plots.history.moments.length }),
     frames: () => view.figure?.frames.map(({ name, matrixWorld }) => ({ name, matrix: matrixWorld.toArray() })) ?? [],
     pixel: (name: string) => {

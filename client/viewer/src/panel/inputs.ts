@@ -156,8 +156,13 @@ function showValue(entry: Entry): void {
 function want(entry: Entry, value: number): void {
   entry.wanted = value;
   showValue(entry);
+  if (!lease) void takeUnlessLockstep();
+}
+
+async function takeUnlessLockstep(): Promise<void> {
+  if (!app.info.get()?.run) await look();
   const run = app.info.get()?.run;
-  if (!lease && run && run.settings?.pace !== Pace.LOCKSTEP) void takeLease();
+  if (run && run.settings?.pace !== Pace.LOCKSTEP) await takeLease();
 }
 
 /** Takes the lease, and holds it until it is given back. */
