@@ -1,4 +1,4 @@
-//! Generates the message and service types from `plantd/v1/*.proto`, without protoc.
+//! Generates the types of messages and services from `plantd/v1/*.proto` and `foxglove/scene.proto`, without protoc.
 
 use std::path::Path;
 
@@ -6,6 +6,7 @@ use prost::Message as _;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     println!("cargo:rerun-if-changed=plantd");
+    println!("cargo:rerun-if-changed=foxglove");
     let names = [
         "model_service",
         "plant_service",
@@ -14,10 +15,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "recording",
         "recording_service",
     ];
-    let files = names.map(|name| format!("plantd/v1/{name}.proto"));
-    let descriptors = protox::compile(files, ["."])?;
+    let contract: Vec<_> = names.iter().map(|name| format!("plantd/v1/{name}.proto")).collect();
+    let players = vec!["foxglove/scene.proto".to_owned()];
     let out = std::env::var("OUT_DIR")?;
-    std::fs::write(Path::new(&out).join("descriptors.bin"), descriptors.encode_to_vec())?;
-    tonic_prost_build::configure().compile_fds(descriptors)?;
+    for (files, name) in [(contract, "descriptors.bin"), (players, "foxglove.bin")] {
+        let descriptors = protox::compile(files, ["."])?;
+        std::fs::write(Path::new(&out).join(name), descriptors.encode_to_vec())?;
+        tonic_prost_build::configure().compile_fds(descriptors)?;
+    }
     Ok(())
 }

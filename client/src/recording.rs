@@ -24,6 +24,28 @@ pub enum RecordingEntry {
     Mark(v1::MarkRecord),
     /// What happened to the plant besides its steps.
     Event(v1::Event),
+    /// Energy after a step, at some of the steps; older recordings have none.
+    Energy {
+        /// The plant's time, s.
+        time_s: f64,
+        /// The energy.
+        energy: v1::Energy,
+    },
+}
+
+/// What is read of the signals for players.
+#[derive(prost::Message)]
+struct Signals {
+    #[prost(message, optional, tag = "8")]
+    energy: Option<SignalsEnergy>,
+}
+
+#[derive(prost::Message)]
+struct SignalsEnergy {
+    #[prost(double, tag = "1")]
+    kinetic: f64,
+    #[prost(double, tag = "2")]
+    potential: f64,
 }
 
 /// Reads a recording (MCAP), entry by entry.
@@ -102,7 +124,12 @@ impl RecordingReader {
                 }
                 "/mark" => v1::MarkRecord::decode(bytes).map(RecordingEntry::Mark),
                 "/event" => v1::Event::decode(bytes).map(RecordingEntry::Event),
-                // Of a later version.
+                "/signals" => Signals::decode(bytes).map(|signals| {
+                    let SignalsEnergy { kinetic, potential } = signals.energy.unwrap_or_default();
+                    let energy = v1::Energy { kinetic_j: kinetic, potential_j: potential };
+                    RecordingEntry::Energy { time_s: message.publish_time as f64 * 1e-9, energy }
+                }),
+                // For players, or of a later version.
                 _ => continue,
             };
             return Ok(Some(entry.map_err(|error| problem(&self.path, error))?));

@@ -12,6 +12,16 @@ pub mod v1 {
     tonic::include_proto!("plantd.v1");
 }
 
+/// Messages of the package `foxglove`, which players of recordings show in space.
+#[allow(missing_docs, unreachable_pub, clippy::all)]
+pub mod foxglove {
+    tonic::include_proto!("foxglove");
+
+    /// These messages as an encoded `FileDescriptorSet`.
+    pub const FILE_DESCRIPTOR_SET: &[u8] =
+        include_bytes!(concat!(env!("OUT_DIR"), "/foxglove.bin"));
+}
+
 /// The contract as an encoded `FileDescriptorSet`, for server reflection.
 pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin"));
 

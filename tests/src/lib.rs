@@ -2,4 +2,4 @@
 
 pub mod links;
 pub mod reference;
-pub mod server;
+pub use plantd_process as server;

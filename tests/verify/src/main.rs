@@ -159,7 +159,7 @@ fn demo(context: &mut Context) -> Outcome {
     context.must_build()?;
     let binaries = context.binaries();
     let mut command = Command::new(binaries.join("demo"));
-    command.arg("--output").arg(context.scratch().join("demo-output"));
+    command.arg("--no-view").arg("--output").arg(context.scratch().join("demo-output"));
     run(command.current_dir(&context.root).env("PLANTD_BINARY_DIR", binaries))
 }
 

@@ -2,6 +2,7 @@
 
 mod commands;
 mod contract;
+mod figure;
 mod input;
 mod output;
 mod report;
@@ -16,8 +17,8 @@ use clap::{Parser, Subcommand};
 
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, guard, import,
-    inventory, kalman, linearize, lqr, mechanics, optimize, parameters, record, reference, replay,
-    run, scene, settle, state, step, test, timing, watch,
+    inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record, reference,
+    replay, run, scene, settle, state, step, test, timing, view, watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
@@ -46,6 +47,8 @@ Examples:
   plantctl record start p1 --name trial             then `record stop trial`, `record get trial`
   plantctl replay trial.mcap                        the same steps again, compared bit for bit
   plantctl export trial.mcap --csv trial.csv
+  plantctl plot trial.mcap q.theta u.tau            in the terminal; --out plot.svg draws a picture
+  plantctl view trial.mcap                          in the browser; `view p1` shows a plant
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
@@ -111,6 +114,8 @@ enum Command {
     Record(record::Record),
     Replay(replay::Replay),
     Export(export::Export),
+    Plot(plot::Plot),
+    View(view::View),
     Reset(state::Reset),
     Snapshot(state::Snapshot),
     Restore(state::Restore),
@@ -174,6 +179,8 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Record(command) => command.run(context).await?,
         Command::Replay(command) => return command.run(context).await,
         Command::Export(command) => command.run(context)?,
+        Command::Plot(command) => command.run(context)?,
+        Command::View(command) => command.run(context).await?,
         Command::Reset(command) => command.run(context).await?,
         Command::Snapshot(command) => command.run(context).await?,
         Command::Restore(command) => command.run(context).await?,

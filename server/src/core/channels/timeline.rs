@@ -54,8 +54,8 @@ pub(crate) struct Timeline {
 #[derive(Clone, Debug)]
 struct Entry {
     set: Set,
-    /// Of the set's model, wherever its plant is.
-    digest: u64,
+    /// The set's model, wherever its plant is.
+    model: Arc<Model>,
     plant: Spare,
     parameters: Arc<Parameters>,
     /// Those of outputs and pushes, in the order of [`crate::core::channels::pipeline::Channels::sites_mut`].
@@ -81,8 +81,8 @@ pub(crate) struct Base {
 pub(crate) struct Announced {
     /// What the numbers are without changes.
     pub(crate) unchanged: Arc<Parameters>,
-    /// Digests of the models that can be in force, with what is changed in them.
-    pub(crate) models: Vec<(u64, Arc<Parameters>)>,
+    /// The models that can be in force, with what is changed in them.
+    pub(crate) models: Vec<(Arc<Model>, Arc<Parameters>)>,
 }
 
 impl Timeline {
@@ -109,10 +109,10 @@ impl Timeline {
             }
             let (what, count) = ("numbers of the scene changed", parameters.len());
             LimitExceeded::check("parameters", limits.parameters, what, count)?;
-            let (digest, sites) = (model.digest(), sites(&model));
-            let plant = Spare::new(model, base.settings);
+            let sites = sites(&model);
+            let plant = Spare::new(Arc::clone(&model), base.settings);
             let plant = plant?;
-            entries.push(Entry { set, digest, plant, parameters, sites });
+            entries.push(Entry { set, model, plant, parameters, sites });
         }
         let (base, unchanged) = (base.clone(), Arc::new(unchanged));
         Ok(Self { base, unchanged, entries, current: None, asked: None, is_refused: false })
@@ -125,7 +125,7 @@ impl Timeline {
 
     /// What a recorder needs to know.
     pub(crate) fn announced(&self) -> Announced {
-        let model = |entry: &Entry| (entry.digest, Arc::clone(&entry.parameters));
+        let model = |entry: &Entry| (Arc::clone(&entry.model), Arc::clone(&entry.parameters));
         Announced {
             unchanged: Arc::clone(&self.unchanged),
             models: self.entries.iter().map(model).collect(),
@@ -180,7 +180,7 @@ impl Timeline {
 
     /// The entry of a plant's model.
     fn entry_of(&self, plant: &Plant) -> Option<usize> {
-        self.entries.iter().position(|entry| entry.digest == plant.model().digest())
+        self.entries.iter().position(|entry| entry.model.digest() == plant.model().digest())
     }
 
     /// The plant is in another state: what could not be done may be possible.

@@ -461,7 +461,7 @@ impl Core {
             step: self.plant.step_index(),
             time_s: self.plant.time_s(),
             time_step_s: self.plant.settings().time_step_s,
-            model_digest: self.plant.model().digest(),
+            model: Arc::clone(self.plant.model()),
             parameters: Arc::clone(&self.changed.parameters),
             announced: timeline.map(|timeline| timeline.announced()).unwrap_or_default(),
         }

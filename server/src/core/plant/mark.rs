@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use plantd_models::Snapshot;
+use plantd_models::{Model, Snapshot};
 
 use crate::core::channels::timeline::Announced;
 use crate::core::parameters::Parameters;
@@ -27,7 +27,7 @@ pub(crate) struct Mark {
     pub(crate) step: u64,
     pub(crate) time_s: f64,
     pub(crate) time_step_s: f64,
-    pub(crate) model_digest: u64,
+    pub(crate) model: Arc<Model>,
     pub(crate) parameters: Arc<Parameters>,
     /// Changes of parameters by faults that may come.
     pub(crate) announced: Announced,

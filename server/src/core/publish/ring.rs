@@ -104,6 +104,11 @@ impl Reader {
         Self { ring, next, lost: 0, record }
     }
 
+    /// Number of the record that is read next, if it is not overwritten by then.
+    pub fn position(&self) -> u64 {
+        self.next
+    }
+
     /// The next record and its number, if there is one. Skips what has been overwritten.
     pub fn read_next(&mut self) -> Option<(u64, &[u64])> {
         self.read_before(u64::MAX)

@@ -6,13 +6,20 @@ use std::io::Write;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::write::NoSeek;
 use mcap::{McapError, WriteOptions};
-use plantd_proto::v1;
+use plantd_proto::foxglove::{FrameTransforms, SceneUpdate};
+use plantd_proto::{FILE_DESCRIPTOR_SET, foxglove, v1};
 use prost::Message;
 
 use crate::wire::record::schema::descriptors;
+use crate::wire::record::signals;
 
 /// Bytes after which a chunk is written. What was not written is lost when the server is killed.
 const CHUNK_BYTES: u64 = 1 << 18;
+
+const PLANT: &str = "plantd.v1.PlantRecord";
+const STEP: &str = "plantd.v1.StepRecord";
+const MARK: &str = "plantd.v1.MarkRecord";
+const EVENT: &str = "plantd.v1.Event";
 
 /// Writes a recording.
 pub(super) struct Writer<W: Write> {
@@ -20,6 +27,10 @@ pub(super) struct Writer<W: Write> {
     step: Topic,
     mark: Topic,
     event: Topic,
+    transforms: Topic,
+    scene: Topic,
+    lines: Topic,
+    signals: Topic,
     buffer: Vec<u8>,
 }
 
@@ -29,13 +40,37 @@ struct Topic {
     sequence: u32,
 }
 
-/// When a message was written, and when it came about.
+/// When a message came about.
 #[derive(Clone, Copy)]
 pub(super) struct Times {
-    /// Wall clock, ns since 1970.
-    pub(super) log_ns: u64,
+    /// By which players play: the plant's time, which goes on where the plant goes back, ns.
+    pub(super) play_ns: u64,
     /// The plant's time, s.
     pub(super) plant_s: f64,
+}
+
+/// The time by which players play.
+#[derive(Default)]
+pub(super) struct PlayClock {
+    /// What the plant has gone back, ns.
+    offset_ns: u64,
+    last_ns: u64,
+}
+
+impl PlayClock {
+    /// Round-off of the plant's time, ns.
+    const ROUNDING_NS: u64 = 1000;
+
+    /// The times at a time of the plant, s.
+    pub(super) fn at(&mut self, plant_s: f64) -> Times {
+        let mut play_ns = (plant_s * 1e9).round() as u64 + self.offset_ns;
+        if play_ns + Self::ROUNDING_NS < self.last_ns {
+            self.offset_ns += self.last_ns - play_ns;
+        }
+        play_ns = play_ns.max(self.last_ns);
+        self.last_ns = play_ns;
+        Times { play_ns, plant_s }
+    }
 }
 
 impl<W: Write> Writer<W> {
@@ -48,26 +83,33 @@ impl<W: Write> Writer<W> {
             .disable_seeking(true)
             .create(NoSeek::new(file))?;
         mcap.write_metadata(&Metadata { name: "plantd".to_owned(), metadata: metadata(plant) })?;
-        let (mut step, mut mark, mut event, mut first) = (0, 0, 0, 0);
-        for (id, topic, message) in [
-            (&mut first, "/plant", "PlantRecord"),
-            (&mut step, "/step", "StepRecord"),
-            (&mut mark, "/mark", "MarkRecord"),
-            (&mut event, "/event", "Event"),
-        ] {
-            let (name, data) = (format!("plantd.v1.{message}"), descriptors(message));
-            let schema = mcap.add_schema(&name, "protobuf", &data)?;
-            *id = mcap.add_channel(schema, topic, "protobuf", &BTreeMap::new())?;
-        }
-        let topic = |id| Topic { id, sequence: 0 };
+        let mut topic = |topic: &str, message: &str, data: &[u8]| {
+            let schema = mcap.add_schema(message, "protobuf", data)?;
+            let id = mcap.add_channel(schema, topic, "protobuf", &BTreeMap::new())?;
+            Ok::<_, McapError>(Topic { id, sequence: 0 })
+        };
+        let ours = |message: &str| descriptors(FILE_DESCRIPTOR_SET, message);
+        let players = |message: &str| descriptors(foxglove::FILE_DESCRIPTOR_SET, message);
+        let default = v1::Model::default();
+        let model = plant.model.as_ref().unwrap_or(&default);
+        let (frames, update) = ("foxglove.FrameTransforms", "foxglove.SceneUpdate");
+        let mut first = topic("/plant", PLANT, &ours(PLANT))?;
         let mut writer = Self {
+            step: topic("/step", STEP, &ours(STEP))?,
+            mark: topic("/mark", MARK, &ours(MARK))?,
+            event: topic("/event", EVENT, &ours(EVENT))?,
+            transforms: topic("/tf", frames, &players(frames))?,
+            scene: topic("/scene", update, &players(update))?,
+            lines: topic("/lines", update, &players(update))?,
+            signals: topic(
+                "/signals",
+                signals::NAME,
+                &signals::descriptors(model, &plant.outputs),
+            )?,
             mcap,
-            step: topic(step),
-            mark: topic(mark),
-            event: topic(event),
             buffer: Vec::new(),
         };
-        write(&mut writer.mcap, &mut topic(first), &mut writer.buffer, plant, times)?;
+        write(&mut writer.mcap, &mut first, &mut writer.buffer, plant, times)?;
         writer.flush()?;
         Ok(writer)
     }
@@ -85,6 +127,30 @@ impl<W: Write> Writer<W> {
     /// Writes an event.
     pub(super) fn event(&mut self, event: &v1::Event, times: Times) -> Result<(), McapError> {
         write(&mut self.mcap, &mut self.event, &mut self.buffer, event, times)
+    }
+
+    /// Writes where frames are.
+    pub(super) fn transforms(
+        &mut self,
+        transforms: &FrameTransforms,
+        times: Times,
+    ) -> Result<(), McapError> {
+        write(&mut self.mcap, &mut self.transforms, &mut self.buffer, transforms, times)
+    }
+
+    /// Writes shapes.
+    pub(super) fn scene(&mut self, scene: &SceneUpdate, times: Times) -> Result<(), McapError> {
+        write(&mut self.mcap, &mut self.scene, &mut self.buffer, scene, times)
+    }
+
+    /// Writes lines and arrows.
+    pub(super) fn lines(&mut self, lines: &SceneUpdate, times: Times) -> Result<(), McapError> {
+        write(&mut self.mcap, &mut self.lines, &mut self.buffer, lines, times)
+    }
+
+    /// Writes signals, which are encoded.
+    pub(super) fn signals(&mut self, signals: &[u8], times: Times) -> Result<(), McapError> {
+        write_bytes(&mut self.mcap, &mut self.signals, signals, times)
     }
 
     /// Hands what was written to the system: it stays when the server is killed.
@@ -109,14 +175,23 @@ fn write<W: Write>(
     buffer.clear();
     // A vector grows as needed.
     let _ = message.encode(buffer);
+    write_bytes(mcap, topic, buffer, times)
+}
+
+fn write_bytes<W: Write>(
+    mcap: &mut mcap::Writer<NoSeek<W>>,
+    topic: &mut Topic,
+    message: &[u8],
+    times: Times,
+) -> Result<(), McapError> {
     topic.sequence = topic.sequence.wrapping_add(1);
     let header = MessageHeader {
         channel_id: topic.id,
         sequence: topic.sequence,
-        log_time: times.log_ns,
-        publish_time: (times.plant_s * 1e9) as u64,
+        log_time: times.play_ns,
+        publish_time: (times.plant_s * 1e9).round() as u64,
     };
-    mcap.write_to_known_channel(&header, buffer)
+    mcap.write_to_known_channel(&header, message)
 }
 
 /// What is shown of a file without knowing its messages.
@@ -135,4 +210,18 @@ fn metadata(record: &v1::PlantRecord) -> BTreeMap<String, String> {
     ]
     .map(|(key, value)| (key.to_owned(), value))
     .into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn players_go_on_where_a_plant_goes_back() {
+        let mut clock = PlayClock::default();
+        let at =
+            [0.0, 0.1, 0.2, 0.199_999_999_9, 0.0, 0.1, 0.05, 0.15].map(|s| clock.at(s).play_ns);
+        let ms = [0, 100, 200, 200, 200, 300, 300, 400];
+        assert_eq!(at, ms.map(|ms| ms * 1_000_000));
+    }
 }

@@ -1,6 +1,6 @@
 //! What stands in a recording, from what the plant has left.
 
-use plantd_models::Plant;
+use plantd_models::{Plant, State};
 use plantd_proto::v1;
 
 use crate::core::parameters::Parameters;
@@ -33,6 +33,28 @@ pub(super) fn plant_record(session: &Session, mark: &Mark, plant: &mut Plant) ->
         snapshot: mark.snapshot.to_bytes(),
         outputs: session.channels().0.names.clone(),
         ..Default::default()
+    }
+}
+
+/// The plant at the beginning of a recording, as a frame without a step before it.
+pub(super) fn first_frame(plant: &mut Plant) -> Frame {
+    let mut input = vec![0.0; plant.model().dimensions().input()];
+    plant.hold_input(&mut input);
+    let state = State {
+        step: plant.step_index(),
+        q: plant.q().to_vec(),
+        p: plant.p().to_vec(),
+        v: plant.v().to_vec(),
+        multipliers: plant.multipliers().to_vec(),
+    };
+    Frame {
+        state,
+        time_s: plant.time_s(),
+        velocity: plant.velocity(),
+        input,
+        time_step_s: plant.settings().time_step_s,
+        model_digest: plant.model().digest(),
+        ..Frame::default()
     }
 }
 

@@ -9,11 +9,17 @@
 //! what it has lost and says so in the file. What happens between steps (a reset, changed parameters) comes
 //! as marks, each with a snapshot; so do checkpoints, every few seconds. A replay begins at any mark that
 //! has one.
+//!
+//! For players the recorder adds pictures of some steps: where frames and lines are, and signals by their
+//! names. They give way where it is behind.
 
 pub mod directory;
 pub(crate) mod file;
 pub(crate) mod message;
+pub(crate) mod picture;
 pub(crate) mod progress;
 pub(crate) mod recorder;
+pub(crate) mod scene;
 pub(crate) mod schema;
+pub(crate) mod signals;
 pub(crate) mod work;

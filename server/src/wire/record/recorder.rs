@@ -12,7 +12,6 @@ use plantd_proto::v1::{self, RecordingStatus};
 
 use crate::core::plant::tap::Tap;
 use crate::core::session::shared::Session;
-use crate::wire::record::message::plant_record;
 use crate::wire::record::progress::{Options, Shared, unix_ns};
 use crate::wire::record::work::Work;
 
@@ -45,8 +44,7 @@ impl Recorder {
         file: File,
         options: Options,
     ) -> Result<Self, StartError> {
-        let (tap, mark, mut plant) = session.open_tap().ok_or(StartError::Active)?;
-        let first = plant_record(session, &mark, &mut plant);
+        let (tap, mark, plant) = session.open_tap().ok_or(StartError::Active)?;
         let started = SystemTime::now();
         let info = v1::Recording {
             name: options.name.clone(),
@@ -62,7 +60,7 @@ impl Recorder {
         });
         let (ends, ended) = mpsc::channel();
         let outcome =
-            Work::new(session, &tap, &mark, &first, file, options, &shared).and_then(|run| {
+            Work::new(session, &tap, &mark, plant, file, options, &shared).and_then(|run| {
                 let work = move || {
                     let _ends: Sender<()> = ends;
                     run.run();

@@ -8,6 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
 use mcap::McapError;
+use plantd_models::Plant;
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1::{self, MarkReason, RecordingStatus};
 
@@ -20,8 +21,9 @@ use crate::core::publish::frame::Frame;
 use crate::core::publish::ring::Reader;
 use crate::core::session::shared::Session;
 use crate::wire::message::run_info::event_message;
-use crate::wire::record::file::{Times, Writer};
-use crate::wire::record::message::{all_parameters, fill};
+use crate::wire::record::file::{PlayClock, Times, Writer};
+use crate::wire::record::message::{all_parameters, fill, first_frame, plant_record};
+use crate::wire::record::picture::Picture;
 use crate::wire::record::progress::{Options, Shared, sentence, unix_ns};
 
 /// How often the ring is looked at.
@@ -30,6 +32,9 @@ const POLL_INTERVAL: Duration = Duration::from_millis(5);
 const FLUSH_INTERVAL: Duration = Duration::from_millis(500);
 /// Least time between two snapshots, where disturbances ask for many.
 const SNAPSHOT_INTERVAL_MIN: Duration = Duration::from_millis(50);
+/// Part of the ring that may wait to be written while pictures are drawn. From a half on, plants that are
+/// stepped one by one wait.
+const BEHIND_PART: u64 = 4;
 
 /// Counts what goes into a file.
 struct Counted {
@@ -59,6 +64,8 @@ pub(super) struct Work {
     options: Options,
     shared: Arc<Shared>,
     clock: Clock,
+    play: PlayClock,
+    picture: Picture,
     frame: Frame,
     record: v1::StepRecord,
     /// Step from which the next frame follows; none where it follows from nothing.
@@ -81,15 +88,21 @@ impl Work {
         session: &Arc<Session>,
         tap: &Arc<Tap>,
         mark: &Mark,
-        first: &v1::PlantRecord,
+        mut plant: Plant,
         file: File,
         options: Options,
         shared: &Arc<Shared>,
     ) -> Result<Self, McapError> {
-        let mut clock = Clock::new();
-        let times = Times { log_ns: clock.now_ns(0), plant_s: mark.time_s };
+        let mut first = plant_record(session, mark, &mut plant);
+        let frame = first_frame(&mut plant);
+        let mut picture = Picture::new(plant);
+        first.drawing = picture.drawing().cloned();
+        let mut play = PlayClock::default();
+        let times = play.at(mark.time_s);
         let counted = Counted { file, bytes: Arc::clone(&shared.bytes) };
-        let writer = Writer::new(BufWriter::new(counted), first, times)?;
+        let mut writer = Writer::new(BufWriter::new(counted), &first, times)?;
+        picture.write_shapes(&mut writer, times)?;
+        picture.write(&frame, &mut writer, times)?;
         Ok(Self {
             session: Arc::clone(session),
             tap: Arc::clone(tap),
@@ -98,11 +111,13 @@ impl Work {
             writer,
             options,
             shared: Arc::clone(shared),
-            clock,
-            frame: Frame::default(),
+            clock: Clock::new(),
+            play,
+            picture,
+            frame,
             record: v1::StepRecord::default(),
             at: Some(mark.step),
-            mechanics: (mark.model_digest, mark.time_step_s),
+            mechanics: (mark.model.digest(), mark.time_step_s),
             announced: mark.announced.clone(),
             unchanged: (*mark.announced.unchanged).clone(),
             lost: 0,
@@ -204,8 +219,8 @@ impl Work {
     fn drain_events(&mut self) -> Result<(), McapError> {
         while let Some((number, event)) = self.events.read_next() {
             let message = event_message(number, &event, self.session.model());
-            let log_ns = self.clock.now_ns(event.at_ns);
-            self.writer.event(&message, Times { log_ns, plant_s: self.frame.time_s })?;
+            let times = self.play.at(self.frame.time_s);
+            self.writer.event(&message, times)?;
         }
         Ok(())
     }
@@ -239,11 +254,14 @@ impl Work {
             time_step_s: mark.time_step_s,
             lost,
         };
-        let times = Times { log_ns: self.clock.now_ns(0), plant_s: mark.time_s };
+        let times = self.play.at(mark.time_s);
         self.writer.mark(&message, times)?;
         self.at = Some(mark.step);
-        self.mechanics = (mark.model_digest, mark.time_step_s);
-        Ok(())
+        self.mechanics = (mark.model.digest(), mark.time_step_s);
+        if mark.reason != Marked::Checkpoint {
+            self.picture.begin();
+        }
+        self.picture.enter(&mark.model, &mut self.writer, times)
     }
 
     /// Writes the step in `frame`.
@@ -260,15 +278,23 @@ impl Work {
                 self.break_off(MarkReason::Disturbance)?;
             }
         }
-        let times = Times {
-            log_ns: self.clock.now_ns(self.frame.timing.ended_ns),
-            plant_s: self.frame.time_s,
-        };
+        let times = self.play.at(self.frame.time_s);
         fill(&mut self.record, &self.frame);
+        self.record.utc_ns = self.clock.now_ns(self.frame.timing.ended_ns) as i64;
         self.writer.step(&self.record, times)?;
         self.steps += 1;
         self.has_moved = true;
-        Ok(())
+        self.show(times)
+    }
+
+    /// Draws the step in `frame`, if that is due and the recorder is not behind.
+    fn show(&mut self, times: Times) -> Result<(), McapError> {
+        let waiting = self.tap.ring.written().saturating_sub(self.reader.position());
+        let is_behind = waiting > self.tap.ring.capacity() as u64 / BEHIND_PART;
+        if is_behind || !self.picture.is_due(&self.frame) {
+            return Ok(());
+        }
+        self.picture.write(&self.frame, &mut self.writer, times)
     }
 
     /// Whether the mechanics of the step in `frame` are those that stand in the file; writes a mark before
@@ -278,8 +304,8 @@ impl Work {
         if self.mechanics == (digest, time_step_s) {
             return Ok(true);
         }
-        let model = self.announced.models.iter().find(|model| model.0 == digest);
-        let Some((_, parameters)) = model.filter(|_| time_step_s == self.mechanics.1) else {
+        let model = self.announced.models.iter().find(|(model, _)| model.digest() == digest);
+        let Some((model, parameters)) = model.filter(|_| time_step_s == self.mechanics.1) else {
             return Ok(false);
         };
         self.mechanics.0 = digest;
@@ -290,9 +316,9 @@ impl Work {
             time_step_s,
             ..Default::default()
         };
-        let plant_s = self.frame.time_s - time_step_s;
-        let times = Times { log_ns: self.clock.now_ns(self.frame.timing.began_ns), plant_s };
+        let times = self.play.at(self.frame.time_s - time_step_s);
         self.writer.mark(&message, times)?;
+        self.picture.enter(model, &mut self.writer, times)?;
         Ok(true)
     }
 
@@ -301,8 +327,9 @@ impl Work {
         let lost = self.take_lost();
         let step = self.frame.state.step.saturating_sub(1);
         let message = v1::MarkRecord { reason: reason.into(), step, lost, ..Default::default() };
-        let times = Times { log_ns: self.clock.now_ns(0), plant_s: self.frame.time_s };
+        let times = self.play.at(self.frame.time_s);
         self.at = None;
+        self.picture.begin();
         self.writer.mark(&message, times)
     }
 
@@ -357,7 +384,6 @@ pub(super) mod tests {
     use crate::core::metrics::registry::Metrics;
     use crate::core::realtime::loops::RealTime;
     use crate::core::realtime::settings::RealTimeSettings;
-    use crate::wire::record::message::plant_record;
 
     pub(in crate::wire::record) fn session() -> Arc<Session> {
         let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
@@ -375,12 +401,11 @@ pub(super) mod tests {
 
     /// A recorder whose thread is this one.
     fn recorder(session: &Arc<Session>, file: &File) -> Work {
-        let (tap, mark, mut plant) = session.open_tap().unwrap();
-        let first = plant_record(session, &mark, &mut plant);
+        let (tap, mark, plant) = session.open_tap().unwrap();
         let info = Mutex::new(v1::Recording::default());
         let shared = Shared { is_ending: AtomicBool::new(true), bytes: Arc::default(), info };
         let file = file.try_clone().unwrap();
-        Work::new(session, &tap, &mark, &first, file, options(), &Arc::new(shared)).unwrap()
+        Work::new(session, &tap, &mark, plant, file, options(), &Arc::new(shared)).unwrap()
     }
 
     /// Steps as a plant that runs by itself takes them: without waiting for anybody.

@@ -252,7 +252,7 @@ impl<'a> Twin<'a> {
                         self.take_steps().await?;
                     }
                 }
-                Some(RecordingEntry::Event(_)) => {}
+                Some(RecordingEntry::Event(_) | RecordingEntry::Energy { .. }) => {}
                 Some(RecordingEntry::Mark(mark)) => {
                     self.take_steps().await?;
                     if self.outcome.difference.is_none() {

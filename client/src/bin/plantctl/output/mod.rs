@@ -2,6 +2,7 @@
 
 pub(crate) mod derivatives;
 pub(crate) mod failure;
+pub(crate) mod markup;
 pub(crate) mod model;
 pub(crate) mod plant;
 pub(crate) mod printer;

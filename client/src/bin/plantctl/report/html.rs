@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::report::markup::escaped;
+use crate::output::markup::escaped;
 use crate::report::plot::svg;
 use crate::report::results::{Replay, Report, ScenarioResult};
 use crate::scenario::verdict::{Curve, Verdict};

@@ -2,7 +2,6 @@
 
 pub(crate) mod html;
 pub(crate) mod junit;
-pub(crate) mod markup;
 pub(crate) mod plot;
 pub(crate) mod results;
 pub(crate) mod text;

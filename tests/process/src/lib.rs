@@ -208,12 +208,21 @@ fn build() -> Result<PathBuf> {
     };
     let target = directory.parent().context("the target directory has no parent")?;
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    // With the binaries of this package as well, so that Cargo sees the same dependencies as for the
+    // With the binaries of the packages that ask, so that Cargo sees the same dependencies as for the
     // running program and builds none of them a second time.
     let output = Command::new(cargo)
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .args(["build", "--quiet", "--bins"])
-        .args(["-p", "plantd-server", "-p", "plantd-client", "-p", env!("CARGO_PKG_NAME")])
+        .args([
+            "-p",
+            "plantd-server",
+            "-p",
+            "plantd-client",
+            "-p",
+            "plantd-tests",
+            "-p",
+            "plantd-demo",
+        ])
         .args(["--profile", profile, "--target-dir"])
         .arg(target)
         .output()

@@ -46,7 +46,7 @@ pub(crate) async fn control(client: &Client) -> Result<Report> {
     let linearization = linearized.linearization.context("no linearization")?;
     let solution = regulator(client).await?;
     let gain = solution.gain.context("no gain")?;
-    let mut stopwatch = Stopwatch::new();
+    let mut stopwatch = Stopwatch::default();
     let regulated = disturbed_run(client, Some(&gain), &mut stopwatch).await?;
     let unregulated = disturbed_run(client, None, &mut stopwatch).await?;
     Ok(Report {

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, BufReader};
 use tokio::process::{Child, Command};
 
-use crate::{latency, marionette, pendulum};
+use crate::{latency, marionette, pendulum, show};
 
 /// A controller takes seconds; one that takes this long hangs.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -29,6 +29,8 @@ pub(crate) enum Name {
     GrpcLatency,
     /// Round trips of a pendulum over shared memory.
     LinkLatency,
+    /// The marionette dancing and the pendulum being pushed, for people to look at.
+    Show,
 }
 
 /// A line that a controller prints.
@@ -62,6 +64,7 @@ pub(crate) fn run(name: Name, address: &str) -> Result<()> {
             Name::Marionette => to_value(marionette::control(&client).await?),
             Name::GrpcLatency => to_value(latency::over_grpc(&client).await?),
             Name::LinkLatency => to_value(latency::over_shared_memory(&client).await?),
+            Name::Show => to_value(show::control(&client).await?),
         }
     })?;
     emit(&Event::Result(result));
@@ -109,6 +112,15 @@ impl Process {
         }
         let value = value.with_context(|| format!("the {} ended without a result", self.name))?;
         Ok(serde_json::from_value(value)?)
+    }
+
+    /// Waits until it ends, however long it goes on.
+    pub(crate) async fn end(mut self) -> Result<()> {
+        let (_, status, complaint) = self.follow().await?;
+        match status.success() {
+            true => Ok(()),
+            false => bail!("the {} failed: {}", self.name, complaint.trim()),
+        }
     }
 
     async fn follow(&mut self) -> Result<(Option<serde_json::Value>, ExitStatus, String)> {

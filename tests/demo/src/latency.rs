@@ -3,7 +3,6 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
-use hdrhistogram::Histogram;
 use plantd_client::link::{LinkDriver, LinkOptions};
 use plantd_client::{Client, v1};
 use serde::{Deserialize, Serialize};
@@ -25,25 +24,29 @@ pub(crate) struct RoundTrips {
 }
 
 /// Collects round trips.
+#[derive(Default)]
 pub(crate) struct Stopwatch {
-    histogram: Histogram<u64>,
+    times: Vec<Duration>,
 }
 
 impl Stopwatch {
-    pub(crate) fn new() -> Self {
-        let histogram = Histogram::new_with_bounds(1, 60_000_000_000, 3);
-        Self { histogram: histogram.expect("the bounds are in order") }
-    }
     pub(crate) fn record(&mut self, round_trip: Duration) {
-        self.histogram.saturating_record(round_trip.as_nanos() as u64);
+        self.times.push(round_trip);
     }
+
+    /// The quantile `x` is the time that a part `x` of all take at most.
     pub(crate) fn round_trips(&self) -> RoundTrips {
-        let us = |quantile| self.histogram.value_at_quantile(quantile) as f64 / 1e3;
+        let mut times = self.times.clone();
+        times.sort_unstable();
+        let us = |quantile: f64| {
+            let rank = (quantile * times.len() as f64).ceil().max(1.0) as usize;
+            times.get(rank - 1).map_or(f64::NAN, |time| time.as_nanos() as f64 / 1e3)
+        };
         RoundTrips {
             p50_us: us(0.5),
             p99_us: us(0.99),
             p999_us: us(0.999),
-            steps: self.histogram.len(),
+            steps: times.len() as u64,
         }
     }
 }
@@ -52,7 +55,7 @@ impl Stopwatch {
 pub(crate) async fn over_grpc(client: &Client) -> Result<RoundTrips> {
     let plant = pendulum(client).await?;
     let mut driver = client.drive(&plant).await?;
-    let mut stopwatch = Stopwatch::new();
+    let mut stopwatch = Stopwatch::default();
     for k in 0..WARM_UP + STEPS {
         let start = Instant::now();
         driver.step(&[0.0]).await?;
@@ -70,7 +73,7 @@ pub(crate) async fn over_grpc(client: &Client) -> Result<RoundTrips> {
 pub(crate) async fn over_shared_memory(client: &Client) -> Result<RoundTrips> {
     let plant = pendulum(client).await?;
     let mut driver = connect_link(client, &plant).await?;
-    let mut stopwatch = Stopwatch::new();
+    let mut stopwatch = Stopwatch::default();
     for k in 0..WARM_UP + STEPS {
         let start = Instant::now();
         driver.step(&[0.0])?;

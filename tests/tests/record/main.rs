@@ -1,5 +1,8 @@
 //! Recordings of real servers: what is in the files, and that it can be done again bit for bit.
 
+mod players;
+mod seen;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};

@@ -1,4 +1,5 @@
-//! `cargo demo`: a real server, controllers in processes of their own, and the numbers of the paper.
+//! `cargo demo`: a real server, controllers in processes of their own, a page that shows them, and the
+//! numbers of the paper.
 //!
 //! The director (this process without a subcommand) starts `plantd`, starts one controller after
 //! the other (this program again, with the subcommand `controller`), and compares what they report
@@ -11,6 +12,7 @@ mod marionette;
 mod pendulum;
 mod plots;
 mod report;
+mod show;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -20,11 +22,18 @@ use clap::{Parser, Subcommand};
 /// Stabilises the paper's pendulum and the 40-coordinate marionette from outside a running plantd
 /// server, over gRPC and over shared memory, and compares with the paper.
 #[derive(Parser)]
-#[command(name = "cargo demo", after_help = "Ends with code 0 if every number is as it should be.")]
+#[command(
+    name = "cargo demo",
+    max_term_width = 100,
+    after_help = "Ends with code 0 if every number is as it should be."
+)]
 struct Arguments {
     /// Folder for plots and results.
     #[arg(long, value_name = "FOLDER", default_value = "demo-output")]
     output: PathBuf,
+    /// Show nothing in a browser: run, print the numbers, and end.
+    #[arg(long)]
+    no_view: bool,
     #[command(subcommand)]
     role: Option<Role>,
 }
@@ -44,7 +53,7 @@ enum Role {
 fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let outcome = match arguments.role {
-        None => director::run(&arguments.output),
+        None => director::run(&arguments.output, !arguments.no_view),
         Some(Role::Controller { controller, address }) => {
             controller::run(controller, &address).map(|()| true)
         }

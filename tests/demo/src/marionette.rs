@@ -57,17 +57,18 @@ pub(crate) struct Run {
 
 pub(crate) async fn control(client: &Client) -> Result<Report> {
     let model = client.get_model(MODEL).await?;
-    let reference = ReferenceInput::of(&model)?;
+    let strings = Strings::of(&model)?;
+    let rows = strings.rows();
     let plant = create(client, at_rest(&model)).await?;
     let start = plant.state.clone().context("no state")?;
 
     let since = Instant::now();
-    let gains = gains(client, start, &reference).await?;
+    let gains = gains(client, start, &rows).await?;
     let solve_s = since.elapsed().as_secs_f64();
 
-    let mut stopwatch = Stopwatch::new();
+    let mut stopwatch = Stopwatch::default();
     let mut driver = connect_link(client, &plant.id).await?;
-    let perturbed = perturb(&mut driver, &reference.rows[0])?;
+    let perturbed = perturb(&mut driver, &rows[0])?;
     drop(driver);
     client.delete_plant(plant.id).await?;
 
@@ -84,8 +85,8 @@ pub(crate) async fn control(client: &Client) -> Result<Report> {
     let angle = index_of(&model, TORSO_ANGLE)?;
     let first_gain = gains[0].k.as_ref().context("no gain")?;
     Ok(Report {
-        dynamic: reference.dynamic,
-        prescribed: model.coordinates.len() - reference.dynamic,
+        dynamic: strings.dynamic,
+        prescribed: model.coordinates.len() - strings.dynamic,
         constraints: model.constraints.len(),
         first_gain_norm: first_gain.data.iter().map(|k| k * k).sum::<f64>().sqrt(),
         solve_s,
@@ -96,26 +97,36 @@ pub(crate) async fn control(client: &Client) -> Result<Report> {
     })
 }
 
-/// Inputs of the reference motion: all strings held but four, which lengthen and shorten.
-struct ReferenceInput {
+/// The strings: all held but four, which lengthen and shorten.
+pub(crate) struct Strings {
     dynamic: usize,
-    rows: Vec<Vec<f64>>,
+    held: Vec<f64>,
+    /// Entries of those that move, and where each starts.
+    moving: Vec<(usize, f64)>,
 }
 
-impl ReferenceInput {
-    fn of(model: &v1::Model) -> Result<Self> {
+impl Strings {
+    pub(crate) fn of(model: &v1::Model) -> Result<Self> {
         let dynamic = model.coordinates.iter().filter(|c| !c.prescribed).count();
         ensure!(model.inputs.is_empty(), "the marionette moves by its strings alone");
-        let held: Vec<f64> = model.coordinates[dynamic..].iter().map(|c| c.initial).collect();
-        let mut rows = vec![held; STEPS];
-        for (name, sign) in MOVING_STRINGS {
-            let column = index_of(model, name)? - dynamic;
-            for (k, row) in rows.iter_mut().enumerate() {
-                let time_s = k as f64 * TIME_STEP_S;
-                row[column] += sign * AMPLITUDE_M * (FREQUENCY_RAD_S * time_s).sin();
-            }
+        let held = model.coordinates[dynamic..].iter().map(|c| c.initial).collect();
+        let moving =
+            MOVING_STRINGS.iter().map(|(name, sign)| Ok((index_of(model, name)? - dynamic, *sign)));
+        Ok(Self { dynamic, held, moving: moving.collect::<Result<_>>()? })
+    }
+
+    /// The input at a time.
+    pub(crate) fn at(&self, time_s: f64) -> Vec<f64> {
+        let mut u = self.held.clone();
+        for &(entry, sign) in &self.moving {
+            u[entry] += sign * AMPLITUDE_M * (FREQUENCY_RAD_S * time_s).sin();
         }
-        Ok(Self { dynamic, rows })
+        u
+    }
+
+    /// Those of the reference motion.
+    fn rows(&self) -> Vec<Vec<f64>> {
+        (0..STEPS).map(|k| self.at(k as f64 * TIME_STEP_S)).collect()
     }
 }
 
@@ -152,12 +163,8 @@ async fn create(client: &Client, initial: v1::initial_state::Form) -> Result<v1:
 
 /// The server simulates the reference, linearizes along it and solves for the gains. One for each
 /// step, and a last one that holds the final reference state only.
-async fn gains(
-    client: &Client,
-    start: v1::State,
-    reference: &ReferenceInput,
-) -> Result<Vec<v1::Gain>> {
-    let (coordinates, inputs) = (start.q.len(), reference.rows[0].len());
+async fn gains(client: &Client, start: v1::State, rows: &[Vec<f64>]) -> Result<Vec<v1::Gain>> {
+    let (coordinates, inputs) = (start.q.len(), rows[0].len());
     let states = 2 * coordinates;
     let mut q = vec![100.0; coordinates];
     q.resize(states, 1.0);
@@ -166,8 +173,7 @@ async fn gains(
         r: Some(diagonal(vec![1.0; inputs])),
         ..Default::default()
     };
-    let trajectory =
-        v1::Trajectory { initial: Some(start), u: Some(v1::Matrix::from_rows(&reference.rows)) };
+    let trajectory = v1::Trajectory { initial: Some(start), u: Some(v1::Matrix::from_rows(rows)) };
     let request = v1::SolveTrajectoryLqrRequest {
         model: MODEL.to_owned(),
         settings: Some(settings()),

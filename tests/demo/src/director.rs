@@ -2,20 +2,24 @@
 
 use std::io::IsTerminal as _;
 use std::path::{Path, PathBuf};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use indicatif::ProgressBar;
-use plantd_tests::server::{ServerProcess, binary};
+use plantd_process::{ServerProcess, binary};
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::controller::{Name, Process};
 use crate::latency::RoundTrips;
 use crate::report::Table;
-use crate::{marionette, pendulum, plots, report};
+use crate::{marionette, pendulum, plots, report, show};
 
-/// Shows everything; `false` if a number is off.
-pub(crate) fn run(output: &Path) -> Result<bool> {
+/// How long the show lasts where nobody can press a key.
+const SHOW: Duration = Duration::from_secs(30);
+
+/// Shows everything, plants that move first if `with_view`; `false` if a number is off.
+pub(crate) fn run(output: &Path, with_view: bool) -> Result<bool> {
     // Asked for first: building the server may put another file in this program's place.
     let program = std::env::current_exe()?;
     std::fs::create_dir_all(output)
@@ -24,28 +28,82 @@ pub(crate) fn run(output: &Path) -> Result<bool> {
     runtime.block_on(async {
         let mut interruption = std::pin::pin!(interrupted()?);
         let (mut server, memory) = start_server().await?;
-        let start = Instant::now();
+        let all = async {
+            println!("plantd, process {}, at {}", server.pid(), server.address());
+            if with_view {
+                show(&program, &server).await?;
+            }
+            let start = Instant::now();
+            Ok((compare(&program, &server, output).await?, start.elapsed()))
+        };
         // Whatever happens in between, the server is asked to leave and leaves nothing.
         let shown = tokio::select! {
-            shown = show(&program, &server, output) => shown,
+            shown = all => shown,
             () = &mut interruption => Err(anyhow::anyhow!("interrupted")),
         };
         let cleared = clear(&mut server, &memory);
-        let table = shown?;
+        let (table, time) = shown?;
         cleared?;
         println!();
         println!(
             "{} in {:.1} s; the server has ended and left nothing behind",
             table.verdict(),
-            start.elapsed().as_secs_f64()
+            time.as_secs_f64()
         );
         println!("plots and results: {}", output.display());
         Ok(table.is_good())
     })
 }
 
-async fn show(program: &Path, server: &ServerProcess, output: &Path) -> Result<Table> {
-    println!("plantd, process {}, at {}", server.pid(), server.address());
+/// Lets the plants of the show move until somebody has seen enough.
+async fn show(program: &Path, server: &ServerProcess) -> Result<()> {
+    let show = Process::start(program, Name::Show, server.address())?;
+    let url = format!("{}/?plant={}", server.address(), show::MARIONETTE);
+    println!();
+    println!("   The marionette dances and the pendulum is pushed (by process {}):", show.pid());
+    println!();
+    println!("       {url}");
+    println!();
+    let is_person = std::io::stdin().is_terminal();
+    if is_person {
+        open_in_browser(&url);
+        println!("   Press Enter for the numbers of the paper.");
+    } else {
+        println!("   The numbers of the paper follow in {} s.", SHOW.as_secs());
+    }
+    let enough =
+        async { if is_person { key_pressed().await } else { tokio::time::sleep(SHOW).await } };
+    tokio::select! {
+        ended = show.end() => match ended {
+            Ok(()) => bail!("the show has ended by itself"),
+            Err(error) => Err(error),
+        },
+        () = enough => Ok(()),
+    }
+}
+
+/// Opens an address where there is a display; whoever has none sees it printed.
+fn open_in_browser(url: &str) {
+    if ["DISPLAY", "WAYLAND_DISPLAY"].iter().any(|name| std::env::var_os(name).is_some()) {
+        let mut command = std::process::Command::new("xdg-open");
+        command.arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let _ = command.spawn();
+    }
+}
+
+/// Waits for a line on standard input, or for its end.
+async fn key_pressed() {
+    let (sender, pressed) = tokio::sync::oneshot::channel();
+    // A thread of its own: the runtime would wait for one of its threads.
+    std::thread::spawn(move || {
+        let _ = std::io::stdin().read_line(&mut String::new());
+        let _ = sender.send(());
+    });
+    let _ = pressed.await;
+}
+
+/// Runs the controllers, and compares what they report with the paper.
+async fn compare(program: &Path, server: &ServerProcess, output: &Path) -> Result<Table> {
     let mut table = Table::default();
 
     let (pid, pendulum) =
