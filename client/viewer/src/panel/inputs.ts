@@ -123,7 +123,7 @@ function make(model: Model, size: number): Entry[] {
       wanted,
       sent: wanted,
       slider: h("input", { type: "range", ...common, "aria-label": name }),
-      field: h("input", { type: "number", step: "any", value: number(wanted), "aria-label": `${name}, value` }),
+      field: h("input", { type: "number", step: "any", value: Number(wanted.toPrecision(4)), "aria-label": `${name}, value` }),
     };
   };
   return [
@@ -149,7 +149,7 @@ function row(entry: Entry): HTMLElement {
 
 function showValue(entry: Entry): void {
   entry.slider.value = String(entry.wanted);
-  if (document.activeElement !== entry.field) entry.field.value = number(entry.wanted, 4).replace("−", "-");
+  if (document.activeElement !== entry.field) entry.field.value = String(Number(entry.wanted.toPrecision(4)));
 }
 
 /** Wants another value, and takes the lease for it where one is needed. */
