@@ -294,6 +294,19 @@ impl Client {
         Ok(self.plants().pause(self.limited(request)).await?.into_inner())
     }
 
+    /// Takes the lease of a plant until the stream is dropped, for drivers that give inputs by calls of their own; the
+    /// one message names the lease for [`Client::set_input`].
+    pub async fn hold(&self, id: impl Into<String>) -> Result<Answers<v1::HoldResponse>> {
+        let request = v1::HoldRequest { id: id.into() };
+        self.open(self.plants().hold(request)).await
+    }
+
+    /// Gives a plant that runs by itself an input, under a lease of [`Client::hold`].
+    pub async fn set_input(&self, request: v1::SetInputRequest) -> Result<()> {
+        self.plants().set_input(self.limited(request)).await?;
+        Ok(())
+    }
+
     /// Sets the bounds that protect a plant, in place of those before.
     pub async fn set_safety(&self, request: v1::SetSafetyRequest) -> Result<()> {
         self.plants().set_safety(self.limited(request)).await?;

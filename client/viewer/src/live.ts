@@ -45,6 +45,7 @@ export async function describe(plant: string, signal?: AbortSignal): Promise<Sub
 /** One Watch stream of a plant, opened again whenever it breaks, closed while nobody looks. */
 export class Watcher {
   #ending = new AbortController();
+  #renewing = new AbortController();
   #before: Moment | undefined;
 
   constructor(
@@ -62,6 +63,11 @@ export class Watcher {
   ) {
     // Not before whoever makes it knows it.
     queueMicrotask(() => void this.#run());
+  }
+
+  /** Opens the stream anew: what is wanted, or what is computed for it, has changed. */
+  renew(): void {
+    this.#renewing.abort();
   }
 
   /** Ends it for good. */
@@ -115,11 +121,12 @@ export class Watcher {
     const fields = withPoles ? [...FIELDS, WatchField.POLES] : FIELDS;
     const request = { id: this.plant, fields, atMostHz: STATES_HZ };
     const inner = new AbortController();
+    this.#renewing = inner;
     signal.addEventListener("abort", () => inner.abort());
     for await (const message of plants.watch(request, { signal: inner.signal })) {
       arrived();
       this.told.connection("live");
-      if (message.generation !== subject.generation || this.told.wantsPoles() !== withPoles) {
+      if (message.generation !== subject.generation) {
         inner.abort();
         return;
       }
@@ -203,6 +210,16 @@ export function show(plant: string): void {
   watcher = mine;
   void look();
 }
+
+// A plant that stands still tells nothing by itself when poles are wanted, or when its feedback has changed.
+let told = "";
+const changed = (): void => {
+  const key = `${app.wantsPoles.get()} ${app.info.get()?.feedback?.revision ?? ""}`;
+  if (key !== told) watcher?.renew();
+  told = key;
+};
+app.wantsPoles.on(changed);
+app.info.on(changed);
 
 /** Id of the plant that is shown. */
 export function current(): string {

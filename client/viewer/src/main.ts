@@ -200,6 +200,7 @@ function followNext(): void {
 Object.defineProperty(window, "plantdView", {
   value: {
     drawn: () => view.drawn,
+    isDrawn: () => view.isDrawn,
     shown: () => ({ step: app.shown.get()?.step, q: app.shown.get()?.q, samples: plots.history.moments.length }),
     frames: () => view.figure?.frames.map(({ name, matrixWorld }) => ({ name, matrix: matrixWorld.toArray() })) ?? [],
     pixel: (name: string) => {
@@ -217,19 +218,20 @@ Object.defineProperty(window, "plantdView", {
 
 async function begin(): Promise<void> {
   const asked = new URLSearchParams(location.search);
-  await list();
-  follow();
   const file = asked.get("recording");
-  if (file !== null && /^[a-z0-9-]{1,63}$/.test(file)) {
-    await openRecording(file, () => download(file));
-    return;
-  }
-  if (file !== null) {
-    await openRecording(file, async () => {
+  if (file !== null && !/^[a-z0-9-]{1,63}$/.test(file)) {
+    // A recording at an address: there need be no plants where it comes from.
+    await openRecording(file.slice(file.lastIndexOf("/") + 1), async () => {
       const answer = await fetch(file);
       if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
       return new Uint8Array(await answer.arrayBuffer());
     });
+    return;
+  }
+  await list();
+  follow();
+  if (file !== null) {
+    await openRecording(file, () => download(file));
     return;
   }
   const plants = app.plants.get();

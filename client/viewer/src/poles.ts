@@ -105,8 +105,8 @@ export class PolePlot {
         h("thead", {}, h("tr", {}, h("th", {}, "|z|"), h("th", {}, "z"), h("th", {}, "motion"))),
         h("tbody", {}, ...sorted.slice(0, LISTED).map((pole) => {
           const { real, imaginary } = pole;
-          const text = imaginary === 0 ? number(real, 4) : `${number(real, 4)} ± ${number(imaginary, 3)}i`;
-          return h("tr", {}, h("td", {}, number(size(pole), 5)), h("td", {}, text), h("td", {}, motion(pole, this.#timeStep)));
+          const text = imaginary === 0 ? real.toFixed(3) : `${real.toFixed(3)} ± ${imaginary.toFixed(3)}i`;
+          return h("tr", {}, h("td", {}, size(pole).toFixed(4)), h("td", {}, text), h("td", {}, motion(pole, this.#timeStep)));
         })),
       );
     };

@@ -1,11 +1,10 @@
 // Recordings: MCAP files as plantd writes them, read in the browser.
 
-import { createFileRegistry, fromBinary, type DescMessage, type FileRegistry, type Message } from "@bufbuild/protobuf";
+import { create, createFileRegistry, fromBinary, type DescMessage, type Message } from "@bufbuild/protobuf";
 import { FileDescriptorSetSchema } from "@bufbuild/protobuf/wkt";
 import { McapStreamReader } from "@mcap/core";
 import { type Drawing, LineKind, type Poses, PosesSchema } from "./gen/plantd/v1/drawing_pb.js";
 import { PlantRecordSchema, type StepRecord, StepRecordSchema } from "./gen/plantd/v1/recording_pb.js";
-import { create } from "@bufbuild/protobuf";
 import { multiply, rotate, type Vector } from "./scene/poses.js";
 import type { Moment, Subject } from "./state.js";
 
@@ -30,12 +29,27 @@ interface Transforms {
   }[];
 }
 
+type Triple = { x: number; y: number; z: number };
+
+/** foxglove.SceneUpdate, as far as it is read: lines and arrows in the order of the drawing. */
+interface SceneUpdate {
+  entities: {
+    id: string;
+    metadata: { key: string; value: string }[];
+    lines: { points: Triple[] }[];
+    arrows: { pose?: { position?: Triple; orientation?: Triple & { w: number } }; shaftLength: number; headLength: number }[];
+  }[];
+}
+
+/** Name of the entity that has the lines and arrows. */
+const LINES = "lines";
+
 /** A recording that can be looked at step by step. */
 export class Recording {
   #steps: Entry[] = [];
   #transforms: Entry[] = [];
-  #transformsType: DescMessage | undefined;
-  #registry: FileRegistry | undefined;
+  #scenes: Entry[] = [];
+  #types = new Map<string, DescMessage | undefined>();
   readonly subject: Subject;
 
   constructor(name: string, bytes: Uint8Array) {
@@ -52,24 +66,19 @@ export class Recording {
       if (record.type === "Schema") schemas.set(record.id, record);
       else if (record.type === "Channel") {
         topics.set(record.id, record.topic);
-        if (record.topic === "/tf") this.#learn(schemas.get(record.schemaId));
+        if (record.topic === "/tf" || record.topic === "/scene") this.#types.set(record.topic, type(schemas.get(record.schemaId)));
       } else if (record.type === "Message") {
         const topic = topics.get(record.channelId);
         const entry = { time: Number(record.publishTime) / 1e9, data: record.data };
         if (topic === "/plant") plant = describe(name, record.data);
         else if (topic === "/step" && this.#steps.length < RECORDS_MAX) this.#steps.push(entry);
         else if (topic === "/tf" && this.#transforms.length < RECORDS_MAX) this.#transforms.push(entry);
+        else if (topic === "/scene" && this.#scenes.length < RECORDS_MAX) this.#scenes.push(entry);
       }
     }
     if (!plant) throw new Error("is no recording of plantd: it has no topic /plant");
     if (this.#steps.length === 0) throw new Error("holds no step");
     this.subject = plant;
-  }
-
-  #learn(schema: { name: string; data: Uint8Array } | undefined): void {
-    if (!schema) return;
-    this.#registry = createFileRegistry(fromBinary(FileDescriptorSetSchema, schema.data));
-    this.#transformsType = this.#registry.getMessage(schema.name);
   }
 
   /** Number of steps in it. */
@@ -120,11 +129,40 @@ export class Recording {
   }
 
   #poses(time: number): Poses | undefined {
-    const entry = this.#transforms[Math.max(0, before(this.#transforms, time + 1e-9))];
-    if (!entry || !this.#transformsType) return undefined;
-    const message = fromBinary(this.#transformsType, entry.data) as Message & Partial<Transforms>;
-    return assemble(this.subject.drawing, message.transforms ?? []);
+    const transforms = this.#decode<Transforms>("/tf", this.#transforms, time);
+    if (!transforms) return undefined;
+    const scene = this.#decode<SceneUpdate>("/scene", this.#scenes, time);
+    const poses = assemble(this.subject.drawing, transforms.transforms);
+    const moving = scene?.entities.find(({ id }) => id === LINES);
+    if (moving) overlay(this.subject.drawing, poses, moving);
+    return poses;
   }
+
+  /** The last message of a topic at a time or before it; the first one before that. */
+  #decode<T>(topic: string, entries: Entry[], time: number): T | undefined {
+    const entry = entries[Math.max(0, before(entries, time))];
+    const type = this.#types.get(topic);
+    return entry && type ? (fromBinary(type, entry.data) as Message & T) : undefined;
+  }
+}
+
+/** The type of a topic's messages, by the descriptors in the file. */
+function type(schema: { name: string; data: Uint8Array } | undefined): DescMessage | undefined {
+  return schema && createFileRegistry(fromBinary(FileDescriptorSetSchema, schema.data)).getMessage(schema.name);
+}
+
+/** Puts the recorded lines and arrows into poses. */
+function overlay(drawing: Drawing, poses: Poses, { lines, arrows, metadata }: SceneUpdate["entities"][number]): void {
+  const points = lines.flatMap((line) => line.points.flatMap(({ x, y, z }) => [x, y, z]));
+  if (points.length === poses.points.length) poses.points = points;
+  const scale = (key: string): number => Number(metadata.find((each) => each.key === key)?.value ?? NaN);
+  const [perNewton, perNewtonMetre] = [scale("metres_per_newton"), scale("metres_per_newton_metre")];
+  poses.arrows = arrows.flatMap(({ pose, shaftLength, headLength }, index) => {
+    const { x = 0, y = 0, z = 0 } = pose?.position ?? {};
+    const { w = 1, x: i = 0, y: j = 0, z: k = 0 } = pose?.orientation ?? {};
+    const size = (shaftLength + headLength) / (drawing.arrows[index]?.torque ? perNewtonMetre : perNewton);
+    return [x, y, z, ...rotate([w, i, j, k], [size, 0, 0])];
+  });
 }
 
 function before(entries: Entry[], time: number): number {

@@ -1,6 +1,6 @@
 // Tests of the page in a real browser against a real server.
 //
-//   npm test -- --server PATH [--pictures FOLDER]
+//   npm test -- --server PATH [--pictures FOLDER] [--only WORDS]
 //
 // Without Chromium it says so and ends with 77.
 
@@ -12,7 +12,7 @@ import { connect, Pace } from "./api.mjs";
 import { chromium, launch, Server } from "./browser.mjs";
 
 const SKIPPED = 77;
-const { values: options } = parseArgs({ options: { server: { type: "string" }, pictures: { type: "string" } } });
+const { values: options } = parseArgs({ options: { server: { type: "string" }, pictures: { type: "string" }, only: { type: "string" } } });
 if (!options.server) {
   console.error("usage: npm test -- --server PATH [--pictures FOLDER]");
   process.exit(2);
@@ -69,7 +69,7 @@ async function run(id, speed = 1) {
   await api.plants.run({ id, settings: { pace: Pace.PACED, speed } });
 }
 
-const shows = (page, id) => until(page, `${id} to be seen`, () => window.plantdView?.frames().length > 0 && window.plantdView.shown().step !== undefined && window.plantdView.drawn() > 1);
+const shows = (page, id) => until(page, `${id} to be seen`, () => window.plantdView?.frames().length > 0 && window.plantdView.shown().step !== undefined && window.plantdView.isDrawn());
 
 const tests = {
   async "the canvas shows something"() {
@@ -99,11 +99,7 @@ const tests = {
       await shows(page, id);
       await api.plants.step({ id, hold: 37 });
       await until(page, "step 37", () => window.plantdView.shown().step === 37);
-      // The picture after the one in which the state arrived.
-      const drawn = await page.evaluate(() => window.plantdView.drawn());
-      await page.evaluate(() => window.dispatchEvent(new Event("resize")));
-      await until(page, "a picture", (before) => window.plantdView.drawn() >= before, drawn);
-      await new Promise((resolve) => setTimeout(resolve, 300));
+      await until(page, "the picture of it", () => window.plantdView.isDrawn());
       const frames = await page.evaluate(() => window.plantdView.frames());
       const { frames: truth } = await api.control.kinematics({ state: { plant: id } });
       const known = new Map(truth.map((each) => [each.frame, each]));
@@ -351,6 +347,7 @@ let failed = 0;
 try {
   if (options.pictures) await pictures(options.pictures);
   for (const [name, test] of Object.entries(tests)) {
+    if (options.only && !name.includes(options.only)) continue;
     try {
       await test();
       if (troubles.length > 0) throw new Error(troubles.splice(0).join("; "));
@@ -360,6 +357,11 @@ try {
       troubles.length = 0;
       expectsTrouble = false;
       console.log(`FAILED  ${name}\n        ${error.message}`);
+      for (const page of (await browser.pages()).slice(1)) {
+        const told = await page.evaluate(() => document.getElementById("notice")?.textContent ?? "").catch(() => "");
+        if (told !== "") console.log(`        the page says: ${told}`);
+        await page.close();
+      }
     }
   }
 } finally {

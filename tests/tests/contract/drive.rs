@@ -45,6 +45,54 @@ async fn a_driver_that_dies_gives_up_the_lease() {
 }
 
 #[tokio::test]
+async fn a_lease_is_held_without_a_stream_of_inputs() {
+    let (_server, client) = server().await;
+    let id = plant(&client, "cart-pole").await.id;
+    let mut lease = client.hold(&id).await.unwrap();
+    let held = soon(lease.next()).await.unwrap().unwrap();
+    assert_eq!(held.plant.unwrap().id, id);
+    assert_eq!(client.get_plant(&id).await.unwrap().plant.unwrap().driver, "drive");
+    assert_refused(client.drive(&id).await, Code::FailedPrecondition, "LEASE_HELD", "");
+
+    let input = |token: &str, u: &[f64]| v1::SetInputRequest {
+        id: id.clone(),
+        lease_token: token.to_owned(),
+        u: u.to_vec(),
+        sequence: 7,
+    };
+    let token = &held.lease_token;
+    let set = client.set_input(input(token, &[2.0])).await;
+    assert_refused(set, Code::FailedPrecondition, "LOCKSTEP", "");
+    let settings = v1::RunSettings { pace: v1::Pace::Paced.into(), ..Default::default() };
+    let run = v1::RunRequest { id: id.clone(), settings: Some(settings), ..Default::default() };
+    client.run(run).await.unwrap();
+    let set = client.set_input(input("0", &[2.0])).await;
+    assert_refused(set, Code::FailedPrecondition, "LEASE_LOST", "");
+    let set = client.set_input(input(token, &[2.0, 0.0])).await;
+    assert_refused(set, Code::InvalidArgument, "INPUT_DIMENSION", "");
+    client.set_input(input(token, &[2.0])).await.unwrap();
+    let fields = vec![v1::WatchField::Input.into(), v1::WatchField::Timing.into()];
+    let request = v1::WatchRequest { id: id.clone(), fields, ..Default::default() };
+    let mut states = client.watch(request).await.unwrap();
+    loop {
+        let state = soon(states.next()).await.unwrap().unwrap();
+        if state.u == [2.0] {
+            assert_eq!(state.timing.unwrap().input_sequence, 7);
+            break;
+        }
+    }
+
+    drop(lease);
+    let deadline = Instant::now() + Duration::from_secs(30);
+    while !client.get_plant(&id).await.unwrap().plant.unwrap().driver.is_empty() {
+        assert!(Instant::now() < deadline, "the lease is never given up");
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let set = client.set_input(input(token, &[1.0])).await;
+    assert_refused(set, Code::FailedPrecondition, "LEASE_LOST", "");
+}
+
+#[tokio::test]
 async fn a_bad_input_is_answered_in_band_and_the_stream_goes_on() {
     let (_server, client) = server().await;
     let id = plant(&client, "cart-pole").await.id;

@@ -3,6 +3,7 @@
 mod python;
 mod stage;
 mod tools;
+mod viewer;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
@@ -31,6 +32,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "doctests", quick: false, run: doctests },
     Stage { name: "stress", quick: false, run: stress },
     Stage { name: "python", quick: false, run: python::test_client },
+    Stage { name: "viewer", quick: false, run: viewer::test_page },
     Stage { name: "demo", quick: false, run: demo },
 ];
 

@@ -35,6 +35,11 @@ const TOOLS: &[Tool] = &[
         probe: ("python3", &["-c", "import venv, ensurepip"]),
         package: "python3-venv",
     },
+    Tool {
+        purpose: "the page in a browser",
+        probe: ("chromium", &["--version"]),
+        package: "chromium",
+    },
 ];
 
 /// Whether the command runs and succeeds.

@@ -123,7 +123,7 @@ function make(model: Model, size: number): Entry[] {
       wanted,
       sent: wanted,
       slider: h("input", { type: "range", ...common, "aria-label": name }),
-      field: h("input", { type: "number", step: "any", value: number(wanted), "aria-label": `${name}, value` }),
+      field: h("input", { type: "number", step: "any", value: Number(wanted.toPrecision(4)), "aria-label": `${name}, value` }),
     };
   };
   return [
@@ -149,15 +149,20 @@ function row(entry: Entry): HTMLElement {
 
 function showValue(entry: Entry): void {
   entry.slider.value = String(entry.wanted);
-  if (document.activeElement !== entry.field) entry.field.value = number(entry.wanted, 4).replace("−", "-");
+  if (document.activeElement !== entry.field) entry.field.value = String(Number(entry.wanted.toPrecision(4)));
 }
 
 /** Wants another value, and takes the lease for it where one is needed. */
 function want(entry: Entry, value: number): void {
   entry.wanted = value;
   showValue(entry);
+  if (!lease) void takeUnlessLockstep();
+}
+
+async function takeUnlessLockstep(): Promise<void> {
+  if (!app.info.get()?.run) await look();
   const run = app.info.get()?.run;
-  if (!lease && run && run.settings?.pace !== Pace.LOCKSTEP) void takeLease();
+  if (run && run.settings?.pace !== Pace.LOCKSTEP) await takeLease();
 }
 
 /** Takes the lease, and holds it until it is given back. */

@@ -9,7 +9,7 @@ import { section } from "./section.js";
 export function poles(): void {
   const part = section("poles", "Poles", true);
   const canvas = h("canvas", { id: "pole-canvas", tabindex: "0", role: "img", "aria-label": "Poles and the unit circle. Plus and minus zoom about 1, 0 shows all." });
-  const list = h("div", { class: "matrix", id: "pole-list" });
+  const list = h("div", { id: "pole-list" });
   const hint = h("p", { class: "hint" }, "Eigenvalues of the linearized map at the state on the screen.");
   const whole = h("button", { type: "button", class: "chip" }, "Circle");
   const near = h("button", { type: "button", class: "chip" }, "Near 1");

@@ -76,6 +76,11 @@ export class View {
     this.#isStale = true;
   }
 
+  /** All changes are on the canvas. */
+  get isDrawn(): boolean {
+    return !this.#isStale;
+  }
+
   get figure(): Figure | undefined {
     return this.#figure;
   }
@@ -265,6 +270,7 @@ export class View {
   /** Where a point of the world is in the window. */
   pixel(point: Vector3): { x: number; y: number } {
     const area = this.canvas.getBoundingClientRect();
+    this.camera.updateMatrixWorld();
     const at = point.clone().project(this.camera);
     return { x: area.left + ((at.x + 1) / 2) * area.width, y: area.top + ((1 - at.y) / 2) * area.height };
   }
