@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
+use plantd_models::scene::in_plain_words;
 use plantd_proto::link::Wait;
 use serde::{Deserialize, Serialize};
 
@@ -247,12 +248,14 @@ pub enum ConfigError {
         cause: std::io::Error,
     },
     /// The file is not a configuration.
-    #[error("configuration file `{path}`: {cause}")]
+    #[error("configuration file `{path}`, line {line}: {problem}")]
     Parse {
         /// Path.
         path: PathBuf,
-        /// Cause; names the key.
-        cause: Box<toml::de::Error>,
+        /// Line, from 1.
+        line: usize,
+        /// What is wrong; names the key.
+        problem: String,
     },
     /// A value is out of range.
     #[error("{key} is {value}; it must lie between 0 and {max}")]
@@ -299,8 +302,15 @@ impl Config {
     pub fn from_file(path: &Path) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path)
             .map_err(|cause| ConfigError::Read { path: path.to_owned(), cause })?;
-        toml::from_str(&text)
-            .map_err(|cause| ConfigError::Parse { path: path.to_owned(), cause: cause.into() })
+        toml::from_str(&text).map_err(|error: toml::de::Error| {
+            let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
+            let line = before.matches('\n').count() + 1;
+            ConfigError::Parse {
+                path: path.to_owned(),
+                line,
+                problem: in_plain_words(error.message()),
+            }
+        })
     }
 
     /// Refuses values that are out of range.
@@ -437,8 +447,10 @@ mod tests {
             ("[limits]\nplant = 3", "plant"),
             ("[link]\nwait = \"poll\"\nrooot = \"/\"", "rooot"),
         ] {
-            let error = toml::from_str::<Config>(text).unwrap_err().to_string();
-            assert!(error.contains(key), "{error}");
+            let file = tempfile::NamedTempFile::new().unwrap();
+            std::fs::write(file.path(), text).unwrap();
+            let error = Config::from_file(file.path()).unwrap_err().to_string();
+            assert!(error.contains(&format!("there is no key `{key}`")), "{error}");
         }
     }
 

@@ -1,17 +1,15 @@
-"""Balances the pendulum upright over gRPC: python pendulum_lqr.py [ADDRESS]"""
+"""Balances the pendulum upright: python pendulum_lqr.py [ADDRESS]; by default on a server of its own."""
 
 import math
 import sys
 
 import plantd
 
-address = sys.argv[1] if len(sys.argv) > 1 else "http://127.0.0.1:50051"
-with plantd.connect(address) as client:
-    gain = client.solve_lqr("pendulum", at="upright", q=[100, 1], r=[1])
-    plant = client.create_plant("pendulum", q=[math.pi - 0.2])
-    state = plant.state
-    with client.drive(plant.id) as driver:
+client = plantd.connect(sys.argv[1]) if len(sys.argv) > 1 else plantd.launch()
+with client, client.plant("pendulum", q=[math.pi - 0.2]) as plant:
+    law = plant.lqr(at="upright", q=[100, 1], r=[1])
+    with plant.drive() as driver:
+        state = driver.plant.state
         for _ in range(50):
-            state = driver.step(gain(state))
+            state = driver.step(law(state))
             print(f"{state.time:5.2f} s  angle from upright {state.q[0] - math.pi:+.6f} rad")
-    client.delete_plant(plant.id)

@@ -35,6 +35,7 @@ def test_a_plant_that_is_kept_stays(client):
     assert plant.state.step == 0
     with client.plant("pendulum", keep=True) as other:
         pass
+    assert other.info.expires == 0
     assert {p.id for p in client.list_plants()} == {plant.id, other.id}
     plant.delete()
 

@@ -96,7 +96,7 @@ limits! {
     max_substeps = 256 in 1..=256;
     /// Coordinates times stages of a plant of an order above 2, of which half the order are the stages.
     stage_coordinates = 1024 in 1..=393_216;
-    /// Steps of one Step call.
+    /// Steps of one Step call, or of all plants of a StepMany call together.
     steps_per_call = 100_000 in 1..=1_000_000_000;
     /// Steps of a trajectory, or of one rollout case.
     horizon = 100_000 in 1..=1_000_000_000;

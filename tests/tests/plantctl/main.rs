@@ -534,7 +534,7 @@ fn errors_of_the_configuration_are_printed_once() {
     std::fs::write(&file, "bogus = 3\n").unwrap();
     let file = file.to_str().unwrap();
     for (arguments, said) in [
-        (["--config", file], "unknown field `bogus`"),
+        (["--config", file], "line 1: there is no key `bogus`"),
         (["--config", "/nowhere/plantd.toml"], "No such file"),
         (["--limit", "plant=3"], "there is no limit `plant`"),
     ] {

@@ -17,7 +17,7 @@ pub(crate) fn lint_proto(context: &mut Context) -> Outcome {
     run(lint.args(["lint", "proto"]).current_dir(&context.root))
 }
 
-/// Installs the Python client and runs its tests against a real server.
+/// Installs the Python client, runs its tests against a real server, and checks its types.
 pub(crate) fn test_client(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment(context)?;
@@ -26,7 +26,10 @@ pub(crate) fn test_client(context: &mut Context) -> Outcome {
     run(&mut install)?;
     let mut test = Command::new(environment.join("bin/python"));
     test.args(["-m", "pytest", "client/python/tests"]).current_dir(&context.root);
-    run(test.env("PLANTD_SERVER", context.binaries().join("plantd")))
+    run(test.env("PLANTD_SERVER", context.binaries().join("plantd")))?;
+    let mut types = Command::new(environment.join("bin/mypy"));
+    types.args(["--config-file", "client/python/pyproject.toml", "--package", "plantd"]);
+    run(types.current_dir(&context.root))
 }
 
 /// The environment's folder; creates the environment if it is not there.

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 _R = TypeVar("_R")
 
+#: How long a plant is kept that nobody uses and nobody has deleted.
+_EXPIRES_SECONDS = 3600.0
+
 
 def _by_id(
     call: Callable[Concatenate[Any, str, _P], _R],
@@ -83,7 +86,7 @@ class PlantHandle:
                 raise
 
     def keep(self) -> None:
-        """Lets it live on after the block. Its time to live without use goes on counting."""
+        """Lets it live on after the block, for as long as somebody uses it: ``expires`` goes on to hold."""
         self._kept = True
 
     delete = _by_id(PlantCalls.delete_plant)
@@ -279,15 +282,18 @@ class HandleCalls(PlantCalls):
         initial: common_pb2.InitialState | None = None,
         open_link: bool = False,
         tolerance: float = 0.0,
-        expires: float = 3600.0,
+        expires: float | None = None,
         keep: bool = False,
         **stepping: Unpack[Stepping],
     ) -> PlantHandle:
         """Creates a plant for a ``with`` statement, which deletes it at the end of the block.
 
         Arguments are those of `create_plant`. Where the script is killed before the end, the server
-        deletes the plant when nobody has used it for ``expires`` seconds. ``keep`` lets it live on.
+        deletes the plant when nobody has used it for ``expires`` seconds, by default an hour. ``keep`` lets
+        it live on, by default without such a bound.
         """
+        if expires is None:
+            expires = 0.0 if keep else _EXPIRES_SECONDS
         plant = self.create_plant(
             model,
             id=id,

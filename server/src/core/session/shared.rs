@@ -113,6 +113,9 @@ impl Session {
 
     /// Nobody has used it for as long as it is to be kept.
     pub fn is_expired(&self) -> bool {
+        if self.life.expires().is_none() {
+            return false;
+        }
         if self.driver().is_some() || self.feed.watchers.count() > 0 {
             self.life.touch();
         }
