@@ -31,6 +31,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "doctests", quick: false, run: doctests },
     Stage { name: "stress", quick: false, run: stress },
     Stage { name: "python", quick: false, run: python::test_client },
+    Stage { name: "robots", quick: false, run: python::compare_robots },
     Stage { name: "demo", quick: false, run: demo },
 ];
 
