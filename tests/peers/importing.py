@@ -1,9 +1,12 @@
 """What the comparisons of imported robots share: the import, the cells of a table, and the table."""
 
 import argparse
+import contextlib
 import json
 import pathlib
 import subprocess
+import tempfile
+import time
 import tomllib
 
 import plantd
@@ -14,10 +17,37 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 def arguments(doc, files):
     """Where the server and the binaries are, and files in place of the published ones."""
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
-    parser.add_argument("--server", default="http://127.0.0.1:50051")
+    parser.add_argument("--server", help="address of one that runs; by default one is started for the comparison")
     parser.add_argument("--binaries", type=pathlib.Path, default=ROOT / "target" / "release")
+    parser.add_argument("--few", action="store_true", help="compare a choice, and write no table")
     parser.add_argument(files, nargs="*", type=pathlib.Path)
     return parser.parse_args()
+
+
+@contextlib.contextmanager
+def connected(options):
+    """A client of the server that is named, or of one that lives as long."""
+    if options.server:
+        with plantd.connect(options.server) as client:
+            yield client
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        ready = pathlib.Path(folder) / "ready.json"
+        command = [options.binaries / "plantd", "serve", "--grpc", "127.0.0.1:0", "--ready-file", ready]
+        with (pathlib.Path(folder) / "log").open("w+") as log:
+            server = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            try:
+                deadline = time.monotonic() + 60
+                while not ready.exists():
+                    if server.poll() is not None or time.monotonic() > deadline:
+                        log.seek(0)
+                        raise SystemExit(f"the server did not start: {log.read()}")
+                    time.sleep(0.01)
+                with plantd.connect(json.loads(ready.read_text())["grpc"]) as client:
+                    yield client
+            finally:
+                server.terminate()
+                server.wait()
 
 
 def imported(plantctl, file, *flags, without=()):
@@ -44,7 +74,7 @@ def cell(scene, refusal, compare, bars):
     if worst is None:
         return "nothing moves", True
     is_good = all(value < bar for value, bar in zip(worst, bars))
-    return f"{count}: {worst[0]:.0e}, {worst[1]:.0e}", is_good
+    return f"{count}: {', '.join(f'{value:.0e}' for value in worst)}", is_good
 
 
 def write(file, title, text, script, columns, rows):

@@ -2,7 +2,7 @@
 
   pip install mujoco dm_control gymnasium ./client/python
   cargo build --release -p plantd-server -p plantd-client
-  python3 tests/peers/models.py [--server http://127.0.0.1:50051] [MODEL.xml ...]
+  python3 tests/peers/models.py [--few] [--server http://127.0.0.1:50051] [MODEL.xml ...]
 
 Each model is imported with `plantctl import`, its scene uploaded to a running server, and looked at in three
 random states: the mass matrix by the momenta of unit velocities, and the accelerations with springs, dampers,
@@ -21,9 +21,14 @@ import mujoco
 import numpy as np
 
 import plantd
-from importing import arguments, cell, imported, write
+from importing import arguments, cell, connected, imported, write
 
 FOLDERS = {"dm_control": "suite", "gymnasium": "envs/mujoco/assets"}
+#: Of each kind one, for a quick look.
+FEW = [
+    *(f"dm_control/{name}.xml" for name in ("cartpole", "finger", "fish", "humanoid_CMU", "manipulator", "swimmer")),
+    *(f"gymnasium/{name}.xml" for name in ("ant", "humanoid", "pusher", "walker2d_v5")),
+]
 
 
 def published():
@@ -122,16 +127,19 @@ def compared(client, scene, file):
 
 def main():
     options = arguments(__doc__, "models")
+    files = [(file.name, file) for file in options.models] or list(published())
+    if options.few:
+        files = [(name, file) for name, file in files if name in FEW]
     rows, is_good = [], True
-    with plantd.connect(options.server) as client:
-        for name, file in [(file.name, file) for file in options.models] or published():
+    with connected(options) as client:
+        for name, file in files:
             scene = smooth(options.binaries / "plantctl", file)
             compare = lambda scene: compared(client, scene, file)
             text, is_close = cell(*scene, compare, (1e-9, 1e-7))
             is_good &= is_close
             rows.append(f"| {name} | {text} |")
             print(rows[-1], flush=True)
-    if not options.models:
+    if not options.models and not options.few:
         versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in FOLDERS)
         text = f"The MJCFs of {versions}, imported, and MuJoCo {mujoco.__version__}: the number of coordinates, and the largest differences of the mass matrix and of the accelerations (springs, dampers, armature and actuators included) over their largest entries, in three random states."
         title = "Models in MJCF beside MuJoCo"

@@ -2,12 +2,13 @@
 
   pip install pin example-robot-data ./client/python
   cargo build --release -p plantd-server -p plantd-client
-  python3 tests/peers/robots.py [--server http://127.0.0.1:50051] [ROBOT.urdf ...]
+  python3 tests/peers/robots.py [--few] [--server http://127.0.0.1:50051] [ROBOT.urdf ...]
 
 Each robot is imported with `plantctl import`, once held by the world and once with a free base, its scene
 uploaded to a running server, and looked at in three random states: the mass matrix by the momenta of unit
-velocities, the bias forces by the accelerations that follow. Couplings, damping and friction are taken out
-before: Pinocchio has none of them.
+velocities and by `Dynamics`, the bias forces by the accelerations that follow and by `Dynamics`, with gravity and
+inverse dynamics; poses, velocities and Jacobians of frames and the centre of mass by `Kinematics`. Couplings,
+damping and friction are taken out before: Pinocchio has none of them.
 """
 
 import json
@@ -19,9 +20,11 @@ import numpy as np
 import pinocchio as pin
 
 import plantd
-from importing import arguments, cell, imported, write
+from importing import arguments, cell, connected, imported, write
 
 SHARE = pathlib.Path(pin.__file__).parents[4] / "share/example-robot-data/robots"
+#: Of each kind one, for a quick look.
+FEW = ["panda", "allegro_left_hand", "go2", "iris_simple", "ur5_robot", "double_pendulum", "talos_reduced"]
 BASES = {"fixed": None, "free": "root_joint"}
 
 
@@ -62,8 +65,35 @@ def state(model, places, rng):
     return q, own, v, turn, drift
 
 
+def off(found, expected):
+    """The largest difference over the largest entry."""
+    return abs(found - expected).max() / max(abs(expected).max(), 1e-300)
+
+
+def kinematics(model, data, motion, places, q, v, turn):
+    """The largest difference of poses, velocities and Jacobians of links and the centre of mass."""
+    pin.forwardKinematics(model, data, q, turn @ v)
+    pin.updateFramePlacements(model, data)
+    pin.computeJointJacobians(model, data, q)
+    worst, axes = 0.0, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    for index, frame in enumerate(model.frames):
+        own = motion.frames.get(plain(frame.name)) if frame.type == pin.FrameType.BODY else None
+        if own is None:
+            continue
+        pose, (w, x, y, z) = data.oMf[index], own.orientation
+        turned = pin.Quaternion(w, x, y, z).toRotationMatrix()
+        jacobian = pin.getFrameJacobian(model, data, index, axes) @ turn
+        speed = pin.getFrameVelocity(model, data, index, axes).vector
+        worst = max(worst, abs(own.position - pose.translation).max(), abs(turned - pose.rotation).max())
+        worst = max(worst, abs(own.jacobian[:, places] - jacobian).max() / max(abs(jacobian).max(), 1))
+        velocity = np.concatenate([own.linear_velocity, own.angular_velocity])
+        worst = max(worst, abs(velocity - speed).max() / max(abs(speed).max(), 1))
+    center = pin.centerOfMass(model, data, q)
+    return max(worst, abs(motion.center_of_mass.position - center).max())
+
+
 def compared(client, scene, file, base):
-    """Freedoms, and the largest differences of mass matrix and bias over their largest entries."""
+    """Freedoms, and the largest differences of mass matrix, forces and kinematics over their largest entries."""
     parts = [str(file)] if base == "fixed" else [str(file), pin.JointModelFreeFlyer()]
     model = pin.buildModelFromUrdf(*parts)
     data = model.createData()
@@ -76,7 +106,7 @@ def compared(client, scene, file, base):
         places = columns(model, names, root)
         if len(places) != len(names):
             raise ValueError(f"{len(names)} coordinates instead of {len(places)}")
-        rng, worst = np.random.default_rng(1), np.zeros(2)
+        rng, worst = np.random.default_rng(1), np.zeros(3)
         plant = client.create_plant(made.name)
         put = lambda values: np.array(values)[np.argsort(places)]
         for _ in range(3):
@@ -90,6 +120,19 @@ def compared(client, scene, file, base):
             worst[0] = max(worst[0], abs(np.array(found).T - peer).max() / abs(peer).max())
             acceleration = client.evaluate_dynamics(made.name, put(own), put(v)).acceleration[places]
             worst[1] = max(worst[1], abs(peer @ acceleration + bias).max() / max(abs(bias).max(), 1e-300))
+            asked = rng.normal(size=model.nv)
+            own_terms = client.dynamics(made.name, q=put(own), v=put(v), acceleration=put(asked))
+            rest = turn.T @ pin.computeGeneralizedGravity(model, data, q)
+            at = np.ix_(places, places)
+            worst[0] = max(worst[0], off(own_terms.mass_matrix[at], peer))
+            for found, expected in [
+                (own_terms.bias[places], bias),
+                (own_terms.gravity[places], rest),
+                (own_terms.inverse.force[places], peer @ asked + bias),
+            ]:
+                worst[1] = max(worst[1], off(found, expected))
+            motion = client.kinematics(made.name, q=put(own), v=put(v), jacobians=True)
+            worst[2] = max(worst[2], kinematics(model, data, motion, places, q, v, turn))
         client.delete_plant(plant.id)
         return len(names), worst
     finally:
@@ -99,24 +142,26 @@ def compared(client, scene, file, base):
 def main():
     options = arguments(__doc__, "robots")
     files = options.robots or sorted(SHARE.rglob("*.urdf"))
+    if options.few:
+        files = [file for file in files if file.stem in FEW]
     rows, is_good = [], True
     # What Pinocchio does not have.
     without = ("constraints", "forces", "coordinates")
-    with plantd.connect(options.server) as client:
+    with connected(options) as client:
         for file in files:
             cells = []
             for base in BASES:
                 flags = ("--base", base, "--inputs", "none")
                 scene = imported(options.binaries / "plantctl", file, *flags, without=without)
                 compare = lambda scene: compared(client, scene, file, base)
-                text, is_close = cell(*scene, compare, (1e-9, 1e-9))
+                text, is_close = cell(*scene, compare, (1e-9, 1e-9, 1e-9))
                 cells.append(text)
                 is_good &= is_close
             name = file.relative_to(SHARE) if file.is_relative_to(SHARE) else file.name
             rows.append(f"| {name} | {' | '.join(cells)} |")
             print(rows[-1], flush=True)
-    if not options.robots:
-        text = f"Every URDF of example-robot-data 6.0.0, imported, and Pinocchio {pin.__version__}: the number of coordinates, and the largest differences of the mass matrix and of the bias forces over their largest entries, in three random states; held by the world, and with a free base."
+    if not options.robots and not options.few:
+        text = f"Every URDF of example-robot-data 6.0.0, imported, and Pinocchio {pin.__version__}: the number of coordinates, and the largest differences of the mass matrix, of the forces (bias, gravity, inverse dynamics) and of poses, velocities, Jacobians and centre of mass over their largest entries, in three random states; held by the world, and with a free base."
         columns = ("robot", "held", "free")
         write("ROBOTS.md", "Robots in URDF beside Pinocchio", text, "robots.py", columns, rows)
     sys.exit(0 if is_good else 1)

@@ -33,6 +33,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "stress", quick: false, run: stress },
     Stage { name: "python", quick: false, run: python::test_client },
     Stage { name: "viewer", quick: false, run: viewer::test_page },
+    Stage { name: "robots", quick: false, run: python::compare_robots },
     Stage { name: "demo", quick: false, run: demo },
 ];
 

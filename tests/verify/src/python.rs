@@ -32,6 +32,34 @@ pub(crate) fn test_client(context: &mut Context) -> Outcome {
     run(types.current_dir(&context.root))
 }
 
+/// Robots and the engines that they are compared with; what cannot be had is told.
+const PEERS: [(&str, &[&str]); 2] = [
+    ("robots.py", &["pin==4.1.0", "example-robot-data==6.0.0"]),
+    ("models.py", &["mujoco==4.0.0", "dm_control", "gymnasium"]),
+];
+
+/// Imports a choice of published robots and compares them with the engines for which they were made.
+pub(crate) fn compare_robots(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    let environment = environment(context)?;
+    let pip = |packages: &[&str]| {
+        let mut install = Command::new(environment.join("bin/pip"));
+        run(install.args(["install", "--quiet"]).args(packages).current_dir(&context.root))
+    };
+    pip(&["client/python"])?;
+    let mut absent = Vec::new();
+    for (script, packages) in PEERS {
+        if pip(packages).is_err() {
+            absent.push(format!("no {}: {script}", packages.join(", ")));
+            continue;
+        }
+        let mut compare = Command::new(environment.join("bin/python"));
+        compare.arg(context.root.join("tests/peers").join(script)).arg("--few");
+        run(compare.arg("--binaries").arg(context.binaries()).current_dir(context.scratch()))?;
+    }
+    if absent.is_empty() { Ok(()) } else { Err(Failure::Skipped(absent.join("; "))) }
+}
+
 /// The environment's folder; creates the environment if it is not there.
 fn environment(context: &Context) -> Result<PathBuf, Failure> {
     let path = context.scratch().join("venv");
