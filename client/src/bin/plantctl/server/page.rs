@@ -206,7 +206,7 @@ fn pieces(file: File, from: u64, end: u64) -> Body {
             Err(error) => Some((Err(error), (file, end))),
         }
     };
-    BodyExt::boxed(StreamBody::new(stream::unfold((file, from), piece)))
+    StreamBody::new(stream::unfold((file, from), piece)).boxed()
 }
 
 #[cfg(test)]
