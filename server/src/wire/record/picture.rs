@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use mcap::McapError;
 use plantd_models::drawing::{Drawing, Instant, Poses};
-use plantd_models::{Energy, Model, Plant};
+use plantd_models::{Energy, Model, Plant, Settings};
 use plantd_proto::v1;
 
 use crate::core::publish::frame::Frame;
@@ -20,8 +20,7 @@ const DRAWN_MAX: usize = 32;
 
 /// Draws a plant into its recording.
 pub(super) struct Picture {
-    /// Settings and memory for energies.
-    plant: Plant,
+    settings: Settings,
     /// The models that have been in force, the present one last.
     drawn: Vec<Drawn>,
     /// Which hundredth of a second has been drawn.
@@ -31,32 +30,29 @@ pub(super) struct Picture {
 
 /// A model as it is drawn.
 struct Drawn {
-    plant: Plant,
+    digest: u64,
+    /// For energies; none where changed numbers make of the scene's initial configuration a guess.
+    plant: Option<Plant>,
     drawing: Drawing,
     message: v1::Drawing,
     poses: Poses,
 }
 
 impl Drawn {
-    /// None where the model has no plant with these settings, which there is not while it is recorded.
-    fn new(model: &Arc<Model>, like: &Plant) -> Option<Self> {
-        let plant = Plant::new(Arc::clone(model), *like.settings()).ok()?;
+    fn new(model: &Model, plant: Option<Plant>) -> Self {
         let drawing = Drawing::new(model);
         let message = drawing::drawing(&drawing, |_| None);
         let poses = drawing.poses();
-        Some(Self { plant, drawing, message, poses })
-    }
-
-    fn is_of(&self, digest: u64) -> bool {
-        self.plant.model().digest() == digest
+        Self { digest: model.digest(), plant, drawing, message, poses }
     }
 }
 
 impl Picture {
     /// Draws a plant that is like this one.
     pub(super) fn new(plant: Plant) -> Self {
-        let drawn = Drawn::new(plant.model(), &plant).into_iter().collect();
-        Self { plant, drawn, last: None, buffer: Vec::new() }
+        let (model, settings) = (Arc::clone(plant.model()), *plant.settings());
+        let drawn = vec![Drawn::new(&model, Some(plant))];
+        Self { settings, drawn, last: None, buffer: Vec::new() }
     }
 
     /// The drawing of the present model.
@@ -83,16 +79,16 @@ impl Picture {
         writer: &mut Writer<W>,
         times: Times,
     ) -> Result<(), McapError> {
-        if self.drawn.last().is_some_and(|drawn| drawn.is_of(model.digest())) {
+        if self.drawn.last().is_some_and(|drawn| drawn.digest == model.digest()) {
             return Ok(());
         }
-        let known = self.drawn.iter().position(|drawn| drawn.is_of(model.digest()));
-        let drawn = match known {
-            Some(known) => Some(self.drawn.remove(known)),
-            None => Drawn::new(model, &self.plant),
-        };
         let before = self.drawing().cloned();
-        self.drawn.extend(drawn);
+        let known = self.drawn.iter().position(|drawn| drawn.digest == model.digest());
+        let drawn = match known {
+            Some(known) => self.drawn.remove(known),
+            None => Drawn::new(model, Plant::new(Arc::clone(model), self.settings).ok()),
+        };
+        self.drawn.push(drawn);
         if self.drawn.len() > DRAWN_MAX {
             self.drawn.remove(0);
         }
@@ -116,8 +112,8 @@ impl Picture {
         writer: &mut Writer<W>,
         times: Times,
     ) -> Result<(), McapError> {
-        let Some(drawn) = self.drawn.last_mut().filter(|drawn| drawn.is_of(frame.model_digest))
-        else {
+        let is_of_frame = |drawn: &&mut Drawn| drawn.digest == frame.model_digest;
+        let Some(drawn) = self.drawn.last_mut().filter(is_of_frame) else {
             return Ok(());
         };
         self.last = Some(hundredth(frame));
@@ -135,7 +131,11 @@ impl Picture {
             writer.lines(&scene::lines(&drawn.message, &poses, times.play_ns), times)?;
         }
         let unknown = Energy { kinetic_j: f64::NAN, potential_j: f64::NAN };
-        let energy = drawn.plant.energy_at(&frame.state.q, &frame.velocity).unwrap_or(unknown);
+        let energy = drawn
+            .plant
+            .as_mut()
+            .and_then(|plant| plant.energy_at(&frame.state.q, &frame.velocity).ok())
+            .unwrap_or(unknown);
         signals::encode(frame, energy, &mut self.buffer);
         writer.signals(&self.buffer, times)
     }

@@ -61,26 +61,24 @@ pub(super) fn shapes(drawing: &v1::Drawing, at_ns: u64) -> SceneUpdate {
     SceneUpdate { deletions: vec![all], entities: entities.collect() }
 }
 
-/// Lines and arrows, in the order of the drawing.
+/// Lines, those of one kind that follow each other in one, and arrows, in the order of the drawing.
 pub(super) fn lines(drawing: &v1::Drawing, poses: &v1::Poses, at_ns: u64) -> SceneUpdate {
     let mut entity = entity("lines", WORLD, at_ns);
     let mut points = poses.points.chunks_exact(3);
+    let mut last = None;
     for line in &drawing.lines {
-        let points = points.by_ref().take(line.points as usize);
-        entity.lines.push(LinePrimitive {
-            r#type: Type::LineStrip.into(),
-            pose: Some(pose(&[], &[])),
-            thickness: LINE_PIXELS,
-            scale_invariant: true,
-            points: points.map(|at| Point3 { x: at[0], y: at[1], z: at[2] }).collect(),
-            color: Some(match line.kind() {
-                v1::LineKind::Link | v1::LineKind::Unspecified => LINK,
-                v1::LineKind::Spring => SPRING,
-                v1::LineKind::Constraint => CONSTRAINT,
-                v1::LineKind::Path => PATH,
-            }),
-            ..Default::default()
-        });
+        if last != Some(line.kind()) {
+            last = Some(line.kind());
+            entity.lines.push(segments(line.kind()));
+        }
+        let points: Vec<_> = points
+            .by_ref()
+            .take(line.points as usize)
+            .map(|at| Point3 { x: at[0], y: at[1], z: at[2] })
+            .collect();
+        if let Some(segments) = entity.lines.last_mut() {
+            segments.points.extend(points.windows(2).flatten());
+        }
     }
     let mass = drawing.frames.iter().map(|frame| frame.mass_kg).sum::<f64>();
     let newton = OF_SIZE * drawing.size_m / (mass.max(1e-6) * GRAVITY);
@@ -98,6 +96,23 @@ pub(super) fn lines(drawing: &v1::Drawing, poses: &v1::Poses, at_ns: u64) -> Sce
         entity.arrows.push(arrow_at(numbers, scale, drawing.size_m, color));
     }
     SceneUpdate { deletions: Vec::new(), entities: vec![entity] }
+}
+
+/// Room for the segments of lines of a kind.
+fn segments(kind: v1::LineKind) -> LinePrimitive {
+    LinePrimitive {
+        r#type: Type::LineList.into(),
+        pose: Some(pose(&[], &[])),
+        thickness: LINE_PIXELS,
+        scale_invariant: true,
+        color: Some(match kind {
+            v1::LineKind::Link | v1::LineKind::Unspecified => LINK,
+            v1::LineKind::Spring => SPRING,
+            v1::LineKind::Constraint => CONSTRAINT,
+            v1::LineKind::Path => PATH,
+        }),
+        ..Default::default()
+    }
 }
 
 /// An arrow from where it acts, as long as it is strong up to a length.
