@@ -295,6 +295,18 @@ fn defaults_of_actuators_hold_for_all_kinds() {
     assert_eq!(gains, [(3.0, unit), (8.0, unit), (1.0, None), (3.0, unit)]);
     let [Force::Servo { gain, stiffness, .. }] = &scene.forces[..] else { panic!("{scene:?}") };
     assert_eq!((*gain, *stiffness), (8.0 * 50.0, 64.0 * 50.0));
+    // What a class says of one kind is not forgotten where an inner one speaks of another.
+    let laws = "<default><position kp='50' kv='2'/><default class='weak'><motor gear='1'/>
+          </default></default>
+        <actuator><position class='weak' joint='hinge'/><velocity class='weak' joint='hinge'/>
+          <general class='weak' joint='hinge'/></actuator>";
+    let scene = import(&with(laws), &Options::default()).unwrap().scene;
+    let law = |force: &Force| match force {
+        Force::Servo { gain, stiffness, damping, .. } => [*gain, *stiffness, *damping],
+        other => panic!("{other:?}"),
+    };
+    let found: Vec<_> = scene.forces.iter().map(law).collect();
+    assert_eq!(found, [[50.0, 50.0, 2.0], [1.0, 0.0, 1.0]]);
     let all = Options { inputs: Inputs::All, ..Options::default() };
     let inputs = import(&with(inner), &all).unwrap().scene.inputs;
     let inputs: Vec<_> = inputs.iter().map(|input| &*input.name).collect();
@@ -614,6 +626,20 @@ fn what_is_wrong_is_named_with_its_place() {
         let problems = problems(&text);
         assert!(problems.iter().any(|p| p.contains(message)), "{message}: {problems:?}");
     }
+}
+
+/// What stands on the world never moves, so nobody asks what it weighs.
+#[test]
+fn meshes_weigh_where_bodies_move() {
+    let robot = |joint: &str| {
+        format!(
+            "<mujoco><worldbody><body><geom type='mesh' mesh='m'/>{joint}
+             <body><joint/><geom size='0.1'/></body></body></worldbody></mujoco>"
+        )
+    };
+    assert!(import(&robot(""), &Options::default()).is_ok());
+    let told = problems(&robot("<joint/>"));
+    assert!(told.iter().any(|problem| problem.contains("the inertia of a mesh")), "{told:?}");
 }
 
 #[test]

@@ -85,6 +85,28 @@ impl Range {
     }
 }
 
+/// The defaults that say what the force law of an actuator is. Of each class it is the last one alone, and it counts
+/// for actuators of its kind; a `general` one has and gives laws of all kinds.
+fn laws<'a>(node: Node<'a, 'a>, defaults: &[Node<'a, 'a>]) -> Vec<Node<'a, 'a>> {
+    let kind = |node: &Node<'a, 'a>| node.tag_name().name();
+    let after = defaults.iter().skip(1).map(Some).chain([None]);
+    let is_last = |next: Option<&Node<'a, 'a>>, node: &Node<'a, 'a>| {
+        next.is_none_or(|next| next.parent() != node.parent())
+    };
+    let mut last: Vec<_> = defaults
+        .iter()
+        .zip(after)
+        .filter(|(node, next)| is_last(*next, node))
+        .map(|(node, _)| *node)
+        .collect();
+    let own = match (kind(&node), last.last()) {
+        ("general", Some(default)) => kind(default),
+        (own, _) => own,
+    };
+    last.retain(|default| kind(default) == own || kind(default) == "general");
+    last
+}
+
 fn first(value: f64) -> [f64; 10] {
     let mut all = [0.0; 10];
     all[0] = value;
@@ -110,13 +132,25 @@ impl Default for Actuator {
 }
 
 impl Actuator {
-    /// Takes what an element says, one that acts or a default.
+    /// Takes what an element says for actuators of all kinds, one that acts or a default.
     fn take(&mut self, reader: &mut Reader<'_>, node: Node<'_, '_>) {
         self.control.take(reader, node, "ctrlrange", "ctrllimited");
         self.force.take(reader, node, "forcerange", "forcelimited");
         if let Some(text) = node.attribute("gear") {
             reader.first_numbers(node, "gear", text, &mut self.gear);
         }
+        for name in ["damping", "armature", "delay"] {
+            let text = node.attribute(name).unwrap_or("0");
+            if reader.all_numbers(node, name, text).iter().any(|number| *number != 0.0) {
+                self.refused = Some(
+                    "its own `damping` or `armature` belongs to the joint, a `delay` to the channel of the input",
+                );
+            }
+        }
+    }
+
+    /// Takes the force law that an element says.
+    fn take_law(&mut self, reader: &mut Reader<'_>, node: Node<'_, '_>) {
         for (name, values) in [("gainprm", &mut self.gain), ("biasprm", &mut self.bias)] {
             if let Some(text) = node.attribute(name) {
                 reader.first_numbers(node, name, text, values);
@@ -132,14 +166,6 @@ impl Actuator {
         }
         if let Some(kind) = node.attribute("dyntype") {
             self.has_state = kind != "none";
-        }
-        for name in ["damping", "armature", "delay"] {
-            let text = node.attribute(name).unwrap_or("0");
-            if reader.all_numbers(node, name, text).iter().any(|number| *number != 0.0) {
-                self.refused = Some(
-                    "its own `damping` or `armature` belongs to the joint, a `delay` to the channel of the input",
-                );
-            }
         }
         let mut set = |name: &str, default: f64| reader.number_or(node, name, default);
         match node.tag_name().name() {
@@ -207,10 +233,15 @@ impl<'a> Build<'_, 'a, '_> {
     fn add_actuator(&mut self, node: Node<'a, 'a>, tendons: &Tendons<'a>) -> Option<String> {
         let class = self.classes.named(self.reader, node, "class").unwrap_or(MAIN);
         let mut actuator = Actuator::default();
-        for default in self.classes.chain(class, |name| TAKEN.contains(&name)) {
-            actuator.take(self.reader, default);
+        let defaults = self.classes.chain(class, |name| TAKEN.contains(&name));
+        for default in &defaults {
+            actuator.take(self.reader, *default);
         }
         actuator.take(self.reader, node);
+        for default in laws(node, &defaults) {
+            actuator.take_law(self.reader, default);
+        }
+        actuator.take_law(self.reader, node);
         let mut targets = TARGETS.iter().filter(|target| node.has_attribute(**target));
         let Some(target) = targets.next() else {
             self.reader

@@ -106,8 +106,7 @@ impl<'a> Walk<'_, 'a, '_> {
         }
         let Some(shape) = shape else {
             if !matches!(settings.text("type"), Some("plane" | "hfield")) {
-                let message = "the inertia of a mesh: give its body an `inertial`";
-                self.reader.refuse(settings.node(), message);
+                self.tree.meshed.push((body, settings.node()));
             }
             return;
         };

@@ -21,6 +21,8 @@ pub(super) struct Tree<'a> {
     pub(super) bodies: Vec<Body<'a>>,
     pub(super) joints: Vec<Joint<'a>>,
     pub(super) sites: Vec<Site>,
+    /// Geoms whose inertia is that of a mesh, by body.
+    pub(super) meshed: Vec<(usize, Node<'a, 'a>)>,
     /// Geoms that touch others, and the first of them.
     pub(super) touching: Option<(Node<'a, 'a>, usize)>,
     /// Bodies, joints and sites by name.
@@ -155,6 +157,14 @@ pub(super) fn read<'a>(
         walk.fill(world, &place);
     }
     let mut tree = walk.tree;
+    // Without effect where nothing moves, but for a mass that all bodies share.
+    let meshed = std::mem::take(&mut tree.meshed);
+    for (_, node) in meshed
+        .iter()
+        .filter(|(body, _)| compiler.total_mass.is_some() || tree.is_moved(Some(*body)))
+    {
+        reader.refuse(*node, "the inertia of a mesh: give its body an `inertial`");
+    }
     if let Some(total) = compiler.total_mass {
         let mass: f64 = tree.bodies.iter().filter_map(|body| body.inertia).map(|i| i.mass).sum();
         if mass > 0.0 {
