@@ -5,11 +5,12 @@
 // Without Chromium it says so and ends with 77.
 
 import assert from "node:assert/strict";
-import { mkdirSync } from "node:fs";
+import { mkdirSync, writeFileSync } from "node:fs";
 import { createServer, request } from "node:http";
 import { parseArgs } from "node:util";
 import { connect, Pace } from "./api.mjs";
 import { chromium, launch, Server } from "./browser.mjs";
+import { small } from "./png.mjs";
 
 const SKIPPED = 77;
 const { values: options } = parseArgs({ options: { server: { type: "string" }, pictures: { type: "string" }, only: { type: "string" } } });
@@ -69,6 +70,24 @@ async function run(id, speed = 1) {
   await api.plants.run({ id, settings: { pace: Pace.PACED, speed } });
 }
 
+/** The pixels of a picture, which a browser decodes. */
+async function decoded(page, picture) {
+  const { width, height, data } = await page.evaluate(async (base64) => {
+    const image = new Image();
+    image.src = `data:image/png;base64,${base64}`;
+    await image.decode();
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [image.width, image.height];
+    const context = canvas.getContext("2d");
+    context.drawImage(image, 0, 0);
+    const bytes = context.getImageData(0, 0, image.width, image.height).data;
+    let data = "";
+    for (let at = 0; at < bytes.length; at += 0x8000) data += String.fromCharCode(...bytes.subarray(at, at + 0x8000));
+    return { width: image.width, height: image.height, data: btoa(data) };
+  }, picture);
+  return { width, height, pixels: new Uint8Array(Buffer.from(data, "base64")) };
+}
+
 const shows = (page, id) => until(page, `${id} to be seen`, () => window.plantdView?.frames().length > 0 && window.plantdView.shown().step !== undefined && window.plantdView.isDrawn());
 
 const tests = {
@@ -77,17 +96,8 @@ const tests = {
     await shows(page, "double-pendulum");
     const canvas = await page.$("#canvas");
     const picture = await canvas.screenshot({ encoding: "base64" });
-    const colors = await page.evaluate(async (data) => {
-      const image = new Image();
-      image.src = `data:image/png;base64,${data}`;
-      await image.decode();
-      const canvas = document.createElement("canvas");
-      [canvas.width, canvas.height] = [image.width, image.height];
-      const context = canvas.getContext("2d");
-      context.drawImage(image, 0, 0);
-      const pixels = new Uint32Array(context.getImageData(0, 0, image.width, image.height).data.buffer);
-      return new Set(pixels).size;
-    }, picture);
+    const { pixels } = await decoded(page, picture);
+    const colors = new Set(new Uint32Array(pixels.buffer, pixels.byteOffset, pixels.length / 4)).size;
     assert.ok(colors > 50, `${colors} colours on the canvas`);
     await page.close();
   },
@@ -337,7 +347,8 @@ async function pictures(folder) {
     const page = await open(`?plant=${id}&theme=${theme}`, 1120, 700);
     await shows(page, id);
     await new Promise((resolve) => setTimeout(resolve, 6000));
-    await page.screenshot({ path: `${folder}/view-${model}.png` });
+    const { width, height, pixels } = await decoded(page, await page.screenshot({ encoding: "base64" }));
+    writeFileSync(`${folder}/view-${model}.png`, small(width, height, pixels));
     await page.close();
     await api.plants.deletePlant({ id });
   }

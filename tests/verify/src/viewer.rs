@@ -28,9 +28,9 @@ pub(crate) fn test_page(context: &mut Context) -> Outcome {
     let mut test = at("node", &["test/run.mjs", "--server"]);
     match test.arg(server).status() {
         Ok(status) if status.success() => Ok(()),
-        Ok(status) if status.code() == Some(SKIPPED) => {
-            Err(Failure::Skipped("no chromium (package chromium): the page in a browser".to_owned()))
-        }
+        Ok(status) if status.code() == Some(SKIPPED) => Err(Failure::Skipped(
+            "no chromium (package chromium): the page in a browser".to_owned(),
+        )),
         Ok(status) => Err(Failure::Failed(format!("the tests of the page: {status}"))),
         Err(error) => Err(Failure::Failed(format!("the tests of the page did not start: {error}"))),
     }

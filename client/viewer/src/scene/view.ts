@@ -193,7 +193,7 @@ export class View {
     const extent = box.getSize(new Vector3());
     const size = figure.drawing.sizeM || extent.length() || 1;
     const center = box.getCenter(new Vector3());
-    const radius = Math.max(0.58 * extent.length(), 0.5 * size);
+    const radius = Math.max(0.56 * extent.length(), 0.46 * size);
     const { side, flat } = this.#side(extent, size);
     const right = new Vector3().crossVectors(this.#up, side);
     const azimuth = flat ? 0.3 : 0.65;
