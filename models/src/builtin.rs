@@ -8,7 +8,8 @@ use crate::scene::{
     Axis, Body, Constraint, Coordinate, Frame, Input, Joint, OperatingPoint, Scene,
 };
 
-/// Names of the built-in scenes. `chain-N`, `tree-N` and `scissor-N` stand for whole families.
+/// Names of the built-in scenes. `chain-N`, `tree-N` and `scissor-N` stand for whole families, and there are
+/// two more, `balls-N` and `walker-N`.
 pub const NAMES: &[&str] = &[
     "pendulum",
     "damped-pendulum",
@@ -27,8 +28,11 @@ const MAX_LINKS: usize = 1024;
 /// Most segments of a scissor.
 const MAX_SEGMENTS: usize = 64;
 
-/// The built-in scene of that name; any `chain-N` and `tree-N` with 1 ≤ N ≤ 1024 and
-/// `scissor-N` with 1 ≤ N ≤ 64 exists.
+/// Most legs of a walker.
+const MAX_LEGS: usize = 64;
+
+/// The built-in scene of that name; any `chain-N`, `tree-N` and `balls-N` with 1 ≤ N ≤ 1024,
+/// `scissor-N` and `walker-N` with 1 ≤ N ≤ 64 exists.
 pub fn scene(name: &str) -> Option<Scene> {
     let text = match name {
         "pendulum" => include_str!("../scenes/pendulum.toml"),
@@ -51,6 +55,8 @@ fn family(name: &str) -> Option<Scene> {
     match family {
         "chain" if (1..=MAX_LINKS).contains(&n) => Some(chain(n)),
         "tree" if (1..=MAX_LINKS).contains(&n) => Some(tree(n)),
+        "balls" if (1..=MAX_LINKS).contains(&n) => Some(balls(n)),
+        "walker" if (1..=MAX_LEGS).contains(&n) => Some(walker(n)),
         "scissor" if (1..=MAX_SEGMENTS).contains(&n) => Some(scissor(n)),
         _ => None,
     }
@@ -163,6 +169,87 @@ fn tree(n: usize) -> Scene {
     scene
 }
 
+/// A balanced binary tree of `n` boxes on ball joints.
+fn balls(n: usize) -> Scene {
+    let mut scene = empty(
+        format!("balls-{n}"),
+        format!("Balanced binary tree of {n} boxes of 1 kg on ball joints."),
+    );
+    for i in 0..n {
+        let (parent, translation) = match i {
+            0 => ("world".to_owned(), [0.0; 3]),
+            _ => {
+                let side = if i % 2 == 1 { 0.2 } else { -0.2 };
+                (format!("box{}", (i - 1) / 2), [side, 0.05, -0.2])
+            }
+        };
+        let name = format!("box{i}");
+        scene.coordinates.push(dynamic(format!("{name}_rx"), 0.6 * sin_cos_of(0.7 + i as f64).0));
+        scene.frames.push(Frame {
+            name,
+            parent,
+            translation,
+            joint: Some(Joint::Ball { coordinate: None }),
+            body: Some(limb(1.0)),
+            ..Frame::default()
+        });
+    }
+    scene
+}
+
+/// A hull that floats, with `n` legs of three motors each around it.
+fn walker(n: usize) -> Scene {
+    let mut scene = empty(
+        format!("walker-{n}"),
+        format!("A hull of 5 kg that floats, with {n} legs of three hinges, each with a motor."),
+    );
+    scene.time_step_s = 0.002;
+    scene.frames.push(Frame {
+        name: "hull".to_owned(),
+        joint: Some(Joint::Free { coordinate: None }),
+        body: Some(limb(5.0)),
+        parent: "world".to_owned(),
+        ..Frame::default()
+    });
+    for leg in 0..n {
+        let (sine, cosine) = sin_cos_of(2.0 * PI * leg as f64 / n as f64);
+        let mut parent = "hull".to_owned();
+        for (part, axis) in [("hip", [1.0, 0.0, 0.0]), ("knee", AXIS_Y), ("foot", AXIS_Y)] {
+            let name = format!("{part}{leg}");
+            let place = [0.2 * cosine, 0.2 * sine, 0.0];
+            scene.frames.push(Frame {
+                name: name.clone(),
+                parent,
+                translation: if part == "hip" { place } else { [0.0, 0.0, -0.2] },
+                joint: Some(Joint::Revolute { axis, coordinate: None }),
+                body: Some(limb(0.7)),
+                ..Frame::default()
+            });
+            let angle = 0.3 * sin_cos_of(1.3 * scene.frames.len() as f64).0;
+            scene.coordinates.push(dynamic(name.clone(), angle));
+            scene.inputs.push(Input {
+                name: format!("{name}_motor"),
+                coordinate: Some(name.clone()),
+                ..Input::default()
+            });
+            parent = name;
+        }
+    }
+    scene
+}
+
+const AXIS_Y: [f64; 3] = [0.0, 1.0, 0.0];
+
+/// A body that hangs from its joint.
+fn limb(mass: f64) -> Body {
+    Body {
+        mass,
+        center_of_mass: [0.01, 0.005, -0.1],
+        inertia: [0.012, 0.010, 0.006].map(|inertia| inertia * mass).to_vec(),
+        ..Body::default()
+    }
+}
+
 /// A stack of `n` pairs of crossed links below a rail: one pair's upper ends hang from a fixed hinge
 /// and from a slider, each further pair from the ends of the pair above.
 ///
@@ -239,9 +326,15 @@ mod tests {
 
     #[test]
     fn every_scene_is_valid_and_bears_its_name() {
-        for name in
-            NAMES.iter().copied().chain(["chain-1", "chain-1024", "tree-1024", "scissor-64"])
-        {
+        for name in NAMES.iter().copied().chain([
+            "chain-1",
+            "chain-1024",
+            "tree-1024",
+            "scissor-64",
+            "balls-7",
+            "walker-4",
+            "walker-64",
+        ]) {
             let scene = scene(name).unwrap_or_else(|| panic!("{name} does not exist"));
             assert_eq!(scene.name, name);
             assert_eq!(scene.validate(), [], "{name}");
@@ -262,7 +355,13 @@ mod tests {
 
     #[test]
     fn plants_start_and_step_at_every_operating_point() {
-        for name in NAMES.iter().copied().chain(["tree-63", "scissor-1", "scissor-12"]) {
+        for name in NAMES.iter().copied().chain([
+            "tree-63",
+            "scissor-1",
+            "scissor-12",
+            "balls-15",
+            "walker-6",
+        ]) {
             let model = Arc::new(Model::compile(&scene(name).unwrap()).unwrap());
             let mut plant = Plant::new(model.clone(), Settings::new(&model)).unwrap();
             for point in model.operating_points() {

@@ -88,7 +88,7 @@ fn drive(plant: &mut Plant, input: &mut [f64], out: &mut Linearization) {
 
 /// Built-in scenes, and those of all elements.
 fn scenes() -> Vec<Scene> {
-    let families = ["chain-8", "chain-32", "scissor-8", "scissor-16"];
+    let families = ["chain-8", "chain-32", "scissor-8", "scissor-16", "balls-7", "walker-4"];
     let names = builtin::NAMES.iter().chain(&families);
     let builtin = names.map(|name| builtin::scene(name).expect("the scene is built in"));
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../models/scenes/elements");

@@ -10,7 +10,8 @@
 //! ```
 //!
 //! which is what the equations of the other coordinates are with `N = T = 1`. Nothing is singular but
-//! a whole turn in one step. See [`crate::math::rotation`] for the maps.
+//! a whole turn in one step. In the Newton matrix the maps weigh rows and columns of the joint: see
+//! [`crate::lagrangian::generators`]. See [`crate::math::rotation`] for the maps.
 
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;

@@ -1,8 +1,8 @@
 //! First-order derivatives of the equations of a step as dense matrices, for any scalar.
 //!
 //! Evaluated with [`Dual`] numbers they give the second-order linearization: their dual parts are
-//! derivatives of these along a direction. The first-order linearization itself is
-//! [`linearize`](crate::linearization::linearize), which knows the sparsity.
+//! derivatives of these along a direction. Steps and the first-order linearization itself, which is
+//! [`linearize`](crate::linearization::linearize), know the sparsity.
 
 use crate::constraints::closure::Closure;
 use crate::integrator::settings::Settings;

@@ -175,3 +175,67 @@ impl Linearization {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use nalgebra::DMatrix;
+
+    use super::*;
+    use crate::builtin;
+    use crate::integrator::settings::Settings;
+    use crate::lagrangian::samples;
+    use crate::math::sparse_map::Map;
+    use crate::model::mechanism::Model;
+    use crate::plant::facade::Plant;
+
+    fn models() -> Vec<Model> {
+        let names = ["cart-pole", "chain-8", "marionette", "balls-3", "walker-2"];
+        let builtin = names.map(|name| Model::compile(&builtin::scene(name).unwrap()).unwrap());
+        samples::models().into_iter().chain(builtin).collect()
+    }
+
+    #[test]
+    fn both_layouts_hold_the_same_matrices() {
+        for model in models().into_iter().map(Arc::new) {
+            for order in [2, 4] {
+                let settings = Settings { order, ..Settings::new(&model) };
+                let Ok(mut plant) = Plant::new(Arc::clone(&model), settings) else { continue };
+                let mut u = vec![0.0; model.dimensions.input()];
+                plant.hold_input(&mut u);
+                let mut out = Linearization::new(&model);
+                if plant.linearize(&u, &mut out).is_err() {
+                    continue;
+                }
+                let (a, b) = (out.a(), out.b());
+                let mut numbers = vec![f64::NAN; a.len()];
+                out.a_into(&mut numbers, Layout::Rows);
+                let name = &model.scene.name;
+                assert_eq!(a, DMatrix::from_row_slice(a.nrows(), a.ncols(), &numbers), "{name}");
+                let mut numbers = vec![f64::NAN; b.len()];
+                out.b_into(&mut numbers, Layout::Rows);
+                assert_eq!(b, DMatrix::from_row_slice(b.nrows(), b.ncols(), &numbers), "{name}");
+                // Linear-quadratic problems get both row by row.
+                let mut map = Map::default();
+                out.write_map(&mut map);
+                let (mut packed, mut next) = (Vec::new(), vec![0.0; a.nrows()]);
+                for j in 0..a.ncols() + b.ncols() {
+                    let unit = |i: usize| if i == j { 1.0 } else { 0.0 };
+                    let x: Vec<f64> = (0..a.ncols()).map(unit).collect();
+                    let u: Vec<f64> = (0..b.ncols()).map(|k| unit(a.ncols() + k)).collect();
+                    map.apply(&x, &u, &mut packed, &mut next);
+                    let column = if j < a.ncols() { a.column(j) } else { b.column(j - a.ncols()) };
+                    assert!(next.iter().eq(column.iter()), "{name}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[should_panic(expected = "the matrix has 2 rows of 2 numbers, not 3")]
+    fn a_matrix_of_another_size_is_refused() {
+        let model = Model::compile(&builtin::scene("pendulum").unwrap()).unwrap();
+        Linearization::new(&model).a_into(&mut [0.0; 3], Layout::Columns);
+    }
+}

@@ -1,9 +1,10 @@
 //! The discrete map differentiated: `A = ∂x[k+1]/∂x[k]`, `B = ∂x[k+1]/∂u[k]`, multipliers, second derivatives.
 //!
 //! Everything is differentiated by one list of parameters, `θ = (q, p, u, k)` ([`parameters`]). Read
-//! [`linearize`] first: it has the equations of a step; [`mod@step`] fills their right-hand sides, [`chain`] goes on
-//! over the steps of a period, [`collocation`] over stages, [`map`] hands it to linear-quadratic problems, [`matrices`] to whoever wants `A` and `B`, and
-//! [`second_order`] differentiates once more.
+//! [`linearize`] first: it has the equations of a step; [`mod@step`] fills their right-hand sides, with ball
+//! joints [`turned`], [`chain`] goes on over the steps of a period, [`collocation`] over stages, [`map`] hands
+//! it to linear-quadratic problems, [`matrices`] to whoever wants `A` and `B`, and [`second_order`]
+//! differentiates once more.
 
 pub(crate) mod chain;
 pub(crate) mod collocation;
