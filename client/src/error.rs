@@ -47,6 +47,22 @@ pub enum Error {
         /// Entries of the state.
         actual: usize,
     },
+    /// A gain was computed for a plant of another model.
+    #[error("the gain is for model `{expected}`, the plant is one of `{actual}`")]
+    GainModel {
+        /// Model of the gain.
+        expected: String,
+        /// Model of the plant.
+        actual: String,
+    },
+    /// A gain was computed for a plant of another time step.
+    #[error("the gain is for time step {expected} s, that of the plant is {actual} s")]
+    GainTimeStep {
+        /// Time step of the gain, s.
+        expected: f64,
+        /// Time step of the plant, s.
+        actual: f64,
+    },
     /// A feedback law was asked about a step whose gain the server no longer sends.
     #[error("the plant has left step {step} behind: its gains begin at step {first}")]
     GainPassed {

@@ -100,6 +100,12 @@ pub trait GainExt {
     /// # Panics
     /// If `x` has not as many entries as `K` has columns.
     fn control_at(&self, x: &[f64]) -> Vec<f64>;
+    /// Whether the gain was computed for such a plant, over whichever link it is driven.
+    ///
+    /// # Errors
+    /// The plant has another model, another time step or states of another length. What a gain does not say
+    /// of itself is not compared.
+    fn suits(&self, plant: &v1::PlantInfo) -> Result<()>;
 }
 
 impl GainExt for v1::Gain {
@@ -120,6 +126,23 @@ impl GainExt for v1::Gain {
             *u -= du;
         }
         u
+    }
+
+    fn suits(&self, plant: &v1::PlantInfo) -> Result<()> {
+        let time_step = plant.settings.as_ref().map_or(0.0, |settings| settings.time_step_s);
+        if !self.model.is_empty() && self.model != plant.model {
+            let (expected, actual) = (self.model.clone(), plant.model.clone());
+            return Err(Error::GainModel { expected, actual });
+        }
+        if self.time_step_s != 0.0 && self.time_step_s != time_step {
+            return Err(Error::GainTimeStep { expected: self.time_step_s, actual: time_step });
+        }
+        match (self.x_reference.len(), plant.state.as_ref().map(|state| state.x().len())) {
+            (expected, Some(actual)) if actual != expected => {
+                Err(Error::StateLength { expected, actual })
+            }
+            _ => Ok(()),
+        }
     }
 }
 
@@ -202,6 +225,28 @@ mod tests {
             ..Default::default()
         };
         gain.control_at(&[2.0, 0.0, 1.0, 0.0]);
+    }
+
+    #[test]
+    fn a_gain_knows_its_plants() {
+        let gain = v1::Gain {
+            model: "pendulum".into(),
+            time_step_s: 0.01,
+            x_reference: vec![0.0; 2],
+            ..Default::default()
+        };
+        let plant = |model: &str, time_step_s, entries| v1::PlantInfo {
+            model: model.into(),
+            settings: Some(v1::PlantSettings { time_step_s, ..Default::default() }),
+            state: Some(v1::State { q: vec![0.0; entries], ..Default::default() }),
+            ..Default::default()
+        };
+        assert!(gain.suits(&plant("pendulum", 0.01, 2)).is_ok());
+        let refusal = |plant| gain.suits(&plant).unwrap_err();
+        assert!(matches!(refusal(plant("cart-pole", 0.01, 2)), Error::GainModel { .. }));
+        assert!(matches!(refusal(plant("pendulum", 0.02, 2)), Error::GainTimeStep { .. }));
+        assert!(matches!(refusal(plant("pendulum", 0.01, 4)), Error::StateLength { .. }));
+        assert!(v1::Gain::default().suits(&v1::PlantInfo::default()).is_ok());
     }
 
     #[test]
