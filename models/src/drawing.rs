@@ -167,8 +167,8 @@ impl Drawing {
         }
     }
 
-    /// Diagonal of the box that has the initial configuration inside: frames that move, with their shapes, and
-    /// ends of lines; 1 if that is a point.
+    /// Diagonal of a box that has the initial configuration inside: frames that move, with balls around their
+    /// shapes, and ends of lines; 1 if that is a point.
     fn extent(&self) -> f64 {
         let poses = self.poses();
         let moves = |placed: &&Placed| placed.placement.joint != WORLD;
@@ -180,11 +180,14 @@ impl Drawing {
                 high[k] = high[k].max(x + reach);
             }
         };
-        for (placed, pose) in self.frames.iter().zip(&poses.frames) {
-            if moves(&placed) || !any_moves {
-                let reach = placed.frame.shapes.iter().map(Shape::reach).fold(0.0, f64::max);
-                take(&pose[..3], reach);
-            }
+        for placed in self.frames.iter().filter(|placed| moves(placed) || !any_moves) {
+            let Placed { frame, placement: Placement { joint, rotation, translation } } = placed;
+            let at = |point: Vec3| {
+                let point = *translation + rotation.apply(point);
+                self.rig.place(&poses.joints, &Attachment { joint: *joint, point }).0
+            };
+            take(&at(Vec3::ZERO), 0.0);
+            frame.shapes.iter().for_each(|shape| take(&at(Vec3(shape.position)), shape.reach()));
         }
         poses.points.iter().for_each(|point| take(point, 0.0));
         let diagonal = Vec3([0, 1, 2].map(|k| high[k] - low[k])).norm();

@@ -194,6 +194,22 @@ fn boxes_have_the_inertia_that_they_stand_for() {
     assert!(boxes > 60, "a test of little: {boxes} boxes");
 }
 
+/// A point mass on a rod of one metre is one metre in size; its ball is seen beside it.
+#[test]
+fn sizes_are_those_of_the_mechanism() {
+    let drawing = Drawing::new(&model(&builtin("pendulum")));
+    assert!((drawing.size_m() - 1.0).abs() < 1e-12, "{}", drawing.size_m());
+    let bob = drawing.frames().next().unwrap();
+    let Form::Capsule { radius, length } = bob.shapes[0].form else { panic!("{bob:?}") };
+    assert!((radius - 0.04).abs() < 1e-12 && length == 0.0, "{bob:?}");
+    for (name, low, high) in
+        [("chain-8", 1.0, 1.4), ("four-bar", 1.0, 4.0), ("marionette", 1.0, 6.0)]
+    {
+        let size = Drawing::new(&model(&builtin(name))).size_m();
+        assert!((low..high).contains(&size), "{name}: {size}");
+    }
+}
+
 #[test]
 fn rods_can_be_seen_and_visuals_take_the_place_of_bodies() {
     let drawing = Drawing::new(&model(&builtin("four-bar")));

@@ -82,16 +82,15 @@ pub enum Form {
 }
 
 impl Shape {
-    /// Radius of a ball about its frame's origin that has it inside; of a mesh, its origin alone.
+    /// Radius of a ball about its origin that has it inside; 0 of a mesh, which nobody has read.
     pub(super) fn reach(&self) -> f64 {
-        let half = match self.form {
+        match self.form {
             Form::Box(size) => 0.5 * Vec3(size).norm(),
             Form::Ellipsoid(size) => 0.5 * size.into_iter().fold(0.0, f64::max),
             Form::Capsule { radius, length } => radius + 0.5 * length,
             Form::Cylinder { radius, length } => radius.hypot(0.5 * length),
             Form::Mesh { .. } => 0.0,
-        };
-        Vec3(self.position).norm() + half
+        }
     }
 }
 

@@ -28,6 +28,8 @@ pub struct Addresses {
     pub grpc: String,
     /// gRPC over a Unix-domain socket, `unix:/path`.
     pub unix: String,
+    /// The page that shows the plants, `http://host:port/`.
+    pub view: Option<String>,
     /// Prometheus metrics, `http://host:port/metrics`.
     pub metrics: Option<String>,
 }
@@ -73,7 +75,8 @@ impl ServerProcess {
         configure(&mut command);
         let child = command.spawn().with_context(|| format!("cannot start {command:?}"))?;
         // From here on the process is this value's to kill.
-        let nowhere = Addresses { grpc: String::new(), unix: String::new(), metrics: None };
+        let nowhere =
+            Addresses { grpc: String::new(), unix: String::new(), view: None, metrics: None };
         Ok(Self { child, addresses: nowhere, directory })
     }
 

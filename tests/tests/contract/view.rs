@@ -10,6 +10,10 @@ use nalgebra::{Complex, DMatrix};
 use plantd_client::{Answers, Client, Code, operating_point, present_state, v1};
 use plantd_models::{Kinematics, Model, builtin};
 use plantd_tests::server::{ServerProcess, binary};
+use tonic::body::Body;
+use tonic::codegen::Service as _;
+use tonic::codegen::http::{Request, StatusCode};
+use tonic::transport::Endpoint;
 use v1::drawn_shape::Shape;
 use v1::get_drawing_request::Of;
 use v1::set_feedback_request::Reference;
@@ -393,8 +397,9 @@ async fn the_page_is_served_beside_the_services() {
     let long = format!("GET /{}", "x".repeat(4000));
     assert_status(&http(&server, &long, ""), 404);
     client.get_model("pendulum").await.unwrap();
-    let line = format!("See the plants: {}/", server.address());
-    assert!(server.log().contains(&line), "{}", server.log());
+    let url = format!("{}/", server.address());
+    assert_eq!(server.addresses().view.as_ref(), Some(&url));
+    assert!(server.log().contains(&format!("See the plants: {url}\n")), "{}", server.log());
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -444,6 +449,15 @@ async fn the_page_is_not_for_strangers() {
             assert_status(&answer, 403);
             assert!(!answer.0.contains("access-control") && !answer.1.ends_with(b"mesh"));
         }
+    }
+    // Over HTTP/2 the name is the authority.
+    for (authority, status) in [(own, StatusCode::OK), ("evil.example", StatusCode::FORBIDDEN)] {
+        let endpoint = Endpoint::from_shared(server.address().to_owned()).unwrap();
+        let origin = format!("http://{authority}");
+        let mut channel = endpoint.origin(origin.parse().unwrap()).connect().await.unwrap();
+        std::future::poll_fn(|context| channel.poll_ready(context)).await.unwrap();
+        let request = Request::get(format!("{origin}{url}")).body(Body::empty()).unwrap();
+        assert_eq!(soon(channel.call(request)).await.unwrap().status(), status, "{authority}");
     }
     // Beyond the loopback interface programs may call it by any name; a page sends no `Origin` for a mesh.
     let (server, _client) = server_with(&["--grpc", "0.0.0.0:0"]).await;

@@ -2,7 +2,7 @@
 //!
 //! The stream asks for the next frame when the transport has taken the last message, so a slow reader
 //! loses frames at the plant, where they are counted, and never holds more than its queue. What is computed
-//! for a watcher is so on a worker, see [`crate::wire::plants::computed`].
+//! for a watcher is so on a worker (`computed.rs`).
 
 use std::collections::HashSet;
 use std::sync::Arc;

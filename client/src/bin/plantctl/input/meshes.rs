@@ -67,7 +67,7 @@ impl Meshes {
         // Where robots are kept, the file stands in its package, or beside it.
         let folder = std::path::absolute(&self.folder).unwrap_or_else(|_| self.folder.clone());
         let around = folder.ancestors();
-        let here = around.clone().filter(|f| f.file_name().is_some_and(|n| n == name));
+        let here = around.filter(|f| f.file_name().is_some_and(|n| n == name));
         let here = here.map(|package| package.join(path));
         let beside = around.map(|folder| folder.join(name)).filter(|package| package.is_dir());
         let mut places: Vec<PathBuf> = here.chain(beside.map(|p| p.join(path))).collect();
