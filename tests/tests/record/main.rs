@@ -325,7 +325,7 @@ async fn plants_that_run_by_themselves_are_recorded_with_times_and_events() {
                 last_ns = timing.ended_ns;
             }
             RecordingEntry::Event(event) => kinds.push(event.kind()),
-            RecordingEntry::Mark(_) => {}
+            RecordingEntry::Mark(_) | RecordingEntry::Energy { .. } => {}
         }
     }
     for kind in [v1::EventKind::Started, v1::EventKind::Paused, v1::EventKind::StateSet] {

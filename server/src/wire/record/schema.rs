@@ -56,8 +56,8 @@ fn parts(
         for field in message.field.iter().filter(|field| !field.type_name().is_empty()) {
             let name = field.type_name().trim_start_matches('.');
             // The message around a nested one is named by its beginning.
-            let outer = name.match_indices('.').map(|(end, _)| &name[..end]);
-            let around = outer.filter(|outer| messages.contains_key(*outer)).next();
+            let mut outer = name.match_indices('.').map(|(end, _)| &name[..end]);
+            let around = outer.find(|outer| messages.contains_key(*outer));
             parts.push(around.unwrap_or(name).to_owned());
         }
     }

@@ -119,6 +119,7 @@ fn width() -> usize {
 }
 
 type OfEnergy = fn(&v1::Energy) -> f64;
+type IsThere = fn(&v1::Coordinate) -> bool;
 
 /// Signals of the energy.
 const ENERGIES: [(&str, OfEnergy); 3] = [
@@ -226,7 +227,7 @@ fn signals(model: &v1::Model, outputs: &[String]) -> Vec<(String, String)> {
         }
     };
     let all = &model.coordinates;
-    let of_coordinates: [(_, _, _, fn(&v1::Coordinate) -> bool); 4] = [
+    let of_coordinates: [(_, _, _, IsThere); 4] = [
         ("q", "m", "rad", |_| true),
         ("p", "kg m/s", "kg m²/s", |c| !c.prescribed),
         ("velocity", "m/s", "rad/s", |_| true),

@@ -12,7 +12,7 @@ use http_body_util::combinators::BoxBody;
 use http_body_util::{BodyExt as _, Full, StreamBody};
 use hyper::body::{Bytes, Frame, Incoming};
 use hyper::header::{
-    ACCEPT_RANGES, ALLOW, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_RANGE,
+    ACCEPT_RANGES, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_RANGE,
     CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, HeaderName, HeaderValue, ORIGIN, RANGE,
     REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS,
 };
@@ -121,9 +121,11 @@ impl Site {
             return Ok(text(StatusCode::FORBIDDEN, "not under this name\n"));
         }
         if !matches!(*request.method(), Method::GET | Method::HEAD) {
-            let mut response = text(StatusCode::METHOD_NOT_ALLOWED, "only GET\n");
-            response.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
-            return Ok(response);
+            // What the page asks a server of plants: it knows what to do where there is none.
+            return Ok(text(
+                StatusCode::SERVICE_UNAVAILABLE,
+                "a recording, and no server of plants\n",
+            ));
         }
         let path = request.uri().path();
         if path == RECORDING {
