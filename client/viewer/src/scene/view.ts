@@ -10,12 +10,20 @@ import { Ground } from "./ground.js";
 /** A picture that takes longer than this, ms, is drawn with less. */
 const SLOW_MS = 40;
 /** Slow pictures in a row after which less is drawn. */
-const PATIENCE = 25;
+const PATIENCE = 6;
 
 /** A part of a mechanism under the pointer. */
 export interface Hit {
   frame: number;
   point: Vector3;
+}
+
+/** A graphics card draws, not the processor. */
+function isHardware(): boolean {
+  const context = document.createElement("canvas").getContext("webgl2");
+  const name = String(context?.getParameter(context.RENDERER) ?? "");
+  context?.getExtension("WEBGL_lose_context")?.loseContext();
+  return !/swiftshader|llvmpipe|software/i.test(name);
 }
 
 /** The 3D view. */
@@ -40,10 +48,13 @@ export class View {
   #lowest = Infinity;
   #slow = 0;
   #last = 0;
+  /** Asked for by the address: as good as can be, however long it takes. */
+  #isBest = new URLSearchParams(location.search).get("quality") === "best";
   #quality: { shadows: boolean; ratio: number };
 
   constructor(readonly canvas: HTMLCanvasElement) {
-    this.#renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+    const isFast = isHardware() || this.#isBest;
+    this.#renderer = new WebGLRenderer({ canvas, antialias: isFast, powerPreference: "high-performance" });
     this.#renderer.shadowMap.enabled = true;
     this.#renderer.shadowMap.type = PCFShadowMap;
     this.#quality = { shadows: true, ratio: Math.min(devicePixelRatio, 2) };
@@ -311,7 +322,7 @@ export class View {
     // Between two pictures that follow each other directly: the time that one takes.
     this.#slow = this.#last > 0 && now - this.#last > SLOW_MS ? this.#slow + 1 : Math.max(0, this.#slow - 1);
     this.#last = now;
-    if (this.#slow > PATIENCE) this.#spare();
+    if (this.#slow > PATIENCE && !this.#isBest) this.#spare();
   }
 
   /** Draws with less: without shadows, then with fewer pixels. */
