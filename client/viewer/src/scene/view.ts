@@ -1,6 +1,6 @@
 // The canvas: camera, light, mechanisms. It is drawn when something on it has changed.
 
-import { Box3, Color, DirectionalLight, HemisphereLight, PCFShadowMap, PerspectiveCamera, Plane, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
+import { Box3, Color, DirectionalLight, HemisphereLight, Mesh, type Object3D, PCFShadowMap, PerspectiveCamera, Plane, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Drawing, Poses } from "../gen/plantd/v1/drawing_pb.js";
 import { color } from "../theme.js";
@@ -16,6 +16,10 @@ const PATIENCE = 6;
 export interface Hit {
   frame: number;
   point: Vector3;
+}
+
+function isShown(object: Object3D): boolean {
+  return object.visible && (!object.parent || isShown(object.parent));
 }
 
 /** A graphics card draws, not the processor. */
@@ -259,7 +263,8 @@ export class View {
     if (!this.#figure?.object.visible) return undefined;
     const caster = this.#caster(x, y);
     for (const { object, point, instanceId } of caster.intersectObject(this.#figure.object, true)) {
-      const frame = this.#figure.frameOf(object, instanceId);
+      // Rays hit what is hidden, too, and lines from afar.
+      const frame = object instanceof Mesh && isShown(object) ? this.#figure.frameOf(object, instanceId) : undefined;
       if (frame !== undefined) return { frame, point: point.clone() };
     }
     return undefined;
