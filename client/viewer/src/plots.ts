@@ -8,7 +8,7 @@ import { app, remember, remembered } from "./state.js";
 import { color, curve, theme } from "./theme.js";
 
 /** From one drawing to the next, ms. */
-const DRAW_MS = 80;
+const DRAW_MS = 125;
 /** Curves of a plot that are shown at first. */
 const CURVES_FIRST = 6;
 /** Points of a curve; of more, some are left out. */

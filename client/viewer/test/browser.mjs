@@ -15,7 +15,7 @@ export function chromium() {
 
 /** A browser with WebGL in software. */
 export function launch() {
-  const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars"];
+  const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars", "--disable-accelerated-2d-canvas"];
   return puppeteer.launch({ executablePath: chromium(), headless: true, args, protocolTimeout: 120_000 });
 }
 

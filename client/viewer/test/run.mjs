@@ -169,8 +169,9 @@ const tests = {
   },
 
   async "dragging pushes the body under the pointer"() {
-    const id = await plant("double-pendulum", "pushed");
-    await api.plants.reset({ id, initial: { form: { case: "operatingPoint", value: (await api.models.getModel({ name: "double-pendulum" })).model.operatingPoints[0] } } });
+    // At rest, so that the body is still there when the pointer comes.
+    const id = await plant("cart-pole", "pushed");
+    await api.plants.reset({ id, initial: { form: { case: "operatingPoint", value: "hanging" } } });
     await run(id);
     const page = await open(`?plant=${id}`);
     await shows(page, id);
@@ -344,7 +345,7 @@ async function pictures(folder) {
   for (const [model, theme] of Object.entries(scenes)) {
     const id = await plant(model, `picture-${model}`);
     await run(id);
-    const page = await open(`?plant=${id}&theme=${theme}`, 1120, 700);
+    const page = await open(`?plant=${id}&theme=${theme}&quality=best`, 1120, 700);
     await shows(page, id);
     await new Promise((resolve) => setTimeout(resolve, 6000));
     const { width, height, pixels } = await decoded(page, await page.screenshot({ encoding: "base64" }));

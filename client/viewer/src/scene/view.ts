@@ -1,6 +1,6 @@
 // The canvas: camera, light, mechanisms. It is drawn when something on it has changed.
 
-import { Box3, Color, DirectionalLight, HemisphereLight, PCFShadowMap, PerspectiveCamera, Plane, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
+import { Box3, Color, DirectionalLight, HemisphereLight, Mesh, type Object3D, PCFShadowMap, PerspectiveCamera, Plane, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { Drawing, Poses } from "../gen/plantd/v1/drawing_pb.js";
 import { color } from "../theme.js";
@@ -10,12 +10,24 @@ import { Ground } from "./ground.js";
 /** A picture that takes longer than this, ms, is drawn with less. */
 const SLOW_MS = 40;
 /** Slow pictures in a row after which less is drawn. */
-const PATIENCE = 25;
+const PATIENCE = 6;
 
 /** A part of a mechanism under the pointer. */
 export interface Hit {
   frame: number;
   point: Vector3;
+}
+
+function isShown(object: Object3D): boolean {
+  return object.visible && (!object.parent || isShown(object.parent));
+}
+
+/** A graphics card draws, not the processor. */
+function isHardware(): boolean {
+  const context = document.createElement("canvas").getContext("webgl2");
+  const name = String(context?.getParameter(context.RENDERER) ?? "");
+  context?.getExtension("WEBGL_lose_context")?.loseContext();
+  return !/swiftshader|llvmpipe|software/i.test(name);
 }
 
 /** The 3D view. */
@@ -40,10 +52,13 @@ export class View {
   #lowest = Infinity;
   #slow = 0;
   #last = 0;
+  /** Asked for by the address: as good as can be, however long it takes. */
+  #isBest = new URLSearchParams(location.search).get("quality") === "best";
   #quality: { shadows: boolean; ratio: number };
 
   constructor(readonly canvas: HTMLCanvasElement) {
-    this.#renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
+    const isFast = isHardware() || this.#isBest;
+    this.#renderer = new WebGLRenderer({ canvas, antialias: isFast, powerPreference: "high-performance" });
     this.#renderer.shadowMap.enabled = true;
     this.#renderer.shadowMap.type = PCFShadowMap;
     this.#quality = { shadows: true, ratio: Math.min(devicePixelRatio, 2) };
@@ -248,7 +263,8 @@ export class View {
     if (!this.#figure?.object.visible) return undefined;
     const caster = this.#caster(x, y);
     for (const { object, point, instanceId } of caster.intersectObject(this.#figure.object, true)) {
-      const frame = this.#figure.frameOf(object, instanceId);
+      // Rays hit what is hidden, too, and lines from afar.
+      const frame = object instanceof Mesh && isShown(object) ? this.#figure.frameOf(object, instanceId) : undefined;
       if (frame !== undefined) return { frame, point: point.clone() };
     }
     return undefined;
@@ -311,7 +327,7 @@ export class View {
     // Between two pictures that follow each other directly: the time that one takes.
     this.#slow = this.#last > 0 && now - this.#last > SLOW_MS ? this.#slow + 1 : Math.max(0, this.#slow - 1);
     this.#last = now;
-    if (this.#slow > PATIENCE) this.#spare();
+    if (this.#slow > PATIENCE && !this.#isBest) this.#spare();
   }
 
   /** Draws with less: without shadows, then with fewer pixels. */
