@@ -385,7 +385,6 @@ pub(super) mod tests {
     use crate::core::realtime::loops::RealTime;
     use crate::core::realtime::settings::RealTimeSettings;
     use crate::core::session::creation::Origin;
-    use crate::wire::record::message::plant_record;
 
     pub(in crate::wire::record) fn session() -> Arc<Session> {
         let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
