@@ -66,7 +66,7 @@ impl BallJoints {
     #[inline]
     pub(crate) fn of(&self, coordinate: usize) -> Option<(usize, usize)> {
         let place = *self.places.get(coordinate)?;
-        (place != NONE).then(|| (place as usize / 4, place as usize % 4))
+        (place != NONE).then_some((place as usize / 4, place as usize % 4))
     }
 
     /// Calls `entry(i, factor)` for what a coordinate's row gives to the rows of its joint, by a map of theirs.

@@ -169,7 +169,7 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     let settings = Settings { order, ..Settings::new(model) };
     let mut fast = Plant::new(Arc::clone(model), settings).unwrap();
     assert!(order == 2 || model.solver == Solver::Spatial);
-    let generators = SpatialRecursion::new(&model);
+    let generators = SpatialRecursion::new(model);
     fast.workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
     let n = model.dimensions.dynamic;
     let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
