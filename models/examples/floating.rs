@@ -28,14 +28,14 @@ const NAMES: &[&str] = &[
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut wanted: Vec<String> = std::env::args().skip(1).collect();
-    if let [flag, folder] = &wanted[..] {
-        if flag == "--write" {
-            for name in NAMES {
-                let text = scene(name).ok_or("no such mechanism")?.to_toml();
-                std::fs::write(Path::new(folder).join(format!("{name}.toml")), text)?;
-            }
-            return Ok(());
+    if let [flag, folder] = &wanted[..]
+        && flag == "--write"
+    {
+        for name in NAMES {
+            let text = scene(name).ok_or("no such mechanism")?.to_toml();
+            std::fs::write(Path::new(folder).join(format!("{name}.toml")), text)?;
         }
+        return Ok(());
     }
     if wanted.is_empty() {
         wanted = NAMES.iter().map(|name| (*name).to_owned()).collect();
@@ -141,7 +141,7 @@ fn scene(name: &str) -> Option<Scene> {
 }
 
 fn side(i: usize) -> f64 {
-    if i % 2 == 0 { 1.0 } else { -1.0 }
+    if i.is_multiple_of(2) { 1.0 } else { -1.0 }
 }
 
 /// Bodies one by one.

@@ -178,8 +178,6 @@ const CASES: &[(&str, u64, &[&str])] = &[
     ("chain-128", 5, PLANT),
     ("tree-30", 20, PLANT),
     ("tree-127", 5, PLANT),
-    ("balls-7", 50, PLANT),
-    ("walker-4", 50, PLANT),
     ("four-bar", 50, PLANT),
     ("scissor-8", 50, PLANT),
     ("scissor-32", 20, PLANT),
