@@ -27,6 +27,7 @@ async fn a_robot_is_uploaded_and_driven() {
             scene: PENDULUM.to_owned(),
             format: format.into(),
             name: format!("rod-{}", format as i32),
+            replace: false,
         };
         let answer = client.import_model(request).await.unwrap();
         let model = answer.model.unwrap();
@@ -67,6 +68,7 @@ async fn a_model_in_mjcf_is_uploaded_and_driven() {
             scene: text.to_owned(),
             format: format.into(),
             name: format!("rod-{}", format as i32),
+            replace: false,
         };
         let answer = client.import_model(request).await.unwrap();
         let (model, report) = (answer.model.unwrap(), answer.import_report.unwrap());
