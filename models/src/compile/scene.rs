@@ -52,7 +52,7 @@ impl Model {
     ///
     /// scene.frames[0].parent = "ceiling".to_owned();
     /// let error = Model::compile(&scene).unwrap_err();
-    /// assert_eq!(error.to_string(), "frames[0].parent: there is no frame `ceiling`");
+    /// assert_eq!(error.to_string(), "frames[0].parent: there is no frame `ceiling`; there is `arm`");
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     pub fn compile(scene: &Scene) -> Result<Self, SceneError> {

@@ -69,7 +69,7 @@ async fn a_lease_is_held_without_a_stream_of_inputs() {
     let set = client.set_input(input("0", &[2.0])).await;
     assert_refused(set, Code::FailedPrecondition, "LEASE_LOST", "");
     let set = client.set_input(input(token, &[2.0, 0.0])).await;
-    assert_refused(set, Code::InvalidArgument, "INPUT_DIMENSION", "");
+    assert_refused(set, Code::InvalidArgument, "INPUT_DIMENSION", "u");
     client.set_input(input(token, &[2.0])).await.unwrap();
     let fields = vec![v1::WatchField::Input.into(), v1::WatchField::Timing.into()];
     let request = v1::WatchRequest { id: id.clone(), fields, ..Default::default() };

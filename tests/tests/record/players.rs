@@ -119,11 +119,13 @@ async fn players_get_a_hundred_pictures_a_second_and_go_on_after_a_reset() {
     let frames = messages::<FrameTransforms>(&file, "/tf");
     let ms = 1_000_000;
     let times: Vec<_> = frames.iter().map(|(log, publish, _)| (log / ms, publish / ms)).collect();
-    // 0, 10, ... 500; then from 1 on, 10, ... 100, and with other numbers at once, 110, ... 200.
-    assert_eq!(times[..51], (0..=50).map(|k| (10 * k, 10 * k)).collect::<Vec<_>>());
-    assert_eq!(times[51..54], [(501, 1), (510, 10), (520, 20)]);
-    assert_eq!(*times.last().unwrap(), (700, 200));
-    assert!(times.len() <= 51 + 21 + 2, "{times:?}");
+    // At most one in each ten milliseconds of the plant, and one when its numbers change; fewer where the recorder
+    // is behind. The time of the log goes on where that of the plant begins anew.
+    assert_eq!(times[0], (0, 0));
+    assert!(times.windows(2).all(|pair| pair[0].0 < pair[1].0), "{times:?}");
+    let (first, second): (Vec<_>, Vec<_>) = times.iter().partition(|(log, time)| log == time);
+    assert!(second.iter().all(|(log, time)| *log == time + 500), "{times:?}");
+    assert!((2..=51).contains(&first.len()) && (2..=23).contains(&second.len()), "{times:?}");
     // The mass hangs elsewhere, and so does what shows it.
     let scenes = messages::<SceneUpdate>(&file, "/scene");
     assert_eq!(scenes.len(), 2);
