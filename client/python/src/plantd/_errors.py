@@ -76,6 +76,9 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
             reason, violations = _details(value)
     code = error.code().name
     message = error.details() or ""
+    if code == "CANCELLED" and message == "Timeout expired":
+        # The server keeps the client's time as well, and was the first to see that it is over.
+        code = "DEADLINE_EXCEEDED"
     if not reason:
         # It did not come from the server.
         message = _TRANSPORT.get(code, message)
