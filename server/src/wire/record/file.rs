@@ -55,6 +55,7 @@ pub(super) struct PlayClock {
     /// What the plant has gone back, ns.
     offset_ns: u64,
     last_ns: u64,
+    last_s: f64,
 }
 
 impl PlayClock {
@@ -68,8 +69,14 @@ impl PlayClock {
             self.offset_ns += self.last_ns - play_ns;
         }
         play_ns = play_ns.max(self.last_ns);
-        self.last_ns = play_ns;
+        (self.last_ns, self.last_s) = (play_ns, plant_s);
         Times { play_ns, plant_s }
+    }
+
+    /// The times of what was last written: where the plant is, also when it was put elsewhere and no step has
+    /// followed yet.
+    pub(super) fn now(&self) -> Times {
+        Times { play_ns: self.last_ns, plant_s: self.last_s }
     }
 }
 

@@ -219,8 +219,7 @@ impl Work {
     fn drain_events(&mut self) -> Result<(), McapError> {
         while let Some((number, event)) = self.events.read_next() {
             let message = event_message(number, &event, self.session.model());
-            let times = self.play.at(self.frame.time_s);
-            self.writer.event(&message, times)?;
+            self.writer.event(&message, self.play.now())?;
         }
         Ok(())
     }
