@@ -8,7 +8,7 @@ from typing import Any, Union
 import numpy as np
 import numpy.typing as npt
 
-from plantd.v1 import common_pb2, control_service_pb2
+from plantd.v1 import common_pb2
 
 from ._check import shown
 
@@ -54,7 +54,7 @@ def tensor(m: common_pb2.Tensor) -> Array:
     return array(m.data).reshape(m.outputs, m.first, m.second)
 
 
-def complexes(values: Iterable[control_service_pb2.Complex]) -> npt.NDArray[np.complex128]:
+def complexes(values: Iterable[common_pb2.Complex]) -> npt.NDArray[np.complex128]:
     """Complex numbers as an array."""
     return np.array([complex(z.real, z.imaginary) for z in values], dtype=np.complex128)
 

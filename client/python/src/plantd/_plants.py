@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from plantd.v1 import common_pb2, drawing_pb2, plant_service_pb2, realtime_pb2
 
-from ._arrays import Array, Vector, array, failure_text, matrix_message, numbers
+from ._arrays import Array, Vector, array, complexes, failure_text, matrix_message, numbers
 from ._calls import Calls
 from ._channels import Outputs
 from ._check import build, mapping, one_of, texts
@@ -193,8 +193,7 @@ class Poles:
 
     @classmethod
     def _from(cls, m: plant_service_pb2.Poles) -> Poles:
-        both = m.open_loop, m.closed_loop
-        return cls(*(np.array([complex(z.real, z.imaginary) for z in of], complex) for of in both))
+        return cls(complexes(m.open_loop), complexes(m.closed_loop))
 
 
 @dataclass(frozen=True, eq=False)
