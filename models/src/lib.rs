@@ -16,23 +16,21 @@
 // The mechanics does not log.
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
-pub mod builtin;
 mod compile;
 mod constraints;
 mod continuous;
-pub mod control;
 pub mod drawing;
 mod integrator;
 mod kkt;
 mod lagrangian;
 mod linearization;
-mod math;
 mod model;
-pub mod optimize;
 pub mod parameters;
 mod plant;
-pub mod reference;
-pub mod scene;
+
+use plantd_math as math;
+pub use plantd_scene as scene;
+pub use plantd_scene::builtin;
 
 pub use crate::compile::cost::StageCost;
 pub use crate::continuous::kinematics::{CenterOfMass, FrameMotion, FramePoint, Kinematics};
@@ -57,6 +55,7 @@ pub use crate::plant::choice::{Choice, ChoiceError, ErrorEstimate};
 pub use crate::plant::diagnose::Diagnostics;
 pub use crate::plant::facade::Plant;
 pub use crate::plant::initial::{Initial, InitialError};
+pub use crate::plant::known::KnownStep;
 pub use crate::plant::settle::{Equilibrium, SettleError, SettleRequest};
 pub use crate::plant::site::Pose;
 pub use crate::plant::snapshot::{Snapshot, SnapshotError};

@@ -2,10 +2,12 @@
 
 mod common;
 
+use std::sync::Arc;
+
 use common::{SPLITS, builtin, floating, plant, random_tree, wave, waving_input};
 use nalgebra::DMatrix;
 use plantd_models::scene::{Axis, Constraint, Point, Spring};
-use plantd_models::{Initial, Linearization, Plant, Scene};
+use plantd_models::{Initial, Linearization, Model, Plant, Scene, Settings};
 
 /// A plant of a conservative scene without inputs, set in motion by unlike momenta.
 fn set_in_motion(scene: &Scene, time_step_s: f64, size: f64) -> Plant {
@@ -318,6 +320,39 @@ fn angles_wind_without_loss() {
             coast(&mut plain, 100);
             for (a, b) in wound.p().iter().zip(plain.p()) {
                 assert!((a - b).abs() <= 2e-13, "{}: {:e}", scene.name, a - b);
+            }
+        }
+    }
+}
+
+#[test]
+fn plants_start_and_step_at_every_operating_point() {
+    for name in plantd_models::builtin::NAMES.iter().copied().chain([
+        "tree-63",
+        "scissor-1",
+        "scissor-12",
+        "balls-15",
+        "walker-6",
+    ]) {
+        let model = Arc::new(Model::compile(&builtin(name)).unwrap());
+        let mut plant = Plant::new(model.clone(), Settings::new(&model)).unwrap();
+        for point in model.operating_points() {
+            plant.initialize(&Initial::OperatingPoint(point.name.clone())).unwrap();
+            plant.step(&point.u).unwrap_or_else(|e| panic!("{name} at {}: {e}", point.name));
+        }
+    }
+}
+
+#[test]
+fn named_operating_points_are_equilibria() {
+    for name in plantd_models::builtin::NAMES {
+        let model = Arc::new(Model::compile(&builtin(name)).unwrap());
+        let mut plant = Plant::new(model.clone(), Settings::new(&model)).unwrap();
+        for point in model.operating_points().iter().filter(|p| p.name != "initial") {
+            plant.initialize(&Initial::OperatingPoint(point.name.clone())).unwrap();
+            plant.step(&point.u).unwrap();
+            for (now, then) in plant.q().iter().zip(&point.q) {
+                assert!((now - then).abs() < 1e-14, "{name} at {}: {now} {then}", point.name);
             }
         }
     }

@@ -424,13 +424,13 @@ fn equations_that_are_redundant_on_the_manifold_only() {
     let u = [0.2];
     let (first, second) = (linearization(&mut one, &u), linearization(&mut two, &u));
     let dh = two.constraint_jacobian();
-    let tangent = plantd_models::control::tangent_basis(&dh);
+    let tangent = plantd_math::null_space::tangent_basis(&dh);
     let mut directions = DMatrix::zeros(8, tangent.ncols() + 4);
     directions.view_mut((0, 0), (4, tangent.ncols())).copy_from(&tangent);
     directions.view_mut((4, tangent.ncols()), (4, 4)).fill_with_identity();
     // Momenta agree up to what the constraints of the next state absorb.
     one.step(&u).unwrap();
-    let free = plantd_models::control::tangent_basis(&one.constraint_jacobian()).transpose();
+    let free = plantd_math::null_space::tangent_basis(&one.constraint_jacobian()).transpose();
     for (x, y) in [(first.a() * &directions, second.a() * &directions), (first.b(), second.b())] {
         let scale = x.amax();
         assert!((x.rows(0, 4) - y.rows(0, 4)).amax() < 1e-9 * scale, "q");

@@ -358,7 +358,6 @@ damping = {damping}
             plant.step(&[]).map(|_| ()).map_err(|error| error.to_string())
         }
         Err(error) => {
-            assert_eq!(scene.validate(), error.problems);
             assert_eq!(error.problems[0].path, "frames[1].joint");
             Err(error.problems[0].message.clone())
         }

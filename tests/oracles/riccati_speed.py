@@ -1,6 +1,6 @@
-"""Times the marionette's time-varying regulator in numpy, beside models/examples/riccati_speed.rs.
+"""Times the marionette's time-varying regulator in numpy, beside models/control/examples/riccati_speed.rs.
 
-    cargo run --release -p plantd-models --example riccati_speed /tmp/marionette.bin
+    cargo run --release -p plantd-control --example riccati_speed /tmp/marionette.bin
     OPENBLAS_NUM_THREADS=1 venv/bin/python riccati_speed.py /tmp/marionette.bin
 
 The plain recursion, as one writes it: P = Q + A'PA - (B'PA)'K with K = (R + B'PB)^-1 B'PA, symmetrised.

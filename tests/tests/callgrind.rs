@@ -290,7 +290,7 @@ fn step_count() -> PathBuf {
         let test = std::env::current_exe().expect("a test has a path");
         let target = test.ancestors().nth(3).expect("the test is target/PROFILE/deps/NAME");
         let status = Command::new(env!("CARGO"))
-            .args(["build", "--quiet", "--release", "--locked", "-p", "plantd-models"])
+            .args(["build", "--quiet", "--release", "--locked", "-p", "plantd-control"])
             .args(["--example", "step_count", "--target-dir"])
             .arg(target)
             .current_dir(env!("CARGO_MANIFEST_DIR"))

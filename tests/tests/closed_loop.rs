@@ -6,7 +6,7 @@ use std::f64::consts::PI;
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
-use plantd_models::control::{
+use plantd_control::{
     FiniteHorizon, Sample, Tangent, Values, Weights, controllability_rank, finite_horizon,
     finite_horizon_on_manifold, infinite_horizon, infinite_horizon_on_manifold,
 };

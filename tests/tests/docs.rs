@@ -104,8 +104,15 @@ fn files_that_documents_name_exist() {
     {
         let text = read(document);
         // Within the text of a crate its files go by their path from its sources.
-        let folders =
-            ["", "models/src", "models/import/src", "server/src", "client/src", "proto/src"];
+        let folders = [
+            "",
+            "models/src",
+            "models/control/src",
+            "models/import/src",
+            "server/src",
+            "client/src",
+            "proto/src",
+        ];
         let is_path = |name: &&str| {
             let is_file =
                 [".rs", ".toml", ".md", ".py", ".h"].iter().any(|end| name.ends_with(end));

@@ -95,7 +95,10 @@ fn floors() -> Vec<(String, Vec<String>)> {
         roots,
         [
             "proto/src",
+            "models/math/src",
+            "models/scene/src",
             "models/src",
+            "models/control/src",
             "models/import/src",
             "server/src",
             "client/src",

@@ -11,8 +11,8 @@ use crate::model::mechanism::{
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree, WORLD};
 use crate::scene;
+use crate::scene::Component;
 use crate::scene::Scene;
-use crate::scene::forces::Component;
 
 impl Layout {
     pub(super) fn coordinate_inputs(&self, scene: &Scene) -> Vec<CoordinateInput> {

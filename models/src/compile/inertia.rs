@@ -86,22 +86,26 @@ mod tests {
         Scene::from_toml(&text).unwrap()
     }
 
+    fn problems(scene: &Scene) -> Vec<Problem> {
+        Model::compile(scene).map_or_else(|error| error.problems, |_| Vec::new())
+    }
+
     #[test]
     fn impossible_moments_are_judged_with_what_is_fixed_to_them() {
         const LINK: &str = "inertia = [0.1, 0.2, 0.4]";
-        let refused = scene(LINK, "").validate();
+        let refused = problems(&scene(LINK, ""));
         assert_eq!(refused[0].path, "frames[0].body.inertia", "{refused:?}");
         assert!(refused[0].message.contains("any_inertia"), "{refused:?}");
         // 0.2 more of each.
         let heavy = "body = { mass = 1, inertia = [0.2, 0.2, 0.2] }";
-        assert_eq!(scene(LINK, heavy).validate(), []);
+        assert_eq!(problems(&scene(LINK, heavy)), []);
         let light = "body = { mass = 1, inertia = [0.02, 0.02, 0.02] }";
-        assert_eq!(scene(LINK, light).validate().len(), 1);
+        assert_eq!(problems(&scene(LINK, light)).len(), 1);
         let allowed = scene(&format!("{LINK}, any_inertia = true"), "");
         let model = Model::compile(&allowed).unwrap();
         assert_eq!(model.warnings().len(), 1, "{:?}", model.warnings());
         assert!(model.plan().contains("warning"), "{}", model.plan());
         let negative = scene("inertia = [-0.1, 0.2, 0.2], any_inertia = true", "");
-        assert!(negative.validate()[0].message.contains("negative"));
+        assert!(problems(&negative)[0].message.contains("negative"));
     }
 }

@@ -22,13 +22,6 @@ use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, W
 use crate::scene;
 use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError};
 
-impl Scene {
-    /// Everything that is wrong with the scene; empty when it will compile.
-    pub fn validate(&self) -> Vec<Problem> {
-        Model::compile(self).map_or_else(|error| error.problems, |_| Vec::new())
-    }
-}
-
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.
     ///
@@ -56,7 +49,7 @@ impl Model {
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     pub fn compile(scene: &Scene) -> Result<Self, SceneError> {
-        let problems = scene.problems();
+        let problems = scene.validate();
         if !problems.is_empty() {
             return Err(SceneError { problems });
         }
@@ -183,7 +176,7 @@ fn initial(scene: &Scene, name: &str) -> f64 {
     let is_input = scene.inputs.iter().any(|input| input.name == name);
     let signal = scene.signals.iter().find(|signal| signal.drives() == name && !is_input);
     match signal {
-        Some(signal) => signal.initial(),
+        Some(signal) => scene::TimeFunction::new(signal).at(0.0),
         None => settings(scene, name).map_or(0.0, |c| c.initial),
     }
 }

@@ -8,8 +8,8 @@ use crate::model::mechanism::{
 };
 use crate::model::tree::Tree;
 use crate::scene;
+use crate::scene::LinearTerm;
 use crate::scene::Scene;
-use crate::scene::linear_term::LinearTerm;
 
 /// Depth of a stop at which its stiffness is whole, of its range, if the scene does not say.
 const DEFAULT_TRANSITION: f64 = 0.01;

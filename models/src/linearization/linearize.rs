@@ -358,7 +358,7 @@ impl Linearization {
 
     /// What unit inputs give to the residual, `a h ∂f/∂u`, and to `p[k+1]` beyond that,
     /// `(1 − a) h ∂f/∂u`, nd by ni each.
-    pub(crate) fn input_impulses(&self) -> [DMatrix<f64>; 2] {
+    pub fn input_impulses(&self) -> [DMatrix<f64>; 2] {
         let [mut at_start, mut at_end] = [0; 2].map(|_| DMatrix::zeros(self.nd, self.ni));
         for &InputImpulse { input, coordinate, residual, momentum } in &self.inputs {
             at_start[(coordinate, input)] += residual;

@@ -9,7 +9,7 @@ use crate::math::sparse_map::Map;
 impl Linearization {
     /// Writes `[B A]` without its zeros: rows of dynamic coordinates and momenta are full, those of
     /// prescribed coordinates have an entry or two.
-    pub(crate) fn write_map(&self, map: &mut Map) {
+    pub fn write_map(&self, map: &mut Map) {
         let theta = self.parameters();
         let (nd, nk, ni) = (theta.nd, theta.nk, theta.ni);
         let (n, next, inputs) = (theta.n(), theta.inputs(), ni + nk);

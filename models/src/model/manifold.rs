@@ -50,6 +50,24 @@ impl Model {
         );
         difference(&self.orientations, reference, q, change);
     }
+
+    /// [`Model::difference`] of whole states, `x ⊖ reference`.
+    ///
+    /// # Panics
+    ///
+    /// If a state ends within an orientation.
+    pub fn write_state_difference(&self, reference: &[f64], x: &[f64], change: &mut [f64]) {
+        difference(&self.orientations, reference, x, change);
+    }
+
+    /// [`Model::retract`] of whole states, by `length` times `change`.
+    ///
+    /// # Panics
+    ///
+    /// If a state ends within an orientation.
+    pub fn write_state_retraction(&self, x: &[f64], change: &[f64], length: f64, out: &mut [f64]) {
+        retract(&self.orientations, x, change, length, out);
+    }
 }
 
 /// `x ⊖ reference`, of configurations or whole states, as far as `out` goes; `orientations` are the first

@@ -18,7 +18,7 @@ use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
 use crate::plant::facade::Plant;
 use crate::plant::settle::{SettleError, SettleRequest};
-use crate::scene::words::UnknownName;
+use crate::scene::UnknownName;
 
 /// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
 /// half turns about an axis and for cyclic exchanges of the axes, it is −1 or 0.
@@ -231,11 +231,7 @@ impl Plant {
 
     /// The nearest configuration on the constraints, with the shortest corrections
     /// `dq = −Aᵀ (A Aᵀ)⁻¹ h`, `A` the columns that move.
-    pub(crate) fn project(
-        &self,
-        mut q: Vec<f64>,
-        moves: &[bool],
-    ) -> Result<Vec<f64>, InitialError> {
+    pub fn project(&self, mut q: Vec<f64>, moves: &[bool]) -> Result<Vec<f64>, InitialError> {
         let model = &self.model;
         let (n, nc) = (q.len(), model.dimensions.constraints);
         let mut closure = Closure::new(model);

@@ -11,26 +11,26 @@ use crate::plant::facade::Plant;
 
 /// A step that was taken before, or one that a reference asks for.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct KnownStep<'a> {
+pub struct KnownStep<'a> {
     /// Index of the step: the time of signals.
-    pub(crate) index: u64,
+    pub index: u64,
     /// Configuration at the start, nd + nk.
-    pub(crate) q0: &'a [f64],
+    pub q0: &'a [f64],
     /// Momentum at the start, nd and whatever follows in the state; none where the end is asked for.
-    pub(crate) p0: Option<&'a [f64]>,
+    pub p0: Option<&'a [f64]>,
     /// Configuration at the end, nd + nk.
-    pub(crate) q1: &'a [f64],
+    pub q1: &'a [f64],
     /// Constraint impulses, nc.
-    pub(crate) multipliers: &'a [f64],
+    pub multipliers: &'a [f64],
     /// Input, ni + nk.
-    pub(crate) u: &'a [f64],
+    pub u: &'a [f64],
 }
 
 impl Plant {
     /// Linearizes the map at a known step. Costs one residual evaluation, a factorization, and
     /// O(n²·depth); where the period has several steps or stages, it is solved again from `p0`. Leaves
     /// the plant at the start of the step, with the momentum that it had.
-    pub(crate) fn linearize_known(
+    pub fn linearize_known(
         &mut self,
         step: &KnownStep<'_>,
         out: &mut Linearization,
@@ -50,12 +50,12 @@ impl Plant {
     }
 
     /// Whether the period is one step of the midpoint rule.
-    pub(crate) fn is_one_midpoint_step(&self) -> bool {
+    pub fn is_one_midpoint_step(&self) -> bool {
         self.period.scheme == Scheme::Midpoint && self.settings.substeps == 1
     }
 
     /// Never halves a period: all steps are of one map.
-    pub(crate) fn keep_periods_whole(&mut self) {
+    pub fn keep_periods_whole(&mut self) {
         self.settings.halvings = 0;
     }
 
@@ -74,7 +74,7 @@ impl Plant {
 
     /// Momenta that a step from `q0` to `q1` leaves with and arrives with, without the impulse of
     /// constraints: `−D1 Ld − F⁻` and `D2 Ld + F⁺`.
-    pub(crate) fn momenta_of_known(
+    pub fn momenta_of_known(
         &mut self,
         step: &KnownStep<'_>,
         at_start: &mut [f64],
@@ -97,7 +97,7 @@ impl Plant {
     }
 
     /// Mass matrix of the dynamic coordinates, nd square (allocates).
-    pub(crate) fn mass_matrix_at(&mut self, q: &[f64]) -> DMatrix<f64> {
+    pub fn mass_matrix_at(&mut self, q: &[f64]) -> DMatrix<f64> {
         let nd = self.model.dimensions.dynamic;
         self.place_configuration(q);
         let mut mass = DMatrix::zeros(nd, nd);
@@ -112,7 +112,7 @@ impl Plant {
     }
 
     /// Values `h(q)` of the constraints and their Jacobian, nc by nd + nk (allocates).
-    pub(crate) fn constraints_at(&mut self, q: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
+    pub fn constraints_at(&mut self, q: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
         let d = self.model.dimensions;
         let closure = &mut self.workspace.constraints.end;
         closure.evaluate(&self.model, q, &orientations(&self.model, q));

@@ -24,8 +24,13 @@ use crate::plant::facade::Plant;
 const REDUNDANT: f64 = 1e-11;
 
 impl Plant {
-    /// Takes `x = (q, p, v)` as it is, whether it satisfies the constraints or not.
-    pub(crate) fn place(&mut self, x: &[f64]) {
+    /// Takes `x = (q, p, v)` as it is, whether it satisfies the constraints or not: for what is evaluated at
+    /// states that nobody moves to. [`Plant::initialize`] takes states to go on from.
+    ///
+    /// # Panics
+    ///
+    /// If `x` is not 2 nd + 2 nk long.
+    pub fn place(&mut self, x: &[f64]) {
         let (q, rest) = x.split_at(self.state.q.len());
         let (p, v) = rest.split_at(self.state.p.len());
         self.place_configuration(q);

@@ -23,7 +23,7 @@ use crate::math::null_space::tangent_basis;
 use crate::model::conditioning::Conditioning;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
-use crate::scene::words::UnknownName;
+use crate::scene::UnknownName;
 
 /// Iterations before the search is given up.
 const MAX_ITERATIONS: u32 = 300;

@@ -35,6 +35,11 @@ impl Spare {
         self.0.model()
     }
 
+    /// The plant that it will be. Its state means nothing yet.
+    pub fn plant(&self) -> &Plant {
+        &self.0
+    }
+
     /// The plant in a state, step 0.
     pub fn start(mut self, initial: &Initial) -> Result<Plant, InitialError> {
         self.0.initialize(initial)?;

@@ -8,6 +8,7 @@ pub(crate) mod oracle;
 pub(crate) mod random_scene;
 
 use std::f64::consts::PI;
+use std::path::Path;
 use std::sync::Arc;
 
 pub(crate) use numbers::Numbers;
@@ -20,6 +21,12 @@ use plantd_models::{ForceSplit, Model, Plant, Settings, builtin};
 /// Both ways to split forces.
 pub(crate) const SPLITS: [ForceSplit; 2] = [ForceSplit::Symmetric, ForceSplit::Paper];
 
+/// The folder `models`, from each of the crates in it.
+pub(crate) fn folder() -> &'static Path {
+    let package = Path::new(env!("CARGO_MANIFEST_DIR"));
+    package.ancestors().find(|folder| folder.ends_with("models")).expect("a folder of this name")
+}
+
 /// A built-in scene.
 pub(crate) fn builtin(name: &str) -> Scene {
     builtin::scene(name).unwrap_or_else(|| panic!("no scene {name}"))
@@ -27,7 +34,7 @@ pub(crate) fn builtin(name: &str) -> Scene {
 
 /// The scene of each element, without those whose ball joints have no coordinates to displace.
 pub(crate) fn elements_with_coordinates() -> Vec<Scene> {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let folder = folder().join("scenes/elements");
     let mut paths: Vec<_> =
         std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.sort();

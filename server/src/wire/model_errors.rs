@@ -1,8 +1,8 @@
 //! Errors of the mechanics, of regulators, filters and searches, as errors for clients.
 
-use plantd_models::control::{AnalysisError, KalmanError, NoiseError, RiccatiError, WeightsError};
-use plantd_models::optimize::{OptimizeError, Stuck};
-use plantd_models::reference::ReferenceError;
+use plantd_control::optimize::{OptimizeError, Stuck};
+use plantd_control::reference::ReferenceError;
+use plantd_control::{AnalysisError, KalmanError, NoiseError, RiccatiError, WeightsError};
 use plantd_models::{
     ChoiceError, ContinuousError, InitialError, SettleError, SnapshotError, StepError, TooLarge,
 };

@@ -126,7 +126,7 @@ fn docs(context: &mut Context) -> Outcome {
 fn build(context: &mut Context) -> Outcome {
     let built = run(&mut context.cargo(&["build", "--workspace", "--all-targets", "--locked"]))
         .and_then(|()| {
-            let counter = ["build", "--release", "--locked", "-p", "plantd-models"];
+            let counter = ["build", "--release", "--locked", "-p", "plantd-control"];
             run(context.cargo(&counter).args(["--example", "step_count"]))
         });
     context.broken = built.is_err();

@@ -4,9 +4,9 @@
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
-use plantd_models::control::{
-    self, FiniteHorizon, Momentum, Regulator, RiccatiError, Sample, Tangent, TrajectoryWeights,
-    Values, Weights, WeightsError,
+use plantd_control::{
+    self as control, FiniteHorizon, Momentum, Regulator, RiccatiError, Sample, Tangent,
+    TrajectoryWeights, Values, Weights, WeightsError,
 };
 use plantd_models::{
     Initial, InitialError, Linearization, Model, Plant, Settings, Spare, State, StepError,

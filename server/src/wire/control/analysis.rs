@@ -1,7 +1,7 @@
 //! Analysis of the linearized map: ranks, modes and frequency responses.
 
 use nalgebra::DMatrix;
-use plantd_models::control::{self, Mode, Tangent, TransferFunction};
+use plantd_control::{self as control, Mode, Tangent, TransferFunction};
 use plantd_models::scene::UnknownName;
 use plantd_models::{Linearization, Model, Plant};
 use plantd_proto::v1;

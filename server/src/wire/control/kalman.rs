@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
-use plantd_models::control::{self, Kalman, Momentum, NoiseCovariances, Sample, Values};
+use plantd_control::{self as control, Kalman, Momentum, NoiseCovariances, Sample, Values};
 use plantd_models::{Linearization, Model, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;

@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use futures::stream;
 use nalgebra::DMatrix;
-use plantd_models::control::Momentum;
-use plantd_models::optimize::{
+use plantd_control::Momentum;
+use plantd_control::optimize::{
     Bound, Bounds, Checkpoint, FreeInitialState, Method, Optimizer, Options, Progress, Status,
     TrajectoryCost,
 };

@@ -1,9 +1,9 @@
 //! `ControlService.ProjectReference`: references from outside.
 
 use nalgebra::DMatrix;
+use plantd_control::Values;
+use plantd_control::reference::{self, Assessment, Projected};
 use plantd_models::Spare;
-use plantd_models::control::Values;
-use plantd_models::reference::{self, Assessment, Projected};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use v1::project_reference_response::Response as Answer;

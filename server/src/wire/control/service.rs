@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use futures::{StreamExt, stream};
 use nalgebra::{DMatrix, DVector};
-use plantd_models::control::{self, Values};
+use plantd_control::{self as control, Values};
 use plantd_models::{Linearization, Plant, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;

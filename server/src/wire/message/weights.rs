@@ -1,8 +1,8 @@
 //! Weights of regulators, filters and optimisations.
 
 use nalgebra::{DMatrix, DVector};
+use plantd_control::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
 use plantd_models::Model;
-use plantd_models::control::{Momentum, StageWeights, TrajectoryWeights, Weights, WeightsError};
 use plantd_proto::v1;
 use v1::weight::Form as WeightForm;
 

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
-use plantd_models::control::{Momentum, Weights};
+use plantd_control::{Momentum, Weights};
 use plantd_models::drawing::{Drawing, Instant, Poses};
 use plantd_models::{Initial, Linearization, Plant};
 use plantd_proto::v1;

@@ -6,7 +6,7 @@
 
 use std::sync::Arc;
 
-use plantd_models::control::Values;
+use plantd_control::Values;
 use plantd_models::{Initial, Model};
 use plantd_proto::v1;
 use tokio::sync::watch::Receiver;

@@ -8,7 +8,7 @@ use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use plantd_models::control::{Momentum, Weights};
+use plantd_control::{Momentum, Weights};
 use plantd_proto::v1;
 use tokio::time::Instant;
 

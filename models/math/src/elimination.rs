@@ -1,0 +1,83 @@
+//! Which entries of the Newton matrix are stored, and in which order they are eliminated.
+//!
+//! The Newton matrix of a tree couples a joint only with its ancestors, and elimination from the
+//! leaves to the root creates no fill-in. A spring between two branches couples these branches: the
+//! elimination tree then runs through both. A row stores all its ancestors in the elimination tree,
+//! so one factorization serves every scene.
+
+use std::collections::BTreeSet;
+
+/// The elimination tree.
+#[derive(Clone, Debug, Default)]
+pub struct SymbolicElimination {
+    /// Row `j` owns `ancestors[offsets[j]..offsets[j + 1]]`.
+    pub offsets: Vec<usize>,
+    /// Ancestors of each row, root first, the row itself last.
+    pub ancestors: Vec<usize>,
+    /// Row `i` owns `descendants[descendant_offsets[i]..descendant_offsets[i + 1]]`.
+    descendant_offsets: Vec<usize>,
+    /// Proper descendants of each row, and the slots of their entries with it.
+    descendants: Vec<(usize, usize)>,
+}
+
+impl SymbolicElimination {
+    /// Symbolic elimination of the pattern `couplings[j]` (indices below `j`), from the last row to
+    /// the first.
+    pub fn new(couplings: &[BTreeSet<usize>]) -> Self {
+        let n = couplings.len();
+        let mut rows = couplings.to_vec();
+        let mut parent = vec![None; n];
+        for j in (0..n).rev() {
+            parent[j] = rows[j].last().copied();
+            if let Some(p) = parent[j] {
+                let passed_up: Vec<usize> = rows[j].range(..p).copied().collect();
+                rows[p].extend(passed_up);
+            }
+        }
+        let mut elimination = Self { offsets: vec![0], ..Self::default() };
+        for j in 0..n {
+            let mut path = vec![j];
+            while let Some(p) = parent[path[path.len() - 1]] {
+                path.push(p);
+            }
+            path.reverse();
+            elimination.ancestors.extend(path);
+            elimination.offsets.push(elimination.ancestors.len());
+        }
+        elimination.descendant_offsets = vec![0];
+        for i in 0..n {
+            let below = (i + 1..n).filter_map(|j| elimination.slot(j, i).map(|slot| (j, slot)));
+            let below: Vec<_> = below.collect();
+            elimination.descendants.extend(below);
+            elimination.descendant_offsets.push(elimination.descendants.len());
+        }
+        elimination
+    }
+
+    /// Proper descendants of a row, and the slots of their entries with it.
+    pub fn below(&self, row: usize) -> &[(usize, usize)] {
+        &self.descendants[self.descendant_offsets[row]..self.descendant_offsets[row + 1]]
+    }
+
+    /// Rows.
+    pub fn len(&self) -> usize {
+        self.offsets.len() - 1
+    }
+
+    /// Stored entries of one triangle, diagonal included.
+    pub fn entries(&self) -> usize {
+        self.ancestors.len()
+    }
+
+    /// Independent blocks.
+    pub fn islands(&self) -> usize {
+        self.offsets.windows(2).filter(|w| w[1] - w[0] == 1).count()
+    }
+
+    /// Place of the entry of `descendant` with `ancestor`.
+    pub fn slot(&self, descendant: usize, ancestor: usize) -> Option<usize> {
+        let range = self.offsets[descendant]..self.offsets[descendant + 1];
+        let start = range.start;
+        self.ancestors[range].binary_search(&ancestor).ok().map(|k| start + k)
+    }
+}

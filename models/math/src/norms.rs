@@ -1,0 +1,49 @@
+//! Largest magnitudes, by which residuals are measured.
+
+/// The larger of two numbers; a NaN wins, so that it is never taken for converged.
+///
+/// Both are taken without their signs, and bits of such numbers are in their order.
+#[inline(always)]
+pub fn larger(a: f64, b: f64) -> f64 {
+    f64::from_bits(a.abs().to_bits().max(b.abs().to_bits()))
+}
+
+/// The largest magnitude of some numbers; NaN if one is not finite.
+pub fn largest(numbers: &[f64]) -> f64 {
+    let (blocks, rest) = numbers.as_chunks::<4>();
+    let (mut most, mut sum) = ([0.0_f64; 4], [0.0_f64; 4]);
+    let mut see = |i: usize, number: f64| {
+        let size = number.abs();
+        most[i] = if size > most[i] { size } else { most[i] };
+        sum[i] += size;
+    };
+    for block in blocks {
+        for (i, number) in block.iter().enumerate() {
+            see(i, *number);
+        }
+    }
+    rest.iter().for_each(|number| see(0, *number));
+    let most = most.into_iter().fold(0.0, f64::max);
+    if sum.into_iter().sum::<f64>() < f64::INFINITY { most } else { f64::NAN }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_largest_number_is_found_and_nothing_infinite_passes() {
+        for len in 0..10 {
+            let mut numbers: Vec<f64> = (0..len).map(|i| -0.5 * f64::from(i)).collect();
+            assert_eq!(largest(&numbers), 0.5 * f64::from((len - 1).max(0)));
+            for place in 0..numbers.len() {
+                let kept = numbers[place];
+                for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+                    numbers[place] = bad;
+                    assert!(largest(&numbers).is_nan(), "{len} {place}");
+                }
+                numbers[place] = kept;
+            }
+        }
+    }
+}

@@ -1,0 +1,404 @@
+//! Rotations: orientations as unit quaternions, and the maps between rotations and rotation vectors
+//! that a ball joint needs.
+//!
+//! A ball joint turns in one step by `R[k+1] = R[k] exp(ξ)`, with `ξ` in its own axes. With
+//! `t = |ξ|` and `ξ^ x = ξ × x` all maps are polynomials `1 + a ξ^ + b ξ^²` whose coefficients are even
+//! functions of `t`: series near zero, so that no direction and no rate is special.
+
+use crate::scalar::{Dual, Scalar};
+use crate::spatial::{Mat3, Vec3};
+use crate::sums::two_sum;
+use crate::trigonometry::sin_cos_of;
+
+/// An orientation, as a unit quaternion `[w, x, y, z]`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Quaternion(pub [f64; 4]);
+
+impl Default for Quaternion {
+    fn default() -> Self {
+        Self([1.0, 0.0, 0.0, 0.0])
+    }
+}
+
+impl Quaternion {
+    /// `exp(v)`: the rotation about the direction of `v` by its length.
+    pub fn exp(v: Vec3) -> Self {
+        let angle = v.norm();
+        let (sine, cosine) = sin_cos_of(0.5 * angle);
+        // sin(t/2)/t to round-off where the quotient would be 0/0.
+        let scale = if angle < 1e-4 { 0.5 - angle * angle / 48.0 } else { sine / angle };
+        Self([cosine, scale * v[0], scale * v[1], scale * v[2]])
+    }
+
+    /// Of a rotation matrix: from its largest component, which loses no digits.
+    pub fn of_matrix(Mat3([x, y, z]): &Mat3) -> Self {
+        let squares = [
+            1.0 + x[0] + y[1] + z[2],
+            1.0 + x[0] - y[1] - z[2],
+            1.0 - x[0] + y[1] - z[2],
+            1.0 - x[0] - y[1] + z[2],
+        ];
+        let largest = (1..4).fold(0, |m, i| if squares[i] > squares[m] { i } else { m });
+        let square = squares[largest];
+        let (a, b, c) = (y[2] - z[1], z[0] - x[2], x[1] - y[0]);
+        let (d, e, f) = (x[1] + y[0], z[0] + x[2], y[2] + z[1]);
+        let components = match largest {
+            0 => [square, a, b, c],
+            1 => [a, square, d, e],
+            2 => [b, d, square, f],
+            _ => [c, e, f, square],
+        };
+        Self(components).normalized()
+    }
+
+    /// The rotation vector, at most half a turn long.
+    pub fn log(self) -> Vec3 {
+        let [w, x, y, z] = self.0;
+        let vector = Vec3([x, y, z]);
+        let sine = vector.norm();
+        if sine == 0.0 {
+            return Vec3::ZERO;
+        }
+        // `atan2` keeps all digits near half a turn, where the cosine alone would lose them.
+        let angle = 2.0 * libm::atan2(sine, w.abs());
+        vector * (angle.copysign(w) / sine)
+    }
+
+    /// `self · o`, normalised.
+    pub fn times(self, o: Self) -> Self {
+        Self(product(self.0, o.0)).normalized()
+    }
+
+    /// `(self + low) exp(turn)`, and what rounding took from it: the increment, of which no digits cancel,
+    /// is added by compensated sums, so that turns do not drift.
+    pub fn turned(self, low: [f64; 4], turn: Vec3) -> (Self, [f64; 4]) {
+        let Self([_, x, y, z]) = Self::exp(turn);
+        // cos(t/2) − 1
+        let quarter = sin_cos_of(0.25 * turn.norm()).0;
+        let change = [-2.0 * quarter * quarter, x, y, z];
+        let (of_high, of_low) = (product(self.0, change), product(low, change));
+        let sums = [0, 1, 2, 3].map(|i| two_sum(self.0[i], of_high[i] + (low[i] + of_low[i])));
+        let (high, low) = (sums.map(|(high, _)| high), sums.map(|(_, low)| low));
+        // To length 1: that is no turn.
+        let dot = |a: [f64; 4], b: [f64; 4]| (0..4).map(|i| a[i] * b[i]).sum::<f64>();
+        let excess = 0.5 * (dot(high, high) - 1.0) + dot(high, low);
+        (Self(high), [0, 1, 2, 3].map(|i| low[i] - excess * high[i]))
+    }
+
+    /// The opposite rotation: the conjugate.
+    pub fn inverse(self) -> Self {
+        let [w, x, y, z] = self.0;
+        Self([w, -x, -y, -z])
+    }
+
+    fn normalized(self) -> Self {
+        let norm = self.0.iter().map(|c| c * c).sum::<f64>().sqrt();
+        Self(self.0.map(|c| c / norm))
+    }
+
+    /// The rotation matrix.
+    pub fn matrix(self) -> Mat3 {
+        let [w, x, y, z] = self.0;
+        Mat3::from_rows([
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ])
+    }
+}
+
+fn product([a, b, c, d]: [f64; 4], [w, x, y, z]: [f64; 4]) -> [f64; 4] {
+    [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+}
+
+/// Squares of angles below this are summed as series.
+const SERIES_BELOW: f64 = 1.0;
+
+/// Squares of angles below this are done with the first terms: of them and their slopes no digit is missing.
+const FIRST_BELOW: f64 = 1e-3;
+
+/// `Σ c_i sⁱ`.
+#[inline]
+fn series<S: Scalar, const N: usize>(s: S, coefficients: &[f64; N]) -> S {
+    let sum = |coefficients: &[f64]| coefficients.iter().rev().fold(S::ZERO, |sum, c| sum * s + *c);
+    if s.value() < FIRST_BELOW { sum(&coefficients[..6]) } else { sum(coefficients) }
+}
+
+/// `sin t / t`, `(1 − cos t) / t²` and `(t − sin t) / t³` for `s = t²`.
+#[inline]
+fn exponential<S: Scalar>(s: S) -> [S; 3] {
+    /// `1/n!`.
+    const fn inverse_factorial(n: usize) -> f64 {
+        let (mut product, mut i) = (1.0, 2);
+        while i <= n {
+            product *= i as f64;
+            i += 1;
+        }
+        1.0 / product
+    }
+    /// `(−1)ⁱ / (2i + first)!`.
+    const fn alternating(first: usize) -> [f64; 10] {
+        let (mut c, mut i) = ([0.0; 10], 0);
+        while i < 10 {
+            let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
+            c[i] = sign * inverse_factorial(2 * i + first);
+            i += 1;
+        }
+        c
+    }
+    const SINE: [f64; 10] = alternating(1);
+    const COSINE: [f64; 10] = alternating(2);
+    const REST: [f64; 10] = alternating(3);
+    if s.value() < SERIES_BELOW {
+        return [series(s, &SINE), series(s, &COSINE), series(s, &REST)];
+    }
+    let t = s.sqrt();
+    let (sine, cosine) = t.sin_cos();
+    let inverse = s.recip();
+    let sine_over_t = sine * t.recip();
+    [sine_over_t, (S::ONE - cosine) * inverse, (S::ONE - sine_over_t) * inverse]
+}
+
+/// `c = (1 − (t/2) cot(t/2)) / t²` for `s = t²`.
+#[inline]
+fn inverse_coefficient<S: Scalar>(s: S) -> S {
+    /// `|B_2i| / (2i)!` with the Bernoulli numbers.
+    const BERNOULLI: [f64; 11] = [
+        1.0 / 12.0,
+        1.0 / 720.0,
+        1.0 / 30_240.0,
+        1.0 / 1_209_600.0,
+        1.0 / 47_900_160.0,
+        691.0 / 1_307_674_368_000.0,
+        1.0 / 74_724_249_600.0,
+        3_617.0 / 10_670_622_842_880_000.0,
+        43_867.0 / 5_109_094_217_170_944_000.0,
+        174_611.0 / 802_857_662_698_291_200_000.0,
+        77_683.0 / 14_101_100_039_391_805_440_000.0,
+    ];
+    if s.value() < SERIES_BELOW {
+        return series(s, &BERNOULLI);
+    }
+    let half = s.sqrt() * 0.5;
+    let (sine, cosine) = half.sin_cos();
+    (S::ONE - half * cosine * sine.recip()) * s.recip()
+}
+
+/// `k = tan(t/4) / t` for `s = t²`.
+#[inline]
+fn midpoint_coefficient<S: Scalar>(s: S) -> S {
+    /// Coefficients of `tan x = Σ c_i x^(2i+1)`.
+    const TANGENT: [f64; 11] = [
+        1.0,
+        1.0 / 3.0,
+        2.0 / 15.0,
+        17.0 / 315.0,
+        62.0 / 2_835.0,
+        1_382.0 / 155_925.0,
+        21_844.0 / 6_081_075.0,
+        929_569.0 / 638_512_875.0,
+        6_404_582.0 / 10_854_718_875.0,
+        443_861_162.0 / 1_856_156_927_625.0,
+        18_888_466_084.0 / 194_896_477_400_625.0,
+    ];
+    if s.value() < SERIES_BELOW {
+        return series(s * (1.0 / 16.0), &TANGENT) * 0.25;
+    }
+    let t = s.sqrt();
+    let (sine, cosine) = (t * 0.25).sin_cos();
+    sine * (cosine * t).recip()
+}
+
+/// `1 + a y^ + b y^²`.
+#[inline(always)]
+fn polynomial<S: Scalar>(y: Vec3<S>, a: S, b: S) -> Mat3<S> {
+    let turn = y * a;
+    let (square, along) = (Vec3([y[0] * y[0], y[1] * y[1], y[2] * y[2]]), y * b);
+    let [xy, xz, yz] = [along[0] * y[1], along[0] * y[2], along[1] * y[2]];
+    let diagonal = |i: usize, j: usize| S::ONE - b * (square[i] + square[j]);
+    Mat3([
+        Vec3([diagonal(1, 2), xy + turn[2], xz - turn[1]]),
+        Vec3([xy - turn[2], diagonal(0, 2), yz + turn[0]]),
+        Vec3([xz + turn[1], yz - turn[0], diagonal(0, 1)]),
+    ])
+}
+
+/// `δ ↦ δ × v`.
+#[inline(always)]
+pub fn crossed<S: Scalar>(v: Vec3<S>) -> Mat3<S> {
+    Mat3([Vec3([S::ZERO, -v[2], v[1]]), Vec3([v[2], S::ZERO, -v[0]]), Vec3([-v[1], v[0], S::ZERO])])
+}
+
+/// `exp(y)` as a matrix.
+#[inline]
+pub fn exp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
+    let [a, b, _] = exponential(y.dot(y));
+    polynomial(y, a, b)
+}
+
+/// `dexp₋y`: how `exp(y)` turns in its own axes as `y` changes, `exp(−y) d exp(y) = (dexp₋y dy)^`.
+#[inline]
+pub fn dexp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
+    let [_, b, c] = exponential(y.dot(y));
+    polynomial(y, -b, c)
+}
+
+/// `N⁻ = 1 + ½ ξ^ + c ξ^²`: takes the momentum at the midpoint to the start; the inverse of
+/// [`dexp`]. Its transpose `N⁺` takes it to the end.
+#[inline]
+pub fn momentum_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
+    polynomial(xi, S::constant(0.5), inverse_coefficient(xi.dot(xi)))
+}
+
+/// `T⁻ = 1 + k ξ^`: takes a torque at the midpoint to the start. Its transpose `T⁺` takes it to the end.
+#[inline]
+pub fn torque_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
+    polynomial(xi, midpoint_coefficient(xi.dot(xi)), S::ZERO)
+}
+
+/// `N⁻ m` without the matrix.
+#[inline]
+pub fn momentum_to_start(xi: Vec3, m: Vec3) -> Vec3 {
+    let turned = xi.cross(m);
+    m + turned * 0.5 + xi.cross(turned) * inverse_coefficient(xi.dot(xi))
+}
+
+/// `T⁻ τ` without the matrix.
+#[inline]
+pub fn torque_to_start(xi: Vec3, torque: Vec3) -> Vec3 {
+    torque + xi.cross(torque) * midpoint_coefficient(xi.dot(xi))
+}
+
+/// A function of `s` and its derivative.
+fn with_slope<S: Scalar>(f: impl Fn(Dual<S>) -> Dual<S>, s: S) -> [S; 2] {
+    let value = f(Dual::new(s, S::ONE));
+    [value.re, value.eps]
+}
+
+/// How `N⁻ m` changes with `ξ`: `½ δ×m + c (δ×(ξ×m) + ξ×(δ×m)) + 2c' (ξ·δ) ξ×(ξ×m)` for a change `δ`, `c'`
+/// by `t²`.
+pub fn momentum_change<S: Scalar>(xi: Vec3<S>, m: Vec3<S>) -> Mat3<S> {
+    let [c, slope] = with_slope(inverse_coefficient, xi.dot(xi));
+    let (turned, along) = (xi.cross(m), xi.dot(m));
+    let twice = xi.cross(turned) * (slope + slope) - m * (c + c);
+    // δ×(ξ×m) + ξ×(δ×m) = ξ (m·δ) + δ (ξ·m) − 2 m (ξ·δ)
+    let (mut change, weight, along) = (crossed(m.scaled(0.5)), m * c, along * c);
+    for (b, column) in change.0.iter_mut().enumerate() {
+        *column += xi * weight[b] + twice * xi[b];
+        column.0[b] += along;
+    }
+    change
+}
+
+/// How `T⁻ τ` changes with `ξ`: `k δ×τ + 2k' (ξ·δ) ξ×τ` for a change `δ`, `k'` by `t²`.
+pub fn torque_change<S: Scalar>(xi: Vec3<S>, torque: Vec3<S>) -> Mat3<S> {
+    let [k, slope] = with_slope(midpoint_coefficient, xi.dot(xi));
+    let twice = xi.cross(torque) * (slope + slope);
+    let mut change = crossed(torque * k);
+    for (b, column) in change.0.iter_mut().enumerate() {
+        *column += twice * xi[b];
+    }
+    change
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn vectors() -> impl Iterator<Item = Vec3> {
+        let lengths = [0.0, 1e-9, 1e-3, 0.3, 0.99, 1.01, 2.0, 3.1];
+        lengths.into_iter().map(|t| Vec3([2.0, -1.0, 0.5]) * (t / 5.25_f64.sqrt()))
+    }
+
+    fn distance(a: &Mat3, b: &Mat3) -> f64 {
+        (0..3).map(|i| (a.0[i] - b.0[i]).norm()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn quaternions_and_matrices_turn_alike() {
+        for v in vectors() {
+            let q = Quaternion::exp(v);
+            assert!(distance(&q.matrix(), &exp(v)) < 1e-15, "{v:?}");
+            assert!((q.log() - v).norm() < 1e-15 * (1.0 + v.norm()), "{v:?}");
+            let w = Vec3([0.3, 0.7, -0.2]);
+            let product = q.times(Quaternion::exp(w)).matrix();
+            assert!(distance(&product, &exp(v).times(&exp(w))) < 1e-15, "{v:?}");
+        }
+        let more_than_half_a_turn = Vec3([0.0, 0.0, 4.0]);
+        let short = Quaternion::exp(more_than_half_a_turn).log();
+        assert!((short[2] - (4.0 - std::f64::consts::TAU)).abs() < 1e-15);
+    }
+
+    #[test]
+    fn the_differential_of_the_exponential() {
+        let direction = Vec3([0.4, 0.1, -0.8]);
+        for v in vectors() {
+            let dual = Vec3([0, 1, 2].map(|i| Dual::new(v[i], direction[i])));
+            let turned = exp(dual);
+            let rate = Mat3(turned.0.map(|c| Vec3(c.0.map(|x| x.eps))));
+            let spin = exp(v).transpose().times(&rate);
+            let axis = Vec3([spin.0[1][2], spin.0[2][0], spin.0[0][1]]);
+            assert!((axis - dexp(v).apply(direction)).norm() < 1e-14, "{v:?}");
+            let identity = dexp(v).times(&momentum_at_start(v));
+            assert!(distance(&identity, &Mat3::IDENTITY) < 1e-14, "{v:?}");
+            // ½ (1 + exp(−ξ/2)) T⁻ = 1: a torque at the midpoint turns both ends alike.
+            let (half, one) = (exp(v * -0.5), Mat3::IDENTITY);
+            let mean = Mat3([0, 1, 2].map(|i| (half.0[i] + one.0[i]) * 0.5));
+            assert!(distance(&mean.times(&torque_at_start(v)), &one) < 1e-14, "{v:?}");
+        }
+    }
+
+    #[test]
+    fn maps_are_the_same_without_their_matrices() {
+        let v = Vec3([0.7, -0.3, 0.5]);
+        for xi in vectors() {
+            let momentum = momentum_at_start(xi).apply(v) - momentum_to_start(xi, v);
+            let torque = torque_at_start(xi).apply(v) - torque_to_start(xi, v);
+            assert!(momentum.norm() < 1e-15 && torque.norm() < 1e-15, "{xi:?}");
+            let turned = Mat3([0, 1, 2].map(|i| xi.cross(Mat3::IDENTITY.0[i])));
+            let squared = turned.times(&turned);
+            let [_, b, c] = exponential(xi.dot(xi));
+            let dexp_of = Mat3::IDENTITY.minus(&turned.scaled(b)).plus(&squared.scaled(c));
+            assert!(distance(&dexp(xi), &dexp_of) < 1e-15, "{xi:?}");
+        }
+    }
+
+    #[test]
+    fn the_changes_of_the_maps_are_their_derivatives() {
+        let (v, direction) = (Vec3([0.7, -0.3, 0.5]), Vec3([0.4, 0.1, -0.8]));
+        let lifted = Vec3(v.0.map(Dual::constant));
+        for xi in vectors() {
+            let dual = Vec3([0, 1, 2].map(|i| Dual::new(xi[i], direction[i])));
+            for (map, change) in [
+                (momentum_at_start(dual), momentum_change(xi, v)),
+                (torque_at_start(dual), torque_change(xi, v)),
+            ] {
+                let rate = Vec3(map.apply(lifted).0.map(|x| x.eps));
+                assert!((rate - change.apply(direction)).norm() < 1e-14, "{xi:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn series_and_closed_forms_meet() {
+        let (below, above) = (SERIES_BELOW - 1e-12, SERIES_BELOW + 1e-12);
+        for (a, b) in [
+            (exponential(below)[0], exponential(above)[0]),
+            (exponential(below)[1], exponential(above)[1]),
+            (exponential(below)[2], exponential(above)[2]),
+            (inverse_coefficient(below), inverse_coefficient(above)),
+            (midpoint_coefficient(below), midpoint_coefficient(above)),
+        ] {
+            assert!((a - b).abs() < 1e-12 * a, "{a} {b}");
+        }
+        let slope = |f: fn(Dual) -> Dual, s: f64| f(Dual::new(s, 1.0)).eps;
+        for f in [inverse_coefficient as fn(Dual) -> Dual, midpoint_coefficient] {
+            assert!((slope(f, below) - slope(f, above)).abs() < 1e-12);
+        }
+    }
+}
