@@ -200,7 +200,7 @@ mod tests {
     /// `PLANTD_BLESS=1` rewrites the committed schema.
     #[test]
     fn committed_schema_is_current() {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/scene.schema.json");
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/scene.schema.json");
         let current = serde_json::to_string_pretty(&Scene::json_schema()).unwrap() + "\n";
         if std::env::var_os("PLANTD_BLESS").is_some() {
             std::fs::write(path, &current).unwrap();

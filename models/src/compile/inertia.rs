@@ -96,6 +96,10 @@ mod tests {
         let refused = problems(&scene(LINK, ""));
         assert_eq!(refused[0].path, "frames[0].body.inertia", "{refused:?}");
         assert!(refused[0].message.contains("any_inertia"), "{refused:?}");
+        for impossible in ["[0.1, -0.1, 0.0]", "[0.1, 0.1, 0.1, 0.2, 0.0, 0.0]"] {
+            let refused = problems(&scene(&format!("inertia = {impossible}"), ""));
+            assert_eq!(refused[0].path, "frames[0].body.inertia", "{impossible}: {refused:?}");
+        }
         // 0.2 more of each.
         let heavy = "body = { mass = 1, inertia = [0.2, 0.2, 0.2] }";
         assert_eq!(problems(&scene(LINK, heavy)), []);

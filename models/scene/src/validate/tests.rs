@@ -283,7 +283,7 @@ fn faults_are_found_where_they_are() {
 
 /// The scene of an element.
 fn element(name: &str) -> String {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/elements");
     std::fs::read_to_string(format!("{folder}/{name}.toml")).unwrap()
 }
 
