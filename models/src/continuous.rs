@@ -27,6 +27,11 @@ pub(crate) mod terms;
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
+use plantd_math::rotation;
+use plantd_math::rows::padded;
+use plantd_math::scalar::{Dual, Scalar};
+use plantd_math::spatial::{Mat3, Vec3, three};
+use plantd_math::tree_lu::TreeLu;
 
 use crate::constraints::closure::Closure;
 use crate::kkt::schur::SchurComplement;
@@ -34,11 +39,6 @@ use crate::lagrangian::armature;
 use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::math::rotation;
-use crate::math::rows::padded;
-use crate::math::scalar::{Dual, Scalar};
-use crate::math::spatial::{Mat3, Vec3, three};
-use crate::math::tree_lu::TreeLu;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Dimensions, Model};
 

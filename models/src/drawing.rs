@@ -34,14 +34,15 @@ pub use crate::drawing::arrows::{Arrow, ArrowKind, Instant};
 pub use crate::drawing::lines::{Line, LineKind};
 pub use crate::drawing::shapes::{Form, Frame, Shape};
 
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::{Mat3, Vec3, three};
+
 use crate::compile::scene::Placement;
 use crate::drawing::arrows::Arrows;
 use crate::drawing::lines::Lines;
 use crate::drawing::rig::Rig;
 use crate::drawing::shapes::{Placed, shown, size_balls};
 use crate::lagrangian::kinematics::Poses as JointPoses;
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
 use crate::model::tree::{Attachment, WORLD};
 

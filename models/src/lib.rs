@@ -28,7 +28,6 @@ mod model;
 pub mod parameters;
 mod plant;
 
-use plantd_math as math;
 pub use plantd_scene as scene;
 pub use plantd_scene::builtin;
 
@@ -48,7 +47,6 @@ pub use crate::linearization::linearize::Linearization;
 pub use crate::linearization::matrices::Layout;
 pub use crate::linearization::second_order::contraction::Contraction;
 pub use crate::linearization::second_order::tensors::{SecondOrder, TooLarge};
-pub use crate::math::hash::fnv1a;
 pub use crate::model::mechanism::{Coordinate, Dimensions, Model, OperatingPoint, Violation};
 pub use crate::model::site::Site;
 pub use crate::plant::choice::{Choice, ChoiceError, ErrorEstimate};
@@ -61,4 +59,5 @@ pub use crate::plant::site::Pose;
 pub use crate::plant::snapshot::{Snapshot, SnapshotError};
 pub use crate::plant::spare::Spare;
 pub use crate::plant::targets::Target;
-pub use crate::scene::{Problem, Scene, SceneError};
+pub use plantd_math::hash::fnv1a;
+pub use plantd_scene::{Problem, Scene, SceneError};

@@ -13,10 +13,10 @@
 
 use std::collections::BTreeMap;
 
+use plantd_scene::{Scene, SceneError, UnknownName};
 use serde_json::Value;
 
 use crate::model::mechanism::Model;
-use crate::scene::{Scene, SceneError, UnknownName};
 
 /// Numbers that differ from those of the model that a plant was made from, by path. A path has one
 /// notation here: names where entries have them.
@@ -239,7 +239,7 @@ fn name(item: &Value) -> Option<&str> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::builtin;
+    use plantd_scene::builtin;
 
     fn model(name: &str) -> Model {
         Model::compile(&builtin::scene(name).unwrap()).unwrap()

@@ -2,17 +2,17 @@
 
 use std::collections::BTreeMap;
 
+use plantd_math::spatial::{Force, Mat3, Vec3};
+use plantd_scene as scene;
+use plantd_scene::{Component, Scene};
+
 use crate::compile::scene::{Layout, Places, settings};
-use crate::math::spatial::{Force, Mat3, Vec3};
 use crate::model::mechanism::{
     Coordinate, CoordinateForce, CoordinateInput, CoordinateLaw, Forces, LinearDamper, PathForce,
     PointForce, PointLaw, Resistance, Wrench, WrenchKind,
 };
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree, WORLD};
-use crate::scene;
-use crate::scene::Component;
-use crate::scene::Scene;
 
 impl Layout {
     pub(super) fn coordinate_inputs(&self, scene: &Scene) -> Vec<CoordinateInput> {

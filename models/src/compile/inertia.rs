@@ -1,10 +1,10 @@
 //! Moments of inertia that no body has: judged once bodies that move together are one.
 
 use nalgebra::Matrix3;
+use plantd_math::spatial::Sym3;
+use plantd_scene::{Frame, Problem, Scene};
 
 use crate::compile::scene::{Layout, Placement, full, placed};
-use crate::math::spatial::Sym3;
-use crate::scene::{Frame, Problem, Scene};
 
 /// How far principal moments may be from possible ones, relative to the largest.
 const TOLERANCE: f64 = 1e-9;

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeSet;
 
+use plantd_math::elimination::SymbolicElimination;
+
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::math::elimination::SymbolicElimination;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Forces, MixedPair, Model, Pair, Potentials, Spring};
 use crate::model::tree::Tree;
@@ -107,7 +108,7 @@ pub(super) fn check(model: &Model) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Scene;
+    use plantd_scene::Scene;
 
     const SCENE: &str = include_str!("../../scenes/elements/two-point-damper.toml");
 

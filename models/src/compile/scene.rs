@@ -3,13 +3,16 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use plantd_math::elimination::SymbolicElimination;
+use plantd_math::hash::fnv1a;
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::{Mat3, Sym3, Vec3};
+use plantd_math::trigonometry::sin_cos_of;
+use plantd_scene as scene;
+use plantd_scene::{CoordinateKind, Motion, Problem, Scene, SceneError};
+
 use crate::compile::pattern::{couplings, joint_pairs};
 use crate::compile::{inertia, pattern, settling};
-use crate::math::elimination::SymbolicElimination;
-use crate::math::hash::fnv1a;
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::{Mat3, Sym3, Vec3};
-use crate::math::trigonometry::sin_cos_of;
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
     Alignment, AlongAxis, Carries, Constraint, ConstraintKind, Coordinate, Coupling, Dimensions,
@@ -19,8 +22,6 @@ use crate::model::mechanism::{
 use crate::model::planar_tree::planar;
 use crate::model::site::Site;
 use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
-use crate::scene;
-use crate::scene::{CoordinateKind, Motion, Problem, Scene, SceneError};
 
 impl Model {
     /// Compiles a scene. All errors of the scene are reported at once.

@@ -9,12 +9,13 @@
 //!
 //! so that `(1 + ω t) e^(−ω t)` has fallen to a fiftieth at `settling_time_s`.
 
+use plantd_scene::{Scene, Spring};
+
 use crate::lagrangian::armature;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
-use crate::scene::{Scene, Spring};
 
 /// `ω t` at which `(1 + ω t) e^(−ω t)` is a fiftieth.
 const SETTLED: f64 = 5.834;

@@ -1,15 +1,15 @@
 //! Springs of a scene, resolved.
 
+use plantd_math::spline::Spline;
+use plantd_scene as scene;
+use plantd_scene::{LinearTerm, Scene};
+
 use crate::compile::scene::{Layout, Places};
-use crate::math::spline::Spline;
 use crate::model::mechanism::{
     CoordinateSpring, CoordinateStop, LinearSpring, PathLaw, PathSpring, PointSpring, Potentials,
     SplineSpring, Spring, Stop,
 };
 use crate::model::tree::Tree;
-use crate::scene;
-use crate::scene::LinearTerm;
-use crate::scene::Scene;
 
 /// Depth of a stop at which its stiffness is whole, of its range, if the scene does not say.
 const DEFAULT_TRANSITION: f64 = 0.01;

@@ -3,11 +3,12 @@
 //! The equations are those of [`equations`](crate::constraints::equations). Second derivatives of distances and
 //! of equations along axes are summed up as forces on what joints carry.
 
+use plantd_math::norms::larger;
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::{Mat3, Vec3};
+
 use crate::constraints::in_plane::InPlane;
 use crate::lagrangian::kinematics::{Place, Poses};
-use crate::math::norms::larger;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::{AlongAxis, ConstraintKind, Length, Model, PointDistance, PointPair};
 use crate::model::tree::{JointKind, Tree};
 
@@ -308,7 +309,7 @@ mod tests {
     use super::*;
     use crate::lagrangian::samples;
     use crate::lagrangian::samples::Configuration;
-    use crate::math::scalar::Dual;
+    use plantd_math::scalar::Dual;
 
     fn closure<S: Scalar>(model: &Model, at: &Configuration<S>) -> Closure<S> {
         let mut closure = Closure::new(model);

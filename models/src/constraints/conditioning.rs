@@ -20,10 +20,10 @@
 use std::f64::consts::TAU;
 
 use nalgebra::{DMatrix, DVector, SVD};
+use plantd_math::pivoted_lu::DEPENDENT;
 
 use crate::constraints::closure::Closure;
 use crate::constraints::projection::{Limits, Reached, project};
-use crate::math::pivoted_lu::DEPENDENT;
 use crate::model::conditioning::Conditioning;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;

@@ -9,9 +9,10 @@ mod path_length;
 mod point_distance;
 mod product;
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::{Place, Poses};
 use crate::lagrangian::vectors::Distance;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{Constraint, ConstraintKind, Length, PointPair};
 use crate::model::tree::Tree;
 

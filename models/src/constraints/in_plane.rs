@@ -3,8 +3,9 @@
 //!
 //! A wrench `(n, f)` is about the joint of its body, as in [`crate::lagrangian::planar`].
 
+use plantd_math::spatial::Vec3;
+
 use crate::lagrangian::kinematics::Poses;
-use crate::math::spatial::Vec3;
 use crate::model::loop_plan::Loops;
 use crate::model::mechanism::{AlongAxis, ConstraintKind, Model, PointPair};
 use crate::model::planar_tree::PlanarJoint;

@@ -6,8 +6,9 @@
 //!
 //! Corrections have least norm, each caller's by its own inner product.
 
+use plantd_math::norms::larger;
+
 use crate::constraints::closure::Closure;
-use crate::math::norms::larger;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
 

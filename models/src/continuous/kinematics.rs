@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::{Inertia, Mat3, Motion, Sym3, Vec3};
 
 use crate::compile::scene::{Placement, frames};
 use crate::continuous::{ContinuousError, take};
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::{Inertia, Mat3, Motion, Sym3, Vec3};
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
 use crate::model::tree::{Attachment, Tree, WORLD};

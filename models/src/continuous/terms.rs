@@ -1,12 +1,12 @@
 //! The terms of the equation of motion one by one, and inverse dynamics.
 
 use nalgebra::DMatrix;
+use plantd_math::rows::padded;
 
 use crate::continuous::{Continuous, ContinuousError, ContinuousPoint, take};
 use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::energy::{Energy, energy};
 use crate::lagrangian::forces::{Instant, add_damping, input_forces};
-use crate::math::rows::padded;
 
 /// The terms of the equation of motion of all coordinates, `n = nd + nk`, at a point:
 ///

@@ -15,11 +15,12 @@
 //! A coupling of coordinates acts at no place. Of two points that coincide and move both, the arrow is that on the
 //! first; the other is its opposite.
 
+use plantd_math::spatial::Vec3;
+use plantd_scene::{Component, Constraint, Force, Point, Scene};
+
 use crate::drawing::rig::{Direction, Rig};
 use crate::lagrangian::kinematics::Poses as JointPoses;
-use crate::math::spatial::Vec3;
 use crate::model::tree::{Attachment, WORLD};
-use crate::scene::{Component, Constraint, Force, Point, Scene};
 
 /// What an arrow stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

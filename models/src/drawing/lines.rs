@@ -2,10 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use plantd_scene::{Constraint, Force, Motion, Point, Scene};
+
 use crate::drawing::rig::Rig;
 use crate::drawing::shapes::Placed;
 use crate::model::tree::Attachment;
-use crate::scene::{Constraint, Force, Motion, Point, Scene};
 
 /// What a line stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use plantd_math::spatial::{Mat3, Vec3};
+use plantd_scene::Point;
+
 use crate::compile::scene::{Placement, frames};
 use crate::lagrangian::kinematics::Poses as JointPoses;
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 use crate::model::tree::{Attachment, JointKind, Tree, WORLD};
-use crate::scene::Point;
 
 /// The joints of a scene, those without mass too, with its frames and coordinates.
 #[derive(Clone, Debug)]

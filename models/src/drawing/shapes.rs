@@ -8,12 +8,12 @@
 //! ```
 
 use nalgebra::Matrix3;
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::{Mat3, Sym3, Vec3};
+use plantd_scene as scene;
 
 use crate::compile::scene::{Placement, full, placed, rotation};
 use crate::drawing::rig::Rig;
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::{Mat3, Sym3, Vec3};
-use crate::scene;
 
 /// Least edge of a box that stands for inertia, of its longest one: a rod can be seen, too.
 const THIN: f64 = 1.0 / 50.0;

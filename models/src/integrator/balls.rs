@@ -11,7 +11,12 @@
 //!
 //! which is what the equations of the other coordinates are with `N = T = 1`. Nothing is singular but
 //! a whole turn in one step. In the Newton matrix the maps weigh rows and columns of the joint: see
-//! [`crate::lagrangian::generators`]. See [`crate::math::rotation`] for the maps.
+//! [`crate::lagrangian::generators`]. See [`plantd_math::rotation`] for the maps.
+
+use plantd_math::rotation;
+use plantd_math::rotation::Quaternion;
+use plantd_math::simd::wide;
+use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
@@ -19,10 +24,6 @@ use crate::integrator::workspace::{Tangents, Workspace};
 use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, Vertical, dot, of_ball};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::{Turning, Weights};
-use crate::math::rotation;
-use crate::math::rotation::Quaternion;
-use crate::math::simd::wide;
-use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
 use crate::model::tree::JointKind;
 

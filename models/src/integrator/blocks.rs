@@ -4,13 +4,14 @@
 //! derivatives of these along a direction. Steps and the first-order linearization itself, which is
 //! [`linearize`](crate::linearization::linearize), know the sparsity.
 
+use plantd_math::rotation;
+use plantd_math::scalar::{Dual, Scalar};
+use plantd_math::spatial::{Mat3, Vec3, three};
+
 use crate::constraints::closure::Closure;
 use crate::integrator::settings::Settings;
 use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::turning::Turning;
-use crate::math::rotation;
-use crate::math::scalar::{Dual, Scalar};
-use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
 
 /// The blocks of one step's equations, row-major.

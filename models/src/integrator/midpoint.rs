@@ -2,13 +2,14 @@
 
 use std::f64::consts::TAU;
 
+use plantd_math::scalar::{Side, side_by_side};
+use plantd_math::simd::wide;
+use plantd_math::spatial::Mat3;
+
 use crate::integrator::state::PreciseState;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::{armature, forces};
-use crate::math::scalar::{Side, side_by_side};
-use crate::math::simd::wide;
-use crate::math::spatial::Mat3;
 use crate::model::mechanism::Model;
 use crate::model::tree::JointKind;
 

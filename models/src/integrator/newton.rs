@@ -4,11 +4,12 @@
 //! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
 //! measured in units of its own round-off; the solver stops where arithmetic does.
 
+use plantd_math::norms::{larger, largest};
+
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Residual, StepContext, Workspace};
-use crate::math::norms::{larger, largest};
 use crate::model::mechanism::Model;
 
 /// A residual this small, in units of round-off, is as good as zero.

@@ -1,7 +1,8 @@
 //! What the solver of a step did, and why it failed.
 
+use plantd_math::tree_lu::SmallestPivot;
+
 use crate::kkt::system::Estimates;
-use crate::math::tree_lu::SmallestPivot;
 use crate::model::mechanism::Model;
 
 /// What the solver did.

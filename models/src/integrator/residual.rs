@@ -18,15 +18,16 @@
 //!
 //! Ball joints weigh the terms by their maps: see [`balls`](crate::integrator::balls).
 
+use plantd_math::norms::largest;
+use plantd_math::rotation;
+use plantd_math::scalar::side_by_side;
+use plantd_math::simd::wide;
+use plantd_math::spatial::{Vec3, three};
+
 use crate::integrator::midpoint::Midpoint;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Residual, Workspace};
-use crate::math::norms::largest;
-use crate::math::rotation;
-use crate::math::scalar::side_by_side;
-use crate::math::simd::wide;
-use crate::math::spatial::{Vec3, three};
 use crate::model::mechanism::Model;
 
 impl Residual {

@@ -14,7 +14,8 @@
 //! backward, which keeps constraints and rotations: the five steps of Suzuki (Phys. Lett. A 146, 1990),
 //! and the nine and seventeen of Kahan and Li (Math. Comp. 66, 1997).
 
-use crate::math::trigonometry::sin_cos_of;
+use plantd_math::trigonometry::sin_cos_of;
+
 use crate::model::mechanism::Model;
 
 /// Stages at most.

@@ -1,9 +1,10 @@
 //! The state of a plant: as users see it, and with the digits that rounding took.
 
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::three;
+
 use crate::integrator::predictor::Past;
 use crate::integrator::scheme::Scheme;
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::three;
 use crate::model::mechanism::Model;
 
 /// A state, by value.

@@ -1,5 +1,7 @@
 //! The memory of a step.
 
+use plantd_math::rows::{Term, padded, spread};
+
 use crate::constraints::closure::Closure;
 use crate::integrator::balls::BallJoints;
 use crate::integrator::midpoint::Midpoint;
@@ -7,7 +9,6 @@ use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::generators::Flanks;
-use crate::math::rows::{Term, padded, spread};
 use crate::model::mechanism::Model;
 
 /// What a step is taken of.

@@ -16,6 +16,10 @@
 
 mod column;
 
+use plantd_math::rows::{Block, LANES, padded};
+use plantd_math::simd::widest;
+use plantd_math::tree_lu::SmallestPivot;
+
 use crate::constraints::in_plane::InPlane;
 use crate::kkt::loops::column::Column;
 use crate::kkt::planar::{Diagonal, Method, PlanarRecursion, add_to, dot3, product};
@@ -23,9 +27,6 @@ use crate::lagrangian::arrangement::Fours;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::Joints;
 use crate::lagrangian::plane::{Vec2, Vec3, cross};
-use crate::math::rows::{Block, LANES, padded};
-use crate::math::simd::widest;
-use crate::math::tree_lu::SmallestPivot;
 use crate::model::loop_plan::{Above, BODY, Loops, Opened, Step};
 use crate::model::planar_tree::PlanarJoint;
 

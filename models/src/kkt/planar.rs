@@ -21,13 +21,14 @@
 //! the leaves to the root are `D_j`. As each sum is about its own
 //! joint, long chains lose no digits.
 
+use plantd_math::rows::{Block, LANES};
+use plantd_math::simd::{wide, widest};
+use plantd_math::tree_lu::SmallestPivot;
+
 use crate::lagrangian::arrangement::Fours;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::{Joints, Link};
 use crate::lagrangian::plane::{Vec2, Vec3, cross, dot, linear};
-use crate::math::rows::{Block, LANES};
-use crate::math::simd::{wide, widest};
-use crate::math::tree_lu::SmallestPivot;
 use crate::model::planar_tree::PlanarJoint;
 
 /// What a joint gives to the matrix, and what is left of it when it has been eliminated.

@@ -1,9 +1,10 @@
 //! The Schur complement of `K` in the KKT system: `S = A1 K⁻¹ A0ᵀ`.
 
+use plantd_math::pivoted_lu::PivotedLu;
+use plantd_math::rows::padded;
+use plantd_math::tree_lu::TreeLu;
+
 use crate::constraints::closure::Closure;
-use crate::math::pivoted_lu::PivotedLu;
-use crate::math::rows::padded;
-use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Model;
 
 /// `S`, factored, with what it is made of.

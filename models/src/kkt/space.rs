@@ -23,15 +23,16 @@
 #[cfg(test)]
 mod tests;
 
+use plantd_math::rows::Block;
+use plantd_math::simd::widest;
+use plantd_math::spatial::{Mat3, Vec3};
+use plantd_math::tree_lu::SmallestPivot;
+
 use crate::lagrangian::generators::{
     Generators, MatrixKind, Step, Vertical, dot, of_ball, rows as times,
 };
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
-use crate::math::rows::Block;
-use crate::math::simd::widest;
-use crate::math::spatial::{Mat3, Vec3};
-use crate::math::tree_lu::SmallestPivot;
 use crate::model::mechanism::Model;
 use crate::model::tree::{JointKind, Tree};
 

@@ -8,6 +8,8 @@
 //! The tree LU of `K` with the Schur complement `S` serves every scene. Where a recursion is faster, it takes
 //! its place; what it cannot do sound falls back on the tree.
 
+use plantd_math::tree_lu::{SmallestPivot, TreeLu};
+
 use crate::constraints::closure::Closure;
 use crate::kkt::loops::{Mechanism, Multifrontal, Scales};
 use crate::kkt::planar::PlanarRecursion;
@@ -17,7 +19,6 @@ use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::planar::PlanarTree;
 use crate::lagrangian::turning::Weights;
-use crate::math::tree_lu::{SmallestPivot, TreeLu};
 use crate::model::mechanism::{Model, Solver};
 
 /// Pivots of loops, relative to what they are compared with, from which on they are taken.

@@ -7,7 +7,7 @@
 //! `v` is the coordinate's velocity; of a ball joint that is a component of the angular velocity in its own
 //! axes.
 
-use crate::math::scalar::Scalar;
+use plantd_math::scalar::Scalar;
 
 /// A dynamic coordinate and its armature, kg or kg·m².
 pub(crate) type Armature = (usize, f64);

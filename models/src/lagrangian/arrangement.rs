@@ -4,8 +4,9 @@ use std::fmt::Debug;
 use std::marker::PhantomData;
 use std::ops::Mul;
 
+use plantd_math::scalar::{Lanes, Scalar};
+
 use crate::lagrangian::plane::{Vec2, Vec3};
-use crate::math::scalar::{Lanes, Scalar};
 use crate::model::planar_tree::{Body, PlanarJoints};
 
 /// How numbers of joints lie: those of several side by side, or one after the other.

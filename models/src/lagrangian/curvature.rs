@@ -6,12 +6,13 @@
 //!                ∂²L/∂q_i∂q_j = J̇_i·P_j + w_i·(f_j × g)      w_i: angular part of J_i, f_j: force part of F_j
 //! ```
 
+use plantd_math::scalar::Scalar;
+use plantd_math::simd::wide;
+use plantd_math::spatial::{Force, Inertia, Mat3, Motion, Sym3, Vec3};
+use plantd_math::tree_lu::TreeLu;
+
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::math::scalar::Scalar;
-use crate::math::simd::wide;
-use crate::math::spatial::{Force, Inertia, Mat3, Motion, Sym3, Vec3};
-use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Pair;
 use crate::model::tree::{Rotational, Tree, WORLD};
 

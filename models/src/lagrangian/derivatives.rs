@@ -13,19 +13,20 @@
 //! ```
 //!
 //! with `n` coordinates, `nd` of them dynamic, `ni` inputs; row-major. Springs count as a part of `L`,
-//! dampers as forces. Evaluated with [`Dual`](crate::math::scalar::Dual) numbers, their dual parts are
+//! dampers as forces. Evaluated with [`Dual`](plantd_math::scalar::Dual) numbers, their dual parts are
 //! derivatives along a direction: third derivatives of `L`, which second-order linearizations need.
 //! Where sparsity counts, [`Mechanics::for_each_second_derivative`] names the entries one by one.
 //!
 //! [`Mechanics::for_each_second_derivative`]: crate::lagrangian::mechanics::Mechanics::for_each_second_derivative
+
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::Mat3;
 
 use crate::lagrangian::armature;
 use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::Mat3;
 use crate::model::mechanism::{CoordinateInput, Forces, Model};
 use crate::model::tree::{JointKind, WORLD};
 
@@ -219,8 +220,8 @@ impl<S: Scalar> Derivatives<S> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::builtin;
     use crate::lagrangian::mechanics::Mechanics;
+    use plantd_scene::builtin;
 
     #[test]
     fn entries_one_by_one_are_those_of_the_matrices() {

@@ -11,9 +11,10 @@ pub(crate) mod point;
 mod tests;
 pub(crate) mod wrench;
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{CoordinateInput, Forces};
 use crate::model::tree::Tree;
 

@@ -43,11 +43,12 @@
 //!
 //! with products that are, like those of `K`, those of the residual itself.
 
+use plantd_math::rows::Block;
+use plantd_math::spatial::{Mat3, Vec3};
+
 use crate::lagrangian::curvature::Within;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::{Turning, Weights};
-use crate::math::rows::Block;
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 
 /// Which matrix of the second derivatives of the Lagrangian.

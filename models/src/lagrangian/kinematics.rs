@@ -1,8 +1,9 @@
 //! Poses of the joints at a configuration.
 
-use crate::math::scalar::Scalar;
-use crate::math::simd::wide;
-use crate::math::spatial::{Mat3, Vec3};
+use plantd_math::scalar::Scalar;
+use plantd_math::simd::wide;
+use plantd_math::spatial::{Mat3, Vec3};
+
 use crate::model::tree::{Attachment, JointKind, Tree, WORLD};
 
 /// Poses of the joints of a tree, each position measured from the origin of its own tree.

@@ -1,13 +1,14 @@
 //! The Lagrangian of joint trees at a configuration and velocity, without springs: in the plane where the
 //! scene allows it, else in space.
 
+use plantd_math::spatial::Mat3;
+
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::curvature::{Curvature, Entry, SecondDerivatives};
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::lagrangian::planar::PlanarTree;
-use crate::math::spatial::Mat3;
 use crate::model::mechanism::Model;
 
 /// What its derivatives are found from.

@@ -7,10 +7,11 @@
 //!                ∂L/∂q_i = J̇_i · H_i + J_i · W_i      W_i: weight of the subtree
 //! ```
 
+use plantd_math::scalar::Scalar;
+use plantd_math::simd::wide;
+use plantd_math::spatial::{Force, Motion, Sym3, Vec3};
+
 use crate::lagrangian::kinematics::Poses;
-use crate::math::scalar::Scalar;
-use crate::math::simd::wide;
-use crate::math::spatial::{Force, Motion, Sym3, Vec3};
 use crate::model::tree::{Body, JointKind, Rotational, Tree, WORLD};
 
 /// Twists and momenta of the joints of a tree.

@@ -28,14 +28,15 @@
 
 use std::ops::Range;
 
+use plantd_math::scalar::Scalar;
+use plantd_math::simd::wide;
+use plantd_math::tree_lu::TreeLu;
+
 use crate::lagrangian::arrangement::{Arrangement, Fours, Ones, Planar, one2, one3, put2};
 use crate::lagrangian::curvature::SecondDerivatives;
 use crate::lagrangian::plane::{
     Vec2, Vec3, add, add4, combined, cross, dot, linear, spun, times, turned,
 };
-use crate::math::scalar::Scalar;
-use crate::math::simd::wide;
-use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Pair;
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 

@@ -2,7 +2,7 @@
 
 use std::ops::Mul;
 
-use crate::math::scalar::Scalar;
+use plantd_math::scalar::Scalar;
 
 /// A vector in the plane.
 pub(crate) type Vec2<S = f64> = [S; 2];

@@ -11,8 +11,9 @@ pub(crate) mod path_spring;
 pub(crate) mod point_spring;
 pub(crate) mod spline_spring;
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::{Place, Poses};
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{Model, Spring};
 
 /// A potential `V(q)`.
@@ -105,7 +106,7 @@ mod tests {
     use super::*;
     use crate::lagrangian::samples;
     use crate::lagrangian::samples::Configuration;
-    use crate::math::scalar::Dual;
+    use plantd_math::scalar::Dual;
 
     fn energy<S: Scalar>(model: &Model, at: &Configuration<S>) -> S {
         model.spring_energy(&at.poses(&model.dynamics), &at.q)
@@ -178,7 +179,7 @@ mod tests {
         let ends = [two_point, &format!("{two_point}rest_length = 0.5"), path];
         for (case, spring) in ends.iter().enumerate() {
             let model =
-                Model::compile(&crate::scene::Scene::from_toml(&text(spring)).unwrap()).unwrap();
+                Model::compile(&plantd_scene::Scene::from_toml(&text(spring)).unwrap()).unwrap();
             let q = vec![Dual::new(0.0, 1.0), Dual::new(0.0, -2.0)];
             let q = Configuration { q, orientations: Vec::new() };
             let all =

@@ -2,14 +2,15 @@
 
 use std::path::Path;
 
+use plantd_math::rotation;
+use plantd_math::scalar::{Dual, Scalar};
+use plantd_math::spatial::{Mat3, Vec3};
+use plantd_scene::Scene;
+
 use crate::lagrangian::kinematics::Poses;
-use crate::math::rotation;
-use crate::math::scalar::{Dual, Scalar};
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
 use crate::model::tree::Tree;
-use crate::scene::Scene;
 
 /// Models of the scenes of all elements.
 pub(crate) fn models() -> Vec<Model> {

@@ -10,7 +10,8 @@
 //!
 //! `G' = F`, `F' = w`, and `w` is twice continuously differentiable; `c` is the resistance of the damper.
 
-use crate::math::scalar::Scalar;
+use plantd_math::scalar::Scalar;
+
 use crate::model::mechanism::Stop;
 
 impl Stop {
@@ -73,7 +74,7 @@ impl Stop {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::scalar::Dual;
+    use plantd_math::scalar::Dual;
 
     const STOP: Stop = Stop { range: [-1.0, 2.0], stiffness: 7.0, damping: 3.0, transition: 0.5 };
 

@@ -1,8 +1,9 @@
-//! The maps by which a ball joint weighs the derivatives of a step; see [`crate::math::rotation`].
+//! The maps by which a ball joint weighs the derivatives of a step; see [`plantd_math::rotation`].
 
-use crate::math::rotation;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::{Mat3, Vec3};
+use plantd_math::rotation;
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::{Mat3, Vec3};
+
 use crate::model::mechanism::Model;
 
 /// How one ball joint weighs the derivatives of a step.

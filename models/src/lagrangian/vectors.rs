@@ -3,9 +3,10 @@
 //! A joint with axis `w` turns every vector that it carries: `∂u/∂q = w × u`. With joint `i` above
 //! joint `j`, both carrying `u`, `∂²u/∂q_i ∂q_j = w_i × ∂u/∂q_j`; across branches it is zero.
 
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::Vec3;
+
 use crate::lagrangian::kinematics::Poses;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::Vec3;
 use crate::model::mechanism::{Carries, PathJoint, PointPair, Product, Vector};
 use crate::model::tree::{Tree, WORLD};
 

@@ -9,8 +9,9 @@
 //!
 //! O(n²) for each of the parameters and steps.
 
+use plantd_math::rows::{Term, add_rows, padded};
+
 use crate::linearization::linearize::{InputImpulse, Kind, Linearization, Part};
-use crate::math::rows::{Term, add_rows, padded};
 use crate::model::mechanism::Model;
 
 /// Numbers that the steps of a period may take: 1 GiB.
@@ -120,8 +121,8 @@ impl Chain {
             for column in 0..stride {
                 let at = |i: usize| (t.coordinate + i) * stride + column;
                 let [turn, start] = [&*next, &*tangent].map(|m| [0, 1, 2].map(|i| m[at(i)]));
-                let end = t.to_end.apply(crate::math::spatial::Vec3(turn))
-                    + t.carried.apply(crate::math::spatial::Vec3(start));
+                let end = t.to_end.apply(plantd_math::spatial::Vec3(turn))
+                    + t.carried.apply(plantd_math::spatial::Vec3(start));
                 for i in 0..3 {
                     // What is added below.
                     next[at(i)] = end[i] - start[i];

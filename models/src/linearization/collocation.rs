@@ -8,6 +8,8 @@
 //!
 //! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
 
+use plantd_math::rows::{add_product, add_rows};
+
 use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::system::System;
 use crate::integrator::report::StepError;
@@ -15,7 +17,6 @@ use crate::integrator::scheme::Tableau;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::linearization::linearize::{Linearization, StageTangents};
 use crate::linearization::parameters::Parameters;
-use crate::math::rows::{add_product, add_rows};
 
 impl Collocation {
     /// Linearizes at the solution.

@@ -26,6 +26,10 @@
 //! signals replace have no effect.
 
 use nalgebra::DMatrix;
+use plantd_math::dense_inverse::DenseInverse;
+use plantd_math::pivoted_lu::PivotedLu;
+use plantd_math::rows::{Term, padded, spread};
+use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
@@ -35,10 +39,6 @@ use crate::kkt::system::Factors;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::matrices::Layout;
 use crate::linearization::parameters::Parameters;
-use crate::math::dense_inverse::DenseInverse;
-use crate::math::pivoted_lu::PivotedLu;
-use crate::math::rows::{Term, padded, spread};
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 
 /// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.

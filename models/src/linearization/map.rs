@@ -1,10 +1,10 @@
 //! A linearization as the map of a linear-quadratic problem.
 
 use nalgebra::DMatrix;
+use plantd_math::sparse_map::Map;
 
 use crate::linearization::linearize::{Linearization, Output};
 use crate::linearization::matrices::Layout;
-use crate::math::sparse_map::Map;
 
 impl Linearization {
     /// Writes `[B A]` without its zeros: rows of dynamic coordinates and momenta are full, those of

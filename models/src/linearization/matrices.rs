@@ -3,8 +3,9 @@
 //! Rows of a [`Linearization`] hold the derivatives of increments; `q[k+1] = q[k] + x` adds a one on the
 //! diagonal. Ball joints turn at their ends by `dexp₋ξ ξ' + exp(−ξ) η`.
 
+use plantd_math::spatial::{Mat3, Vec3};
+
 use crate::linearization::linearize::{Kind, Linearization};
-use crate::math::spatial::{Mat3, Vec3};
 
 /// How the numbers of a matrix follow each other in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -183,12 +184,12 @@ mod tests {
     use nalgebra::DMatrix;
 
     use super::*;
-    use crate::builtin;
     use crate::integrator::settings::Settings;
     use crate::lagrangian::samples;
-    use crate::math::sparse_map::Map;
     use crate::model::mechanism::Model;
     use crate::plant::facade::Plant;
+    use plantd_math::sparse_map::Map;
+    use plantd_scene::builtin;
 
     fn models() -> Vec<Model> {
         let names = ["cart-pole", "chain-8", "marionette", "balls-3", "walker-2"];

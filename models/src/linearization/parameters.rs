@@ -8,7 +8,8 @@
 //! Derivatives by `x = (q, p, v)` are those by `(q, p)`, with zeros for `v`; those by the input of the
 //! map are those by `(u, k)`. Where inputs act like momenta, rows leave their columns out: `(q, p, k)`.
 
-use crate::math::rows::padded;
+use plantd_math::rows::padded;
+
 use crate::model::mechanism::Model;
 
 /// How many parameters there are of each kind, so which columns are theirs; and how many constraints.

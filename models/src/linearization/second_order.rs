@@ -18,15 +18,15 @@ pub(crate) mod contraction;
 pub(crate) mod tensors;
 
 use nalgebra::DMatrix;
+use plantd_math::rotation;
+use plantd_math::rows::Term;
+use plantd_math::scalar::Dual;
+use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::integrator::blocks::StepBlocks;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::SolvedStep;
 use crate::linearization::parameters::Parameters;
-use crate::math::rotation;
-use crate::math::rows::Term;
-use crate::math::scalar::Dual;
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
 
 /// What both forms compute with.

@@ -1,14 +1,15 @@
 //! Linearizes the step that is solved in a workspace.
 
+use plantd_math::rows::{add_rows, add_rows_portable, padded};
+use plantd_math::simd::{wide, widest};
+use plantd_math::spatial::three;
+
 use crate::integrator::report::StepError;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::kkt::system::Recursion;
 use crate::kkt::{loops, planar};
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::{Kind, Linearization};
-use crate::math::rows::{add_rows, add_rows_portable, padded};
-use crate::math::simd::{wide, widest};
-use crate::math::spatial::three;
 
 impl Workspace {
     /// Linearizes at the solution in the workspace.

@@ -14,6 +14,10 @@
 //! [`generators`](crate::lagrangian::generators); springs and forces come entry by entry, and each goes to all
 //! rows and columns of the ball joints that it belongs to.
 
+use plantd_math::rotation;
+use plantd_math::simd::wide;
+use plantd_math::spatial::{Mat3, Vec3, three};
+
 use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
 use crate::lagrangian::curvature::Within;
@@ -21,9 +25,6 @@ use crate::lagrangian::generators::{Parts, dot};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::Linearization;
-use crate::math::rotation;
-use crate::math::simd::wide;
-use crate::math::spatial::{Mat3, Vec3, three};
 use crate::model::mechanism::Model;
 use crate::model::tree::JointKind;
 
@@ -322,7 +323,7 @@ mod tests {
     use crate::integrator::settings::{ForceSplit, Settings};
     use crate::lagrangian::samples::assert_close;
     use crate::plant::facade::Plant;
-    use crate::scene::Scene;
+    use plantd_scene::Scene;
 
     /// A body that floats beside a base that is turned, with all that acts on ball joints.
     const SCENE: &str = r#"

@@ -1,6 +1,6 @@
 //! Loops in planes, and the plan of their elimination.
 
-use crate::math::spatial::Mat3;
+use plantd_math::spatial::Mat3;
 
 /// Rows of a body in a front.
 pub(crate) const BODY: usize = 6;

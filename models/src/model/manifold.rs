@@ -1,7 +1,8 @@
 //! The configuration manifold: sums and differences of configurations, with the rotations of ball joints.
 
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::{Mat3, three};
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::{Mat3, three};
+
 use crate::model::mechanism::Model;
 
 /// Orientations of all ball joints at `q`.

@@ -1,14 +1,15 @@
 //! Models: compiled scenes.
 
-use crate::math::elimination::SymbolicElimination;
-use crate::math::spatial::{Force, Vec3};
-use crate::math::spline::Spline;
+use plantd_math::elimination::SymbolicElimination;
+use plantd_math::spatial::{Force, Vec3};
+use plantd_math::spline::Spline;
+use plantd_scene::{CoordinateKind, Problem, Scene};
+
 use crate::model::conditioning::Conditioning;
 use crate::model::loop_plan::Loops;
 use crate::model::planar_tree::{PlanarJoint, PlanarJoints};
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree};
-use crate::scene::{CoordinateKind, Problem, Scene};
 
 /// A compiled scene: immutable, shared by all plants made from it.
 #[derive(Debug)]

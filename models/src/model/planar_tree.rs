@@ -3,8 +3,9 @@
 
 use std::ops::Deref;
 
-use crate::math::scalar::Lanes;
-use crate::math::spatial::{Mat3, Vec3};
+use plantd_math::scalar::Lanes;
+use plantd_math::spatial::{Mat3, Vec3};
+
 use crate::model::tree::{JointKind, Rotational, Tree, WORLD};
 
 /// Sine of the angle below which two axes count as parallel: what rounding leaves of a rotation.

@@ -1,6 +1,7 @@
 //! Points of frames, by the joints that move them.
 
-use crate::math::spatial::{Mat3, Vec3};
+use plantd_math::spatial::{Mat3, Vec3};
+
 use crate::model::tree::Joint;
 
 /// A frame of a model, with a point of it.

@@ -1,7 +1,7 @@
 //! The joint tree as a step walks it: depth first, fixed joints merged into their parents, every
 //! joint turned so that its axis is its own z axis.
 
-use crate::math::spatial::{Mat3, Sym3, Vec3};
+use plantd_math::spatial::{Mat3, Sym3, Vec3};
 
 /// "No parent": the joint hangs from the world.
 pub(crate) const WORLD: usize = usize::MAX;

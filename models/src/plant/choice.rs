@@ -9,11 +9,12 @@
 
 use std::sync::Arc;
 
+use plantd_math::norms::larger;
+
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{SUBSTEPS_MAX, Settings};
 use crate::integrator::state::State;
-use crate::math::norms::larger;
 use crate::plant::facade::Plant;
 use crate::plant::initial::{Initial, InitialError};
 

@@ -1,6 +1,12 @@
 //! Where a plant starts: states from momenta, velocities, two configurations, or a guess; and the
 //! velocity and energy that belong to a state.
 
+use plantd_math::pivoted_lu::PivotedLu;
+use plantd_math::rotation;
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::three;
+use plantd_scene::UnknownName;
+
 use crate::constraints::closure::Closure;
 use crate::constraints::projection::{Limits, Reached, project};
 use crate::integrator::scheme::Scheme;
@@ -10,15 +16,10 @@ use crate::integrator::workspace::Workspace;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::armature;
 use crate::lagrangian::energy::{Energy, energy};
-use crate::math::pivoted_lu::PivotedLu;
-use crate::math::rotation;
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::three;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::{Model, Violation};
 use crate::plant::facade::Plant;
 use crate::plant::settle::{SettleError, SettleRequest};
-use crate::scene::UnknownName;
 
 /// Trace of the rotation between two aligned frames. It is 3; where the equations hold otherwise, for
 /// half turns about an axis and for cyclic exchanges of the axes, it is −1 or 0.

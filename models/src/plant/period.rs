@@ -9,13 +9,14 @@
 //! The next period begins with as many; after four that went well, half as many are tried. How often a
 //! period was halved is in its report: it is another map then.
 
+use plantd_math::sums::two_sum;
+
 use crate::integrator::collocation::Collocation;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::linearization::chain::Chain;
-use crate::math::sums::two_sum;
 use crate::model::mechanism::Model;
 use crate::model::signal::Target;
 

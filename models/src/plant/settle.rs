@@ -14,16 +14,16 @@
 //! coordinates are scaled by the root of their inertia. Dense and allocating: not for a control path.
 
 use nalgebra::{DMatrix, DVector, SVD};
+use plantd_math::null_space::tangent_basis;
+use plantd_scene::UnknownName;
 
 use crate::constraints::closure::Closure;
 use crate::constraints::projection::{Limits, Reached, project};
 use crate::lagrangian::derivatives::Derivatives;
 use crate::lagrangian::energy::potential_energy;
-use crate::math::null_space::tangent_basis;
 use crate::model::conditioning::Conditioning;
 use crate::model::manifold::orientations;
 use crate::model::mechanism::Model;
-use crate::scene::UnknownName;
 
 /// Iterations before the search is given up.
 const MAX_ITERATIONS: u32 = 300;

@@ -11,10 +11,11 @@
 //!
 //! with the joint's axis `a_j` through `o_j`, and the point `x`.
 
+use plantd_math::rotation::Quaternion;
+use plantd_math::spatial::{Mat3, Vec3};
+use plantd_math::trigonometry::sin_cos_of;
+
 use crate::integrator::report::StepError;
-use crate::math::rotation::Quaternion;
-use crate::math::spatial::{Mat3, Vec3};
-use crate::math::trigonometry::sin_cos_of;
 use crate::model::mechanism::Model;
 use crate::model::site::Site;
 use crate::model::tree::{Joint, JointKind};

@@ -6,10 +6,11 @@
 //! halvings of the last period and good ones since (u8 each), what the next step is guessed from (its kind and
 //! two of its counts, u8 each), the numbers as f64 bits, and the FNV-1a hash (u64) of all that.
 
+use plantd_math::hash::fnv1a;
+
 use crate::integrator::predictor::Past;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, Precision, Settings};
 use crate::integrator::state::PreciseState;
-use crate::math::hash::fnv1a;
 use crate::plant::facade::Plant;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";

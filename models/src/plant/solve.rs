@@ -170,8 +170,8 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::builtin;
     use crate::model::mechanism::Model;
+    use plantd_scene::builtin;
 
     /// A snapshot may say that the last period was halved more often than its settings allow.
     #[test]

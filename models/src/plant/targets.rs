@@ -1,7 +1,8 @@
 //! Inverse kinematics: targets of frames as constraints.
 
+use plantd_scene::{Axis, Constraint, Frame, Point, Rotation, SceneError};
+
 use crate::model::mechanism::Model;
-use crate::scene::{Axis, Constraint, Frame, Point, Rotation, SceneError};
 
 /// Where a frame shall be, in world axes.
 #[derive(Clone, Debug, Default, PartialEq)]

@@ -4,10 +4,11 @@
 //! h = d·e    h_i = d_i·e    h_ij = d_ij·e
 //! ```
 
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::Vec3;
+
 use crate::constraints::equations::Equation;
 use crate::lagrangian::kinematics::Place;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::Vec3;
 use crate::model::mechanism::AlongAxis;
 
 impl Equation for AlongAxis {

@@ -4,9 +4,10 @@
 //! h = Σ c_jk q_j^k + c    h_j = Σ k c_jk q_j^(k−1)    h_jj = Σ k (k − 1) c_jk q_j^(k−2)
 //! ```
 
+use plantd_math::scalar::Scalar;
+
 use crate::constraints::equations::Equation;
 use crate::lagrangian::kinematics::Place;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{Coupling, Polynomial};
 
 impl Equation for Coupling {

@@ -5,10 +5,11 @@
 //! h = Σ |d_s| − l
 //! ```
 
+use plantd_math::scalar::Scalar;
+
 use crate::constraints::equations::Equation;
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::vectors::Distance;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{Length, PathLength, PointPair};
 
 impl Equation for PathLength {

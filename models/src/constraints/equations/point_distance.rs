@@ -4,10 +4,11 @@
 //! h = |d|² − l²    h_i = 2 d·d_i    h_ij = 2 (d_i·d_j + d·d_ij)
 //! ```
 
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::Vec3;
+
 use crate::constraints::equations::Equation;
 use crate::lagrangian::kinematics::Place;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::Vec3;
 use crate::model::mechanism::{Length, PointDistance};
 
 impl Equation for PointDistance {

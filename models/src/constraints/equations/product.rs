@@ -5,10 +5,11 @@
 //! h = u·w
 //! ```
 
+use plantd_math::scalar::Scalar;
+
 use crate::constraints::equations::Equation;
 use crate::lagrangian::kinematics::{Place, Poses};
 use crate::lagrangian::vectors::ProductAt;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{Alignment, Product};
 use crate::model::tree::Tree;
 

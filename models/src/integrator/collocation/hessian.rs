@@ -1,9 +1,10 @@
 //! Second derivatives at the stages.
 
+use plantd_math::scalar::Side;
+
 use crate::integrator::workspace::Workspace;
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::math::scalar::Side;
 use crate::model::mechanism::Model;
 
 /// Derivatives of `L` and of the forces: rows of dynamic coordinates, n columns unless said, row-major,

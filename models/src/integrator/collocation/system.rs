@@ -3,6 +3,12 @@
 //! What belongs to the stages of a coordinate lies side by side, padded to whole [`Lanes`]: number `i` of
 //! coordinate `a` is entry `a·width + i`.
 
+use plantd_math::dense_inverse::DenseInverse;
+use plantd_math::norms::{larger, largest};
+use plantd_math::scalar::{Lanes, Scalar, Side};
+use plantd_math::simd::wide;
+use plantd_math::trigonometry::without_turns;
+
 use crate::integrator::collocation::hessian::Hessian;
 use crate::integrator::newton::{CHORD_FLOOR, FLOOR};
 use crate::integrator::report::{StepError, StepReport};
@@ -12,11 +18,6 @@ use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::forces;
 use crate::lagrangian::mechanics::Mechanics;
-use crate::math::dense_inverse::DenseInverse;
-use crate::math::norms::{larger, largest};
-use crate::math::scalar::{Lanes, Scalar, Side};
-use crate::math::simd::wide;
-use crate::math::trigonometry::without_turns;
 use crate::model::mechanism::Model;
 
 /// Rounds of corrections beyond which shorter steps are the better way.

@@ -1,6 +1,6 @@
 //! Right-hand sides of fronts, alone or several side by side.
 
-use crate::math::rows::{Block, LANES};
+use plantd_math::rows::{Block, LANES};
 
 /// What a right-hand side is made of: a number, or several side by side.
 pub(super) trait Column: Copy {

@@ -3,8 +3,10 @@
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
+use plantd_math::rows::padded;
+use plantd_math::simd::narrowly;
+use plantd_scene::{Scene, builtin};
 
-use crate::builtin;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
@@ -16,12 +18,9 @@ use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
 use crate::linearization::second_order::contraction::Contraction;
 use crate::linearization::second_order::tensors::SecondOrder;
-use crate::math::rows::padded;
-use crate::math::simd::narrowly;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
-use crate::scene::Scene;
 
 /// A body on a hinge about y, or on a slider along x.
 struct Body {

@@ -3,19 +3,18 @@
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
+use plantd_math::rows::padded;
+use plantd_math::simd::narrowly;
+use plantd_scene::{Coordinate, CoordinateKind, Scene, builtin};
 
-use crate::builtin;
 use crate::integrator::settings::Settings;
 use crate::kkt::planar::Diagonal;
 use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
 use crate::linearization::linearize::Linearization;
-use crate::math::rows::padded;
-use crate::math::simd::narrowly;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
-use crate::scene::{Coordinate, CoordinateKind, Scene};
 
 /// A number between −1 and 1 that looks random.
 fn wave(i: usize) -> f64 {

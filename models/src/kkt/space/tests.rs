@@ -3,8 +3,9 @@
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
+use plantd_math::tree_lu::TreeLu;
+use plantd_scene::{Scene, builtin};
 
-use crate::builtin;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::Workspace;
@@ -12,11 +13,9 @@ use crate::kkt::space::SpatialRecursion;
 use crate::kkt::system::{Linearized, Recursion};
 use crate::lagrangian::generators::MatrixKind;
 use crate::linearization::linearize::Linearization;
-use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
-use crate::scene::Scene;
 
 /// A number between −1 and 1 that looks random.
 fn wave(i: usize) -> f64 {

@@ -1,7 +1,8 @@
 //! Forces on coordinates that follow from their velocities, and of stops from their positions.
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{CoordinateForce, CoordinateLaw};
 
 impl GeneralizedForce for CoordinateForce {

@@ -1,7 +1,8 @@
 //! A damper on a sum of coordinates: `f_i = −d c_i Σ c_j v_j`, `∂f_i/∂v_j = −d c_i c_j`.
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::LinearDamper;
 
 impl GeneralizedForce for LinearDamper {

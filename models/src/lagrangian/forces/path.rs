@@ -7,9 +7,10 @@
 //!
 //! with `L` the sum of the lengths of the path's segments.
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::lagrangian::vectors::Distance;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{PathForce, PointPair, Resistance};
 
 /// A path in motion.

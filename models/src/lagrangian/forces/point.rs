@@ -8,10 +8,11 @@
 //! The rate of a point `x` carried with twist `V` changes with a joint `j` above it by
 //! `J_j × (V − V_before)` taken at `x`, plus `w × ∂x/∂q_j`, where `V_before` is the twist before `j`.
 
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::{Motion, Vec3};
+
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::lagrangian::vectors::Separation;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::{Motion, Vec3};
 use crate::model::mechanism::{Carries, PathJoint, PointForce, PointLaw};
 use crate::model::tree::{Attachment, JointKind, WORLD};
 

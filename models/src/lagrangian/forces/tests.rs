@@ -1,10 +1,11 @@
 //! Derivatives against dual numbers, which differentiate the forces themselves.
 
+use plantd_math::scalar::Dual;
+use plantd_math::spatial::{Mat3, Vec3};
+use plantd_scene::Scene;
+
 use crate::lagrangian::forces::*;
-use crate::math::scalar::Dual;
-use crate::math::spatial::{Mat3, Vec3};
 use crate::model::mechanism::Model;
-use crate::scene::Scene;
 
 /// Every force, on a tree with oblique hinges and slides and a ball joint; `shaken` is prescribed.
 const EVERYTHING: &str = r#"
@@ -174,7 +175,7 @@ impl<S: Scalar> Case<S> {
             let [x, y, z] = [0, 1, 2].map(|a| self.q[i + a] - self.q[i + a].value());
             let i = S::ONE;
             let more = Mat3::from_rows([[i, -z, y], [z, i, -x], [-y, x, i]]);
-            Mat3::lift(crate::math::rotation::exp(Vec3([0.4, -0.9, 0.7]))).times(&more)
+            Mat3::lift(plantd_math::rotation::exp(Vec3([0.4, -0.9, 0.7]))).times(&more)
         };
         let orientations: Vec<_> = self.model.orientations.iter().map(orientation).collect();
         poses.evaluate(tree, &self.q, &orientations);

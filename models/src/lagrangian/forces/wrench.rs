@@ -11,9 +11,10 @@
 //! Two axes of one ball joint: they turn with the joint, so the second line holds for both orders,
 //! and the first for none.
 
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::{Force, Vec3};
+
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
-use crate::math::scalar::Scalar;
-use crate::math::spatial::{Force, Vec3};
 use crate::model::mechanism::{Wrench, WrenchKind};
 
 impl Wrench {

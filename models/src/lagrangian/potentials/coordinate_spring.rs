@@ -4,9 +4,10 @@
 //! V = ½ k (q − rest)²    V_i = k (q − rest)    V_ii = k
 //! ```
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::CoordinateSpring;
 
 impl Potential for CoordinateSpring {

@@ -1,8 +1,9 @@
 //! The spring of a stop of a coordinate: `V_i = V'(q)`, `V_ii = V''(q)` of the [stop](crate::lagrangian::stop).
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::CoordinateStop;
 
 impl Potential for CoordinateStop {

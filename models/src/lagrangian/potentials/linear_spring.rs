@@ -4,9 +4,10 @@
 //! V = ½ k s²    V_i = k s c_i    V_ij = k c_i c_j    s = Σ c_i q_i − rest
 //! ```
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::LinearSpring;
 
 impl LinearSpring {

@@ -7,10 +7,11 @@
 //! with `L` the sum of the lengths of the path's segments. Of a [stop](crate::lagrangian::stop) `V(L)`,
 //! `T = V'(L)` and `k = V''(L)`.
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
 use crate::lagrangian::vectors::Distance;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::{PathLaw, PathSpring, PointPair};
 
 impl PathSpring {

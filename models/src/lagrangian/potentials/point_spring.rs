@@ -7,11 +7,12 @@
 //! with `d` from point to point, `t = k (|d| − rest)/|d|`, `c = k rest/|d|³`. Where the points coincide, a
 //! spring with a rest length pulls nowhere; its stiffness there is taken as `k` in all directions.
 
+use plantd_math::scalar::Scalar;
+use plantd_math::spatial::Vec3;
+
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
 use crate::lagrangian::vectors::Separation;
-use crate::math::scalar::Scalar;
-use crate::math::spatial::Vec3;
 use crate::model::mechanism::PointSpring;
 
 /// A two-point spring at one configuration.

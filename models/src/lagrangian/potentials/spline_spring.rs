@@ -4,9 +4,10 @@
 //! V = −∫ f dq    V_i = −f    V_ii = −f'
 //! ```
 
+use plantd_math::scalar::Scalar;
+
 use crate::lagrangian::kinematics::Place;
 use crate::lagrangian::potentials::Potential;
-use crate::math::scalar::Scalar;
 use crate::model::mechanism::SplineSpring;
 
 impl Potential for SplineSpring {

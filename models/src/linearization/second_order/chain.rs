@@ -1,10 +1,11 @@
 //! Weighted second derivatives of collocation, and of periods of several steps.
 
+use plantd_math::rows::{Term, add_product, add_rows};
+use plantd_math::scalar::Dual;
+
 use crate::integrator::report::StepError;
 use crate::linearization::linearize::{Linearization, Part, StageTangents};
 use crate::linearization::second_order::contraction::Contraction;
-use crate::math::rows::{Term, add_product, add_rows};
-use crate::math::scalar::Dual;
 use crate::model::mechanism::Model;
 
 /// `sum += leftᵀ right`, all with rows of `stride` numbers.

@@ -15,6 +15,13 @@
 //! `Sᵀ μ₂ = −(K⁻¹A0ᵀ)ᵀ (z_x + O_xᵀ z_p) − A0 μ₁`.
 
 use nalgebra::DMatrix;
+use plantd_math::gemm::{Into, Operand, mirror_head, product};
+use plantd_math::pivoted_lu::PivotedLu;
+use plantd_math::rotation;
+use plantd_math::rows::{Term, add_product, padded};
+use plantd_math::scalar::Dual;
+use plantd_math::spatial::three;
+use plantd_math::tree_lu::TreeLu;
 
 use crate::constraints::closure::Closure;
 use crate::integrator::blocks::StepBlocks;
@@ -24,13 +31,6 @@ use crate::lagrangian::kinematics::Place;
 use crate::linearization::linearize::{Linearization, SolvedStep};
 use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::{Scratch, assert_layout, spin_change};
-use crate::math::gemm::{Into, Operand, mirror_head, product};
-use crate::math::pivoted_lu::PivotedLu;
-use crate::math::rotation;
-use crate::math::rows::{Term, add_product, padded};
-use crate::math::scalar::Dual;
-use crate::math::spatial::three;
-use crate::math::tree_lu::TreeLu;
 use crate::model::mechanism::Model;
 
 /// A weighted sum of second derivatives, `Σ z_i ∂²x_i[k+1] + Σ w_c ∂²λ_c`, preallocated.

@@ -1,6 +1,8 @@
 //! All second derivatives of a step.
 
 use nalgebra::DMatrix;
+use plantd_math::scalar::Dual;
+use plantd_math::spatial::Mat3;
 
 use crate::integrator::report::StepError;
 use crate::lagrangian::turning::Turning;
@@ -8,8 +10,6 @@ use crate::linearization::linearize::Linearization;
 use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::Scratch;
 use crate::linearization::second_order::contraction::Contraction;
-use crate::math::scalar::Dual;
-use crate::math::spatial::Mat3;
 use crate::model::mechanism::Model;
 
 /// Full tensors with more numbers than this are refused: 1 GiB.
