@@ -2,6 +2,7 @@
 
 import { words } from "./api.js";
 import { byId, fill, h, icon, write } from "./dom.js";
+import { films } from "./film.js";
 import { groups } from "./history.js";
 import { keys, showHelp } from "./keys.js";
 import { current, follow, list, show } from "./live.js";
@@ -57,6 +58,12 @@ recordings((name, read) => void openRecording(name, read));
 compare(view);
 tools();
 dropping();
+films({
+  view,
+  history: plots.history,
+  recorded: () => recording && [recording.time(0), recording.time(recording.length - 1)],
+  show: (time) => (recording ? scrubber.to(time) : app.held.set(time)),
+});
 pushing(view, (text, x, y) => {
   const label = byId("label");
   label.hidden = text === "";
@@ -209,6 +216,7 @@ Object.defineProperty(window, "plantdView", {
       const part = group?.children[0];
       return part ? view.pixel(part.getWorldPosition(part.position.clone())) : undefined;
     },
+    shapes: (name: string) => view.boxes(view.figure?.frame(name) ?? -1).map(({ min, max }) => ({ low: min.toArray(), high: max.toArray() })),
     under: (x: number, y: number) => {
       const hit = view.pick(x, y);
       return hit && view.figure?.drawing.frames[hit.frame]?.name;

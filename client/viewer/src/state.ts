@@ -60,8 +60,8 @@ export interface Subject {
   timeStep: number;
 }
 
-/** How it stands with the server. */
-export type Connection = "connecting" | "live" | "lost" | "hidden" | "none";
+/** How it stands with the server; `turns`: a state now and then, because other windows watch. */
+export type Connection = "connecting" | "live" | "turns" | "lost" | "hidden" | "none";
 
 /** A message to the person at the page. */
 export interface Notice {
