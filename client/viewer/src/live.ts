@@ -228,15 +228,12 @@ export function show(plant: string): void {
   void look();
 }
 
-// A plant that stands still tells nothing by itself when poles are wanted, or when its feedback has changed.
-let told = "";
-const changed = (): void => {
-  const key = `${app.wantsPoles.get()} ${app.info.get()?.feedback?.revision ?? ""}`;
-  if (key !== told) watcher?.renew();
-  told = key;
-};
-app.wantsPoles.on(changed);
-app.info.on(changed);
+// A stream has what was wanted when it was opened.
+let hadPoles = app.wantsPoles.get();
+app.wantsPoles.on((wants) => {
+  if (wants !== hadPoles) watcher?.renew();
+  hadPoles = wants;
+});
 
 /** Id of the plant that is shown. */
 export function current(): string {

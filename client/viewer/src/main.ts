@@ -20,7 +20,7 @@ import { Recording } from "./recording.js";
 import { pushing } from "./scene/push.js";
 import { View } from "./scene/view.js";
 import { layers, notices, Scrubber, status } from "./stage.js";
-import { app, complain, inform, type Subject } from "./state.js";
+import { alone, app, complain, inform, type Subject } from "./state.js";
 import { switchTheme, theme } from "./theme.js";
 
 /** Points of a recording's plots. */
@@ -227,10 +227,10 @@ Object.defineProperty(window, "plantdView", {
 async function begin(): Promise<void> {
   const asked = new URLSearchParams(location.search);
   const file = asked.get("recording");
-  if (file !== null && !/^[a-z0-9-]{1,63}$/.test(file)) {
-    // A recording at an address: there need be no plants where it comes from.
-    await openRecording(file.slice(file.lastIndexOf("/") + 1), async () => {
-      const answer = await fetch(file);
+  const address = alone;
+  if (address !== null) {
+    await openRecording(address.slice(address.lastIndexOf("/") + 1), async () => {
+      const answer = await fetch(address);
       if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
       return new Uint8Array(await answer.arrayBuffer());
     });

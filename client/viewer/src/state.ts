@@ -89,6 +89,10 @@ export const app = {
   drives: new Value<boolean>(false),
 };
 
+const recording = new URLSearchParams(location.search).get("recording");
+/** Address of a recording that is shown without a server of plants; null elsewhere, where recordings have names. */
+export const alone = recording !== null && !/^[a-z0-9-]{1,63}$/.test(recording) ? recording : null;
+
 /** Says something that went wrong, in words. */
 export function complain(text: string): void {
   app.notice.set({ text, kind: "error" });

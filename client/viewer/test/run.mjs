@@ -2,6 +2,8 @@
 //
 //   npm test -- --server PATH [--pictures FOLDER] [--only WORDS]
 //
+// `plantctl` lies beside the server.
+//
 // Without Chromium it says so and ends with 77.
 
 import assert from "node:assert/strict";
@@ -10,6 +12,7 @@ import { createServer, request } from "node:http";
 import { parseArgs } from "node:util";
 import { connect, Pace } from "./api.mjs";
 import { chromium, launch, Server } from "./browser.mjs";
+import { commandTests } from "./command.mjs";
 import { small } from "./png.mjs";
 import { robotTests } from "./robots.mjs";
 import { windowTests } from "./windows.mjs";
@@ -125,7 +128,7 @@ async function cpuSeconds() {
   return processInfo.reduce((sum, { cpuTime }) => sum + cpuTime, 0);
 }
 
-const context = { api, browser, server, posed, cpuSeconds, decoded, eventually, open, plant, run, shows, until, watched };
+const context = { binary: options.server, api, browser, server, posed, cpuSeconds, decoded, eventually, open, plant, run, shows, until, watched };
 
 const tests = {
   async "the canvas shows something"() {
@@ -323,6 +326,7 @@ const tests = {
     foreign.close();
   },
 
+  ...commandTests(context),
   ...robotTests(context),
   ...windowTests(context),
 

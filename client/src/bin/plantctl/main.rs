@@ -19,7 +19,8 @@ use clap_complete::CompleteEnv;
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, fmu, guard,
     import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record,
-    reference, render, replay, run, scene, settle, shell, state, step, test, timing, top, view, watch,
+    reference, render, replay, run, scene, settle, shell, state, step, test, timing, top, view,
+    watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;

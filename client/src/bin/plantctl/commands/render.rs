@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail, ensure};
 use clap::{Args, ValueEnum};
-use plantd_client::RecordingReader;
+use plantd_client::{RecordingReader, v1};
 use serde_json::{Value, json};
 
 use crate::commands::view::{is_recording, page_of};
@@ -147,8 +147,11 @@ impl Render {
     async fn check_plant(&self, context: &Context, kind: Kind) -> Result<()> {
         ensure!(self.from.is_none(), "--from is a time of a recording; a plant is filmed as it is");
         let info = plant(&context.connect().await?, &self.what).await?;
-        let is_running = info.run.is_some_and(|run| run.running);
-        if self.length_of_plant(kind) > 0.0 && !is_running {
+        let run = info.run.unwrap_or_default();
+        let pace = run.settings.unwrap_or_default().pace();
+        // In lockstep it moves if somebody drives it.
+        let may_move = run.running && (pace != v1::Pace::Lockstep || !info.driver.is_empty());
+        if self.length_of_plant(kind) > 0.0 && !may_move {
             bail!(
                 "{id} stands still: `plantctl run {id}` first, or a picture by --out FILE.png",
                 id = self.what
@@ -199,12 +202,8 @@ impl Render {
         let duration = asked.min(last - from);
         self.check_pictures(duration)?;
         let (right, up) = self.turn;
-        let look = format!(
-            "plantdFilm.look({}, {}, {})",
-            right.to_radians(),
-            up.to_radians(),
-            self.zoom
-        );
+        let look =
+            format!("plantdFilm.look({}, {}, {})", right.to_radians(), up.to_radians(), self.zoom);
         tab.evaluate(&look, PICTURE).await?;
         let (width, height) = self.size;
         let mut film = Film::new(width, height);

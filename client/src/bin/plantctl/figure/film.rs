@@ -38,13 +38,17 @@ impl Film {
         let mut bytes = vec![0; reader.output_buffer_size().unwrap_or_default()];
         let info = reader.next_frame(&mut bytes)?;
         let size = (u32::from(self.width), u32::from(self.height));
-        ensure!((info.width, info.height) == size, "the browser has made a picture of another size");
+        ensure!(
+            (info.width, info.height) == size,
+            "the browser has made a picture of another size"
+        );
         bytes.truncate(info.buffer_size());
         let bytes = match info.color_type {
             png::ColorType::Rgba => bytes,
-            png::ColorType::Rgb => {
-                bytes.chunks_exact(3).flat_map(|pixel| [pixel[0], pixel[1], pixel[2], 255]).collect()
-            }
+            png::ColorType::Rgb => bytes
+                .chunks_exact(3)
+                .flat_map(|pixel| [pixel[0], pixel[1], pixel[2], 255])
+                .collect(),
             other => anyhow::bail!("the browser has made a picture in {other:?}"),
         };
         self.frames.push(bytes);
@@ -84,11 +88,14 @@ impl Film {
         encoder.set_repeat(gif::Repeat::Infinite)?;
         let mut before: Option<Vec<u8>> = None;
         for (index, frame) in self.frames.iter().enumerate() {
-            let shown: Vec<u8> = frame.chunks_exact(PIXEL).map(|pixel| colors.index(pixel)).collect();
+            let shown: Vec<u8> =
+                frame.chunks_exact(PIXEL).map(|pixel| colors.index(pixel)).collect();
             // Delays are hundredths of a second: what rounding loses, the next one has.
             let at = |index: usize| (100.0 * index as f64 / fps).round();
             let mut picture = match &before {
-                None => gif::Frame::from_indexed_pixels(self.width, self.height, shown.clone(), None),
+                None => {
+                    gif::Frame::from_indexed_pixels(self.width, self.height, shown.clone(), None)
+                }
                 Some(before) => self.difference(before, &shown),
             };
             picture.delay = (at(index + 1) - at(index)) as u16;
@@ -104,9 +111,8 @@ impl Film {
     fn difference(&self, before: &[u8], shown: &[u8]) -> gif::Frame<'static> {
         let width = usize::from(self.width);
         let row = |y: usize| y * width..(y + 1) * width;
-        let changed: Vec<usize> = (0..usize::from(self.height))
-            .filter(|y| before[row(*y)] != shown[row(*y)])
-            .collect();
+        let changed: Vec<usize> =
+            (0..usize::from(self.height)).filter(|y| before[row(*y)] != shown[row(*y)]).collect();
         let rows = match (changed.first(), changed.last()) {
             (Some(first), Some(last)) => *first..*last + 1,
             _ => 0..1,
@@ -117,9 +123,8 @@ impl Film {
         let end = (0..width).rfind(is_changed).map_or(1, |last| last + 1);
         let columns: Range<usize> = first..end;
         let inside = rows.clone().flat_map(|y| columns.clone().map(move |x| y * width + x));
-        let pixels: Vec<u8> = inside
-            .map(|at| if before[at] == shown[at] { UNCHANGED } else { shown[at] })
-            .collect();
+        let pixels: Vec<u8> =
+            inside.map(|at| if before[at] == shown[at] { UNCHANGED } else { shown[at] }).collect();
         gif::Frame {
             left: columns.start as u16,
             top: rows.start as u16,
@@ -156,9 +161,10 @@ impl Colors {
     fn index(&mut self, pixel: &[u8]) -> u8 {
         let color = [pixel[0], pixel[1], pixel[2]];
         let chosen = &self.chosen;
-        *self.known.entry(color).or_insert_with(|| {
-            chosen.index_of(&[color[0], color[1], color[2], 255]) as u8
-        })
+        *self
+            .known
+            .entry(color)
+            .or_insert_with(|| chosen.index_of(&[color[0], color[1], color[2], 255]) as u8)
     }
 }
 
@@ -214,7 +220,8 @@ mod tests {
     #[test]
     fn a_png_has_all_pictures() {
         let film = film();
-        let mut reader = png::Decoder::new(Cursor::new(film.png(20.0).unwrap())).read_info().unwrap();
+        let mut reader =
+            png::Decoder::new(Cursor::new(film.png(20.0).unwrap())).read_info().unwrap();
         let animation = *reader.info().animation_control().unwrap();
         assert_eq!((animation.num_frames, animation.num_plays), (4, 0));
         for frame in &film.frames {

@@ -93,11 +93,7 @@ impl Tab {
     }
 
     /// The value of an expression in the page, waited for if it is a promise.
-    pub(crate) async fn evaluate(
-        &mut self,
-        expression: &str,
-        patience: Duration,
-    ) -> Result<Value> {
+    pub(crate) async fn evaluate(&mut self, expression: &str, patience: Duration) -> Result<Value> {
         let asked =
             json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
         let mut answer = self.call_within(patience, "Runtime.evaluate", asked).await?;
