@@ -225,6 +225,7 @@ const tests = {
     await page.click("#lease");
     await eventually("the lease to be free", async () => (await driver()) === "");
     // Whoever closes the page gives it back, too.
+    await until(page, "it to be offered", () => /Take/.test(document.getElementById("lease").textContent) && !document.getElementById("lease").disabled);
     await page.click("#lease");
     await eventually("the lease", async () => (await driver()) === "drive");
     await page.close();

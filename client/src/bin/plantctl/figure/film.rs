@@ -172,16 +172,22 @@ impl Colors {
 mod tests {
     use super::*;
 
-    const SIZE: (u16, u16) = (8, 6);
+    const SIZE: (u16, u16) = (64, 48);
     const BACK: [u8; 4] = [240, 240, 240, 255];
     const SPOT: [u8; 4] = [200, 30, 30, 255];
+    /// Width and height of the spot, and how far it goes from one picture to the next.
+    const WIDE: usize = 8;
 
-    /// A spot that goes right, a pixel from one picture to the next.
+    /// A spot that goes right.
     fn film() -> Film {
         let mut film = Film::new(SIZE.0, SIZE.1);
+        let width = usize::from(SIZE.0);
         for at in 0..4 {
-            let mut pixels = BACK.repeat(usize::from(SIZE.0) * usize::from(SIZE.1));
-            pixels[PIXEL * (8 * 2 + at)..][..PIXEL].copy_from_slice(&SPOT);
+            let mut pixels = BACK.repeat(width * usize::from(SIZE.1));
+            for y in WIDE..2 * WIDE {
+                let row = PIXEL * (y * width + at * WIDE);
+                pixels[row..row + PIXEL * WIDE].copy_from_slice(&SPOT.repeat(WIDE));
+            }
             let mut still = Film::new(SIZE.0, SIZE.1);
             still.frames.push(pixels);
             film.push(&still.png(1.0).unwrap()).unwrap();
@@ -205,7 +211,9 @@ mod tests {
             let width = usize::from(frame.width);
             for (index, pixel) in frame.buffer.chunks_exact(PIXEL).enumerate() {
                 let (x, y) = (index % width, index / width);
-                let at = (y + usize::from(frame.top)) * 8 + x + usize::from(frame.left);
+                let at = (y + usize::from(frame.top)) * usize::from(SIZE.0)
+                    + x
+                    + usize::from(frame.left);
                 if pixel[3] > 0 {
                     screen[PIXEL * at..][..PIXEL].copy_from_slice(pixel);
                 }
@@ -214,7 +222,7 @@ mod tests {
             delays.push((frame.delay, width));
         }
         // A thirtieth of a second on the average; after the first, what has changed alone.
-        assert_eq!(delays, [(3, 8), (4, 2), (3, 2), (3, 2)]);
+        assert_eq!(delays, [(3, 64), (4, 16), (3, 16), (3, 16)]);
     }
 
     #[test]
@@ -234,6 +242,6 @@ mod tests {
     #[test]
     fn a_picture_of_another_size_is_refused() {
         let picture = film().png(1.0).unwrap();
-        assert!(Film::new(8, 7).push(&picture).is_err());
+        assert!(Film::new(64, 49).push(&picture).is_err());
     }
 }
