@@ -57,12 +57,17 @@ def test_messages_are_those_that_are_published(client, tmp_path):
     }
     with file.open("rb") as source:
         reader = make_reader(source, decoder_factories=[DecoderFactory()])
-        seen = set()
+        seen, shown, frames = set(), set(), {"world"}
         for schema, channel, message, decoded in reader.iter_decoded_messages():
             kind = published.get(channel.topic)
             if kind is None:
                 continue
             seen.add(channel.topic)
+            shown |= {entity.frame_id for entity in getattr(decoded, "entities", ())}
+            for transform in getattr(decoded, "transforms", ()):
+                # A frame hangs on one that a player knows.
+                assert transform.parent_frame_id in frames, transform.child_frame_id
+                frames.add(transform.child_frame_id)
             assert schema.name == kind.DESCRIPTOR.full_name
             same_fields(decoded.DESCRIPTOR, kind.DESCRIPTOR)
             # Nothing is left over when the published schema reads it.
@@ -71,6 +76,7 @@ def test_messages_are_those_that_are_published(client, tmp_path):
                 deterministic=True
             )
     assert seen == set(published)
+    assert shown and shown <= frames
 
 
 def same_fields(ours, theirs, checked=None):

@@ -35,6 +35,34 @@ def test_the_same_loop_drives_a_plant_that_runs_by_itself(client):
     assert client.get_plant(id).state.step == stands_at + 1
 
 
+def test_an_input_now_and_then_acts_under_a_lease(client):
+    with client.plant("cart-pole") as plant:
+        with plant.hold() as lease:
+            # In lockstep an input is a step.
+            with pytest.raises(plantd.PlantdError) as refused:
+                lease.set_input([1.0])
+            assert (refused.value.code, refused.value.reason) == ("FAILED_PRECONDITION", "LOCKSTEP")
+        plant.run("paced", speed=10)
+        with plant.hold() as lease:
+            assert lease.plant.id == plant.id and plant.info.driver == "drive"
+            lease.set_input([2.5])
+            lease.set_input([1.5])
+            seen = next(s for s in plant.watch(["input", "timing"]) if s.timing.input_sequence == 2)
+            assert seen.u == [1.5]
+            with pytest.raises(plantd.PlantdError) as refused:
+                lease.set_input([1.0, 2.0])
+            assert refused.value.code == "INVALID_ARGUMENT"
+            with pytest.raises(plantd.PlantdError) as refused:
+                client.set_input(plant.id, "0", [1.0])
+            assert refused.value.reason == "LEASE_LOST"
+        for event in plant.watch_events(since=0):
+            if event.kind == "driver_left":
+                break
+        with pytest.raises(plantd.PlantdError) as refused:
+            client.set_input(plant.id, lease.lease_token, [1.0])
+        assert refused.value.reason == "LEASE_LOST"
+
+
 def test_watchdogs_hold_a_plant_and_say_why(client):
     id = client.create_plant("cart-pole").id
     assert client.get_plant(id).safety is None

@@ -1,5 +1,6 @@
 // The plant that is shown: its description, one Watch stream for all that is seen of it, and how it is run.
 
+import { place } from "./connections.js";
 import { complain, app, type Moment, type Subject } from "./state.js";
 import { channels, isAway, isCanceled, isNotFound, models, plants, words } from "./api.js";
 import { WatchField, type WatchResponse } from "./gen/plantd/v1/plant_service_pb.js";
@@ -10,6 +11,8 @@ const STATES_HZ = 60;
 const LOOK_MS = 1000;
 /** Between two attempts to reach a server that does not answer, ms. */
 const RETRY_MS = [300, 600, 1000, 2000];
+/** From one look at the states to the next, while other windows have the streams, ms. */
+const TURN_MS = 250;
 
 const FIELDS = [
   WatchField.STATE,
@@ -42,7 +45,10 @@ export async function describe(plant: string, signal?: AbortSignal): Promise<Sub
   };
 }
 
-/** One Watch stream of a plant, opened again whenever it breaks, closed while nobody looks. */
+/**
+ * One Watch stream of a plant, opened again whenever it breaks, closed while nobody looks. While other windows of the
+ * browser have all the places for streams, it is opened for one state at a time.
+ */
 export class Watcher {
   #ending = new AbortController();
   #renewing = new AbortController();
@@ -55,7 +61,7 @@ export class Watcher {
       subject(subject: Subject): void;
       state(moment: Moment): void;
       /** How it stands. */
-      connection(state: "connecting" | "live" | "lost" | "hidden"): void;
+      connection(state: "connecting" | "live" | "turns" | "lost" | "hidden"): void;
       /** There is no such plant any more. */
       gone(): void;
       wantsPoles(): boolean;
@@ -123,20 +129,31 @@ export class Watcher {
     const inner = new AbortController();
     this.#renewing = inner;
     signal.addEventListener("abort", () => inner.abort());
-    for await (const message of plants.watch(request, { signal: inner.signal })) {
-      arrived();
-      this.told.connection("live");
-      if (message.generation !== subject.generation) {
-        inner.abort();
-        return;
+    while (!inner.signal.aborted) {
+      const giveBack = await place("watch");
+      const turn = new AbortController();
+      const stop = (): void => turn.abort();
+      inner.signal.addEventListener("abort", stop);
+      try {
+        for await (const message of plants.watch(request, { signal: turn.signal })) {
+          arrived();
+          this.told.connection(giveBack ? "live" : "turns");
+          if (message.generation !== subject.generation) return;
+          const moment = read(message, this.#before);
+          if (moment) {
+            this.#before = moment;
+            this.told.state(moment);
+          }
+          if (!giveBack) break;
+        }
+      } finally {
+        stop();
+        inner.signal.removeEventListener("abort", stop);
+        giveBack?.();
       }
-      const moment = read(message, this.#before);
-      if (moment) {
-        this.#before = moment;
-        this.told.state(moment);
-      }
+      if (!giveBack) await pause(TURN_MS, inner.signal);
+      else if (!signal.aborted) throw new TypeError("the stream has ended");
     }
-    if (!signal.aborted) throw new TypeError("the stream has ended");
   }
 }
 
@@ -211,15 +228,12 @@ export function show(plant: string): void {
   void look();
 }
 
-// A plant that stands still tells nothing by itself when poles are wanted, or when its feedback has changed.
-let told = "";
-const changed = (): void => {
-  const key = `${app.wantsPoles.get()} ${app.info.get()?.feedback?.revision ?? ""}`;
-  if (key !== told) watcher?.renew();
-  told = key;
-};
-app.wantsPoles.on(changed);
-app.info.on(changed);
+// A stream has what was wanted when it was opened.
+let hadPoles = app.wantsPoles.get();
+app.wantsPoles.on((wants) => {
+  if (wants !== hadPoles) watcher?.renew();
+  hadPoles = wants;
+});
 
 /** Id of the plant that is shown. */
 export function current(): string {

@@ -2,6 +2,7 @@
 
 import { words } from "./api.js";
 import { byId, fill, h, icon, write } from "./dom.js";
+import { films } from "./film.js";
 import { groups } from "./history.js";
 import { keys, showHelp } from "./keys.js";
 import { current, follow, list, show } from "./live.js";
@@ -19,7 +20,7 @@ import { Recording } from "./recording.js";
 import { pushing } from "./scene/push.js";
 import { View } from "./scene/view.js";
 import { layers, notices, Scrubber, status } from "./stage.js";
-import { app, complain, inform, type Subject } from "./state.js";
+import { alone, app, complain, inform, type Subject } from "./state.js";
 import { switchTheme, theme } from "./theme.js";
 
 /** Points of a recording's plots. */
@@ -57,6 +58,12 @@ recordings((name, read) => void openRecording(name, read));
 compare(view);
 tools();
 dropping();
+films({
+  view,
+  history: plots.history,
+  recorded: () => recording && [recording.time(0), recording.time(recording.length - 1)],
+  show: (time) => (recording ? scrubber.to(time) : app.held.set(time)),
+});
 pushing(view, (text, x, y) => {
   const label = byId("label");
   label.hidden = text === "";
@@ -209,6 +216,7 @@ Object.defineProperty(window, "plantdView", {
       const part = group?.children[0];
       return part ? view.pixel(part.getWorldPosition(part.position.clone())) : undefined;
     },
+    shapes: (name: string) => view.boxes(view.figure?.frame(name) ?? -1).map(({ min, max }) => ({ low: min.toArray(), high: max.toArray() })),
     under: (x: number, y: number) => {
       const hit = view.pick(x, y);
       return hit && view.figure?.drawing.frames[hit.frame]?.name;
@@ -219,10 +227,10 @@ Object.defineProperty(window, "plantdView", {
 async function begin(): Promise<void> {
   const asked = new URLSearchParams(location.search);
   const file = asked.get("recording");
-  if (file !== null && !/^[a-z0-9-]{1,63}$/.test(file)) {
-    // A recording at an address: there need be no plants where it comes from.
-    await openRecording(file.slice(file.lastIndexOf("/") + 1), async () => {
-      const answer = await fetch(file);
+  const address = alone;
+  if (address !== null) {
+    await openRecording(address.slice(address.lastIndexOf("/") + 1), async () => {
+      const answer = await fetch(address);
       if (!answer.ok) throw new Error(`${answer.status} ${answer.statusText}`);
       return new Uint8Array(await answer.arrayBuffer());
     });

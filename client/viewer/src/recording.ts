@@ -29,6 +29,11 @@ interface Transforms {
   }[];
 }
 
+/** plantd.Signals, as far as it is read. */
+interface Signals {
+  energy?: { kinetic: number; potential: number };
+}
+
 type Triple = { x: number; y: number; z: number };
 
 /** foxglove.SceneUpdate, as far as it is read: lines and arrows in the order of the drawing. */
@@ -49,6 +54,7 @@ export class Recording {
   #steps: Entry[] = [];
   #transforms: Entry[] = [];
   #scenes: Entry[] = [];
+  #signals: Entry[] = [];
   #types = new Map<string, DescMessage | undefined>();
   readonly subject: Subject;
 
@@ -66,13 +72,14 @@ export class Recording {
       if (record.type === "Schema") schemas.set(record.id, record);
       else if (record.type === "Channel") {
         topics.set(record.id, record.topic);
-        if (record.topic === "/tf" || record.topic === "/scene") this.#types.set(record.topic, type(schemas.get(record.schemaId)));
+        if (["/tf", "/scene", "/signals"].includes(record.topic)) this.#types.set(record.topic, type(schemas.get(record.schemaId)));
       } else if (record.type === "Message") {
         const topic = topics.get(record.channelId);
         const entry = { time: Number(record.publishTime) / 1e9, data: record.data };
         if (topic === "/plant") plant = describe(name, record.data);
         else if (topic === "/step" && this.#steps.length < RECORDS_MAX) this.#steps.push(entry);
         else if (topic === "/tf" && this.#transforms.length < RECORDS_MAX) this.#transforms.push(entry);
+        else if (topic === "/signals" && this.#signals.length < RECORDS_MAX) this.#signals.push(entry);
         else if (topic === "/scene" && this.#scenes.length < RECORDS_MAX) this.#scenes.push(entry);
       }
     }
@@ -109,8 +116,7 @@ export class Recording {
       velocity: record.state?.velocity ?? [],
       u: record.u,
       outputs: record.outputs?.y ?? [],
-      kinetic: NaN,
-      potential: NaN,
+      ...this.#energy(time),
       poses: this.#poses(time),
       poles: undefined,
       timing: record.timing,
@@ -126,6 +132,12 @@ export class Recording {
       if (moment) moments.push({ ...moment, poses: undefined });
     }
     return moments;
+  }
+
+  /** The energy that was recorded last, J. */
+  #energy(time: number): { kinetic: number; potential: number } {
+    const energy = this.#decode<Signals>("/signals", this.#signals, time)?.energy;
+    return { kinetic: energy?.kinetic ?? NaN, potential: energy?.potential ?? NaN };
   }
 
   #poses(time: number): Poses | undefined {

@@ -48,14 +48,14 @@ export function status(release: () => void): void {
     const held = app.held.get();
     const isLive = app.subject.get()?.plant !== "";
     const stopped = app.info.get()?.run?.stoppedBy?.message ?? "";
-    const text = !isLive ? "" : connection === "lost" ? "The server does not answer. Trying again." : connection === "connecting" ? "Connecting" : held !== null ? `Held at ${held.toFixed(3)} s` : stopped !== "" ? `Stopped: ${stopped}` : "";
+    const text = !isLive ? "" : connection === "lost" ? "The server does not answer. Trying again." : connection === "connecting" ? "Connecting" : held !== null ? `Held at ${held.toFixed(3)} s` : stopped !== "" ? `Stopped: ${stopped}` : connection === "turns" ? "Some states a second: other windows watch, too" : "";
     line.hidden = text === "";
     line.classList.toggle("bad", connection === "lost" || text.startsWith("Stopped"));
     if (line.dataset["text"] === text) return;
     line.dataset["text"] = text;
     const button = h("button", { type: "button" }, "Live");
     button.addEventListener("click", release);
-    fill(line, text, connection === "live" && held !== null && button);
+    fill(line, text, (connection === "live" || connection === "turns") && held !== null && button);
   };
   app.connection.on(show);
   app.held.on(show);

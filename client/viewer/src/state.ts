@@ -60,8 +60,8 @@ export interface Subject {
   timeStep: number;
 }
 
-/** How it stands with the server. */
-export type Connection = "connecting" | "live" | "lost" | "hidden" | "none";
+/** How it stands with the server; `turns`: a state now and then, because other windows watch. */
+export type Connection = "connecting" | "live" | "turns" | "lost" | "hidden" | "none";
 
 /** A message to the person at the page. */
 export interface Notice {
@@ -88,6 +88,10 @@ export const app = {
   /** This page holds the lease. */
   drives: new Value<boolean>(false),
 };
+
+const recording = new URLSearchParams(location.search).get("recording");
+/** Address of a recording that is shown without a server of plants; null elsewhere, where recordings have names. */
+export const alone = recording !== null && !/^[a-z0-9-]{1,63}$/.test(recording) ? recording : null;
 
 /** Says something that went wrong, in words. */
 export function complain(text: string): void {

@@ -2,6 +2,8 @@
 //
 //   npm test -- --server PATH [--pictures FOLDER] [--only WORDS]
 //
+// `plantctl` lies beside the server.
+//
 // Without Chromium it says so and ends with 77.
 
 import assert from "node:assert/strict";
@@ -10,7 +12,10 @@ import { createServer, request } from "node:http";
 import { parseArgs } from "node:util";
 import { connect, Pace } from "./api.mjs";
 import { chromium, launch, Server } from "./browser.mjs";
+import { commandTests } from "./command.mjs";
 import { small } from "./png.mjs";
+import { robotTests } from "./robots.mjs";
+import { windowTests } from "./windows.mjs";
 
 const SKIPPED = 77;
 const { values: options } = parseArgs({ options: { server: { type: "string" }, pictures: { type: "string" }, only: { type: "string" } } });
@@ -29,17 +34,22 @@ const browser = await launch();
 const troubles = [];
 let expectsTrouble = false;
 
-/** A page that tells of every error and of every request to somebody else. */
-async function open(query, width = 1280, height = 800) {
-  const page = await browser.newPage();
-  await page.setViewport({ width, height });
+/** Notes every error of a page and every request to somebody else. */
+function watched(page, own = server.url) {
   const trouble = (text) => expectsTrouble || troubles.push(text);
   page.on("console", (message) => message.type() === "error" && trouble(`console: ${message.text()}`));
   page.on("pageerror", (error) => trouble(`page: ${error.message}`));
   page.on("request", (request) => {
     const { origin, protocol } = new URL(request.url());
-    if (protocol !== "data:" && protocol !== "blob:" && origin !== server.url) troubles.push(`request to ${request.url()}`);
+    if (protocol !== "data:" && protocol !== "blob:" && origin !== own) troubles.push(`request to ${request.url()}`);
   });
+}
+
+/** A page that tells of every error and of every request to somebody else. */
+async function open(query, width = 1280, height = 800) {
+  const page = await browser.newPage();
+  await page.setViewport({ width, height });
+  watched(page);
   await page.goto(`${server.url}/${query}`);
   return page;
 }
@@ -90,6 +100,36 @@ async function decoded(page, picture) {
 
 const shows = (page, id) => until(page, `${id} to be seen`, () => window.plantdView?.frames().length > 0 && window.plantdView.shown().step !== undefined && window.plantdView.isDrawn());
 
+/** The frames of a page are where the kinematics of its plant has them. */
+async function posed(page, id, model) {
+  const frames = await page.evaluate(() => window.plantdView.frames());
+  const { frames: truth } = await api.control.kinematics({ state: { plant: id } });
+  const known = new Map(truth.map((each) => [each.frame, each]));
+  assert.ok(frames.length > 0);
+  for (const { name, matrix } of frames) {
+    const { position, orientation } = known.get(name);
+    const [w, x, y, z] = orientation;
+    const expected = [
+      1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y), 0,
+      2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x), 0,
+      2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y), 0,
+      ...position, 1,
+    ];
+    const apart = Math.max(...expected.map((value, index) => Math.abs(value - matrix[index])));
+    assert.ok(apart < 1e-6, `${model}, ${name}: off by ${apart}`);
+  }
+}
+
+/** Processor time that the browser has used, s. */
+async function cpuSeconds() {
+  const session = await browser.target().createCDPSession();
+  const { processInfo } = await session.send("SystemInfo.getProcessInfo");
+  await session.detach();
+  return processInfo.reduce((sum, { cpuTime }) => sum + cpuTime, 0);
+}
+
+const context = { binary: options.server, api, browser, server, posed, cpuSeconds, decoded, eventually, open, plant, run, shows, until, watched };
+
 const tests = {
   async "the canvas shows something"() {
     const page = await open(`?plant=${await plant("double-pendulum")}`);
@@ -110,41 +150,8 @@ const tests = {
       await api.plants.step({ id, hold: 37 });
       await until(page, "step 37", () => window.plantdView.shown().step === 37);
       await until(page, "the picture of it", () => window.plantdView.isDrawn());
-      const frames = await page.evaluate(() => window.plantdView.frames());
-      const { frames: truth } = await api.control.kinematics({ state: { plant: id } });
-      const known = new Map(truth.map((each) => [each.frame, each]));
-      assert.ok(frames.length > 0);
-      for (const { name, matrix } of frames) {
-        const { position, orientation } = known.get(name);
-        const [w, x, y, z] = orientation;
-        const expected = [
-          1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y), 0,
-          2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x), 0,
-          2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y), 0,
-          ...position, 1,
-        ];
-        const apart = Math.max(...expected.map((value, index) => Math.abs(value - matrix[index])));
-        assert.ok(apart < 1e-6, `${model}, ${name}: off by ${apart}`);
-      }
+      await posed(page, id, model);
       await page.close();
-    }
-  },
-
-  async "pictures follow each other while plants run"() {
-    for (const model of ["marionette", "chain-32"]) {
-      const id = await plant(model, `fast-${model}`);
-      await run(id);
-      const page = await open(`?plant=${id}`);
-      await shows(page, id);
-      const count = () => page.evaluate(() => [window.plantdView.drawn(), performance.now()]);
-      await new Promise((resolve) => setTimeout(resolve, 1500));
-      const [before, began] = await count();
-      await new Promise((resolve) => setTimeout(resolve, 4000));
-      const [after, ended] = await count();
-      console.log(`  ${model}: ${((1000 * (after - before)) / (ended - began)).toFixed(1)} pictures a second`);
-      assert.ok(after - before >= 3, `${after - before} pictures`);
-      await page.close();
-      await api.plants.deletePlant({ id });
     }
   },
 
@@ -218,6 +225,7 @@ const tests = {
     await page.click("#lease");
     await eventually("the lease to be free", async () => (await driver()) === "");
     // Whoever closes the page gives it back, too.
+    await until(page, "it to be offered", () => /Take/.test(document.getElementById("lease").textContent) && !document.getElementById("lease").disabled);
     await page.click("#lease");
     await eventually("the lease", async () => (await driver()) === "drive");
     await page.close();
@@ -318,6 +326,10 @@ const tests = {
     await page.close();
     foreign.close();
   },
+
+  ...commandTests(context),
+  ...robotTests(context),
+  ...windowTests(context),
 
   // The last one: the plants of the others end with the server.
   async "it goes on after the server has restarted"() {

@@ -17,7 +17,7 @@ Vectors and matrices are numpy arrays in SI units and radians. What the server r
 from ._batch import Rollout, Rollouts, Stepped
 from ._channels import Channels, Outputs
 from ._client import Client, connect
-from ._drive import Driver
+from ._drive import Driver, Hold
 from ._errors import PlantdError, StepError, Violation
 from ._feedback import Feedback, Follower, GainSchedule, WatchedGain
 from ._gains import Gain, Regulator, TrajectoryGain
@@ -65,6 +65,7 @@ __all__ = [
     "FrameMotion",
     "Gain",
     "GainSchedule",
+    "Hold",
     "InverseDynamics",
     "Kalman",
     "KalmanStep",

@@ -13,7 +13,7 @@ from ._arrays import Array, Vector, array, vector
 from ._calls import Calls
 from ._channels import Outputs
 from ._check import build
-from ._errors import PlantdError, from_failure, translate
+from ._errors import PlantdError, from_failure, translate, translated
 from ._linearize import Linearization
 from ._plants import Plant
 from ._realtime import StepTiming
@@ -127,8 +127,43 @@ class Driver:
         self.close()
 
 
+class Hold:
+    """Holds the lease of a plant that runs by itself; inputs are calls of their own.
+
+    Use it in a ``with`` statement. `Driver` streams its inputs and sees what becomes of each; this is
+    for those who give one now and then.
+    """
+
+    def __init__(self, calls: DriveCalls, id: str):
+        self._calls = calls
+        self._id = id
+        self._stream: Any = calls.plants.Hold(build(pb.HoldRequest, id=id))
+        self._sequence = 0
+        with translated():
+            opened = next(self._stream)
+        #: The plant as it was when the lease was taken.
+        self.plant = Plant._from(opened.plant)
+        #: Names the lease, for `Client.set_input`.
+        self.lease_token: str = opened.lease_token
+
+    def set_input(self, u: Vector) -> None:
+        """Gives the plant an input, which acts from its next step on until there is another one."""
+        self._sequence += 1
+        self._calls.set_input(self._id, self.lease_token, u, sequence=self._sequence)
+
+    def close(self) -> None:
+        """Gives the lease back."""
+        self._stream.cancel()
+
+    def __enter__(self) -> Hold:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
 class DriveCalls(Calls):
-    """The call that takes the lease of a plant."""
+    """The calls that take the lease of a plant."""
 
     def drive(
         self, id: str, *, linearization: bool = False, grace: float = 0.0, resume: str = ""
@@ -143,3 +178,18 @@ class DriveCalls(Calls):
             id=id, linearization=linearization, grace_s=grace, resume=resume
         )
         return Driver(self.plants, open)
+
+    def hold(self, id: str) -> Hold:
+        """Takes the lease of a plant that runs by itself, to give it an input now and then."""
+        return Hold(self, id)
+
+    def set_input(self, id: str, lease_token: str, u: Vector, *, sequence: int = 0) -> None:
+        """Gives a plant an input under the lease that ``lease_token`` names (`Hold.lease_token`).
+
+        Refused with the reason ``LOCKSTEP`` where the plant does not run by itself, and ``LEASE_LOST``
+        where the lease has ended. ``sequence`` is the number by which `StepTiming` tells the input.
+        """
+        request = build(
+            pb.SetInputRequest, id=id, lease_token=lease_token, u=vector(u, "u"), sequence=sequence
+        )
+        self._call(self.plants.SetInput, request)

@@ -137,6 +137,7 @@ class PlantHandle:
     set_parameters = _by_id(PlantCalls.set_parameters)
     open_link = _by_id(PlantCalls.open_link)
     drive = _by_id(DriveCalls.drive)
+    hold = _by_id(DriveCalls.hold)
     run = _by_id(RealtimeCalls.run)
     pause = _by_id(RealtimeCalls.pause)
     set_safety = _by_id(RealtimeCalls.set_safety)

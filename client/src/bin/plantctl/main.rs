@@ -19,7 +19,8 @@ use clap_complete::CompleteEnv;
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, fmu, guard,
     import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record,
-    reference, replay, run, scene, settle, shell, state, step, test, timing, top, view, watch,
+    reference, render, replay, run, scene, settle, shell, state, step, test, timing, top, view,
+    watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
@@ -53,6 +54,7 @@ Examples:
   plantctl top                                      rates, drivers and lateness of all plants
   plantctl plot trial.mcap q.theta u.tau            in the terminal; --out plot.svg draws a picture
   plantctl view trial.mcap                          in the browser; `view p1` shows a plant
+  plantctl render trial.mcap --out trial.gif        a film for documents; .png is a picture
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
@@ -121,6 +123,7 @@ enum Command {
     Export(export::Export),
     Plot(plot::Plot),
     View(view::View),
+    Render(render::Render),
     Reset(state::Reset),
     Snapshot(state::Snapshot),
     Restore(state::Restore),
@@ -196,6 +199,7 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Export(command) => command.run(context)?,
         Command::Plot(command) => command.run(context)?,
         Command::View(command) => command.run(context).await?,
+        Command::Render(command) => command.run(context).await?,
         Command::Reset(command) => command.run(context).await?,
         Command::Snapshot(command) => command.run(context).await?,
         Command::Restore(command) => command.run(context).await?,

@@ -1,6 +1,7 @@
 // Inputs as sliders. In lockstep a step takes them; a plant that runs by itself is driven under a lease.
 
 import { isCanceled, plants, words } from "../api.js";
+import { place } from "../connections.js";
 import { fill, h } from "../dom.js";
 import { number } from "../format.js";
 import type { Model } from "../gen/plantd/v1/model_service_pb.js";
@@ -171,7 +172,13 @@ async function takeLease(): Promise<void> {
   if (taking || lease || plant === "") return;
   taking = true;
   const stream = new AbortController();
+  let free: (() => void) | undefined;
   try {
+    free = await place("hold");
+    if (!free) {
+      complain("Two windows of this browser drive already: give the lease back in one of them.");
+      return;
+    }
     for await (const { leaseToken } of plants.hold({ id: plant }, { signal: stream.signal })) {
       taking = false;
       if (plant !== current()) break;
@@ -184,6 +191,7 @@ async function takeLease(): Promise<void> {
     if (!isCanceled(error)) complain(`Lease: ${words(error)}`);
   } finally {
     stream.abort();
+    free?.();
     taking = false;
     if (lease?.stream === stream) lease = undefined;
     app.drives.set(lease !== undefined);

@@ -3,7 +3,7 @@
 import { attempt, models, plants } from "../api.js";
 import { byId, fill, h, options } from "../dom.js";
 import { current, list, show } from "../live.js";
-import { app } from "../state.js";
+import { alone, app } from "../state.js";
 
 const NEW = "\u0000new";
 
@@ -46,7 +46,8 @@ export function picker(): void {
     const shown = current();
     if (shown !== "" && !all.some(({ id }) => id === shown)) ids.unshift([shown, shown]);
     const lead: [string, string][] = subject && subject.plant === "" ? [["", `Recording: ${subject.title}`]] : ids.length === 0 ? [["", "No plant"]] : [];
-    options(select, [...lead, ...ids, [NEW, "New plant…"]]);
+    const more: [string, string][] = alone === null ? [[NEW, "New plant…"]] : [];
+    options(select, [...lead, ...ids, ...more]);
     select.value = shown;
     if (app.connection.get() === "none" && !subject && all.length === 0) void offer();
     else if (!asked) empty.hidden = true;
@@ -61,7 +62,7 @@ export function picker(): void {
   }
 
   async function offer(): Promise<void> {
-    if (!empty.hidden) return;
+    if (!empty.hidden || alone !== null) return;
     asked = app.plants.get().length > 0;
     empty.hidden = false;
     const name = h("input", { type: "text", "aria-label": "Name of a model", placeholder: "chain-12, scissor-6, …" });

@@ -5,7 +5,7 @@ import { fill, h, icon } from "../dom.js";
 import { bytes, count } from "../format.js";
 import { RecordingStatus, type Recording as Listed } from "../gen/plantd/v1/recording_service_pb.js";
 import { current } from "../live.js";
-import { app, complain } from "../state.js";
+import { alone, app, complain } from "../state.js";
 import { everySecond, section } from "./section.js";
 
 /** The bytes of a recording of the server. */
@@ -67,6 +67,6 @@ export function recordings(open: (name: string, read: () => Promise<Uint8Array>)
   }
   everySecond(part, () => void show());
   app.subject.on(() => {
-    if (part.root.open) void show().catch((error: unknown) => complain(words(error)));
+    if (part.root.open && alone === null) void show().catch((error: unknown) => complain(words(error)));
   });
 }

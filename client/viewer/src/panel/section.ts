@@ -1,7 +1,7 @@
 // Sections of the panel: each can be closed, and stays so in this browser.
 
 import { byId, h } from "../dom.js";
-import { remember, remembered } from "../state.js";
+import { alone, remember, remembered } from "../state.js";
 
 /** A section of the panel. */
 export interface Section {
@@ -39,9 +39,9 @@ export function section(key: string, title: string, open: boolean): Section {
 /** Does something every second while a section is open and the page is seen. */
 export function everySecond(part: Section, action: () => void): void {
   setInterval(() => {
-    if (part.root.open && !document.hidden) action();
+    if (part.root.open && !document.hidden && alone === null) action();
   }, 1000);
   part.onOpen((open) => {
-    if (open) action();
+    if (open && alone === null) action();
   });
 }

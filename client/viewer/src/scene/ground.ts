@@ -35,6 +35,11 @@ export class Ground {
     this.axes = axes(0.12 * size);
   }
 
+  /** Whether anything throws a shadow on it: what would stay clear all over need not be drawn. */
+  set hasShadow(has: boolean) {
+    this.#shadow.visible = has;
+  }
+
   /** Puts it under the lowest point, on a line of the grid. */
   place(lowest: number, beside: Vector3): void {
     const height = Math.floor(lowest / this.#cell + 1e-6) * this.#cell;

@@ -99,7 +99,8 @@ async function load(group: Group, mesh: DrawnMesh, material: MeshStandardMateria
 }
 
 async function read(url: string, material: MeshStandardMaterial, painted: boolean): Promise<Object3D> {
-  const extension = url.slice(url.lastIndexOf(".") + 1).toLowerCase();
+  // Behind the name is the tag of the file.
+  const extension = /\.([a-z0-9]+)(?:$|\?)/i.exec(url)?.[1]?.toLowerCase();
   switch (extension) {
     case "stl": {
       const geometry = await new STLLoader().loadAsync(url);

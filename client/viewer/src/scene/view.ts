@@ -96,6 +96,11 @@ export class View {
     return !this.#isStale;
   }
 
+  /** The camera is where the mechanism is seen. */
+  get isPlaced(): boolean {
+    return this.#isPlaced;
+  }
+
   get figure(): Figure | undefined {
     return this.#figure;
   }
@@ -122,6 +127,7 @@ export class View {
     this.#up.normalize();
     this.#ground?.dispose();
     this.#ground = new Ground(drawing.sizeM || 1, this.#up);
+    this.#ground.hasShadow = this.#quality.shadows;
     this.scene.add(this.#ground.object, this.#ground.axes);
     if (!keeps) this.#isPlaced = false;
     else this.#ground.place(this.#lowest, this.controls.target);
@@ -258,6 +264,13 @@ export class View {
     return { side, flat: across(side) < 0.35 * size };
   }
 
+  /** The boxes that the shapes of a frame fill in the world; of meshes once they have come. */
+  boxes(frame: number): Box3[] {
+    const parts = this.#figure?.frames[frame]?.children ?? [];
+    const boxes = parts.filter(({ type }) => type !== "AxesHelper").map((part) => new Box3().setFromObject(part));
+    return boxes.filter((box) => !box.isEmpty());
+  }
+
   /** What is under a point of the window. */
   pick(x: number, y: number): Hit | undefined {
     if (!this.#figure?.object.visible) return undefined;
@@ -336,6 +349,7 @@ export class View {
     if (this.#quality.shadows) {
       this.#quality.shadows = false;
       this.#sun.castShadow = false;
+      if (this.#ground) this.#ground.hasShadow = false;
     } else if (this.#quality.ratio > 0.7) {
       this.#quality.ratio *= 0.8;
       this.#resize();

@@ -9,6 +9,7 @@ use crate::core::feedback::active::{Feedback, FeedbackInfo, InForce};
 use crate::core::feedback::law::Law;
 use crate::core::feedback::regulator::{RegulatorError, Spec};
 use crate::core::limits::LimitExceeded;
+use crate::core::plant::core::Core;
 use crate::core::plant::view::Mechanics;
 use crate::core::session::shared::Session;
 
@@ -35,7 +36,9 @@ impl Session {
             feedback.generation = if is_outdated { generation } else { core.changed.generation };
             let info = feedback.info();
             session.gains.in_force.send_replace(Some(feedback.in_force()));
-            (info, is_outdated, core.feedback.replace(feedback))
+            let former = core.feedback.replace(feedback);
+            session.tell_again(core);
+            (info, is_outdated, former)
         });
         (info, is_outdated)
     }
@@ -45,7 +48,11 @@ impl Session {
         let session = Arc::clone(self);
         let former = self.with_core(move |core| {
             session.gains.in_force.send_replace(None);
-            core.feedback.take()
+            let former = core.feedback.take();
+            if former.is_some() {
+                session.tell_again(core);
+            }
+            former
         });
         former.is_some()
     }
@@ -86,7 +93,16 @@ impl Session {
                 Err(error) => feedback.failure = Some(Arc::new(error)),
             }
             session.gains.in_force.send_replace(Some(feedback.in_force()));
+            session.tell_again(core);
         });
+    }
+
+    /// Tells watchers the state of a plant at rest once more: its poles and gains are others now. One that runs by
+    /// itself tells its next state soon.
+    fn tell_again(&self, core: &mut Core) {
+        if !core.own_loop.has_core {
+            self.publish(core);
+        }
     }
 
     /// The feedback in force. Does not touch the core.

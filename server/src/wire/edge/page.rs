@@ -17,12 +17,12 @@ use std::task::{Context, Poll};
 
 use futures::future::{Either, Ready, ready};
 use http_body::{Body as HttpBody, Frame, SizeHint};
+use plantd_viewer::{HEADERS, PARTS, POLICY, Part};
 use tonic::body::Body;
 use tonic::codegen::Bytes;
 use tonic::codegen::http::header::{
     ACCEPT_ENCODING, ALLOW, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_LENGTH,
-    CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG, IF_NONE_MATCH, REFERRER_POLICY, VARY,
-    X_CONTENT_TYPE_OPTIONS,
+    CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG, IF_NONE_MATCH, VARY,
 };
 use tonic::codegen::http::{HeaderMap, HeaderValue, Method, Request, Response, StatusCode};
 use tower::{Layer, Service};
@@ -31,26 +31,9 @@ use crate::core::files::{File, tag};
 use crate::wire::edge::admission::{OpenCall, Place};
 use crate::wire::edge::gate::is_grpc;
 
-macro_rules! dist {
-    ($file:literal) => {
-        include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../client/viewer/dist/", $file))
-    };
-}
-
-/// What the page is made of: path, content type, bytes, and whether these are compressed with gzip.
-const PARTS: [(&str, &str, &[u8], bool); 3] = [
-    ("/", "text/html; charset=utf-8", dist!("index.html"), false),
-    ("/viewer.js", "text/javascript; charset=utf-8", dist!("viewer.js.gz"), true),
-    ("/viewer.css", "text/css; charset=utf-8", dist!("viewer.css"), false),
-];
-
 /// Tags of [`PARTS`].
-static TAGS: LazyLock<[u64; 3]> = LazyLock::new(|| PARTS.map(|(_, _, bytes, _)| tag(bytes)));
+static TAGS: LazyLock<[u64; PARTS.len()]> = LazyLock::new(|| PARTS.map(|part| tag(part.bytes)));
 
-/// The page runs its own script and talks to its own server, and nobody shows it in a frame.
-const PAGE_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
-    connect-src 'self' blob:; img-src 'self' data: blob:; font-src 'self'; form-action 'none'; \
-    frame-ancestors 'none'; base-uri 'none'";
 /// A file of a model is never a page.
 const FILE_POLICY: &str = "default-src 'none'; sandbox; frame-ancestors 'none'";
 
@@ -161,13 +144,12 @@ impl Answer {
             (CONTENT_TYPE, self.kind),
             (CONTENT_SECURITY_POLICY, self.policy),
             (CACHE_CONTROL, self.cache),
-            (X_CONTENT_TYPE_OPTIONS, "nosniff"),
-            (REFERRER_POLICY, "no-referrer"),
         ] {
             headers.insert(name, HeaderValue::from_static(value));
         }
-        // No page of another origin gets it as an image or a script.
-        headers.insert("cross-origin-resource-policy", HeaderValue::from_static("same-origin"));
+        for (name, value) in HEADERS {
+            headers.insert(name, HeaderValue::from_static(value));
+        }
         if let Some(encoding) = self.encoding {
             headers.insert(CONTENT_ENCODING, HeaderValue::from_static(encoding));
             headers.insert(VARY, HeaderValue::from_static("accept-encoding"));
@@ -199,7 +181,7 @@ impl<S> Page<S> {
         };
         let path = request.uri().path();
         let (headers, query) = (request.headers(), request.uri().query());
-        let part = PARTS.iter().position(|(known, ..)| *known == path).map(part);
+        let part = PARTS.iter().position(|part| part.path == path).map(part);
         let found = part.or_else(|| {
             let (model, path) = path.strip_prefix("/models/")?.split_once("/files/")?;
             Some(file(files(model, path)?, query))
@@ -215,11 +197,11 @@ impl<S> Page<S> {
 }
 
 fn part(index: usize) -> Answer {
-    let (_, kind, bytes, is_compressed) = PARTS[index];
+    let Part { kind, bytes, is_compressed, .. } = PARTS[index];
     Answer {
         status: StatusCode::OK,
         kind,
-        policy: PAGE_POLICY,
+        policy: POLICY,
         cache: ASK_AGAIN,
         tag: Some(TAGS[index]),
         encoding: is_compressed.then_some("gzip"),
@@ -307,12 +289,5 @@ mod tests {
         assert!(takes("gzip, deflate, br, zstd") && takes("br;q=1.0, gzip;q=0.8") && takes("GZIP"));
         assert!(!takes("identity") && !takes("gzip;q=0, br") && !takes("x-gzip") && !takes(""));
         assert!(!takes_gzip(&HeaderMap::new()));
-    }
-
-    #[test]
-    fn the_script_is_there_compressed() {
-        for (path, _, bytes, is_compressed) in PARTS {
-            assert_eq!(bytes.starts_with(&[0x1f, 0x8b]), is_compressed, "{path}");
-        }
     }
 }

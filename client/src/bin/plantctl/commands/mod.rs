@@ -23,6 +23,7 @@ pub(crate) mod parameters;
 pub(crate) mod plot;
 pub(crate) mod record;
 pub(crate) mod reference;
+pub(crate) mod render;
 pub(crate) mod replay;
 pub(crate) mod run;
 pub(crate) mod scene;

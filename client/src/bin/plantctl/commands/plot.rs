@@ -40,6 +40,9 @@ pub(crate) struct Plot {
     /// Picture instead of characters, those of one unit in one panel: FILE.svg, or FILE.png by a browser.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Browser for PNG: a Chromium or Chrome; the first on the path if not given.
+    #[arg(long, value_name = "PROGRAM", env = "CHROME")]
+    browser: Option<PathBuf>,
     /// Begin at this time of the plant, s.
     #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
     from: Option<f64>,
@@ -76,7 +79,11 @@ impl Plot {
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("svg") => std::fs::write(&path, svg)
                 .with_context(|| format!("cannot write {}", path.display()))?,
-            Some("png") => browser::png_of_svg(&svg, size, &path)?,
+            Some("png") => {
+                let browser = browser::find(self.browser.as_deref())
+                    .context("a picture as PNG is made by a browser; one as SVG needs nothing")?;
+                browser::png_of_svg(&browser, &svg, size, &path)?;
+            }
             _ => bail!("{}: plots are written as .svg or .png", path.display()),
         }
         context.output.done(json!({ "file": path, "signals": self.signals }))

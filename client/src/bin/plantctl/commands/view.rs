@@ -25,10 +25,25 @@ pub(crate) struct View {
     no_open: bool,
 }
 
+/// What was named is the file of a recording, and no plant.
+pub(crate) fn is_recording(what: &str) -> bool {
+    what.ends_with(".mcap") || Path::new(what).is_file()
+}
+
+/// Address of the server's page, without a slash at the end.
+pub(crate) fn page_of(context: &Context) -> Result<&str> {
+    let address = context.address.as_deref().unwrap_or(DEFAULT_ADDRESS);
+    if !address.starts_with("http://") {
+        bail!(
+            "browsers do not reach {address}: give the server's address over TCP, http://host:port"
+        );
+    }
+    Ok(address.trim_end_matches('/'))
+}
+
 impl View {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
-        let is_file = |what: &&String| what.ends_with(".mcap") || Path::new(what).is_file();
-        if let Some(file) = self.what.as_ref().filter(is_file) {
+        if let Some(file) = self.what.as_ref().filter(|what| is_recording(what)) {
             // What is no recording is better told here than by the page.
             RecordingReader::open(file)?;
             let server = PageServer::bind(Path::new(file)).await?;
@@ -42,14 +57,9 @@ impl View {
         if let Some(id) = &self.what {
             plant(&client, id).await?;
         }
-        let address = context.address.as_deref().unwrap_or(DEFAULT_ADDRESS);
-        if !address.starts_with("http://") {
-            bail!(
-                "browsers do not reach {address}: give the server's address over TCP, http://host:port"
-            );
-        }
+        let address = page_of(context)?;
         let query = self.what.as_ref().map(|id| format!("?plant={id}")).unwrap_or_default();
-        self.show(&format!("{}/{query}", address.trim_end_matches('/')), context)
+        self.show(&format!("{address}/{query}"), context)
     }
 
     fn show(&self, url: &str, context: &Context) -> Result<()> {

@@ -9,20 +9,45 @@ use anyhow::{Context as _, Result, bail};
 const BROWSERS: [&str; 4] =
     ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
 
+/// The browser to use: the one that was asked for, or the first on the path.
+pub(crate) fn find(asked: Option<&Path>) -> Result<PathBuf> {
+    if let Some(asked) = asked {
+        let is_path = asked.components().count() > 1;
+        let found = if is_path { Some(asked.to_owned()) } else { on_path(&[asked]) };
+        return found
+            .filter(|program| program.is_file())
+            .with_context(|| format!("there is no browser {}", asked.display()));
+    }
+    on_path(&BROWSERS.map(Path::new)).with_context(|| {
+        format!(
+            "there is no browser to draw with: none of {} on the path. Install Chromium (Debian: \
+             `apt install chromium`) or Chrome, or say where one is with --browser or CHROME",
+            BROWSERS.join(", ")
+        )
+    })
+}
+
+/// The first of these programs on the path.
+fn on_path(names: &[&Path]) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH")?;
+    let places: Vec<PathBuf> = std::env::split_paths(&path).collect();
+    let all = names.iter().flat_map(|name| places.iter().map(move |place| place.join(name)));
+    all.into_iter().find(|program| program.is_file())
+}
+
 /// Writes what an SVG file of this size, pixels, looks like as PNG.
-pub(crate) fn png_of_svg(svg: &str, (width, height): (u32, u32), path: &Path) -> Result<()> {
-    let Some(browser) = browser() else {
-        let names = BROWSERS.join(", ");
-        bail!(
-            "a picture as PNG needs a browser ({names}), and there is none; one as SVG needs nothing"
-        );
-    };
+pub(crate) fn png_of_svg(
+    browser: &Path,
+    svg: &str,
+    (width, height): (u32, u32),
+    path: &Path,
+) -> Result<()> {
     let directory = tempfile::Builder::new().prefix("plantctl-").tempdir()?;
     let source = directory.path().join("plot.svg");
     let picture = directory.path().join("plot.png");
     std::fs::write(&source, svg)?;
     let of = |name: &str, value: &Path| format!("--{name}={}", value.display());
-    let mut command = Command::new(&browser);
+    let mut command = Command::new(browser);
     command
         .args(["--headless", "--disable-gpu", "--hide-scrollbars", "--force-device-scale-factor=1"])
         .arg(of("user-data-dir", &directory.path().join("profile")))
@@ -41,12 +66,4 @@ pub(crate) fn png_of_svg(svg: &str, (width, height): (u32, u32), path: &Path) ->
     }
     std::fs::copy(&picture, path).with_context(|| format!("cannot write {}", path.display()))?;
     Ok(())
-}
-
-/// The first browser on the path.
-fn browser() -> Option<PathBuf> {
-    let path = std::env::var_os("PATH")?;
-    let places: Vec<PathBuf> = std::env::split_paths(&path).collect();
-    let all = BROWSERS.iter().flat_map(|name| places.iter().map(move |place| place.join(name)));
-    all.into_iter().find(|program| program.is_file())
 }

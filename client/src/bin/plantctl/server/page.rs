@@ -13,36 +13,19 @@ use http_body_util::{BodyExt as _, Full, StreamBody};
 use hyper::body::{Bytes, Frame, Incoming};
 use hyper::header::{
     ACCEPT_RANGES, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_RANGE,
-    CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, HeaderName, HeaderValue, ORIGIN, RANGE,
-    REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS,
+    CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, HeaderValue, ORIGIN, RANGE,
 };
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::TokioIo;
+use plantd_viewer::{HEADERS, PARTS, POLICY, Part};
 use tokio::net::TcpListener;
 
 /// Where the recording is.
 const RECORDING: &str = "/recording.mcap";
-/// The page runs its own script and talks to its own server, and nobody shows it in a frame.
-const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
-    connect-src 'self' blob:; img-src 'self' data: blob:; font-src 'self'; form-action 'none'; \
-    frame-ancestors 'none'; base-uri 'none'";
 /// Bytes that are read at a time.
 const PIECE: usize = 1 << 18;
-
-macro_rules! dist {
-    ($file:literal) => {
-        include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/viewer/dist/", $file))
-    };
-}
-
-/// What the page is made of: path, content type, bytes, and whether these are compressed with gzip.
-const PARTS: [(&str, &str, &[u8], bool); 3] = [
-    ("/", "text/html; charset=utf-8", dist!("index.html"), false),
-    ("/viewer.js", "text/javascript; charset=utf-8", dist!("viewer.js.gz"), true),
-    ("/viewer.css", "text/css; charset=utf-8", dist!("viewer.css"), false),
-];
 
 type Body = BoxBody<Bytes, io::Error>;
 
@@ -96,13 +79,9 @@ impl Site {
     fn answer(&self, request: &Request<Incoming>) -> io::Result<Response<Body>> {
         let mut response = self.find(request)?;
         let headers = response.headers_mut();
-        for (name, value) in [
-            (CONTENT_SECURITY_POLICY, POLICY),
-            (CACHE_CONTROL, "no-cache"),
-            (X_CONTENT_TYPE_OPTIONS, "nosniff"),
-            (REFERRER_POLICY, "no-referrer"),
-            (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
-        ] {
+        headers.insert(CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY));
+        headers.insert(CACHE_CONTROL, HeaderValue::from_static("no-cache"));
+        for (name, value) in HEADERS {
             headers.insert(name, HeaderValue::from_static(value));
         }
         Ok(response)
@@ -132,7 +111,9 @@ impl Site {
             let range = header(RANGE).and_then(|range| part_of(range, self.length));
             return self.recording(range, request.method() == Method::HEAD);
         }
-        let Some((_, kind, bytes, is_compressed)) = PARTS.iter().find(|part| part.0 == path) else {
+        let Some(Part { kind, bytes, is_compressed, .. }) =
+            PARTS.iter().find(|part| part.path == path)
+        else {
             return Ok(text(StatusCode::NOT_FOUND, "there is nothing here\n"));
         };
         let mut response = Response::new(whole(bytes));
