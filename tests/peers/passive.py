@@ -81,7 +81,7 @@ def main():
             print(rows[-1], flush=True)
     if not options.robots:
         text = (
-            f"The robots of `tests/robots` without actuators, dampers and stops, over {options.steps} steps of the midpoint "
+            f"The robots of `tests/robots` without actuators and dampers (the quadrotor without weight, the biped on springs), over {options.steps} steps of the midpoint "
             "rule: the energy that is exchanged between kinetic and potential (J), the largest error of the "
             "total over it in the first hundredth of the run and in all of it, and what a straight line through the errors "
             "wins over the whole run."

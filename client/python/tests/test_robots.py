@@ -230,3 +230,24 @@ def moving(client, model):
         free = rows[np.count_nonzero(sizes > 1e-9 * sizes[0]) :]
         v = free.T @ (free @ v)
     return at.q, v
+
+
+def test_meshes_are_read_where_the_robot_stands(client, tmp_path):
+    """A file brings the meshes from which its inertia comes; a text does not, and is told which it misses."""
+    (tmp_path / "parts").mkdir()
+    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "parts" / "tip.obj").write_text(tetrahedron)
+    robot = tmp_path / "robot.xml"
+    robot.write_text(
+        """<mujoco model="tip"><compiler meshdir="parts"/><asset><mesh name="tip" file="tip.obj"/>
+        <mesh name="unused" file="gone.stl"/></asset><worldbody><body name="tip"><joint type="slide" axis="1 0 0"/>
+        <geom type="mesh" mesh="tip" contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
+    )
+    assert client.validate_scene(robot) == []
+    model = client.create_model(robot)
+    assert client.dynamics(model.name).mass_matrix[0, 0] == pytest.approx(1000 / 6)
+    client.delete_model(model.name)
+    with pytest.raises(plantd.PlantdError, match="mesh file `parts/tip.obj`, which is not here"):
+        client.create_model(robot.read_text())
+    (tmp_path / "parts" / "tip.obj").unlink()
+    assert "`parts/tip.obj`" in client.validate_scene(robot)[0].message
