@@ -69,7 +69,7 @@ async fn main() -> plantd_client::Result<()> {
                 farthest = farthest.max((truth[i] - gain.x_reference[i]).abs());
             }
         }
-        let u = gain.control_at(&estimate);
+        let u = gain.control_at(&estimate)?;
         estimator.predict(&u);
         state = driver.step(&u).await?.state.unwrap_or_default();
     }

@@ -3,9 +3,7 @@
 
 use std::f64::consts::PI;
 
-use plantd_client::{
-    Client, DEFAULT_ADDRESS, GainExt as _, diagonal, operating_point, v1, weights,
-};
+use plantd_client::{Client, DEFAULT_ADDRESS, diagonal, operating_point, v1, weights};
 
 #[tokio::main]
 async fn main() -> plantd_client::Result<()> {
@@ -31,7 +29,7 @@ async fn main() -> plantd_client::Result<()> {
 
     let mut driver = client.drive(&plant.id).await?;
     for _ in 0..50 {
-        state = driver.step(&gain.control(&state)).await?.state.unwrap_or_default();
+        state = driver.step_by(&gain, &state).await?.state.unwrap_or_default();
         println!("{:.1} s  angle from upright {:+.6} rad", state.time_s, state.q[0] - PI);
     }
     driver.close().await?;

@@ -140,6 +140,14 @@ impl Client {
         scene: impl Into<String>,
     ) -> Result<v1::ValidateSceneResponse> {
         let request = v1::ValidateSceneRequest { scene: scene.into(), ..Default::default() };
+        self.validate_scene_as(request).await
+    }
+
+    /// Checks a scene with its notation stated, or with files of a robot.
+    pub async fn validate_scene_as(
+        &self,
+        request: v1::ValidateSceneRequest,
+    ) -> Result<v1::ValidateSceneResponse> {
         Ok(self.models().validate_scene(self.limited(request)).await?.into_inner())
     }
 

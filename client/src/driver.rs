@@ -9,6 +9,7 @@ use tonic::transport::Channel;
 
 use crate::connection::within;
 use crate::error::{Error, Result};
+use crate::schedule::Law;
 
 /// Holds the lease of a plant: steps it in lockstep, or gives inputs to one that runs by itself.
 ///
@@ -94,6 +95,30 @@ impl Driver {
         let step = within(self.step_timeout, answer).await?;
         self.answers_ns = step.clocks.map_or(0, |clocks| clocks.monotonic_ns);
         Ok(step)
+    }
+
+    /// Takes one step with the input that a law has at the plant's last state: [`step`](Self::step), with a law
+    /// that is refused unless it is for this plant.
+    ///
+    /// ```no_run
+    /// # use plantd_client::{Client, v1};
+    /// # async fn hold(client: Client, gain: v1::Gain) -> plantd_client::Result<()> {
+    /// let mut driver = client.drive("pendulum").await?;
+    /// let mut state = driver.plant().state.clone().expect("a plant has a state");
+    /// loop {
+    ///     state = driver.step_by(&gain, &state).await?.state.expect("a step has a state");
+    /// }
+    /// # }
+    /// ```
+    ///
+    /// # Errors
+    /// Those of [`step`](Self::step). [`Error::GainModel`], [`Error::GainTimeStep`] and [`Error::StateLength`] if
+    /// the law was computed for another plant than this one is, as it was when the driver opened it: no step is
+    /// taken, and the driver goes on.
+    pub async fn step_by(&mut self, law: &impl Law, state: &v1::State) -> Result<v1::DriveStep> {
+        law.check_plant(&self.plant)?;
+        let u = law.input_at(state).await?;
+        self.step(&u).await
     }
 
     /// Gives a plant that runs by itself an input, which acts from its next step on, and does not wait.

@@ -19,7 +19,7 @@ use crate::rotation::{compose, difference};
 /// # fn lqg(kalman: v1::SolveKalmanResponse, gain: v1::Gain, y: &[f64]) -> plantd_client::Result<()> {
 /// let mut estimator = Estimator::new(kalman)?;
 /// estimator.correct(y, None);
-/// let u = gain.control_at(&estimator.x());
+/// let u = gain.control_at(&estimator.x())?;
 /// estimator.predict(&u);
 /// # Ok(())
 /// # }

@@ -12,7 +12,8 @@ use tonic::transport::Channel;
 
 use crate::connection::within;
 use crate::error::{Error, Refusal, Result};
-use crate::schedule::{LawState, check, input_of};
+use crate::messages::{GainExt as _, LawState, check};
+use crate::schedule::{Law, input_of};
 use crate::stream::Answers;
 
 /// Gains of a trajectory that are kept ahead of the step asked for.
@@ -273,7 +274,8 @@ impl Follower {
     ///
     /// # Errors
     /// The error with which the stream ended; along a trajectory only where the gains that came before
-    /// do not cover the step. [`Error::StateLength`] if the state is not one of this plant,
+    /// do not cover the step. [`Error::StateLength`] and [`Error::GainTimeStep`] if the state is not one of
+    /// this plant,
     /// [`Error::GainPassed`] if it is of a step that the plant has left behind, `DEADLINE_EXCEEDED` if
     /// the gain does not come within the connection's request timeout.
     pub async fn input(&self, state: &impl LawState) -> Result<Vec<f64>> {
@@ -350,6 +352,17 @@ impl Follower {
     /// The error with which the stream has ended; `None` while it goes on.
     pub fn end(&self) -> Option<Error> {
         self.shared.window().end.clone().map(Error::from)
+    }
+}
+
+impl Law for Follower {
+    /// Compares what the gains say of themselves that have arrived.
+    fn check_plant(&self, plant: &v1::PlantInfo) -> Result<()> {
+        self.shared.window().gains.front().map_or(Ok(()), |gain| gain.suits(plant))
+    }
+
+    async fn input_at(&self, state: &v1::State) -> Result<Vec<f64>> {
+        self.input(state).await
     }
 }
 

@@ -5,7 +5,7 @@
 //! one call per step:
 //!
 //! ```no_run
-//! use plantd_client::{Client, GainExt, diagonal, operating_point, v1, weights};
+//! use plantd_client::{Client, diagonal, operating_point, v1, weights};
 //!
 //! # async fn balance() -> plantd_client::Result<()> {
 //! let client = Client::connect("http://127.0.0.1:50051").await?;
@@ -25,7 +25,7 @@
 //! let mut state = plant.state.expect("a plant has a state");
 //! let mut driver = client.drive(&plant.id).await?;
 //! for _ in 0..1000 {
-//!     state = driver.step(&gain.control(&state)).await?.state.expect("a step has a state");
+//!     state = driver.step_by(&gain, &state).await?.state.expect("a step has a state");
 //! }
 //! # Ok(())
 //! # }
@@ -69,12 +69,12 @@ pub use error::{ConnectProblem, Error, Refusal, Result, Violation};
 pub use estimator::Estimator;
 pub use follower::Follower;
 pub use messages::{
-    GainExt, MatrixExt, RolloutExt, StateExt, WeightsExt, diagonal, full, operating_point,
-    present_state, weights,
+    GainExt, LawState, MatrixExt, RolloutExt, StateExt, WeightsExt, diagonal, full,
+    operating_point, present_state, weights,
 };
 pub use recording::{RecordingEntry, RecordingReader};
 pub use rotation::{compose, difference, rotations};
-pub use schedule::{GainSchedule, LawState};
+pub use schedule::{GainSchedule, Law};
 pub use stream::Answers;
 
 /// The messages and stubs of the contract, `plantd.v1`.

@@ -1,5 +1,7 @@
 //! Arithmetic on the contract's messages, so that a controller needs no linear-algebra library.
 
+use std::borrow::Cow;
+
 use plantd_proto::v1;
 
 use crate::error::{Error, Result};
@@ -85,6 +87,29 @@ impl StateExt for v1::State {
     }
 }
 
+/// A state that a feedback law can be asked about: of a [`Driver`](crate::Driver), a watch or a
+/// [`LinkDriver`](crate::link::LinkDriver).
+pub trait LawState {
+    /// Steps since the plant was created or reset.
+    fn step_index(&self) -> u64;
+    /// `x = (q, p, v)`.
+    fn state_vector(&self) -> Cow<'_, [f64]>;
+    /// Time step of the plant, s, if the state knows it.
+    fn time_step_s(&self) -> Option<f64> {
+        None
+    }
+}
+
+impl LawState for v1::State {
+    fn step_index(&self) -> u64 {
+        self.step
+    }
+
+    fn state_vector(&self) -> Cow<'_, [f64]> {
+        Cow::Owned(self.x())
+    }
+}
+
 /// Use of [`v1::Gain`].
 pub trait GainExt {
     /// The feedback law `u = u_reference + feedforward − K (x − x_reference)`.
@@ -92,15 +117,19 @@ pub trait GainExt {
     /// Differences of angles are taken as they are: a joint that has turned by 2π is 2π away. Those of
     /// ball joints are rotation vectors, see [`difference`].
     ///
-    /// # Panics
-    /// If the state has not as many entries as `K` has columns.
-    fn control(&self, state: &v1::State) -> Vec<f64>;
+    /// # Errors
+    /// [`Error::StateLength`] if the state has not as many entries as the reference, and
+    /// [`Error::GainTimeStep`] if it knows that it is one of a plant of another time step, as those of the
+    /// shared-memory link do.
+    fn control(&self, state: &impl LawState) -> Result<Vec<f64>>;
     /// The feedback law at a state vector `x = (q, p, v)`, as [`control`](Self::control).
     ///
-    /// # Panics
-    /// If `x` has not as many entries as `K` has columns.
-    fn control_at(&self, x: &[f64]) -> Vec<f64>;
-    /// Whether the gain was computed for such a plant, over whichever link it is driven.
+    /// # Errors
+    /// [`Error::StateLength`] if `x` has not as many entries as the reference, [`Error::Protocol`] if the
+    /// gain's own sizes do not fit each other.
+    fn control_at(&self, x: &[f64]) -> Result<Vec<f64>>;
+    /// Whether the gain was computed for such a plant, over whichever link it is driven;
+    /// [`Driver::step_by`](crate::Driver::step_by) asks it.
     ///
     /// # Errors
     /// The plant has another model, another time step or states of another length. What a gain does not say
@@ -109,13 +138,17 @@ pub trait GainExt {
 }
 
 impl GainExt for v1::Gain {
-    fn control(&self, state: &v1::State) -> Vec<f64> {
-        self.control_at(&state.x())
+    fn control(&self, state: &impl LawState) -> Result<Vec<f64>> {
+        check_time_step(self, state.time_step_s())?;
+        self.control_at(&state.state_vector())
     }
 
-    fn control_at(&self, x: &[f64]) -> Vec<f64> {
-        let columns = self.x_reference.len();
-        assert_eq!(x.len(), columns, "a state has {columns} entries here");
+    fn control_at(&self, x: &[f64]) -> Result<Vec<f64>> {
+        check(self)?;
+        let expected = self.x_reference.len();
+        if x.len() != expected {
+            return Err(Error::StateLength { expected, actual: x.len() });
+        }
         let error = difference(&self.x_reference, x, &self.rotations);
         let correction = self.k.as_ref().map(|k| k.times(&error)).unwrap_or_default();
         let mut u = self.u_reference.clone();
@@ -125,24 +158,40 @@ impl GainExt for v1::Gain {
         for (u, du) in u.iter_mut().zip(correction) {
             *u -= du;
         }
-        u
+        Ok(u)
     }
 
     fn suits(&self, plant: &v1::PlantInfo) -> Result<()> {
-        let time_step = plant.settings.as_ref().map_or(0.0, |settings| settings.time_step_s);
         if !self.model.is_empty() && self.model != plant.model {
             let (expected, actual) = (self.model.clone(), plant.model.clone());
             return Err(Error::GainModel { expected, actual });
         }
-        if self.time_step_s != 0.0 && self.time_step_s != time_step {
-            return Err(Error::GainTimeStep { expected: self.time_step_s, actual: time_step });
-        }
+        check_time_step(self, plant.settings.as_ref().map(|settings| settings.time_step_s))?;
         match (self.x_reference.len(), plant.state.as_ref().map(|state| state.x().len())) {
             (expected, Some(actual)) if actual != expected => {
                 Err(Error::StateLength { expected, actual })
             }
             _ => Ok(()),
         }
+    }
+}
+
+/// Whether the contract's promises on a gain hold, so that it can be applied.
+pub(crate) fn check(gain: &v1::Gain) -> Result<()> {
+    let (inputs, states) = (gain.u_reference.len(), gain.x_reference.len());
+    let fits = gain.k.as_ref().is_none_or(|k| {
+        (k.rows as usize, k.cols as usize) == (inputs, states) && k.data.len() == inputs * states
+    });
+    if fits { Ok(()) } else { Err(Error::Protocol("a gain whose sizes do not fit")) }
+}
+
+/// Refuses a time step that is known and another one than the gain says.
+fn check_time_step(gain: &v1::Gain, time_step_s: Option<f64>) -> Result<()> {
+    match time_step_s {
+        Some(actual) if gain.time_step_s != 0.0 && gain.time_step_s != actual => {
+            Err(Error::GainTimeStep { expected: gain.time_step_s, actual })
+        }
+        _ => Ok(()),
     }
 }
 
@@ -210,13 +259,12 @@ mod tests {
             ..Default::default()
         };
         let state = v1::State { q: vec![2.0], p: vec![0.0], ..Default::default() };
-        assert_eq!(gain.control(&state), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);
+        assert_eq!(gain.control(&state).unwrap(), [10.0 - 2.0 * 1.0 + 3.0 * 0.5]);
         let forward = v1::Gain { feedforward: vec![0.25], ..gain };
-        assert_eq!(forward.control_at(&[2.0, 0.0]), [10.25 - 2.0 * 1.0 + 3.0 * 0.5]);
+        assert_eq!(forward.control_at(&[2.0, 0.0]).unwrap(), [10.25 - 2.0 * 1.0 + 3.0 * 0.5]);
     }
 
     #[test]
-    #[should_panic(expected = "a state has 2 entries here")]
     fn a_state_of_another_model_is_refused() {
         let gain = v1::Gain {
             k: Some(v1::Matrix::from_rows(&[[2.0, 3.0]])),
@@ -224,7 +272,16 @@ mod tests {
             u_reference: vec![10.0],
             ..Default::default()
         };
-        gain.control_at(&[2.0, 0.0, 1.0, 0.0]);
+        // One that numbers would be repeated to fit, one that is too long, and none at all.
+        for x in [&[2.0][..], &[2.0, 0.0, 1.0, 0.0], &[]] {
+            let refusal = gain.control_at(x).unwrap_err();
+            assert_eq!(
+                refusal.to_string(),
+                format!("the state has {} entries; the gain is for 2", x.len())
+            );
+        }
+        let torn = v1::Gain { u_reference: Vec::new(), ..gain };
+        assert!(matches!(torn.control_at(&[2.0, 0.0]), Err(Error::Protocol(_))));
     }
 
     #[test]

@@ -6,24 +6,40 @@ use plantd_proto::v1;
 
 use crate::error::{Error, Result};
 use crate::link::driver::StateView;
-use crate::messages::{GainExt as _, StateExt as _};
+use crate::messages::{GainExt as _, LawState, check};
 
-/// A state that a feedback law can be asked about: of a [`Driver`](crate::Driver), a watch or a
-/// [`LinkDriver`](crate::link::LinkDriver).
-pub trait LawState {
-    /// Steps since the plant was created or reset.
-    fn step_index(&self) -> u64;
-    /// `x = (q, p, v)`.
-    fn state_vector(&self) -> Cow<'_, [f64]>;
+/// A feedback law: a [`Gain`](v1::Gain), a [`GainSchedule`] or a [`Follower`](crate::Follower).
+pub trait Law {
+    /// Whether it is for such a plant, as far as it knows what it is for.
+    ///
+    /// # Errors
+    /// As [`GainExt::suits`](crate::GainExt::suits).
+    fn check_plant(&self, plant: &v1::PlantInfo) -> Result<()>;
+    /// Its input at a state; a [`Follower`](crate::Follower) may wait for the gain of the step.
+    ///
+    /// # Errors
+    /// As [`GainExt::control`](crate::GainExt::control), and what keeps a follower from its gain.
+    fn input_at(&self, state: &v1::State) -> impl Future<Output = Result<Vec<f64>>> + Send;
 }
 
-impl LawState for v1::State {
-    fn step_index(&self) -> u64 {
-        self.step
+impl Law for v1::Gain {
+    fn check_plant(&self, plant: &v1::PlantInfo) -> Result<()> {
+        self.suits(plant)
     }
 
-    fn state_vector(&self) -> Cow<'_, [f64]> {
-        Cow::Owned(self.x())
+    async fn input_at(&self, state: &v1::State) -> Result<Vec<f64>> {
+        self.control(state)
+    }
+}
+
+impl Law for GainSchedule {
+    fn check_plant(&self, plant: &v1::PlantInfo) -> Result<()> {
+        // They may be of different origin.
+        self.gains.iter().try_for_each(|gain| gain.suits(plant))
+    }
+
+    async fn input_at(&self, state: &v1::State) -> Result<Vec<f64>> {
+        self.input(state)
     }
 }
 
@@ -35,6 +51,10 @@ impl LawState for StateView<'_> {
     fn state_vector(&self) -> Cow<'_, [f64]> {
         Cow::Borrowed(self.x)
     }
+
+    fn time_step_s(&self) -> Option<f64> {
+        Some(self.time_step_s)
+    }
 }
 
 /// `gain`'s input at `state`, about another reference state if one is given.
@@ -43,26 +63,12 @@ pub(crate) fn input_of(
     state: &impl LawState,
     about: Option<&[f64]>,
 ) -> Result<Vec<f64>> {
-    let x = state.state_vector();
-    let expected = gain.x_reference.len();
-    if x.len() != expected {
-        return Err(Error::StateLength { expected, actual: x.len() });
-    }
     match about {
-        None => Ok(gain.control_at(&x)),
+        None => gain.control(state),
         Some(x_reference) => {
-            Ok(v1::Gain { x_reference: x_reference.to_vec(), ..gain.clone() }.control_at(&x))
+            v1::Gain { x_reference: x_reference.to_vec(), ..gain.clone() }.control(state)
         }
     }
-}
-
-/// Whether the contract's promises on a gain hold, so that it can be applied.
-pub(crate) fn check(gain: &v1::Gain) -> Result<()> {
-    let (inputs, states) = (gain.u_reference.len(), gain.x_reference.len());
-    let fits = gain.k.as_ref().is_none_or(|k| {
-        (k.rows as usize, k.cols as usize) == (inputs, states) && k.data.len() == inputs * states
-    });
-    if fits { Ok(()) } else { Err(Error::Protocol("a gain whose sizes do not fit")) }
 }
 
 /// Time-varying gains as a feedback law: those of `SolveTrajectoryLqr` or of `ProjectReference`, or
@@ -148,7 +154,7 @@ impl GainSchedule {
     /// The input `u_reference + feedforward − K (x − x_reference)` at a state.
     ///
     /// # Errors
-    /// [`Error::StateLength`] if the state is not one of the gains' plant.
+    /// As [`GainExt::control`](crate::GainExt::control).
     pub fn input(&self, state: &impl LawState) -> Result<Vec<f64>> {
         let step = state.step_index();
         let last = self.gains[self.gains.len() - 1].step;

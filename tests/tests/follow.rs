@@ -4,7 +4,10 @@ use std::f64::consts::PI;
 use std::time::Duration;
 
 use plantd_client::link::{LinkDriver, LinkOptions};
-use plantd_client::{Client, GainSchedule, MatrixExt as _, diagonal, operating_point, v1, weights};
+use plantd_client::{
+    Client, Error, GainExt as _, GainSchedule, MatrixExt as _, diagonal, operating_point, v1,
+    weights,
+};
 use plantd_tests::server::ServerProcess;
 use v1::set_feedback_request::Reference;
 
@@ -148,4 +151,86 @@ async fn a_new_computation_replaces_the_gain_in_force() {
     tokio::time::timeout(Duration::from_secs(30), soon).await.expect("a new revision");
     let after = law.input(&state).await.unwrap();
     assert!(after[0].abs() < 0.5 * before[0].abs(), "{before:?}, then {after:?}");
+}
+
+/// A law of another time step, model or length is refused before it moves anything, whoever applies it.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_law_for_another_plant_is_refused() {
+    let directory = tempfile::Builder::new().prefix("plantd-").tempdir().unwrap();
+    let root = directory.path().join("link");
+    let server = ServerProcess::start_with(|command| {
+        command.arg("--link-root").arg(&root);
+    })
+    .unwrap();
+    let client = server.client().await;
+    let solve = |model: &str, states: usize| {
+        let request = v1::SolveLqrRequest {
+            model: model.to_owned(),
+            point: Some(operating_point("upright")),
+            weights: Some(weights(diagonal(vec![1.0; states]), diagonal([1.0]))),
+            ..Default::default()
+        };
+        let client = client.clone();
+        async move { client.solve_lqr(request).await.unwrap().gain.unwrap() }
+    };
+    let (gain, other) = (solve("pendulum", 2).await, solve("cart-pole", 4).await);
+    let request = v1::CreatePlantRequest {
+        model: "pendulum".to_owned(),
+        settings: Some(v1::PlantSettings {
+            time_step_s: 0.5 * gain.time_step_s,
+            ..Default::default()
+        }),
+        initial: at(PI - 0.2),
+        open_link: true,
+        ..Default::default()
+    };
+    let plant = client.create_plant(request).await.unwrap();
+    let state = plant.state.clone().unwrap();
+    let nameless = v1::Gain { model: String::new(), time_step_s: 0.0, ..other.clone() };
+    let schedule = GainSchedule::from_gains([gain.clone()]).unwrap();
+
+    let mut driver = client.drive(&plant.id).await.unwrap();
+    let refused = driver.step_by(&gain, &state).await.unwrap_err();
+    assert!(matches!(refused, Error::GainTimeStep { .. }), "{refused}");
+    let refused = driver.step_by(&schedule, &state).await.unwrap_err();
+    assert!(matches!(refused, Error::GainTimeStep { .. }), "{refused}");
+    let refused = driver.step_by(&other, &state).await.unwrap_err();
+    assert!(matches!(refused, Error::GainModel { .. }), "{refused}");
+    let refused = driver.step_by(&nameless, &state).await.unwrap_err();
+    assert!(matches!(refused, Error::StateLength { expected: 4, actual: 2 }), "{refused}");
+    let own = v1::Gain { time_step_s: 0.5 * gain.time_step_s, ..gain.clone() };
+    let step = driver.step_by(&own, &state).await.unwrap();
+    assert_eq!(step.state.unwrap().step, 1, "none of those before has moved it");
+    driver.close().await.unwrap();
+
+    // A follower and the plant's own loop.
+    set(&client, &plant.id, Reference::Point(operating_point("upright"))).await;
+    let law = client.follow_gains(&plant.id).await.unwrap();
+    let refused = law.input(&v1::State::default()).await.unwrap_err();
+    assert!(matches!(refused, Error::StateLength { expected: 2, actual: 0 }), "{refused}");
+    for (field, gain) in
+        [("gain.time_step_s", gain.clone()), ("gain.model", other), ("gain.k", nameless)]
+    {
+        let request = v1::SetFeedbackRequest {
+            id: plant.id.clone(),
+            reference: Some(Reference::Gain(gain)),
+            ..Default::default()
+        };
+        let refused = client.set_feedback(request).await.unwrap_err();
+        assert!(refused.violations()[0].field.starts_with(field), "{refused}");
+    }
+
+    // States of the link know their time step.
+    let patience = Duration::from_secs(30);
+    let options =
+        LinkOptions { root, timeout: patience, connect_timeout: patience, ..Default::default() };
+    tokio::task::spawn_blocking(move || {
+        let driver = LinkDriver::connect(&plant.id, options).unwrap();
+        for refused in [gain.control(&driver.state()), schedule.input(&driver.state())] {
+            assert!(matches!(refused, Err(Error::GainTimeStep { .. })), "{refused:?}");
+        }
+        assert_eq!(own.control(&driver.state()).unwrap().len(), 1);
+    })
+    .await
+    .unwrap();
 }

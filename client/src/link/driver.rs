@@ -69,6 +69,8 @@ pub struct StateView<'a> {
     pub step: u64,
     /// Plant time, s.
     pub time_s: f64,
+    /// Time step of the plant, s.
+    pub time_step_s: f64,
     /// Configuration, nd + nk.
     pub q: &'a [f64],
     /// Momentum, nd.
@@ -206,6 +208,7 @@ impl LinkDriver {
         StateView {
             step: self.last.step,
             time_s: self.last.time_s,
+            time_step_s: self.last.time_step_s,
             q,
             p,
             v,

@@ -152,8 +152,13 @@ impl<'a> Reader<'a> {
 
     /// A number that must be there.
     pub(crate) fn number(&mut self, node: Node<'_, '_>, name: &str) -> f64 {
-        let text = self.required(node, name).to_owned();
-        if text.is_empty() { 0.0 } else { self.numbers::<1>(node, name, &text)[0] }
+        match node.attribute(name) {
+            Some(text) => self.numbers::<1>(node, name, text)[0],
+            None => {
+                self.required(node, name);
+                0.0
+            }
+        }
     }
 
     /// A number, or what stands for it.

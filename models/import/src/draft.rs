@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use nalgebra::Isometry3;
 use plantd_models::Scene;
 use plantd_models::scene::{Coordinate, Force, Frame, Spring};
 use roxmltree::Node;
@@ -14,6 +15,13 @@ use crate::report::{Kind, Name};
 pub(crate) const FREE: [&str; 6] = ["_x", "_y", "_z", "_rx", "_ry", "_rz"];
 /// Endings of the coordinates of a ball joint.
 pub(crate) const BALL: [&str; 3] = ["_rx", "_ry", "_rz"];
+
+/// A pose as the six coordinates of a free joint: position and rotation vector.
+pub(crate) fn as_coordinates(pose: &Isometry3<f64>) -> [f64; 6] {
+    let [x, y, z] = pose.translation.vector.into();
+    let [rx, ry, rz] = pose.rotation.scaled_axis().into();
+    [x, y, z, rx, ry, rz]
+}
 
 /// A scene that grows, with names that are free.
 pub(crate) struct Draft {

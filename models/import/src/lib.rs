@@ -34,6 +34,7 @@ mod names;
 mod options;
 mod report;
 mod source;
+mod surface;
 mod table;
 mod urdf;
 mod xml;
@@ -53,16 +54,17 @@ pub fn is_xml(text: &str) -> bool {
 /// Reads a robot in URDF, versions 1.0 to 1.2, or in MJCF, as MuJoCo 4 reads it; the root element says which.
 ///
 /// The scene is not compiled; [`Import::check`] does that. At most [`plantd_models::scene::MAX_TEXT_BYTES`] are read, in time and memory that grow with the text.
-/// An MJCF that includes files is refused; [`import_with_files`] takes it.
+/// An MJCF that includes files, or takes inertia from those of meshes, is refused; [`import_with_files`] takes it.
 ///
 /// # Errors
 ///
 /// All problems of the file at once, each with line and column.
 pub fn import(text: &str, options: &Options) -> Result<Import, ImportError> {
-    read(&Source::single(text), options).map_err(|problems| ImportError { problems })
+    read(&Source::single(text), options, None).map_err(|problems| ImportError { problems })
 }
 
-/// As [`import`], with the files that an MJCF includes.
+/// As [`import`], with the files that an MJCF includes, and the meshes (STL, OBJ, MSH) from which it takes the
+/// inertia of what moves; no other files are asked for.
 ///
 /// # Errors
 ///
@@ -73,7 +75,7 @@ pub fn import_with_files(
     files: &mut Files<'_>,
 ) -> Result<Import, ImportError> {
     source(text, files)
-        .and_then(|source| read(&source, options))
+        .and_then(|source| read(&source, options, Some(files)))
         .map_err(|problems| ImportError { problems })
 }
 
@@ -95,13 +97,17 @@ fn source<'t>(text: &'t str, files: &mut Files<'_>) -> Result<Source<'t>, Vec<Pr
     }
 }
 
-fn read(source: &Source<'_>, options: &Options) -> Result<Import, Vec<Problem>> {
+fn read<'f>(
+    source: &Source<'_>,
+    options: &Options,
+    files: Option<&'f mut Files<'f>>,
+) -> Result<Import, Vec<Problem>> {
     let document = xml::open(&source.text)?;
     let mut reader = Reader::new(source, options.lenient);
     let root = document.root_element();
     let scene = match root.tag_name().name() {
         "robot" => urdf::scene(&mut reader, root, options),
-        "mujoco" => mjcf::scene(&mut reader, root, options),
+        "mujoco" => mjcf::scene(&mut reader, root, options, files),
         name => {
             let allowed = "must be `robot` (URDF) or `mujoco` (MJCF)";
             reader.fail(root, format!("the root is `{name}`; {allowed}"));

@@ -7,11 +7,13 @@ mod classes;
 mod equalities;
 mod frames;
 mod geoms;
+mod hull;
 mod joints;
 mod keyframes;
 mod rope;
 mod settings;
 mod shapes;
+mod solids;
 mod start;
 mod table;
 mod tendons;
@@ -29,6 +31,7 @@ use crate::mjcf::tendons::Tendons;
 use crate::names::Names;
 use crate::options::{Base, Inputs, Options};
 use crate::report::Kind;
+use crate::source::Files;
 use crate::table::NO_CONTACT;
 
 /// The scene of a model; none where something has failed.
@@ -36,6 +39,7 @@ pub(crate) fn scene<'a>(
     reader: &mut Reader<'a>,
     root: Node<'a, 'a>,
     options: &Options,
+    files: Option<&mut Files<'_>>,
 ) -> Option<Scene> {
     // Wherever it stands; those whose files are at hand are not here any more.
     for include in root.descendants().filter(|node| node.has_tag_name("include")) {
@@ -50,7 +54,7 @@ pub(crate) fn scene<'a>(
     let classes = Classes::read(reader, root);
     let compiler = Compiler::read(reader, root);
     let physics = Physics::read(reader, root, options);
-    let tree = tree::read(reader, root, &classes, &compiler);
+    let tree = tree::read(reader, root, &classes, &compiler, files);
     if reader.has_failed() {
         return None;
     }

@@ -14,8 +14,14 @@ use crate::xml::{self, Lines};
 /// Files that include one another at most.
 const FILES_DEEP: usize = 32;
 
-/// Reads a file that a text includes: its path as it stands there to its text, or why not.
-pub type Files<'f> = dyn FnMut(&str) -> Result<String, String> + 'f;
+/// Reads a file that a text includes, or from which it takes inertia: its path as it stands there to its bytes,
+/// or why not.
+pub type Files<'f> = dyn FnMut(&str) -> Result<Vec<u8>, String> + 'f;
+
+/// A file that is text.
+fn text_of(files: &mut Files<'_>, name: &str) -> Result<String, String> {
+    String::from_utf8(files(name)?).map_err(|_| "it is no UTF-8".to_owned())
+}
 
 /// A text, with the texts that it includes in their places.
 pub(crate) struct Source<'t> {
@@ -85,9 +91,9 @@ impl<'t> Source<'t> {
             }
             let beside = self.files[file].name.rsplit_once('/').map(|(folder, _)| folder);
             let beside = beside.map(|folder| format!("{folder}/{name}"));
-            let found = files(&name).map(|text| (name.clone(), text)).or_else(|error| {
+            let found = text_of(files, &name).map(|text| (name.clone(), text)).or_else(|error| {
                 let again = beside.ok_or(error.clone())?;
-                files(&again).map(|text| (again, text)).map_err(|_| error)
+                text_of(files, &again).map(|text| (again, text)).map_err(|_| error)
             });
             let (name, text) = match found {
                 Ok(found) => found,
@@ -159,7 +165,9 @@ mod tests {
     fn whole(files: &[(&str, &str)]) -> Result<String, String> {
         let mut read = |path: &str| {
             let found = files.iter().find(|(name, _)| *name == path);
-            found.map(|(_, text)| (*text).to_owned()).ok_or("there is no such file".to_owned())
+            found
+                .map(|(_, text)| text.as_bytes().to_vec())
+                .ok_or("there is no such file".to_owned())
         };
         let source = Source::with_includes(files[0].1, &mut read);
         source.map(|source| source.text.into_owned()).map_err(|problems| problems[0].to_string())
@@ -188,7 +196,7 @@ mod tests {
     #[test]
     fn places_are_those_of_the_files() {
         let main = "<m>\n<include file=\"b\"/><ü/></m>";
-        let mut read = |_: &str| Ok("<x>\n\n  <z/></x>".to_owned());
+        let mut read = |_: &str| Ok(b"<x>\n\n  <z/></x>".to_vec());
         let source = Source::with_includes(main, &mut read).unwrap();
         let document = Document::parse(&source.text).unwrap();
         let place = |name: &str| {

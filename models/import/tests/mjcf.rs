@@ -519,7 +519,7 @@ fn files_are_included() {
     let main = r#"<mujoco><include file="parts/leg.xml"/></mujoco>"#;
     let leg = "<mujocoinclude>\n<worldbody><body name='leg'><joint name='hip'/>\n<geom size='x'/></body></worldbody></mujocoinclude>";
     let mut files = |name: &str| match name {
-        "parts/leg.xml" => Ok(leg.to_owned()),
+        "parts/leg.xml" => Ok(leg.into()),
         _ => Err("there is no such file".to_owned()),
     };
     let error = import_with_files(main, &Options::default(), &mut files).unwrap_err();
@@ -528,7 +528,7 @@ fn files_are_included() {
         "parts/leg.xml:3:1: `size` of `geom` is `x`; must be 1 to 3 finite numbers\n\
          parts/leg.xml:3:1: `size` of a sphere must be one number greater than 0"
     );
-    let mut good = |_: &str| Ok(leg.replace('x', "0.1"));
+    let mut good = |_: &str| Ok(leg.replace('x', "0.1").into_bytes());
     let robot = import_with_files(main, &Options::default(), &mut good).unwrap();
     assert_eq!(robot.scene.frames[0].name, "leg");
     let lenient = Options { lenient: true, ..Options::default() };
@@ -555,6 +555,42 @@ fn damping_ratios_take_the_inertia_of_what_moves() {
         let expected = 2.0 * 0.5 * (8.0_f64 / rate).sqrt();
         assert!((damping - expected).abs() < 1e-12, "{damping} instead of {expected}");
     }
+}
+
+/// `−kv u L̇` behind a gear, and what a tendon over one joint has of its own.
+#[test]
+fn brakes_and_loads_of_single_joints() {
+    let text = with(
+        r#"<tendon><fixed name="t" armature="0.5" frictionloss="3"><joint joint="hinge" coef="-2"/></fixed></tendon>
+        <actuator><damper name="brake" joint="hinge" kv="0.4" gear="3"/>
+          <general name="same" joint="hinge" gaintype="affine" gainprm="0 0 -0.4" gear="3"/></actuator>"#,
+    );
+    let scene = import(&text, &Options::default()).unwrap().scene;
+    let dampers = scene.forces.iter().filter_map(|force| match force {
+        Force::LinearDamper { terms, damping, input } => Some((terms, *damping, input.as_deref())),
+        _ => None,
+    });
+    let dampers: Vec<_> = dampers.collect();
+    assert_eq!(dampers.len(), 2, "{:?}", scene.forces);
+    for ((terms, damping, input), name) in dampers.into_iter().zip(["brake", "same"]) {
+        assert_eq!((terms[0].coordinate.as_str(), terms[0].coefficient), ("hinge", 1.0));
+        assert!((damping - 3.6).abs() < 1e-12 && input == Some(name), "{damping} {input:?}");
+    }
+    let friction = scene.forces.iter().find_map(|force| match force {
+        Force::Friction { coordinate, force, velocity } if *force == 6.0 => {
+            Some((coordinate.as_str(), *velocity))
+        }
+        _ => None,
+    });
+    assert_eq!(friction, Some(("hinge", 0.005)));
+    let bare = import(&with(""), &Options::default()).unwrap().scene;
+    let armature = |scene: &plantd_models::Scene| {
+        scene.coordinates.iter().find(|c| c.name == "hinge").map_or(0.0, |c| c.armature)
+    };
+    assert!((armature(&scene) - armature(&bare) - 2.0).abs() < 1e-12);
+    let both =
+        with("<actuator><general joint='hinge' gaintype='affine' gainprm='1 0 -1'/></actuator>");
+    assert!(problems(&both).concat().contains("drives and brakes"));
 }
 
 fn problems(text: &str) -> Vec<String> {
@@ -594,7 +630,7 @@ fn what_is_wrong_is_named_with_its_place() {
         ),
         (
             change("type=\"box\" size=\"0.1 0.02 0.03\"", "type=\"mesh\" mesh=\"m\""),
-            "the inertia of a mesh",
+            "there is no mesh `m`",
         ),
         (acts("<motor joint='hing'/>"), "there is no joint `hing`"),
         (acts("<motor/>"), "acts on nothing"),
@@ -606,7 +642,7 @@ fn what_is_wrong_is_named_with_its_place() {
         (with("<tendon><spatial><site site='hook'/></spatial></tendon>"), "two sites or more"),
         (
             with(
-                "<tendon><fixed frictionloss='1'><joint joint='hinge' coef='1'/></fixed></tendon>",
+                "<tendon><fixed frictionloss='1'><joint joint='hinge' coef='1'/><joint joint='slide' coef='1'/></fixed></tendon>",
             ),
             "`frictionloss`",
         ),
@@ -633,13 +669,62 @@ fn what_is_wrong_is_named_with_its_place() {
 fn meshes_weigh_where_bodies_move() {
     let robot = |joint: &str| {
         format!(
-            "<mujoco><worldbody><body><geom type='mesh' mesh='m'/>{joint}
+            "<mujoco><compiler meshdir='parts'/><asset><mesh name='m' file='a.obj' scale='2 2 2'/></asset>
+             <worldbody><body><geom type='mesh' mesh='m'/>{joint}
              <body><joint/><geom size='0.1'/></body></body></worldbody></mujoco>"
         )
     };
-    assert!(import(&robot(""), &Options::default()).is_ok());
-    let told = problems(&robot("<joint/>"));
-    assert!(told.iter().any(|problem| problem.contains("the inertia of a mesh")), "{told:?}");
+    assert!(import(&robot(""), &Options::default()).is_ok(), "nobody asks what does not move");
+    let told = problems(&robot("<joint/>")).concat();
+    assert!(told.contains("2:31: the inertia is that of the mesh file `parts/a.obj`"), "{told}");
+    // A tetrahedron of a volume of 8/6, and what is asked for.
+    let mut asked = Vec::new();
+    let mut files = |name: &str| {
+        asked.push(name.to_owned());
+        Ok(b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n".to_vec())
+    };
+    let twice = robot("<joint/><geom type='mesh' mesh='m' pos='0 0 1' mass='3'/>");
+    let found = import_with_files(&twice, &Options::default(), &mut files).unwrap();
+    assert_eq!(asked, ["parts/a.obj"], "each file is read once");
+    let body = found.scene.frames[0].body.as_ref().unwrap();
+    assert!((body.mass - (8000.0 / 6.0 + 3.0)).abs() < 1e-9, "{body:?}");
+    assert!((body.center_of_mass[0] - 0.5).abs() < 1e-9, "{body:?}");
+    let mut none = |_: &str| Err("no such file".to_owned());
+    let refused = import_with_files(&robot("<joint/>"), &Options::default(), &mut none);
+    let refused = refused.unwrap_err().to_string();
+    assert!(refused.contains("mesh file `parts/a.obj`: no such file"), "{refused}");
+}
+
+/// Meshes that the model spells out, by all rules, and what is no surface.
+#[test]
+fn meshes_may_be_written_out() {
+    let robot = |mesh: &str, geom: &str| {
+        format!(
+            "<mujoco><asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1' {mesh}/></asset>
+             <worldbody><body><joint/><geom type='mesh' mesh='m' {geom}/></body></worldbody></mujoco>"
+        )
+    };
+    let faces = "face='0 2 1 0 1 3 0 3 2 1 2 3'";
+    for rule in ["", "inertia='legacy'", "inertia='exact'", "inertia='convex'"] {
+        let scene =
+            import(&robot(&format!("{faces} {rule}"), ""), &Options::default()).unwrap().scene;
+        let mass = scene.frames[0].body.as_ref().unwrap().mass;
+        assert!((mass - 1000.0 / 6.0).abs() < 1e-7, "{rule}: {mass}");
+    }
+    for (mesh, geom, part) in [
+        ("", "", "add `face`"),
+        ("face='0 1'", "", "three numbers"),
+        ("face='0 1 7'", "", "point 7"),
+        ("face='0 1 2'", "", "no volume"),
+        ("face='0 1 2 0 1 3 0 3 2 1 2 3' inertia='exact'", "", "`exact` needs a closed surface"),
+        (faces, "shellinertia='true'", "of its shell"),
+        (&format!("{faces} inertia='solid'"), "", "must be one of"),
+    ] {
+        let told = problems(&robot(mesh, geom)).concat();
+        assert!(told.contains(part), "{part}: {told}");
+    }
+    let fitted = robot(faces, "").replace("type='mesh'", "type='box'");
+    assert!(problems(&fitted).concat().contains("fitted to a mesh"));
 }
 
 #[test]
@@ -715,7 +800,48 @@ fn nothing_grows_without_bound() {
     assert!(problems(&deep)[0].contains("stand in one another"));
     let entities = "<!DOCTYPE m [<!ENTITY a \"aa\"><!ENTITY b \"&a;&a;\">]><mujoco model=\"&b;\"/>";
     assert!(problems(entities)[0].contains("DTD"));
-    let mut itself = |_: &str| Ok("<mujoco><include file='a'/></mujoco>".to_owned());
+    let many =
+        "<mujoco><worldbody><replicate count='1000000'><body/></replicate></worldbody></mujoco>";
+    assert_eq!(problems(many), ["1:20: `count` of `replicate` is 1000000; must be 1 to 4096"]);
+    let flat = format!("<mujoco><worldbody>{}</worldbody></mujoco>", "<body/>".repeat(100_000));
+    assert!(problems(&flat)[0].contains("more than 4096 bodies"));
+    let classes = format!("<mujoco>{}", "<default class='a'>".repeat(100_000));
+    assert!(problems(&classes)[0].contains("stand in one another"));
+    let numbers = "0 ".repeat(1 << 20);
+    let long =
+        format!("<mujoco><worldbody><body><joint axis='{numbers}'/></body></worldbody></mujoco>");
+    assert!(problems(&long)[0].contains("must be 3 finite numbers"));
+    for number in ["nan", "inf", "-inf", "1e999", "0x10", "1,5", "١", ""] {
+        let text = format!(
+            "<mujoco>\n <worldbody><body><inertial pos='0 0 0' mass='{number}'/></body></worldbody></mujoco>"
+        );
+        let told = problems(&text);
+        assert!(told[0].starts_with("2:19: `mass` of `inertial`"), "{number}: {told:?}");
+    }
+    // Finite, and yet no mechanism: the scene says so.
+    let huge = "<mujoco><worldbody><body><joint/><geom size='1e200'/></body></worldbody></mujoco>";
+    match import(huge, &Options::default()) {
+        Ok(robot) => assert!(robot.check().is_err()),
+        Err(error) => assert!(error.to_string().starts_with("1:"), "{error}"),
+    }
+    let mut ring = |name: &str| {
+        let next = if name == "a.xml" { "b.xml" } else { "a.xml" };
+        Ok(format!("<mujoco>\n<include file='{next}'/></mujoco>").into_bytes())
+    };
+    let main = "<mujoco><include file='a.xml'/></mujoco>";
+    let error = import_with_files(main, &Options::default(), &mut ring).unwrap_err().to_string();
+    assert!(error.starts_with("b.xml:2:1: ") && error.contains("included twice"), "{error}");
+    let mut forever =
+        |name: &str| Ok(format!("<mujoco><include file='{name}x'/></mujoco>").into_bytes());
+    let error = import_with_files(main, &Options::default(), &mut forever).unwrap_err().to_string();
+    assert!(error.contains("more than 32 files include one another"), "{error}");
+    let mut torn = |_: &str| Ok(b"<mujoco>\n  <worldbody>".to_vec());
+    let error = import_with_files(main, &Options::default(), &mut torn).unwrap_err().to_string();
+    assert!(error.starts_with("a.xml:1:1: not XML"), "{error}");
+    let mut binary = |_: &str| Ok(vec![0xff, 0xfe]);
+    let error = import_with_files(main, &Options::default(), &mut binary).unwrap_err().to_string();
+    assert!(error.contains("`a.xml` cannot be included: it is no UTF-8"), "{error}");
+    let mut itself = |_: &str| Ok(b"<mujoco><include file='a'/></mujoco>".to_vec());
     let main = "<mujoco><include file='a'/></mujoco>";
     let error = import_with_files(main, &Options::default(), &mut itself).unwrap_err();
     assert!(error.to_string().contains("included twice"), "{error}");

@@ -276,6 +276,26 @@ fn planar_and_spherical_joints() {
     assert!(scene.inputs.is_empty(), "no joint of one axis");
 }
 
+/// A body that floats in the world has the world's coordinates, whatever its origin; one on another body has those
+/// of its origin there.
+#[test]
+fn floating_joints() {
+    let text = r#"<robot name="kite"><link name="world"/>
+      <joint name="air" type="floating"><parent link="world"/><child link="kite"/><origin xyz="1 2 3" rpy="0 0.4 0"/></joint>
+      <link name="kite"><inertial><mass value="3"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial></link>
+      <joint name="tail" type="floating"><parent link="kite"/><child link="ribbon"/><origin xyz="0 0 -1"/></joint>
+      <link name="ribbon"><inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial></link>
+    </robot>"#;
+    let mut plant = plant(&import(text, &Options::default()).unwrap().scene);
+    let q = plant.q().to_vec();
+    assert!(q[..6].iter().zip([1.0, 2.0, 3.0, 0.0, 0.4, 0.0]).all(|(a, b)| (a - b).abs() < 1e-15));
+    assert_eq!(q[6..], [0.0; 6]);
+    let site = plant.model().site("ribbon", [0.0; 3]).unwrap();
+    let at = plant.pose(&site).position;
+    let expected = [1.0 - 0.4_f64.sin(), 2.0, 3.0 - 0.4_f64.cos()];
+    assert!(at.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-15), "{at:?}");
+}
+
 /// `follower = −2 middle + 0.1`, `middle = 0.5 leader + 0.2`.
 #[test]
 fn chains_of_mimics_are_couplings_that_hold_at_the_start() {

@@ -89,12 +89,15 @@ pub enum Force {
         /// N·s²/m² or N·m·s²/rad².
         coefficient: f64,
     },
-    /// `f_i = −damping · coefficient_i · Σ coefficient_j v_j` on the coordinates of a sum.
+    /// `f_i = −damping · u · coefficient_i · Σ coefficient_j v_j` on the coordinates of a sum, `u` an input, or 1.
     LinearDamper {
         /// One or more terms, each of another coordinate.
         terms: Vec<LinearTerm>,
         /// N·s/m or N·m·s/rad, as the coefficients make it.
         damping: f64,
+        /// Input that it is multiplied by.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        input: Option<String>,
     },
     /// `F = −damping · dL/dt` along a path of length `L` from point to point.
     PathDamper {
@@ -238,6 +241,7 @@ impl Force {
             Self::Thruster { input, .. } | Self::Servo { input, .. } => {
                 (None, Some(input.as_str()))
             }
+            Self::LinearDamper { input, .. } => (None, input.as_deref()),
             _ => (None, None),
         };
         let components = components.into_iter().flatten();

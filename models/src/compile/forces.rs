@@ -136,9 +136,10 @@ impl Places<'_> {
                 let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
                 forces.coordinate_forces.push(CoordinateForce { coordinate, law });
             }
-            scene::Force::LinearDamper { terms, damping } => {
+            scene::Force::LinearDamper { terms, damping, input } => {
                 let terms = layout.linear(terms);
-                forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
+                let input = input.as_ref().map(|name| layout.inputs[name.as_str()]);
+                forces.linear_dampers.push(LinearDamper { terms, damping: *damping, input });
             }
             scene::Force::PathDamper { points, damping } => forces.path_forces.push(PathForce {
                 segments: self.segments(points),
@@ -149,7 +150,11 @@ impl Places<'_> {
                 // Its input, its spring and the damping of one coordinate are among those of coordinates.
                 if !terms.is_empty() && *damping > 0.0 {
                     let terms = layout.linear(terms);
-                    forces.linear_dampers.push(LinearDamper { terms, damping: *damping });
+                    forces.linear_dampers.push(LinearDamper {
+                        terms,
+                        damping: *damping,
+                        input: None,
+                    });
                 }
                 if *constant != 0.0 {
                     let terms = layout.servo_terms(force).into_iter();

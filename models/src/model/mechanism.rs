@@ -357,12 +357,13 @@ pub(crate) struct LinearSpring {
     pub(crate) rest: f64,
 }
 
-/// `f_i = −d c_i Σ c_j v_j`.
+/// `f_i = −d u c_i Σ c_j v_j`, `u` an input, or 1.
 #[derive(Clone, Debug)]
 pub(crate) struct LinearDamper {
     /// Coordinates `i` and their `c_i`.
     pub(crate) terms: Vec<(usize, f64)>,
     pub(crate) damping: f64,
+    pub(crate) input: Option<usize>,
 }
 
 /// Two points and the joints that move one against the other.

@@ -320,7 +320,12 @@ impl Plant {
     }
 }
 
-fn checked(name: &'static str, values: &[f64], expected: usize) -> Result<Vec<f64>, InitialError> {
+/// So many finite numbers.
+pub(crate) fn checked(
+    name: &'static str,
+    values: &[f64],
+    expected: usize,
+) -> Result<Vec<f64>, InitialError> {
     if values.len() != expected {
         return Err(InitialError::Dimension { name, expected, actual: values.len() });
     }

@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use crate::integrator::settings::Settings;
-use crate::integrator::state::PreciseState;
+use crate::integrator::state::{PreciseState, State};
 use crate::integrator::workspace::Workspace;
 use crate::model::mechanism::Model;
 use crate::plant::facade::Plant;
-use crate::plant::initial::{Initial, InitialError};
+use crate::plant::initial::{Initial, InitialError, checked};
 use crate::plant::period::Period;
 use crate::plant::snapshot::{Snapshot, SnapshotError};
 
@@ -40,6 +40,11 @@ impl Spare {
         &self.0
     }
 
+    /// The settings.
+    pub fn settings(&self) -> &Settings {
+        self.0.settings()
+    }
+
     /// The plant in a state, step 0.
     pub fn start(mut self, initial: &Initial) -> Result<Plant, InitialError> {
         self.0.initialize(initial)?;
@@ -56,6 +61,23 @@ impl Spare {
     pub fn go_on_from(mut self, other: &Plant) -> Result<Plant, InitialError> {
         self.0.go_on_from(other)?;
         Ok(self.0)
+    }
+
+    /// Velocity `q̇` (nd + nk) that belongs to the projected momentum of a state, as [`Plant::velocity`]; its
+    /// configuration need not satisfy the constraints (allocates). Refused where lengths do not fit the
+    /// model.
+    pub fn velocity_of(&mut self, state: &State) -> Result<Vec<f64>, InitialError> {
+        let Plant { model, period, .. } = &self.0;
+        let d = model.dimensions;
+        let mut precise = PreciseState::new(model, period.scheme);
+        precise.q = checked("q", &state.q, d.coordinates())?;
+        precise.p = checked("p", &state.p, d.dynamic)?;
+        precise.v = checked("v", &state.v, d.prescribed)?;
+        precise.orient(model);
+        self.0.state = precise;
+        let velocity = self.0.velocity();
+        self.0.workspace.forget();
+        Ok(velocity)
     }
 
     /// Changes places with a plant and goes on from its state, as [`Plant::go_on_from`] does: `plant` is the

@@ -228,16 +228,12 @@ fn drive(
         if k == STEPS {
             break;
         }
-        let u = if with_feedback { gain.control(&state(driver)) } else { gain.u_reference.clone() };
+        let u =
+            if with_feedback { gain.control(&driver.state())? } else { gain.u_reference.clone() };
         let start = Instant::now();
         driver.step(&u)?;
         stopwatch.record(start.elapsed());
         progress(task, k + 1, STEPS);
     }
     Ok(run)
-}
-
-fn state(driver: &LinkDriver) -> v1::State {
-    let view = driver.state();
-    v1::State { q: view.q.to_vec(), p: view.p.to_vec(), v: view.v.to_vec(), ..Default::default() }
 }

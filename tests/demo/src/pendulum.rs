@@ -139,7 +139,7 @@ async fn disturbed_run(
     let mut driver = client.drive(&plant.id).await?;
     for k in 0..STEPS {
         let start = Instant::now();
-        let mut u = gain.map_or_else(|| vec![0.0], |gain| gain.control(&state));
+        let mut u = gain.map_or_else(|| Ok(vec![0.0]), |gain| gain.control(&state))?;
         if PUSH_STEPS.contains(&k) {
             u[0] += PUSH_N_M;
         }

@@ -216,7 +216,7 @@ async fn an_lqr_gain_balances_the_pendulum() {
     let mut state = plant.state.unwrap();
     let mut driver = client.drive(&plant.id).await.unwrap();
     for _ in 0..100 {
-        state = driver.step(&gain.control(&state)).await.unwrap().state.unwrap();
+        state = driver.step_by(&gain, &state).await.unwrap().state.unwrap();
     }
     assert!((state.q[0] - PI).abs() < 1e-9, "{}", state.q[0]);
 }
@@ -281,7 +281,7 @@ async fn tracking_error(
     let mut state = plant.state.unwrap();
     let mut sum = 0.0;
     for (gain, next) in gains.iter().zip(&gains[1..]) {
-        let u = if feedback { gain.control(&state) } else { gain.u_reference.clone() };
+        let u = if feedback { gain.control(&state).unwrap() } else { gain.u_reference.clone() };
         state = driver.step(&u).await.unwrap().state.unwrap();
         let squares = state.q.iter().zip(&next.x_reference).map(|(q, r)| (q - r).powi(2));
         sum += squares.sum::<f64>().sqrt();

@@ -3,8 +3,7 @@
 use std::path::Path;
 
 use plantd_client::{
-    GainExt as _, MatrixExt as _, diagonal, difference, operating_point, present_state, rotations,
-    v1,
+    MatrixExt as _, diagonal, difference, operating_point, present_state, rotations, v1,
 };
 
 use crate::support::*;
@@ -112,7 +111,7 @@ async fn a_gain_turns_a_ball_joint_the_short_way() {
     let mut largest = norm(&error(&state));
     assert!(largest < 0.7, "a third of a radian about each of two axes");
     for _ in 0..300 {
-        state = driver.step(&gain.control(&state)).await.unwrap().state.unwrap();
+        state = driver.step_by(&gain, &state).await.unwrap().state.unwrap();
         largest = largest.max(norm(&error(&state)));
     }
     assert!(largest < 0.7, "it never went the long way: {largest}");

@@ -155,7 +155,7 @@ async fn the_drivers_forces_add_to_the_law_and_watchers_see_the_sum() {
     let mut state = driver.plant().state.clone().unwrap();
     for k in 0..300 {
         let disturbance = [(0.1 * f64::from(k)).sin()];
-        let law = plantd_client::GainExt::control(&gain, &state);
+        let law = plantd_client::GainExt::control(&gain, &state).unwrap();
         let step = driver.step(&disturbance).await.unwrap();
         assert_eq!(step.u, [law[0] + disturbance[0]], "step {k}");
         let watched = next(&mut watch).await;

@@ -95,7 +95,11 @@ async fn a_search_reports_each_iteration_and_finds_a_motion_of_the_plant() {
     assert_eq!(result.cost, progress.last().unwrap().cost);
 
     // The states are those that the inputs lead to, and they cost what is said.
-    let found = result.checkpoint.unwrap().trajectory.unwrap();
+    let checkpoint = result.checkpoint.unwrap();
+    let found = checkpoint.trajectory.unwrap();
+    for state in [found.initial.as_ref(), checkpoint.initial_reference.as_ref()] {
+        assert_has_velocity(&client, "cart-pole", state.unwrap()).await;
+    }
     let case = v1::RolloutCase {
         initial: Some(v1::InitialState {
             form: Some(v1::initial_state::Form::Momentum(v1::initial_state::Momentum {
@@ -483,13 +487,29 @@ async fn motion(client: &Client) -> Vec<[f64; 2]> {
     q
 }
 
+/// A state has the velocity that a plant in it shows.
+async fn assert_has_velocity(client: &Client, model: &str, state: &v1::State) {
+    let v1::State { q, p, v, .. } = state.clone();
+    let form = v1::initial_state::Form::Momentum(v1::initial_state::Momentum { q, p, v });
+    let request = v1::CreatePlantRequest {
+        model: model.to_owned(),
+        initial: Some(v1::InitialState { form: Some(form) }),
+        ..Default::default()
+    };
+    let plant = client.create_plant(request).await.unwrap();
+    assert_eq!(state.velocity, plant.state.unwrap().velocity);
+    client.delete_plant(plant.id).await.unwrap();
+}
+
 async fn project(
     client: &Client,
     request: v1::ProjectReferenceRequest,
 ) -> plantd_client::Result<(v1::ReferenceReport, Vec<v1::Gain>)> {
-    let answers = client.project_reference(request).await?.collect().await?;
+    let answers = client.project_reference(request.clone()).await?.collect().await?;
     let mut answers = answers.into_iter().map(|answer| answer.response.unwrap());
     let Some(Projected::Report(report)) = answers.next() else { panic!("the report comes first") };
+    let initial = report.trajectory.as_ref().and_then(|t| t.initial.as_ref()).unwrap();
+    assert_has_velocity(client, &request.model, initial).await;
     let step = |answer| match answer {
         Projected::Step(gain) => gain,
         Projected::Report(_) => panic!("there is one report"),

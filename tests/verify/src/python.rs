@@ -33,9 +33,10 @@ pub(crate) fn test_client(context: &mut Context) -> Outcome {
 }
 
 /// Robots and the engines that they are compared with; what cannot be had is told.
-const PEERS: [(&str, &[&str]); 2] = [
-    ("robots.py", &["pin==4.1.0", "example-robot-data==6.0.0"]),
-    ("models.py", &["mujoco==4.0.0", "dm_control", "gymnasium"]),
+const PEERS: [(&str, &[&str], &[&str]); 3] = [
+    ("robots.py", &["pin==4.1.0", "example-robot-data==6.0.0"], &["--few"]),
+    ("models.py", &["mujoco==4.0.0", "dm_control", "gymnasium"], &["--few"]),
+    ("units.py", &["mujoco==4.0.0"], &[]),
 ];
 
 /// Imports a choice of published robots and compares them with the engines for which they were made.
@@ -48,13 +49,13 @@ pub(crate) fn compare_robots(context: &mut Context) -> Outcome {
     };
     pip(&["client/python"])?;
     let mut absent = Vec::new();
-    for (script, packages) in PEERS {
+    for (script, packages, flags) in PEERS {
         if pip(packages).is_err() {
             absent.push(format!("no {}: {script}", packages.join(", ")));
             continue;
         }
         let mut compare = Command::new(environment.join("bin/python"));
-        compare.arg(context.root.join("tests/peers").join(script)).arg("--few");
+        compare.arg(context.root.join("tests/peers").join(script)).args(flags);
         run(compare.arg("--binaries").arg(context.binaries()).current_dir(context.scratch()))?;
     }
     if absent.is_empty() { Ok(()) } else { Err(Failure::Skipped(absent.join("; "))) }

@@ -82,6 +82,27 @@ def _with_includes(text: str, folder: Path, seen: list[str]) -> str:
     return re.sub(r"""<include\s+file=["']([^"']*)["']\s*(?:/>|>\s*</include>)""", included, text)
 
 
+def _mesh_files(scene: str | PathLike[str], text: str) -> dict[str, Path]:
+    """Files of the meshes of an MJCF, by their paths as the importer names them."""
+    if not is_file(scene) or "<mujoco" not in text:
+        return {}
+    found = {kind: path for kind, path in re.findall(r"""\b(meshdir|assetdir)=["']([^"']*)""", text)}
+    folder = found.get("meshdir", found.get("assetdir", "")).rstrip("/")
+    names = re.findall(r"""<mesh\b[^>]*?\bfile=["']([^"']+)["']""", text)
+    paths = [name if not folder or name.startswith("/") else f"{folder}/{name}" for name in names]
+    return {path: Path(scene).parent / path for path in paths}
+
+
+def _missing(problems: str, meshes: Mapping[str, Path], known: Mapping[str, bytes]) -> dict[str, bytes]:
+    """The meshes that a refusal names and that are there, but were not sent."""
+    asked = {file: place for file, place in meshes.items() if f"mesh file `{file}`" in problems}
+    return {
+        file: place.read_bytes()
+        for file, place in asked.items()
+        if file not in known and place.is_file()
+    }
+
+
 class ModelCalls(Calls):
     """Calls of the service of models."""
 
@@ -115,6 +136,7 @@ class ModelCalls(Calls):
         All errors are in the error's ``violations``. What a robot says and a scene cannot is a
         ``UserWarning`` with lines and columns; what has no effect on the motion is not mentioned.
         ``replace`` puts it in the place of an uploaded model of that name, whose plants live on.
+        Meshes from which an MJCF in a file takes inertia are read beside it.
         The meshes that show what is in a file are sent along where they are found: beside it, or in
         the folders of ``packages`` by name, or in folders of these names around it. One that is not
         found, or not taken, is a ``UserWarning``.
@@ -125,8 +147,18 @@ class ModelCalls(Calls):
             name=name,
             replace=replace,
         )
+        meshes = _mesh_files(scene, request.scene)
         answer: model_service_pb2.CreateModelResponse
-        answer = self._call(self.models.CreateModel, request)
+        while True:
+            try:
+                answer = self._call(self.models.CreateModel, request)
+                break
+            except PlantdError as error:
+                # Only the importer knows which of them weigh something.
+                news = _missing(str(error), meshes, request.files)
+                if not news:
+                    raise
+                request.files.update(news)
         told = [
             f"{note.line}:{note.column}: {note.message}"
             for note in answer.import_report.notes
@@ -181,7 +213,13 @@ class ModelCalls(Calls):
     ) -> list[model_service_pb2.SceneProblem]:
         """All errors of a scene or robot, a text of several lines or a file; none when it is good."""
         request = build(model_service_pb2.ValidateSceneRequest, scene=scene_text(scene))
-        return list(self._call(self.models.ValidateScene, request).problems)
+        meshes = _mesh_files(scene, request.scene)
+        while True:
+            problems = list(self._call(self.models.ValidateScene, request).problems)
+            news = _missing("\n".join(p.message for p in problems), meshes, request.files)
+            if not news:
+                return problems
+            request.files.update(news)
 
     def settle(
         self,

@@ -13,35 +13,39 @@ use crate::mjcf::tendons::{Course, Tendons, Term, linear};
 use crate::report::Kind;
 
 /// Kinds of actuators that are taken, all of the same law.
-const TAKEN: [&str; 4] = ["general", "motor", "position", "velocity"];
+const TAKEN: [&str; 5] = ["general", "motor", "position", "velocity", "damper"];
 /// What an actuator acts on.
 const TARGETS: [&str; 7] =
     ["joint", "jointinparent", "tendon", "site", "body", "slidersite", "cranksite"];
 
-/// The force `gain u + constant − stiffness L − damping L̇` along a transmission of length `L`.
+/// The force `gain u + constant − stiffness L − (damping + brake u) L̇` along a transmission of length `L`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Law {
     gain: f64,
     constant: f64,
     stiffness: f64,
     damping: f64,
+    brake: f64,
 }
 
 impl Law {
+    const NONE: Self = Self { gain: 0.0, constant: 0.0, stiffness: 0.0, damping: 0.0, brake: 0.0 };
+
     /// Behind a gear that makes `L` of `gear` times a coordinate.
     fn geared(self, gear: f64) -> Self {
-        let Self { gain, constant, stiffness, damping } = self;
+        let Self { gain, constant, stiffness, damping, brake } = self;
         Self {
             gain: gear * gain,
             constant: gear * constant,
             stiffness: gear * gear * stiffness,
             damping: gear * gear * damping,
+            brake: gear * gear * brake,
         }
     }
 
     /// Whether it is a force in proportion to `u` alone.
     fn is_motor(&self) -> bool {
-        [self.constant, self.stiffness, self.damping] == [0.0; 3]
+        [self.constant, self.stiffness, self.damping, self.brake] == [0.0; 4]
     }
 }
 
@@ -50,8 +54,10 @@ impl Law {
 struct Actuator {
     gain: [f64; 10],
     bias: [f64; 10],
-    /// Whether force is `gain u` with a constant gain; whether what adds to it is none or affine.
+    /// Whether force is `gain u` with a constant gain or one that is in proportion to the velocity; whether what adds
+    /// to it is none or affine.
     has_fixed_gain: bool,
+    is_brake: bool,
     has_known_bias: bool,
     is_affine: bool,
     has_state: bool,
@@ -119,6 +125,7 @@ impl Default for Actuator {
             gain: first(1.0),
             bias: [0.0; 10],
             has_fixed_gain: true,
+            is_brake: false,
             has_known_bias: true,
             is_affine: false,
             has_state: false,
@@ -157,8 +164,8 @@ impl Actuator {
             }
         }
         if let Some(kind) = node.attribute("gaintype") {
-            self.has_fixed_gain =
-                kind == "fixed" || (kind == "affine" && self.gain[1..3] == [0.0; 2]);
+            self.is_brake = kind == "affine" && self.gain[1] == 0.0 && self.gain[2] <= 0.0;
+            self.has_fixed_gain = kind == "fixed" || self.is_brake;
         }
         if let Some(kind) = node.attribute("biastype") {
             (self.has_known_bias, self.is_affine) =
@@ -193,12 +200,24 @@ impl Actuator {
                 (self.gain[0], self.bias[2]) = (damping, -damping);
                 self.set_kind(true);
             }
+            "damper" => {
+                let before = if self.is_brake { -self.gain[2] } else { 0.0 };
+                let brake = set("kv", before);
+                if brake < 0.0 {
+                    reader.fail(node, "`kv` of `damper` must not be negative");
+                }
+                (self.gain, self.bias) = ([0.0; 10], [0.0; 10]);
+                self.gain[2] = -brake;
+                self.set_kind(false);
+                self.is_brake = true;
+            }
             _ => {}
         }
     }
 
     fn set_kind(&mut self, is_affine: bool) {
         (self.has_fixed_gain, self.has_known_bias, self.has_state) = (true, true, false);
+        self.is_brake = false;
         self.is_affine = is_affine;
     }
 }
@@ -325,6 +344,20 @@ impl<'a> Build<'_, 'a, '_> {
         limits: Option<[f64; 2]>,
     ) -> Option<String> {
         let law = self.law(node, &actuator, terms)?.geared(actuator.gear[0]);
+        if law.brake > 0.0 {
+            if law != (Law { brake: law.brake, ..Law::NONE }) {
+                self.reader.refuse(node, "an actuator that drives and brakes: write one of each");
+                return None;
+            }
+            let input = self.add_input(node, &actuator, Input::default(), limits);
+            let damper = Force::LinearDamper {
+                terms: linear(terms),
+                damping: law.brake,
+                input: Some(input.clone()),
+            };
+            self.draft.scene.forces.push(damper);
+            return Some(input);
+        }
         if law.is_motor() {
             let gain = |term: &Term| term.coefficient * law.gain;
             let input = match terms {
@@ -348,7 +381,7 @@ impl<'a> Build<'_, 'a, '_> {
             return None;
         }
         let input = self.add_input(node, &actuator, Input::default(), limits);
-        let Law { gain, constant, stiffness, damping } = law;
+        let Law { gain, constant, stiffness, damping, .. } = law;
         let (coordinate, terms): (_, Vec<LinearTerm>) = match terms {
             [term] if term.coefficient == 1.0 => (Some(term.coordinate.clone()), Vec::new()),
             terms => (None, linear(terms)),
@@ -369,14 +402,14 @@ impl<'a> Build<'_, 'a, '_> {
     ) -> Option<String> {
         // Along the path, which is so many times as long as the tendon.
         let law = self.law(node, actuator, &[])?.geared(actuator.gear[0] / rope.times);
-        let Law { gain, constant, stiffness, damping } = law;
+        let Law { gain, constant, stiffness, damping, brake } = law;
         let rest_length =
             if stiffness == 0.0 { 0.0 } else { constant / stiffness + rope.path_length(0.0) };
         let is_spring = constant == 0.0 || stiffness > 0.0;
-        if stiffness < 0.0 || damping < 0.0 || rest_length < 0.0 || !is_spring {
+        if stiffness < 0.0 || damping < 0.0 || rest_length < 0.0 || !is_spring || brake != 0.0 {
             self.reader.refuse(
                 node,
-                "an actuator with a constant force, or one that pushes away, along a path",
+                "an actuator with a constant force, one that pushes away or one that brakes, along a path",
             );
             return None;
         }
@@ -399,7 +432,7 @@ impl<'a> Build<'_, 'a, '_> {
             |build: &Self, name: &str| build.tree.site(name).map(|site| (site.body, site.pose));
         let (body, pose) = self.find(node, "site", "site", found)?;
         let law = self.law(node, actuator, &[])?;
-        if law.damping != 0.0 || law.constant != 0.0 {
+        if law.damping != 0.0 || law.constant != 0.0 || law.brake != 0.0 {
             self.reader.refuse(node, "at a site only a `motor` acts");
             return None;
         }
@@ -452,10 +485,11 @@ impl<'a> Build<'_, 'a, '_> {
             let inertia = mobility.along(terms).recip();
             damping = 2.0 * ratio * (gain * inertia).sqrt();
         }
-        if gain == 0.0 || actuator.gear == [0.0; 6] {
+        let brake = if actuator.is_brake { -actuator.gain[2] } else { 0.0 };
+        if [gain, brake] == [0.0; 2] || actuator.gear == [0.0; 6] {
             return self.without_force(node).and(None);
         }
-        Some(Law { gain, constant, stiffness, damping })
+        Some(Law { gain, constant, stiffness, damping, brake })
     }
 
     /// Adds an input of an actuator's name and limits.
@@ -478,7 +512,7 @@ impl<'a> Build<'_, 'a, '_> {
             let gain = actuator.gain[0];
             let as_control = [force[0] / gain, force[1] / gain];
             let [low, high] = if gain < 0.0 { [as_control[1], as_control[0]] } else { as_control };
-            if actuator.is_affine {
+            if actuator.is_affine || actuator.is_brake {
                 let message =
                     format!("`forcerange` of actuator `{name}`: its force is not cut off");
                 self.reader.note(Kind::Approximated, node, message);

@@ -5,7 +5,7 @@ use plantd_models::scene::{
     Component, CoordinateKind, Force, Frame, Joint as SceneJoint, Knot, Spring,
 };
 
-use crate::draft::{BALL, FREE};
+use crate::draft::{BALL, FREE, as_coordinates};
 use crate::mjcf::build::Build;
 use crate::mjcf::tree::{Joint, JointKind, rotation};
 use crate::report::Kind;
@@ -256,11 +256,4 @@ pub(super) fn frame_at(parent: &str, place: &Isometry3<f64>) -> Frame {
         rotation: rotation(&place.rotation),
         ..Frame::default()
     }
-}
-
-/// A pose as the six coordinates of a free joint: position and rotation vector.
-pub(super) fn as_coordinates(pose: &Isometry3<f64>) -> [f64; 6] {
-    let [x, y, z] = pose.translation.vector.into();
-    let [rx, ry, rz] = pose.rotation.scaled_axis().into();
-    [x, y, z, rx, ry, rz]
 }

@@ -9,7 +9,7 @@ use crate::inertia::Inertia;
 use crate::mjcf::classes::Settings;
 use crate::mjcf::settings::{TINY, from_z};
 use crate::mjcf::shapes::Shape;
-use crate::mjcf::tree::{Place, Site, Walk, named, rotation};
+use crate::mjcf::tree::{Geom, Place, Site, Walk, named, rotation};
 
 impl<'a> Walk<'_, 'a, '_> {
     /// Reads a site.
@@ -106,7 +106,10 @@ impl<'a> Walk<'_, 'a, '_> {
         }
         let Some(shape) = shape else {
             if !matches!(settings.text("type"), Some("plane" | "hfield")) {
-                self.tree.meshed.push((body, settings.node()));
+                let (node, pose) = (settings.node(), *pose);
+                let is_mesh = settings.text("type") == Some("mesh") && !is_shell;
+                let mesh = settings.text("mesh").filter(|_| is_mesh);
+                self.tree.bodies[body].meshed.push(Geom { node, mesh, pose, mass, density });
             }
             return;
         };
@@ -128,11 +131,13 @@ impl<'a> Walk<'_, 'a, '_> {
         pose: &Isometry3<f64>,
     ) {
         let mesh = settings.text("mesh").and_then(|name| self.meshes.shape(name));
-        let Some(shape) = shape.map(drawn).or(mesh) else { return };
+        let own = shape.map(|shape| (drawn(shape), Isometry3::identity()));
+        let Some((shape, place)) = own.or(mesh) else { return };
         if self.items >= MAX_VISUALS {
             return;
         }
         let color = settings.numbers::<4>(self.reader, "rgba");
+        let pose = pose * place;
         self.tree.bodies[body].visuals.push(Visual {
             shape,
             translation: pose.translation.vector.into(),

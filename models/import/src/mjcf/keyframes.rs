@@ -4,8 +4,8 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use plantd_models::scene::{MAX_OPERATING_POINTS, OperatingPoint};
 use roxmltree::Node;
 
+use crate::draft::as_coordinates;
 use crate::mjcf::build::Build;
-use crate::mjcf::frames::as_coordinates;
 use crate::mjcf::settings::TINY;
 use crate::mjcf::tree::JointKind;
 use crate::names::Names;

@@ -146,11 +146,8 @@ static WORLD: Element = Element::new("worldbody", &[], &CONTENT).without(NOT_CON
 const MESH: Element = Element::new(
     "mesh",
     &[
-        (Read, "name class file scale"),
-        (
-            NoEffect(SEEN),
-            "content_type vertex normal texcoord face refpos refquat smoothnormal maxhullvert inertia builtin params material",
-        ),
+        (Read, "name class file scale vertex face refpos refquat inertia builtin params"),
+        (NoEffect(SEEN), "content_type normal texcoord smoothnormal maxhullvert material"),
     ],
     &[],
 )
@@ -192,7 +189,8 @@ const POSITION: Element = Element::new(
 );
 const VELOCITY: Element =
     Element::new("velocity", &[ACTUATOR_OWN, (Read, "kv"), ACTUATOR_USER], &[]);
-const OTHER_ACTUATORS: &str = "intvelocity orientation pid damper cylinder muscle adhesion dcmotor";
+const DAMPER: Element = Element::new("damper", &[ACTUATOR_OWN, (Read, "kv"), ACTUATOR_USER], &[]);
+const OTHER_ACTUATORS: &str = "intvelocity orientation pid cylinder muscle adhesion dcmotor";
 
 static DEFAULT: Element = Element::new(
     "default",
@@ -209,6 +207,7 @@ static DEFAULT: Element = Element::new(
         &MOTOR,
         &POSITION,
         &VELOCITY,
+        &DAMPER,
     ],
 )
 .without(&[
@@ -283,7 +282,7 @@ pub(super) static MUJOCO: Element = Element::new(
             ],
         )
         .without(&[(Refused(DEFORMABLE), "flex flexvert flexstrain")]),
-        &Element::new("actuator", &[], &[&GENERAL, &MOTOR, &POSITION, &VELOCITY])
+        &Element::new("actuator", &[], &[&GENERAL, &MOTOR, &POSITION, &VELOCITY, &DAMPER])
             .without(&[(Refused(ACTUATOR), OTHER_ACTUATORS), (Refused(SAVED), "plugin")]),
         &Element::new(
             "keyframe",

@@ -169,14 +169,7 @@ impl<'a> Build<'_, 'a, '_> {
                     format!("tendon `{name}` moves past its limits, which nothing enforces");
                 self.reader.note(Kind::Approximated, node, message);
             }
-            for (what, part) in [("frictionloss", "frictionloss"), ("armature", "")] {
-                if settings.amount(self.reader, what) > 0.0
-                    && (part.is_empty() || self.physics.has(part))
-                {
-                    let message = format!("`{what}` of tendon `{name}`: write it of joints");
-                    self.reader.refuse(node, message);
-                }
-            }
+            self.load(settings, name, course);
             let [stiffness, damping] = ["stiffness", "damping"].map(|what| {
                 let all: [f64; 3] = settings.first_numbers(self.reader, what);
                 if all[0] < 0.0 || all[1..] != [0.0; 2] {
@@ -190,7 +183,9 @@ impl<'a> Build<'_, 'a, '_> {
             if damping > 0.0 && self.physics.has("damper") {
                 self.reader.exact("damper of a tendon");
                 self.draft.scene.forces.push(match course {
-                    Course::Sum(terms) => Force::LinearDamper { terms: linear(terms), damping },
+                    Course::Sum(terms) => {
+                        Force::LinearDamper { terms: linear(terms), damping, input: None }
+                    }
                     Course::Path(rope) => Force::PathDamper {
                         points: rope.points(),
                         damping: damping / (rope.times * rope.times),
@@ -202,6 +197,39 @@ impl<'a> Build<'_, 'a, '_> {
                 let range = self.spring_range(settings).unwrap_or([natural; 2]);
                 self.add_spring(settings, course, stiffness, range);
             }
+        }
+    }
+
+    /// Armature and dry friction of a tendon. Over one joint they are the joint's own, `L = c q`.
+    fn load(&mut self, settings: &Settings<'a>, name: &str, course: &Course) {
+        let node = settings.node();
+        let armature = settings.amount(self.reader, "armature");
+        let mut friction = settings.amount(self.reader, "frictionloss");
+        if !self.physics.has("frictionloss") {
+            friction = 0.0;
+        }
+        let single = match course {
+            Course::Sum(terms) if terms.len() == 1 => Some(&terms[0]),
+            _ => None,
+        };
+        for (what, amount) in [("armature", armature), ("frictionloss", friction)] {
+            if amount > 0.0 && single.is_none() {
+                let message = format!(
+                    "`{what}` of tendon `{name}` couples joints, which it does not here: write it of joints"
+                );
+                self.reader.refuse(node, message);
+            }
+        }
+        let Some(Term { joint, coordinate, coefficient }) = single else { return };
+        if armature > 0.0 {
+            self.draft.setting(coordinate).armature += armature * coefficient * coefficient;
+            self.reader.exact("armature");
+        }
+        if friction > 0.0 {
+            let c = coefficient.abs();
+            let law = [friction * c, self.options.friction_velocity / c];
+            let joint = self.tree.joints[*joint].name.clone();
+            self.draft.rub(self.reader, (&joint, node), coordinate, law);
         }
     }
 

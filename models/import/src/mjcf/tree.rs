@@ -11,6 +11,7 @@ use crate::inertia::Inertia;
 use crate::mjcf::assets::Meshes;
 use crate::mjcf::classes::{Classes, MAIN, Settings};
 use crate::mjcf::settings::{Compiler, FromGeoms};
+use crate::source::Files;
 
 /// Geoms, sites and copies of replications that are made at most.
 const ITEMS_MAX: usize = 1 << 17;
@@ -21,8 +22,6 @@ pub(super) struct Tree<'a> {
     pub(super) bodies: Vec<Body<'a>>,
     pub(super) joints: Vec<Joint<'a>>,
     pub(super) sites: Vec<Site>,
-    /// Geoms whose inertia is that of a mesh, by body.
-    pub(super) meshed: Vec<(usize, Node<'a, 'a>)>,
     /// Geoms that touch others, and the first of them.
     pub(super) touching: Option<(Node<'a, 'a>, usize)>,
     /// Bodies, joints and sites by name.
@@ -48,6 +47,20 @@ pub(super) struct Body<'a> {
     /// Whether its geoms give its inertia, and what they give.
     pub(super) is_weighed: bool,
     pub(super) geoms: Vec<Inertia>,
+    /// Those that are meshes.
+    pub(super) meshed: Vec<Geom<'a>>,
+    /// Where it stands in its parent's element.
+    own: Isometry3<f64>,
+}
+
+/// A geom whose inertia is that of a mesh.
+pub(super) struct Geom<'a> {
+    pub(super) node: Node<'a, 'a>,
+    /// None where it is a shape that MuJoCo fits to a mesh, or something else that is not known here.
+    pub(super) mesh: Option<&'a str>,
+    pub(super) pose: Isometry3<f64>,
+    pub(super) mass: Option<f64>,
+    pub(super) density: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -148,6 +161,7 @@ pub(super) fn read<'a>(
     root: Node<'a, 'a>,
     classes: &Classes<'a>,
     compiler: &Compiler,
+    files: Option<&mut Files<'_>>,
 ) -> Tree<'a> {
     let meshes = Meshes::read(reader, root, classes, &compiler.meshes);
     let mut walk = Walk { reader, classes, compiler, meshes, tree: Tree::default(), items: 0 };
@@ -156,15 +170,11 @@ pub(super) fn read<'a>(
             Place { body: None, class: MAIN, frame: Isometry3::identity(), ending: String::new() };
         walk.fill(world, &place);
     }
-    let mut tree = walk.tree;
-    // Without effect where nothing moves, but for a mass that all bodies share.
-    let meshed = std::mem::take(&mut tree.meshed);
-    for (_, node) in meshed
-        .iter()
-        .filter(|(body, _)| compiler.total_mass.is_some() || tree.is_moved(Some(*body)))
-    {
-        reader.refuse(*node, "the inertia of a mesh: give its body an `inertial`");
+    walk.weigh_meshes(files);
+    for body in 0..walk.tree.bodies.len() {
+        walk.settle(body);
     }
+    let mut tree = walk.tree;
     if let Some(total) = compiler.total_mass {
         let mass: f64 = tree.bodies.iter().filter_map(|body| body.inertia).map(|i| i.mass).sum();
         if mass > 0.0 {
@@ -287,11 +297,12 @@ impl<'a> Walk<'_, 'a, '_> {
                 FromGeoms::Else => !has_inertial(node),
             },
             geoms: Vec::new(),
+            meshed: Vec::new(),
+            own,
         });
         let class = self.class_in(node, place);
         let frame = Isometry3::identity();
         self.fill(node, &Place { body: Some(body), class, frame, ending: place.ending.clone() });
-        self.settle(body, own);
         let Body { is_mocap, joints, parent, .. } = &self.tree.bodies[body];
         if *is_mocap && !(joints.is_empty() && parent.is_none()) {
             self.reader.fail(node, "a mocap body has no joints, and the world for a parent");
@@ -304,10 +315,41 @@ impl<'a> Walk<'_, 'a, '_> {
         }
     }
 
+    /// Adds the inertias of meshes to those of their bodies. They are without effect where nothing moves, but for a
+    /// mass that all bodies share.
+    fn weigh_meshes(&mut self, mut files: Option<&mut Files<'_>>) {
+        for body in 0..self.tree.bodies.len() {
+            let meshed = std::mem::take(&mut self.tree.bodies[body].meshed);
+            let counts = self.compiler.total_mass.is_some() || self.tree.is_moved(Some(body));
+            for Geom { node, mesh, pose, mass, density } in meshed.into_iter().filter(|_| counts) {
+                let Some(mesh) = mesh else {
+                    let message = "the inertia of a shape that is fitted to a mesh, or of its shell: give its body an `inertial`";
+                    self.reader.refuse(node, message);
+                    continue;
+                };
+                // Lent anew for each.
+                let lent = files.as_mut().map(|files| &mut **files as &mut Files<'_>);
+                match self.meshes.solid(mesh, lent) {
+                    Ok(solid) => {
+                        let factor = mass.map_or(density, |mass| mass / solid.mass);
+                        let own = Inertia {
+                            mass: solid.mass * factor,
+                            tensor: solid.tensor * factor,
+                            ..solid
+                        };
+                        self.reader.exact("inertia from a mesh");
+                        self.tree.bodies[body].geoms.push(own.at(&pose));
+                    }
+                    Err(why) => self.reader.refuse(node, why),
+                }
+            }
+        }
+    }
+
     /// The inertia of a body all of whose parts are known.
-    fn settle(&mut self, body: usize, own: Isometry3<f64>) {
-        let Body { inertial, geoms, node, .. } = &mut self.tree.bodies[body];
-        let (inertial, geoms, node) = (*inertial, std::mem::take(geoms), *node);
+    fn settle(&mut self, body: usize) {
+        let Body { inertial, geoms, node, own, .. } = &mut self.tree.bodies[body];
+        let (inertial, geoms, node, own) = (*inertial, std::mem::take(geoms), *node, *own);
         let inertia = if !geoms.is_empty() {
             self.reader.exact("inertia from shapes");
             Some(Inertia::sum(geoms.into_iter()))

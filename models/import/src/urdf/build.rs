@@ -7,7 +7,7 @@ use plantd_models::scene::{
 };
 
 use crate::document::Reader;
-use crate::draft::{BALL, Draft, FREE};
+use crate::draft::{BALL, Draft, FREE, as_coordinates};
 use crate::inertia::Inertia;
 use crate::names::Names;
 use crate::options::{Base, EARTH, Inputs, Options};
@@ -98,7 +98,17 @@ impl Builder<'_, '_, '_> {
             JointKind::Revolute => Some(SceneJoint::Revolute { axis, coordinate }),
             JointKind::Prismatic => Some(SceneJoint::Prismatic { axis, coordinate }),
             JointKind::Spherical => Some(SceneJoint::Ball { coordinate }),
-            JointKind::Floating => Some(SceneJoint::Free { coordinate }),
+            JointKind::Floating => {
+                // In the world its coordinates are those of the world, and it begins at its origin.
+                if parent == "world" {
+                    let start = as_coordinates(&origin.pose());
+                    for (name, value) in self.moved[j].clone().iter().zip(start) {
+                        self.draft.begin(name, value);
+                    }
+                    origin = Origin::default();
+                }
+                Some(SceneJoint::Free { coordinate })
+            }
             JointKind::Planar => {
                 parent = self.place_slides(joint, &stem, parent);
                 origin = Origin::default();

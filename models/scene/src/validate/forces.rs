@@ -42,8 +42,11 @@ impl Check<'_> {
                     self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
                     self.not_negative(format!("{path}.coefficient"), *coefficient);
                 }
-                Force::LinearDamper { terms, damping } => {
+                Force::LinearDamper { terms, damping, input } => {
                     self.linear_terms(&path, terms);
+                    if let Some(input) = input {
+                        self.known_input(format!("{path}.input"), input);
+                    }
                     self.not_negative(format!("{path}.damping"), *damping);
                 }
                 Force::PathDamper { points, damping } => {

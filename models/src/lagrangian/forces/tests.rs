@@ -109,6 +109,11 @@ type = "linear_damper"
 damping = 0.6
 terms = [{ coordinate = "shaken", coefficient = 0.4 }, { coordinate = "d", coefficient = -2 }, { coordinate = "c", coefficient = 1.5 }]
 [[forces]]
+type = "linear_damper"
+damping = 0.3
+input = "u"
+terms = [{ coordinate = "b", coefficient = 0.7 }, { coordinate = "d", coefficient = -1.5 }]
+[[forces]]
 type = "friction"
 coordinate = "b"
 force = 0.5

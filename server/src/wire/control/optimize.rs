@@ -12,7 +12,7 @@ use plantd_control::optimize::{
     TrajectoryCost,
 };
 use plantd_models::scene::UnknownName;
-use plantd_models::{Model, Plant, State};
+use plantd_models::{Model, Plant, Spare, State};
 use plantd_proto::v1;
 use tokio::sync::OwnedSemaphorePermit;
 use v1::optimize_trajectory_response::Response as Answer;
@@ -30,7 +30,8 @@ use crate::wire::status::RpcError;
 /// A search.
 pub(crate) struct Search {
     optimizer: Optimizer,
-    time_step_s: f64,
+    /// Finds the velocities of states.
+    spare: Spare,
     checkpoint_every: u32,
     /// Room in memory that the server grants.
     _permit: OwnedSemaphorePermit,
@@ -62,8 +63,9 @@ impl Search {
             }
         };
         optimizer.set_threads(hub.search_threads);
-        let time_step_s = settings.time_step_s;
-        Ok(Self { optimizer, time_step_s, checkpoint_every, _permit: permit })
+        let spare = Spare::new(model, settings)
+            .map_err(|error| RpcError::from_initial(error, "settings"))?;
+        Ok(Self { optimizer, spare, checkpoint_every, _permit: permit })
     }
 
     /// The messages of the search.
@@ -94,11 +96,11 @@ impl Search {
         let mut messages = VecDeque::new();
         if self.optimizer.status() == Status::Running {
             match self.optimizer.iterate(&mut || abandoned.check().is_ok()) {
-                Ok(progress) => messages.push_back(Answer::Progress(self.progress(&progress))),
+                Ok(progress) => messages.push_back(Answer::Progress(self.progress(&progress)?)),
                 // A trajectory that the search cannot leave: what there is is the answer.
                 Err(error) => {
                     abandoned.check()?;
-                    messages.push_back(Answer::Result(self.result(Some(error.into()))));
+                    messages.push_back(Answer::Result(self.result(Some(error.into()))?));
                     return Ok((messages, true));
                 }
             }
@@ -108,14 +110,14 @@ impl Search {
             Status::Converged => None,
             Status::Stuck(stuck) => Some(RpcError::from(stuck)),
         };
-        messages.push_back(Answer::Result(self.result(failure)));
+        messages.push_back(Answer::Result(self.result(failure)?));
         Ok((messages, true))
     }
 
-    fn progress(&self, progress: &Progress) -> v1::OptimizationProgress {
+    fn progress(&mut self, progress: &Progress) -> Result<v1::OptimizationProgress, RpcError> {
         let every = self.checkpoint_every;
         let is_wanted = every > 0 && (progress.iteration + 1).is_multiple_of(every);
-        v1::OptimizationProgress {
+        Ok(v1::OptimizationProgress {
             iteration: progress.iteration,
             cost_before: progress.cost_before,
             cost: progress.cost,
@@ -125,11 +127,11 @@ impl Search {
             step_length: progress.step_length,
             backtracks: progress.backtracks,
             bound_violation: progress.bound_violation,
-            checkpoint: is_wanted.then(|| self.checkpoint()),
-        }
+            checkpoint: if is_wanted { Some(self.checkpoint()?) } else { None },
+        })
     }
 
-    fn checkpoint(&self) -> v1::OptimizationCheckpoint {
+    fn checkpoint(&mut self) -> Result<v1::OptimizationCheckpoint, RpcError> {
         let Checkpoint {
             initial,
             inputs,
@@ -142,31 +144,34 @@ impl Search {
             backtracks,
             last_derivative,
         } = self.optimizer.checkpoint();
-        let state =
-            |state: &State| Some(states::state(state, state.step as f64 * self.time_step_s));
+        let mut state = |state: &State| {
+            states::state(state, &mut self.spare)
+                .map(Some)
+                .map_err(|error| RpcError::from_initial(error, "guess.initial"))
+        };
         let u = Some(matrices::matrix(&inputs));
-        v1::OptimizationCheckpoint {
-            trajectory: Some(v1::Trajectory { initial: state(&initial), u }),
+        Ok(v1::OptimizationCheckpoint {
+            trajectory: Some(v1::Trajectory { initial: state(&initial)?, u }),
             iterations,
             first_cost,
             bound_multipliers,
             penalty,
             bound_violation,
-            initial_reference: state(&initial_reference),
+            initial_reference: state(&initial_reference)?,
             backtracks,
             last_derivative,
-        }
+        })
     }
 
-    fn result(&self, failure: Option<RpcError>) -> v1::OptimizationResult {
-        v1::OptimizationResult {
+    fn result(&mut self, failure: Option<RpcError>) -> Result<v1::OptimizationResult, RpcError> {
+        Ok(v1::OptimizationResult {
             converged: failure.is_none(),
             failure: failure.map(Into::into),
             cost: self.optimizer.cost(),
             bound_violation: self.optimizer.bound_violation(),
-            checkpoint: Some(self.checkpoint()),
+            checkpoint: Some(self.checkpoint()?),
             x: Some(matrices::matrix(&self.optimizer.states())),
-        }
+        })
     }
 }
 

@@ -68,7 +68,7 @@ impl Projection {
             given => Some(weights::weights(given, &model)?),
         };
 
-        let spare = Spare::new(model.clone(), settings)
+        let mut spare = Spare::new(model.clone(), settings)
             .map_err(|error| RpcError::from_initial(error, "settings"))?;
         let assessment = reference::check_reference(&spare, &q, u.as_ref())?;
         abandoned.check()?;
@@ -78,6 +78,8 @@ impl Projection {
         let on_manifold = constraints == Constraints::Manifold;
         let projected = reference::project(&spare, &q, &assessment, pull.as_ref(), on_manifold)?;
         abandoned.check()?;
+        let initial = states::state(&projected.initial, &mut spare)
+            .map_err(|error| RpcError::from_initial(error, "q"))?;
         let gains = match weights {
             None => Vec::new(),
             Some(weights) => {
@@ -89,7 +91,7 @@ impl Projection {
             }
         };
         Ok(Self {
-            report: Some(report(&assessment, &projected, tolerance, settings.time_step_s)),
+            report: Some(report(&assessment, &projected, tolerance, initial)),
             common: states::gain_of(&request.model, &model, &settings),
             inputs: projected.inputs,
             states: projected.states,
@@ -138,10 +140,8 @@ fn report(
     assessment: &Assessment,
     projected: &Projected,
     tolerance: f64,
-    time_step_s: f64,
+    initial: v1::State,
 ) -> v1::ReferenceReport {
-    let initial = &projected.initial;
-    let initial = states::state(initial, initial.step as f64 * time_step_s);
     let u = Some(matrices::matrix(&projected.inputs));
     v1::ReferenceReport {
         feasible: assessment.is_feasible(tolerance),

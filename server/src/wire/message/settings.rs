@@ -1,5 +1,6 @@
 //! A plant's scene, settings and changed numbers.
 
+use std::collections::HashMap;
 use std::time::Duration;
 
 use plantd_import::{ImportError, Options, Report};
@@ -23,12 +24,13 @@ pub type Read = (Scene, Option<Report>);
 pub fn scene(
     text: &str,
     format: i32,
+    files: &HashMap<String, Vec<u8>>,
     limits: &Limits,
 ) -> Result<Result<Read, SceneError>, RpcError> {
     LimitExceeded::check("scene_bytes", limits.scene_bytes, "bytes of scene", text.len())?;
     let read = match v1::SceneFormat::try_from(format) {
-        Ok(v1::SceneFormat::Unspecified) if plantd_import::is_xml(text) => robot(text),
-        Ok(v1::SceneFormat::Urdf | v1::SceneFormat::Mjcf) => robot(text),
+        Ok(v1::SceneFormat::Unspecified) if plantd_import::is_xml(text) => robot(text, files),
+        Ok(v1::SceneFormat::Urdf | v1::SceneFormat::Mjcf) => robot(text, files),
         Ok(v1::SceneFormat::Unspecified) => Scene::from_text(text).map(|scene| (scene, None)),
         Ok(v1::SceneFormat::Toml) => Scene::from_toml(text).map(|scene| (scene, None)),
         Ok(v1::SceneFormat::Json) => Scene::from_json(text).map(|scene| (scene, None)),
@@ -56,12 +58,21 @@ pub fn scene(
     Ok(Ok((scene, report)))
 }
 
-fn robot(text: &str) -> Result<Read, SceneError> {
-    match plantd_import::import(text, &Options::default()) {
+fn robot(text: &str, files: &HashMap<String, Vec<u8>>) -> Result<Read, SceneError> {
+    let options = Options::default();
+    let mut find =
+        |name: &str| files.get(name).cloned().ok_or_else(|| "it is not among `files`".to_owned());
+    let robot = match files.is_empty() {
+        true => plantd_import::import(text, &options),
+        false => plantd_import::import_with_files(text, &options, &mut find),
+    };
+    match robot {
         Ok(robot) => Ok((robot.scene, Some(robot.report))),
         Err(ImportError { problems }) => {
             let problem = |problem: plantd_import::Problem| {
-                let path = format!("{}:{}", problem.line, problem.column);
+                let place = format!("{}:{}", problem.line, problem.column);
+                let is_main = problem.file.is_empty();
+                let path = if is_main { place } else { format!("{}:{place}", problem.file) };
                 Problem { path, message: problem.message }
             };
             Err(SceneError { problems: problems.into_iter().map(problem).collect() })

@@ -2,7 +2,8 @@
 
 use plantd_models::scene::UnknownName;
 use plantd_models::{
-    Diagnostics, Dimensions, Energy, Linearization, Model, Plant, Settings, State,
+    Diagnostics, Dimensions, Energy, InitialError, Linearization, Model, Plant, Settings, Spare,
+    State,
 };
 use plantd_proto::link::monotonic_ns;
 use plantd_proto::v1;
@@ -74,17 +75,17 @@ pub fn plant_state(plant: &mut Plant) -> v1::State {
     }
 }
 
-/// A state at a time as a message without velocity.
-pub fn state(state: &State, time_s: f64) -> v1::State {
-    v1::State {
+/// A state that no plant is in, as a message; its time is that of its step.
+pub fn state(state: &State, spare: &mut Spare) -> Result<v1::State, InitialError> {
+    Ok(v1::State {
         step: state.step,
-        time_s,
+        time_s: state.step as f64 * spare.settings().time_step_s,
         q: state.q.clone(),
         p: state.p.clone(),
         v: state.v.clone(),
         multipliers: multipliers(state.step, &state.multipliers),
-        velocity: Vec::new(),
-    }
+        velocity: spare.velocity_of(state)?,
+    })
 }
 
 /// There are none before the first step.
@@ -172,9 +173,9 @@ pub fn linearization_numbers(d: Dimensions) -> usize {
     (d.state() + d.constraints) * (d.state() + d.input())
 }
 
-/// Numbers in the message of a state without velocity.
+/// Numbers in the message of a state.
 pub fn state_numbers(d: Dimensions) -> usize {
-    d.state() + d.constraints
+    d.state() + d.constraints + d.coordinates()
 }
 
 /// Diagnostics of the state at `step` as a message.

@@ -1,5 +1,6 @@
 //! `plantd.v1.ModelService`.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
 use plantd_import::{Kind, Report};
@@ -31,9 +32,10 @@ impl ModelService {
 pub(crate) fn compile(
     text: &str,
     format: i32,
+    files: &HashMap<String, Vec<u8>>,
     limits: &Limits,
 ) -> Result<Result<(Model, Option<Report>), SceneError>, RpcError> {
-    let read = settings::scene(text, format, limits)?;
+    let read = settings::scene(text, format, files, limits)?;
     let compiled = read.and_then(|(scene, report)| Ok((Model::compile(&scene)?, report)));
     let (model, report) = match compiled {
         Ok(compiled) => compiled,
@@ -89,7 +91,8 @@ impl v1::model_service_server::ModelService for ModelService {
         }
         let hub = Arc::clone(&self.hub);
         let job = move |_: &_| {
-            let (model, report) = compile(&request.scene, request.format, &hub.limits)??;
+            let (model, report) =
+                compile(&request.scene, request.format, &request.files, &hub.limits)??;
             let name = match request.name {
                 name if name.is_empty() => model.scene().name.clone(),
                 name => name,
@@ -113,7 +116,8 @@ impl v1::model_service_server::ModelService for ModelService {
         let request = request.into_inner();
         let hub = Arc::clone(&self.hub);
         let job = move |_: &_| {
-            Ok(match compile(&request.scene, request.format, &hub.limits)? {
+            let v1::ValidateSceneRequest { scene, format, files } = &request;
+            Ok(match compile(scene, *format, files, &hub.limits)? {
                 Ok((model, report)) => {
                     let model = Some(models::model(&model.scene().name, false, &model, true));
                     let import_report = report.map(import_report);

@@ -102,7 +102,7 @@ impl PlantService {
         let limits = &self.hub.limits;
         LimitExceeded::check("steps_per_call", limits.steps_per_call, "steps", plan.steps)?;
         if plan.all_states {
-            let numbers = states::state_numbers(dimensions) + dimensions.coordinates();
+            let numbers = states::state_numbers(dimensions);
             let numbers = plan.steps.saturating_mul(numbers);
             let (name, limit) = ("reply_numbers", limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in all states", numbers)?;

@@ -3,6 +3,7 @@
 //! A file `ID.plant` is a `PlantRecord` in protobuf and the FNV-1a hash (u64, little-endian) of it. It is
 //! written aside and renamed: what is there is complete.
 
+use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
 use std::{fs, io};
@@ -233,7 +234,7 @@ fn is_change(saved: &v1::SavedFault) -> bool {
 
 fn scene(hub: &Hub, model: &v1::Model) -> Result<Model> {
     let format = v1::SceneFormat::Toml.into();
-    Ok(compile(&model.scene_toml, format, &hub.limits).map_err(sentence)??.0)
+    Ok(compile(&model.scene_toml, format, &HashMap::new(), &hub.limits).map_err(sentence)??.0)
 }
 
 fn decode(bytes: &[u8]) -> Result<v1::PlantRecord> {

@@ -82,7 +82,7 @@ fn turns(hub: &Hub, request: v1::StepManyRequest) -> Result<(Vec<Turn>, f64), Rp
         let dimensions = session.model().dimensions();
         let range = entries..entries + dimensions.input();
         entries = range.end;
-        numbers += states::state_numbers(dimensions) + dimensions.coordinates();
+        numbers += states::state_numbers(dimensions);
         sessions.push((session, range));
     }
     LimitExceeded::check("reply_numbers", limits.reply_numbers, "numbers in all states", numbers)?;

@@ -1,6 +1,6 @@
 //! `replay`: the steps of a recording, taken again and compared.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -192,6 +192,7 @@ impl<'a> Twin<'a> {
             scene: model.scene_toml.clone(),
             format: v1::SceneFormat::Toml.into(),
             replace: false,
+            files: HashMap::default(),
         };
         client.create_model_as(request).await.with_context(of)?;
         let snapshot = v1::initial_state::Form::Snapshot(record.snapshot.clone());

@@ -51,10 +51,12 @@ pub(crate) struct Explain {
 impl Upload {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
+        let (scene, files) = read_scene(&self.scene)?;
         let request = v1::CreateModelRequest {
             name: self.name.unwrap_or_default(),
-            scene: read_scene(&self.scene)?,
+            scene,
             replace: self.replace,
+            files,
             ..Default::default()
         };
         let answer = client.import_model(request).await?;
@@ -69,7 +71,11 @@ impl Upload {
 impl Validate {
     pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
         let client = context.connect().await?;
-        let answer = client.validate_scene(read_scene(&self.scene)?).await?;
+        let answer = {
+            let (scene, files) = read_scene(&self.scene)?;
+            let request = v1::ValidateSceneRequest { scene, files, ..Default::default() };
+            client.validate_scene_as(request).await?
+        };
         import::tell(answer.import_report.as_ref());
         context.output.message("ValidateSceneResponse", &answer, || match &answer.model {
             Some(model) if answer.problems.is_empty() => model::validated(model),

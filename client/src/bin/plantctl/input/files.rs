@@ -1,10 +1,12 @@
 //! Files that commands read and write.
 
+use std::collections::HashMap;
 use std::io::Read as _;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 use plantd_client::{MatrixExt as _, v1};
+use plantd_import::Options;
 
 use crate::contract::json;
 
@@ -18,16 +20,28 @@ pub(crate) fn read_text(path: &Path) -> Result<String> {
     std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
 }
 
-/// The text of a scene or robot, with the files that it includes.
-pub(crate) fn read_scene(path: &Path) -> Result<String> {
-    let whole = plantd_import::with_includes(&read_text(path)?, &mut beside(path));
-    whole.with_context(|| format!("{} cannot be read", path.display()))
+/// The text of a scene or robot with the files that it includes, and the meshes that weigh something, by their
+/// paths.
+pub(crate) fn read_scene(path: &Path) -> Result<(String, HashMap<String, Vec<u8>>)> {
+    let (mut read, mut meshes) = (beside(path), HashMap::new());
+    let whole = plantd_import::with_includes(&read_text(path)?, &mut read)
+        .with_context(|| format!("{} cannot be read", path.display()))?;
+    if plantd_import::is_xml(&whole) {
+        let mut keep = |name: &str| {
+            let bytes = read(name)?;
+            meshes.insert(name.to_owned(), bytes.clone());
+            Ok(bytes)
+        };
+        // What is wrong with it, the server says.
+        let _ = plantd_import::import_with_files(&whole, &Options::default(), &mut keep);
+    }
+    Ok((whole, meshes))
 }
 
 /// Reads files that stand where another one is.
-pub(crate) fn beside(path: &Path) -> impl FnMut(&str) -> Result<String, String> {
+pub(crate) fn beside(path: &Path) -> impl FnMut(&str) -> Result<Vec<u8>, String> {
     let folder = path.parent().unwrap_or(Path::new("")).to_owned();
-    move |name| std::fs::read_to_string(folder.join(name)).map_err(|error| error.to_string())
+    move |name| std::fs::read(folder.join(name)).map_err(|error| error.to_string())
 }
 
 /// Writes a file.
