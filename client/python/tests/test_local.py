@@ -1,6 +1,5 @@
 """The server in this process: the same calls, the same bits, the same refusals as over a connection."""
 
-import gc
 import math
 import os
 import signal
@@ -42,12 +41,14 @@ def script(client, model, at):
     with client.plant(model, at=at) as plant:
         lin = plant.linearize()
         seen += bits(lin.a, lin.b, lin.u)
-        law = client.solve_lqr(model, at=at, q=np.ones(len(lin.state.x)), r=np.ones(len(lin.u)))
-        seen += bits(law.k)
+        law = lambda state: lin.u  # noqa: E731
+        if at is not None:
+            law = client.solve_lqr(model, at=at, q=np.ones(len(lin.state.x)), r=np.ones(len(lin.u)))
+            seen += bits(law.k)
         with plant.drive() as driver:
             state = driver.plant.state
             for k in range(60):
-                u = law(state) + 0.1 * math.sin(k)
+                u = law(state) + 0.001 * math.sin(k)
                 state = driver.step(u)
                 seen.append((state_bits(state), driver.report, state.time_step))
         energy = plant.energy
@@ -111,14 +112,14 @@ def test_a_driver_holds_the_lease(local):
             driver.step([1.0])
         with plant.drive() as driver:
             plant.delete()
-            with pytest.raises(plantd.PlantdError, match="PLANT_NOT_FOUND"):
+            with pytest.raises(plantd.PlantdError, match="PLANT_DELETED"):
                 driver.step([1.0])
 
 
 def test_a_driver_goes_on_when_the_plant_runs_by_itself(local):
     with local.plant("pendulum") as plant, plant.drive() as driver:
         assert driver.step([0.5]).step == 1
-        plant.run("realtime")
+        plant.run("paced")
         assert driver.step([0.5]).step > 1 and driver.timing is not None
         assert driver.step([0.5]).step > 2
         plant.pause()
@@ -188,21 +189,28 @@ def test_two_servers_know_nothing_of_each_other():
         assert other.list_plants() == []
 
 
-def test_a_server_goes_with_its_client():
-    def threads():
-        return len(os.listdir("/proc/self/task"))
+DROPPED = """
+import gc, os, time, plantd
 
-    before = threads()
-    for _ in range(3):
-        client = plantd.local()
-        client.create_plant("pendulum")
-        assert threads() > before
-        del client
-        gc.collect()
-    deadline = time.monotonic() + 30
-    while threads() > before:
-        assert time.monotonic() < deadline, "threads stay"
-        time.sleep(0.05)
+def threads():
+    return len(os.listdir("/proc/self/task"))
+
+before = threads()
+for _ in range(3):
+    client = plantd.local()
+    client.create_plant("pendulum")
+    assert threads() > before
+    del client
+    gc.collect()
+deadline = time.monotonic() + 30
+while threads() > before:
+    assert time.monotonic() < deadline, "threads stay"
+    time.sleep(0.05)
+"""
+
+
+def test_a_server_goes_with_its_client():
+    subprocess.run([sys.executable, "-c", DROPPED], check=True, timeout=60)
 
 
 FORKED = """

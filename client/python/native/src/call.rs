@@ -43,6 +43,8 @@ impl Call {
             Some(request) => {
                 // The other end is here.
                 let _ = sender.send(request);
+                // It is the only one: the server waits for their end.
+                drop(sender);
                 None
             }
             None => Some(sender),

@@ -70,23 +70,20 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
     if not isinstance(error, grpc.Call):
         return PlantdError("UNKNOWN", str(error))
     metadata = dict(error.trailing_metadata() or ())
-    return _error(error.code().name, error.details() or "", metadata.get(_DETAILS_KEY, b""))
-
-
-def error_of(number: int, message: str, details: bytes, kind: type[PlantdError] = PlantdError) -> PlantdError:
-    """The error of a call in this process: number of the code, message, and details as the server sends them."""
-    return _error(_code_name(number), message, details, kind)
-
-
-def _error(code: str, message: str, details: bytes, kind: type[PlantdError] = PlantdError) -> PlantdError:
-    reason, violations = _details(details)
+    reason, violations = _details(metadata.get(_DETAILS_KEY, b""))
+    code, message = error.code().name, error.details() or ""
     if code == "CANCELLED" and message == "Timeout expired":
         # The server keeps the client's time as well, and was the first to see that it is over.
         code = "DEADLINE_EXCEEDED"
     if not reason:
         # It did not come from the server.
         message = _TRANSPORT.get(code, message)
-    return kind(code, message, reason, violations)
+    return PlantdError(code, message, reason, violations)
+
+
+def error_of(number: int, message: str, details: bytes, kind: type[PlantdError] = PlantdError) -> PlantdError:
+    """The error of a call in this process: number of the code, message, and details as the server sends them."""
+    return kind(_code_name(number), message, *_details(details))
 
 
 def _details(value: bytes) -> tuple[str, tuple[Violation, ...]]:
