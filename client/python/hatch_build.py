@@ -1,7 +1,13 @@
-"""Puts the stubs of the contract into the wheel, and the contract itself into the source archive."""
+"""Puts the stubs of the contract into the wheel, and the contract itself into the source archive.
+
+Where the variable PLANTD_BINARIES names a folder with the programs and libraries, as `wheel.py` does, the wheel has
+them in it: `plantd` and `plantctl` as scripts, the library of FMUs, and the module behind `plantd.local`.
+"""
 
 import importlib.metadata
+import os
 import re
+import sysconfig
 import tempfile
 from pathlib import Path
 
@@ -35,6 +41,8 @@ class StubsHook(BuildHookInterface):
         (out / "plantd" / "v1" / "__init__.py").write_text(
             '"""Messages and stubs of the contract, generated from plantd/v1/*.proto."""\n'
         )
+        if os.environ.get("PLANTD_BINARIES"):
+            self._add_binaries(Path(os.environ["PLANTD_BINARIES"]), build_data)
         # An editable installation finds them in the source tree, where git ignores them.
         for file in sorted(out.glob("plantd/v1/*")):
             if version == "editable":
@@ -47,6 +55,17 @@ class StubsHook(BuildHookInterface):
     def finalize(self, version, build_data, artifact_path):
         if hasattr(self, "_generated"):
             self._generated.cleanup()
+
+    @staticmethod
+    def _add_binaries(folder: Path, build_data):
+        build_data["pure_python"] = False
+        platform = re.sub(r"[-.]", "_", sysconfig.get_platform())
+        build_data["tag"] = f"cp310-abi3-{platform}"
+        for program in ("plantd", "plantctl"):
+            build_data["shared_scripts"][str(folder / program)] = program
+        # Where `plantctl fmu` looks for it.
+        build_data["shared_data"][str(folder / "libplantd_fmi.so")] = "lib/plantd/libplantd_fmi.so"
+        build_data["force_include"][str(folder / "libplantd_python.so")] = "plantd/_native.abi3.so"
 
     @staticmethod
     def _generate(protos: Path, files: list, out: Path):

@@ -13,11 +13,12 @@ use serde::Serialize;
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
-use tonic::service::LayerExt as _;
+use tonic::service::{LayerExt as _, Routes};
 use tonic::transport::Server;
 use tonic::transport::server::Router;
 use tonic_health::server::HealthReporter;
 use tonic_web::GrpcWebLayer;
+use tower::Layer as _;
 use tower::layer::util::{Identity, Stack};
 use tower::util::MapRequestLayer;
 use v1::channel_service_server::ChannelServiceServer;
@@ -36,7 +37,7 @@ use crate::wire::edge::admission::Places;
 use crate::wire::edge::ending::ending_with;
 use crate::wire::edge::gate::GateLayer;
 use crate::wire::edge::metrics_http;
-use crate::wire::edge::observe::ObserveLayer;
+use crate::wire::edge::observe::{Observe, ObserveLayer};
 use crate::wire::edge::page::{FindFile, PageLayer};
 use crate::wire::link::host::LinkHost;
 use crate::wire::models::model::ModelService;
@@ -205,7 +206,6 @@ impl RunningServer {
     fn router(&self) -> Result<Router<Layers>> {
         let hub = || Arc::clone(&self.hub);
         let limits = &self.hub.limits;
-        let message_bytes = Limits::size(limits.message_bytes);
         let reflection = || {
             tonic_reflection::server::Builder::configure()
                 .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
@@ -224,30 +224,34 @@ impl RunningServer {
             .layer(PageLayer::new(self.config.view.then(|| find_file(hub()))))
             .layer(GrpcWebLayer::new())
             .layer(ObserveLayer::new(Arc::clone(&self.hub.metrics), limits.clone()))
-            .add_service(
-                ModelServiceServer::new(ModelService::new(hub()))
-                    .max_decoding_message_size(message_bytes),
-            )
-            .add_service(
-                PlantServiceServer::new(PlantService::new(hub()))
-                    .max_decoding_message_size(message_bytes),
-            )
-            .add_service(
-                ControlServiceServer::new(ControlService::new(hub()))
-                    .max_decoding_message_size(message_bytes),
-            )
-            .add_service(
-                ChannelServiceServer::new(ChannelService::new(hub())).max_decoding_message_size(
-                    message_bytes.min(Limits::size(limits.channel_message_bytes)),
-                ),
-            )
-            .add_service(
-                RecordingServiceServer::new(RecordingService::new(hub()))
-                    .max_decoding_message_size(message_bytes),
-            )
+            .add_routes(self.routes())
             .add_service(ending_with(reflection().build_v1()?, ending()))
             // Older tools know only this one.
             .add_service(ending_with(reflection().build_v1alpha()?, ending())))
+    }
+
+    /// The services, for calls that come over no connection.
+    pub fn services(&self) -> Services {
+        ObserveLayer::new(Arc::clone(&self.hub.metrics), self.hub.limits.clone())
+            .layer(self.routes().prepare())
+    }
+
+    /// The services of `plantd.v1`.
+    fn routes(&self) -> Routes {
+        let hub = || Arc::clone(&self.hub);
+        let limits = &self.hub.limits;
+        let message_bytes = Limits::size(limits.message_bytes);
+        let channel_bytes = message_bytes.min(Limits::size(limits.channel_message_bytes));
+        let models = ModelServiceServer::new(ModelService::new(hub()));
+        let plants = PlantServiceServer::new(PlantService::new(hub()));
+        let control = ControlServiceServer::new(ControlService::new(hub()));
+        let channels = ChannelServiceServer::new(ChannelService::new(hub()));
+        let recordings = RecordingServiceServer::new(RecordingService::new(hub()));
+        Routes::new(models.max_decoding_message_size(message_bytes))
+            .add_service(plants.max_decoding_message_size(message_bytes))
+            .add_service(control.max_decoding_message_size(message_bytes))
+            .add_service(channels.max_decoding_message_size(channel_bytes))
+            .add_service(recordings.max_decoding_message_size(message_bytes))
     }
 
     async fn listen(&mut self, router: Router<Layers>) -> Result<()> {
@@ -402,6 +406,9 @@ async fn save_once(hub: &Arc<Hub>) {
         tracing::error!(%error, "plants were not saved");
     }
 }
+
+/// The services with the layer that counts calls, for whoever is in this process.
+pub type Services = Observe<Routes>;
 
 type Layers =
     Stack<ObserveLayer, Stack<GrpcWebLayer, Stack<PageLayer, Stack<GateLayer, Identity>>>>;

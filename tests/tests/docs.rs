@@ -9,10 +9,13 @@ const DOCUMENTS: &[&str] = &[
     "CHANGELOG.md",
     "CONTRIBUTING.md",
     "docs/control.md",
+    "docs/deployment.md",
     "docs/figures.md",
     "docs/limits.md",
     "docs/recording.md",
     "docs/robots.md",
+    "docs/theory.md",
+    "docs/tutorial.md",
     "docs/view.md",
     "client/python/README.md",
     "client/TESTING.md",
@@ -61,6 +64,15 @@ fn links_between_files_lead_somewhere() {
             let exists = target.starts_with("https://") || folder.join(file).exists();
             assert!(exists, "{document}: link to {target}");
         }
+    }
+}
+
+#[test]
+fn the_site_has_every_document() {
+    let summary = read("docs/SUMMARY.md");
+    for document in DOCUMENTS {
+        let path = document.strip_prefix("docs/").map_or(format!("../{document}"), str::to_owned);
+        assert!(summary.contains(&format!("]({path})")), "docs/SUMMARY.md has no {document}");
     }
 }
 

@@ -45,10 +45,24 @@ def addresses(tmp_path_factory):
             server.wait()
 
 
-@pytest.fixture(params=["grpc", "unix"])
-def client(addresses, request):
-    """A client, over TCP and over the Unix-domain socket."""
-    with plantd.connect(addresses[request.param]) as client:
+@pytest.fixture(scope="session")
+def local_client(tmp_path_factory):
+    """A client of a server in this process."""
+    pytest.importorskip("plantd._native", reason="the package is installed without the server in it")
+    with plantd.local(recordings=tmp_path_factory.mktemp("local")) as client:
+        yield client
+
+
+@pytest.fixture(params=["grpc", "unix", "local"])
+def client(request):
+    """A client: over TCP, over the Unix-domain socket, and of a server in this process."""
+    if request.param == "local":
+        client = request.getfixturevalue("local_client")
+        yield client
+        for plant in client.list_plants():
+            client.delete_plant(plant.id)
+        return
+    with plantd.connect(request.getfixturevalue("addresses")[request.param]) as client:
         yield client
         for plant in client.list_plants():
             client.delete_plant(plant.id)

@@ -98,6 +98,10 @@ def test_motions_are_tables_with_names(own, tmp_path):
     assert np.array_equal(recorded["theta"], table["theta"]) and set(recorded["u(force)"]) == {0.5}
     ends = own.rollout("cart-pole", np.ones((2, 5, 1)))
     assert list(own.table(ends, "cart-pole", case=1)["x"]) == list(ends.q[1, :, 0])
+    data = own.dataset(ends, "cart-pole")
+    assert data["x"].dims == ("case", "time") and np.array_equal(data["x"], ends.q[..., 0])
+    assert np.array_equal(data.time, ends.time)
+    assert np.array_equal(own.dataset(states)["theta"], table["theta"])
     with pytest.raises(ValueError, match="`model` is needed"):
         own.table(ends)
     with pytest.raises(TypeError, match="`motion` is 3"):

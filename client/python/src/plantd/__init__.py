@@ -25,6 +25,7 @@ from ._handle import PlantHandle
 from ._kalman import Kalman, KalmanStep, TrajectoryKalman
 from ._launch import Server, launch
 from ._linearize import Analysis, Contraction, Linearization, Mode, SecondOrder
+from ._local import local
 from ._mechanics import (
     CenterOfMass,
     Dynamics,
@@ -106,6 +107,7 @@ __all__ = [
     "connect",
     "difference",
     "launch",
+    "local",
     "read_recording",
     "rotations",
 ]

@@ -19,13 +19,16 @@ class Calls:
     """A connection with its stubs, and how a call is made over it."""
 
     def __init__(self, address: str, *, timeout: float = 60.0):
-        self._channel = open_channel(address)
+        self._channel = self._open(address)
         self._timeout = timeout
         self.models = ModelServiceStub(self._channel)
         self.plants = PlantServiceStub(self._channel)
         self.control = ControlServiceStub(self._channel)
         self.channels = ChannelServiceStub(self._channel)
         self.recordings = RecordingServiceStub(self._channel)
+
+    def _open(self, address: str) -> Any:
+        return open_channel(address)
 
     @translate
     def _call(self, method: Any, request: Any, limited: bool = True) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 from typing import Any
 
-from plantd.v1 import common_pb2, plant_service_pb2
+from plantd.v1 import plant_service_pb2
 from plantd.v1 import plant_service_pb2 as pb
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 
@@ -98,13 +98,14 @@ class Driver:
         self.outputs = Outputs._from(answer.step.outputs) if has_outputs else None
         if answer.step.HasField("linearization"):
             self.linearization = Linearization._from(answer.step.linearization)
-        return State._from(answer.step.state, self.plant.model, self._time_step(answer.step.state))
+        state = answer.step.state
+        return State._from(state, self.plant.model, self._time_step(state.step, state.time_s))
 
-    def _time_step(self, state: common_pb2.State) -> float:
+    def _time_step(self, step: int, time: float) -> float:
         """The plant's time step when it was opened, or 0 if another one is seen to be in force."""
         start, time_step = self.plant.state, self.plant.time_step
-        steps = (state.time_s - start.time) / time_step
-        return time_step if abs(steps - (state.step - start.step)) < 0.5 else 0.0
+        steps = (time - start.time) / time_step
+        return time_step if abs(steps - (step - start.step)) < 0.5 else 0.0
 
     def close(self) -> None:
         """Gives the lease back and waits until the server has done so."""
@@ -165,6 +166,9 @@ class Hold:
 class DriveCalls(Calls):
     """The calls that take the lease of a plant."""
 
+    def _driver(self, open: pb.DriveOpen) -> Driver:
+        return Driver(self.plants, open)
+
     def drive(
         self, id: str, *, linearization: bool = False, grace: float = 0.0, resume: str = ""
     ) -> Driver:
@@ -177,7 +181,7 @@ class DriveCalls(Calls):
             plant_service_pb2.DriveOpen,
             id=id, linearization=linearization, grace_s=grace, resume=resume
         )
-        return Driver(self.plants, open)
+        return self._driver(open)
 
     def hold(self, id: str) -> Hold:
         """Takes the lease of a plant that runs by itself, to give it an input now and then."""

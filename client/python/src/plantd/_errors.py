@@ -69,13 +69,9 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
     """The error of a call."""
     if not isinstance(error, grpc.Call):
         return PlantdError("UNKNOWN", str(error))
-    reason = ""
-    violations: tuple[Violation, ...] = ()
-    for key, value in error.trailing_metadata() or ():
-        if key == _DETAILS_KEY:
-            reason, violations = _details(value)
-    code = error.code().name
-    message = error.details() or ""
+    metadata = dict(error.trailing_metadata() or ())
+    reason, violations = _details(metadata.get(_DETAILS_KEY, b""))
+    code, message = error.code().name, error.details() or ""
     if code == "CANCELLED" and message == "Timeout expired":
         # The server keeps the client's time as well, and was the first to see that it is over.
         code = "DEADLINE_EXCEEDED"
@@ -83,6 +79,11 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
         # It did not come from the server.
         message = _TRANSPORT.get(code, message)
     return PlantdError(code, message, reason, violations)
+
+
+def error_of(number: int, message: str, details: bytes, kind: type[PlantdError] = PlantdError) -> PlantdError:
+    """The error of a call in this process: number of the code, message, and details as the server sends them."""
+    return kind(_code_name(number), message, *_details(details))
 
 
 def _details(value: bytes) -> tuple[str, tuple[Violation, ...]]:

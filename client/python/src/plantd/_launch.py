@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import shutil
@@ -130,7 +131,7 @@ def launch(
 
     The server ends when the client is closed or no longer used, and with this process, even if that is
     killed. ``program`` is the ``plantd`` to start; by default the one that the environment variable
-    ``PLANTD`` names, or the one beside this package, beside Python, or in ``PATH``. ``arguments`` are more
+    ``PLANTD`` names, or the one of this package's wheel, the one beside Python, or in ``PATH``. ``arguments`` are more
     of ``plantd serve``, such as ``["--limit", "plants=10"]``; ``timeout`` is that of `connect`.
     """
     if isinstance(arguments, str):
@@ -169,5 +170,12 @@ def _find(program: str | PathLike[str] | None) -> Path:
 
 
 def _places() -> Iterator[Path]:
-    yield Path(__file__).parent / "bin" / "plantd"
+    try:
+        installed = importlib.metadata.files("plantd")
+    except importlib.metadata.PackageNotFoundError:
+        installed = None
+    # Where the wheel has put it, whatever the scheme of the installation.
+    for file in installed or ():
+        if file.name == "plantd" and not str(file).startswith("plantd"):
+            yield Path(os.path.normpath(file.locate()))
     yield Path(sys.executable).parent / "plantd"

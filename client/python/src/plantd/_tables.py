@@ -37,11 +37,27 @@ class TableCalls(ModelCalls):
         the model's. Needs the package ``pandas``.
         """
         pandas = needed("pandas", "table")
+        columns, time = self._columns(motion, model, dt)
+        if isinstance(motion, Rollouts):
+            columns = {name: values[case] for name, values in columns.items()}
+        return pandas.DataFrame(columns, index=pandas.Index(time, name="time"))
+
+    def dataset(self, motion: Motion, model: str = "", *, dt: float = 0.0) -> Any:
+        """A motion as an ``xarray.Dataset``: the columns of `table` as variables over ``time``, and of
+        simulations over ``case`` and ``time``. Needs the package ``xarray``."""
+        xarray = needed("xarray", "xarray")
+        columns, time = self._columns(motion, model, dt)
+        over = ("case", "time") if isinstance(motion, Rollouts) else ("time",)
+        variables = {name: (over, values) for name, values in columns.items()}
+        return xarray.Dataset(variables, coords={"time": ("time", time, {"units": "s"})})
+
+    def _columns(self, motion: Motion, model: str, dt: float) -> tuple[dict[str, Array], Array]:
+        """Numbers by name, and their times; those of simulations have a row for each case."""
         x: Array
         velocity: Array | None
         time: Array
         if isinstance(motion, Rollouts):
-            x, velocity, time, u = motion.x[case], motion.velocity[case], motion.time, None
+            x, velocity, time, u = motion.x, motion.velocity, motion.time, None
         elif isinstance(motion, Optimum):
             known = self.get_model(model)
             x, velocity, u = motion.x, None, motion.u
@@ -58,17 +74,17 @@ class TableCalls(ModelCalls):
             raise ValueError("`model` is needed: this motion does not say of which model it is")
         known = self.get_model(model)
         names = state_names(known)
-        if len(names) != x.shape[1]:
-            raise ValueError(f"the states have {x.shape[1]} entries; those of `{model}` have {len(names)}")
-        columns = dict(zip(names, x.T))
+        if len(names) != x.shape[-1]:
+            raise ValueError(f"the states have {x.shape[-1]} entries; those of `{model}` have {len(names)}")
+        columns = {name: x[..., i] for i, name in enumerate(names)}
         for i, coordinate in enumerate(known.coordinates):
-            if velocity is not None and velocity.shape[1] and not coordinate.prescribed:
-                columns[f"v({coordinate.name})"] = velocity[:, i]
+            if velocity is not None and velocity.shape[-1] and not coordinate.prescribed:
+                columns[f"v({coordinate.name})"] = velocity[..., i]
         if u is not None:
             for name, row in zip(input_names(known), u.T):
                 # The last state has no input.
                 columns[f"u({name})"] = np.append(row, np.nan)
-        return pandas.DataFrame(columns, index=pandas.Index(time, name="time"))
+        return columns, time
 
     def plot(self, motion: Motion, model: str = "", *, case: int = 0, dt: float = 0.0) -> Any:
         """A figure of a motion over time; arguments are those of `table`. Needs ``matplotlib`` and ``pandas``."""

@@ -353,8 +353,13 @@ impl Core {
     /// The plant as it is, with its last step.
     pub(crate) fn frame(&mut self) -> Frame {
         let mut frame = Frame::default();
-        frame.copy_from(&self.published());
+        self.write_frame(&mut frame);
         frame
+    }
+
+    /// The same into memory that is allocated at the first call only.
+    pub fn write_frame(&mut self, frame: &mut Frame) {
+        frame.copy_from(&self.published());
     }
 
     pub(crate) fn mechanics(&self) -> Mechanics {
