@@ -29,7 +29,7 @@ use crate::lagrangian::generators::{
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
 use crate::math::rows::Block;
-use crate::math::simd::widest;
+use crate::math::simd::{wide, widest};
 use crate::math::spatial::{Mat3, Vec3};
 use crate::math::tree_lu::SmallestPivot;
 use crate::model::mechanism::Model;
@@ -136,6 +136,21 @@ fn inverse(d: &Mat3) -> (Mat3, Vec3) {
     (Mat3(rows).transpose(), Vec3([determinant / minor, minor / z[2], z[2]]))
 }
 
+/// What the axes of a ball joint give to the matrix. Apart from their elimination, with which compilers would
+/// mix it number by number.
+#[inline(never)]
+fn write_generators(
+    step: &Step,
+    mechanics: &Mechanics,
+    first: usize,
+    weights: &Weights,
+    out: &mut [Generators; 3],
+) {
+    wide!({
+        *out = of_ball(&step.parts_of_ball(mechanics, first), weights);
+    });
+}
+
 impl SpatialRecursion {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = model.dynamics.joints.len();
@@ -230,7 +245,8 @@ impl SpatialRecursion {
     ) {
         let joint = &model.dynamics.joints[first];
         let weights = &added.balls[joint.orientation];
-        let generators = of_ball(&step.parts_of_ball(mechanics, first), weights);
+        let generators = &mut [Generators::default(); 3];
+        write_generators(step, mechanics, first, weights, generators);
         let place = self.places[first];
         let (sums, own) = self.sums.split_at_mut(place);
         let own = &mut own[0];
@@ -242,7 +258,7 @@ impl SpatialRecursion {
         let k = step.within_ball(mechanics, model.gravity, first, weights);
         let mut d = k;
         for (column, a_plus) in d.0.iter_mut().zip(&a_plus) {
-            for (entry, generators) in column.0.iter_mut().zip(&generators) {
+            for (entry, generators) in column.0.iter_mut().zip(&*generators) {
                 *entry += dot(&generators.minus, a_plus);
             }
         }
