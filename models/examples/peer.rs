@@ -213,7 +213,6 @@ fn scene(mechanism: &Mechanism) -> Scene {
             center_of_mass: link.com,
             inertia: link.inertia.clone(),
             any_inertia: true,
-            ..Body::default()
         }),
         ..Frame::default()
     });
