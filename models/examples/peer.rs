@@ -3,7 +3,8 @@
 //! Reads lines `PATH METHOD DT STEPS PASSES`, runs PASSES times STEPS steps of DT seconds from the
 //! start of the mechanism in the JSON file PATH, and answers each with the CPU seconds of its thread and
 //! the last configuration, or with `error:` and a reason. Methods: `midpoint`, `midpoint-ab` (a step
-//! with A and B of all joint torques), the same with `-moving` (without the first step of a pass, which
+//! with A and B of all torques, column by column in memory of the driver's), the same with `-rough` (with new
+//! torques at each step) or with `-moving` (without the first step of a pass, which
 //! finds the velocity that a momentum means), `order-4` to `order-12` (Gauss collocation), `order-4-fast`
 //! and so on (solved to what precision `fast` asks for), and `scalar`: the midpoint rule written by hand
 //! for a pendulum.
@@ -13,8 +14,10 @@ use std::error::Error;
 use std::io::BufRead;
 use std::sync::Arc;
 
-use plantd_models::scene::{Axis, Body, Constraint, Coordinate, Frame, Input, Joint, Point};
-use plantd_models::{Initial, Linearization, Model, Plant, Precision, Scene, Settings};
+use plantd_models::scene::{
+    Axis, Body, Constraint, Coordinate, Frame, Input, Joint, Point, Rotation,
+};
+use plantd_models::{Initial, Layout, Linearization, Model, Plant, Precision, Scene, Settings};
 use serde::Deserialize;
 
 /// A mechanism of `tests/peers/mechanisms.py`.
@@ -25,6 +28,9 @@ struct Mechanism {
     bodies: Vec<Link>,
     q0: Vec<f64>,
     v0: Vec<f64>,
+    /// The largest torques of all coordinates, where they change at each step.
+    #[serde(default)]
+    rough: Vec<f64>,
     loops: Vec<Loop>,
 }
 
@@ -35,7 +41,11 @@ struct Link {
     axis: [f64; 3],
     mass: f64,
     com: [f64; 3],
-    inertia: [f64; 3],
+    inertia: Vec<f64>,
+    #[serde(default)]
+    r#type: String,
+    /// Orientation in the parent, w first.
+    turn: Option<[f64; 4]>,
 }
 
 /// Two points that coincide; the mechanism moves in the plane of x and z.
@@ -103,8 +113,14 @@ fn run(
     let (q, v) = (mechanism.q0.clone(), mechanism.v0.clone());
     plant.initialize(&Initial::Velocity { q, v })?;
     let start = plant.snapshot();
-    let u = vec![0.0; model.dimensions().input()];
+    let d = model.dimensions();
+    let mut u = vec![0.0; d.input()];
     let mut out = Linearization::new(model);
+    let (mut a, mut b) = (vec![0.0; d.state() * d.state()], vec![0.0; d.state() * d.input()]);
+    let (method, rough) = match method.strip_suffix("-rough") {
+        Some(method) => (method, &mechanism.rough[mechanism.rough.len().saturating_sub(u.len())..]),
+        None => (method, &[][..]),
+    };
     let (method, is_moving) = match method.strip_suffix("-moving") {
         Some(method) => (method, true),
         None => (method, false),
@@ -114,9 +130,18 @@ fn run(
         let mut begin = cpu_time_s();
         plant.restore(&start)?;
         for k in 0..steps {
+            for (i, (u, most)) in u.iter_mut().zip(rough).enumerate() {
+                *u = most * rough_number(k as u32, i as u32);
+            }
             match method {
                 "midpoint" => plant.step(&u)?,
-                "midpoint-ab" => plant.step_and_linearize(&u, &mut out)?,
+                "midpoint-ab" => {
+                    let report = plant.step_and_linearize(&u, &mut out)?;
+                    out.a_into(&mut a, Layout::Columns);
+                    out.b_into(&mut b, Layout::Columns);
+                    std::hint::black_box((&a, &b));
+                    report
+                }
                 _ => return Err("no such method".into()),
             };
             if is_moving && k == 0 {
@@ -126,6 +151,16 @@ fn run(
         seconds += cpu_time_s() - begin;
     }
     Ok((seconds, plant.q().to_vec()))
+}
+
+/// Between -1 and 1: the same in all drivers; see `tests/peers/drivers/driver.h`.
+fn rough_number(step: u32, motor: u32) -> f64 {
+    let mut x =
+        step.wrapping_mul(2_654_435_761).wrapping_add(motor.wrapping_mul(40_503)).wrapping_add(1);
+    x = (x ^ (x >> 15)).wrapping_mul(2_246_822_519);
+    x = (x ^ (x >> 13)).wrapping_mul(3_266_489_917);
+    x ^= x >> 16;
+    f64::from(x) * (2.0 / 4_294_967_296.0) - 1.0
 }
 
 /// The same map for a pendulum alone: p₀ = (J/h)Δ + ½h mgl sin(q₀ + ½Δ), by Newton to round-off.
@@ -166,24 +201,39 @@ fn scene(mechanism: &Mechanism) -> Scene {
         name: name(i),
         parent: name(link.parent),
         translation: link.pos,
-        rotation: None,
-        joint: Some(Joint::Revolute { axis: link.axis, coordinate: None }),
+        rotation: link.turn.map(Rotation::Quaternion),
+        joint: Some(match link.r#type.as_str() {
+            "ball" => Joint::Ball { coordinate: None },
+            "free" => Joint::Free { coordinate: None },
+            "slide" => Joint::Prismatic { axis: link.axis, coordinate: None },
+            _ => Joint::Revolute { axis: link.axis, coordinate: None },
+        }),
         body: (link.mass > 0.0).then(|| Body {
             mass: link.mass,
             center_of_mass: link.com,
-            inertia: link.inertia.to_vec(),
-            ..Body::default()
+            inertia: link.inertia.clone(),
+            any_inertia: true,
         }),
         ..Frame::default()
     });
-    let coordinates = mechanism.q0.iter().zip(0..).map(|(&initial, i)| Coordinate {
-        name: name(i),
+    let names = mechanism.bodies.iter().zip(0..).flat_map(|(link, i)| {
+        let ends: &[&str] = match link.r#type.as_str() {
+            "ball" => &["_rx", "_ry", "_rz"],
+            "free" => &["_x", "_y", "_z", "_rx", "_ry", "_rz"],
+            _ => &[""],
+        };
+        ends.iter().map(move |end| (format!("b{i}{end}"), ends.len() < 6))
+    });
+    let names: Vec<(String, bool)> = names.collect();
+    let coordinates = names.iter().zip(&mechanism.q0).map(|((name, _), &initial)| Coordinate {
+        name: name.clone(),
         initial,
         ..Coordinate::default()
     });
-    let inputs = (0..mechanism.q0.len()).map(|i| Input {
+    let driven = names.iter().filter(|(_, is_driven)| *is_driven);
+    let inputs = driven.zip(0..).map(|((name, _), i): (_, i32)| Input {
         name: format!("torque{i}"),
-        coordinate: Some(format!("b{i}")),
+        coordinate: Some(name.clone()),
         ..Input::default()
     });
     let point = |body, at| Point { frame: name(body), at };

@@ -19,7 +19,8 @@ import time
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 TARGET = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "peers"
-PACKAGES = ["numpy", "scipy", "matplotlib", "mujoco", "pin", "cmeel-eigen", "casadi", "drake"]
+PACKAGES = ["numpy", "scipy", "matplotlib", "mujoco", "pin", "cmeel-eigen", "example-robot-data"]
+PACKAGES += ["casadi", "drake"]
 
 sys.path.insert(0, str(HERE))
 import mechanisms  # noqa: E402
@@ -199,6 +200,25 @@ AB_METHODS = [
     ("Pinocchio", "euler-ab"),
     ("MuJoCo", "euler-ab"),
 ]
+# Arms, floating robots and ball joints: motions of 2 ms steps, also with torques that change at each of them.
+ROBOTS = ["panda", "g1-fixed", "go1", "anymal", "g1", "talos", "B7", "B15", "K8"]
+ROBOT_METHODS = [
+    PLANTD,
+    ("Pinocchio", "euler"),
+    ("MuJoCo", "euler"),
+    ("plantd", "midpoint-rough"),
+    ("Pinocchio", "euler-rough"),
+    ("MuJoCo", "euler-rough"),
+    PLANTD_AB,
+    ("Pinocchio", "euler-ab"),
+]
+# plantd's method beside a peer's.
+ROBOT_RATIOS = [
+    (PLANTD, ("Pinocchio", "euler")),
+    (PLANTD, ("MuJoCo", "euler")),
+    (("plantd", "midpoint-rough"), ("Pinocchio", "euler-rough")),
+    (PLANTD_AB, ("Pinocchio", "euler-ab")),
+]
 TABLE = ["P", "D", "S", "L"]
 TABLE += [f"C{2**k}" for k in range(8)] + ["T7", "T15", "T30", "T63"]
 GROWTH = ["H128", "H256", "H512", "H1024"]
@@ -213,7 +233,9 @@ AB_GOALS += [(name, ("MuJoCo", "euler-ab"), 0.1) for name in ("C8", "C32", "T30"
 
 
 def time_step(name):
-    """0.01 s; shorter for long chains, whose links swing faster."""
+    """0.01 s; shorter for robots, and for long chains, whose links swing faster."""
+    if name in ROBOTS:
+        return 0.002
     return min(0.01, 0.08 / int(name[1:])) if name[0] in "CH" else 0.01
 
 
@@ -221,6 +243,8 @@ def applies(name, method):
     driver, what = method
     if method == BY_HAND:
         return name == "P"
+    if name in ROBOTS:
+        return driver in ("plantd", "Pinocchio", "MuJoCo")
     if name == "L":
         return driver in ("plantd", "MuJoCo")
     if driver == "CasADi C":
@@ -271,6 +295,51 @@ def table_of_calls(measured, methods):
             cells = [f"{statistics.median(cell):.3g}" if cell else "" for cell in cells]
             lines.append(f"| {' '.join(method)} | " + " | ".join(cells) + " |")
     return lines
+
+
+def table_of_robots(measured):
+    own = lambda method: " ".join(method)
+    lines = ["| | " + " | ".join(f"{own(a)} / {own(b)}" for a, b in ROBOT_RATIOS) + " | difference |"]
+    lines.append("| --- |" + " ---: |" * (len(ROBOT_RATIOS) + 1))
+    for name, (times, difference) in measured.items():
+        cells = [f"{ratio(times, *pair):.2f}" if all(m in times for m in pair) else "" for pair in ROBOT_RATIOS]
+        lines.append(f"| {name} | " + " | ".join([*cells, f"{difference:.0e}"]) + " |")
+    return lines
+
+
+def measure_robots(drivers, names, rounds):
+    """Times by method, and the largest difference of coordinates from the peers' after 0.1 s."""
+    measured = {}
+    for name in names:
+        [(_, times)] = measure_calls(drivers, [name], ROBOT_METHODS, rounds).items()
+        ends = []
+        for driver, method in [("plantd", "order-4"), ("Pinocchio", "rk4"), ("MuJoCo", "rk4")]:
+            if driver in drivers:
+                ends.append(coordinates(name, driver, drivers[driver].ask(name, method, 1e-3, 100)[1]))
+        measured[name] = times, max(error_of(q, ends[0]) for q in ends)
+    return measured
+
+
+def coordinates(name, driver, numbers):
+    """With rotation vectors in place of quaternions."""
+    if driver == "plantd":
+        return numbers
+    own, at = [], 0
+    for b in mechanisms.named(name)["bodies"]:
+        size = mechanisms.SIZES[mechanisms.joint_type(b)]
+        if size > 1:
+            own += numbers[at : at + size - 3]
+            at += size - 3
+            w, *v = numbers[at : at + 4] if driver == "MuJoCo" else [numbers[at + 3], *numbers[at : at + 3]]
+            length = math.hypot(*v)
+            angle = 2 * math.atan2(length, w)
+            angle -= 2 * math.pi if angle > math.pi else 0
+            own += [x / length * angle if length else 0.0 for x in v]
+            at += 4
+        else:
+            own.append(numbers[at])
+            at += 1
+    return own
 
 
 def table_of_goals(steps, derivatives):
@@ -507,20 +576,27 @@ def main():
     drivers = start_drivers()
     options.out.mkdir(parents=True, exist_ok=True)
     names = [] if options.accuracy_alone else options.only or TABLE
+    robots = [] if options.accuracy_alone else options.only or ROBOTS
+    names, robots = [n for n in names if n not in ROBOTS], [n for n in robots if n in ROBOTS]
+    robots = measure_robots(drivers, robots, options.rounds)
     steps = measure_calls(drivers, names, STEP_METHODS, options.rounds)
     derivatives = measure_calls(drivers, names, AB_METHODS, options.rounds)
-    growth = [] if options.accuracy_alone else list(measure_growth(drivers["plantd"]))
+    growth = [] if options.accuracy_alone or not names else list(measure_growth(drivers["plantd"]))
     curves = {} if options.without_accuracy else measure_accuracy(drivers)
     report = ["# plantd beside its peers", "", *conditions(), "", "## One step", ""]
     report += [*table_of_calls(steps, STEP_METHODS), "", "## One step, A and B", ""]
     report += [*table_of_calls(derivatives, AB_METHODS), "", "## Goals", ""]
     report += [*table_of_goals(steps, derivatives), "", "## Growth over chains", ""]
     report += ["| plantd's | exponent | |", "| --- | ---: | --- |", *growth, ""]
+    if robots:
+        times = {name: times for name, (times, _) in robots.items()}
+        report += ["## Robots and ball joints", "", *table_of_calls(times, ROBOT_METHODS), ""]
+        report += [*table_of_robots(robots), ""]
     if curves:
         report += ["## Run time against error", "", *table_of_accuracy(curves), ""]
         report += [*table_of_best(curves), ""]
         plot_accuracy(curves, options.out / "accuracy.svg")
-    if names:
+    if any(name[0] == "C" for name in names):
         plot_calls(steps, options.out / "steps.svg", "One step of a chain")
         plot_calls(derivatives, options.out / "derivatives.svg", "One step of a chain, A and B")
     write_csv(options.out / "results.csv", steps, derivatives, curves)

@@ -3,7 +3,9 @@
 Bodies hang from joints: `parent` (-1 is the world), `pos` of the joint in the parent's frame, `axis`, `mass`,
 centre of mass `com` and diagonal `inertia` about it, in the body's axes. A joint is a hinge unless its `type` says
 `slide`, `ball` or `free`; hinges and slides may have `stiffness` about `rest`, and `damping`. In q0 an orientation
-is a rotation vector, after the place of a free body; in v0 its velocity is in the body's axes. Units are SI.
+is a rotation vector, after the place of a free body; in v0 its velocity is in the body's axes. Robots also have
+the orientation `turn` of a joint in its parent as a quaternion, w first, and products of inertia `Ixy`, `Ixz`, `Iyz`
+after the moments. `rough` are the largest of the torques that change at each step. Units are SI.
 """
 
 import math
@@ -177,26 +179,116 @@ def scaled(m, length, mass):
     return m | dict(bodies=bodies, loops=loops)
 
 
+def ball_tree(n):
+    """Balanced binary tree of n boxes on ball joints, numbered depth first as MuJoCo does."""
+    bodies = []
+
+    def add(heap, parent):
+        pos = [-0.2 if heap % 2 else 0.2, 0.05, -0.2] if heap else [0, 0, 0]
+        bodies.append(ball_box(parent, pos))
+        own = len(bodies) - 1
+        for child in (2 * heap + 1, 2 * heap + 2):
+            if child < n:
+                add(child, own)
+
+    add(0, -1)
+    return moving(f"B{n}", bodies)
+
+
+def ball_chain(n):
+    """n boxes, each on a ball joint at the end of the one before."""
+    return moving(f"K{n}", [ball_box(i - 1, [0, 0, -0.3 if i else 0]) for i in range(n)])
+
+
+def ball_box(parent, pos):
+    inertia = [0.012, 0.010, 0.006]
+    return body(parent, pos, [0, 0, 0], 1.0, [0.01, 0.005, -0.1], inertia, type="ball")
+
+
+def moving(name, bodies):
+    """In a pose and a motion of all joints; a base that floats begins upright."""
+    q0, v0, rough = [], [], []
+    for i, b in enumerate(bodies):
+        size = SIZES[joint_type(b)]
+        q0 += [0.0 if size == 6 else 0.3 * math.sin(1.3 * (i + k)) for k in range(size)]
+        v0 += [0.5 * math.sin(1.7 * (len(v0) + k)) for k in range(size)]
+        rough += [0.0 if size == 6 else 0.05 * GRAVITY * b["mass"]] * size
+    return mechanism(name, bodies, q0, v0) | dict(rough=rough)
+
+
+# Robots of example-robot-data: file, whether the base floats, joints that are held.
+ROBOTS = {
+    "panda": ("panda_description/urdf/panda.urdf", False, ["panda_finger_joint1", "panda_finger_joint2"]),
+    "g1-fixed": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", False, []),
+    "go1": ("go1_description/urdf/go1.urdf", True, []),
+    "anymal": ("anymal_c_simple_description/urdf/anymal.urdf", True, []),
+    "g1": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True, []),
+    "talos": ("talos_data/robots/talos_reduced.urdf", True, []),
+}
+
+
+def robot(name):
+    """A robot as Pinocchio reads it."""
+    import pathlib
+
+    import pinocchio as pin
+
+    path, floats, held = ROBOTS[name]
+    parents = pathlib.Path(pin.__file__).resolve().parents
+    share = "share/example-robot-data/robots"
+    [file] = [p / share / path for p in parents if (p / share / path).exists()]
+    base = [pin.JointModelFreeFlyer()] if floats else []
+    model = pin.buildModelFromUrdf(str(file), *base)
+    if held:
+        held = [model.getJointId(joint) for joint in held]
+        model = pin.buildReducedModel(model, held, pin.neutral(model))
+    bodies = []
+    for i in range(1, model.njoints):
+        place, inertia, kind = model.jointPlacements[i], model.inertias[i], model.joints[i].shortname()
+        turn = pin.Quaternion(place.rotation)
+        about = inertia.inertia
+        joint = dict(turn=[turn.w, turn.x, turn.y, turn.z])
+        axis = [0.0, 0.0, 0.0]
+        if kind == "JointModelFreeFlyer":
+            joint["type"] = "free"
+        elif kind[:-1] in ("JointModelR", "JointModelRUB"):
+            axis["XYZ".index(kind[-1])] = 1.0
+        else:
+            axis = [float(a) for a in model.joints[i].extract().axis]
+        numbers = [about[0, 0], about[1, 1], about[2, 2], about[0, 1], about[0, 2], about[1, 2]]
+        place = [float(x) for x in place.translation]
+        com = [float(x) for x in inertia.lever]
+        bodies.append(
+            body(model.parents[i] - 1, place, axis, float(inertia.mass), com, [*map(float, numbers)], **joint)
+        )
+    return moving(name, bodies)
+
+
 SINGLE = {"P": pendulum, "D": double_pendulum, "S": spherical_pendulum, "L": four_bar}
-FAMILIES = {"C": chain, "H": hanging_chain, "T": tree, "X": scissor}
+FAMILIES = {"B": ball_tree, "K": ball_chain, "C": chain, "H": hanging_chain, "T": tree, "X": scissor}
 
 
 def named(name):
     """The mechanism of that name, for example P or C32."""
+    if name in ROBOTS:
+        return robot(name)
     return SINGLE[name]() if name in SINGLE else FAMILIES[name[0]](int(name[1:]))
 
 
 def text(m):
-    """Numbers alone: bodies, loops, gravity; a line per body; q0; v0."""
+    """Numbers alone: bodies, loops, gravity; a line per body; q0; v0; rough torques."""
     lines = [[len(m["bodies"]), len(m["loops"]), m["gravity"]]]
     for b in m["bodies"]:
-        lines.append([b["parent"], *b["pos"], *b["axis"], b["mass"], *b["com"], *b["inertia"]])
-    lines += [m["q0"], m["v0"]]
+        inertia = [*b["inertia"], 0, 0, 0][:6]
+        lines.append([SIZES[joint_type(b)], b["parent"], *b["pos"], *b.get("turn", [1, 0, 0, 0])])
+        lines[-1] += [*b["axis"], b["mass"], *b["com"], *inertia]
+    lines += [m["q0"], m["v0"], m.get("rough", [0] * len(m["v0"]))]
     return "".join(" ".join(map(repr, line)) + "\n" for line in lines)
 
 
 def mjcf(m):
-    """For MuJoCo: a motor on every hinge and slide; bodies without mass are merged into their children."""
+    """For MuJoCo: a motor on every hinge and slide, and three on a ball where there are rough torques; bodies
+    without mass are merged into their children."""
     children = {i: [] for i in range(-1, len(m["bodies"]))}
     for i, b in enumerate(m["bodies"]):
         children[b["parent"]].append(i)
@@ -212,17 +304,19 @@ def mjcf(m):
 
     def open_bodies(parent):
         for i in children[parent]:
-            lines.append(f'<body pos="{spread(m["bodies"][i]["pos"])}">')
             b = m["bodies"][i]
+            turn = f' quat="{spread(b["turn"])}"' if "turn" in b else ""
+            lines.append(f'<body pos="{spread(b["pos"])}"{turn}>')
             while True:
                 lines.append(joint(i, b))
                 if b["mass"]:
                     break
                 [i] = children[i]
                 b = m["bodies"][i]
-            inertia = [max(entry, LEAST_INERTIA) for entry in b["inertia"]]
+            inertia = [max(entry, LEAST_INERTIA) for entry in b["inertia"][:3]] + b["inertia"][3:]
+            kind = "fullinertia" if len(inertia) > 3 else "diaginertia"
             lines.append(
-                f'<inertial pos="{spread(b["com"])}" mass="{b["mass"]!r}" diaginertia="{spread(inertia)}"/>'
+                f'<inertial pos="{spread(b["com"])}" mass="{b["mass"]!r}" {kind}="{spread(inertia)}"/>'
             )
             for k, loop in enumerate(m["loops"]):
                 for side in "ab":
@@ -233,11 +327,20 @@ def mjcf(m):
 
     open_bodies(-1)
     turns = [joint_type(b) in ("ball", "free") for b in m["bodies"]]
-    motors = "".join(f'<motor joint="j{i}"/>' for i, turn in enumerate(turns) if not turn)
+    rough, motors, at = m.get("rough"), "", 0
+    for i, b in enumerate(m["bodies"]):
+        size = SIZES[joint_type(b)]
+        gears = [[1]] if size == 1 else [[0] * k + [1] + [0] * (2 - k) for k in range(3)]
+        if size == 1 or (size == 3 and rough):
+            for k, gear in enumerate(gears):
+                most = f' user="{rough[at + k]!r}"' if rough else ""
+                motors += f'<motor joint="j{i}" gear="{spread(gear)}"{most}/>'
+        at += size
     q0 = [x for (_, q, _), turn in zip(parts(m), turns) for x in (q[:-3] + quaternion(q[-3:]) if turn else q)]
     connects = "".join(f'<connect site1="a{k}" site2="b{k}"/>' for k in range(len(m["loops"])))
     return f"""<mujoco model="{m["name"]}">
 <compiler angle="radian" autolimits="false" boundmass="0" boundinertia="0"/>
+<size nuser_actuator="1"/>
 <option gravity="0 0 {-m["gravity"]!r}"><flag contact="disable" sensor="disable" autoreset="disable"/></option>
 <worldbody>{"".join(lines)}</worldbody>
 <equality>{connects}</equality>

@@ -182,6 +182,8 @@ const CASES: &[(&str, u64, &[&str])] = &[
     ("scissor-8", 50, PLANT),
     ("scissor-32", 20, PLANT),
     ("marionette", 50, PLANT),
+    ("walker-4", 20, PLANT),
+    ("balls-7", 20, PLANT),
     ("marionette", 10, &["riccati"]),
 ];
 const PLANT: &[&str] = &["step", "linearize", "step-and-linearize", "contract"];

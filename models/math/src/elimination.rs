@@ -18,6 +18,10 @@ pub struct SymbolicElimination {
     descendant_offsets: Vec<usize>,
     /// Proper descendants of each row, and the slots of their entries with it.
     descendants: Vec<(usize, usize)>,
+    /// Row `i` owns `coupled[coupled_offsets[i]..coupled_offsets[i + 1]]`.
+    coupled_offsets: Vec<usize>,
+    /// Ancestors of each row, the row itself, and its descendants.
+    coupled: Vec<usize>,
 }
 
 impl SymbolicElimination {
@@ -45,11 +49,18 @@ impl SymbolicElimination {
             elimination.offsets.push(elimination.ancestors.len());
         }
         elimination.descendant_offsets = vec![0];
+        elimination.coupled_offsets = vec![0];
         for i in 0..n {
             let below = (i + 1..n).filter_map(|j| elimination.slot(j, i).map(|slot| (j, slot)));
             let below: Vec<_> = below.collect();
             elimination.descendants.extend(below);
             elimination.descendant_offsets.push(elimination.descendants.len());
+            let above = elimination.offsets[i]..elimination.offsets[i + 1];
+            elimination.coupled.extend_from_slice(&elimination.ancestors[above]);
+            let below = elimination.descendant_offsets[i];
+            let below = elimination.descendants[below..].iter().map(|(j, _)| *j);
+            elimination.coupled.extend(below);
+            elimination.coupled_offsets.push(elimination.coupled.len());
         }
         elimination
     }
@@ -57,6 +68,11 @@ impl SymbolicElimination {
     /// Proper descendants of a row, and the slots of their entries with it.
     pub fn below(&self, row: usize) -> &[(usize, usize)] {
         &self.descendants[self.descendant_offsets[row]..self.descendant_offsets[row + 1]]
+    }
+
+    /// Ancestors of a row, the row itself, and its descendants, in this order.
+    pub(crate) fn coupled(&self, row: usize) -> &[usize] {
+        &self.coupled[self.coupled_offsets[row]..self.coupled_offsets[row + 1]]
     }
 
     /// Rows.

@@ -1,11 +1,13 @@
 //! Row operations on row-major matrices whose rows are padded to whole blocks.
 
+use std::ops::{Deref, DerefMut};
+
 /// Rows are padded to a multiple of this, and worked on in blocks of it.
 pub const LANES: usize = 8;
 
 /// A block of numbers side by side, so that compilers use whole registers.
 #[derive(Clone, Copy, Debug, Default)]
-#[repr(align(64))]
+#[repr(C, align(64))]
 pub struct Block(pub [f64; LANES]);
 
 impl Block {
@@ -30,6 +32,35 @@ impl Block {
             *entry *= factor;
         }
         Self(product)
+    }
+}
+
+/// Rows that begin with a cache line, so that no block lies in two.
+#[derive(Clone, Debug, Default)]
+pub struct AlignedRows(Vec<Block>);
+
+impl AlignedRows {
+    /// So many numbers, which are whole blocks, all zero.
+    pub fn zeros(len: usize) -> Self {
+        Self(vec![Block::ZERO; len.div_ceil(LANES)])
+    }
+}
+
+impl Deref for AlignedRows {
+    type Target = [f64];
+
+    #[inline(always)]
+    fn deref(&self) -> &[f64] {
+        // SAFETY: a block is eight numbers, and nothing else.
+        unsafe { std::slice::from_raw_parts(self.0.as_ptr().cast(), self.0.len() * LANES) }
+    }
+}
+
+impl DerefMut for AlignedRows {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut [f64] {
+        // SAFETY: a block is eight numbers, and nothing else.
+        unsafe { std::slice::from_raw_parts_mut(self.0.as_mut_ptr().cast(), self.0.len() * LANES) }
     }
 }
 
@@ -72,6 +103,9 @@ fn add_rows_avx2(target: &mut [f64], source: &[f64], stride: usize, terms: &[Ter
 /// hide the latency of an addition.
 #[inline(always)]
 pub fn add_rows_portable(target: &mut [f64], source: &[f64], stride: usize, terms: &[Term]) {
+    if terms.is_empty() {
+        return;
+    }
     let (wide, rest) = target.as_chunks_mut::<{ 4 * LANES }>();
     let mut column = 0;
     for block in wide {

@@ -2,7 +2,7 @@
 //! Featherstone's LTL, without fill-in. O(n·depth²) to factor, O(n·depth) to solve.
 
 use crate::elimination::SymbolicElimination;
-use crate::rows::{Term, add_rows_portable};
+use crate::rows::{LANES, Term, add_rows_portable, padded};
 use crate::simd::{wide, widest};
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
@@ -127,7 +127,6 @@ impl TreeLu {
 
     /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
     /// are whole blocks.
-    #[inline(never)]
     pub fn solve_rows(
         &mut self,
         elimination: &SymbolicElimination,
@@ -135,13 +134,35 @@ impl TreeLu {
         stride: usize,
         columns: usize,
     ) {
+        self.solve_units(elimination, x, stride, columns, columns);
+    }
+
+    /// [`Self::solve_rows`] where the columns from `units` on begin with the identity, of which rows below
+    /// another have nothing but in their own columns; without them, `units` is at least `columns`.
+    #[inline(never)]
+    pub fn solve_units(
+        &mut self,
+        elimination: &SymbolicElimination,
+        x: &mut [f64],
+        stride: usize,
+        columns: usize,
+        units: usize,
+    ) {
         widest!({
+            let first = padded(units).min(columns);
+            let rest = ((units + elimination.len()) / LANES * LANES).clamp(first, columns);
             for i in (0..elimination.len()).rev() {
                 let (row, below) = x[i * stride..].split_at_mut(stride);
-                let terms = elimination.below(i).iter();
+                let terms = elimination.below(i);
+                let Some(&(last, _)) = terms.last() else { continue };
                 self.terms.clear();
-                self.terms.extend(terms.map(|&(j, slot)| (-self.upper[slot], j - i - 1)));
-                add_rows_portable(&mut row[..columns], below, stride, &self.terms);
+                self.terms.extend(terms.iter().map(|&(j, slot)| (-self.upper[slot], j - i - 1)));
+                add_rows_portable(&mut row[..first], below, stride, &self.terms);
+                let own = (units + i) / LANES * LANES;
+                let own = own.clamp(first, rest)..padded(units + last + 1).clamp(first, rest);
+                let source = &below[own.start..];
+                add_rows_portable(&mut row[own], source, stride, &self.terms);
+                add_rows_portable(&mut row[rest..columns], &below[rest..], stride, &self.terms);
             }
             for i in 0..elimination.len() {
                 let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;

@@ -36,6 +36,7 @@ impl Model {
         };
         let others = self.potentials.springs.len() as f64
             + self.forces.as_ref().map_or(0, Forces::coupling) as f64;
+        let balls = 1500.0 * self.orientations.len() as f64;
         let joints = self.dynamics.joints.len() as f64;
         // Of loops.
         let plan = self.loops.as_ref().map(|loops| &loops.plan);
@@ -59,7 +60,7 @@ impl Model {
 
         let stage = |name, times, instructions| StageCost { name, times, instructions };
         let mut stages = vec![
-            stage("evaluation", 3.2, 560.0 + evaluation + 300.0 * others),
+            stage("evaluation", 3.2, 560.0 + evaluation + balls + 300.0 * others),
             stage("factorization", 1.1, 100.0 + factorization),
             stage(
                 "correction",

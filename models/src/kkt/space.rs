@@ -24,7 +24,7 @@
 mod tests;
 
 use plantd_math::rows::Block;
-use plantd_math::simd::widest;
+use plantd_math::simd::{wide, widest};
 use plantd_math::spatial::{Mat3, Vec3};
 use plantd_math::tree_lu::SmallestPivot;
 
@@ -137,6 +137,21 @@ fn inverse(d: &Mat3) -> (Mat3, Vec3) {
     (Mat3(rows).transpose(), Vec3([determinant / minor, minor / z[2], z[2]]))
 }
 
+/// What the axes of a ball joint give to the matrix. Apart from their elimination, with which compilers would
+/// mix it number by number.
+#[inline(never)]
+fn write_generators(
+    step: &Step,
+    mechanics: &Mechanics,
+    first: usize,
+    weights: &Weights,
+    out: &mut [Generators; 3],
+) {
+    wide!({
+        *out = of_ball(&step.parts_of_ball(mechanics, first), weights);
+    });
+}
+
 impl SpatialRecursion {
     pub(crate) fn new(model: &Model) -> Self {
         let joints = model.dynamics.joints.len();
@@ -231,7 +246,8 @@ impl SpatialRecursion {
     ) {
         let joint = &model.dynamics.joints[first];
         let weights = &added.balls[joint.orientation];
-        let generators = of_ball(&step.parts_of_ball(mechanics, first), weights);
+        let generators = &mut [Generators::default(); 3];
+        write_generators(step, mechanics, first, weights, generators);
         let place = self.places[first];
         let (sums, own) = self.sums.split_at_mut(place);
         let own = &mut own[0];
@@ -243,7 +259,7 @@ impl SpatialRecursion {
         let k = step.within_ball(mechanics, model.gravity, first, weights);
         let mut d = k;
         for (column, a_plus) in d.0.iter_mut().zip(&a_plus) {
-            for (entry, generators) in column.0.iter_mut().zip(&generators) {
+            for (entry, generators) in column.0.iter_mut().zip(&*generators) {
                 *entry += dot(&generators.minus, a_plus);
             }
         }

@@ -28,7 +28,7 @@
 use nalgebra::DMatrix;
 use plantd_math::dense_inverse::DenseInverse;
 use plantd_math::pivoted_lu::PivotedLu;
-use plantd_math::rows::{Term, padded, spread};
+use plantd_math::rows::{AlignedRows, Term, padded, spread};
 use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::integrator::report::StepError;
@@ -114,11 +114,11 @@ pub struct Linearization {
     /// Length of a row: the columns of the parameters `(q, p, k)`, padded.
     pub(crate) stride: usize,
     /// `x'`, row-major, nd rows.
-    pub(crate) increment: Vec<f64>,
+    pub(crate) increment: AlignedRows,
     /// `p[k+1]'`, row-major, nd rows.
-    pub(crate) momentum: Vec<f64>,
+    pub(crate) momentum: AlignedRows,
     /// `λ'`, row-major, nc rows.
-    pub(crate) multipliers: Vec<f64>,
+    pub(crate) multipliers: AlignedRows,
     /// How ball joints turn in the step.
     pub(crate) turnings: Vec<Turning>,
     pub(crate) solved: SolvedStep,
@@ -221,9 +221,9 @@ impl Linearization {
             replaced: model.replaced_inputs().collect(),
             at_start: 0.5,
             stride,
-            increment: vec![0.0; d.dynamic * stride],
-            momentum: vec![0.0; d.dynamic * stride],
-            multipliers: vec![0.0; d.constraints * stride],
+            increment: AlignedRows::zeros(d.dynamic * stride),
+            momentum: AlignedRows::zeros(d.dynamic * stride),
+            multipliers: AlignedRows::zeros(d.constraints * stride),
             turnings: Vec::with_capacity(model.orientations.len()),
             solved: SolvedStep::new(model),
         }

@@ -80,6 +80,23 @@ impl<'a> Target<'a> {
         }
     }
 
+    /// Adds `factor` times `count` numbers, `stride` apart, to a column.
+    fn add_column(
+        &mut self,
+        factor: f64,
+        source: &[f64],
+        stride: usize,
+        count: usize,
+        [row, column]: [usize; 2],
+    ) {
+        let (first, step) = match self.layout {
+            Layout::Rows => (row * self.columns + column, self.columns),
+            Layout::Columns => (column * self.rows + row, 1),
+        };
+        let to = self.numbers[first..].iter_mut().step_by(step).take(count);
+        to.zip(source.iter().step_by(stride)).for_each(|(to, entry)| *to += factor * entry);
+    }
+
     /// Multiplies three rows, beginning at `row`, by a matrix.
     fn turn_rows(&mut self, by: &Mat3, row: usize) {
         for column in 0..self.columns {
@@ -144,9 +161,7 @@ impl Linearization {
             for impulse in &self.inputs {
                 let (column, input) = (n + impulse.coordinate, impulse.input);
                 for (rows, first) in [(&self.increment, 0), (&self.momentum, n)] {
-                    for i in 0..nd {
-                        *b.at(first + i, input) += impulse.residual * rows[i * stride + column];
-                    }
+                    b.add_column(impulse.residual, &rows[column..], stride, nd, [first, input]);
                 }
                 *b.at(n + impulse.coordinate, input) += impulse.momentum - impulse.residual;
             }

@@ -38,7 +38,9 @@ impl Workspace {
             || at.model.potentials.couple_branches
             || at.model.forces.is_some();
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
-        self.kkt.tree.solve_rows(&at.model.elimination, &mut out.increment, out.stride, columns);
+        let units = at.model.dimensions.coordinates();
+        let elimination = &at.model.elimination;
+        self.kkt.tree.solve_units(elimination, &mut out.increment, out.stride, columns, units);
         if d.constraints > 0 {
             self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
@@ -203,7 +205,7 @@ impl Workspace {
     /// `out.momentum`.
     pub(crate) fn differentiate_momentum(&mut self, at: StepContext<'_>, out: &mut Linearization) {
         widest!({
-            for x in &mut out.increment {
+            for x in out.increment.iter_mut() {
                 *x = -*x;
             }
             let model = at.model;
@@ -218,14 +220,12 @@ impl Workspace {
                 let stiffness = &self.tangents.stiffness[i * nd..][..nd];
                 target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
                 let slopes = &self.tangents.end_slopes[i * nd..][..nd];
-                let elimination = &model.elimination;
-                let above = elimination.offsets[i]..elimination.offsets[i + 1];
-                let coupled = elimination.ancestors[above].iter().copied();
-                let coupled = coupled.chain(elimination.below(i).iter().map(|(j, _)| *j));
                 self.tangents.terms.clear();
-                self.tangents
-                    .terms
-                    .extend(coupled.map(|j| (slopes[j], j)).filter(|(slope, _)| *slope != 0.0));
+                for &j in model.elimination.coupled(i) {
+                    if slopes[j] != 0.0 {
+                        self.tangents.terms.push((slopes[j], j));
+                    }
+                }
                 add_rows_portable(target, &out.increment, stride, &self.tangents.terms);
             }
             for (c, constraint) in model.constraints.iter().enumerate() {

@@ -30,6 +30,15 @@ static double cpu_seconds(void) {
   return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
+// Between -1 and 1: the same in all drivers, whatever they are written in.
+static double rough_number(long step, long motor) {
+  unsigned x = (unsigned)step * 2654435761u + (unsigned)motor * 40503u + 1u;
+  x = (x ^ (x >> 15)) * 2246822519u;
+  x = (x ^ (x >> 13)) * 3266489917u;
+  x ^= x >> 16;
+  return (double)x * (2.0 / 4294967296.0) - 1.0;
+}
+
 static void answer(double seconds, const double *q, int n) {
   printf("%.9e", seconds);
   for (int i = 0; i < n; ++i) printf(" %.17g", q[i]);

@@ -1,6 +1,6 @@
 // MuJoCo: `mj_step` with its integrators, and finite differences of it.
 //
-// Methods: `euler`, `implicitfast`, `rk4`, `euler-ab`.
+// Methods: `euler`, `implicitfast`, `rk4`, `euler-ab`; with `-rough`, new torques at each step.
 
 #include <stdlib.h>
 
@@ -10,8 +10,8 @@
 
 static int integrator(const char *method) {
   if (!strncmp(method, "euler", 5)) return mjINT_EULER;
-  if (!strcmp(method, "implicitfast")) return mjINT_IMPLICITFAST;
-  if (!strcmp(method, "rk4")) return mjINT_RK4;
+  if (!strncmp(method, "implicitfast", 12)) return mjINT_IMPLICITFAST;
+  if (!strncmp(method, "rk4", 3)) return mjINT_RK4;
   return -1;
 }
 
@@ -43,7 +43,8 @@ int main(void) {
     }
     m->opt.integrator = integrator(c.method);
     m->opt.timestep = c.dt;
-    const int derivatives = !strcmp(c.method, "euler-ab");
+    const int derivatives = !strncmp(c.method, "euler-ab", 8);
+    const int rough = strstr(c.method, "-rough") != NULL && m->nuser_actuator > 0;
     const size_t n = (size_t)m->nv;
     double *A = derivatives ? malloc(4 * n * n * sizeof(double)) : NULL;
     double *B = derivatives ? malloc(2 * n * (size_t)m->nu * sizeof(double)) : NULL;
@@ -51,6 +52,7 @@ int main(void) {
     for (long pass = 0; pass < c.passes; ++pass) {
       mj_resetDataKeyframe(m, d, 0);
       for (long k = 0; k < c.steps; ++k) {
+        for (int i = 0; rough && i < m->nu; ++i) d->ctrl[i] = m->actuator_user[i] * rough_number(k, i);
         if (derivatives) mjd_transitionFD(m, d, 1e-6, 0, A, B, NULL, NULL);
         mj_step(m, d);
       }

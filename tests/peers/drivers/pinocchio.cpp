@@ -1,7 +1,8 @@
 // Pinocchio: ABA with semi-implicit Euler, Runge-Kutta 4 and DOP853, and the analytic derivatives of the
 // semi-implicit Euler map. Header-only, so that everything is compiled for this processor.
 //
-// Methods: `euler`, `rk4`, `dop853:TOLERANCE` (DT is the whole time then), `euler-ab`.
+// Methods: `euler`, `rk4`, `dop853:TOLERANCE` (DT is the whole time then), `euler-ab`; `euler` and `euler-ab`
+// also with `-rough`, new torques at each step. Of ball and free joints A is by turns in the body's axes.
 
 #include <cmath>
 #include <cstdlib>
@@ -10,9 +11,11 @@
 #include <memory>
 #include <stdexcept>
 #include <string>
+#include <vector>
 
 #include <pinocchio/algorithm/aba-derivatives.hpp>
 #include <pinocchio/algorithm/aba.hpp>
+#include <pinocchio/algorithm/joint-configuration.hpp>
 #include <pinocchio/multibody.hpp>
 
 #include "dop853.h"  // A, B, C, E3, E5 of the pair, written by compare.py
@@ -26,7 +29,10 @@ using Eigen::VectorXd;
 struct Mechanism {
   pinocchio::Model model;
   std::unique_ptr<pinocchio::Data> data;
-  VectorXd q0, v0, tau;
+  VectorXd q0, v0, tau, rough;
+  // Joints that turn as no coordinates do, and the first velocity that has a motor.
+  std::vector<pinocchio::JointIndex> groups;
+  int first_motor = 0;
 
   explicit Mechanism(const std::string &path) {
     std::ifstream in(path);
@@ -35,31 +41,69 @@ struct Mechanism {
     if (!(in >> n >> loops >> gravity)) throw std::runtime_error("no mechanism");
     if (loops != 0) throw std::runtime_error("loops are not driven");
     model.gravity.linear() = Eigen::Vector3d(0, 0, -gravity);
+    std::vector<int> sizes;
     for (int i = 0; i < n; ++i) {
-      int parent;
+      int parent, size;
       double mass;
-      Eigen::Vector3d at, axis, com, inertia;
-      in >> parent >> at[0] >> at[1] >> at[2] >> axis[0] >> axis[1] >> axis[2] >> mass;
-      in >> com[0] >> com[1] >> com[2] >> inertia[0] >> inertia[1] >> inertia[2];
-      const pinocchio::SE3 place(Eigen::Matrix3d::Identity(), at);
+      Eigen::Vector3d at, axis, com;
+      Eigen::Quaterniond turn;
+      Eigen::Matrix3d about_com;
+      in >> size >> parent >> at[0] >> at[1] >> at[2];
+      in >> turn.w() >> turn.x() >> turn.y() >> turn.z();
+      in >> axis[0] >> axis[1] >> axis[2] >> mass >> com[0] >> com[1] >> com[2];
+      for (const auto &[row, column] : {std::pair(0, 0), {1, 1}, {2, 2}, {0, 1}, {0, 2}, {1, 2}}) {
+        in >> about_com(row, column);
+        about_com(column, row) = about_com(row, column);
+      }
+      const pinocchio::SE3 place(turn.normalized().toRotationMatrix(), at);
       const std::string name = std::to_string(i);
       pinocchio::JointIndex joint;
-      if (axis[0] == 1) {
+      if (size == 6) {
+        joint = model.addJoint(parent + 1, pinocchio::JointModelFreeFlyer(), place, name);
+        first_motor = 6;
+      } else if (size == 3) {
+        joint = model.addJoint(parent + 1, pinocchio::JointModelSpherical(), place, name);
+      } else if (axis[0] == 1) {
         joint = model.addJoint(parent + 1, pinocchio::JointModelRX(), place, name);
       } else if (axis[1] == 1) {
         joint = model.addJoint(parent + 1, pinocchio::JointModelRY(), place, name);
-      } else {
+      } else if (axis[2] == 1) {
         joint = model.addJoint(parent + 1, pinocchio::JointModelRZ(), place, name);
+      } else {
+        const pinocchio::JointModelRevoluteUnaligned unaligned(axis);
+        joint = model.addJoint(parent + 1, unaligned, place, name);
       }
-      const Eigen::Matrix3d about_com = inertia.asDiagonal();
+      if (size > 1) groups.push_back(joint);
+      sizes.push_back(size);
       model.appendBodyToJoint(joint, pinocchio::Inertia(mass, com, about_com), pinocchio::SE3::Identity());
     }
-    q0.resize(n);
-    v0.resize(n);
-    for (double &q : q0) in >> q;
+    q0.resize(model.nq);
+    v0.resize(model.nv);
+    rough.resize(model.nv);
+    int at = 0;
+    for (int size : sizes) {
+      if (size == 6) {
+        for (int k = 0; k < 3; ++k) in >> q0[at++];
+      }
+      if (size == 1) {
+        in >> q0[at++];
+      } else {
+        Eigen::Vector3d turn;
+        in >> turn[0] >> turn[1] >> turn[2];
+        Eigen::Quaterniond quaternion(Eigen::AngleAxisd(turn.norm(), turn.norm() > 0 ? turn.normalized() : Eigen::Vector3d::UnitX()));
+        q0.segment<4>(at) = quaternion.coeffs();
+        at += 4;
+      }
+    }
     for (double &v : v0) in >> v;
+    for (double &r : rough) in >> r;
     if (!in) throw std::runtime_error("a mechanism breaks off");
-    tau = VectorXd::Zero(n);
+    if (first_motor == 6) {
+      // The velocity of a free body is along the world's axes in the file.
+      const Eigen::Quaterniond turn(q0[6], q0[3], q0[4], q0[5]);
+      v0.head<3>() = turn.inverse() * v0.head<3>().eval();
+    }
+    tau = VectorXd::Zero(model.nv);
     data = std::make_unique<pinocchio::Data>(model);
   }
 };
@@ -67,16 +111,49 @@ struct Mechanism {
 class Run {
 public:
   explicit Run(Mechanism &mechanism)
-      : m_(mechanism), n_(int(m_.q0.size())), q(m_.q0), v(m_.v0), A(2 * n_, 2 * n_), B(2 * n_, n_),
-        dq_(n_, n_), dv_(n_, n_), minverse_(n_, n_), y_(2 * n_), stage_(2 * n_), scale_(2 * n_),
-        k_(2 * n_, 13) {}
+      : m_(mechanism), n_(m_.model.nv), q(m_.q0), v(m_.v0), A(2 * n_, 2 * n_),
+        B(2 * n_, n_ - m_.first_motor), dq_(n_, n_), dv_(n_, n_), minverse_(n_, n_), y_(2 * n_),
+        stage_(2 * n_), scale_(2 * n_), k_(2 * n_, 13), by_q_(MatrixXd::Zero(n_, n_)),
+        by_v_(MatrixXd::Zero(n_, n_)), step_(n_) {}
+
+  // The same torques as in all drivers.
+  void draw(long step) {
+    for (int i = m_.first_motor; i < n_; ++i) {
+      m_.tau[i] = m_.rough[i] * rough_number(step, i - m_.first_motor);
+    }
+  }
 
   void euler(double h) {
     v.noalias() += h * acceleration(q, v);
-    q.noalias() += h * v;
+    move(h);
+  }
+
+  // Stages of ball and free joints are velocities of the turn since the start of the step. To compare
+  // configurations with: its dense solutions are not made to be timed.
+  void rk4_on_groups(double h) {
+    const VectorXd q_start = q, v_start = v;
+    static const double node[3] = {0.5, 0.5, 1.0};
+    VectorXd turn = VectorXd::Zero(n_), velocity = v;
+    MatrixXd back = MatrixXd::Identity(n_, n_);
+    for (int s = 0; s < 4; ++s) {
+      step_ = turn;
+      q = pinocchio::integrate(m_.model, q_start, step_);
+      // How the turn changes: velocity = J turn'.
+      pinocchio::dIntegrate(m_.model, q_start, step_, back, pinocchio::ARG1);
+      k_.col(s).head(n_) = back.partialPivLu().solve(velocity);
+      k_.col(s).tail(n_) = acceleration(q, velocity);
+      if (s < 3) {
+        turn = h * node[s] * k_.col(s).head(n_);
+        velocity = v_start + h * node[s] * k_.col(s).tail(n_);
+      }
+    }
+    y_ = (h / 6) * (k_.col(0) + 2 * k_.col(1) + 2 * k_.col(2) + k_.col(3));
+    q = pinocchio::integrate(m_.model, q_start, y_.head(n_));
+    v = v_start + y_.tail(n_);
   }
 
   void rk4(double h) {
+    if (!m_.groups.empty()) return rk4_on_groups(h);
     y_ << q, v;
     static const double node[3] = {0.5, 0.5, 1.0};
     stage_ = y_;
@@ -99,10 +176,11 @@ public:
     A.topLeftCorner(n_, n_) = h * A.bottomLeftCorner(n_, n_);
     A.topLeftCorner(n_, n_).diagonal().array() += 1;
     A.topRightCorner(n_, n_) = h * A.bottomRightCorner(n_, n_);
-    B.bottomRows(n_) = h * minverse_;
+    B.bottomRows(n_) = h * minverse_.rightCols(n_ - m_.first_motor);
     B.topRows(n_) = h * B.bottomRows(n_);
     v.noalias() += h * m_.data->ddq;
-    q.noalias() += h * v;
+    turn_derivatives(h);
+    move(h);
   }
 
   // Hairer, Nørsett, Wanner: Solving Ordinary Differential Equations I, II.5.
@@ -144,6 +222,41 @@ public:
   }
 
 private:
+  void move(double h) {
+    if (m_.groups.empty()) {
+      q.noalias() += h * v;
+      return;
+    }
+    step_.noalias() = h * v;
+    pinocchio::integrate(m_.model, q, step_, next_);
+    q.swap(next_);
+  }
+
+  // The rows of ball and free joints, by their turns at the start and by their velocities.
+  void turn_derivatives(double h) {
+    if (m_.groups.empty()) return;
+    step_.noalias() = h * v;
+    pinocchio::dIntegrate(m_.model, q, step_, by_q_, pinocchio::ARG0);
+    pinocchio::dIntegrate(m_.model, q, step_, by_v_, pinocchio::ARG1);
+    for (pinocchio::JointIndex joint : m_.groups) {
+      const int i = m_.model.joints[joint].idx_v(), size = m_.model.joints[joint].nv();
+      if (size == 6) {
+        turn_rows<6>(i);
+      } else {
+        turn_rows<3>(i);
+      }
+    }
+  }
+
+  template <int size>
+  void turn_rows(int i) {
+    const Eigen::Matrix<double, size, size> by_v = by_v_.block<size, size>(i, i);
+    A.block<size, size>(i, i).diagonal().array() -= 1;
+    A.middleRows<size>(i) = by_v * A.middleRows<size>(i).eval();
+    A.block<size, size>(i, i) += by_q_.block<size, size>(i, i);
+    B.middleRows<size>(i) = by_v * B.middleRows<size>(i).eval();
+  }
+
   const VectorXd &acceleration(const VectorXd &at, const VectorXd &velocity) {
     return pinocchio::aba(m_.model, *m_.data, at, velocity, m_.tau, pinocchio::Convention::WORLD);
   }
@@ -165,11 +278,15 @@ public:
 private:
   MatrixXd dq_, dv_, minverse_;
   VectorXd y_, stage_, scale_, at_, velocity_;
-  MatrixXd k_;
+  MatrixXd k_, by_q_, by_v_;
+  VectorXd step_, next_ = VectorXd(m_.model.nq);
 };
 
 void serve(const command &c, Mechanism &mechanism) {
-  const std::string method = c.method;
+  std::string method = c.method;
+  const bool rough = method.size() > 6 && method.substr(method.size() - 6) == "-rough";
+  if (rough) method.resize(method.size() - 6);
+  mechanism.tau.setZero();
   Run run(mechanism);
   const bool adaptive = method.rfind("dop853:", 0) == 0;
   const double tolerance = adaptive ? std::atof(c.method + 7) : 0;
@@ -180,11 +297,17 @@ void serve(const command &c, Mechanism &mechanism) {
     if (adaptive) {
       run.dop853(c.dt * double(c.steps), tolerance);
     } else if (method == "euler") {
-      for (long k = 0; k < c.steps; ++k) run.euler(c.dt);
+      for (long k = 0; k < c.steps; ++k) {
+        if (rough) run.draw(k);
+        run.euler(c.dt);
+      }
     } else if (method == "rk4") {
       for (long k = 0; k < c.steps; ++k) run.rk4(c.dt);
     } else if (method == "euler-ab") {
-      for (long k = 0; k < c.steps; ++k) run.euler_and_derivatives(c.dt);
+      for (long k = 0; k < c.steps; ++k) {
+        if (rough) run.draw(k);
+        run.euler_and_derivatives(c.dt);
+      }
     } else {
       throw std::runtime_error("no such method");
     }
