@@ -27,6 +27,14 @@ time.sleep(600)
 """
 
 
+@pytest.fixture(autouse=True)
+def over_connections_only(request):
+    """A server in this process has no shared memory."""
+    case = getattr(request.node, "callspec", None)
+    if case is not None and case.params.get("client") == "local":
+        pytest.skip("a server in this process has no shared memory")
+
+
 @pytest.fixture
 def connect(client):
     """Makes a plant with an open link; gives its id and what connects a driver to it."""

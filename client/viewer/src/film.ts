@@ -7,6 +7,9 @@ import { app } from "./state.js";
 /** What is filmed stands still or has stopped when nothing new comes for so long, ms. */
 const PATIENCE_MS = 15_000;
 
+/** Times of a film at which it is looked how far the mechanism reaches. */
+const PLACES = 60;
+
 /** What a film is made from. */
 export interface Source {
   view: View;
@@ -46,6 +49,16 @@ export function films({ view, history, recorded, show }: Source): void {
           if (moments.length !== seen) [since, seen] = [performance.now(), moments.length];
           else if (performance.now() - since > PATIENCE_MS) throw new Error(trouble || (first ? "the plant stands still" : "the page shows nothing"));
         }
+      },
+      /** Puts the camera where all that happens between two times, s, is seen. */
+      frame(from: number, until: number): void {
+        show(from);
+        const box = view.extent;
+        for (let place = 1; place <= PLACES; place++) {
+          show(from + ((until - from) * place) / PLACES);
+          box.union(view.extent);
+        }
+        view.home(box);
       },
       /** Turns the camera to the right and up, rad, and brings it nearer by a factor. */
       look(right: number, up: number, zoom: number): void {

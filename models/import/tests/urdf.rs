@@ -286,7 +286,7 @@ fn floating_joints() {
       <joint name="tail" type="floating"><parent link="kite"/><child link="ribbon"/><origin xyz="0 0 -1"/></joint>
       <link name="ribbon"><inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial></link>
     </robot>"#;
-    let mut plant = plant(&import(text, &Options::default()).unwrap().scene);
+    let plant = plant(&import(text, &Options::default()).unwrap().scene);
     let q = plant.q().to_vec();
     assert!(q[..6].iter().zip([1.0, 2.0, 3.0, 0.0, 0.4, 0.0]).all(|(a, b)| (a - b).abs() < 1e-15));
     assert_eq!(q[6..], [0.0; 6]);

@@ -98,7 +98,7 @@ async fn a_search_reports_each_iteration_and_finds_a_motion_of_the_plant() {
     let checkpoint = result.checkpoint.unwrap();
     let found = checkpoint.trajectory.unwrap();
     for state in [found.initial.as_ref(), checkpoint.initial_reference.as_ref()] {
-        assert_has_velocity(&client, "cart-pole", state.unwrap()).await;
+        assert_has_velocity(&client, &swing_up().model, state.unwrap()).await;
     }
     let case = v1::RolloutCase {
         initial: Some(v1::InitialState {

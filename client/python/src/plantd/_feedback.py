@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import grpc
 import numpy.typing as npt
 
 from plantd.v1 import plant_service_pb2
@@ -17,7 +16,7 @@ from plantd.v1 import plant_service_pb2
 from ._arrays import Array, Vector, failure_text
 from ._calls import Calls
 from ._check import build, one_of, shown
-from ._errors import PlantdError, from_rpc_error
+from ._errors import PlantdError, translated
 from ._gains import Gain
 from ._requests import (
     Bounds,
@@ -175,18 +174,19 @@ class Follower:
 
     def _read(self, call: Any) -> None:
         try:
-            for message in call:
-                with self._changed:
-                    if call is not self._stream:
-                        return
-                    self._note(message)
-                    self._changed.notify_all()
-                    self._changed.wait_for(
-                        lambda: self._closed or call is not self._stream or self._has_room()
-                    )
+            with translated():
+                for message in call:
+                    with self._changed:
+                        if call is not self._stream:
+                            return
+                        self._note(message)
+                        self._changed.notify_all()
+                        self._changed.wait_for(
+                            lambda: self._closed or call is not self._stream or self._has_room()
+                        )
             end = PlantdError("UNAVAILABLE", "the server closed the stream")
-        except grpc.RpcError as error:
-            end = from_rpc_error(error)
+        except PlantdError as error:
+            end = error
         with self._changed:
             if call is self._stream:
                 self._end = end

@@ -198,19 +198,25 @@ export class View {
     this.controls.target.add(shift);
   }
 
-  /** Puts the camera where the whole mechanism is seen: from the side if it moves in a plane, else from above. */
-  home(): void {
-    const figure = this.#figure;
-    if (!figure) return;
-    this.scene.updateMatrixWorld(true);
+  /** The box that the mechanism fills. */
+  get extent(): Box3 {
     const box = new Box3();
+    const figure = this.#figure;
+    if (!figure) return box;
+    this.scene.updateMatrixWorld(true);
     const point = new Vector3();
     for (const group of figure.frames) {
       box.expandByPoint(point.setFromMatrixPosition(group.matrixWorld));
       for (const child of group.children) if (child.type !== "AxesHelper") box.expandByObject(child);
     }
     if (box.isEmpty()) box.expandByPoint(point.set(0, 0, 0));
-    box.union(new Box3().setFromObject(figure.lines.rods));
+    return box.union(new Box3().setFromObject(figure.lines.rods));
+  }
+
+  /** Puts the camera where a whole box is seen: from the side if it is flat, else from above. */
+  home(box = this.extent): void {
+    const figure = this.#figure;
+    if (!figure) return;
     const extent = box.getSize(new Vector3());
     const size = figure.drawing.sizeM || extent.length() || 1;
     const center = box.getCenter(new Vector3());

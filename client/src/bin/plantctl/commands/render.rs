@@ -201,6 +201,8 @@ impl Render {
         let asked = self.duration.unwrap_or(if kind == Kind::Gif { f64::INFINITY } else { 0.0 });
         let duration = asked.min(last - from);
         self.check_pictures(duration)?;
+        let frame = format!("plantdFilm.frame({from}, {})", from + duration);
+        tab.evaluate(&frame, PICTURE).await?;
         let (right, up) = self.turn;
         let look =
             format!("plantdFilm.look({}, {}, {})", right.to_radians(), up.to_radians(), self.zoom);
