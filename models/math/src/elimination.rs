@@ -71,7 +71,7 @@ impl SymbolicElimination {
     }
 
     /// Ancestors of a row, the row itself, and its descendants, in this order.
-    pub(crate) fn coupled(&self, row: usize) -> &[usize] {
+    pub fn coupled(&self, row: usize) -> &[usize] {
         &self.coupled[self.coupled_offsets[row]..self.coupled_offsets[row + 1]]
     }
 

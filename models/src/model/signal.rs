@@ -1,6 +1,6 @@
 //! Signals: functions of time that drive inputs and prescribed coordinates.
 
-use plantd_scene::{TimeFunction, self as scene};
+use plantd_scene::{self as scene, TimeFunction};
 
 /// A signal with what it drives.
 #[derive(Clone, Debug)]
