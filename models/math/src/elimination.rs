@@ -76,7 +76,7 @@ impl SymbolicElimination {
     }
 
     /// Rows.
-    pub fn len(&self) -> usize {
+    pub fn rows(&self) -> usize {
         self.offsets.len() - 1
     }
 

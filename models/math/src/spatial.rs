@@ -292,7 +292,7 @@ pub struct Force<S = f64> {
 impl<S: Scalar> Force<S> {
     /// The sum.
     #[inline(always)]
-    pub fn add(self, o: Self) -> Self {
+    pub fn plus(self, o: Self) -> Self {
         Self { n: self.n + o.n, f: self.f + o.f }
     }
 

@@ -47,9 +47,9 @@ impl TreeLu {
         Self {
             upper: vec![0.0; elimination.entries()],
             lower: vec![0.0; elimination.entries()],
-            inverse_pivot: vec![0.0; elimination.len()],
-            reference: vec![0.0; elimination.len()],
-            terms: Vec::with_capacity(elimination.len()),
+            inverse_pivot: vec![0.0; elimination.rows()],
+            reference: vec![0.0; elimination.rows()],
+            terms: Vec::with_capacity(elimination.rows()),
         }
     }
 
@@ -95,7 +95,7 @@ impl TreeLu {
                 *reference = self.upper[end - 1].abs().max(scale * factor);
             }
             let mut smallest = SmallestPivot::NONE;
-            for k in (0..elimination.len()).rev() {
+            for k in (0..elimination.rows()).rev() {
                 let start = elimination.offsets[k];
                 let ancestors = &elimination.ancestors[start..elimination.offsets[k + 1] - 1];
                 let depth = ancestors.len();
@@ -150,8 +150,8 @@ impl TreeLu {
     ) {
         widest!({
             let first = padded(units).min(columns);
-            let rest = ((units + elimination.len()) / LANES * LANES).clamp(first, columns);
-            for i in (0..elimination.len()).rev() {
+            let rest = ((units + elimination.rows()) / LANES * LANES).clamp(first, columns);
+            for i in (0..elimination.rows()).rev() {
                 let (row, below) = x[i * stride..].split_at_mut(stride);
                 let terms = elimination.below(i);
                 let Some(&(last, _)) = terms.last() else { continue };
@@ -164,7 +164,7 @@ impl TreeLu {
                 add_rows_portable(&mut row[own], source, stride, &self.terms);
                 add_rows_portable(&mut row[rest..columns], &below[rest..], stride, &self.terms);
             }
-            for i in 0..elimination.len() {
+            for i in 0..elimination.rows() {
                 let range = elimination.offsets[i]..elimination.offsets[i + 1] - 1;
                 let (above, row) = x.split_at_mut(i * stride);
                 let row = &mut row[..columns];
@@ -181,7 +181,7 @@ impl TreeLu {
     /// Solves `K x = b` in place.
     #[inline(never)]
     pub fn solve(&self, elimination: &SymbolicElimination, x: &mut [f64]) {
-        for k in (0..elimination.len()).rev() {
+        for k in (0..elimination.rows()).rev() {
             let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
             let value = x[k];
             for (&ancestor, u) in
@@ -190,7 +190,7 @@ impl TreeLu {
                 x[ancestor] -= u * value;
             }
         }
-        for k in 0..elimination.len() {
+        for k in 0..elimination.rows() {
             let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
             let mut value = x[k];
             for (&ancestor, l) in
@@ -219,7 +219,7 @@ mod tests {
 
     /// A diagonally dominant matrix on the pattern, with the dense one that it stands for.
     fn matrix(elimination: &SymbolicElimination) -> (TreeLu, DMatrix<f64>) {
-        let n = elimination.len();
+        let n = elimination.rows();
         let (mut lu, mut dense) = (TreeLu::new(elimination), DMatrix::zeros(n, n));
         for row in 0..n {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
@@ -237,7 +237,7 @@ mod tests {
     fn a_solution_satisfies_the_dense_system() {
         let elimination = elimination();
         let (mut lu, dense) = matrix(&elimination);
-        let b = DVector::from_fn(elimination.len(), |i, _| (i as f64).cos());
+        let b = DVector::from_fn(elimination.rows(), |i, _| (i as f64).cos());
         let mut x = b.as_slice().to_vec();
         assert!(lu.factor(&elimination, &[0.0; 8], 1.0).relative > 0.1);
         lu.solve(&elimination, &mut x);
@@ -249,7 +249,7 @@ mod tests {
         let elimination = elimination();
         let (mut lu, _) = matrix(&elimination);
         lu.factor(&elimination, &[0.0; 8], 1.0);
-        let (n, stride) = (elimination.len(), 24);
+        let (n, stride) = (elimination.rows(), 24);
         let mut rows: Vec<f64> = (0..n * stride).map(|i| (i as f64).sin()).collect();
         for column in 0..stride {
             let mut single: Vec<f64> =

@@ -116,7 +116,7 @@ impl<S: Scalar> Curvature<S> {
                 forces[i] = composite.momentum(axis);
                 rates[i] = axis
                     .cross_force(momenta.momentum[i])
-                    .add(composite.momentum(momenta.axis_rate[i]));
+                    .plus(composite.momentum(momenta.axis_rate[i]));
             }
         })
     }

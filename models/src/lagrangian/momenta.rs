@@ -64,7 +64,7 @@ impl<S: Scalar> Momenta<S> {
                 let (momentum, moment) = (momenta[i], moments[i]);
                 if joint.parent != WORLD {
                     let parent = joint.parent;
-                    momenta[parent] = momenta[parent].add(momentum);
+                    momenta[parent] = momenta[parent].plus(momentum);
                     moments[parent] += moment;
                 }
                 if let Some(l_v) = l_v.get_mut(joint.coordinate) {
@@ -147,7 +147,7 @@ impl Momenta {
         let mut totals = Totals::default();
         for (i, joint) in tree.joints.iter().enumerate().filter(|(i, j)| j.root == *i) {
             let (Force { n, f }, origin) = (self.momentum[i], poses.origin[i]);
-            totals.momentum = totals.momentum.add(Force { n: n + origin.cross(f), f });
+            totals.momentum = totals.momentum.plus(Force { n: n + origin.cross(f), f });
             totals.moment += self.moment[i] + origin * joint.subtree_mass;
             totals.mass += joint.subtree_mass;
         }
