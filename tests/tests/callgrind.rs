@@ -33,7 +33,7 @@ const DAMPING: &[&str] = &["lagrangian::forces::add_damping"];
 const INPUTS: &[&str] = &["lagrangian::forces::input_forces"];
 const FORCES: &[&str] =
     &["Forces::", "forces::wrench::", "forces::point::", "forces::coordinate::"];
-const SIGNALS: &[&str] = &["model::signal::"];
+const SIGNALS: &[&str] = &["model::signal::", "time_function::"];
 const BALLS: &[&str] = &["integrator::balls::", "math::rotation::", "integrator::blocks::"];
 
 /// A pendulum without anything else.
