@@ -9,7 +9,22 @@ pub fn larger(a: f64, b: f64) -> f64 {
 }
 
 /// The largest magnitude of some numbers; NaN if one is not finite.
+#[inline]
 pub fn largest(numbers: &[f64]) -> f64 {
+    // Four sums side by side cost a pendulum a twentieth of its step.
+    if numbers.len() >= 4 {
+        return largest_of_many(numbers);
+    }
+    let (mut most, mut sum) = (0.0, 0.0);
+    for number in numbers {
+        let size = number.abs();
+        most = if size > most { size } else { most };
+        sum += size;
+    }
+    if sum < f64::INFINITY { most } else { f64::NAN }
+}
+
+fn largest_of_many(numbers: &[f64]) -> f64 {
     let (blocks, rest) = numbers.as_chunks::<4>();
     let (mut most, mut sum) = ([0.0_f64; 4], [0.0_f64; 4]);
     let mut see = |i: usize, number: f64| {
