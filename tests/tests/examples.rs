@@ -20,8 +20,7 @@ fn example(name: &str) -> PathBuf {
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
         let status = Command::new(cargo)
             .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .args(["build", "--quiet", "--bins", "--examples"])
-            .args(["-p", "plantd-server", "-p", "plantd-client", "-p", env!("CARGO_PKG_NAME")])
+            .args(["build", "--quiet", "--workspace", "--bins", "--examples"])
             .args(["--profile", profile, "--target-dir"])
             .arg(directory.parent().unwrap())
             .status()
