@@ -77,6 +77,8 @@ def test_where_the_program_is_looked_for(program, monkeypatch, tmp_path):
     monkeypatch.delenv("PLANTD")
     with pytest.raises(plantd.PlantdError, match="`program` names `nowhere`, which is no program"):
         plantd.launch("nowhere")
+    # The installed package may have brought one.
+    monkeypatch.setattr("plantd._launch._places", lambda: iter([tmp_path / "plantd"]))
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(plantd.PlantdError, match="there is no program `plantd` in PATH.*cargo build"):
         plantd.launch()
