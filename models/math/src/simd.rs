@@ -20,7 +20,7 @@ macro_rules! wide {
                     block()
                 }
                 #[cfg(target_arch = "x86_64")]
-                if $crate::simd::registers() >= $crate::simd::$registers {
+                if $crate::simd::has($crate::simd::$registers) {
                     // SAFETY: the processor has the feature.
                     return unsafe { $wider(block) };
                 }
@@ -51,13 +51,11 @@ pub const AVX512: u8 = 3;
 /// The widest registers that blocks may use; 0 until the processor has been asked.
 static REGISTERS: AtomicU8 = AtomicU8::new(0);
 
-/// The widest registers that blocks may use: those that the processor has, but within [`narrowly`].
+/// Whether blocks may use these registers: the processor has them, and it is not within [`narrowly`].
 #[inline(always)]
-pub fn registers() -> u8 {
-    match REGISTERS.load(Ordering::Relaxed) {
-        0 => ask_the_processor(),
-        known => known,
-    }
+pub fn has(registers: u8) -> bool {
+    let widest = REGISTERS.load(Ordering::Relaxed);
+    widest >= registers || (widest == 0 && ask_the_processor() >= registers)
 }
 
 #[cold]
@@ -78,7 +76,7 @@ fn ask_the_processor() -> u8 {
 
 /// Runs the code for all processors, in all threads: for tests that compare it with the wider code.
 pub fn narrowly<R>(run: impl FnOnce() -> R) -> R {
-    let before = registers();
+    let before = ask_the_processor();
     REGISTERS.store(PORTABLE, Ordering::Relaxed);
     let result = run();
     REGISTERS.store(before, Ordering::Relaxed);
