@@ -45,8 +45,10 @@ def test_a_server_ends_with_its_object(program):
     assert ended(pid)
 
 
+# Whoever starts the tests may ignore Ctrl-C, which is inherited.
 SCRIPT = """
-import sys, time, plantd
+import signal, sys, time, plantd
+signal.signal(signal.SIGINT, signal.default_int_handler)
 client = plantd.launch(sys.argv[1])
 print(client.server.pid, flush=True)
 if sys.argv[2] == "return":
