@@ -236,8 +236,11 @@ def test_a_forked_process_makes_its_own():
     subprocess.run([sys.executable, "-c", FORKED], check=True, timeout=60)
 
 
+# Whoever starts the tests may ignore Ctrl-C, which is inherited.
 INTERRUPTED = """
+import signal
 import plantd
+signal.signal(signal.SIGINT, signal.default_int_handler)
 client = plantd.local()
 plant = client.create_plant("pendulum")
 print("waiting", flush=True)
