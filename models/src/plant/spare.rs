@@ -40,11 +40,6 @@ impl Spare {
         &self.0
     }
 
-    /// The settings.
-    pub fn settings(&self) -> &Settings {
-        self.0.settings()
-    }
-
     /// The plant in a state, step 0.
     pub fn start(mut self, initial: &Initial) -> Result<Plant, InitialError> {
         self.0.initialize(initial)?;

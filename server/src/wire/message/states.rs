@@ -79,7 +79,7 @@ pub fn plant_state(plant: &mut Plant) -> v1::State {
 pub fn state(state: &State, spare: &mut Spare) -> Result<v1::State, InitialError> {
     Ok(v1::State {
         step: state.step,
-        time_s: state.step as f64 * spare.settings().time_step_s,
+        time_s: state.step as f64 * spare.plant().settings().time_step_s,
         q: state.q.clone(),
         p: state.p.clone(),
         v: state.v.clone(),
