@@ -2,6 +2,7 @@
 
 use std::io::{IsTerminal as _, Write as _};
 use std::path::Path;
+use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use sd_notify::NotifyState;
@@ -12,6 +13,9 @@ use tracing_subscriber::EnvFilter;
 use crate::config::{Config, LogConfig, LogFormat};
 use crate::core::modes::Mode;
 use crate::serve::{Addresses, Shutdown, run};
+
+/// Time for computations that nobody waits for any more to notice that the server has ended.
+const LEFTOVERS_MAX: Duration = Duration::from_secs(1);
 
 /// Sets up logging to standard error.
 pub fn start_log(config: &LogConfig) -> Result<()> {
@@ -28,9 +32,22 @@ pub fn start_log(config: &LogConfig) -> Result<()> {
     Ok(())
 }
 
-/// Serves until SIGTERM or SIGINT, or until standard input ends where that is asked for. A second signal
-/// cuts short what open calls and balancers are given to end.
-pub async fn serve(config: Config, until_stdin_ends: bool) -> Result<()> {
+/// Serves, on threads of its own, until SIGTERM or SIGINT, or until standard input ends where that is asked
+/// for. A second signal cuts short what open calls and balancers are given to end.
+///
+/// No `async fn`: what a program waits for is compiled with the program, and the server would be twice.
+pub fn serve(config: Config, until_stdin_ends: bool) -> Result<()> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(config.thread_count())
+        .enable_all()
+        .build()
+        .context("threads")?;
+    let outcome = runtime.block_on(serve_until_told(config, until_stdin_ends));
+    runtime.shutdown_timeout(LEFTOVERS_MAX);
+    outcome
+}
+
+async fn serve_until_told(config: Config, until_stdin_ends: bool) -> Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let shutdown = async {

@@ -1,16 +1,12 @@
 //! The `plantd` server binary.
 
 use std::process::ExitCode;
-use std::time::Duration;
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 use clap::Parser as _;
 use plantd_server::cli::{Cli, Command, Settings};
 use plantd_server::core::limits::Limits;
 use plantd_server::daemon;
-
-/// Time for computations that nobody waits for any more to notice that the server has ended.
-const LEFTOVERS_MAX: Duration = Duration::from_secs(1);
 
 fn main() -> ExitCode {
     match run(Cli::parse().command) {
@@ -40,14 +36,7 @@ fn serve(settings: Settings) -> Result<()> {
         return Ok(());
     }
     daemon::start_log(&config.log)?;
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(config.thread_count())
-        .enable_all()
-        .build()
-        .context("threads")?;
-    let outcome = runtime.block_on(daemon::serve(config, until_stdin_ends));
-    runtime.shutdown_timeout(LEFTOVERS_MAX);
-    outcome
+    daemon::serve(config, until_stdin_ends)
 }
 
 fn print_limits(limits: &Limits) {
