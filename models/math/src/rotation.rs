@@ -5,7 +5,7 @@
 //! `t = |ξ|` and `ξ^ x = ξ × x` all maps are polynomials `1 + a ξ^ + b ξ^²` whose coefficients are even
 //! functions of `t`: series near zero, so that no direction and no rate is special.
 
-use crate::scalar::{Dual, Scalar};
+use crate::scalar::Scalar;
 use crate::spatial::{Mat3, Vec3};
 use crate::sums::two_sum;
 use crate::trigonometry::sin_cos_of;
@@ -72,10 +72,7 @@ impl Quaternion {
     /// `(self + low) exp(turn)`, and what rounding took from it: the increment, of which no digits cancel,
     /// is added by compensated sums, so that turns do not drift.
     pub fn turned(self, low: [f64; 4], turn: Vec3) -> (Self, [f64; 4]) {
-        let Self([_, x, y, z]) = Self::exp(turn);
-        // cos(t/2) − 1
-        let quarter = sin_cos_of(0.25 * turn.norm()).0;
-        let change = [-2.0 * quarter * quarter, x, y, z];
+        let change = Turn::new(turn).change();
         let (of_high, of_low) = (product(self.0, change), product(low, change));
         let sums = [0, 1, 2, 3].map(|i| two_sum(self.0[i], of_high[i] + (low[i] + of_low[i])));
         let (high, low) = (sums.map(|(high, _)| high), sums.map(|(_, low)| low));
@@ -129,89 +126,42 @@ fn series<S: Scalar, const N: usize>(s: S, coefficients: &[f64; N]) -> S {
     if s.value() < FIRST_BELOW { sum(&coefficients[..6]) } else { sum(coefficients) }
 }
 
-/// `sin t / t`, `(1 − cos t) / t²` and `(t − sin t) / t³` for `s = t²`.
+/// `1/n!`.
+const fn inverse_factorial(n: usize) -> f64 {
+    let (mut product, mut i) = (1.0, 2);
+    while i <= n {
+        product *= i as f64;
+        i += 1;
+    }
+    1.0 / product
+}
+
+/// `(−1)ⁱ / (2i + N)!`: the coefficients of `e_N(s) = Σ (−s)ⁱ / (2i + N)!`.
+const fn alternating<const N: usize>() -> [f64; 10] {
+    let (mut c, mut i) = ([0.0; 10], 0);
+    while i < 10 {
+        let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
+        c[i] = sign * inverse_factorial(2 * i + N);
+        i += 1;
+    }
+    c
+}
+
+/// `e1 = sin t / t`, `e2 = (1 − cos t) / t²` and `e3 = (t − sin t) / t³` for `s = t²`.
 #[inline]
 fn exponential<S: Scalar>(s: S) -> [S; 3] {
-    /// `1/n!`.
-    const fn inverse_factorial(n: usize) -> f64 {
-        let (mut product, mut i) = (1.0, 2);
-        while i <= n {
-            product *= i as f64;
-            i += 1;
-        }
-        1.0 / product
-    }
-    /// `(−1)ⁱ / (2i + first)!`.
-    const fn alternating(first: usize) -> [f64; 10] {
-        let (mut c, mut i) = ([0.0; 10], 0);
-        while i < 10 {
-            let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
-            c[i] = sign * inverse_factorial(2 * i + first);
-            i += 1;
-        }
-        c
-    }
-    const SINE: [f64; 10] = alternating(1);
-    const COSINE: [f64; 10] = alternating(2);
-    const REST: [f64; 10] = alternating(3);
     if s.value() < SERIES_BELOW {
-        return [series(s, &SINE), series(s, &COSINE), series(s, &REST)];
+        return [
+            series(s, const { &alternating::<1>() }),
+            series(s, const { &alternating::<2>() }),
+            series(s, const { &alternating::<3>() }),
+        ];
     }
     let t = s.sqrt();
     let (sine, cosine) = t.sin_cos();
     let inverse = s.recip();
     let sine_over_t = sine * t.recip();
     [sine_over_t, (S::ONE - cosine) * inverse, (S::ONE - sine_over_t) * inverse]
-}
-
-/// `c = (1 − (t/2) cot(t/2)) / t²` for `s = t²`.
-#[inline]
-fn inverse_coefficient<S: Scalar>(s: S) -> S {
-    /// `|B_2i| / (2i)!` with the Bernoulli numbers.
-    const BERNOULLI: [f64; 11] = [
-        1.0 / 12.0,
-        1.0 / 720.0,
-        1.0 / 30_240.0,
-        1.0 / 1_209_600.0,
-        1.0 / 47_900_160.0,
-        691.0 / 1_307_674_368_000.0,
-        1.0 / 74_724_249_600.0,
-        3_617.0 / 10_670_622_842_880_000.0,
-        43_867.0 / 5_109_094_217_170_944_000.0,
-        174_611.0 / 802_857_662_698_291_200_000.0,
-        77_683.0 / 14_101_100_039_391_805_440_000.0,
-    ];
-    if s.value() < SERIES_BELOW {
-        return series(s, &BERNOULLI);
-    }
-    let half = s.sqrt() * 0.5;
-    let (sine, cosine) = half.sin_cos();
-    (S::ONE - half * cosine * sine.recip()) * s.recip()
-}
-
-/// `k = tan(t/4) / t` for `s = t²`.
-#[inline]
-fn midpoint_coefficient<S: Scalar>(s: S) -> S {
-    /// Coefficients of `tan x = Σ c_i x^(2i+1)`.
-    const TANGENT: [f64; 11] = [
-        1.0,
-        1.0 / 3.0,
-        2.0 / 15.0,
-        17.0 / 315.0,
-        62.0 / 2_835.0,
-        1_382.0 / 155_925.0,
-        21_844.0 / 6_081_075.0,
-        929_569.0 / 638_512_875.0,
-        6_404_582.0 / 10_854_718_875.0,
-        443_861_162.0 / 1_856_156_927_625.0,
-        18_888_466_084.0 / 194_896_477_400_625.0,
-    ];
-    if s.value() < SERIES_BELOW {
-        return series(s * (1.0 / 16.0), &TANGENT) * 0.25;
-    }
-    let t = s.sqrt();
-    let (sine, cosine) = (t * 0.25).sin_cos();
-    sine * (cosine * t).recip()
 }
 
 /// `1 + a y^ + b y^²`.
@@ -252,63 +202,133 @@ pub fn dexp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
 /// [`dexp`]. Its transpose `N⁺` takes it to the end.
 #[inline]
 pub fn momentum_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
-    polynomial(xi, S::constant(0.5), inverse_coefficient(xi.dot(xi)))
+    Turn::new(xi).momentum_at_start()
 }
 
-/// `T⁻ = 1 + k ξ^`: takes a torque at the midpoint to the start. Its transpose `T⁺` takes it to the end.
-#[inline]
-pub fn torque_at_start<S: Scalar>(xi: Vec3<S>) -> Mat3<S> {
-    polynomial(xi, midpoint_coefficient(xi.dot(xi)), S::ZERO)
+/// How a ball joint turns in a step, `ξ`, with the coefficients of all maps that the step needs.
+///
+/// They are those of half the turn: with `e1`, `e2`, `e3` of `s = |ξ|²/4`,
+///
+/// ```text
+/// k = tan(t/4) / t = e2 / 2e1      c = (1 − (t/2) cot(t/2)) / t² = (e2 − e3) / 4e1
+/// ```
+///
+/// of which no digits cancel; all are singular only at a whole turn.
+#[derive(Clone, Copy, Debug)]
+pub struct Turn<S = f64> {
+    /// `ξ`.
+    pub xi: Vec3<S>,
+    /// `|ξ|²/4`.
+    square: S,
+    /// `e1`, `e2` and `e3` of that.
+    half: [S; 3],
+    c: S,
+    k: S,
 }
 
-/// `N⁻ m` without the matrix.
-#[inline]
-pub fn momentum_to_start(xi: Vec3, m: Vec3) -> Vec3 {
-    let turned = xi.cross(m);
-    m + turned * 0.5 + xi.cross(turned) * inverse_coefficient(xi.dot(xi))
-}
-
-/// `T⁻ τ` without the matrix.
-#[inline]
-pub fn torque_to_start(xi: Vec3, torque: Vec3) -> Vec3 {
-    torque + xi.cross(torque) * midpoint_coefficient(xi.dot(xi))
-}
-
-/// A function of `s` and its derivative.
-fn with_slope<S: Scalar>(f: impl Fn(Dual<S>) -> Dual<S>, s: S) -> [S; 2] {
-    let value = f(Dual::new(s, S::ONE));
-    [value.re, value.eps]
-}
-
-/// How `N⁻ m` changes with `ξ`: `½ δ×m + c (δ×(ξ×m) + ξ×(δ×m)) + 2c' (ξ·δ) ξ×(ξ×m)` for a change `δ`, `c'`
-/// by `t²`.
-pub fn momentum_change<S: Scalar>(xi: Vec3<S>, m: Vec3<S>) -> Mat3<S> {
-    let [c, slope] = with_slope(inverse_coefficient, xi.dot(xi));
-    let (turned, along) = (xi.cross(m), xi.dot(m));
-    let twice = xi.cross(turned) * (slope + slope) - m * (c + c);
-    // δ×(ξ×m) + ξ×(δ×m) = ξ (m·δ) + δ (ξ·m) − 2 m (ξ·δ)
-    let (mut change, weight, along) = (crossed(m.scaled(0.5)), m * c, along * c);
-    for (b, column) in change.0.iter_mut().enumerate() {
-        *column += xi * weight[b] + twice * xi[b];
-        column.0[b] += along;
+impl<S: Scalar> Turn<S> {
+    /// By `ξ`.
+    #[inline(always)]
+    pub fn new(xi: Vec3<S>) -> Self {
+        let square = xi.dot(xi) * 0.25;
+        let half = exponential(square);
+        let [e1, e2, e3] = half;
+        let inverse = e1.recip() * 0.25;
+        Self { xi, square, half, c: (e2 - e3) * inverse, k: (e2 + e2) * inverse }
     }
-    change
+
+    /// `exp(ξ/2)`.
+    #[inline(always)]
+    pub fn half(&self) -> Mat3<S> {
+        polynomial(self.xi * S::constant(0.5), self.half[0], self.half[1])
+    }
+
+    /// `dexp₋ξ/2`.
+    #[inline(always)]
+    pub fn dexp_of_half(&self) -> Mat3<S> {
+        polynomial(self.xi * S::constant(0.5), -self.half[1], self.half[2])
+    }
+
+    /// `N⁻`, as [`momentum_at_start`].
+    #[inline(always)]
+    pub fn momentum_at_start(&self) -> Mat3<S> {
+        polynomial(self.xi, S::constant(0.5), self.c)
+    }
+
+    /// `T⁻ = 1 + k ξ^`: takes a torque at the midpoint to the start. Its transpose `T⁺` takes it to the end.
+    #[inline(always)]
+    pub fn torque_at_start(&self) -> Mat3<S> {
+        polynomial(self.xi, self.k, S::ZERO)
+    }
+
+    /// `N⁻ m` without the matrix.
+    #[inline(always)]
+    pub fn momentum_to_start(&self, m: Vec3<S>) -> Vec3<S> {
+        let turned = self.xi.cross(m);
+        m + turned.scaled(0.5) + self.xi.cross(turned) * self.c
+    }
+
+    /// `T⁻ τ` without the matrix.
+    #[inline(always)]
+    pub fn torque_to_start(&self, torque: Vec3<S>) -> Vec3<S> {
+        torque + self.xi.cross(torque) * self.k
+    }
+
+    /// How `N⁻ m` and `T⁻ τ` change with `ξ`: for a change `δ`, with `c'` and `k'` by `t²`,
+    ///
+    /// ```text
+    /// ½ δ×m + c (δ×(ξ×m) + ξ×(δ×m)) + 2c' (ξ·δ) ξ×(ξ×m)      k δ×τ + 2k' (ξ·δ) ξ×τ
+    /// ```
+    #[inline]
+    pub fn changes(&self, m: Vec3<S>, torque: Vec3<S>) -> [Mat3<S>; 2] {
+        let (xi, [c_slope, k_slope]) = (self.xi, self.slopes());
+        let (turned, along) = (xi.cross(m), xi.dot(m));
+        let twice = xi.cross(turned) * (c_slope + c_slope) - m * (self.c + self.c);
+        // δ×(ξ×m) + ξ×(δ×m) = ξ (m·δ) + δ (ξ·m) − 2 m (ξ·δ)
+        let (weight, along) = (m * self.c, along * self.c);
+        let mut momentum = crossed(m.scaled(0.5));
+        let turned = xi.cross(torque) * (k_slope + k_slope);
+        let mut of_torque = crossed(torque * self.k);
+        for (b, column) in momentum.0.iter_mut().enumerate() {
+            *column += xi * weight[b] + twice * xi[b];
+            column.0[b] += along;
+            of_torque.0[b] += turned * xi[b];
+        }
+        [momentum, of_torque]
+    }
+
+    /// `c'` and `k'` by `t²`, from `e_n' = ½ (n e_n+2 − e_n+1)`.
+    #[inline(always)]
+    fn slopes(&self) -> [S; 2] {
+        let (s, [e1, e2, e3]) = (self.square, self.half);
+        let [e4, e5] = if s.value() < SERIES_BELOW {
+            [series(s, const { &alternating::<4>() }), series(s, const { &alternating::<5>() })]
+        } else {
+            let inverse = s.recip();
+            [(S::constant(0.5) - e2) * inverse, (S::constant(1.0 / 6.0) - e3) * inverse]
+        };
+        // Twice the slopes of e1, e2, e3.
+        let (by_e1, by_e2, by_e3) = (e3 - e2, e4 + e4 - e3, e5 * 3.0 - e4);
+        let inverse = e1.recip() * (1.0 / 32.0);
+        let c = (by_e2 - by_e3 - by_e1 * self.c * 4.0) * inverse;
+        let k = (by_e2 - by_e1 * self.k) * (inverse + inverse);
+        [c, k]
+    }
 }
 
-/// How `T⁻ τ` changes with `ξ`: `k δ×τ + 2k' (ξ·δ) ξ×τ` for a change `δ`, `k'` by `t²`.
-pub fn torque_change<S: Scalar>(xi: Vec3<S>, torque: Vec3<S>) -> Mat3<S> {
-    let [k, slope] = with_slope(midpoint_coefficient, xi.dot(xi));
-    let twice = xi.cross(torque) * (slope + slope);
-    let mut change = crossed(torque * k);
-    for (b, column) in change.0.iter_mut().enumerate() {
-        *column += twice * xi[b];
+impl Turn {
+    /// `exp(ξ) − 1`, as a quaternion: of no component digits cancel.
+    fn change(&self) -> [f64; 4] {
+        let [e1, e2, _] = self.half;
+        let Vec3([x, y, z]) = self.xi * (0.5 * e1);
+        [-self.square * e2, x, y, z]
     }
-    change
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scalar::Dual;
 
     fn vectors() -> impl Iterator<Item = Vec3> {
         let lengths = [0.0, 1e-9, 1e-3, 0.3, 0.99, 1.01, 2.0, 3.1];
@@ -349,7 +369,7 @@ mod tests {
             // ½ (1 + exp(−ξ/2)) T⁻ = 1: a torque at the midpoint turns both ends alike.
             let (half, one) = (exp(v * -0.5), Mat3::IDENTITY);
             let mean = Mat3([0, 1, 2].map(|i| (half.0[i] + one.0[i]) * 0.5));
-            assert!(distance(&mean.times(&torque_at_start(v)), &one) < 1e-14, "{v:?}");
+            assert!(distance(&mean.times(&Turn::new(v).torque_at_start()), &one) < 1e-14, "{v:?}");
         }
     }
 
@@ -357,9 +377,16 @@ mod tests {
     fn maps_are_the_same_without_their_matrices() {
         let v = Vec3([0.7, -0.3, 0.5]);
         for xi in vectors() {
-            let momentum = momentum_at_start(xi).apply(v) - momentum_to_start(xi, v);
-            let torque = torque_at_start(xi).apply(v) - torque_to_start(xi, v);
+            let turn = Turn::new(xi);
+            let momentum = turn.momentum_at_start().apply(v) - turn.momentum_to_start(v);
+            let torque = turn.torque_at_start().apply(v) - turn.torque_to_start(v);
             assert!(momentum.norm() < 1e-15 && torque.norm() < 1e-15, "{xi:?}");
+            assert!(distance(&turn.half(), &exp(xi * 0.5)) < 1e-15, "{xi:?}");
+            assert!(distance(&turn.dexp_of_half(), &dexp(xi * 0.5)) < 1e-15, "{xi:?}");
+            let Quaternion([w, x, y, z]) = Quaternion::exp(xi);
+            for (a, b) in [w - 1.0, x, y, z].into_iter().zip(turn.change()) {
+                assert!((a - b).abs() < 2e-16, "{xi:?}");
+            }
             let turned = Mat3([0, 1, 2].map(|i| xi.cross(Mat3::IDENTITY.0[i])));
             let squared = turned.times(&turned);
             let [_, b, c] = exponential(xi.dot(xi));
@@ -374,10 +401,10 @@ mod tests {
         let lifted = Vec3(v.0.map(Dual::constant));
         for xi in vectors() {
             let dual = Vec3([0, 1, 2].map(|i| Dual::new(xi[i], direction[i])));
-            for (map, change) in [
-                (momentum_at_start(dual), momentum_change(xi, v)),
-                (torque_at_start(dual), torque_change(xi, v)),
-            ] {
+            let (along, [momentum, torque]) = (Turn::new(dual), Turn::new(xi).changes(v, v));
+            for (map, change) in
+                [(along.momentum_at_start(), momentum), (along.torque_at_start(), torque)]
+            {
                 let rate = Vec3(map.apply(lifted).0.map(|x| x.eps));
                 assert!((rate - change.apply(direction)).norm() < 1e-14, "{xi:?}");
             }
@@ -391,14 +418,14 @@ mod tests {
             (exponential(below)[0], exponential(above)[0]),
             (exponential(below)[1], exponential(above)[1]),
             (exponential(below)[2], exponential(above)[2]),
-            (inverse_coefficient(below), inverse_coefficient(above)),
-            (midpoint_coefficient(below), midpoint_coefficient(above)),
         ] {
             assert!((a - b).abs() < 1e-12 * a, "{a} {b}");
         }
-        let slope = |f: fn(Dual) -> Dual, s: f64| f(Dual::new(s, 1.0)).eps;
-        for f in [inverse_coefficient as fn(Dual) -> Dual, midpoint_coefficient] {
-            assert!((slope(f, below) - slope(f, above)).abs() < 1e-12);
+        // Of turns of twice the angle, along one axis.
+        let turn = |s: f64| Turn::new(Vec3([2.0 * s.sqrt(), 0.0, 0.0]));
+        let numbers = |turn: Turn| [[turn.c, turn.k], turn.slopes()].concat();
+        for (a, b) in numbers(turn(below)).iter().zip(numbers(turn(above))) {
+            assert!((a - b).abs() < 1e-12 * a, "{a} {b}");
         }
     }
 }

@@ -14,7 +14,7 @@
 //! [`crate::lagrangian::generators`]. See [`plantd_math::rotation`] for the maps.
 
 use plantd_math::rotation;
-use plantd_math::rotation::Quaternion;
+use plantd_math::rotation::{Quaternion, Turn};
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
@@ -36,8 +36,8 @@ pub(crate) struct BallJoints {
     /// Orientations at the start and at the end.
     pub(crate) start: Vec<Mat3>,
     pub(crate) end: Vec<Mat3>,
-    /// How they turn over the step, in their own axes.
-    pub(crate) turns: Vec<Vec3>,
+    /// How they turn over the step, in their own axes, at the last evaluation.
+    pub(crate) turns: Vec<Turn>,
     /// Of each coordinate the orientation that it is a component of, times four, and the axis.
     places: Vec<u32>,
     pub(crate) vertical: Vertical,
@@ -56,7 +56,7 @@ impl BallJoints {
         Self {
             start: vec![Mat3::IDENTITY; no],
             end: vec![Mat3::IDENTITY; no],
-            turns: vec![Vec3::ZERO; no],
+            turns: vec![Turn::new(Vec3::ZERO); no],
             places,
             vertical: Vertical::new(model),
             generators: vec![Generators::default(); if no > 0 { joints } else { 0 }],
@@ -118,8 +118,7 @@ impl Workspace {
             if i >= model.dimensions.dynamic {
                 let end = Quaternion::exp(three(&self.step.q_end, i));
                 let turn = state.orientations[o].inverse().times(end).log();
-                self.balls.turns[o] = turn;
-                self.mid.orientations[o] = self.balls.start[o].times(&rotation::exp(turn * 0.5));
+                self.turn_by(o, turn);
                 self.balls.end[o] = end.matrix();
                 let velocity = turn * (1.0 / settings.time_step_s);
                 self.mid.velocity[i..i + 3].copy_from_slice(&velocity.0);
@@ -131,11 +130,17 @@ impl Workspace {
     pub(crate) fn turn_to_midpoint(&mut self, model: &Model) {
         for (o, &i) in model.orientations.iter().enumerate() {
             if i < model.dimensions.dynamic {
-                let turn = three(&self.step.increment, i);
-                self.balls.turns[o] = turn;
-                self.mid.orientations[o] = self.balls.start[o].times(&rotation::exp(turn * 0.5));
+                self.turn_by(o, three(&self.step.increment, i));
             }
         }
+    }
+
+    /// Moves a ball joint to the middle of a turn.
+    #[inline(always)]
+    pub(crate) fn turn_by(&mut self, orientation: usize, xi: Vec3) {
+        let turn = Turn::new(xi);
+        self.balls.turns[orientation] = turn;
+        self.mid.orientations[orientation] = self.balls.start[orientation].times(&turn.half());
     }
 
     /// Moves ball joints to the end of the increment.
@@ -156,13 +161,13 @@ impl Workspace {
             if i >= model.dimensions.dynamic {
                 continue;
             }
-            let turn = balls.turns[o];
+            let turn = &balls.turns[o];
             let weights = &mut kkt.balls[o];
             *weights = Weights::of_rows(turn);
-            weights.column = rotation::dexp(turn * 0.5);
+            weights.column = turn.dexp_of_half();
             let impulse = three(&mid.l_q, i) * (0.5 * h) + three(&mid.force, i) * (a * h);
-            weights.own = rotation::torque_change(turn, impulse)
-                .minus(&rotation::momentum_change(turn, three(&mid.l_v, i)));
+            let [carried, turned] = turn.changes(three(&mid.l_v, i), impulse);
+            weights.own = turned.minus(&carried);
             if let Some(damping) = model.damping.get(i..i + 3) {
                 for (b, c) in damping.iter().enumerate() {
                     weights.own.0[b] += weights.torque.0[b] * (-a * c);

@@ -263,7 +263,7 @@ impl<S: Scalar> StepBlocks<S> {
                 let residual = turning.torque.apply(impulse) - turning.momentum.apply(momentum);
                 let split_force = (turning.torque.apply(force) - force).scaled(skew);
                 let change =
-                    (torque + force).scaled(h) + momentum.cross(turning.turn) + split_force;
+                    (torque + force).scaled(h) + momentum.cross(turning.turn.xi) + split_force;
                 (residual, change)
             };
             for j in 0..n {

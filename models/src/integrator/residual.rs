@@ -19,7 +19,6 @@
 //! Ball joints weigh the terms by their maps: see [`balls`](crate::integrator::balls).
 
 use plantd_math::norms::largest;
-use plantd_math::rotation;
 use plantd_math::scalar::side_by_side;
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Vec3, three};
@@ -105,10 +104,9 @@ impl Workspace {
         let mut momentum: Vec<f64> = (0..mid.l_v.len()).map(|i| mid.l_v[i] + torque(i)).collect();
         for (turn, &i) in self.balls.turns.iter().zip(&model.orientations) {
             if let Some(momentum) = momentum.get_mut(i..i + 3) {
-                let carried =
-                    rotation::momentum_at_start(*turn).apply_transposed(three(&mid.l_v, i));
+                let carried = turn.momentum_at_start().apply_transposed(three(&mid.l_v, i));
                 let torque = Vec3([torque(i), torque(i + 1), torque(i + 2)]);
-                let torque = rotation::torque_at_start(*turn).apply_transposed(torque);
+                let torque = turn.torque_at_start().apply_transposed(torque);
                 momentum.copy_from_slice(&(carried + torque).0);
             }
         }
@@ -128,11 +126,11 @@ impl Workspace {
             if i >= model.dimensions.dynamic {
                 continue;
             }
-            let turn = self.balls.turns[o];
+            let turn = &self.balls.turns[o];
             let momentum = three(&self.mid.l_v, i);
             let torque = three(&self.mid.l_q, i) * (0.5 * h) + three(&self.mid.force, i) * weight;
-            let momentum = rotation::momentum_to_start(turn, momentum);
-            let torque = rotation::torque_to_start(turn, torque);
+            let momentum = turn.momentum_to_start(momentum);
+            let torque = turn.torque_to_start(torque);
             for a in 0..3 {
                 self.residual.dynamics[i + a] =
                     ((state.p[i + a] - momentum[a]) + torque[a]) + state.p_low[i + a];
@@ -148,13 +146,13 @@ impl Workspace {
             if i >= model.dimensions.dynamic {
                 continue;
             }
-            let turn = self.balls.turns[o];
-            let carried = three(&self.mid.l_v, i).cross(turn);
+            let turn = &self.balls.turns[o];
+            let carried = three(&self.mid.l_v, i).cross(turn.xi);
             let force = three(&self.mid.force, i);
             let change = if skew == 0.0 {
                 carried
             } else {
-                carried + (rotation::torque_to_start(turn, force) - force) * skew
+                carried + (turn.torque_to_start(force) - force) * skew
             };
             for a in 0..3 {
                 self.step.impulse[i + a] += change[a];

@@ -1,6 +1,6 @@
 //! The maps by which a ball joint weighs the derivatives of a step; see [`plantd_math::rotation`].
 
-use plantd_math::rotation;
+use plantd_math::rotation::{self, Turn};
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Mat3, Vec3};
 
@@ -11,8 +11,7 @@ use crate::model::mechanism::Model;
 pub(crate) struct Turning<S = f64> {
     /// First of its three coordinates.
     pub(crate) coordinate: usize,
-    /// `ξ`.
-    pub(crate) turn: Vec3<S>,
+    pub(crate) turn: Turn<S>,
     /// `N⁻`.
     pub(crate) momentum: Mat3<S>,
     /// `T⁻`.
@@ -31,10 +30,11 @@ pub(crate) struct Turning<S = f64> {
 impl<S: Scalar> Turning<S> {
     pub(crate) fn new(model: &Model, coordinate: usize, turn: Vec3<S>, time_step_s: f64) -> Self {
         let rate = S::constant(1.0 / time_step_s);
-        let half = turn.scaled(0.5);
-        let middle = rotation::dexp(half).scaled(S::constant(0.5));
-        let start = rotation::exp(-half);
-        let momentum = rotation::momentum_at_start(turn);
+        let whole = turn;
+        let turn = Turn::new(whole);
+        let middle = turn.dexp_of_half().scaled(S::constant(0.5));
+        let start = turn.half().transpose();
+        let momentum = turn.momentum_at_start();
         let (by_start, by_next) = if coordinate < model.dimensions.dynamic {
             ((start, Mat3::ZERO), (middle, Mat3::IDENTITY.scaled(rate)))
         } else {
@@ -50,9 +50,9 @@ impl<S: Scalar> Turning<S> {
             coordinate,
             turn,
             momentum,
-            torque: rotation::torque_at_start(turn),
-            to_end: rotation::dexp(turn),
-            carried: rotation::exp(-turn),
+            torque: turn.torque_at_start(),
+            to_end: rotation::dexp(whole),
+            carried: rotation::exp(-whole),
             by_start,
             by_next,
         }
@@ -60,7 +60,7 @@ impl<S: Scalar> Turning<S> {
 
     /// `m ↦ m × ξ`.
     pub(crate) fn spin(&self) -> Mat3<S> {
-        rotation::crossed(self.turn)
+        rotation::crossed(self.turn.xi)
     }
 
     /// Change of `T⁻ impulse − N⁻ momentum` with `ξ`, and of `T⁻ force`.
@@ -70,9 +70,8 @@ impl<S: Scalar> Turning<S> {
         momentum: Vec3<S>,
         force: Vec3<S>,
     ) -> [Mat3<S>; 2] {
-        let carried = rotation::momentum_change(self.turn, momentum);
-        let residual = rotation::torque_change(self.turn, impulse).minus(&carried);
-        [residual, rotation::torque_change(self.turn, force)]
+        let [carried, turned] = self.turn.changes(momentum, impulse);
+        [turned.minus(&carried), self.turn.changes(momentum, force)[1]]
     }
 }
 
@@ -98,8 +97,8 @@ impl Weights {
     };
 
     /// The maps of rows, of a joint that turns by `ξ`.
-    pub(crate) fn of_rows(turn: Vec3) -> Self {
-        let momentum = rotation::momentum_at_start(turn);
-        Self { momentum, torque: rotation::torque_at_start(turn), ..Self::REST }
+    pub(crate) fn of_rows(turn: &Turn) -> Self {
+        let (momentum, torque) = (turn.momentum_at_start(), turn.torque_at_start());
+        Self { momentum, torque, ..Self::REST }
     }
 }

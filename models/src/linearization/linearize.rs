@@ -181,7 +181,9 @@ impl SolvedStep {
         }
         if !self.orientations.is_empty() {
             self.orientations.copy_from_slice(&workspace.balls.start);
-            self.turns.copy_from_slice(&workspace.balls.turns);
+            for (to, turn) in self.turns.iter_mut().zip(&workspace.balls.turns) {
+                *to = turn.xi;
+            }
         }
         if !self.multipliers.is_empty() {
             self.multipliers.copy_from_slice(&workspace.step.multipliers);

@@ -209,7 +209,7 @@ impl Workspace {
         let Self { mid, kkt, balls, tangents, .. } = self;
         let balls = &*balls;
         let turns = model.orientations.iter().zip(&balls.turns);
-        out.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, *turn, h)));
+        out.turnings.extend(turns.map(|(&i, turn)| Turning::new(model, i, turn.xi, h)));
         tangents.find_flanks(
             model,
             &mid.mechanics,
@@ -437,7 +437,7 @@ coefficient = 0.03
             blocks.next[..nd].copy_from_slice(&workspace.step.increment);
             blocks.next[nd..].copy_from_slice(&workspace.step.q_end[nd..]);
             for (o, &i) in model.orientations.iter().enumerate() {
-                blocks.next[i..i + 3].copy_from_slice(&workspace.balls.turns[o].0);
+                blocks.next[i..i + 3].copy_from_slice(&workspace.balls.turns[o].xi.0);
             }
             blocks.orientations[0].copy_from_slice(&workspace.balls.start);
             blocks.multipliers.copy_from_slice(&workspace.step.multipliers);

@@ -2,7 +2,6 @@
 //! velocity and energy that belong to a state.
 
 use plantd_math::pivoted_lu::PivotedLu;
-use plantd_math::rotation;
 use plantd_math::rotation::Quaternion;
 use plantd_math::spatial::three;
 use plantd_scene::UnknownName;
@@ -185,8 +184,8 @@ impl Plant {
         let turns = self.model.orientations.iter().map(|&i| three(&change, i));
         let orientations = orientations(&self.model, q0);
         for (o, turn) in turns.enumerate() {
-            workspace.balls.turns[o] = turn;
-            workspace.mid.orientations[o] = orientations[o].times(&rotation::exp(turn * 0.5));
+            workspace.balls.start[o] = orientations[o];
+            workspace.turn_by(o, turn);
         }
         workspace.mid.set_inputs(&self.model, inputs);
         workspace.mid.evaluate(&self.model);
