@@ -51,6 +51,7 @@
 
 mod client;
 mod connection;
+mod credentials;
 mod driver;
 mod error;
 mod estimator;
@@ -64,6 +65,7 @@ mod stream;
 
 pub use client::Client;
 pub use connection::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
+pub use credentials::{Authorization, AuthorizedChannel, Credentials};
 pub use driver::Driver;
 pub use error::{ConnectProblem, Error, Refusal, Result, Violation};
 pub use estimator::Estimator;

@@ -10,7 +10,7 @@ use std::io;
 use std::net::{IpAddr, Ipv6Addr};
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
@@ -24,6 +24,8 @@ use tokio::time::{Sleep, sleep, timeout};
 use tonic::transport::server::Connected;
 
 use crate::core::limits::Limits;
+use crate::wire::edge::auth::certificate::Certificate;
+use crate::wire::edge::auth::credential::Credential;
 
 /// A known connection keeps its place at least this long after its last call: the next one may be
 /// on its way.
@@ -61,17 +63,28 @@ impl Peer {
 pub trait HasPeer {
     /// The other end.
     fn peer(&self) -> io::Result<Peer>;
+
+    /// The user whose process the other end is, where the system tells.
+    fn uid(&self) -> Option<u32>;
 }
 
 impl HasPeer for TcpStream {
     fn peer(&self) -> io::Result<Peer> {
         Ok(Peer::at(self.peer_addr()?.ip()))
     }
+
+    fn uid(&self) -> Option<u32> {
+        None
+    }
 }
 
 impl HasPeer for UnixStream {
     fn peer(&self) -> io::Result<Peer> {
         Ok(Peer::Unix)
+    }
+
+    fn uid(&self) -> Option<u32> {
+        self.peer_cred().ok().map(|credentials| credentials.uid())
     }
 }
 
@@ -145,6 +158,10 @@ impl Places {
                 let Ok(peer) = io.peer() else { continue };
                 match places.place(peer).await {
                     Some(place) => {
+                        if let Some(uid) = io.uid() {
+                            // Nobody else has the place yet.
+                            let _ = place.uid.set(uid);
+                        }
                         return Some((Ok(places.admitted(io, place)), (places, incoming)));
                     }
                     None => tracing::debug!(?peer, "refused: too many connections of this peer"),
@@ -211,6 +228,9 @@ impl Taken {
         let place = Arc::new(Place {
             id,
             peer,
+            uid: OnceLock::new(),
+            certificate: OnceLock::new(),
+            credential: OnceLock::new(),
             start,
             is_known: AtomicBool::new(false),
             calls: AtomicUsize::new(0),
@@ -260,6 +280,10 @@ fn raise_file_limit() -> usize {
 pub struct Place {
     id: u64,
     peer: Peer,
+    uid: OnceLock<u32>,
+    certificate: OnceLock<Arc<Certificate>>,
+    /// By which it is known, kept for as long as the connection.
+    credential: OnceLock<Arc<Credential>>,
     start: Instant,
     /// It has made a request.
     is_known: AtomicBool,
@@ -277,6 +301,21 @@ impl Place {
     /// Where its connection comes from.
     pub fn peer(&self) -> Peer {
         self.peer
+    }
+
+    /// The user whose process is at the other end of a unix-domain socket.
+    pub fn uid(&self) -> Option<u32> {
+        self.uid.get().copied()
+    }
+
+    /// The certificate with which the other end has shown who it is.
+    pub fn certificate(&self) -> Option<&Arc<Certificate>> {
+        self.certificate.get()
+    }
+
+    /// Keeps the credential by which the other end is known for as long as the connection.
+    pub fn keep(&self, credential: Arc<Credential>) {
+        let _ = self.credential.set(credential);
     }
 
     /// Which of the server's connections this is; no two have the same number.
@@ -331,6 +370,11 @@ pub struct Admitted<IO> {
 }
 
 impl<IO> Admitted<IO> {
+    /// The other end has shown who it is. What was said first stands.
+    pub fn set_certificate(&self, certificate: Certificate) {
+        let _ = self.place.certificate.set(Arc::new(certificate));
+    }
+
     /// What the socket answered, unless the connection has been ended. Whoever has to wait for the
     /// socket is woken by that, too.
     fn while_admitted<T>(
