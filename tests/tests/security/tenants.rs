@@ -97,7 +97,7 @@ async fn what_is_anothers_is_not_there() {
     };
     assert_refused(blue.step_many(many).await, Code::NotFound, "PLANT_NOT_FOUND");
     let theirs = v1::LinearizeRequest {
-        at: Some(v1::linearize_request::At::PlantId("red-1".to_owned())),
+        point: Some(plantd_client::present_state("red-1")),
         ..Default::default()
     };
     assert_refused(blue.linearize(theirs).await, Code::NotFound, "PLANT_NOT_FOUND");

@@ -65,16 +65,14 @@ pub trait HasPeer {
     fn peer(&self) -> io::Result<Peer>;
 
     /// The user whose process the other end is, where the system tells.
-    fn uid(&self) -> Option<u32>;
+    fn uid(&self) -> Option<u32> {
+        None
+    }
 }
 
 impl HasPeer for TcpStream {
     fn peer(&self) -> io::Result<Peer> {
         Ok(Peer::at(self.peer_addr()?.ip()))
-    }
-
-    fn uid(&self) -> Option<u32> {
-        None
     }
 }
 

@@ -80,8 +80,11 @@ impl Tokens {
         let text = read().map_err(|cause| TokensError::Read { path: path.to_owned(), cause })?;
         let wrong = |problem| TokensError::Wrong { path: path.to_owned(), problem };
         // An error of the parser shows what is in the file, which is nothing that opens a door.
-        let file: TokenFile =
-            toml::from_str(&text).map_err(|error| wrong(error.message().to_owned()))?;
+        let file: TokenFile = toml::from_str(&text).map_err(|error| {
+            let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
+            let line = before.matches('\n').count() + 1;
+            wrong(format!("line {line}: {}", error.message()))
+        })?;
         let mut tokens = Self::default();
         for entry in file.tokens {
             let name = entry.name.clone();
@@ -223,7 +226,7 @@ mod tests {
             (good.replace("driver", "king"), "king"),
             (entry("bert", "role = \"viewer\"\ntenant = \"a/b\""), "a/b"),
             (good.replace("sha256 = \"", "sha256 = \"0"), "64 hexadecimal digits"),
-            (entry("bert", "role = \"viewer\"\nexpires = \"soon\""), "expires"),
+            (entry("bert", "role = \"viewer\"\nexpires = \"soon\""), "line "),
             (good.replace("name", "nom"), "nom"),
         ] {
             let error = read(&text, &tokens, &tenants).unwrap_err().to_string();
