@@ -11,6 +11,7 @@ use tonic::transport::Endpoint;
 
 use crate::credentials::{AuthorizedChannel, Credentials};
 use crate::error::{ConnectProblem, Error, Result, root_cause};
+use crate::handshake::refusal;
 
 /// Where a server listens unless it is told otherwise.
 pub const DEFAULT_ADDRESS: &str = "http://127.0.0.1:50051";
@@ -54,7 +55,8 @@ impl Default for ConnectOptions {
 pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<AuthorizedChannel> {
     let authorization = options.credentials.header()?;
     let endpoint = endpoint(address)?;
-    let endpoint = match address.starts_with("https://") {
+    let is_secured = address.starts_with("https://");
+    let endpoint = match is_secured {
         true => secured(endpoint, &options.credentials)?,
         false => endpoint,
     };
@@ -79,6 +81,10 @@ pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<A
     match tokio::time::timeout(limit, speaks_grpc(channel.clone())).await {
         Ok(Ok(Some(stranger))) => Err(stranger.into()),
         Ok(Ok(None)) => Ok(channel),
+        Ok(Err(problem)) if is_secured => {
+            let said = refusal(address, &options.credentials, limit).await;
+            Err(failed(said.and_then(|said| tls_problem(&said)).unwrap_or(problem)))
+        }
         Ok(Err(problem)) => Err(failed(problem)),
         Err(_) => Err(failed(ConnectProblem::Silent(limit))),
     }

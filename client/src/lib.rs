@@ -56,6 +56,7 @@ mod driver;
 mod error;
 mod estimator;
 mod follower;
+mod handshake;
 pub mod link;
 mod messages;
 mod recording;

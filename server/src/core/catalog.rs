@@ -136,7 +136,6 @@ impl Catalog {
 
     /// The model of that name. May compile it: call it on a worker.
     pub fn get(&self, name: &str) -> Result<Entry, CatalogError> {
-        Caller::note(name);
         if let Some(uploaded) = lock(&self.uploaded).get(name).filter(|found| self.shows(found)) {
             return Ok(uploaded.entry(name));
         }
