@@ -21,8 +21,8 @@ use tokio_rustls::server::TlsStream;
 use tonic::transport::server::Connected;
 
 use crate::wire::edge::admission::{Admitted, Place};
-use crate::wire::edge::auth::certificate::Certificate;
 use crate::wire::edge::auth::door::{LOOK_PERIOD, Stamp};
+use crate::wire::edge::certificate::Certificate;
 
 /// The table `[tls]`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]

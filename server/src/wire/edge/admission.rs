@@ -5,6 +5,7 @@
 //! request; if all are known, that of the one that has been idle for longest; and waits if none is.
 //! A connection with an open call keeps its place.
 
+use std::any::Any;
 use std::collections::{BTreeMap, HashMap};
 use std::io;
 use std::net::{IpAddr, Ipv6Addr};
@@ -24,8 +25,7 @@ use tokio::time::{Sleep, sleep, timeout};
 use tonic::transport::server::Connected;
 
 use crate::core::limits::Limits;
-use crate::wire::edge::auth::certificate::Certificate;
-use crate::wire::edge::auth::credential::Credential;
+use crate::wire::edge::certificate::Certificate;
 
 /// A known connection keeps its place at least this long after its last call: the next one may be
 /// on its way.
@@ -228,7 +228,7 @@ impl Taken {
             peer,
             uid: OnceLock::new(),
             certificate: OnceLock::new(),
-            credential: OnceLock::new(),
+            kept: OnceLock::new(),
             start,
             is_known: AtomicBool::new(false),
             calls: AtomicUsize::new(0),
@@ -280,8 +280,8 @@ pub struct Place {
     peer: Peer,
     uid: OnceLock<u32>,
     certificate: OnceLock<Arc<Certificate>>,
-    /// By which it is known, kept for as long as the connection.
-    credential: OnceLock<Arc<Credential>>,
+    /// What is to live as long as the connection.
+    kept: OnceLock<Arc<dyn Any + Send + Sync>>,
     start: Instant,
     /// It has made a request.
     is_known: AtomicBool,
@@ -311,9 +311,9 @@ impl Place {
         self.certificate.get()
     }
 
-    /// Keeps the credential by which the other end is known for as long as the connection.
-    pub fn keep(&self, credential: Arc<Credential>) {
-        let _ = self.credential.set(credential);
+    /// Lets something live as long as the connection: the first that is to.
+    pub fn keep(&self, kept: Arc<dyn Any + Send + Sync>) {
+        let _ = self.kept.set(kept);
     }
 
     /// Which of the server's connections this is; no two have the same number.

@@ -2,6 +2,7 @@
 
 pub mod admission;
 pub mod auth;
+pub mod certificate;
 pub mod ending;
 pub mod gate;
 pub(crate) mod methods;

@@ -193,7 +193,8 @@ impl Door {
             return Ok(credential);
         }
         let credential = self.of_connection(place)?;
-        place.keep(Arc::clone(&credential));
+        let kept: Arc<Credential> = Arc::clone(&credential);
+        place.keep(kept);
         lock(&self.of_connections).insert(place.id(), Arc::downgrade(&credential));
         Ok(credential)
     }

@@ -4,13 +4,11 @@
 //! | --- | --- |
 //! | `settings` | what the configuration says of it |
 //! | `role` | the table from methods to roles |
-//! | `certificate` | what a client's certificate says |
 //! | `credential` | by what somebody is known, and until when |
 //! | `tokens` | the file of bearer tokens |
 //! | `door` | who somebody is, by token, certificate or user; credentials that are over |
 //! | `guard` | the layer through which every request passes |
 
-pub mod certificate;
 pub mod credential;
 pub mod door;
 pub mod guard;
