@@ -277,15 +277,9 @@ async fn one_tenants_excess_costs_another_nothing() {
     soon(driver.offer(&[0.0])).await.unwrap();
     plant(&red, "red-2").await;
     let outcome = v1::CreatePlantRequest { model: "pendulum".to_owned(), ..Default::default() };
-    let refused = soon(async {
-        loop {
-            match blue.create_plant(outcome.clone()).await {
-                Err(error) if error.reason() == "LIMIT_EXCEEDED" => break error.to_string(),
-                other => panic!("{other:?}"),
-            }
-        }
-    })
-    .await;
+    let refused = soon(blue.create_plant(outcome)).await.unwrap_err();
+    assert_eq!(refused.reason(), "LIMIT_EXCEEDED", "{refused}");
+    let refused = refused.to_string();
     assert!(
         refused.contains("`tenant.plants`") || refused.contains("`tenant.streams`"),
         "{refused}"

@@ -87,7 +87,6 @@ struct Args {
         long,
         global = true,
         value_name = "NAME",
-        env = "PLANTD_SERVER",
         conflicts_with = "address"
     )]
     on: Option<String>,
