@@ -83,12 +83,7 @@ struct Args {
     #[arg(long, global = true, env = "PLANTD_ADDRESS")]
     address: Option<String>,
     /// Server by its name in ~/.config/plantd/servers.toml, which has address, token, ca, cert and key.
-    #[arg(
-        long,
-        global = true,
-        value_name = "NAME",
-        conflicts_with = "address"
-    )]
+    #[arg(long, global = true, value_name = "NAME", conflicts_with = "address")]
     on: Option<String>,
     /// Token with which the server knows you; the environment does not show it to others, a command line does.
     #[arg(long, global = true, env = "PLANTD_TOKEN", hide_env_values = true)]
