@@ -5,9 +5,9 @@ use plantd_proto::v1::{
     control_service_client::ControlServiceClient, model_service_client::ModelServiceClient,
     plant_service_client::PlantServiceClient, recording_service_client::RecordingServiceClient,
 };
-use tonic::transport::Channel;
 
 use crate::connection::{ConnectOptions, MAX_RECEIVE_BYTES, connect};
+use crate::credentials::AuthorizedChannel;
 use crate::driver::Driver;
 use crate::error::{Error, Result};
 use crate::follower::Follower;
@@ -19,13 +19,13 @@ use crate::stream::Answers;
 /// leave the rest to `..Default::default()`.
 #[derive(Clone, Debug)]
 pub struct Client {
-    channel: Channel,
+    channel: AuthorizedChannel,
     options: ConnectOptions,
 }
 
 impl Client {
-    /// Connects to `http://host:port` (or just `host:port`) or `unix:/path`, where a gRPC server has to
-    /// answer.
+    /// Connects to `http://host:port` (or just `host:port`), `https://host:port` or `unix:/path`, where a gRPC
+    /// server has to answer.
     ///
     /// # Errors
     /// [`Error::Address`] and [`Error::Connect`] say what is wrong with the address, or what there is.
@@ -42,33 +42,33 @@ impl Client {
     // ---- the generated stubs, for what is not wrapped ----
 
     /// The generated client of `ModelService`.
-    pub fn models(&self) -> ModelServiceClient<Channel> {
+    pub fn models(&self) -> ModelServiceClient<AuthorizedChannel> {
         ModelServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
     /// The generated client of `PlantService`.
-    pub fn plants(&self) -> PlantServiceClient<Channel> {
+    pub fn plants(&self) -> PlantServiceClient<AuthorizedChannel> {
         PlantServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
     /// The generated client of `ControlService`.
-    pub fn control(&self) -> ControlServiceClient<Channel> {
+    pub fn control(&self) -> ControlServiceClient<AuthorizedChannel> {
         ControlServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
     /// The generated client of `ChannelService`.
-    pub fn channels(&self) -> ChannelServiceClient<Channel> {
+    pub fn channels(&self) -> ChannelServiceClient<AuthorizedChannel> {
         ChannelServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
     /// The generated client of `RecordingService`.
-    pub fn recordings(&self) -> RecordingServiceClient<Channel> {
+    pub fn recordings(&self) -> RecordingServiceClient<AuthorizedChannel> {
         RecordingServiceClient::new(self.channel.clone())
             .max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
     /// The channel itself, for services that are not plantd's own (health, reflection).
-    pub fn channel(&self) -> Channel {
+    pub fn channel(&self) -> AuthorizedChannel {
         self.channel.clone()
     }
 

@@ -1,14 +1,17 @@
 //! Connections: addresses, timeouts and limits.
 
+use std::fmt::Write as _;
 use std::io;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 use std::time::Duration;
 
 use tonic::codegen::http::uri::PathAndQuery;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::Endpoint;
 
+use crate::credentials::{AuthorizedChannel, Credentials};
 use crate::error::{ConnectProblem, Error, Result, root_cause};
+use crate::handshake::refusal;
 
 /// Where a server listens unless it is told otherwise.
 pub const DEFAULT_ADDRESS: &str = "http://127.0.0.1:50051";
@@ -27,24 +30,37 @@ const STREAM_WINDOW_BYTES: u32 = 64 << 10;
 const CONNECTION_WINDOW_BYTES: u32 = 64 << 20;
 
 /// Limits of a connection.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConnectOptions {
     /// Longest wait for the connection; 5 s by default.
     pub connect_timeout: Duration,
     /// Longest wait for the answer of a call, for the opening of a stream and for each step of a
     /// [`Driver`](crate::Driver); 60 s by default. Sent to the server, which gives up as well.
     pub request_timeout: Duration,
+    /// How the client shows who it is, and how it knows the server.
+    pub credentials: Credentials,
 }
 
 impl Default for ConnectOptions {
     fn default() -> Self {
-        Self { connect_timeout: Duration::from_secs(5), request_timeout: Duration::from_secs(60) }
+        Self {
+            connect_timeout: Duration::from_secs(5),
+            request_timeout: Duration::from_secs(60),
+            credentials: Credentials::default(),
+        }
     }
 }
 
-/// Opens a channel to `http://host:port`, `host:port` or `unix:/path`.
-pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<Channel> {
-    let endpoint = endpoint(address)?
+/// Opens a channel to `http://host:port`, `https://host:port`, `host:port` or `unix:/path`.
+pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<AuthorizedChannel> {
+    let authorization = options.credentials.header()?;
+    let endpoint = endpoint(address)?;
+    let is_secured = address.starts_with("https://");
+    let endpoint = match is_secured {
+        true => secured(endpoint, &options.credentials)?,
+        false => endpoint,
+    };
+    let endpoint = endpoint
         .connect_timeout(options.connect_timeout)
         // Without it a round trip waits for the peer's delayed acknowledgement, 40 ms.
         .tcp_nodelay(true)
@@ -61,8 +77,14 @@ pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<C
         Ok(Err(error)) => return Err(failed(problem(address, &error, limit))),
         Err(_) => return Err(failed(ConnectProblem::TimedOut(limit))),
     };
+    let channel = AuthorizedChannel::new(channel, authorization);
     match tokio::time::timeout(limit, speaks_grpc(channel.clone())).await {
-        Ok(Ok(())) => Ok(channel),
+        Ok(Ok(Some(stranger))) => Err(stranger.into()),
+        Ok(Ok(None)) => Ok(channel),
+        Ok(Err(problem)) if is_secured => {
+            let said = refusal(address, &options.credentials, limit).await;
+            Err(failed(said.and_then(|said| tls_problem(&said)).unwrap_or(problem)))
+        }
         Ok(Err(problem)) => Err(failed(problem)),
         Err(_) => Err(failed(ConnectProblem::Silent(limit))),
     }
@@ -81,6 +103,9 @@ fn problem(
             return ConnectProblem::UnknownHost;
         }
         cause = error.source();
+    }
+    if let Some(problem) = tls_problem(error) {
+        return problem;
     }
     let cause = root_cause(error);
     let kind = cause.downcast_ref::<io::Error>().map(io::Error::kind);
@@ -101,13 +126,45 @@ fn is_socket(path: &Path) -> bool {
     std::fs::metadata(path).is_ok_and(|metadata| metadata.file_type().is_socket())
 }
 
-/// Whether there is a gRPC server at the other end: it says of a method that nobody has that it has none.
-/// HTTP/2 does not wait for the other side before it calls a connection made.
-async fn speaks_grpc(channel: Channel) -> Result<(), ConnectProblem> {
+/// Which side has refused TLS, and why.
+fn tls_problem(error: &(dyn std::error::Error + 'static)) -> Option<ConnectProblem> {
+    let mut text = String::new();
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        let _ = write!(text, "{error}; ");
+        cause = error.source();
+    }
+    let said = |words: &[&str]| words.iter().any(|word| text.contains(word));
+    // What rustls says of the server's certificate, and the alerts that servers send.
+    let problem = if said(&["invalid peer certificate: UnknownIssuer"]) {
+        ConnectProblem::UnknownAuthority
+    } else if said(&["certificate not valid for name", "NotValidForName"]) {
+        ConnectProblem::WrongName
+    } else if said(&["invalid peer certificate"]) {
+        ConnectProblem::BadCertificate(root_cause(error).to_string())
+    } else if said(&["fatal alert: CertificateRequired"]) {
+        ConnectProblem::CertificateNeeded
+    } else if said(&["fatal alert: UnknownCA", "fatal alert: BadCertificate"])
+        || said(&["fatal alert: CertificateExpired", "fatal alert: DecryptError"])
+        || said(&["fatal alert: CertificateUnknown"])
+    {
+        ConnectProblem::CertificateRefused(root_cause(error).to_string())
+    } else if said(&["InvalidContentType", "InvalidMessage("]) {
+        ConnectProblem::NoTls
+    } else {
+        return None;
+    };
+    Some(problem)
+}
+
+/// Whether there is a gRPC server at the other end: it says of a method that nobody has that it has none, or that it
+/// does not know who asks. HTTP/2 does not wait for the other side before it calls a connection made.
+async fn speaks_grpc(channel: AuthorizedChannel) -> Result<Option<tonic::Status>, ConnectProblem> {
     let mut stub = tonic::client::Grpc::new(channel);
     let path = PathAndQuery::from_static("/plantd.v1.Connection/Probe");
     let not_grpc = |error: &(dyn std::error::Error + 'static)| {
-        Err(ConnectProblem::NotGrpc(root_cause(error).to_string()))
+        let other = || ConnectProblem::NotGrpc(root_cause(error).to_string());
+        Err(tls_problem(error).unwrap_or_else(other))
     };
     if let Err(error) = stub.ready().await {
         return not_grpc(&error);
@@ -115,7 +172,8 @@ async fn speaks_grpc(channel: Channel) -> Result<(), ConnectProblem> {
     let codec = tonic_prost::ProstCodec::<(), ()>::default();
     match stub.unary(tonic::Request::new(()), path, codec).await {
         Err(status) if is_local(&status) => not_grpc(&status),
-        _ => Ok(()),
+        Err(status) if status.code() == tonic::Code::Unauthenticated => Ok(Some(status)),
+        _ => Ok(None),
     }
 }
 
@@ -137,6 +195,14 @@ pub(crate) async fn within<T, E: Into<Error>>(
     }
 }
 
+/// An endpoint with TLS.
+fn secured(endpoint: Endpoint, credentials: &Credentials) -> Result<Endpoint> {
+    endpoint.tls_config(credentials.tls()?).map_err(|error| Error::Credentials {
+        what: "ca, cert or key",
+        problem: root_cause(&error).to_string(),
+    })
+}
+
 fn endpoint(address: &str) -> Result<Endpoint> {
     let refused = |problem| Error::Address { address: address.to_owned(), problem };
     let url = if address.contains("://") || address.starts_with("unix:") {
@@ -147,11 +213,10 @@ fn endpoint(address: &str) -> Result<Endpoint> {
     let problem = match url.split_once(':') {
         Some(("unix", path)) if path.trim_start_matches("//").starts_with('/') => None,
         Some(("unix", _)) => Some("the path of a socket begins with `/`"),
-        Some(("http", rest)) => {
+        Some(("http" | "https", rest)) => {
             let has_host = rest.strip_prefix("//").is_some_and(|host| !host.is_empty());
             (!has_host).then_some("it names no host")
         }
-        Some(("https", _)) => Some("plantd does not speak TLS"),
         _ => Some("the scheme is unknown"),
     };
     if let Some(problem) = problem {
@@ -166,8 +231,13 @@ mod tests {
 
     #[test]
     fn addresses() {
-        for good in ["http://127.0.0.1:1", "localhost:50051", "unix:/run/plantd.sock", "unix:///a"]
-        {
+        for good in [
+            "http://127.0.0.1:1",
+            "https://plants.lab:1",
+            "localhost:50051",
+            "unix:/run/plantd.sock",
+            "unix:///a",
+        ] {
             assert!(endpoint(good).is_ok(), "{good}");
         }
         for (bad, said) in [
@@ -176,7 +246,7 @@ mod tests {
             ("unix:", "begins with `/`"),
             ("unix:relative", "begins with `/`"),
             ("ftp://a:1", "scheme"),
-            ("https://a:1", "TLS"),
+            ("https://", "no host"),
             ("a b", "cannot be read"),
         ] {
             let error = endpoint(bad).unwrap_err();

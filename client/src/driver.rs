@@ -5,9 +5,9 @@ use std::time::Duration;
 use plantd_proto::v1::{self, plant_service_client::PlantServiceClient};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::Channel;
 
 use crate::connection::within;
+use crate::credentials::AuthorizedChannel;
 use crate::error::{Error, Result};
 use crate::schedule::Law;
 
@@ -41,7 +41,7 @@ pub struct Driver {
 
 impl Driver {
     pub(crate) async fn open(
-        mut plants: PlantServiceClient<Channel>,
+        mut plants: PlantServiceClient<AuthorizedChannel>,
         open: v1::DriveOpen,
         step_timeout: Duration,
     ) -> Result<Self> {

@@ -14,12 +14,22 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The address is neither `http://host:port` nor `unix:/path`.
-    #[error("`{address}` is not an address: {problem}; write http://host:port or unix:/path")]
+    #[error(
+        "`{address}` is not an address: {problem}; write http://host:port, https://host:port or unix:/path"
+    )]
     Address {
         /// What was given.
         address: String,
         /// What is wrong with it.
         problem: &'static str,
+    },
+    /// The client's token, certificate, key or CA cannot be used.
+    #[error("`{what}` cannot be used: {problem}")]
+    Credentials {
+        /// Which of them.
+        what: &'static str,
+        /// What is wrong with it.
+        problem: String,
     },
     /// There is no server at the address.
     #[error("cannot connect to {address}: {problem}")]
@@ -129,10 +139,39 @@ pub enum ConnectProblem {
         .0.as_secs_f64()
     )]
     Silent(std::time::Duration),
+    /// The client does not trust who issued the server's certificate.
+    #[error(
+        "this client refuses the server: its certificate was issued by nobody that the client trusts; is \
+         `ca` the server's CA?"
+    )]
+    UnknownAuthority,
+    /// The server's certificate is another host's.
+    #[error(
+        "this client refuses the server: its certificate is not for the host in the address; write the name \
+         that it is for"
+    )]
+    WrongName,
+    /// There is something else wrong with the server's certificate.
+    #[error("this client refuses the server's certificate: {0}")]
+    BadCertificate(String),
+    /// The server wants to see a certificate.
+    #[error(
+        "the server refuses this client: it lets in only those with a certificate; give `cert` and `key`"
+    )]
+    CertificateNeeded,
+    /// The server does not like the client's certificate.
+    #[error(
+        "the server refuses this client's certificate ({0}): is it in date, and did a CA issue it that the \
+         server trusts?"
+    )]
+    CertificateRefused(String),
+    /// There is no TLS at the other end.
+    #[error("what answers there does not speak TLS: write http:// in place of https://")]
+    NoTls,
     /// There is a server, of something else.
     #[error(
         "what answers there does not speak gRPC without TLS ({0}); is this the port of plantd's gRPC, and \
-         not that of its metrics or of another server?"
+         not that of its metrics or of another server? One with TLS is at https://"
     )]
     NotGrpc(String),
     /// Something else.

@@ -8,9 +8,9 @@ use plantd_proto::v1::{self, plant_service_client::PlantServiceClient};
 use tokio::runtime::Handle;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
-use tonic::transport::Channel;
 
 use crate::connection::within;
+use crate::credentials::AuthorizedChannel;
 use crate::error::{Error, Refusal, Result};
 use crate::messages::{GainExt as _, LawState, check};
 use crate::schedule::{Law, input_of};
@@ -183,7 +183,7 @@ impl Window {
 
 /// Where the gains of a plant come from.
 struct Source {
-    plants: PlantServiceClient<Channel>,
+    plants: PlantServiceClient<AuthorizedChannel>,
     id: String,
     /// Longest wait for the stream to open, and for its first message.
     timeout: Duration,
@@ -252,7 +252,7 @@ async fn read(
 impl Follower {
     /// Opens the stream of a plant's gains and takes its first message in.
     pub(crate) async fn open(
-        plants: PlantServiceClient<Channel>,
+        plants: PlantServiceClient<AuthorizedChannel>,
         id: String,
         timeout: Duration,
     ) -> Result<Self> {

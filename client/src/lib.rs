@@ -51,10 +51,12 @@
 
 mod client;
 mod connection;
+mod credentials;
 mod driver;
 mod error;
 mod estimator;
 mod follower;
+mod handshake;
 pub mod link;
 mod messages;
 mod recording;
@@ -64,6 +66,7 @@ mod stream;
 
 pub use client::Client;
 pub use connection::{ConnectOptions, DEFAULT_ADDRESS, MAX_RECEIVE_BYTES};
+pub use credentials::{Authorization, AuthorizedChannel, Credentials};
 pub use driver::Driver;
 pub use error::{ConnectProblem, Error, Refusal, Result, Violation};
 pub use estimator::Estimator;

@@ -25,7 +25,7 @@ pub enum Command {
     /// Flags win over environment variables, those over the configuration file; of two flags the last wins.
     #[command(after_help = "Examples:\n  \
         plantd serve\n  \
-        plantd serve --grpc 0.0.0.0:50051 --unix /run/plantd/plantd.sock\n  \
+        plantd serve --unix /run/plantd/plantd.sock\n  \
         plantd serve --config /etc/plantd/plantd.toml --limit plants=10")]
     Serve(Box<Settings>),
     /// Show the limits in force, with the names by which they can be set.
@@ -69,6 +69,16 @@ pub struct Settings {
         value_delimiter = ','
     )]
     pub allowed_hosts: Vec<String>,
+    /// Listen beyond the loopback interface without TLS or without asking who calls.
+    #[arg(
+        long,
+        env = "PLANTD_INSECURE",
+        num_args = 0..=1,
+        require_equals = true,
+        default_missing_value = "true",
+        value_parser = clap::builder::BoolishValueParser::new()
+    )]
+    pub insecure: Option<bool>,
     /// The page that shows the plants, on the port of gRPC.
     #[arg(long, env = "PLANTD_VIEW")]
     pub view: Option<Switch>,
@@ -169,6 +179,7 @@ impl Settings {
         replace(&mut config.state_interval_s, self.state_interval_s);
         replace(&mut config.log.filter, self.log);
         replace(&mut config.log.format, self.log_format);
+        replace(&mut config.insecure, self.insecure);
         replace(&mut config.view, self.view.map(|switch| switch == Switch::On));
         replace(&mut config.link.enabled, self.link.map(|switch| switch == Switch::On));
         config.unix = self.unix.or(config.unix);

@@ -1,5 +1,6 @@
 //! The configuration: defaults, then the file, then the environment, then flags; the last one wins.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -14,6 +15,9 @@ use crate::core::limits::{LimitError, Limits};
 use crate::core::modes::Mode;
 use crate::core::priority::{Priority, Scheduling};
 use crate::core::realtime::settings::RealTimeSettings;
+use crate::core::tenant::{ANY_TENANT, TenantSettings, is_tenant_name};
+use crate::tls::{ClientCertificates, TlsSettings};
+use crate::wire::edge::auth::settings::AuthSettings;
 use crate::wire::link::config::LinkConfig;
 use crate::wire::names::{Names, is_host_name, is_origin};
 
@@ -43,6 +47,8 @@ pub struct Config {
     pub allowed_origins: Vec<String>,
     /// Host names under which it may be called, besides `localhost` and IP addresses.
     pub allowed_hosts: Vec<String>,
+    /// Listen beyond the loopback interface without TLS or without asking who calls.
+    pub insecure: bool,
     /// The page that shows the plants, at the address of gRPC over TCP.
     pub view: bool,
     /// Directory of scenes (`*.toml`, `*.json`) to load as models at the start, with their meshes.
@@ -75,6 +81,15 @@ pub struct Config {
     pub drain_s: f64,
     /// Logging.
     pub log: LogConfig,
+    /// TLS of gRPC over TCP; without it nothing is encrypted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tls: Option<TlsSettings>,
+    /// Who is let in; without it everybody is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub auth: Option<AuthSettings>,
+    /// What each tenant may use; `*` stands for those that are not named.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub tenants: BTreeMap<String, TenantSettings>,
     /// Shared-memory links.
     pub link: LinkSettings,
     /// Plants that follow the wall clock.
@@ -93,6 +108,7 @@ impl Default for Config {
             metrics: Listen::Off,
             allowed_origins: Vec::new(),
             allowed_hosts: Vec::new(),
+            insecure: false,
             view: true,
             scenes: None,
             state_directory: None,
@@ -106,6 +122,9 @@ impl Default for Config {
             shutdown_grace_s: 5.0,
             drain_s: 5.0,
             log: LogConfig::default(),
+            tls: None,
+            auth: None,
+            tenants: BTreeMap::new(),
             link: LinkSettings::default(),
             realtime: RealTimeSettings::default(),
             limits: Limits::default(),
@@ -292,6 +311,38 @@ pub enum ConfigError {
     /// A limit is unknown or out of range.
     #[error(transparent)]
     Limit(#[from] LimitError),
+    /// A tenant has a name that none can have.
+    #[error(
+        "`{key}` has `{value}`, which is no name of a tenant: letters, digits and `-_.`, at most 64"
+    )]
+    Tenant {
+        /// Key.
+        key: &'static str,
+        /// Value.
+        value: String,
+    },
+    /// Clients are asked for certificates of nobody.
+    #[error(
+        "`tls.client` asks clients for certificates: `tls.client_ca` has to name those who issue them"
+    )]
+    ClientCa,
+    /// Tenants without anybody who says whose call it is.
+    #[error("`tenants` has limits, but without `[auth]` nobody is asked whose tenant they are of")]
+    TenantsOfNobody,
+    /// Others could reach the server, and nothing keeps them out.
+    #[error(
+        "{what} at {address} can be reached by other machines, {lack}: give it what it lacks, listen on \
+         127.0.0.1 or on a unix-domain socket, or write `insecure = true` (`--insecure`) if the network is \
+         closed to strangers"
+    )]
+    Exposed {
+        /// What listens.
+        what: &'static str,
+        /// Where.
+        address: SocketAddr,
+        /// What is missing.
+        lack: &'static str,
+    },
     /// Nothing to serve on.
     #[error("gRPC is off and there is no unix socket: the server could not be reached")]
     Nowhere,
@@ -313,9 +364,59 @@ impl Config {
         })
     }
 
+    fn check_identities(&self) -> Result<(), ConfigError> {
+        let wrong = |key, value: &str| ConfigError::Tenant { key, value: value.to_owned() };
+        let tenants = self.tenants.keys().filter(|name| name.as_str() != ANY_TENANT);
+        if let Some(name) = tenants.into_iter().find(|name| !is_tenant_name(name)) {
+            return Err(wrong("tenants", name));
+        }
+        if let Some(name) = self.auth.as_ref().and_then(AuthSettings::wrong_tenant) {
+            return Err(wrong("auth", name));
+        }
+        if self.auth.is_none() && !self.tenants.is_empty() {
+            return Err(ConfigError::TenantsOfNobody);
+        }
+        match &self.tls {
+            Some(tls) if tls.client != ClientCertificates::None && tls.client_ca.is_none() => {
+                Err(ConfigError::ClientCa)
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Refuses to be reached by other machines without TLS, or without asking who calls, unless that is written out.
+    pub fn check_exposure(&self) -> Result<(), ConfigError> {
+        self.exposure().filter(|_| !self.insecure).map_or(Ok(()), Err)
+    }
+
+    /// What other machines can reach without TLS, or without being asked who they are.
+    pub fn exposure(&self) -> Option<ConfigError> {
+        let needs_certificate =
+            self.tls.as_ref().is_some_and(|tls| tls.client == ClientCertificates::Required);
+        let lack = match (&self.tls, self.auth.is_some() || needs_certificate) {
+            (None, false) => Some("without TLS, and asks nobody who they are"),
+            (None, true) => Some("without TLS"),
+            (Some(_), false) => Some("and asks nobody who they are"),
+            (Some(_), true) => None,
+        };
+        // Metrics at an address of their own have neither; behind the door they are at that of gRPC.
+        let metrics = Some("without TLS, and asks nobody who they are");
+        for (what, listen, lack) in [("gRPC", self.grpc, lack), ("metrics", self.metrics, metrics)]
+        {
+            if let Listen::At(address) = listen
+                && let Some(lack) = lack
+                && listen.is_beyond_loopback()
+            {
+                return Some(ConfigError::Exposed { what, address, lack });
+            }
+        }
+        None
+    }
+
     /// Refuses values that are out of range.
     pub fn check(&self) -> Result<(), ConfigError> {
         self.limits.check()?;
+        self.check_identities()?;
         for (key, value) in [
             ("shutdown_grace_s", self.shutdown_grace_s),
             ("drain_s", self.drain_s),

@@ -22,4 +22,5 @@ pub mod listen;
 mod memory;
 mod scenes;
 pub mod serve;
+pub mod tls;
 pub mod wire;

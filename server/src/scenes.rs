@@ -110,7 +110,7 @@ visuals = [
         std::fs::write(outside.path().join("secret.png"), b"secret").unwrap();
         std::os::unix::fs::symlink("../../secret.stl", scenes.join("meshes/link.stl")).unwrap();
         let limits = Limits { model_file_bytes: 99, ..Limits::default() };
-        let catalog = Catalog::new(&limits, Gauge::default());
+        let catalog = Catalog::new(&limits, Gauge::default(), Arc::default());
         load(&catalog, &scenes).unwrap();
         let files = catalog.files("shown").unwrap();
         for file in ["meshes/arm.obj", "meshes/arm.mtl", "meshes/arm.png"] {

@@ -28,12 +28,17 @@ use v1::plant_service_server::PlantServiceServer;
 use v1::recording_service_server::RecordingServiceServer;
 
 use crate::config::{Config, Listen};
+use crate::core::connection::Connection;
 use crate::core::limits::Limits;
+use crate::core::tenant::Tenant;
 use crate::listen::{KEEP_ALIVE_INTERVAL, KEEP_ALIVE_TIMEOUT, UnixSocket, bind_tcp};
 use crate::memory;
 use crate::scenes;
+use crate::tls::{TlsFiles, over_tls};
 use crate::wire::control::service::ControlService;
 use crate::wire::edge::admission::Places;
+use crate::wire::edge::auth::door::Door;
+use crate::wire::edge::auth::guard::GuardLayer;
 use crate::wire::edge::ending::ending_with;
 use crate::wire::edge::gate::GateLayer;
 use crate::wire::edge::metrics_http;
@@ -90,6 +95,10 @@ pub struct RunningServer {
     /// Deletes plants that nobody uses any more.
     reaper: tokio::task::JoinHandle<()>,
     metrics: Option<tokio::task::JoinHandle<()>>,
+    /// Where callers say who they are.
+    door: Option<Arc<Door>>,
+    /// Looks whether tokens and certificates have changed.
+    lookouts: JoinSet<()>,
     /// Removed from the file system when dropped.
     unix: Option<UnixSocket>,
 }
@@ -133,6 +142,13 @@ pub enum Shutdown {
 impl RunningServer {
     /// Starts to serve.
     pub async fn start(config: Config) -> Result<Self> {
+        config.check_exposure()?;
+        if let Some(exposure) = config.exposure() {
+            // Said at every start.
+            tracing::warn!(
+                "`insecure` is set: whoever reaches the server may do everything. {exposure}"
+            );
+        }
         let links = config.link.host_config().map(LinkHost::new).transpose();
         let links = links.context("shared-memory links (turn them off with `--link off`)")?;
         let link_root = config.link.host_config().filter(|_| links.is_some()).map(|link| link.root);
@@ -142,24 +158,34 @@ impl RunningServer {
             config.worker_priority,
             config.realtime.clone(),
             links,
+            config.auth.as_ref().map(|_| config.tenants.clone()),
         );
         hub.search_threads = config.search_thread_count();
         if let Some(path) = &config.state_directory {
-            let state = StateDirectory::open(path, config.file_mode);
+            let state = StateDirectory::open(path, config.file_mode, Arc::clone(&hub.tenants));
             hub.state = Some(state.with_context(|| format!("plants in {}", path.display()))?);
         }
         if let Some(path) = &config.recordings {
-            let recordings = Recordings::open(path, config.file_mode, config.limits.clone());
+            let (limits, tenants) = (config.limits.clone(), Arc::clone(&hub.tenants));
+            let recordings = Recordings::open(path, config.file_mode, limits, tenants);
             let recordings =
                 recordings.with_context(|| format!("recordings in {}", path.display()));
             hub.recordings = Some(recordings?);
         }
         let hub = Arc::new(hub);
         if let Some(directory) = &config.scenes {
-            scenes::load(&hub.catalog, directory)?;
+            // They are there for everybody.
+            Connection::server(Tenant::NONE).scope(|| scenes::load(&hub.catalog, directory))?;
         }
         if let Some(state) = &hub.state {
             state.load(&hub).await.context("saved plants")?;
+        }
+        let tenants = Arc::clone(&hub.tenants);
+        let door = config.auth.clone().map(|settings| Door::new(settings, tenants)).transpose()?;
+        let door = door.map(Arc::new);
+        let mut lookouts = JoinSet::new();
+        if let Some(door) = &door {
+            lookouts.spawn(Arc::clone(door).look_after());
         }
         let (health, health_service) = tonic_health::server::health_reporter();
         health.set_serving::<ModelServiceServer<ModelService>>().await;
@@ -184,6 +210,8 @@ impl RunningServer {
             memory: tokio::spawn(memory::give_back()),
             reaper: tokio::spawn(delete_expired(Arc::clone(&hub))),
             metrics: None,
+            door,
+            lookouts,
             unix: None,
             hub,
             config,
@@ -221,7 +249,11 @@ impl RunningServer {
             .http2_keepalive_interval(Some(KEEP_ALIVE_INTERVAL))
             .http2_keepalive_timeout(Some(KEEP_ALIVE_TIMEOUT))
             .layer(GateLayer::new(self.config.names()))
-            .layer(PageLayer::new(self.config.view.then(|| find_file(hub()))))
+            .layer(GuardLayer::new(self.door.clone(), Arc::clone(&self.hub.metrics)))
+            .layer(PageLayer::new(
+                self.config.view.then(|| find_file(hub())),
+                self.door.as_ref().map(|_| Arc::clone(&self.hub.metrics)),
+            ))
             .layer(GrpcWebLayer::new())
             .layer(ObserveLayer::new(Arc::clone(&self.hub.metrics), limits.clone()))
             .add_routes(self.routes())
@@ -258,13 +290,24 @@ impl RunningServer {
         let places = Arc::new(Places::new(&self.hub.limits));
         if let Listen::At(address) = self.config.grpc {
             let incoming = bind_tcp(address).with_context(|| format!("gRPC on {address}"))?;
-            warn_beyond_loopback("gRPC", address);
             let address = incoming.local_addr()?;
-            self.addresses.grpc = Some(format!("http://{address}"));
-            self.addresses.view = self.config.view.then(|| format!("http://{}/", within(address)));
+            let scheme = if self.config.tls.is_some() { "https" } else { "http" };
+            self.addresses.grpc = Some(format!("{scheme}://{address}"));
+            let view = || format!("{scheme}://{}/", within(address));
+            self.addresses.view = self.config.view.then(view);
             let incoming = Arc::clone(&places).admit(incoming);
-            let closing = self.closing.clone().cancelled_owned();
-            self.listeners.spawn(router.clone().serve_with_incoming_shutdown(incoming, closing));
+            let (router, closing) = (router.clone(), self.closing.clone().cancelled_owned());
+            match &self.config.tls {
+                Some(settings) => {
+                    let files = TlsFiles::read(settings.clone())?;
+                    self.lookouts.spawn(Arc::clone(&files).look_after());
+                    let incoming = over_tls(incoming, files);
+                    self.listeners.spawn(router.serve_with_incoming_shutdown(incoming, closing));
+                }
+                None => {
+                    self.listeners.spawn(router.serve_with_incoming_shutdown(incoming, closing));
+                }
+            }
         }
         if let Some(path) = &self.config.unix {
             let path = std::path::absolute(path)?;
@@ -281,7 +324,6 @@ impl RunningServer {
             let listener = TcpListener::bind(address)
                 .await
                 .with_context(|| format!("metrics on {address}"))?;
-            warn_beyond_loopback("metrics", address);
             self.addresses.metrics = Some(format!("http://{}/metrics", listener.local_addr()?));
             let metrics = Arc::clone(&self.hub.metrics);
             let names = self.config.names().strict();
@@ -359,24 +401,13 @@ impl RunningServer {
         self.saver.abort();
         self.memory.abort();
         self.reaper.abort();
+        self.lookouts.abort_all();
         if tokio::time::timeout(SAVE_WAIT_MAX, save_once(&self.hub)).await.is_err() {
             tracing::error!("the disk does not answer: not all plants were saved");
         }
         if let Some(metrics) = &self.metrics {
             metrics.abort();
         }
-    }
-}
-
-/// Says at every start who can reach the server.
-fn warn_beyond_loopback(what: &str, address: SocketAddr) {
-    if Listen::At(address).is_beyond_loopback() {
-        tracing::warn!(
-            %address,
-            "{what}: other machines can reach this address, and nobody is asked who they are: whoever \
-             reaches it may do everything. Listen on 127.0.0.1 or on a unix-domain socket, or see to it \
-             that the network is closed"
-        );
     }
 }
 
@@ -410,8 +441,10 @@ async fn save_once(hub: &Arc<Hub>) {
 /// The services with the layer that counts calls, for whoever is in this process.
 pub type Services = Observe<Routes>;
 
-type Layers =
-    Stack<ObserveLayer, Stack<GrpcWebLayer, Stack<PageLayer, Stack<GateLayer, Identity>>>>;
+type Layers = Stack<
+    ObserveLayer,
+    Stack<GrpcWebLayer, Stack<PageLayer, Stack<GuardLayer, Stack<GateLayer, Identity>>>>,
+>;
 
 /// An address under which this machine reaches what listens at one.
 fn within(address: SocketAddr) -> SocketAddr {

@@ -317,8 +317,9 @@ fn a_recorded_step_allocates_nothing() {
     let plant = Plant::new(Arc::clone(&model), Settings::new(&model)).expect("a plant");
     let session = new_session(plant);
     let directory = tempfile::tempdir().expect("a directory");
-    let recordings = Recordings::open(directory.path(), modes::Mode::PRIVATE, Limits::default())
-        .expect("opened");
+    let (path, mode) = (directory.path(), modes::Mode::PRIVATE);
+    let recordings =
+        Recordings::open(path, mode, Limits::default(), Arc::default()).expect("opened");
     recordings.start(&session, "steps".to_owned(), 0.0).expect("it can be recorded");
     let mut lease = session.acquire(DriverKind::Step).expect("nobody has it");
     // More than the ring holds, so that some steps wait for the recorder.

@@ -6,6 +6,7 @@ use std::process::Command;
 use plantd_server::config::{Config, Listen, LogFormat};
 use plantd_server::core::limits::Limits;
 use plantd_server::core::metrics::registry::Metrics;
+use plantd_server::tls::ClientCertificates;
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
@@ -18,10 +19,13 @@ fn read(path: &str) -> String {
 
 /// The annotated configuration with the keys that are commented out.
 fn full_configuration() -> String {
-    let keys = ["scenes", "ready_file", "state_directory", "recordings"];
-    keys.iter().fold(read("deploy/plantd.toml"), |text, key| {
-        text.replace(&format!("\n#{key}"), &format!("\n{key}"))
-    })
+    let text = read("deploy/plantd.toml");
+    // What is commented out has no space after the mark; what is said has one.
+    let lines = text.lines().map(|line| match line.strip_prefix('#') {
+        Some(key) if key.starts_with(|c: char| c == '[' || c.is_ascii_lowercase()) => key,
+        _ => line,
+    });
+    lines.collect::<Vec<_>>().join("\n")
 }
 
 /// Dotted names of all keys of a table.
@@ -49,6 +53,11 @@ fn the_annotated_configuration_has_every_key() {
     assert!(config.unix.is_some() && config.scenes.is_some() && config.ready_file.is_some());
     assert!(config.link.root.is_some());
     assert!(config.state_directory.is_some() && config.recordings.is_some());
+    let tls = config.tls.as_ref().expect("it has TLS");
+    assert!(tls.client_ca.is_some() && tls.client != ClientCertificates::default());
+    let auth = config.auth.as_ref().expect("it asks who calls");
+    assert!(auth.tokens.is_some() && !auth.certificates.is_empty() && auth.peers[0].name.is_some());
+    config.check().expect("it is in range");
     let known: toml::Table = config.to_toml().expect("it is written").parse().expect("as TOML");
     let annotated: toml::Table = text.parse().expect("it is TOML");
     assert_eq!(keys(&annotated, ""), keys(&known, ""));
@@ -64,6 +73,19 @@ fn the_annotated_configuration_differs_from_the_defaults_only_where_it_says_so()
     config.link.root = None;
     config.log.format = LogFormat::Text;
     assert_eq!(config, Config::default());
+}
+
+#[test]
+fn the_annotated_configuration_has_every_limit_of_tenants() {
+    let config: Config = toml::from_str(&full_configuration()).expect("it is read");
+    let limits = toml::Table::try_from(config.tenants["lab"].limits).expect("as a table");
+    let document = read("docs/security.md");
+    let all = plantd_server::core::tenant::TenantLimits::NAMES;
+    assert_eq!(limits.len(), all.len());
+    for name in all {
+        assert!(limits.contains_key(*name), "deploy/plantd.toml lacks {name}");
+        assert!(document.contains(&format!("`{name}`")), "docs/security.md lacks {name}");
+    }
 }
 
 #[test]

@@ -22,7 +22,7 @@ def refusal(address):
 
 def test_addresses_that_are_none():
     for address, said in [
-        ("https://127.0.0.1:1", "TLS"),
+        ("https://", "no host"),
         ("ftp://127.0.0.1:1", "scheme"),
         ("http://", "no host"),
         ("unix:relative", "begins with `/`"),

@@ -1,14 +1,27 @@
 // The services of plantd, over gRPC-Web on the address that the page came from.
 
-import { Code, ConnectError, createClient } from "@connectrpc/connect";
+import { Code, ConnectError, createClient, type Interceptor } from "@connectrpc/connect";
 import { createGrpcWebTransport } from "@connectrpc/connect-web";
 import { ChannelService } from "./gen/plantd/v1/channel_service_pb.js";
 import { ModelService } from "./gen/plantd/v1/model_service_pb.js";
 import { PlantService } from "./gen/plantd/v1/plant_service_pb.js";
 import { RecordingService } from "./gen/plantd/v1/recording_service_pb.js";
 import { complain } from "./state.js";
+import { askForToken } from "./token.js";
 
-const transport = createGrpcWebTransport({ baseUrl: location.origin });
+/** A call that the server refuses because it does not know who asks is made once more when it does. */
+const known: Interceptor = (next) => async (request) => {
+  try {
+    return await next(request);
+  } catch (error) {
+    const { code, rawMessage } = ConnectError.from(error);
+    if (code !== Code.Unauthenticated || request.stream) throw error;
+    await askForToken(rawMessage);
+    return next(request);
+  }
+};
+
+const transport = createGrpcWebTransport({ baseUrl: location.origin, interceptors: [known], fetch: (input, init) => fetch(input, init) });
 
 export const plants = createClient(PlantService, transport);
 export const models = createClient(ModelService, transport);

@@ -7,9 +7,12 @@ use plantd_models::scene::UnknownName;
 use plantd_models::{Model, builtin};
 use prometheus_client::metrics::gauge::Gauge;
 
+use crate::core::connection::{Caller, Connection};
 use crate::core::files::{File, FileNameError, FileRoom, Files, path_of};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::mutex::lock;
+use crate::core::room::Reservation;
+use crate::core::tenant::{Tenant, Tenants};
 
 /// Why a model was not found, kept or forgotten.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -71,11 +74,14 @@ pub struct Entry {
 struct Uploaded {
     model: Arc<Model>,
     files: Arc<Files>,
+    /// Whose it is; nobody's is there for all.
+    owner: Tenant,
+    room: Reservation,
 }
 
 impl Uploaded {
     fn entry(&self, name: &str) -> Entry {
-        let Self { model, files } = self;
+        let Self { model, files, .. } = self;
         let (model, files) = (Arc::clone(model), Arc::clone(files));
         Entry { name: name.to_owned(), builtin: false, model, files }
     }
@@ -92,11 +98,12 @@ pub struct Catalog {
     file_room: FileRoom,
     /// Shows how many are uploaded.
     gauge: Gauge,
+    tenants: Arc<Tenants>,
 }
 
 impl Catalog {
     /// A catalog with room for so many uploaded models and files as the limits say; the gauge counts the models.
-    pub fn new(limits: &Limits, gauge: Gauge) -> Self {
+    pub fn new(limits: &Limits, gauge: Gauge, tenants: Arc<Tenants>) -> Self {
         Self {
             named: builtin::NAMES.iter().map(|name| (*name, OnceLock::new())).collect(),
             generated: Mutex::default(),
@@ -104,12 +111,32 @@ impl Catalog {
             models_max: limits.models,
             file_room: FileRoom::new(limits),
             gauge,
+            tenants,
         }
+    }
+
+    fn shows(&self, uploaded: &Uploaded) -> bool {
+        uploaded.owner == Tenant::NONE || self.tenants.shows(uploaded.owner)
+    }
+
+    /// It is there for the caller, and may be changed.
+    fn gives(&self, uploaded: &Uploaded) -> bool {
+        match uploaded.owner {
+            Tenant::NONE => self.tenants.may_change_shared(),
+            owner => self.tenants.shows(owner),
+        }
+    }
+
+    /// Names of the uploaded models that the caller may know.
+    fn shown(&self) -> Vec<String> {
+        let uploaded = lock(&self.uploaded);
+        let shown = uploaded.iter().filter(|(_, uploaded)| self.shows(uploaded));
+        shown.map(|(name, _)| name.clone()).collect()
     }
 
     /// The model of that name. May compile it: call it on a worker.
     pub fn get(&self, name: &str) -> Result<Entry, CatalogError> {
-        if let Some(uploaded) = lock(&self.uploaded).get(name) {
+        if let Some(uploaded) = lock(&self.uploaded).get(name).filter(|found| self.shows(found)) {
             return Ok(uploaded.entry(name));
         }
         let model = self.builtin(name)?.ok_or_else(|| self.not_found(name))?;
@@ -118,7 +145,7 @@ impl Catalog {
 
     fn not_found(&self, name: &str) -> CatalogError {
         let families = ["chain-8", "tree-8", "scissor-8"].map(str::to_owned);
-        let uploaded: Vec<String> = lock(&self.uploaded).keys().cloned().collect();
+        let uploaded = self.shown();
         let known = self.named.keys().map(|name| (*name).to_owned());
         let known = known.chain(uploaded).chain(families);
         CatalogError::NotFound { name: UnknownName::among(name, known) }
@@ -153,17 +180,25 @@ impl Catalog {
     }
 
     fn keep(&self, name: &str, model: Arc<Model>, replace: bool) -> Result<Entry, CatalogError> {
+        Caller::note(name);
         if builtin::scene(name).is_some() {
             return Err(CatalogError::Exists { name: name.to_owned() });
         }
         let mut uploaded = lock(&self.uploaded);
-        let is_there = uploaded.contains_key(name);
-        if is_there && !replace {
+        let former = uploaded.get(name);
+        if former.is_some_and(|former| !replace || !self.gives(former)) {
             return Err(CatalogError::Exists { name: name.to_owned() });
         }
+        let is_there = former.is_some();
+        let owner = former.map_or_else(|| Connection::current().tenant(), |former| former.owner);
         let count = uploaded.len() + usize::from(!is_there);
         LimitExceeded::check("models", self.models_max, "uploaded models", count)?;
-        let new = Uploaded { model, files: Arc::default() };
+        // The room of what is replaced goes on to be taken.
+        let room = match uploaded.remove(name) {
+            Some(former) => former.room,
+            None => self.tenants.account(owner).rooms.models.reserve(1)?,
+        };
+        let new = Uploaded { model, files: Arc::default(), owner, room };
         let entry = new.entry(name);
         uploaded.insert(name.to_owned(), new);
         self.gauge.set(uploaded.len() as i64);
@@ -179,14 +214,18 @@ impl Catalog {
         bytes: Vec<u8>,
     ) -> Result<(String, Arc<File>), CatalogError> {
         let path = path_of(name)?;
-        let Some(files) = self.files(model) else {
+        Caller::note(model);
+        let found = self.files(model);
+        let is_given = lock(&self.uploaded).get(model).is_some_and(|found| self.gives(found));
+        let Some(files) = found.as_ref().filter(|_| is_given) else {
             let name = model.to_owned();
-            return Err(match builtin::scene(model) {
-                Some(_) => CatalogError::BuiltinFile { name },
-                None => self.not_found(model),
+            let came_with_the_server = found.is_some() || builtin::scene(model).is_some();
+            return Err(match came_with_the_server {
+                true => CatalogError::BuiltinFile { name },
+                false => self.not_found(model),
             });
         };
-        let file = self.file_room.put(&files, &path, bytes)?;
+        let file = self.file_room.put(files, &path, bytes)?;
         Ok((path, file))
     }
 
@@ -197,17 +236,22 @@ impl Catalog {
 
     /// The files of an uploaded model.
     pub fn files(&self, model: &str) -> Option<Arc<Files>> {
-        lock(&self.uploaded).get(model).map(|uploaded| Arc::clone(&uploaded.files))
+        let uploaded = lock(&self.uploaded);
+        let shown = uploaded.get(model).filter(|found| self.shows(found));
+        shown.map(|uploaded| Arc::clone(&uploaded.files))
     }
 
     /// Forgets an uploaded model.
     pub fn remove(&self, name: &str) -> Result<(), CatalogError> {
         let mut uploaded = lock(&self.uploaded);
-        if uploaded.remove(name).is_some() {
+        Caller::note(name);
+        let found = uploaded.get(name).map(|found| (self.shows(found), self.gives(found)));
+        if let Some((_, true)) = found {
+            uploaded.remove(name);
             self.gauge.set(uploaded.len() as i64);
             return Ok(());
         }
-        if builtin::scene(name).is_some() {
+        if matches!(found, Some((true, false))) || builtin::scene(name).is_some() {
             return Err(CatalogError::Builtin { name: name.to_owned() });
         }
         drop(uploaded);
@@ -218,7 +262,7 @@ impl Catalog {
     /// more. May compile: call it on a worker.
     pub fn page(&self, after: &str, size: usize) -> Result<(Vec<Entry>, bool), CatalogError> {
         let builtin_names = self.named.keys().map(|name| (*name).to_owned());
-        let uploaded_names: Vec<String> = lock(&self.uploaded).keys().cloned().collect();
+        let uploaded_names = self.shown();
         let is_uploaded = !after.is_empty() && !self.named.contains_key(after);
         let mut names: Vec<String> = builtin_names
             .filter(|name| !is_uploaded && name.as_str() > after)

@@ -21,4 +21,5 @@ pub mod publish;
 pub mod realtime;
 pub mod room;
 pub mod session;
+pub mod tenant;
 pub mod workers;

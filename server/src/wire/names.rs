@@ -1,6 +1,6 @@
 //! By which names the server may be called, and by which pages.
 //!
-//! There is no authentication, and a browser lets any page send requests to servers that its machine
+//! Also where nobody is asked who they are, a browser lets any page send requests to servers that its machine
 //! reaches. So the server looks at two things that a page cannot choose: `Origin`, where the page
 //! comes from, which browsers add to each request but plain GETs; and the host (`Host`, or
 //! `:authority` of HTTP/2), the name under which the server was looked up. An attacker's own name

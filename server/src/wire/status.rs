@@ -40,7 +40,10 @@
 //! | FAILED_PRECONDITION | `RECORDINGS_DISABLED` | PreconditionFailure | the server has no directory for recordings |
 //! | FAILED_PRECONDITION | `RECORDING_ACTIVE` | PreconditionFailure | the plant is being recorded, or the recording is in progress |
 //! | PERMISSION_DENIED | `FOREIGN_HOST`, `FOREIGN_ORIGIN` | | with HTTP status 403: the request comes from a page of a stranger, see [`crate::wire::names`] |
-//! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::core::limits`] |
+//! | UNAUTHENTICATED | `NO_CREDENTIALS`, `TOKEN_UNKNOWN`, `CERTIFICATE_UNKNOWN`, `USER_UNKNOWN` | | the server wants to know who calls, and does not |
+//! | UNAUTHENTICATED | `CREDENTIALS_EXPIRED`, `CREDENTIALS_REVOKED` | | token or certificate are not in force any more; open streams end so |
+//! | PERMISSION_DENIED | `ROLE` | | the caller is known, and may not do this, see [`crate::wire::edge::auth`] |
+//! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::core::limits`], or `tenant.NAME`, one of the caller's tenant |
 //! | UNAVAILABLE | `SHUTTING_DOWN` | | the server ends; try again |
 //! | UNAVAILABLE | `LINK_FAILED` | | shared memory could not be set up |
 //! | UNAVAILABLE | `RECORDING_FAILED` | | a recording's file could not be read or written |

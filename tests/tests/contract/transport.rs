@@ -71,21 +71,32 @@ async fn reflection_lists_and_describes_the_services() {
 }
 
 #[tokio::test]
-async fn a_server_that_other_machines_reach_says_so() {
-    let warning = "other machines can reach this address";
+async fn a_server_is_not_reached_by_other_machines_unless_it_is_told_so() {
+    let warning = "`insecure` is set";
     let (inside, _client) = server().await;
     assert!(!inside.log().contains(warning), "{}", inside.log());
 
-    let open = Command::new(binary("plantd").unwrap())
-        .args(["serve", "--grpc", "0.0.0.0:0", "--metrics", "[::]:0", "--link", "off"])
-        .arg("--until-stdin-ends")
-        .stdin(Stdio::null())
-        .stderr(Stdio::piped())
-        .output()
-        .unwrap();
-    let log = String::from_utf8(open.stderr).unwrap();
-    assert!(open.status.success(), "{log}");
-    assert_eq!(log.matches(warning).count(), 2, "{log}");
+    let start = |addresses: [&str; 2], insecure: &[&str]| {
+        let [grpc, metrics] = addresses;
+        let open = Command::new(binary("plantd").unwrap())
+            .args(["serve", "--grpc", grpc, "--metrics", metrics, "--link", "off"])
+            .args(insecure)
+            .arg("--until-stdin-ends")
+            .stdin(Stdio::null())
+            .stderr(Stdio::piped())
+            .output()
+            .unwrap();
+        (open.status.success(), String::from_utf8(open.stderr).unwrap())
+    };
+    let (serves, log) = start(["0.0.0.0:0", "[::]:0"], &["--insecure"]);
+    assert!(serves && log.matches(warning).count() == 1, "{log}");
+    for (addresses, what) in [
+        (["0.0.0.0:0", "off"], "gRPC at 0.0.0.0:0"),
+        (["127.0.0.1:0", "[::]:0"], "metrics at [::]:0"),
+    ] {
+        let (serves, log) = start(addresses, &[]);
+        assert!(!serves && log.contains(what) && log.contains("--insecure"), "{log}");
+    }
 }
 
 /// A browser's request: HTTP/1.1, a frame of a length and a message, trailers in the body.

@@ -460,7 +460,7 @@ async fn the_page_is_not_for_strangers() {
         assert_eq!(soon(channel.call(request)).await.unwrap().status(), status, "{authority}");
     }
     // Beyond the loopback interface programs may call it by any name; a page sends no `Origin` for a mesh.
-    let (server, _client) = server_with(&["--grpc", "0.0.0.0:0"]).await;
+    let (server, _client) = server_with(&["--grpc", "0.0.0.0:0", "--insecure"]).await;
     let port = server.address().rsplit(':').next().unwrap().to_owned();
     let reach = |fields: &str| {
         let mut stream = TcpStream::connect(format!("127.0.0.1:{port}")).unwrap();

@@ -11,14 +11,15 @@ from plantd.v1.model_service_pb2_grpc import ModelServiceStub
 from plantd.v1.plant_service_pb2_grpc import PlantServiceStub
 from plantd.v1.recording_service_pb2_grpc import RecordingServiceStub
 
-from ._connect import open_channel
+from ._connect import Credentials, open_channel
 from ._errors import translate, translated
 
 
 class Calls:
     """A connection with its stubs, and how a call is made over it."""
 
-    def __init__(self, address: str, *, timeout: float = 60.0):
+    def __init__(self, address: str, *, timeout: float = 60.0, credentials: Credentials | None = None):
+        self._credentials = credentials
         self._channel = self._open(address)
         self._timeout = timeout
         self.models = ModelServiceStub(self._channel)
@@ -28,7 +29,7 @@ class Calls:
         self.recordings = RecordingServiceStub(self._channel)
 
     def _open(self, address: str) -> Any:
-        return open_channel(address)
+        return open_channel(address, self._credentials)
 
     @translate
     def _call(self, method: Any, request: Any, limited: bool = True) -> Any:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import TYPE_CHECKING
 
 from ._batch import BatchCalls
 from ._channels import ChannelCalls
+from ._connect import Credentials
 from ._drive import DriveCalls
 from ._feedback import FeedbackCalls
 from ._handle import HandleCalls
@@ -25,13 +27,26 @@ if TYPE_CHECKING:
 DEFAULT_ADDRESS = "http://127.0.0.1:50051"
 
 
-def connect(address: str = DEFAULT_ADDRESS, *, timeout: float = 60.0) -> Client:
-    """Connects to ``http://host:port``, ``host:port`` or ``unix:/path``.
+def connect(
+    address: str = DEFAULT_ADDRESS,
+    *,
+    timeout: float = 60.0,
+    token: str | None = None,
+    ca: str | PathLike[str] | None = None,
+    cert: str | PathLike[str] | None = None,
+    key: str | PathLike[str] | None = None,
+) -> Client:
+    """Connects to ``http://host:port``, ``https://host:port``, ``host:port`` or ``unix:/path``.
 
     A server that is just starting is waited for, 5 seconds at most; after that the error says what
     there is in its place. ``timeout`` in seconds limits each call that is not a stream.
+
+    Where the server asks who calls, ``token`` says it, or a certificate ``cert`` with its ``key``; ``ca`` has
+    the certificates of the CA that issued the server's, without which those count that gRPC knows. These three
+    are files in PEM. What is not given comes from the variables PLANTD_TOKEN, PLANTD_CA, PLANTD_CERT and
+    PLANTD_KEY.
     """
-    return Client(address, timeout=timeout)
+    return Client(address, timeout=timeout, credentials=Credentials.of(token, ca, cert, key))
 
 
 class Client(

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import ssl
+from collections import namedtuple
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -25,8 +31,93 @@ _HOW_TO_START = (
 )
 
 
-def open_channel(address: str) -> grpc.Channel:
-    """A connection to ``http://host:port``, ``host:port`` or ``unix:/path`` on which a server answers."""
+@dataclass(frozen=True)
+class Credentials:
+    """How a client shows who it is, and how it knows the server; files are in PEM."""
+
+    token: str | None = field(default=None, repr=False)
+    ca: str | None = None
+    cert: str | None = None
+    key: str | None = None
+
+    @classmethod
+    def of(
+        cls,
+        token: str | None,
+        ca: str | PathLike[str] | None,
+        cert: str | PathLike[str] | None,
+        key: str | PathLike[str] | None,
+    ) -> Credentials:
+        """What is given; for what is not, the variables ``PLANTD_TOKEN``, ``PLANTD_CA`` and so on."""
+
+        def chosen(given: str | PathLike[str] | None, name: str) -> str | None:
+            return os.fspath(given) if given is not None else os.environ.get(name) or None
+
+        return cls(
+            chosen(token, "PLANTD_TOKEN"),
+            chosen(ca, "PLANTD_CA"),
+            chosen(cert, "PLANTD_CERT"),
+            chosen(key, "PLANTD_KEY"),
+        )
+
+    def of_tls(self) -> grpc.ChannelCredentials:
+        """What gRPC makes a connection with."""
+        if (self.cert is None) != (self.key is None):
+            raise PlantdError("INVALID_ARGUMENT", "`cert` and `key` belong together: one of them is missing")
+        ca, key, cert = (_read(name, getattr(self, name)) for name in ("ca", "key", "cert"))
+        return grpc.ssl_channel_credentials(ca, key, cert)
+
+
+def _read(name: str, path: str | None) -> bytes | None:
+    if path is None:
+        return None
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise PlantdError("INVALID_ARGUMENT", f"`{name}`: {error}") from None
+
+
+class _Details(
+    namedtuple("_Details", ("method", "timeout", "metadata", "credentials", "wait_for_ready", "compression")),
+    grpc.ClientCallDetails,
+):
+    """What a call is made with."""
+
+
+class _WithToken(
+    grpc.UnaryUnaryClientInterceptor,
+    grpc.UnaryStreamClientInterceptor,
+    grpc.StreamUnaryClientInterceptor,
+    grpc.StreamStreamClientInterceptor,
+):
+    """Sends a token with every call; gRPC itself would not without TLS, over a unix-domain socket either."""
+
+    def __init__(self, token: str):
+        self._header = ("authorization", f"Bearer {token.strip()}")
+
+    def _call(self, go_on: Any, details: Any, request: Any) -> Any:
+        metadata = [*(details.metadata or ()), self._header]
+        return go_on(
+            _Details(
+                details.method,
+                details.timeout,
+                metadata,
+                details.credentials,
+                details.wait_for_ready,
+                details.compression,
+            ),
+            request,
+        )
+
+    intercept_unary_unary = _call
+    intercept_unary_stream = _call
+    intercept_stream_unary = _call
+    intercept_stream_stream = _call
+
+
+def open_channel(address: str, credentials: Credentials | None = None) -> grpc.Channel:
+    """A connection to ``http://host:port``, ``https://host:port``, ``host:port`` or ``unix:/path`` on which a
+    server answers."""
     if not isinstance(address, str):
         raise TypeError(f"`address` is {shown(address)}; a text such as http://127.0.0.1:50051 is needed")
     target = _target(address)
@@ -34,13 +125,20 @@ def open_channel(address: str) -> grpc.Channel:
     if target.startswith(_UNIX):
         # Without it gRPC sends the path as the authority, which HTTP/2 servers refuse.
         options.append(("grpc.default_authority", "localhost"))
-    channel = grpc.insecure_channel(target, options)
+    credentials = credentials or Credentials()
+    is_secured = address.startswith("https://")
+    if is_secured:
+        channel = grpc.secure_channel(target, credentials.of_tls(), options)
+    else:
+        channel = grpc.insecure_channel(target, options)
     try:
         grpc.channel_ready_future(channel).result(timeout=_CONNECT_SECONDS)
     except grpc.FutureTimeoutError:
         channel.close()
-        message = f"cannot connect to {address}: {_problem(target)}. {_HOW_TO_START}"
+        message = f"cannot connect to {address}: {_problem(target, credentials if is_secured else None)}. {_HOW_TO_START}"
         raise PlantdError("UNAVAILABLE", message) from None
+    if credentials.token is not None:
+        return grpc.intercept_channel(channel, _WithToken(credentials.token))
     return channel
 
 
@@ -55,9 +153,7 @@ def _target(address: str) -> str:
     if not separator:
         scheme, place = "http", address
     place = place.rstrip("/")
-    if scheme == "https":
-        raise _refused(address, "plantd does not speak TLS")
-    if scheme != "http":
+    if scheme not in ("http", "https"):
         raise _refused(address, "the scheme is unknown")
     if not place:
         raise _refused(address, "it names no host")
@@ -65,15 +161,15 @@ def _target(address: str) -> str:
         has_port = urlsplit(f"//{place}").port is not None
     except ValueError:
         raise _refused(address, "it cannot be read") from None
-    return place if has_port else f"{place}:80"
+    return place if has_port else f"{place}:{443 if scheme == 'https' else 80}"
 
 
 def _refused(address: str, problem: str) -> PlantdError:
-    message = f"`{address}` is not an address: {problem}; write http://host:port or unix:/path"
+    message = f"`{address}` is not an address: {problem}; write http://host:port, https://host:port or unix:/path"
     return PlantdError("INVALID_ARGUMENT", message)
 
 
-def _problem(target: str) -> str:
+def _problem(target: str, secured: Credentials | None = None) -> str:
     """Why gRPC got no answer; it does not tell, so that the connection is made once more by hand."""
     is_unix = target.startswith(_UNIX)
     try:
@@ -83,7 +179,9 @@ def _problem(target: str) -> str:
                 by_hand.connect(target.removeprefix(_UNIX))
         else:
             place = urlsplit(f"//{target}")
-            socket.create_connection((place.hostname, place.port), _CONNECT_SECONDS).close()
+            with socket.create_connection((place.hostname, place.port), _CONNECT_SECONDS) as by_hand:
+                if secured is not None:
+                    return _tls_problem(by_hand, place.hostname or "", secured)
     except socket.gaierror:
         return "there is no host of that name; is it spelt right? A number such as 127.0.0.1 will do too"
     except FileNotFoundError:
@@ -106,5 +204,30 @@ def _problem(target: str) -> str:
         return str(error)
     return (
         "what answers there does not speak gRPC without TLS, or has no room for more connections; is this "
-        "the port of plantd's gRPC, and not that of its metrics or of another server?"
+        "the port of plantd's gRPC, and not that of its metrics or of another server? One with TLS is at https://"
     )
+
+
+def _tls_problem(connection: socket.socket, host: str, credentials: Credentials) -> str:
+    """Which side refuses TLS, and why; gRPC does not tell."""
+    try:
+        context = ssl.create_default_context(cafile=credentials.ca)
+        if credentials.cert is not None:
+            context.load_cert_chain(credentials.cert, credentials.key)
+        context.set_alpn_protocols(["h2"])
+        with context.wrap_socket(connection, server_hostname=host) as secured:
+            # With TLS 1.3 a server looks at the client's certificate after the client has done.
+            secured.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\x00\x00\x00\x04\x00\x00\x00\x00\x00")
+            secured.recv(1)
+    except ssl.SSLCertVerificationError as error:
+        return f"this client refuses the server's certificate: {error.verify_message}; is `ca` the server's CA?"
+    except ssl.SSLError as error:
+        reason = (error.reason or str(error)).replace("_", " ").lower()
+        if "certificate required" in reason:
+            return "the server refuses this client: it lets in only those with a certificate; give `cert` and `key`"
+        if "wrong version number" in reason or "record layer" in reason:
+            return "what answers there does not speak TLS: write http:// in place of https://"
+        return f"TLS was refused: {reason}; did a CA issue the client's certificate that the server trusts?"
+    except OSError as error:
+        return str(error)
+    return "it speaks TLS, but does not answer as gRPC; is this the port of plantd's gRPC?"

@@ -10,21 +10,24 @@ mod scenario;
 mod server;
 mod trial;
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{CommandFactory as _, Parser, Subcommand};
 use clap_complete::CompleteEnv;
+use plantd_client::Credentials;
 
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, fmu, guard,
     import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record,
-    reference, render, replay, run, scene, settle, shell, state, step, test, timing, top, view,
-    watch,
+    reference, render, replay, run, scene, settle, shell, state, step, test, timing, token, top,
+    view, watch,
 };
 use crate::output::failure;
 use crate::output::printer::Output;
 use crate::server::context::Context;
+use crate::server::known::{KnownServer, read_token};
 use crate::server::names;
 
 const EXAMPLES: &str = "\
@@ -56,6 +59,8 @@ Examples:
   plantctl view trial.mcap                          in the browser; `view p1` shows a plant
   plantctl render trial.mcap --out trial.gif        a film for documents; .png is a picture
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
+  plantctl token new anna --role driver --tenant lab --file tokens.toml
+  plantctl --on lab list                            a server of ~/.config/plantd/servers.toml
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
 const EXIT_CODES: &str = "\
@@ -73,10 +78,28 @@ Exit codes:
 #[derive(Debug, Parser)]
 #[command(name = "plantctl", version, before_help = EXAMPLES, after_help = EXIT_CODES, max_term_width = 100)]
 struct Args {
-    /// Server: http://host:port or unix:/path.
+    /// Server: http://host:port, https://host:port or unix:/path.
     /// http://127.0.0.1:50051 if not given; `test` then starts a server of its own.
     #[arg(long, global = true, env = "PLANTD_ADDRESS")]
     address: Option<String>,
+    /// Server by its name in ~/.config/plantd/servers.toml, which has address, token, ca, cert and key.
+    #[arg(long, global = true, value_name = "NAME", conflicts_with = "address")]
+    on: Option<String>,
+    /// Token with which the server knows you; the environment does not show it to others, a command line does.
+    #[arg(long, global = true, env = "PLANTD_TOKEN", hide_env_values = true)]
+    token: Option<String>,
+    /// File with that token.
+    #[arg(long, global = true, value_name = "FILE", env = "PLANTD_TOKEN_FILE")]
+    token_file: Option<PathBuf>,
+    /// CA of the server's certificate, PEM; the system's CAs if not given.
+    #[arg(long, global = true, value_name = "FILE", env = "PLANTD_CA")]
+    ca: Option<PathBuf>,
+    /// Certificate of your own, PEM.
+    #[arg(long, global = true, value_name = "FILE", env = "PLANTD_CERT")]
+    cert: Option<PathBuf>,
+    /// Key of that certificate, PEM.
+    #[arg(long, global = true, value_name = "FILE", env = "PLANTD_KEY")]
+    key: Option<PathBuf>,
     /// Print JSON, in the field names of the contract; streams print one object per line.
     #[arg(long, global = true)]
     json: bool,
@@ -130,6 +153,7 @@ enum Command {
     Test(test::Test),
     Delete(inventory::Delete),
     Top(top::Top),
+    Token(token::Token),
     Completions(shell::Completions),
     Man(shell::Man),
 }
@@ -143,19 +167,44 @@ fn main() -> ExitCode {
 
 #[tokio::main(flavor = "current_thread")]
 async fn answer(args: Args) -> ExitCode {
-    let context = Context { address: args.address, output: Output { json: args.json } };
-    match run(args.command, &context).await {
+    let json = args.json;
+    let outcome = async {
+        let (command, context) = args.resolve()?;
+        run(command, &context).await
+    };
+    match outcome.await {
         Ok(code) => code,
         // Whoever reads our output has seen enough (`plantctl watch ... | head`).
         Err(error) if failure::is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            if args.json {
+            if json {
                 eprintln!("{}", failure::as_json(&error));
             } else {
                 eprintln!("plantctl: {error:#}");
             }
             ExitCode::from(failure::code(&error))
         }
+    }
+}
+
+impl Args {
+    /// What is to be done, and where: flags and environment variables win over the file of servers.
+    fn resolve(self) -> Result<(Command, Context)> {
+        let Self { address, on, token, token_file, ca, cert, key, json, command } = self;
+        let known = on.map(|name| KnownServer::named(&name)).transpose()?;
+        let there = known.as_ref().map(KnownServer::credentials).transpose()?.unwrap_or_default();
+        let token = match (token, token_file) {
+            (None, Some(path)) => Some(read_token(&path)?),
+            (token, _) => token,
+        };
+        let credentials = Credentials {
+            token: token.or(there.token),
+            ca: ca.or(there.ca),
+            cert: cert.or(there.cert),
+            key: key.or(there.key),
+        };
+        let address = address.or(known.map(|known| known.address));
+        Ok((command, Context { address, credentials, output: Output { json } }))
     }
 }
 
@@ -206,6 +255,7 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Test(command) => return command.run(context).await,
         Command::Delete(command) => command.run(context).await?,
         Command::Top(command) => command.run(context).await?,
+        Command::Token(command) => command.run(context)?,
         Command::Completions(command) => command.run()?,
         Command::Man(command) => command.run(Args::command(), context.output)?,
     }

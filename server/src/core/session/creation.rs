@@ -5,6 +5,9 @@ use std::time::Duration;
 
 use plantd_models::{Model, Plant, Settings, Snapshot, State};
 
+use crate::core::room::{Reservation, Room};
+use crate::core::tenant::Tenant;
+
 /// What was promised when the method of a plant was chosen by a tolerance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Accuracy {
@@ -26,12 +29,31 @@ pub struct Origin {
     pub accuracy: Option<Accuracy>,
     /// How long it is kept when nobody uses it; `None` for as long as the server.
     pub expires: Option<Duration>,
+    /// Whose it is.
+    pub owner: Owner,
+}
+
+/// Whose a plant is.
+#[derive(Debug, Default)]
+pub struct Owner {
+    /// The tenant.
+    pub tenant: Tenant,
+    /// Its room for the plant; none of somebody without limits.
+    pub room: Option<Reservation>,
+    /// Its room for plants that run by themselves.
+    pub running: Option<Arc<Room>>,
 }
 
 impl Origin {
     /// A plant of which no more is known.
     pub fn new(id: impl Into<String>, model_name: impl Into<String>) -> Self {
-        Self { id: id.into(), model_name: model_name.into(), accuracy: None, expires: None }
+        Self {
+            id: id.into(),
+            model_name: model_name.into(),
+            accuracy: None,
+            expires: None,
+            owner: Owner::default(),
+        }
     }
 }
 
@@ -48,11 +70,12 @@ pub(super) struct Creation {
     pub(super) settings: Settings,
     /// Why the method is as it is, if it was chosen by a tolerance.
     pub(super) accuracy: Option<Accuracy>,
+    pub(super) owner: Owner,
 }
 
 impl Creation {
     pub(super) fn of(plant: &Plant, origin: Origin) -> Self {
-        let Origin { id, model_name, accuracy, expires: _ } = origin;
+        let Origin { id, model_name, accuracy, expires: _, owner } = origin;
         Self {
             id,
             model_name,
@@ -62,6 +85,7 @@ impl Creation {
             state: plant.state(),
             settings: *plant.settings(),
             accuracy,
+            owner,
         }
     }
 }

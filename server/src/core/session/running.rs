@@ -42,7 +42,7 @@ impl Session {
         // Its room is kept by a plant that has one.
         let permit = match (self.halt(), &threads) {
             (Some(permit), Some(_)) => Some(permit),
-            (None, Some(_)) => Some(self.realtime.admit(running_max)?),
+            (None, Some(_)) => Some(self.admit(running_max)?),
             (_, None) => None,
         };
         let number = {
@@ -70,6 +70,15 @@ impl Session {
         }
         self.tell_run_status();
         Ok(number)
+    }
+
+    /// Room in the loops, and among the plants of its owner that run.
+    fn admit(&self, running_max: u64) -> Result<Permit, RunError> {
+        let permit = self.realtime.admit(running_max)?;
+        match &self.creation.owner.running {
+            Some(room) => Ok(permit.and(room.reserve(1)?)),
+            None => Ok(permit),
+        }
     }
 
     /// Pauses the plant between two steps.

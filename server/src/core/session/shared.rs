@@ -30,10 +30,11 @@ use crate::core::session::creation::{Accuracy, Creation, Origin};
 use crate::core::session::life::Life;
 use crate::core::session::place::Place;
 use crate::core::session::run::RunControl;
+use crate::core::tenant::Tenant;
 
 /// A plant with everything that belongs to it, shared by all who use it.
 pub struct Session {
-    creation: Creation,
+    pub(super) creation: Creation,
     life: Arc<Life>,
     pub(super) place: Mutex<Place>,
     /// Held by whoever replaces the plant; taken before the core's lock.
@@ -93,6 +94,11 @@ impl Session {
     /// Id of the plant.
     pub fn id(&self) -> &str {
         &self.creation.id
+    }
+
+    /// Whose the plant is.
+    pub fn owner(&self) -> Tenant {
+        self.creation.owner.tenant
     }
 
     /// Name of the model at the time of creation.

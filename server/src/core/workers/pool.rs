@@ -11,10 +11,11 @@ use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
 
-use crate::core::connection::Connection;
+use crate::core::connection::{Caller, Connection};
 use crate::core::limits::LimitExceeded;
 use crate::core::mutex::lock;
 use crate::core::priority::Priority;
+use crate::core::tenant::Tenant;
 use crate::core::workers::queue::{Admission, Baton, Lane, May, Queue, Ticket, Work};
 
 /// How long a job keeps its turn while others wait for one.
@@ -27,8 +28,9 @@ const TURN_OVERDUE: Duration = Duration::from_millis(40);
 /// Threads for each turn, at most: those that wait for their next turn included.
 const THREADS_PER_TURN: usize = 32;
 
-/// Threads for each turn of the jobs of one connection, at most.
+/// Threads for each turn of the jobs of one connection, and of one tenant, at most.
 const CONNECTION_THREADS_PER_TURN: usize = 8;
+const TENANT_THREADS_PER_TURN: usize = 16;
 
 /// Runs a long computation, or a wait, on this thread, while the runtime that it may belong to moves its
 /// other tasks to another one.
@@ -170,21 +172,23 @@ impl Workers {
         let (sender, mut receiver) = oneshot::channel();
         let work = {
             let (token, pool) = (token.clone(), Arc::clone(&self.pool));
+            let caller = Caller::current();
             Box::new(move |id| {
                 let turn_began = Cell::new(Instant::now());
                 // Nobody may wait any more.
-                let _ = sender.send(job(&Abandoned { token, pool, id, turn_began }));
+                let abandoned = Abandoned { token, pool, id, turn_began };
+                let _ = sender.send(caller.scope(|| job(&abandoned)));
             })
         };
         let id = self.pool.submit(admission, lane, work).map_err(WorkError::from)?;
-        let mut caller = Caller { pool: &self.pool, id, token, waits: true };
+        let mut waiting = Waiting { pool: &self.pool, id, token, waits: true };
         let outcome = loop {
             match tokio::time::timeout(TURN_OVERDUE, &mut receiver).await {
                 Ok(outcome) => break outcome,
                 Err(_) => self.pool.look_after(),
             }
         };
-        caller.waits = false;
+        waiting.waits = false;
         outcome.unwrap_or_else(|_| {
             tracing::error!("a computation broke off");
             Err(WorkError::BrokeOff.into())
@@ -193,14 +197,14 @@ impl Workers {
 }
 
 /// Whoever waits for a job.
-struct Caller<'a> {
+struct Waiting<'a> {
     pool: &'a Pool,
     id: u64,
     token: CancellationToken,
     waits: bool,
 }
 
-impl Drop for Caller<'_> {
+impl Drop for Waiting<'_> {
     fn drop(&mut self) {
         if self.waits {
             self.token.cancel();
@@ -265,7 +269,11 @@ impl State {
                 return May::Nothing;
             }
             let held = begun.values().filter(|job| job.connection == connection).count();
-            let may_begin = has_thread && held < CONNECTION_THREADS_PER_TURN * pool.count;
+            let of_tenant = |job: &&Begun| job.connection.tenant() == connection.tenant();
+            let tenant_has_thread = connection.tenant() == Tenant::NONE
+                || begun.values().filter(of_tenant).count() < TENANT_THREADS_PER_TURN * pool.count;
+            let may_begin =
+                has_thread && tenant_has_thread && held < CONNECTION_THREADS_PER_TURN * pool.count;
             if may_begin { May::Begin } else { May::GoOn }
         })
     }

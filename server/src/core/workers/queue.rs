@@ -1,11 +1,12 @@
-//! What waits for a turn. The connections take turns in each of two lanes, and the lanes take turns: one is for
-//! what has just come and may be short, the other for what is known to be long.
+//! What waits for a turn. The lanes take turns: one is for what has just come and may be short, the other for what
+//! is known to be long. In each the tenants take turns, and the connections of each tenant.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use crate::core::connection::Connection;
 use crate::core::mutex::lock;
+use crate::core::tenant::Tenant;
 
 /// Whether a job counts against the limit of those that wait.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -88,8 +89,14 @@ impl Baton {
     }
 }
 
-/// The tickets of a lane; the connections in the order in which it is their turn.
-type Connections = VecDeque<(Connection, VecDeque<Ticket>)>;
+/// The tickets of a lane; the connections of each tenant in the order in which it is their turn.
+#[derive(Default)]
+struct Connections {
+    waiting: VecDeque<(Connection, VecDeque<Ticket>)>,
+    /// When each tenant that waits had its last turn, in turns.
+    last_turns: HashMap<Tenant, u64>,
+    turns: u64,
+}
 
 /// The queue.
 #[derive(Default)]
@@ -101,7 +108,7 @@ pub(super) struct Queue {
 
 impl Queue {
     pub(super) fn is_empty(&self) -> bool {
-        self.short.is_empty() && self.long.is_empty()
+        self.short.waiting.is_empty() && self.long.waiting.is_empty()
     }
 
     pub(super) fn push(&mut self, lane: Lane, connection: Connection, ticket: Ticket) {
@@ -109,9 +116,9 @@ impl Queue {
             Lane::Short => &mut self.short,
             Lane::Long => &mut self.long,
         };
-        match connections.iter_mut().find(|(owner, _)| *owner == connection) {
+        match connections.waiting.iter_mut().find(|(owner, _)| *owner == connection) {
             Some((_, tickets)) => tickets.push_back(ticket),
-            None => connections.push_back((connection, VecDeque::from([ticket]))),
+            None => connections.waiting.push_back((connection, VecDeque::from([ticket]))),
         }
     }
 
@@ -134,6 +141,7 @@ impl Queue {
             let place =
                 |(_, tickets): &(Connection, VecDeque<Ticket>)| tickets.iter().position(is_it);
             let (i, k) = connections
+                .waiting
                 .iter()
                 .enumerate()
                 .find_map(|(i, connection)| Some((i, place(connection)?)))?;
@@ -152,7 +160,7 @@ impl Queue {
     }
 
     fn tickets(&self) -> impl Iterator<Item = (Connection, &Ticket)> {
-        let connections = self.short.iter().chain(&self.long);
+        let connections = self.short.waiting.iter().chain(&self.long.waiting);
         connections
             .flat_map(|(connection, tickets)| tickets.iter().map(|ticket| (*connection, ticket)))
     }
@@ -169,17 +177,33 @@ fn pop(
         }
         tickets.iter().position(|ticket| may.admits(ticket))
     };
-    let (i, k) =
-        connections.iter().enumerate().find_map(|(i, connection)| Some((i, place(connection)?)))?;
-    take(connections, i, k)
+    // Of those who may, the tenant that has waited longest; of its connections the first.
+    let last_turn = |connection: Connection| {
+        connections.last_turns.get(&connection.tenant()).copied().unwrap_or_default()
+    };
+    let (i, k) = connections
+        .waiting
+        .iter()
+        .enumerate()
+        .filter_map(|(i, waiting)| Some((i, place(waiting)?, last_turn(waiting.0))))
+        .min_by_key(|(_, _, last_turn)| *last_turn)
+        .map(|(i, k, _)| (i, k))?;
+    let tenant = connections.waiting[i].0.tenant();
+    connections.turns += 1;
+    connections.last_turns.insert(tenant, connections.turns);
+    let taken = take(connections, i, k);
+    if connections.waiting.is_empty() {
+        connections.last_turns.clear();
+    }
+    taken
 }
 
 /// Takes a ticket of a connection, who is the last one after that.
 fn take(connections: &mut Connections, i: usize, k: usize) -> Option<(Connection, Ticket)> {
-    let (connection, mut tickets) = connections.remove(i)?;
+    let (connection, mut tickets) = connections.waiting.remove(i)?;
     let ticket = tickets.remove(k)?;
     if !tickets.is_empty() {
-        connections.push_back((connection, tickets));
+        connections.waiting.push_back((connection, tickets));
     }
     Some((connection, ticket))
 }
@@ -187,7 +211,10 @@ fn take(connections: &mut Connections, i: usize, k: usize) -> Option<(Connection
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::core::connection::Sight;
     use crate::core::connection::tests::connection;
+    use crate::core::room::Room;
+    use crate::core::tenant::Tenants;
 
     fn begin(id: u64) -> Ticket {
         Ticket::Begin { id, admission: Admission::Bounded, work: Box::new(|_| {}) }
@@ -212,6 +239,22 @@ mod tests {
         queue.push(Lane::Short, connection(3), begin(31));
         assert_eq!(ids(&mut queue, |_| May::Begin), [30, 10, 31, 20, 11, 12, 13]);
         assert!(queue.is_empty());
+    }
+
+    #[test]
+    fn tenants_take_turns_however_many_connections_they_have() {
+        let room = Room::new("numbers", "numbers", 1);
+        let tenants = Tenants::new(true, Default::default(), &room, &room);
+        let of = |number, name| Connection::of_tenant(number, tenants.named(name), Sight::Own);
+        let mut queue = Queue::default();
+        for number in 1..=3 {
+            queue.push(Lane::Long, of(number, "many"), begin(number));
+            queue.push(Lane::Long, of(number, "many"), begin(10 + number));
+        }
+        for id in 20..23 {
+            queue.push(Lane::Long, of(4, "one"), begin(id));
+        }
+        assert_eq!(ids(&mut queue, |_| May::Begin), [1, 20, 2, 21, 3, 22, 11, 12, 13]);
     }
 
     #[test]

@@ -6,7 +6,6 @@ use nalgebra::{DMatrix, DVector};
 use plantd_control::{self as control, Kalman, Momentum, NoiseCovariances, Sample, Values};
 use plantd_models::{Linearization, Model, State};
 use plantd_proto::v1;
-use tokio::sync::OwnedSemaphorePermit;
 
 use crate::core::feedback::regulator::{Constraints, Path, check_equilibrium};
 use crate::core::inputs::Inputs;
@@ -15,7 +14,7 @@ use crate::core::workers::pool::Abandoned;
 use crate::wire::control::analysis::Outputs;
 use crate::wire::control::points::{along_trajectory, at_point};
 use crate::wire::message::{matrices, states, weights};
-use crate::wire::shared::hub::Hub;
+use crate::wire::shared::hub::{Hub, TrajectoryPermit};
 use crate::wire::status::RpcError;
 
 /// Answers a SolveKalman call.
@@ -102,14 +101,14 @@ pub(crate) struct TrajectoryFilter {
     rotations: Vec<u32>,
     next: usize,
     /// Room in memory that the server grants.
-    _permit: OwnedSemaphorePermit,
+    _permit: TrajectoryPermit,
 }
 
 impl TrajectoryFilter {
     pub(crate) fn solve(
         hub: &Hub,
         request: v1::SolveTrajectoryKalmanRequest,
-        permit: OwnedSemaphorePermit,
+        permit: TrajectoryPermit,
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;

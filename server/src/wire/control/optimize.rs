@@ -14,7 +14,6 @@ use plantd_control::optimize::{
 use plantd_models::scene::UnknownName;
 use plantd_models::{Model, Plant, Spare, State};
 use plantd_proto::v1;
-use tokio::sync::OwnedSemaphorePermit;
 use v1::optimize_trajectory_response::Response as Answer;
 
 use crate::core::inputs::Inputs;
@@ -24,7 +23,7 @@ use crate::wire::answers::Answers;
 use crate::wire::control::points::model_and_settings;
 use crate::wire::message::weights::{self, WeightFields};
 use crate::wire::message::{checks, matrices, states};
-use crate::wire::shared::hub::Hub;
+use crate::wire::shared::hub::{Hub, TrajectoryPermit};
 use crate::wire::status::RpcError;
 
 /// A search.
@@ -34,7 +33,7 @@ pub(crate) struct Search {
     spare: Spare,
     checkpoint_every: u32,
     /// Room in memory that the server grants.
-    _permit: OwnedSemaphorePermit,
+    _permit: TrajectoryPermit,
 }
 
 impl Search {
@@ -42,7 +41,7 @@ impl Search {
     pub(crate) fn new(
         hub: &Hub,
         request: v1::OptimizeTrajectoryRequest,
-        permit: OwnedSemaphorePermit,
+        permit: TrajectoryPermit,
     ) -> Result<Self, RpcError> {
         let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
         let (given, checkpoint_every) = given_options(hub, request.options, &model)?;

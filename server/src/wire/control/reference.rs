@@ -5,7 +5,6 @@ use plantd_control::Values;
 use plantd_control::reference::{self, Assessment, Projected};
 use plantd_models::Spare;
 use plantd_proto::v1;
-use tokio::sync::OwnedSemaphorePermit;
 use v1::project_reference_response::Response as Answer;
 
 use crate::core::feedback::regulator::{Constraints, Memory, Path};
@@ -15,7 +14,7 @@ use crate::core::workers::pool::Abandoned;
 use crate::wire::control::points::model_and_settings;
 use crate::wire::message::start::{self, Start};
 use crate::wire::message::{matrices, states, weights};
-use crate::wire::shared::hub::Hub;
+use crate::wire::shared::hub::{Hub, TrajectoryPermit};
 use crate::wire::status::RpcError;
 
 /// Error in an acceleration or a constraint up to which a reference is feasible.
@@ -31,14 +30,14 @@ pub(crate) struct Projection {
     common: v1::Gain,
     next: usize,
     /// Room in memory that the server grants.
-    _permit: OwnedSemaphorePermit,
+    _permit: TrajectoryPermit,
 }
 
 impl Projection {
     pub(crate) fn new(
         hub: &Hub,
         request: v1::ProjectReferenceRequest,
-        permit: OwnedSemaphorePermit,
+        permit: TrajectoryPermit,
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;

@@ -9,7 +9,6 @@ use nalgebra::{DMatrix, DVector};
 use plantd_control::{self as control, Values};
 use plantd_models::{Linearization, Plant, State};
 use plantd_proto::v1;
-use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status};
 
 use crate::core::feedback::regulator::{self, Constraints, Memory, Path};
@@ -23,7 +22,7 @@ use crate::wire::control::{
 use crate::wire::message::report::report_message;
 use crate::wire::message::weights::{self, WeightFields};
 use crate::wire::message::{matrices, states};
-use crate::wire::shared::hub::Hub;
+use crate::wire::shared::hub::{Hub, TrajectoryPermit};
 use crate::wire::status::RpcError;
 
 /// Numbers that one portion of a stream holds, about: 2 MB.
@@ -188,14 +187,14 @@ struct TrajectoryRegulator {
     common: v1::Gain,
     next: usize,
     /// Room in memory that the server grants.
-    _permit: OwnedSemaphorePermit,
+    _permit: TrajectoryPermit,
 }
 
 impl TrajectoryRegulator {
     fn solve(
         hub: &Hub,
         request: v1::SolveTrajectoryLqrRequest,
-        permit: OwnedSemaphorePermit,
+        permit: TrajectoryPermit,
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;

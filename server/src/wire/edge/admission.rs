@@ -5,12 +5,13 @@
 //! request; if all are known, that of the one that has been idle for longest; and waits if none is.
 //! A connection with an open call keeps its place.
 
+use std::any::Any;
 use std::collections::{BTreeMap, HashMap};
 use std::io;
 use std::net::{IpAddr, Ipv6Addr};
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
@@ -24,6 +25,7 @@ use tokio::time::{Sleep, sleep, timeout};
 use tonic::transport::server::Connected;
 
 use crate::core::limits::Limits;
+use crate::wire::edge::certificate::Certificate;
 
 /// A known connection keeps its place at least this long after its last call: the next one may be
 /// on its way.
@@ -61,6 +63,11 @@ impl Peer {
 pub trait HasPeer {
     /// The other end.
     fn peer(&self) -> io::Result<Peer>;
+
+    /// The user whose process the other end is, where the system tells.
+    fn uid(&self) -> Option<u32> {
+        None
+    }
 }
 
 impl HasPeer for TcpStream {
@@ -72,6 +79,10 @@ impl HasPeer for TcpStream {
 impl HasPeer for UnixStream {
     fn peer(&self) -> io::Result<Peer> {
         Ok(Peer::Unix)
+    }
+
+    fn uid(&self) -> Option<u32> {
+        self.peer_cred().ok().map(|credentials| credentials.uid())
     }
 }
 
@@ -145,6 +156,10 @@ impl Places {
                 let Ok(peer) = io.peer() else { continue };
                 match places.place(peer).await {
                     Some(place) => {
+                        if let Some(uid) = io.uid() {
+                            // Nobody else has the place yet.
+                            let _ = place.uid.set(uid);
+                        }
                         return Some((Ok(places.admitted(io, place)), (places, incoming)));
                     }
                     None => tracing::debug!(?peer, "refused: too many connections of this peer"),
@@ -211,6 +226,9 @@ impl Taken {
         let place = Arc::new(Place {
             id,
             peer,
+            uid: OnceLock::new(),
+            certificate: OnceLock::new(),
+            kept: OnceLock::new(),
             start,
             is_known: AtomicBool::new(false),
             calls: AtomicUsize::new(0),
@@ -260,6 +278,10 @@ fn raise_file_limit() -> usize {
 pub struct Place {
     id: u64,
     peer: Peer,
+    uid: OnceLock<u32>,
+    certificate: OnceLock<Arc<Certificate>>,
+    /// What is to live as long as the connection.
+    kept: OnceLock<Arc<dyn Any + Send + Sync>>,
     start: Instant,
     /// It has made a request.
     is_known: AtomicBool,
@@ -277,6 +299,21 @@ impl Place {
     /// Where its connection comes from.
     pub fn peer(&self) -> Peer {
         self.peer
+    }
+
+    /// The user whose process is at the other end of a unix-domain socket.
+    pub fn uid(&self) -> Option<u32> {
+        self.uid.get().copied()
+    }
+
+    /// The certificate with which the other end has shown who it is.
+    pub fn certificate(&self) -> Option<&Arc<Certificate>> {
+        self.certificate.get()
+    }
+
+    /// Lets something live as long as the connection: the first that is to.
+    pub fn keep(&self, kept: Arc<dyn Any + Send + Sync>) {
+        let _ = self.kept.set(kept);
     }
 
     /// Which of the server's connections this is; no two have the same number.
@@ -331,6 +368,11 @@ pub struct Admitted<IO> {
 }
 
 impl<IO> Admitted<IO> {
+    /// The other end has shown who it is. What was said first stands.
+    pub fn set_certificate(&self, certificate: Certificate) {
+        let _ = self.place.certificate.set(Arc::new(certificate));
+    }
+
     /// What the socket answered, unless the connection has been ended. Whoever has to wait for the
     /// socket is woken by that, too.
     fn while_admitted<T>(

@@ -19,6 +19,8 @@ const REQUEST_BYTES_MAX: usize = 8192;
 /// Time for a request and for its answer.
 const PATIENCE: Duration = Duration::from_secs(5);
 
+/// Content type of metrics.
+pub(super) const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
 
 /// Serves until dropped.
@@ -77,7 +79,6 @@ fn check(head: &[u8], names: &Names) -> Result<(), Foreign> {
 }
 
 fn respond(head: &[u8], metrics: &Metrics) -> (&'static str, &'static str, String) {
-    const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
     let line = head.split(|byte| *byte == b'\r').next().unwrap_or_default();
     let mut words = line.split(|byte| *byte == b' ');
     match (words.next(), words.next()) {

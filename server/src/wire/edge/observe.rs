@@ -1,47 +1,28 @@
-//! A layer around all services: counts calls by method and code, knows for which connection they are, keeps the places
-//! of connections with open calls, bounds what unfinished messages take, and gives the one error that
+//! A layer around all services: counts calls by method and code, knows for whom they are, writes down what changes
+//! something, ends calls whose credential is over, keeps the places of connections with open calls, bounds what unfinished messages take, and gives the one error that
 //! tonic itself makes of a request, an oversized message, its documented code and details.
 
-use std::collections::HashSet;
 use std::pin::Pin;
-use std::sync::{Arc, LazyLock};
+use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use futures::future::BoxFuture;
 use http_body::{Body as HttpBody, Frame, SizeHint};
-use plantd_proto::{FILE_DESCRIPTOR_SET, code_name};
-use prost::Message as _;
-use prost_types::FileDescriptorSet;
+use plantd_proto::code_name;
 use tonic::body::Body;
 use tonic::codegen::http::{HeaderMap, Request, Response};
 use tonic::{Code, Status};
 use tower::{Layer, Service};
 
-use crate::core::connection::Connection;
+use crate::core::connection::{Caller, Connection};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::metrics::registry::Metrics;
-use crate::wire::edge::admission::{OpenCall, Place};
+use crate::wire::edge::admission::{OpenCall, Peer, Place};
+use crate::wire::edge::auth::credential::{Over, Pass};
+use crate::wire::edge::auth::role;
+use crate::wire::edge::methods::method_label;
 use crate::wire::edge::unfinished::Budget;
 use crate::wire::status::RpcError;
-
-/// Paths of all methods of `plantd.v1`: the only ones that become labels of metrics.
-static METHODS: LazyLock<HashSet<String>> = LazyLock::new(|| {
-    // The descriptors were encoded by this crate's own build.
-    let set = FileDescriptorSet::decode(FILE_DESCRIPTOR_SET).unwrap_or_default();
-    let mut methods = HashSet::new();
-    for file in &set.file {
-        for service in &file.service {
-            for method in &service.method {
-                methods.insert(format!("/{}.{}/{}", file.package(), service.name(), method.name()));
-            }
-        }
-    }
-    methods
-});
-
-fn method_label(path: &str) -> &'static str {
-    METHODS.get(path).map_or("other", |path| path.as_str())
-}
 
 /// Name and value of the limit on messages to a method, by its path.
 fn message_limit(limits: &Limits, path: &str) -> (&'static str, u64) {
@@ -114,26 +95,42 @@ where
     }
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
+        let pass = request.extensions().get::<Arc<Pass>>().cloned();
         let mut call = Call {
             metrics: Arc::clone(&self.layer.metrics),
             method: method_label(request.uri().path()),
             code: None,
+            pass: pass.clone(),
+            peer: request.extensions().get::<Arc<Place>>().map(|place| place.peer()),
             _open: request.extensions().get::<Arc<Place>>().cloned().map(Place::call),
         };
         let limits = Arc::clone(&self.layer.limits);
         let place = request.extensions().get::<Arc<Place>>();
-        let connection = Connection::numbered(place.map_or(0, |place| place.id() + 1));
+        let caller = match &pass {
+            Some(pass) => pass.caller(),
+            None => Connection::numbered(place.map_or(0, |place| place.id() + 1)).into(),
+        };
         let unfinished = &self.layer.unfinished;
         let response = self.inner.call(request.map(|body| unfinished.follow(call.method, body)));
         Box::pin(async move {
-            let mut response = connection.work(response).await?;
+            let mut watch = pass.map(Watch::new);
+            let answered = caller.clone().work(response);
+            let mut response = match &mut watch {
+                None => answered.await?,
+                Some(watch) => tokio::select! {
+                    biased;
+                    response = answered => response?,
+                    () = &mut watch.ended => watch.farewell().into_http(),
+                },
+            };
             if let Some(status) = Status::from_header_map(response.headers()) {
                 if status.code() == Code::OutOfRange {
                     response = with_limit_details(status, call.method, &limits).into_http();
                 }
                 call.see(response.headers());
             }
-            Ok(response.map(|body| Body::new(Observed { body, call, connection })))
+            Ok(response
+                .map(|body| Body::new(Observed { body, call, caller, watch, has_ended: false })))
         })
     }
 }
@@ -143,6 +140,9 @@ struct Call {
     metrics: Arc<Metrics>,
     method: &'static str,
     code: Option<Code>,
+    /// Of whom, and from where.
+    pass: Option<Arc<Pass>>,
+    peer: Option<Peer>,
     /// Keeps its connection's place.
     _open: Option<OpenCall>,
 }
@@ -160,6 +160,21 @@ impl Drop for Call {
         // Without a status the client went away first.
         let code = self.code.unwrap_or(Code::Cancelled);
         self.metrics.rpc_ended(self.method, code_name(code));
+        if let Some(pass) = &self.pass
+            && role::changes(self.method)
+        {
+            let (who, peer) = (pass.principal(), self.peer);
+            tracing::info!(
+                target: "audit",
+                who = who.name,
+                tenant = who.tenant_name,
+                role = who.role.as_str(),
+                ?peer,
+                method = self.method,
+                what = pass.subject(),
+                result = code_name(code),
+            );
+        }
     }
 }
 
@@ -167,7 +182,27 @@ impl Drop for Call {
 struct Observed {
     body: Body,
     call: Call,
-    connection: Connection,
+    caller: Caller,
+    watch: Option<Watch>,
+    has_ended: bool,
+}
+
+/// Looks whether the credential of a call is over.
+struct Watch {
+    pass: Arc<Pass>,
+    ended: Pin<Box<dyn Future<Output = ()> + Send>>,
+}
+
+impl Watch {
+    fn new(pass: Arc<Pass>) -> Self {
+        let ended = Box::pin(pass.ended());
+        Self { pass, ended }
+    }
+
+    /// The status of a call that has ended so.
+    fn farewell(&self) -> Status {
+        RpcError::from(self.pass.over().unwrap_or(Over::Revoked)).into()
+    }
 }
 
 impl HttpBody for Observed {
@@ -179,7 +214,27 @@ impl HttpBody for Observed {
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Self::Data>, Self::Error>>> {
         let this = &mut *self;
-        let frame = this.connection.scope(|| Pin::new(&mut this.body).poll_frame(context));
+        if this.has_ended {
+            return Poll::Ready(None);
+        }
+        let is_over = this.watch.as_ref().is_some_and(|watch| watch.pass.over().is_some());
+        let caller = &this.caller;
+        let frame = match is_over {
+            true => Poll::Pending,
+            false => caller.clone().scope(|| Pin::new(&mut this.body).poll_frame(context)),
+        };
+        if frame.is_pending()
+            && let Some(watch) = &mut this.watch
+            && (is_over || watch.ended.as_mut().poll(context).is_ready())
+        {
+            let mut trailers = HeaderMap::new();
+            // A status with few details always fits into headers.
+            let _ = watch.farewell().add_header(&mut trailers);
+            this.call.see(&trailers);
+            // What was under way ends with its body, and a lease with that.
+            (this.body, this.has_ended) = (Body::empty(), true);
+            return Poll::Ready(Some(Ok(Frame::trailers(trailers))));
+        }
         if let Poll::Ready(Some(Ok(frame))) = &frame
             && let Some(trailers) = frame.trailers_ref()
         {
@@ -189,22 +244,10 @@ impl HttpBody for Observed {
     }
 
     fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
+        self.has_ended || self.body.is_end_stream()
     }
 
     fn size_hint(&self) -> SizeHint {
         self.body.size_hint()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn methods_are_known_by_path() {
-        let path = "/plantd.v1.PlantService/Drive";
-        assert_eq!(method_label(path), path);
-        assert_eq!(method_label("/plantd.v1.PlantService/Nonsense"), "other");
     }
 }

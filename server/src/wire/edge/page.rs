@@ -5,6 +5,7 @@
 //! | --- | --- |
 //! | `GET /`, `/viewer.js`, `/viewer.css` | the page, compiled into the program |
 //! | `GET /models/NAME/files/PATH` | a file of a model, as it was given to the server |
+//! | `GET /metrics` | the metrics, where callers are asked who they are |
 //! | another `GET` | 404 |
 //! | gRPC, gRPC-Web | the services' |
 //! | any other method | 405 |
@@ -28,8 +29,10 @@ use tonic::codegen::http::{HeaderMap, HeaderValue, Method, Request, Response, St
 use tower::{Layer, Service};
 
 use crate::core::files::{File, tag};
+use crate::core::metrics::registry::Metrics;
 use crate::wire::edge::admission::{OpenCall, Place};
 use crate::wire::edge::gate::is_grpc;
+use crate::wire::edge::metrics_http::OPEN_METRICS;
 
 /// Tags of [`PARTS`].
 static TAGS: LazyLock<[u64; PARTS.len()]> = LazyLock::new(|| PARTS.map(|part| tag(part.bytes)));
@@ -51,12 +54,14 @@ pub type FindFile = Arc<dyn Fn(&str, &str) -> Option<Arc<File>> + Send + Sync>;
 pub struct PageLayer {
     /// None where there is no page.
     files: Option<FindFile>,
+    /// None where they are not shown here.
+    metrics: Option<Arc<Metrics>>,
 }
 
 impl PageLayer {
-    /// A layer with the page, or without one.
-    pub fn new(files: Option<FindFile>) -> Self {
-        Self { files }
+    /// A layer with the page, or without one, and with metrics, or without.
+    pub fn new(files: Option<FindFile>, metrics: Option<Arc<Metrics>>) -> Self {
+        Self { files, metrics }
     }
 }
 
@@ -64,7 +69,7 @@ impl<S> Layer<S> for PageLayer {
     type Service = Page<S>;
 
     fn layer(&self, inner: S) -> Self::Service {
-        Page { inner, files: self.files.clone() }
+        Page { inner, files: self.files.clone(), metrics: self.metrics.clone() }
     }
 }
 
@@ -73,6 +78,7 @@ impl<S> Layer<S> for PageLayer {
 pub struct Page<S> {
     inner: S,
     files: Option<FindFile>,
+    metrics: Option<Arc<Metrics>>,
 }
 
 impl<S> Service<Request<Body>> for Page<S>
@@ -176,6 +182,10 @@ impl<S> Page<S> {
         if !matches!(*request.method(), Method::GET | Method::HEAD) {
             return Answer::text(StatusCode::METHOD_NOT_ALLOWED, "only GET, and gRPC\n");
         }
+        if let Some(metrics) = self.metrics.as_ref().filter(|_| request.uri().path() == "/metrics")
+        {
+            return metrics_text(metrics);
+        }
         let Some(files) = &self.files else {
             return Answer::text(StatusCode::NOT_FOUND, "this server shows no page\n");
         };
@@ -193,6 +203,14 @@ impl<S> Page<S> {
             Some(answer) => answer.unless_known(headers),
             None => Answer::text(StatusCode::NOT_FOUND, "there is nothing here\n"),
         }
+    }
+}
+
+fn metrics_text(metrics: &Metrics) -> Answer {
+    let text = Answer::text(StatusCode::OK, "");
+    match metrics.encode() {
+        Ok(metrics) => Answer { kind: OPEN_METRICS, bytes: Bytes::from(metrics), ..text },
+        Err(_) => Answer { status: StatusCode::INTERNAL_SERVER_ERROR, ..text },
     }
 }
 

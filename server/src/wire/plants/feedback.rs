@@ -13,6 +13,7 @@ use tokio::sync::watch::Receiver;
 use v1::point::Source;
 use v1::set_feedback_request::Reference as Form;
 
+use crate::core::connection::Connection;
 use crate::core::feedback::active::{Feedback, GuardBound, InForce, Mode};
 use crate::core::feedback::law::{Law, Stage};
 use crate::core::feedback::regulator::{Constraints, Memory, Reference, RegulatorError, Spec};
@@ -64,7 +65,9 @@ pub(crate) async fn set_parameters(
 
 /// Starts to compute the law of a plant's feedback anew, unless somebody is at it.
 fn recompute(hub: Arc<Hub>, session: Arc<Session>) {
-    tokio::spawn(async move {
+    // The work is the owner's, whoever has changed the plant.
+    let connection = Connection::server(session.owner());
+    tokio::spawn(connection.work(async move {
         // A change that comes while the task ends finds it ended, or is found by it.
         while outdated(&hub, &session).await.is_some() && session.begin_recomputing() {
             let work = async {
@@ -85,7 +88,7 @@ fn recompute(hub: Arc<Hub>, session: Arc<Session>) {
             }
             session.end_recomputing();
         }
-    });
+    }));
 }
 
 async fn outdated(hub: &Hub, session: &Arc<Session>) -> Option<(Arc<Spec>, Mechanics)> {
@@ -118,7 +121,8 @@ fn solve(
     abandoned: &Abandoned,
 ) -> Result<Law, RegulatorError> {
     let Mechanics { model, settings, .. } = mechanics;
-    spec.solve(model, *settings, &hub.limits, &hub.feedback_room, abandoned)
+    let room = &hub.tenants.current().rooms.feedback_numbers;
+    spec.solve(model, *settings, &hub.limits, room, abandoned)
 }
 
 /// Answers a SetFeedback call.

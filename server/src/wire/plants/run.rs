@@ -197,6 +197,7 @@ pub(crate) fn get_timing(
     let counts = &session.live().counts;
     let response = timing(counts);
     if request.clear {
+        hub.check_may_drive()?;
         counts.clear();
     }
     Ok(response)

@@ -14,13 +14,16 @@ use plantd_proto::v1;
 use prost::Message as _;
 
 use crate::core::channels::noise::hash;
+use crate::core::connection::Connection;
 use crate::core::plant::view::PlantSnapshot;
 use crate::core::session::shared::Session;
+use crate::core::tenant::Tenant;
 use crate::wire::message::run_info::run_info;
 use crate::wire::message::{checks, models, settings, start};
 use crate::wire::models::model::compile;
 use crate::wire::plants::feedback::set_feedback;
 use crate::wire::plants::run::{protect, run};
+use crate::wire::record::folders::folders;
 use crate::wire::shared::hub::Hub;
 use crate::wire::shared::state_directory::{EXTENSION, Saved, StateDirectory};
 use crate::wire::status::RpcError;
@@ -29,9 +32,16 @@ impl StateDirectory {
     /// Makes the plants anew that the directory holds. What cannot be used is named in the log and
     /// left as it is.
     pub async fn load(&self, hub: &Arc<Hub>) -> io::Result<()> {
-        let mut paths = fs::read_dir(&self.path)?
-            .map(|entry| Ok(entry?.path()))
-            .collect::<io::Result<Vec<_>>>()?;
+        for (tenant, folder) in folders(&self.path, &self.tenants)? {
+            // What is made is this tenant's.
+            Connection::server(tenant).work(self.load_folder(hub, &folder)).await?;
+        }
+        Ok(())
+    }
+
+    async fn load_folder(&self, hub: &Arc<Hub>, folder: &Path) -> io::Result<()> {
+        let mut paths =
+            fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>()?;
         paths.retain(|path| path.extension().is_some_and(|kind| kind == EXTENSION));
         paths.sort();
         for path in paths {
@@ -54,6 +64,10 @@ impl StateDirectory {
 
     /// Saves all plants that have changed since they were saved.
     pub fn save(&self, hub: &Hub) {
+        Connection::server(Tenant::NONE).scope(|| self.save_all(hub));
+    }
+
+    fn save_all(&self, hub: &Hub) {
         let mut after = String::new();
         loop {
             let (sessions, has_more) = hub.page(&after, 100);
@@ -104,7 +118,7 @@ impl StateDirectory {
         record.model = Some(message(&model));
         let start = session.model();
         record.start_model = (start.digest() != model.digest()).then(|| message(start));
-        self.write(session.id(), record.encode_to_vec())?;
+        self.write(session, record.encode_to_vec())?;
         saved.insert(session.id().to_owned(), Saved::Plant { model, hash });
         Ok(())
     }

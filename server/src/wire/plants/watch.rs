@@ -49,7 +49,7 @@ pub(crate) fn stream(
     let pace = Pace::new(request.at_most_hz, queue)?;
     // The one frame that every watcher has is covered by the limit of watchers.
     let numbers = (queue - 1).saturating_mul(record_words(session.model().dimensions()));
-    let room = hub.watch_room.reserve(numbers)?;
+    let room = hub.tenants.current().rooms.watch_numbers.reserve(numbers)?;
     let watcher = Watcher {
         session: Arc::clone(&session),
         subscription: session.subscribe(every, queue, hub.limits.watchers_per_plant)?,

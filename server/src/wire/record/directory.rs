@@ -1,4 +1,5 @@
-//! The recordings in a directory.
+//! The recordings in a directory. Those of a tenant lie in a folder of its own, see [`crate::wire::record::folders`];
+//! names are taken for all tenants together.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -11,11 +12,15 @@ use plantd_proto::v1::{self, RecordingStatus};
 use tokio::sync::Semaphore;
 use tonic::Code;
 
+use crate::core::connection::Caller;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::modes::Mode;
+use crate::core::room::Reservation;
 use crate::core::session::shared::Session;
+use crate::core::tenant::{Account, Tenant, Tenants};
 use crate::wire::message::checks::check_name;
-use crate::wire::record::progress::{Options, sentence};
+use crate::wire::record::folders::{folder_of, folders};
+use crate::wire::record::progress::{Options, Share, sentence};
 use crate::wire::record::recorder::{Recorder, StartError};
 use crate::wire::status::RpcError;
 
@@ -28,23 +33,44 @@ const CHECKPOINT_INTERVAL_RANGE_S: (f64, f64) = (0.1, 86_400.0);
 /// Calls that may wait for the disk at a time.
 const WAITING_MAX: usize = 8;
 
+/// A recording that this server has begun.
+struct Own {
+    recorder: Arc<Recorder>,
+    /// Its bytes go on to count until it is deleted.
+    _share: Share,
+}
+
+/// A recording's file.
+struct Entry {
+    name: String,
+    tenant: Tenant,
+    path: PathBuf,
+}
+
 /// The recordings in a directory.
 pub struct Recordings {
     directory: PathBuf,
     mode: Mode,
     limits: Limits,
+    tenants: Arc<Tenants>,
     /// Those that this server has begun; none while it begins. Nobody waits for the disk with this in hand.
-    own: Mutex<BTreeMap<String, Option<Arc<Recorder>>>>,
+    own: Mutex<BTreeMap<String, Option<Own>>>,
     /// Permits to wait for the disk: one that does not answer holds no more threads than these.
     permits: Arc<Semaphore>,
 }
 
 impl Recordings {
     /// The recordings in a directory, made if there is none; the mode is that of its files.
-    pub fn open(directory: &Path, mode: Mode, limits: Limits) -> io::Result<Self> {
+    pub fn open(
+        directory: &Path,
+        mode: Mode,
+        limits: Limits,
+        tenants: Arc<Tenants>,
+    ) -> io::Result<Self> {
         mode.create_directory(directory)?;
         let permits = Arc::new(Semaphore::new(WAITING_MAX));
-        Ok(Self { directory: directory.to_owned(), mode, limits, own: Mutex::default(), permits })
+        let (directory, own) = (directory.to_owned(), Mutex::default());
+        Ok(Self { directory, mode, limits, tenants, own, permits })
     }
 
     /// Does something for which the disk is waited for, on a thread that may wait.
@@ -53,9 +79,10 @@ impl Recordings {
         job: impl FnOnce() -> Result<R, RpcError> + Send + 'static,
     ) -> Result<R, RpcError> {
         let permit = Arc::clone(&self.permits).acquire_owned().await;
+        let caller = Caller::current();
         let work = move || {
             let _permit = permit;
-            job()
+            caller.scope(job)
         };
         let outcome = tokio::task::spawn_blocking(work).await;
         outcome.unwrap_or_else(|error| Err(RpcError::internal(error.to_string())))
@@ -79,6 +106,9 @@ impl Recordings {
             let problem = format!("is {interval_s}; it must lie between {low} and {high}");
             return Err(RpcError::field("checkpoint_interval_s", problem));
         }
+        Caller::note(&name);
+        let owner = self.tenants.account(session.owner());
+        let in_progress = owner.rooms.active_recordings.reserve(1)?;
         let former = {
             let mut own = self.own();
             let active = own.values().filter(|recorder| is_active(recorder)).count() + 1;
@@ -89,12 +119,16 @@ impl Recordings {
             }
             own.insert(name.clone(), None)
         };
-        let started = self.begin(session, &name, Duration::from_secs_f64(interval_s));
+        let interval = Duration::from_secs_f64(interval_s);
+        let started = self.share(&owner).and_then(|share| {
+            Ok((self.begin(session, &name, interval, share.clone(), in_progress)?, share))
+        });
         let mut own = self.own();
         match started {
-            Ok(recorder) => {
+            Ok((recorder, share)) => {
                 let info = recorder.info();
-                own.insert(name, Some(Arc::new(recorder)));
+                let recorder = Arc::new(recorder);
+                own.insert(name, Some(Own { recorder, _share: share }));
                 Ok(info)
             }
             Err(fault) => {
@@ -105,21 +139,53 @@ impl Recordings {
         }
     }
 
+    /// What the recordings of a tenant may still take.
+    fn share(&self, owner: &Account) -> Result<Share, RpcError> {
+        let room = Arc::clone(&owner.rooms.recording_bytes);
+        let own = Arc::new(Mutex::new(room.reserve(0)?));
+        let Some(limit) = owner.limits.recording_bytes else {
+            return Ok(Share { room, own, bytes_max: u64::MAX });
+        };
+        // What former servers have left, which nobody counts yet.
+        let files = self.files().map_err(|error| failed(&error))?;
+        let begun = self.own();
+        let left = files.iter().filter(|file| {
+            file.tenant == owner.tenant && begun.get(&file.name).is_none_or(Option::is_none)
+        });
+        let bytes = |file: &Entry| fs::metadata(&file.path).map_or(0, |metadata| metadata.len());
+        let left: u64 = left.map(bytes).sum();
+        let (name, what) = ("tenant.recording_bytes", "bytes of this tenant's recordings");
+        let actual = left.saturating_add(room.used());
+        if actual >= limit {
+            return Err(LimitExceeded { name, limit, what, actual }.into());
+        }
+        Ok(Share { room, own, bytes_max: limit - left })
+    }
+
     fn begin(
         &self,
         session: &Arc<Session>,
         name: &str,
         checkpoint_interval: Duration,
+        share: Share,
+        in_progress: Reservation,
     ) -> Result<Recorder, RpcError> {
-        let count = self.files().map_err(|error| failed(&error))?.len() + 1;
-        LimitExceeded::check("recordings", self.limits.recordings, "recordings", count)?;
-        let path = self.path(name);
+        let files = self.files().map_err(|error| failed(&error))?;
+        let (limit, count) = (self.limits.recordings, files.len() + 1);
+        LimitExceeded::check("recordings", limit, "recordings", count)?;
+        if files.iter().any(|file| file.name == name) {
+            return Err(RpcError::recording_exists(name));
+        }
+        let folder = folder_of(&self.directory, &self.tenants, session.owner());
+        self.mode.create_directory(&folder).map_err(|error| failed(&error))?;
+        let path = folder.join(name).with_extension(EXTENSION);
         let file = self.mode.create_new(&path).map_err(|error| match error.kind() {
             io::ErrorKind::AlreadyExists => RpcError::recording_exists(name),
             _ => failed(&error),
         })?;
         let (name, bytes_max) = (name.to_owned(), self.limits.recording_bytes);
-        let options = Options { name, checkpoint_interval, bytes_max };
+        let options =
+            Options { name, checkpoint_interval, bytes_max, share, _in_progress: in_progress };
         Recorder::start(session, file, options).map_err(|error| {
             // Nothing is in it yet.
             let _ = fs::remove_file(&path);
@@ -132,42 +198,44 @@ impl Recordings {
 
     /// Ends a recording and waits for it: call it on a worker.
     pub fn stop(&self, name: &str) -> Result<v1::Recording, RpcError> {
-        check_name("name", name)?;
+        let file = self.find(name)?;
         match self.recorder(name) {
             Some(recorder) => {
                 recorder.stop();
                 Ok(recorder.info())
             }
-            None => self.left(name),
+            None => left(&file),
         }
     }
 
     /// Ends all of them.
     pub fn stop_all(&self) {
-        let all: Vec<_> = self.own().values().flatten().map(Arc::clone).collect();
+        let own = self.own();
+        let all: Vec<_> = own.values().flatten().map(|own| Arc::clone(&own.recorder)).collect();
+        drop(own);
         Recorder::stop_all(&all);
     }
 
     /// Up to `size` recordings after the one named `after`, and whether there are more.
     pub fn page(&self, after: &str, size: usize) -> Result<(Vec<v1::Recording>, bool), RpcError> {
-        let mut names = self.files().map_err(|error| failed(&error))?;
-        names.retain(|name| name.as_str() > after);
-        names.sort();
-        let has_more = names.len() > size;
-        names.truncate(size);
-        let info = |name: &String| match self.recorder(name) {
+        let mut files = self.files().map_err(|error| failed(&error))?;
+        files.retain(|file| file.name.as_str() > after && self.tenants.shows(file.tenant));
+        files.sort_by(|one, other| one.name.cmp(&other.name));
+        let has_more = files.len() > size;
+        files.truncate(size);
+        let info = |file: &Entry| match self.recorder(&file.name) {
             Some(recorder) => Ok(recorder.info()),
-            None => self.left(name),
+            None => left(file),
         };
         // One that was deleted since is left out.
-        Ok((names.iter().filter_map(|name| info(name).ok()).collect(), has_more))
+        Ok((files.iter().filter_map(|file| info(file).ok()).collect(), has_more))
     }
 
     /// The file of a recording, and its present length.
     pub fn file(&self, name: &str) -> Result<(File, u64), RpcError> {
-        check_name("name", name)?;
+        let found = self.find(name)?;
         let open = || {
-            let file = File::open(self.path(name))?;
+            let file = File::open(&found.path)?;
             let length = file.metadata()?.len();
             Ok((file, length))
         };
@@ -176,11 +244,11 @@ impl Recordings {
 
     /// Deletes a recording that is not in progress.
     pub fn delete(&self, name: &str) -> Result<(), RpcError> {
-        check_name("name", name)?;
+        let file = self.find(name)?;
         if self.own().get(name).is_some_and(is_active) {
             return Err(RpcError::recording_active(format!("recording:{name}")));
         }
-        fs::remove_file(self.path(name)).map_err(|error| not_found_or_failed(name, &error))?;
+        fs::remove_file(&file.path).map_err(|error| not_found_or_failed(name, &error))?;
         // One of that name may have begun since.
         self.own().retain(|other, recorder| other != name || is_active(recorder));
         Ok(())
@@ -188,44 +256,59 @@ impl Recordings {
 
     /// One that this server has begun.
     fn recorder(&self, name: &str) -> Option<Arc<Recorder>> {
-        self.own().get(name)?.as_ref().map(Arc::clone)
+        self.own().get(name)?.as_ref().map(|own| Arc::clone(&own.recorder))
     }
 
-    /// What can be said of a file that another server has left.
-    fn left(&self, name: &str) -> Result<v1::Recording, RpcError> {
-        let metadata = fs::metadata(self.path(name));
-        let bytes = metadata.map_err(|error| not_found_or_failed(name, &error))?.len();
-        let status = RecordingStatus::Done.into();
-        Ok(v1::Recording { name: name.to_owned(), status, bytes, ..Default::default() })
+    /// The file of a recording that is there for the caller.
+    fn find(&self, name: &str) -> Result<Entry, RpcError> {
+        check_name("name", name)?;
+        Caller::note(name);
+        let folders = folders(&self.directory, &self.tenants).map_err(|error| failed(&error))?;
+        let of = |(tenant, folder): (Tenant, PathBuf)| {
+            let path = folder.join(name).with_extension(EXTENSION);
+            Entry { name: name.to_owned(), tenant, path }
+        };
+        let mut shown =
+            folders.into_iter().filter(|(tenant, _)| self.tenants.shows(*tenant)).map(of);
+        let found = shown.find(|file| file.path.exists());
+        found.ok_or_else(|| RpcError::recording_not_found(name))
     }
 
-    /// Names of all recordings. Files with other names belong to somebody else.
-    fn files(&self) -> io::Result<Vec<String>> {
-        let mut names = Vec::new();
-        for entry in fs::read_dir(&self.directory)? {
-            let path = entry?.path();
-            let stem = path.file_stem().and_then(|stem| stem.to_str());
-            if let Some(name) = stem.filter(|name| check_name("name", name).is_ok())
-                && path.extension().is_some_and(|kind| kind == EXTENSION)
-            {
-                names.push(name.to_owned());
+    /// All recordings. Files with other names belong to somebody else.
+    fn files(&self) -> io::Result<Vec<Entry>> {
+        let mut files = Vec::new();
+        for (tenant, folder) in folders(&self.directory, &self.tenants)? {
+            for entry in fs::read_dir(&folder)? {
+                let path = entry?.path();
+                let stem = path.file_stem().and_then(|stem| stem.to_str());
+                if let Some(name) = stem.filter(|name| check_name("name", name).is_ok())
+                    && path.extension().is_some_and(|kind| kind == EXTENSION)
+                {
+                    let name = name.to_owned();
+                    files.push(Entry { name, tenant, path });
+                }
             }
         }
-        Ok(names)
+        Ok(files)
     }
 
-    fn path(&self, name: &str) -> PathBuf {
-        self.directory.join(name).with_extension(EXTENSION)
-    }
-
-    fn own(&self) -> MutexGuard<'_, BTreeMap<String, Option<Arc<Recorder>>>> {
+    fn own(&self) -> MutexGuard<'_, BTreeMap<String, Option<Own>>> {
         self.own.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
+/// What can be said of a file that another server has left.
+fn left(file: &Entry) -> Result<v1::Recording, RpcError> {
+    let name = &file.name;
+    let metadata = fs::metadata(&file.path);
+    let bytes = metadata.map_err(|error| not_found_or_failed(name, &error))?.len();
+    let status = RecordingStatus::Done.into();
+    Ok(v1::Recording { name: name.clone(), status, bytes, ..Default::default() })
+}
+
 /// It begins or is in progress.
-fn is_active(recorder: &Option<Arc<Recorder>>) -> bool {
-    recorder.as_ref().is_none_or(|recorder| recorder.is_active())
+fn is_active(own: &Option<Own>) -> bool {
+    own.as_ref().is_none_or(|own| own.recorder.is_active())
 }
 
 /// A name from a plant's id, cut where it would be too long, and the time.

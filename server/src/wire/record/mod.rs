@@ -15,6 +15,7 @@
 
 pub mod directory;
 pub(crate) mod file;
+pub(crate) mod folders;
 pub(crate) mod message;
 pub(crate) mod picture;
 pub(crate) mod progress;

@@ -7,6 +7,8 @@ use std::time::{Duration, SystemTime};
 use mcap::McapError;
 use plantd_proto::v1;
 
+use crate::core::room::{Reservation, Room};
+
 /// What is asked for.
 pub(super) struct Options {
     /// Name.
@@ -15,6 +17,28 @@ pub(super) struct Options {
     pub(super) checkpoint_interval: Duration,
     /// Most bytes of the file.
     pub(super) bytes_max: u64,
+    /// What its tenant has left.
+    pub(super) share: Share,
+    /// Its tenant's room for a recording in progress.
+    pub(super) _in_progress: Reservation,
+}
+
+/// What a tenant's recordings have taken, and may take.
+#[derive(Clone)]
+pub(super) struct Share {
+    pub(super) room: Arc<Room>,
+    /// Bytes of this one, counted until it is deleted.
+    pub(super) own: Arc<Mutex<Reservation>>,
+    /// Most bytes of all that this server has begun.
+    pub(super) bytes_max: u64,
+}
+
+impl Share {
+    /// Counts the bytes of this recording; whether the tenant has used up what it may.
+    pub(super) fn is_used_up(&self, bytes: u64) -> bool {
+        self.own.lock().unwrap_or_else(PoisonError::into_inner).count(bytes);
+        self.room.used() > self.bytes_max
+    }
 }
 
 /// What the thread shares with whoever ends it.

@@ -175,7 +175,13 @@ impl Work {
             if is_ending {
                 return Ok(None);
             }
-            if self.shared.bytes.load(Ordering::Relaxed) > self.options.bytes_max {
+            let bytes = self.shared.bytes.load(Ordering::Relaxed);
+            if self.options.share.is_used_up(bytes) {
+                let sentence = "its tenant's recordings have as many bytes as they may, the limit \
+                                `tenant.recording_bytes`";
+                return Ok(Some(sentence.to_owned()));
+            }
+            if bytes > self.options.bytes_max {
                 let max = self.options.bytes_max;
                 return Ok(Some(format!("it has {max} bytes, the limit `recording_bytes`")));
             }
@@ -383,7 +389,9 @@ pub(super) mod tests {
     use crate::core::metrics::registry::Metrics;
     use crate::core::realtime::loops::RealTime;
     use crate::core::realtime::settings::RealTimeSettings;
+    use crate::core::room::Room;
     use crate::core::session::creation::Origin;
+    use crate::wire::record::progress::Share;
 
     pub(in crate::wire::record) fn session() -> Arc<Session> {
         let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap()).unwrap());
@@ -396,7 +404,17 @@ pub(super) mod tests {
 
     pub(in crate::wire::record) fn options() -> Options {
         let checkpoint_interval = Duration::from_secs(3600);
-        Options { name: "r".to_owned(), checkpoint_interval, bytes_max: u64::MAX }
+        let room = Room::new("tenant.recording_bytes", "bytes", u64::MAX);
+        let own = Arc::new(Mutex::new(room.reserve(0).unwrap()));
+        let in_progress = room.reserve(0).unwrap();
+        let share = Share { room, own, bytes_max: u64::MAX };
+        Options {
+            name: "r".to_owned(),
+            checkpoint_interval,
+            bytes_max: u64::MAX,
+            share,
+            _in_progress: in_progress,
+        }
     }
 
     /// A recorder whose thread is this one.

@@ -14,14 +14,16 @@ use tokio_util::sync::CancellationToken;
 use tonic::Code;
 
 use crate::core::catalog::Catalog;
+use crate::core::connection::{Caller, Connection};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::metrics::registry::Metrics;
 use crate::core::priority::Priority;
 use crate::core::realtime::loops::RealTime;
 use crate::core::realtime::settings::RealTimeSettings;
-use crate::core::room::Room;
-use crate::core::session::creation::{Accuracy, Origin};
+use crate::core::room::{Reservation, Room};
+use crate::core::session::creation::{Accuracy, Origin, Owner};
 use crate::core::session::shared::Session;
+use crate::core::tenant::{Tenant, TenantSettings, Tenants};
 use crate::core::workers::pool::Workers;
 use crate::wire::answers::Answers;
 use crate::wire::link::host::{LinkError, LinkHost, LinkInfo};
@@ -47,14 +49,12 @@ pub struct Hub {
     /// Workers for steps in lockstep that take long, alone or together: the attendants stay free for
     /// others.
     pub steppers: Jobs,
+    /// Whose things are, and how much each may have.
+    pub tenants: Arc<Tenants>,
     /// Models.
     pub catalog: Catalog,
     /// Permits to hold a trajectory's regulator, filter or optimisation in memory.
     pub trajectory_solves: Arc<Semaphore>,
-    /// Room in memory for the laws of feedbacks.
-    pub feedback_room: Arc<Room>,
-    /// Room in memory for the queues of watchers.
-    pub watch_room: Arc<Room>,
     /// Cancelled when the server begins to shut down: streams end.
     pub ending: CancellationToken,
     /// Threads of one search.
@@ -69,35 +69,40 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// A hub without plants.
+    /// A hub without plants. Tenants are kept apart where there are settings of theirs.
     pub fn new(
         limits: Limits,
         worker_count: usize,
         priority: Priority,
         realtime: RealTimeSettings,
         links: Option<LinkHost>,
+        tenants: Option<BTreeMap<String, TenantSettings>>,
     ) -> Self {
         let metrics = Arc::new(Metrics::default());
         let realtime = RealTime::new(realtime, &metrics);
         let pool = |name, priority| {
             Jobs::new(Workers::new(name, worker_count, limits.queued_jobs, priority))
         };
+        let feedback_room = Room::new(
+            "feedback_numbers",
+            "numbers in the feedbacks of all plants",
+            limits.feedback_numbers,
+        );
+        let watch_room = Room::new(
+            "watch_numbers",
+            "numbers in the queues of all watchers",
+            limits.watch_numbers,
+        );
+        let are_apart = tenants.is_some();
+        let tenants = tenants.unwrap_or_default();
+        let tenants = Arc::new(Tenants::new(are_apart, tenants, &watch_room, &feedback_room));
         Self {
             workers: pool("worker", priority),
             attendants: pool("attendant", Priority::Normal),
             steppers: pool("stepper", Priority::Normal),
-            catalog: Catalog::new(&limits, metrics.models.clone()),
+            catalog: Catalog::new(&limits, metrics.models.clone(), Arc::clone(&tenants)),
+            tenants,
             trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
-            feedback_room: Room::new(
-                "feedback_numbers",
-                "numbers in the feedbacks of all plants",
-                limits.feedback_numbers,
-            ),
-            watch_room: Room::new(
-                "watch_numbers",
-                "numbers in the queues of all watchers",
-                limits.watch_numbers,
-            ),
             ending: CancellationToken::new(),
             search_threads: 1,
             recordings: None,
@@ -110,20 +115,39 @@ impl Hub {
         }
     }
 
-    /// The plant of that id.
+    /// The plant of that id, if it is there for the caller.
     pub fn session(&self, id: &str) -> Result<Arc<Session>, RpcError> {
+        Caller::note(id);
         let plants = self.plants();
         match plants.get(id) {
-            Some(session) if !session.is_closed() => {
+            Some(session) if !session.is_closed() && self.shows(session) => {
                 session.life().touch();
                 Ok(Arc::clone(session))
             }
             _ => {
-                let known = plants.iter().filter(|(_, session)| !session.is_closed());
+                let is_known = |session: &Session| !session.is_closed() && self.shows(session);
+                let known = plants.iter().filter(|(_, session)| is_known(session));
                 let known = known.map(|(id, _)| id).take(COMPARED_PLANTS_MAX);
                 Err(RpcError::plant_not_found(&UnknownName::among(id, known)))
             }
         }
+    }
+
+    /// Refuses a change by somebody who may only look, in a call that changes nothing otherwise.
+    pub fn check_may_drive(&self) -> Result<(), RpcError> {
+        match self.tenants.may_drive() {
+            true => Ok(()),
+            false => Err(RpcError::new(
+                Code::PermissionDenied,
+                "ROLE",
+                "to look is all that the role `viewer` may do; this needs `driver`",
+            )),
+        }
+    }
+
+    /// It is there for the caller.
+    fn shows(&self, session: &Session) -> bool {
+        self.tenants.shows(session.owner())
     }
 
     /// Refuses a new plant that would not be kept, before work is done for it.
@@ -147,12 +171,19 @@ impl Hub {
         accuracy: Option<Accuracy>,
         expires: Option<Duration>,
     ) -> Result<Arc<Session>, RpcError> {
+        let account = self.tenants.current();
+        let owner = Owner {
+            tenant: account.tenant,
+            room: Some(account.rooms.plants.reserve(1)?),
+            running: Some(Arc::clone(&account.rooms.running_plants)),
+        };
         let mut plants = self.plants();
         let id = if id.is_empty() { free_id(&plants) } else { id };
+        Caller::note(&id);
         self.admit(&plants, &id)?;
         let metrics = Arc::clone(&self.metrics);
         let realtime = Arc::clone(&self.realtime);
-        let origin = Origin { id: id.clone(), model_name, accuracy, expires };
+        let origin = Origin { id: id.clone(), model_name, accuracy, expires, owner };
         let session = Session::new(origin, plant, metrics, realtime);
         plants.insert(id, Arc::clone(&session));
         self.metrics.set_plants(plants.len());
@@ -177,7 +208,7 @@ impl Hub {
             hub.metrics.set_plants(plants.len());
             drop(plants);
             if let Some(state) = &hub.state {
-                state.remove(session.id());
+                state.remove(&session);
             }
         });
         end.await.map_err(|error| RpcError::internal(error.to_string()))
@@ -190,7 +221,7 @@ impl Hub {
             self.plants().iter().filter(is_expired).map(|(id, _)| id.clone()).collect();
         for id in expired {
             // Whoever has deleted it meanwhile has done what was to be done.
-            if self.delete(&id).await.is_ok() {
+            if Connection::server(Tenant::NONE).work(self.delete(&id)).await.is_ok() {
                 tracing::info!(plant = id, "plant deleted: nobody has used it");
             }
         }
@@ -201,7 +232,9 @@ impl Hub {
         let plants = self.plants();
         let mut rest = plants
             .iter()
-            .filter(|(id, session)| id.as_str() > after && !session.is_closed())
+            .filter(|(id, session)| {
+                id.as_str() > after && !session.is_closed() && self.shows(session)
+            })
             .map(|(_, session)| Arc::clone(session));
         let page = rest.by_ref().take(size).collect();
         let has_more = rest.next().is_some();
@@ -230,12 +263,13 @@ impl Hub {
     }
 
     /// Room in memory for one more trajectory's regulator, filter or optimisation.
-    pub fn trajectory_permit(&self) -> Result<OwnedSemaphorePermit, RpcError> {
+    pub fn trajectory_permit(&self) -> Result<TrajectoryPermit, RpcError> {
+        let own = self.tenants.take(|rooms| &rooms.trajectory_solves)?;
         let (name, limit) = ("trajectory_solves", self.limits.trajectory_solves);
         let (what, actual) = ("regulators, filters and optimisations at a time", limit + 1);
-        Arc::clone(&self.trajectory_solves)
-            .try_acquire_owned()
-            .map_err(|_| LimitExceeded { name, limit, what, actual }.into())
+        let of_all = Arc::clone(&self.trajectory_solves).try_acquire_owned();
+        let of_all = of_all.map_err(|_| LimitExceeded { name, limit, what, actual })?;
+        Ok(TrajectoryPermit { _of_all: of_all, _own: own })
     }
 
     /// A stream that ends, unfinished, when the server begins to shut down.
@@ -271,6 +305,13 @@ impl Hub {
     fn plants(&self) -> MutexGuard<'_, BTreeMap<String, Arc<Session>>> {
         self.plants.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// Room for a trajectory's regulator, filter or optimisation, of the server and of the tenant.
+#[derive(Debug)]
+pub struct TrajectoryPermit {
+    _of_all: OwnedSemaphorePermit,
+    _own: Reservation,
 }
 
 /// An id that no plant has. Random, so that ids differ between runs of a server.

@@ -1,4 +1,5 @@
-//! The directory in which plants survive their server: its files, and what is known of them.
+//! The directory in which plants survive their server: its files, and what is known of them. Plants of a tenant lie
+//! in a folder of its own, `tenants/NAME`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -12,7 +13,9 @@ use plantd_models::Model;
 use crate::core::channels::noise::hash;
 use crate::core::modes::Mode;
 use crate::core::session::shared::Session;
+use crate::core::tenant::Tenants;
 use crate::wire::message::run_info::run_info;
+use crate::wire::record::folders::folder_of;
 
 pub(crate) const EXTENSION: &str = "plant";
 
@@ -20,6 +23,7 @@ pub(crate) const EXTENSION: &str = "plant";
 pub struct StateDirectory {
     pub(crate) path: PathBuf,
     pub(crate) mode: Mode,
+    pub(crate) tenants: Arc<Tenants>,
     pub(crate) saved: Mutex<BTreeMap<String, Saved>>,
     /// Ids of the plants that were not paused when the server began to pause them all.
     pub(crate) running: OnceLock<BTreeSet<String>>,
@@ -40,9 +44,10 @@ pub(crate) enum Saved {
 
 impl StateDirectory {
     /// The directory at a path, made if there is none; the mode is that of its files.
-    pub fn open(path: &Path, mode: Mode) -> io::Result<Self> {
+    pub fn open(path: &Path, mode: Mode, tenants: Arc<Tenants>) -> io::Result<Self> {
         mode.create_directory(path)?;
-        Ok(Self { path: path.to_owned(), mode, saved: Mutex::default(), running: OnceLock::new() })
+        let path = path.to_owned();
+        Ok(Self { path, mode, tenants, saved: Mutex::default(), running: OnceLock::new() })
     }
 
     /// Notes which plants are not paused: they go on with the next server.
@@ -52,9 +57,11 @@ impl StateDirectory {
         let _ = self.running.set(ids.collect());
     }
 
-    pub(crate) fn write(&self, id: &str, mut bytes: Vec<u8>) -> Result<()> {
+    pub(crate) fn write(&self, session: &Session, mut bytes: Vec<u8>) -> Result<()> {
         bytes.extend(hash(&bytes).to_le_bytes());
-        let path = self.file(id);
+        let folder = folder_of(&self.path, &self.tenants, session.owner());
+        self.mode.create_directory(&folder)?;
+        let path = self.file(session);
         let aside = path.with_extension("partial");
         let mut file = self.mode.create(&aside)?;
         file.write_all(&bytes)?;
@@ -64,18 +71,20 @@ impl StateDirectory {
     }
 
     /// Forgets a plant that was deleted.
-    pub fn remove(&self, id: &str) {
+    pub fn remove(&self, session: &Session) {
+        let id = session.id();
         let mut saved = self.saved();
         if let Some(Saved::Plant { .. }) = saved.get(id) {
             saved.remove(id);
-            if let Err(error) = fs::remove_file(self.file(id)) {
+            if let Err(error) = fs::remove_file(self.file(session)) {
                 tracing::error!(plant = id, %error, "saved plant not removed");
             }
         }
     }
 
-    fn file(&self, id: &str) -> PathBuf {
-        self.path.join(id).with_extension(EXTENSION)
+    fn file(&self, session: &Session) -> PathBuf {
+        let folder = folder_of(&self.path, &self.tenants, session.owner());
+        folder.join(session.id()).with_extension(EXTENSION)
     }
 
     pub(crate) fn saved(&self) -> MutexGuard<'_, BTreeMap<String, Saved>> {

@@ -33,6 +33,7 @@ pub(crate) mod state;
 pub(crate) mod step;
 pub(crate) mod test;
 pub(crate) mod timing;
+pub(crate) mod token;
 pub(crate) mod top;
 pub(crate) mod view;
 pub(crate) mod watch;

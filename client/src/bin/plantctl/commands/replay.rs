@@ -40,7 +40,7 @@ impl Replay {
                 (Some(server), address)
             }
         };
-        let client = Client::connect(&address).await?;
+        let client = context.connect_to(&address).await?;
         let outcome = replay_on(&client, &mut recording).await;
         if let Some(server) = server {
             server.stop().await;

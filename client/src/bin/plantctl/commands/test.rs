@@ -9,7 +9,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
 use futures::{StreamExt as _, stream};
-use plantd_client::Client;
 use serde_json::json;
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -140,7 +139,7 @@ impl Test {
             }
         };
         let server = TestServer {
-            client: Client::connect(&address).await?,
+            client: context.connect_to(&address).await?,
             link_root: own.as_ref().and_then(OwnServer::link_root).map(Path::to_owned),
             address,
             plants: Mutex::new(BTreeSet::new()),

@@ -1,7 +1,7 @@
 //! What every command is given: the server's address, and where results go.
 
 use anyhow::{Context as _, Result};
-use plantd_client::{Answers, Client, DEFAULT_ADDRESS, v1};
+use plantd_client::{Answers, Client, ConnectOptions, Credentials, DEFAULT_ADDRESS, v1};
 
 use crate::output::printer::Output;
 
@@ -9,6 +9,8 @@ use crate::output::printer::Output;
 pub(crate) struct Context {
     /// The server's address, if one was given.
     pub(crate) address: Option<String>,
+    /// How the user shows there who they are.
+    pub(crate) credentials: Credentials,
     /// Where results go.
     pub(crate) output: Output,
 }
@@ -16,7 +18,14 @@ pub(crate) struct Context {
 impl Context {
     /// Connects to the server.
     pub(crate) async fn connect(&self) -> Result<Client> {
-        Ok(Client::connect(self.address.as_deref().unwrap_or(DEFAULT_ADDRESS)).await?)
+        self.connect_to(self.address.as_deref().unwrap_or(DEFAULT_ADDRESS)).await
+    }
+
+    /// Connects to a server at an address, as the same user.
+    pub(crate) async fn connect_to(&self, address: &str) -> Result<Client> {
+        let credentials = self.credentials.clone();
+        let options = ConnectOptions { credentials, ..ConnectOptions::default() };
+        Ok(Client::connect_with(address, options).await?)
     }
 }
 

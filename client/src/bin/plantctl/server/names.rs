@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::{Arg, Command};
 use clap_complete::{ArgValueCandidates, CompletionCandidate};
-use plantd_client::{Client, DEFAULT_ADDRESS, Error};
+use plantd_client::{Client, ConnectOptions, Credentials, DEFAULT_ADDRESS, Error};
 
 /// Longest that somebody who has pressed a key waits for names.
 const PATIENCE: Duration = Duration::from_millis(500);
@@ -60,7 +60,14 @@ fn ask(
     question: impl AsyncFnOnce(Client) -> Result<Vec<CompletionCandidate>, Error>,
 ) -> Vec<CompletionCandidate> {
     let address = std::env::var("PLANTD_ADDRESS").unwrap_or_else(|_| DEFAULT_ADDRESS.to_owned());
-    let answer = async { question(Client::connect(&address).await?).await };
+    let answer = async {
+        question({
+            let options =
+                ConnectOptions { credentials: Credentials::from_env(), ..Default::default() };
+            Client::connect_with(&address, options).await?
+        })
+        .await
+    };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let Ok(runtime) = runtime else { return Vec::new() };
     match runtime.block_on(async { tokio::time::timeout(PATIENCE, answer).await }) {

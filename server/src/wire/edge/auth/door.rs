@@ -1,0 +1,250 @@
+//! Who somebody is: by the token of the request, else by the certificate of the connection, else by the user at the
+//! other end of the unix-domain socket.
+
+use std::collections::HashMap;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError, RwLock, Weak};
+use std::time::{Duration, SystemTime};
+
+use tonic::Code;
+use tonic::codegen::http::HeaderMap;
+use tonic::codegen::http::header::AUTHORIZATION;
+
+use crate::core::mutex::lock;
+use crate::core::tenant::Tenants;
+use crate::wire::edge::admission::Place;
+use crate::wire::edge::auth::credential::{Credential, Pass, Principal};
+use crate::wire::edge::auth::role::{Needs, Role, needs, watches};
+use crate::wire::edge::auth::settings::{ANY_SUBJECT, AuthSettings};
+use crate::wire::edge::auth::tokens::{Tokens, TokensError};
+use crate::wire::status::RpcError;
+
+/// How often the file of tokens and the time are looked at.
+pub const LOOK_PERIOD: Duration = Duration::from_secs(1);
+
+/// Longest token, bytes.
+const TOKEN_BYTES_MAX: usize = 512;
+
+/// What a file was when it was read. Another one of the same name differs in one of these.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stamp {
+    modified: (i64, i64),
+    bytes: u64,
+    inode: u64,
+}
+
+impl Stamp {
+    /// That of a file; none where there is no file.
+    pub fn of(path: &Path) -> Option<Self> {
+        let metadata = std::fs::metadata(path).ok()?;
+        let modified = (metadata.mtime(), metadata.mtime_nsec());
+        Some(Self { modified, bytes: metadata.len(), inode: metadata.ino() })
+    }
+}
+
+/// Where everybody who asks for something has to say who they are.
+pub struct Door {
+    settings: AuthSettings,
+    tenants: Arc<Tenants>,
+    tokens: RwLock<Tokens>,
+    stamp: Mutex<Option<Stamp>>,
+    /// Credentials of connections, by the connection's number: they live as long as it does or is used.
+    of_connections: Mutex<HashMap<u64, Weak<Credential>>>,
+}
+
+/// Why somebody is not let in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stranger {
+    Nameless,
+    BadHeader,
+    UnknownToken,
+    UnknownCertificate,
+    UnknownUser(u32),
+}
+
+impl From<Stranger> for RpcError {
+    fn from(stranger: Stranger) -> Self {
+        let (reason, sentence) = match stranger {
+            Stranger::Nameless => (
+                "NO_CREDENTIALS",
+                "the server wants to know who calls: give a token, or a client certificate that it knows".to_owned(),
+            ),
+            Stranger::BadHeader => (
+                "NO_CREDENTIALS",
+                "the header `authorization` has to be `Bearer TOKEN`, once".to_owned(),
+            ),
+            Stranger::UnknownToken => (
+                "TOKEN_UNKNOWN",
+                "the server does not know this token: it was revoked, or is another server's".to_owned(),
+            ),
+            Stranger::UnknownCertificate => (
+                "CERTIFICATE_UNKNOWN",
+                "no rule of the server says who the holder of this certificate is: see `auth.certificates`".to_owned(),
+            ),
+            Stranger::UnknownUser(uid) => (
+                "USER_UNKNOWN",
+                format!("no rule of the server says who the user with number {uid} is: see `auth.peers`, or give a token"),
+            ),
+        };
+        Self::new(Code::Unauthenticated, reason, sentence)
+    }
+}
+
+impl Door {
+    /// A door as the configuration has it.
+    pub fn new(settings: AuthSettings, tenants: Arc<Tenants>) -> Result<Self, TokensError> {
+        let door = Self {
+            settings,
+            tenants,
+            tokens: RwLock::default(),
+            stamp: Mutex::default(),
+            of_connections: Mutex::default(),
+        };
+        if let Some(path) = &door.settings.tokens {
+            door.read_tokens(path)?;
+        }
+        Ok(door)
+    }
+
+    fn read_tokens(&self, path: &Path) -> Result<(), TokensError> {
+        // Before it is read: what is written meanwhile is found the next time.
+        let stamp = Stamp::of(path);
+        let mut tokens = self.tokens.write().unwrap_or_else(PoisonError::into_inner);
+        *lock(&self.stamp) = stamp;
+        *tokens = Tokens::read(path, &self.tenants, &tokens)?;
+        tracing::info!(path = %path.display(), count = tokens.count(), "tokens read");
+        Ok(())
+    }
+
+    /// Looks over and over whether the file of tokens has changed, and who has expired.
+    pub async fn look_after(self: Arc<Self>) {
+        loop {
+            tokio::time::sleep(LOOK_PERIOD).await;
+            let door = Arc::clone(&self);
+            // The disk may not answer.
+            let _ = tokio::task::spawn_blocking(move || door.look()).await;
+        }
+    }
+
+    fn look(&self) {
+        if let Some(path) = &self.settings.tokens
+            && Stamp::of(path) != *lock(&self.stamp)
+            && let Err(error) = self.read_tokens(path)
+        {
+            tracing::error!(%error, "the tokens that were known before stay in force");
+        }
+        let now = SystemTime::now();
+        self.tokens.read().unwrap_or_else(PoisonError::into_inner).end_expired(now);
+        lock(&self.of_connections).retain(|_, credential| {
+            let credential = credential.upgrade();
+            credential.iter().for_each(|credential| credential.end_if_expired(now));
+            credential.is_some()
+        });
+    }
+
+    /// Lets a call in, if its caller may make it; nothing is needed of a call without a pass.
+    pub(super) fn admit(
+        &self,
+        path: &str,
+        is_call: bool,
+        headers: &HeaderMap,
+        place: Option<&Arc<Place>>,
+    ) -> Result<Option<Arc<Pass>>, RpcError> {
+        let role = match needs(path) {
+            Needs::Nothing if is_call => return Ok(None),
+            Needs::Role(role) if is_call => role,
+            _ => Role::Viewer,
+        };
+        let credential = self.identify(headers, place)?;
+        credential.end_if_expired(SystemTime::now());
+        if let Some(over) = credential.over() {
+            return Err(over.into());
+        }
+        let Principal { name, tenant, role: own, .. } = &credential.principal;
+        if *own < role {
+            let (own, role) = (own.as_str(), role.as_str());
+            let sentence = format!("`{name}` has the role `{own}`; this needs `{role}`");
+            return Err(RpcError::new(Code::PermissionDenied, "ROLE", sentence));
+        }
+        let account = self.tenants.account(*tenant);
+        let stream = is_call.then(|| account.rooms.streams.reserve(1)).transpose()?;
+        let is_watcher = is_call && watches(path);
+        let watcher = is_watcher.then(|| account.rooms.watchers.reserve(1)).transpose()?;
+        let number = place.map_or(0, |place| place.id() + 1);
+        Ok(Some(Pass::new(credential, number, [stream, watcher])))
+    }
+
+    fn identify(
+        &self,
+        headers: &HeaderMap,
+        place: Option<&Arc<Place>>,
+    ) -> Result<Arc<Credential>, Stranger> {
+        let mut values = headers.get_all(AUTHORIZATION).iter();
+        if let Some(value) = values.next() {
+            let token = bearer(value.as_bytes()).filter(|_| values.next().is_none());
+            let token = token.ok_or(Stranger::BadHeader)?;
+            let tokens = self.tokens.read().unwrap_or_else(PoisonError::into_inner);
+            return tokens.find(token).map(Arc::clone).ok_or(Stranger::UnknownToken);
+        }
+        let place = place.ok_or(Stranger::Nameless)?;
+        let known = lock(&self.of_connections).get(&place.id()).and_then(Weak::upgrade);
+        if let Some(credential) = known {
+            return Ok(credential);
+        }
+        let credential = self.of_connection(place)?;
+        let kept: Arc<Credential> = Arc::clone(&credential);
+        place.keep(kept);
+        lock(&self.of_connections).insert(place.id(), Arc::downgrade(&credential));
+        Ok(credential)
+    }
+
+    /// Who is at the other end of a connection.
+    fn of_connection(&self, place: &Place) -> Result<Arc<Credential>, Stranger> {
+        let principal = |name: &str, tenant: &str, role| Principal {
+            name: name.to_owned(),
+            tenant: self.tenants.named(tenant),
+            tenant_name: tenant.to_owned(),
+            role,
+        };
+        if let Some(certificate) = place.certificate() {
+            for rule in &self.settings.certificates {
+                let mut names = certificate.names.iter();
+                let is_it = |name: &&String| rule.subject == ANY_SUBJECT || **name == rule.subject;
+                if let Some(name) = names.find(is_it) {
+                    let principal = principal(name, &rule.tenant, rule.role);
+                    return Ok(Credential::new(principal, Some(certificate.expires)));
+                }
+            }
+            return Err(Stranger::UnknownCertificate);
+        }
+        let Some(uid) = place.uid() else { return Err(Stranger::Nameless) };
+        let rule = self.settings.peers.iter().find(|rule| rule.uid == uid);
+        let rule = rule.ok_or(Stranger::UnknownUser(uid))?;
+        let name = rule.name.clone().unwrap_or_else(|| format!("uid {uid}"));
+        Ok(Credential::new(principal(&name, &rule.tenant, rule.role), None))
+    }
+}
+
+/// The token of a header `Bearer TOKEN`.
+fn bearer(value: &[u8]) -> Option<&[u8]> {
+    let (scheme, token) = value.split_at_checked(b"bearer ".len())?;
+    let is_bearer = scheme.eq_ignore_ascii_case(b"bearer ");
+    let token = token.trim_ascii();
+    (is_bearer && !token.is_empty() && token.len() <= TOKEN_BYTES_MAX).then_some(token)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_header_has_one_bearer_token() {
+        assert_eq!(bearer(b"Bearer abc"), Some(&b"abc"[..]));
+        assert_eq!(bearer(b"bearer  abc "), Some(&b"abc"[..]));
+        for wrong in [&b"Basic abc"[..], b"Bearer", b"Bearer ", b"", b"abc", &[b'x'; 600]] {
+            assert_eq!(bearer(wrong), None);
+        }
+        assert_eq!(bearer(&[&b"Bearer "[..], &[b'x'; 600]].concat()), None);
+    }
+}

@@ -1,0 +1,17 @@
+//! Who is asked who they are, and what they may do.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | `settings` | what the configuration says of it |
+//! | `role` | the table from methods to roles |
+//! | `credential` | by what somebody is known, and until when |
+//! | `tokens` | the file of bearer tokens |
+//! | `door` | who somebody is, by token, certificate or user; credentials that are over |
+//! | `guard` | the layer through which every request passes |
+
+pub mod credential;
+pub mod door;
+pub mod guard;
+pub mod role;
+pub mod settings;
+pub mod tokens;
