@@ -11,6 +11,7 @@ mod hull;
 mod joints;
 mod keyframes;
 mod rope;
+mod rotors;
 mod settings;
 mod shapes;
 mod solids;
@@ -67,6 +68,7 @@ pub(crate) fn scene<'a>(
         draft: Draft::new("MJCF", physics.gravity, physics.time_step_s, options.stops),
         frames: Vec::new(),
         coordinates: vec![Vec::new(); tree.joints.len()],
+        carriers: vec![String::new(); tree.joints.len()],
         home: tree.poses(|joint| joint.reference),
         tree: &tree,
         inputs: Names::new("input", &[]),
@@ -74,8 +76,11 @@ pub(crate) fn scene<'a>(
         reader,
     };
     build.place_bodies();
-    build.adjust_springs();
     let tendons = Tendons::read(&mut build);
+    // All inertia first, from which springs and dampers may follow.
+    build.load(&tendons);
+    build.carry(&tendons);
+    build.adjust_springs();
     build.stretch(&tendons);
     build.constrain(&tendons);
     let controls = match options.inputs {

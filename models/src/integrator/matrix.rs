@@ -1,5 +1,7 @@
 //! The Newton matrices `K` and `S`: filled and factored.
 
+use plantd_math::tree_lu::TreeLu;
+
 use crate::constraints::closure::Closure;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
@@ -10,7 +12,7 @@ use crate::kkt::system::{Factors, Linearized};
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
-use crate::model::mechanism::{Forces, Model};
+use crate::model::mechanism::{Armature, Forces, Model};
 
 impl Workspace {
     /// Factors the KKT system at the last evaluation: by a recursion where that is sound, else by the tree LU of
@@ -85,8 +87,8 @@ impl Workspace {
     pub(super) fn factor_masses(&mut self, model: &Model, settings: &Settings) -> bool {
         self.kkt.diagonal.fill(0.0);
         self.kkt.balls.fill(Weights::REST);
-        for &(i, a) in &model.armature {
-            let added = -a / settings.time_step_s;
+        for armature in &model.armature {
+            let (i, added) = (armature.row, -armature.inertia / settings.time_step_s);
             match self.balls.of(i) {
                 Some((o, axis)) => self.kkt.balls[o].own.0[axis].0[axis] = added,
                 None => self.kkt.diagonal[i] = added,
@@ -127,9 +129,8 @@ impl Workspace {
                     matrix.add(&model.elimination, i, j, -0.25 * h * value);
                 }
             });
-            for &(i, a) in &model.armature {
-                let slot = model.elimination.offsets[i + 1] - 1;
-                self.kkt.tree.add_to_diagonal(slot, -a / h);
+            for armature in &model.armature {
+                add_armature(&mut self.kkt.tree, model, armature, -1.0 / h);
             }
         }
         for (i, c) in model.damping.iter().enumerate() {
@@ -162,7 +163,7 @@ impl Workspace {
             let poses = &self.mid.mechanics.poses;
             let add = |i: usize, _, value| diagonal[i] -= 0.25 * h * value;
             model.for_each_spring_derivative(poses, &self.mid.q, add);
-            model.armature.iter().for_each(|&(i, a)| diagonal[i] -= a / h);
+            model.armature.iter().for_each(|a| diagonal[a.row] -= a.inertia / h);
         }
         let a = settings.force_split.at_start();
         for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
@@ -215,6 +216,17 @@ impl Workspace {
         let SchurComplement { responses, lu } = &mut self.kkt.schur;
         fill_schur(model, &self.constraints.end, responses, lu);
         Err(model.singular_constraints(&lu.matrix, self.kkt.estimates.constraints))
+    }
+}
+
+/// Adds so many times an armature to a matrix.
+#[inline]
+pub(crate) fn add_armature(matrix: &mut TreeLu, model: &Model, armature: &Armature, times: f64) {
+    let &Armature { row, column, inertia } = armature;
+    if row == column {
+        matrix.add_to_diagonal(model.elimination.offsets[row + 1] - 1, times * inertia);
+    } else {
+        matrix.add(&model.elimination, row, column, times * inertia);
     }
 }
 

@@ -9,11 +9,10 @@ use crate::mjcf::build::Build;
 use crate::mjcf::classes::{MAIN, SWITCH, is_on};
 use crate::mjcf::frames::frame_at;
 use crate::mjcf::rope::Rope;
+use crate::mjcf::rotors::TAKEN;
 use crate::mjcf::tendons::{Course, Tendons, Term, linear};
 use crate::report::Kind;
 
-/// Kinds of actuators that are taken, all of the same law.
-const TAKEN: [&str; 5] = ["general", "motor", "position", "velocity", "damper"];
 /// What an actuator acts on.
 const TARGETS: [&str; 7] =
     ["joint", "jointinparent", "tendon", "site", "body", "slidersite", "cranksite"];
@@ -146,13 +145,8 @@ impl Actuator {
         if let Some(text) = node.attribute("gear") {
             reader.first_numbers(node, "gear", text, &mut self.gear);
         }
-        for name in ["damping", "armature", "delay"] {
-            let text = node.attribute(name).unwrap_or("0");
-            if reader.all_numbers(node, name, text).iter().any(|number| *number != 0.0) {
-                self.refused = Some(
-                    "its own `damping` or `armature` belongs to the joint, a `delay` to the channel of the input",
-                );
-            }
+        if reader.number_or(node, "delay", 0.0) != 0.0 {
+            self.refused = Some("a `delay` belongs to the channel of the input");
         }
     }
 

@@ -27,6 +27,8 @@ pub(super) struct Build<'r, 'a, 'd> {
     pub(super) frames: Vec<String>,
     /// Names of the coordinates of joints.
     pub(super) coordinates: Vec<Vec<String>>,
+    /// Names of the frames that have the joints.
+    pub(super) carriers: Vec<String>,
     /// Where bodies stand in the file.
     pub(super) home: Vec<Isometry3<f64>>,
     pub(super) inputs: Names,
