@@ -27,7 +27,7 @@ use crate::document::Reader;
 use crate::draft::Draft;
 use crate::mjcf::build::Build;
 use crate::mjcf::classes::Classes;
-use crate::mjcf::settings::{Compiler, Physics};
+use crate::mjcf::settings::{Compilers, Physics};
 use crate::mjcf::tendons::Tendons;
 use crate::names::Names;
 use crate::options::{Base, Inputs, Options};
@@ -42,10 +42,14 @@ pub(crate) fn scene<'a>(
     options: &Options,
     files: Option<&mut Files<'_>>,
 ) -> Option<Scene> {
-    // Wherever it stands; those whose files are at hand are not here any more.
-    for include in root.descendants().filter(|node| node.has_tag_name("include")) {
-        let message = "`include`: read the file with `plantctl import`, where the other files are";
-        reader.fail(include, message);
+    // Wherever they stand; those whose files are at hand are not here any more.
+    for node in root.descendants() {
+        if let Some(tag) = ["include", "attach"].into_iter().find(|tag| node.has_tag_name(*tag)) {
+            let message = format!(
+                "`{tag}`: read the file with `plantctl import`, where the other files are, or send them along"
+            );
+            reader.fail(node, message);
+        }
     }
     reader.check(root, &table::MUJOCO);
     if options.base == Base::Free {
@@ -53,16 +57,16 @@ pub(crate) fn scene<'a>(
         reader.note(Kind::NoEffect, root, message);
     }
     let classes = Classes::read(reader, root);
-    let compiler = Compiler::read(reader, root);
+    let compilers = Compilers::read(reader, root);
     let physics = Physics::read(reader, root, options);
-    let tree = tree::read(reader, root, &classes, &compiler, files);
+    let tree = tree::read(reader, root, &classes, &compilers, files);
     if reader.has_failed() {
         return None;
     }
     let mut build = Build {
         root,
         classes: &classes,
-        compiler: &compiler,
+        compilers: &compilers,
         physics: &physics,
         options,
         draft: Draft::new("MJCF", physics.gravity, physics.time_step_s, options.stops),

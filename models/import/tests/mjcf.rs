@@ -841,7 +841,7 @@ fn nothing_grows_without_bound() {
     assert!(error.starts_with("a.xml:1:1: not XML"), "{error}");
     let mut binary = |_: &str| Ok(vec![0xff, 0xfe]);
     let error = import_with_files(main, &Options::default(), &mut binary).unwrap_err().to_string();
-    assert!(error.contains("`a.xml` cannot be included: it is no UTF-8"), "{error}");
+    assert!(error.contains("`a.xml` cannot be read: it is no UTF-8"), "{error}");
     let mut itself = |_: &str| Ok(b"<mujoco><include file='a'/></mujoco>".to_vec());
     let main = "<mujoco><include file='a'/></mujoco>";
     let error = import_with_files(main, &Options::default(), &mut itself).unwrap_err();

@@ -6,7 +6,7 @@ use roxmltree::Node;
 
 use crate::document::Reader;
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::{MAIN, SWITCH, is_on};
+use crate::mjcf::classes::{SWITCH, is_on};
 use crate::mjcf::frames::frame_at;
 use crate::mjcf::rope::Rope;
 use crate::mjcf::rotors::TAKEN;
@@ -244,7 +244,10 @@ impl<'a> Build<'_, 'a, '_> {
     }
 
     fn add_actuator(&mut self, node: Node<'a, 'a>, tendons: &Tendons<'a>) -> Option<String> {
-        let class = self.classes.named(self.reader, node, "class").unwrap_or(MAIN);
+        let class = self
+            .classes
+            .named(self.reader, node, "class")
+            .unwrap_or_else(|| self.classes.root(self.reader, node));
         let mut actuator = Actuator::default();
         let defaults = self.classes.chain(class, |name| TAKEN.contains(&name));
         for default in &defaults {
@@ -496,7 +499,7 @@ impl<'a> Build<'_, 'a, '_> {
     ) -> String {
         let default = format!("input_{}", self.draft.scene.inputs.len() + 1);
         let name = self.inputs.add(node.attribute("name").unwrap_or(&default), &[""]);
-        let by_range = self.compiler.limits_by_range;
+        let by_range = self.compilers.of(self.reader, node).limits_by_range;
         let mut limits = actuator.control.limits(by_range);
         if let Some([low, high]) = around.filter(|_| actuator.inherits > 0.0) {
             let (middle, half) = ((low + high) / 2.0, (high - low) / 2.0 * actuator.inherits);

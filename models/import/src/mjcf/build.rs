@@ -7,18 +7,19 @@ use roxmltree::Node;
 use crate::document::Reader;
 use crate::draft::Draft;
 use crate::mjcf::classes::Classes;
-use crate::mjcf::settings::{Compiler, Physics};
+use crate::mjcf::settings::{Compilers, Physics};
 use crate::mjcf::start::Mobility;
 use crate::mjcf::tree::Tree;
 use crate::names::Names;
 use crate::options::Options;
+use crate::report::Kind;
 
 /// Makes the scene.
 pub(super) struct Build<'r, 'a, 'd> {
     pub(super) reader: &'r mut Reader<'d>,
     pub(super) root: Node<'a, 'a>,
     pub(super) classes: &'r Classes<'a>,
-    pub(super) compiler: &'r Compiler,
+    pub(super) compilers: &'r Compilers,
     pub(super) physics: &'r Physics,
     pub(super) tree: &'r Tree<'a>,
     pub(super) options: &'r Options,
@@ -72,6 +73,9 @@ impl Build<'_, '_, '_> {
                 "`{name}` is replicated, and what refers to it is not copied along: write the copies out"
             );
             self.reader.refuse(node, message);
+        } else if found.is_none() && self.reader.model_of(node) != 0 {
+            let message = format!("`{name}` is not attached along; what refers to it is left out");
+            self.reader.note(Kind::NoEffect, node, message);
         } else if found.is_none() && !name.is_empty() {
             self.reader.fail(node, format!("there is no {what} `{name}`"));
         }

@@ -5,7 +5,6 @@ use plantd_models::scene::{Axis, Constraint, CouplingTerm, Length, Point};
 use roxmltree::Node;
 
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::MAIN;
 use crate::mjcf::frames::frame_at;
 use crate::mjcf::settings::TINY;
 use crate::mjcf::tendons::{Course, Tendons};
@@ -19,7 +18,12 @@ impl<'a> Build<'_, 'a, '_> {
     pub(super) fn constrain(&mut self, tendons: &Tendons<'a>) {
         let mut names = Names::new("constraint", &[]);
         for node in Build::section(self.root, "equality") {
-            let settings = self.classes.settings(self.reader, node, MAIN, "equality");
+            let settings = self.classes.settings(
+                self.reader,
+                node,
+                self.classes.root(self.reader, node),
+                "equality",
+            );
             let is_active = settings.keyword(self.reader, "active", &["false", "true"]) != Some(0);
             if !is_active || !self.physics.has("equality") {
                 self.reader.note(Kind::NoEffect, node, "an equality that is switched off");

@@ -4,7 +4,6 @@ use plantd_models::scene::{Armature, Force};
 use roxmltree::Node;
 
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::MAIN;
 use crate::mjcf::tendons::{Course, Tendons, Term, linear};
 
 /// Kinds of actuators that are taken, all of the same law.
@@ -67,7 +66,10 @@ impl<'a> Build<'_, 'a, '_> {
     }
 
     fn rotor(&mut self, node: Node<'a, 'a>) -> Rotor {
-        let class = self.classes.named(self.reader, node, "class").unwrap_or(MAIN);
+        let class = self
+            .classes
+            .named(self.reader, node, "class")
+            .unwrap_or_else(|| self.classes.root(self.reader, node));
         let mut all = self.classes.chain(class, |name| TAKEN.contains(&name));
         all.push(node);
         let (mut rotor, mut gear) = (Rotor::default(), [1.0; 6]);

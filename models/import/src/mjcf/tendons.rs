@@ -7,7 +7,7 @@ use plantd_models::scene::{Force, LinearTerm, Spring};
 use roxmltree::Node;
 
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::{MAIN, Settings};
+use crate::mjcf::classes::Settings;
 use crate::mjcf::rope::{Branch, Rope, Stop};
 use crate::mjcf::tree::Joint;
 use crate::report::Kind;
@@ -67,13 +67,18 @@ impl<'a> Tendons<'a> {
             if !name.is_empty() && all.names.insert(name, all.all.len()).is_some() {
                 build.reader.fail(node, format!("there are two tendons `{name}`"));
             }
-            let settings = build.classes.settings(build.reader, node, MAIN, "tendon");
+            let settings = build.classes.settings(
+                build.reader,
+                node,
+                build.classes.root(build.reader, node),
+                "tendon",
+            );
             let course = match node.tag_name().name() {
                 "fixed" => build.sum(node),
                 "spatial" => build.path(node),
                 _ => continue,
             };
-            let by_range = build.compiler.limits_by_range;
+            let by_range = build.compilers.of(build.reader, node).limits_by_range;
             let limits = settings.range(build.reader, "range", "limited", by_range);
             all.all.push(Tendon { settings, name, course, limits });
         }
