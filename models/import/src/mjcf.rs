@@ -20,6 +20,8 @@ mod table;
 mod tendons;
 mod tree;
 
+use std::collections::BTreeMap;
+
 use plantd_models::Scene;
 use roxmltree::Node;
 
@@ -76,6 +78,8 @@ pub(crate) fn scene<'a>(
         home: tree.poses(|joint| joint.reference),
         tree: &tree,
         inputs: Names::new("input", &[]),
+        copied_tendons: BTreeMap::new(),
+        ending: String::new(),
         mobility: None,
         reader,
     };

@@ -133,3 +133,36 @@ fn what_cannot_be_attached_is_named_with_its_place() {
     );
     assert!(alone.unwrap_err().to_string().contains("1:20: `attach`: read the file with"));
 }
+
+/// What refers to replicated things is copied along, after all that is not, copy by copy.
+#[test]
+fn what_refers_to_copies_is_copied_along() {
+    let text = r#"<mujoco><worldbody>
+      <body name="c"><joint name="cj"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>
+      <replicate count="2" offset="0 1 0" sep="-"><body name="b"><joint name="j"/><joint name="k" type="slide"/>
+        <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></replicate></worldbody>
+      <tendon><fixed name="t" stiffness="3"><joint joint="j" coef="1"/><joint joint="cj" coef="2"/></fixed></tendon>
+      <equality><joint joint1="j" joint2="k" name="e"/><joint joint1="j" joint2="cj" name="f"/></equality>
+      <actuator><motor name="x" joint="cj"/><motor name="m" joint="j" armature="0.5"/><motor tendon="t"/><motor name="y" joint="k-1"/></actuator></mujoco>"#;
+    let robot = import(text, &Options::default()).unwrap_or_else(|e| panic!("{e}"));
+    let scene = &robot.scene;
+    let inputs: Vec<_> = scene.inputs.iter().map(|input| input.name.as_str()).collect();
+    assert_eq!(inputs, ["x", "y", "m-0", "input_4", "m-1", "input_6"]);
+    let driven: Vec<_> = scene.inputs.iter().map(|input| input.coordinate.as_deref()).collect();
+    assert_eq!(driven, [Some("cj"), Some("k-1"), Some("j-0"), None, Some("j-1"), None]);
+    assert_eq!(scene.inputs[5].terms[0].coordinate, "j-1");
+    let constraints: Vec<_> = scene.constraints.iter().map(|c| c.name()).collect();
+    assert_eq!(constraints, ["e-0", "e-1"]);
+    assert!(robot.report.to_string().contains("MuJoCo leaves it out"));
+    assert_eq!(scene.springs.len(), 2);
+    let rotors = scene.coordinates.iter().filter(|c| c.armature == 0.5).count();
+    assert_eq!(rotors, 2);
+    let two = text.replace(
+        "</worldbody>",
+        r#"<replicate count="3"><body><joint name="o"/>
+        <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></replicate></worldbody>"#,
+    );
+    let two = two.replace(r#"joint="cj" coef"#, r#"joint="o" coef"#);
+    let error = import(&two, &Options::default()).unwrap_err().to_string();
+    assert!(error.contains("copies of two replications"), "{error}");
+}

@@ -649,11 +649,6 @@ fn what_is_wrong_is_named_with_its_place() {
         ),
         (with("<equality><weld body1='weel'/></equality>"), "there is no body `weel`"),
         (with("<equality><flex flex='f'/></equality>"), "`flex` in `equality`"),
-        (
-            change("<frame ", "<replicate count=\"2\"><site name=\"s\"/></replicate><frame ")
-                .replace("</mujoco>", "<actuator><motor site=\"s\"/></actuator></mujoco>"),
-            "`s` is replicated",
-        ),
         (with("<deformable/>"), "`deformable` in `mujoco`"),
         (with("<keyframe><key qpos='1 2 3'/></keyframe>"), "`qpos` has 3 numbers; must have 2"),
         (change("<frame ", "<composite type=\"cable\"/><frame "), "`composite` in `body`"),

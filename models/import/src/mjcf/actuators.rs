@@ -235,10 +235,12 @@ impl<'a> Build<'_, 'a, '_> {
             return Vec::new();
         }
         let mut controls = Vec::new();
-        for node in Build::section(self.root, "actuator") {
+        for (node, ending) in self.elements("actuator") {
+            self.ending = ending;
             let is_taken = TAKEN.contains(&node.tag_name().name());
             controls.push(if is_taken { self.add_actuator(node, tendons) } else { None });
         }
+        self.ending.clear();
         self.draft.changed.append(&mut self.inputs.changed);
         controls
     }
@@ -498,7 +500,8 @@ impl<'a> Build<'_, 'a, '_> {
         around: Option<[f64; 2]>,
     ) -> String {
         let default = format!("input_{}", self.draft.scene.inputs.len() + 1);
-        let name = self.inputs.add(node.attribute("name").unwrap_or(&default), &[""]);
+        let name = self.name_of(node, &default);
+        let name = self.inputs.add(&name, &[""]);
         let by_range = self.compilers.of(self.reader, node).limits_by_range;
         let mut limits = actuator.control.limits(by_range);
         if let Some([low, high]) = around.filter(|_| actuator.inherits > 0.0) {

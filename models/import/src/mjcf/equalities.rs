@@ -17,7 +17,8 @@ type Place = (Option<usize>, Isometry3<f64>);
 impl<'a> Build<'_, 'a, '_> {
     pub(super) fn constrain(&mut self, tendons: &Tendons<'a>) {
         let mut names = Names::new("constraint", &[]);
-        for node in Build::section(self.root, "equality") {
+        for (node, ending) in self.elements("equality") {
+            self.ending = ending;
             let settings = self.classes.settings(
                 self.reader,
                 node,
@@ -30,8 +31,9 @@ impl<'a> Build<'_, 'a, '_> {
                 continue;
             }
             let tag = node.tag_name().name();
+            let own = self.name_of(node, "");
             let mut name =
-                |default: &str| names.add(node.attribute("name").unwrap_or(default), &[""]);
+                |default: &str| names.add(if own.is_empty() { default } else { &own }, &[""]);
             let constraint =
                 match tag {
                     "connect" => self.connect(node).map(|(a, b)| Constraint::PointToPoint {
@@ -60,6 +62,7 @@ impl<'a> Build<'_, 'a, '_> {
                 self.draft.scene.constraints.push(constraint);
             }
         }
+        self.ending.clear();
         self.draft.changed.append(&mut names.changed);
     }
 

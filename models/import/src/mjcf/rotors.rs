@@ -22,11 +22,13 @@ struct Rotor {
 impl<'a> Build<'_, 'a, '_> {
     /// Rotors of all actuators.
     pub(super) fn carry(&mut self, tendons: &Tendons<'a>) {
-        for node in Build::section(self.root, "actuator") {
+        for (node, ending) in self.elements("actuator") {
+            self.ending = ending;
             if TAKEN.contains(&node.tag_name().name()) {
                 self.carry_one(node, tendons);
             }
         }
+        self.ending.clear();
     }
 
     fn carry_one(&mut self, node: Node<'a, 'a>, tendons: &Tendons<'a>) {

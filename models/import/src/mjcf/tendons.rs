@@ -15,12 +15,12 @@ use crate::report::Kind;
 /// Tendons by name.
 pub(super) struct Tendons<'a> {
     all: Vec<Tendon<'a>>,
-    names: BTreeMap<&'a str, usize>,
+    names: BTreeMap<String, usize>,
 }
 
 pub(super) struct Tendon<'a> {
     settings: Settings<'a>,
-    pub(super) name: &'a str,
+    pub(super) name: String,
     /// None where it cannot be taken over.
     pub(super) course: Option<Course>,
     pub(super) limits: Option<[f64; 2]>,
@@ -62,9 +62,13 @@ pub(super) fn linear(terms: &[Term]) -> Vec<LinearTerm> {
 impl<'a> Tendons<'a> {
     pub(super) fn read(build: &mut Build<'_, 'a, '_>) -> Self {
         let mut all = Self { all: Vec::new(), names: BTreeMap::new() };
-        for node in Build::section(build.root, "tendon") {
-            let name = node.attribute("name").unwrap_or_default();
-            if !name.is_empty() && all.names.insert(name, all.all.len()).is_some() {
+        for (node, ending) in build.elements("tendon") {
+            if let Some(own) = node.attribute("name").filter(|_| !ending.is_empty()) {
+                build.copied_tendons.entry(own).or_default().push(ending.clone());
+            }
+            build.ending = ending;
+            let name = build.name_of(node, "");
+            if !name.is_empty() && all.names.insert(name.clone(), all.all.len()).is_some() {
                 build.reader.fail(node, format!("there are two tendons `{name}`"));
             }
             let settings = build.classes.settings(
@@ -82,6 +86,7 @@ impl<'a> Tendons<'a> {
             let limits = settings.range(build.reader, "range", "limited", by_range);
             all.all.push(Tendon { settings, name, course, limits });
         }
+        build.ending.clear();
         all
     }
 

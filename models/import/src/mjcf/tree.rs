@@ -1,6 +1,6 @@
 //! Bodies of an MJCF with what they carry, frames and replications unfolded.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, Matrix3, Translation3, Unit, UnitQuaternion, Vector3};
 use plantd_models::scene::{MAX_FRAMES, Rotation, Visual};
@@ -26,8 +26,8 @@ pub(super) struct Tree<'a> {
     pub(super) touching: Option<(Node<'a, 'a>, usize)>,
     /// Bodies, joints and sites by name.
     names: [BTreeMap<String, usize>; 3],
-    /// Names of what is replicated, without what that appends.
-    copied: BTreeSet<&'a str>,
+    /// What replications append to names, in the order of the copies.
+    copied: [BTreeMap<&'a str, Vec<String>>; 3],
 }
 
 pub(super) struct Body<'a> {
@@ -120,9 +120,11 @@ impl Tree<'_> {
         self.names[2].get(name).map(|site| &self.sites[*site])
     }
 
-    /// Whether a name is that of several copies.
-    pub(super) fn is_copied(&self, name: &str) -> bool {
-        self.copied.contains(name)
+    /// What is appended to a name that copies have, and nothing else of their kind: of bodies, joints or sites.
+    pub(super) fn endings(&self, kind: usize, name: &str) -> Option<&[String]> {
+        let is_alone = self.names[kind].contains_key(name);
+        let endings = self.copied[kind].get(name).filter(|_| !is_alone);
+        endings.map(Vec::as_slice)
     }
 
     /// Whether a joint moves a body.
@@ -415,7 +417,10 @@ impl<'r, 'a> Walk<'r, 'a, '_> {
     pub(super) fn register(&mut self, kind: usize, node: Node<'a, 'a>, name: &str, index: usize) {
         let is_new =
             name.is_empty() || self.tree.names[kind].insert(name.to_owned(), index).is_none();
-        self.tree.copied.extend(node.attribute("name").filter(|own| *own != name));
+        let own = node.attribute("name").filter(|own| *own != name);
+        if let Some((own, ending)) = own.and_then(|own| Some((own, name.strip_prefix(own)?))) {
+            self.tree.copied[kind].entry(own).or_default().push(ending.to_owned());
+        }
         if !is_new {
             let kind = ["bodies", "joints", "sites"][kind];
             self.reader.fail(node, format!("there are two {kind} `{name}`"));
