@@ -92,7 +92,7 @@ pub(crate) fn expand(
             );
             return Err(fail(source, message));
         }
-        let file = file_of(source, root, model, files).map_err(|why| fail(source, why))?;
+        let file = file_of(source, &text, root, model, files).map_err(|why| fail(source, why))?;
         let read = source.model(&file, files).map_err(|why| fail(source, why))??;
         let read = expand(source, read, files, depth + 1)?;
         let attached = Attached { text: read, prefix: prefix.to_owned() };
@@ -118,6 +118,7 @@ pub(crate) fn expand(
 /// The file of a model, by the name in `asset` or else by that in the file.
 fn file_of(
     source: &Source<'_>,
+    text: &Text,
     root: Node<'_, '_>,
     name: &str,
     files: &mut Files<'_>,
@@ -129,17 +130,22 @@ fn file_of(
         let Some(file) = node.attribute("file") else {
             return Err("`model` in `asset` has no attribute `file`".to_owned());
         };
+        // Beside the file that attaches it.
+        let file = match source.models[text.model].as_str() {
+            "" => file.to_owned(),
+            folder => format!("{folder}/{file}"),
+        };
         let own = match node.attribute("name") {
             Some(own) => own.to_owned(),
             None => {
-                let (_, text) = source.beside(0, file, files)?;
+                let (_, text) = source.beside(0, &file, files)?;
                 let own = xml::open(&text).ok();
                 let own = own.and_then(|d| d.root_element().attribute("model").map(str::to_owned));
                 own.unwrap_or_default()
             }
         };
         if own == name {
-            return Ok(file.to_owned());
+            return Ok(file);
         }
         known.push(format!("`{own}`"));
     }

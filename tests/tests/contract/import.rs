@@ -119,7 +119,7 @@ async fn files_of_a_robot_come_with_it() {
     let state = v1::MechanicalState { model: model.name, ..Default::default() };
     let question = v1::DynamicsRequest { state: Some(state), ..Default::default() };
     let mass = client.dynamics(question).await.unwrap().mass_matrix.unwrap();
-    assert!((mass.values[0] - 3001.0).abs() < 1e-9, "{:?}", mass.values);
+    assert!((mass.data[0] - 3001.0).abs() < 1e-9, "{:?}", mass.data);
     // Bytes that are no mesh, and none at all.
     for bytes in [b"f 1 2 99\n".to_vec(), Vec::new(), vec![0xff; 1000]] {
         request.name = "torn".to_owned();
