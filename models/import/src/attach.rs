@@ -60,8 +60,15 @@ struct Attached {
     prefix: String,
 }
 
+/// A text with what it includes, and what it attaches, in their places.
+pub(crate) fn whole<'t>(text: &'t str, files: &mut Files<'_>) -> Result<Source<'t>, Vec<Problem>> {
+    let (mut source, text) = Source::joined(text, files)?;
+    let text = expand(&mut source, text, files, 0)?;
+    Ok(source.of_text(text))
+}
+
 /// The text with what it attaches in place; as it is where it attaches nothing.
-pub(crate) fn expand(
+fn expand(
     source: &mut Source<'_>,
     text: Text,
     files: &mut Files<'_>,

@@ -90,12 +90,13 @@ pub fn with_includes(text: &str, files: &mut Files<'_>) -> Result<String, Import
     if !is_mjcf_with(text, &["<include"]) {
         return Ok(text.to_owned());
     }
-    Source::with_includes(text, files).map_err(|problems| ImportError { problems })
+    let whole = Source::with_includes(text, files);
+    whole.map(|whole| whole.text.into_owned()).map_err(|problems| ImportError { problems })
 }
 
 fn source<'t>(text: &'t str, files: &mut Files<'_>) -> Result<Source<'t>, Vec<Problem>> {
     if is_mjcf_with(text, &["<include", "<attach"]) {
-        Source::with_files(text, files)
+        attach::whole(text, files)
     } else {
         Ok(Source::single(text))
     }

@@ -8,7 +8,6 @@ use roxmltree::{Document, Node};
 
 use plantd_models::scene::MAX_TEXT_BYTES;
 
-use crate::attach;
 use crate::report::Problem;
 use crate::xml::{self, Lines};
 
@@ -102,28 +101,29 @@ impl<'t> Source<'t> {
     }
 
     /// A text in which each `include` element is replaced by what is in the root of its `file`, as MJCF has it:
-    /// each file once, searched beside the text and then beside the file that includes it; and each `attach` by
-    /// what it attaches.
-    pub(crate) fn with_files(text: &'t str, files: &mut Files<'_>) -> Result<Self, Vec<Problem>> {
-        let (mut whole, out) = Self::joined(text, files)?;
-        let out = attach::expand(&mut whole, out, files, 0)?;
-        (whole.text, whole.pieces) = (Cow::Owned(out.joined), out.pieces);
-        Ok(whole)
-    }
-
-    /// A text with what it includes.
+    /// each file once, searched beside the text and then beside the file that includes it.
     pub(crate) fn with_includes(
         text: &'t str,
         files: &mut Files<'_>,
-    ) -> Result<String, Vec<Problem>> {
-        Ok(Self::joined(text, files)?.1.joined)
+    ) -> Result<Self, Vec<Problem>> {
+        let (whole, text) = Self::joined(text, files)?;
+        Ok(whole.of_text(text))
     }
 
-    fn joined(text: &'t str, files: &mut Files<'_>) -> Result<(Self, Text), Vec<Problem>> {
+    /// The same, with the text still apart.
+    pub(crate) fn joined(
+        text: &'t str,
+        files: &mut Files<'_>,
+    ) -> Result<(Self, Text), Vec<Problem>> {
         let mut whole = Self::single(text);
         let (mut out, all) = (Text::of(0), 0..text.len());
         whole.splice(&mut out, &mut BTreeSet::new(), files, &[0], all)?;
         Ok((whole, out))
+    }
+
+    /// With a text that is put together of its files.
+    pub(crate) fn of_text(self, text: Text) -> Self {
+        Self { text: Cow::Owned(text.joined), pieces: text.pieces, ..self }
     }
 
     /// The text of a model that is attached, with what it includes; or why it cannot be read.
@@ -273,7 +273,7 @@ mod tests {
                 .map(|(_, text)| text.as_bytes().to_vec())
                 .ok_or("there is no such file".to_owned())
         };
-        let source = Source::with_files(files[0].1, &mut read);
+        let source = Source::with_includes(files[0].1, &mut read);
         source.map(|source| source.text.into_owned()).map_err(|problems| problems[0].to_string())
     }
 
@@ -301,7 +301,7 @@ mod tests {
     fn places_are_those_of_the_files() {
         let main = "<m>\n<include file=\"b\"/><ü/></m>";
         let mut read = |_: &str| Ok(b"<x>\n\n  <z/></x>".to_vec());
-        let source = Source::with_files(main, &mut read).unwrap();
+        let source = Source::with_includes(main, &mut read).unwrap();
         let document = Document::parse(&source.text).unwrap();
         let place = |name: &str| {
             let node = document.descendants().find(|node| node.has_tag_name(name)).unwrap();

@@ -18,10 +18,10 @@ use plantd_math::rotation::Quaternion;
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
-use crate::integrator::matrix::add_armature;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Tangents, Workspace};
+use crate::lagrangian::armature;
 use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, Vertical, dot, of_ball};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::{Turning, Weights};
@@ -261,8 +261,8 @@ impl Workspace {
                 }
             });
         }
-        for armature in model.armature.iter().filter(|armature| balls.of(armature.row).is_none()) {
-            add_armature(matrix, model, armature, -1.0 / h);
+        for entry in model.armature.iter().filter(|entry| balls.of(entry.row).is_none()) {
+            armature::add_to(matrix, model, entry, -1.0 / h);
         }
         for (i, c) in model.damping.iter().enumerate().filter(|(i, _)| balls.of(*i).is_none()) {
             let slot = model.elimination.offsets[i + 1] - 1;

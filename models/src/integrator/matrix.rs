@@ -1,7 +1,5 @@
 //! The Newton matrices `K` and `S`: filled and factored.
 
-use plantd_math::tree_lu::TreeLu;
-
 use crate::constraints::closure::Closure;
 use crate::integrator::report::StepError;
 use crate::integrator::settings::Settings;
@@ -9,10 +7,11 @@ use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::schur::{SchurComplement, fill_schur};
 use crate::kkt::system::{Factors, Linearized};
+use crate::lagrangian::armature;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
-use crate::model::mechanism::{Armature, Forces, Model};
+use crate::model::mechanism::{Forces, Model};
 
 impl Workspace {
     /// Factors the KKT system at the last evaluation: by a recursion where that is sound, else by the tree LU of
@@ -129,8 +128,8 @@ impl Workspace {
                     matrix.add(&model.elimination, i, j, -0.25 * h * value);
                 }
             });
-            for armature in &model.armature {
-                add_armature(&mut self.kkt.tree, model, armature, -1.0 / h);
+            for entry in &model.armature {
+                armature::add_to(&mut self.kkt.tree, model, entry, -1.0 / h);
             }
         }
         for (i, c) in model.damping.iter().enumerate() {
@@ -216,17 +215,6 @@ impl Workspace {
         let SchurComplement { responses, lu } = &mut self.kkt.schur;
         fill_schur(model, &self.constraints.end, responses, lu);
         Err(model.singular_constraints(&lu.matrix, self.kkt.estimates.constraints))
-    }
-}
-
-/// Adds so many times an armature to a matrix.
-#[inline]
-pub(crate) fn add_armature(matrix: &mut TreeLu, model: &Model, armature: &Armature, times: f64) {
-    let &Armature { row, column, inertia } = armature;
-    if row == column {
-        matrix.add_to_diagonal(model.elimination.offsets[row + 1] - 1, times * inertia);
-    } else {
-        matrix.add(&model.elimination, row, column, times * inertia);
     }
 }
 

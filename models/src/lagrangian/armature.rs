@@ -8,8 +8,9 @@
 //! axes.
 
 use plantd_math::scalar::Scalar;
+use plantd_math::tree_lu::TreeLu;
 
-use crate::model::mechanism::Armature;
+use crate::model::mechanism::{Armature, Model};
 
 /// Adds what they make of velocities to `L_v`.
 pub(crate) fn add_momentum<S: Scalar>(armature: &[Armature], velocity: &[S], l_v: &mut [S]) {
@@ -22,4 +23,15 @@ pub(crate) fn add_momentum<S: Scalar>(armature: &[Armature], velocity: &[S], l_v
 pub(crate) fn twice_kinetic_energy(armature: &[Armature], velocity: &[f64]) -> f64 {
     let entry = |a: &Armature| a.inertia * velocity[a.row] * velocity[a.column];
     armature.iter().map(entry).sum()
+}
+
+/// Adds so many times an entry to a matrix.
+#[inline]
+pub(crate) fn add_to(matrix: &mut TreeLu, model: &Model, entry: &Armature, times: f64) {
+    let &Armature { row, column, inertia } = entry;
+    if row == column {
+        matrix.add_to_diagonal(model.elimination.offsets[row + 1] - 1, times * inertia);
+    } else {
+        matrix.add(&model.elimination, row, column, times * inertia);
+    }
 }

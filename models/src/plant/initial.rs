@@ -9,7 +9,6 @@ use plantd_scene::UnknownName;
 
 use crate::constraints::closure::Closure;
 use crate::constraints::projection::{Limits, Reached, project};
-use crate::integrator::matrix::add_armature;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settings};
 use crate::integrator::state::PreciseState;
@@ -386,8 +385,8 @@ impl Workspace {
             &self.mid.mechanics.momenta,
             &mut self.kkt.tree,
         );
-        for armature in &model.armature {
-            add_armature(&mut self.kkt.tree, model, armature, 1.0);
+        for entry in &model.armature {
+            armature::add_to(&mut self.kkt.tree, model, entry, 1.0);
         }
         let pivot = self.kkt.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.dynamics.iter_mut().enumerate() {

