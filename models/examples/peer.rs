@@ -252,6 +252,7 @@ fn scene(mechanism: &Mechanism) -> Scene {
         damping: 0.0,
         frames: frames.collect(),
         coordinates: coordinates.collect(),
+        armatures: Vec::new(),
         springs: Vec::new(),
         inputs: inputs.collect(),
         forces: Vec::new(),

@@ -425,6 +425,124 @@ fn armatures_are_in_every_solver() {
     }
 }
 
+/// Two wheels with one rotor behind them: a mass matrix by hand, and no work from outside.
+#[test]
+fn an_armature_of_a_sum_couples_its_coordinates() {
+    let wheel = |name: &str, inertia: f64| {
+        format!(
+            "name = \"{name}\"\njoint = {{ type = \"revolute\", axis = [0.0, 1.0, 0.0] }}\nbody = {{ mass = 1.0, inertia = [0.9, {inertia}, 0.9] }}"
+        )
+    };
+    let (one, two) = (wheel("one", 0.5), wheel("two", 0.75));
+    let terms = "[[armatures]]\narmature = 0.2\nterms = [{ coordinate = \"one\", coefficient = 2.0 }, { coordinate = \"two\", coefficient = -1.0 }]\n[[inputs]]\nname = \"u\"\ncoordinate = \"one\"\n";
+    let scene = mechanism(&[&one, &two], terms);
+    // M = [0.5 + 0.8, −0.4; −0.4, 0.75 + 0.2]
+    let det = 1.3 * 0.95 - 0.16;
+    accelerates(&scene, &[3.0], "one", 3.0 * 0.95 / det);
+    accelerates(&scene, &[3.0], "two", 3.0 * 0.4 / det);
+    for order in [2, 4] {
+        let mut plant = plant(&scene, |s| s.order = order);
+        let v = vec![1.5, -0.5];
+        plant.initialize(&Initial::Velocity { q: vec![0.1, 0.2], v: v.clone() }).unwrap();
+        let kinetic = 0.25 * v[0] * v[0] + 0.375 * v[1] * v[1] + 0.1 * (2.0 * v[0] - v[1]).powi(2);
+        assert!((plant.energy().kinetic_j - kinetic).abs() < 1e-14);
+        for _ in 0..200 {
+            plant.step(&[0.0]).unwrap();
+        }
+        assert!((plant.energy().kinetic_j - kinetic).abs() < 1e-12, "order {order}");
+    }
+    // One term is an armature of the coordinate itself.
+    let term =
+        "[[armatures]]\narmature = 0.2\nterms = [{ coordinate = \"one\", coefficient = 2.0 }]\n";
+    let alone = mechanism(&[&one], term);
+    let own = mechanism(&[&one], "[[coordinates]]\nname = \"one\"\narmature = 0.8\n");
+    let [alone, own] = [&alone, &own].map(|scene| {
+        let mut plant = plant(scene, |_| ());
+        plant.initialize(&Initial::Velocity { q: vec![0.0], v: vec![1.0] }).unwrap();
+        plant.p()[0]
+    });
+    assert!((alone - own).abs() < 1e-15, "{alone} {own}");
+}
+
+/// About one axis it is a spring of the angle; about two of one inertia each keeps its energy, up to half a
+/// turn and next to it.
+#[test]
+fn a_spring_of_an_orientation_turns_back_the_shorter_way() {
+    let ball = "name = \"ball\"\njoint = { type = \"ball\" }\nbody = { mass = 1.0, inertia = [0.3, 0.3, 0.3] }";
+    let spring = "[[springs]]\ntype = \"orientation\"\nframe = \"ball\"\nstiffness = 2.0\nrest = { rpy = [0.5, 0.0, 0.0] }\n";
+    let scene = mechanism(&[ball], spring);
+    let mut at = plant(&scene, |_| ());
+    for (start, energy) in [
+        (1.5, 1.0),
+        (0.5, 0.0),
+        (0.5 - 3.0, 9.0),
+        (0.5 + 4.0, (4.0 - std::f64::consts::TAU).powi(2)),
+    ] {
+        at.initialize(&Initial::Velocity { q: vec![start, 0.0, 0.0], v: vec![0.0; 3] }).unwrap();
+        assert!((at.energy().potential_j - energy).abs() < 1e-13, "{start}");
+        let p = at.p()[0];
+        at.step(&[]).unwrap();
+        let moved = at.p()[0] - p;
+        let back = (start - 0.5 + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU)
+            - std::f64::consts::PI;
+        assert!(moved * back <= 0.0 && (moved == 0.0) == (back == 0.0), "{start}: {moved}");
+    }
+    // ω² = k / I: a period later it is where it was.
+    let step = std::f64::consts::TAU * (0.3_f64 / 2.0).sqrt() / 500.0;
+    let mut swing = plant(&scene, |s| {
+        s.order = 4;
+        s.time_step_s = step;
+    });
+    let q = vec![0.5 + 2.9, 0.0, 0.0];
+    swing.initialize(&Initial::Velocity { q: q.clone(), v: vec![0.0; 3] }).unwrap();
+    for _ in 0..500 {
+        swing.step(&[]).unwrap();
+    }
+    let beyond = swing.model().difference(&q, swing.q());
+    assert!(beyond.iter().all(|x| x.abs() < 1e-6), "{beyond:?}");
+    // At half a turn all numbers are finite, and the step goes on.
+    let half = vec![0.5 + std::f64::consts::PI, 0.0, 0.0];
+    swing.initialize(&Initial::Velocity { q: half, v: vec![0.0, 0.3, 0.0] }).unwrap();
+    let mut out = Linearization::new(&swing.model().clone());
+    swing.linearize(&[], &mut out).unwrap();
+    assert!(out.a().iter().all(|x| x.is_finite()));
+    for _ in 0..100 {
+        swing.step(&[]).unwrap();
+        assert!(swing.energy().potential_j <= std::f64::consts::PI.powi(2) + 1e-9);
+    }
+}
+
+/// Friction of a sum of one coordinate, and along a path that it alone changes, is its own; so is cubic drag.
+#[test]
+fn friction_of_sums_and_paths() {
+    let cart = "name = \"cart\"\njoint = { type = \"prismatic\", axis = [1.0, 0.0, 0.0] }\nbody = { mass = 2.0 }";
+    let friction = |what: &str| {
+        let law = "[[forces]]\ntype = \"friction\"\nforce = 3.0\nvelocity = 0.5\n";
+        mechanism(&[cart], &format!("{law}{what}\n"))
+    };
+    let path = "points = [{ frame = \"world\", at = [-2.0, 0.0, 0.0] }, { frame = \"cart\" }]";
+    let moved = |scene: &Scene| {
+        let mut plant = plant(scene, |_| ());
+        plant.initialize(&Initial::Velocity { q: vec![0.0], v: vec![0.8] }).unwrap();
+        for _ in 0..50 {
+            plant.step(&[]).unwrap();
+        }
+        plant.q()[0]
+    };
+    let own = moved(&friction("coordinate = \"cart\""));
+    for other in ["terms = [{ coordinate = \"cart\", coefficient = -1.0 }]", path] {
+        assert!((moved(&friction(other)) - own).abs() < 1e-13, "{other}");
+    }
+    let drag = "[[forces]]\ntype = \"coordinate_drag\"\ncoordinate = \"cart\"\ncoefficient = 0.5\ncubic = 0.25\n[[inputs]]\nname = \"u\"\ncoordinate = \"cart\"\n";
+    let mut falling = plant(&mechanism(&[cart], drag), |_| ());
+    falling.initialize(&Initial::Velocity { q: vec![0.0], v: vec![-2.0] }).unwrap();
+    // 4 N hold a speed of 2 m/s: 0.5 · 4 + 0.25 · 8.
+    for _ in 0..50 {
+        falling.step(&[-4.0]).unwrap();
+    }
+    assert!((falling.p()[0] + 4.0).abs() < 1e-12, "{}", falling.p()[0]);
+}
+
 /// A servo is an input, a spring and a damper.
 #[test]
 fn a_servo_is_an_input_with_a_spring_and_a_damper() {

@@ -39,7 +39,14 @@ SMOOTH = {
     + """<tendon><fixed name="f" stiffness="3" damping="0.2"><joint joint="a" coef="1"/><joint joint="c" coef="-2"/></fixed>
     <fixed name="g" armature="0.4"><joint joint="b" coef="1.5"/></fixed><spatial name="h" stiffness="40" damping="1"><site site="s"/>
     <site site="t"/></spatial></tendon><actuator><motor tendon="f"/><motor tendon="h" gear="3"/></actuator>""",
-    "springs and dampers": CHAIN.replace('name="a" axis', 'name="a" stiffness="3 1 0.5" damping="0.2 0.1" springref="20" axis'),
+    "springs and dampers": CHAIN.replace('name="a" axis', 'name="a" stiffness="3 1 0.5" damping="0.2 0.1 0.3" springref="20" axis'),
+    "springs of orientations": f"""<body pos="0.1 0 0.2" quat="0.6 0 0.8 0"><joint type="ball" stiffness="4" damping="0.1 0.2"/>{INERTIAL}
+    <body pos="0 0.3 0" euler="10 20 30"><joint type="ball" springdamper="0.4 0.8"/>{INERTIAL}</body></body>
+    <body pos="1 2 3" quat="0.8 0 0 0.6"><joint type="free" stiffness="5"/>{INERTIAL}</body>""",
+    "rotors": CHAIN
+    + """<tendon><fixed name="f" armature="0.3" damping="0.2"><joint joint="a" coef="1"/><joint joint="c" coef="-2"/></fixed></tendon>
+    <actuator><motor tendon="f" gear="3" armature="0.1" damping="0.2"/><motor joint="b" gear="2" armature="0.2" damping="0.1 0.2 0.3"/>
+    <position joint="a" kp="20" dampratio="0.7" armature="0.05"/></actuator>""",
 }
 EQUALITIES = {
     "connect": '<connect body1="c" body2="e" anchor="0.1 0.2 0"/>',
@@ -102,13 +109,16 @@ def own_state(model, data):
     own = []
     for joint in range(model.njnt):
         at = model.jnt_qposadr[joint]
-        if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        kind = model.jnt_type[joint]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            own += [*data.qpos[at : at + 3]]
+            at += 3
+        elif kind != mujoco.mjtJoint.mjJNT_BALL:
             own.append(data.qpos[at])
             continue
-        turn = data.qpos[at + 3 : at + 7] * np.sign(data.qpos[at + 3])
+        turn = data.qpos[at : at + 4] * np.sign(data.qpos[at])
         length = np.linalg.norm(turn[1:])
-        angle = 2 * np.arctan2(length, turn[0])
-        own += [*data.qpos[at : at + 3], *(turn[1:] / max(length, 1e-300) * angle)]
+        own += [*(turn[1:] / max(length, 1e-300) * (2 * np.arctan2(length, turn[0])))]
     return np.array(own)
 
 
@@ -130,13 +140,14 @@ def smooth(client, name, file, binaries):
     rng, worst = np.random.default_rng(2), np.zeros(2)
     for _ in range(3):
         data = mujoco.MjData(model)
-        data.qpos[:] = rng.uniform(-1, 1, model.nq)
+        mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1)
         data.qvel[:], data.ctrl[:] = rng.normal(size=model.nv), rng.uniform(0, 1, model.nu)
         mujoco.mj_forward(model, data)
         mass = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, mass)
-        own = client.dynamics("unit", q=data.qpos, v=data.qvel)
-        found = client.evaluate_dynamics("unit", data.qpos, data.qvel, inputs=data.ctrl).acceleration
+        q = own_state(model, data)
+        own = client.dynamics("unit", q=q, v=data.qvel)
+        found = client.evaluate_dynamics("unit", q, data.qvel, inputs=data.ctrl).acceleration
         worst = np.maximum(worst, [off(own.mass_matrix, mass), off(found, data.qacc)])
     client.delete_model("unit")
     return worst

@@ -39,6 +39,16 @@ impl<'a> Reader<'a> {
         if self.problems.is_empty() { Ok(self.report) } else { Err(self.problems) }
     }
 
+    /// Whose a node is, of the model itself or one that it attaches.
+    pub(crate) fn model_of(&self, node: Node<'_, '_>) -> usize {
+        self.source.model_at(node.range().start)
+    }
+
+    /// Folders of these models, relative to that of the first.
+    pub(crate) fn models(&self) -> &'a [String] {
+        &self.source.models
+    }
+
     pub(crate) fn has_failed(&self) -> bool {
         !self.problems.is_empty()
     }

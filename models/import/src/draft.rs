@@ -81,7 +81,7 @@ impl Draft {
 
     pub(crate) fn damp(&mut self, reader: &mut Reader<'_>, name: &str, damping: f64) {
         if damping > 0.0 {
-            self.setting(name).damping = Some(damping);
+            *self.setting(name).damping.get_or_insert(0.0) += damping;
             reader.exact("damping of a coordinate");
         }
     }
@@ -127,7 +127,10 @@ impl Draft {
             "dry friction of joint `{joint}` is {force} tanh(v / {velocity}): it creeps under load"
         );
         reader.note(Kind::Approximated, node, message);
-        self.scene.forces.push(Force::Friction { coordinate: name.to_owned(), force, velocity });
+        let coordinate = Some(name.to_owned());
+        let (terms, points) = (Vec::new(), Vec::new());
+        let friction = Force::Friction { coordinate, terms, points, force, velocity };
+        self.scene.forces.push(friction);
     }
 
     /// The scene, and in the report the names that it spells otherwise.

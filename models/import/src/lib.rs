@@ -25,6 +25,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod attach;
 mod document;
 mod draft;
 mod inertia;
@@ -54,7 +55,7 @@ pub fn is_xml(text: &str) -> bool {
 /// Reads a robot in URDF, versions 1.0 to 1.2, or in MJCF, as MuJoCo 4 reads it; the root element says which.
 ///
 /// The scene is not compiled; [`Import::check`] does that. At most [`plantd_models::scene::MAX_TEXT_BYTES`] are read, in time and memory that grow with the text.
-/// An MJCF that includes files, or takes inertia from those of meshes, is refused; [`import_with_files`] takes it.
+/// An MJCF that includes or attaches files, or takes inertia from those of meshes, is refused; [`import_with_files`] takes it.
 ///
 /// # Errors
 ///
@@ -63,7 +64,7 @@ pub fn import(text: &str, options: &Options) -> Result<Import, ImportError> {
     read(&Source::single(text), options, None).map_err(|problems| ImportError { problems })
 }
 
-/// As [`import`], with the files that an MJCF includes, and the meshes (STL, OBJ, MSH) from which it takes the
+/// As [`import`], with the files that an MJCF includes or attaches, and the meshes (STL, OBJ, MSH) from which it takes the
 /// inertia of what moves; no other files are asked for.
 ///
 /// # Errors
@@ -79,22 +80,31 @@ pub fn import_with_files(
         .map_err(|problems| ImportError { problems })
 }
 
-/// A text with the files that it includes, if it is an MJCF; others are as they were.
+/// A text with the files that it includes, if it is an MJCF; others are as they were. What it attaches is not put in
+/// place.
 ///
 /// # Errors
 ///
 /// That a file cannot be read, is no XML, or is included twice.
 pub fn with_includes(text: &str, files: &mut Files<'_>) -> Result<String, ImportError> {
-    let whole = source(text, files).map_err(|problems| ImportError { problems })?;
-    Ok(whole.text.into_owned())
+    if !is_mjcf_with(text, &["<include"]) {
+        return Ok(text.to_owned());
+    }
+    let whole = Source::with_includes(text, files);
+    whole.map(|whole| whole.text.into_owned()).map_err(|problems| ImportError { problems })
 }
 
 fn source<'t>(text: &'t str, files: &mut Files<'_>) -> Result<Source<'t>, Vec<Problem>> {
-    if is_xml(text) && text.contains("<include") && text.contains("<mujoco") {
-        Source::with_includes(text, files)
+    if is_mjcf_with(text, &["<include", "<attach"]) {
+        attach::whole(text, files)
     } else {
         Ok(Source::single(text))
     }
+}
+
+/// Whether a text may be an MJCF that has one of some tags.
+fn is_mjcf_with(text: &str, tags: &[&str]) -> bool {
+    is_xml(text) && text.contains("<mujoco") && tags.iter().any(|tag| text.contains(tag))
 }
 
 fn read<'f>(

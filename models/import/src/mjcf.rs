@@ -11,6 +11,7 @@ mod hull;
 mod joints;
 mod keyframes;
 mod rope;
+mod rotors;
 mod settings;
 mod shapes;
 mod solids;
@@ -19,6 +20,8 @@ mod table;
 mod tendons;
 mod tree;
 
+use std::collections::BTreeMap;
+
 use plantd_models::Scene;
 use roxmltree::Node;
 
@@ -26,7 +29,7 @@ use crate::document::Reader;
 use crate::draft::Draft;
 use crate::mjcf::build::Build;
 use crate::mjcf::classes::Classes;
-use crate::mjcf::settings::{Compiler, Physics};
+use crate::mjcf::settings::{Compilers, Physics};
 use crate::mjcf::tendons::Tendons;
 use crate::names::Names;
 use crate::options::{Base, Inputs, Options};
@@ -41,10 +44,14 @@ pub(crate) fn scene<'a>(
     options: &Options,
     files: Option<&mut Files<'_>>,
 ) -> Option<Scene> {
-    // Wherever it stands; those whose files are at hand are not here any more.
-    for include in root.descendants().filter(|node| node.has_tag_name("include")) {
-        let message = "`include`: read the file with `plantctl import`, where the other files are";
-        reader.fail(include, message);
+    // Wherever they stand; those whose files are at hand are not here any more.
+    for node in root.descendants() {
+        if let Some(tag) = ["include", "attach"].into_iter().find(|tag| node.has_tag_name(*tag)) {
+            let message = format!(
+                "`{tag}`: read the file with `plantctl import`, where the other files are, or send them along"
+            );
+            reader.fail(node, message);
+        }
     }
     reader.check(root, &table::MUJOCO);
     if options.base == Base::Free {
@@ -52,30 +59,36 @@ pub(crate) fn scene<'a>(
         reader.note(Kind::NoEffect, root, message);
     }
     let classes = Classes::read(reader, root);
-    let compiler = Compiler::read(reader, root);
+    let compilers = Compilers::read(reader, root);
     let physics = Physics::read(reader, root, options);
-    let tree = tree::read(reader, root, &classes, &compiler, files);
+    let tree = tree::read(reader, root, &classes, &compilers, files);
     if reader.has_failed() {
         return None;
     }
     let mut build = Build {
         root,
         classes: &classes,
-        compiler: &compiler,
+        compilers: &compilers,
         physics: &physics,
         options,
         draft: Draft::new("MJCF", physics.gravity, physics.time_step_s, options.stops),
         frames: Vec::new(),
         coordinates: vec![Vec::new(); tree.joints.len()],
+        carriers: vec![String::new(); tree.joints.len()],
         home: tree.poses(|joint| joint.reference),
         tree: &tree,
         inputs: Names::new("input", &[]),
+        copied_tendons: BTreeMap::new(),
+        ending: String::new(),
         mobility: None,
         reader,
     };
     build.place_bodies();
-    build.adjust_springs();
     let tendons = Tendons::read(&mut build);
+    // All inertia first, from which springs and dampers may follow.
+    build.load(&tendons);
+    build.carry(&tendons);
+    build.adjust_springs();
     build.stretch(&tendons);
     build.constrain(&tendons);
     let controls = match options.inputs {

@@ -191,6 +191,56 @@ pub fn exp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
     polynomial(y, a, b)
 }
 
+/// The rotation vector of a rotation matrix, at most half a turn long; at half a turn one of the two that there
+/// are. Derivatives are finite everywhere: those of the vector that is taken.
+pub fn log<S: Scalar>(rotation: &Mat3<S>) -> Vec3<S> {
+    /// `2 asin(√s) / √s = Σ c_i sⁱ`.
+    const fn arcsine() -> [f64; 12] {
+        let (mut c, mut binomial, mut i) = ([0.0; 12], 1.0, 0);
+        while i < 12 {
+            let n = i as f64;
+            c[i] = 2.0 * binomial / (2.0 * n + 1.0);
+            binomial *= (2.0 * n + 1.0) / (2.0 * n + 2.0);
+            i += 1;
+        }
+        c
+    }
+    const ARCSINE: [f64; 12] = arcsine();
+    let [w, x, y, z] = quaternion(rotation);
+    let vector = Vec3([x, y, z]);
+    // Of half the angle.
+    let sine = vector.dot(vector);
+    if sine.value() < 0.03 {
+        return vector * series(sine, &ARCSINE);
+    }
+    let sine = sine.sqrt();
+    vector * (sine.atan2(w) * 2.0 * sine.recip())
+}
+
+/// The unit quaternion of a rotation matrix whose first component is not negative, from its largest component.
+fn quaternion<S: Scalar>(Mat3([x, y, z]): &Mat3<S>) -> [S; 4] {
+    let squares = [
+        x[0] + y[1] + z[2] + 1.0,
+        x[0] - y[1] - z[2] + 1.0,
+        y[1] - x[0] - z[2] + 1.0,
+        z[2] - x[0] - y[1] + 1.0,
+    ];
+    let larger = |m: usize, i: usize| squares[i].value() > squares[m].value();
+    let largest = (1..4).fold(0, |m, i| if larger(m, i) { i } else { m });
+    let square = squares[largest];
+    let (a, b, c) = (y[2] - z[1], z[0] - x[2], x[1] - y[0]);
+    let (d, e, f) = (x[1] + y[0], z[0] + x[2], y[2] + z[1]);
+    let components = match largest {
+        0 => [square, a, b, c],
+        1 => [a, square, d, e],
+        2 => [b, d, square, f],
+        _ => [c, e, f, square],
+    };
+    let half = square.sqrt().recip() * 0.5;
+    let sign = if components[0].value() < 0.0 { -half } else { half };
+    components.map(|component| component * sign)
+}
+
 /// `dexp₋y`: how `exp(y)` turns in its own axes as `y` changes, `exp(−y) d exp(y) = (dexp₋y dy)^`.
 #[inline]
 pub fn dexp<S: Scalar>(y: Vec3<S>) -> Mat3<S> {
@@ -370,6 +420,34 @@ mod tests {
             let (half, one) = (exp(v * -0.5), Mat3::IDENTITY);
             let mean = Mat3([0, 1, 2].map(|i| (half.0[i] + one.0[i]) * 0.5));
             assert!(distance(&mean.times(&Turn::new(v).torque_at_start()), &one) < 1e-14, "{v:?}");
+        }
+    }
+
+    /// Next to no turn, on both sides of where the series ends, and next to half a turn.
+    #[test]
+    fn the_logarithm_and_its_slope() {
+        let direction = Vec3([0.4, 0.1, -0.8]);
+        let others = [0.34, 0.36, 3.13, std::f64::consts::PI - 1e-9];
+        let others = others.map(|t| Vec3([-0.6, 0.8, 0.0]) * t);
+        for v in vectors().chain(others) {
+            assert!((log(&exp(v)) - v).norm() < 1e-14, "{v:?}");
+            // Turned on in its own axes.
+            let turned = exp(Vec3(direction.0.map(|x| Dual::new(0.0, x))));
+            let found = log(&Mat3::lift(exp(v)).times(&turned));
+            let slope = Vec3(found.0.map(|x| x.eps));
+            let expected = momentum_at_start(v).apply(direction);
+            assert!((slope - expected).norm() < 1e-7, "{v:?}: {slope:?} {expected:?}");
+        }
+        let half = std::f64::consts::PI;
+        for v in
+            [[half, 0.0, 0.0], [0.0, half, 0.0], [0.0, 0.0, half], [0.0, -0.6 * half, 0.8 * half]]
+        {
+            let turned =
+                Mat3::lift(exp(Vec3(v))).times(&exp(Vec3([0, 1, 2].map(|_| Dual::new(0.0, 1.0)))));
+            let found = log(&turned);
+            assert!(found.0.iter().all(|x| x.re.is_finite() && x.eps.is_finite()), "{found:?}");
+            let length = Vec3(found.0.map(|x| x.re)).norm();
+            assert!((length - half).abs() < 1e-14, "{found:?}");
         }
     }
 

@@ -85,6 +85,8 @@ pub trait Scalar:
     fn recip(self) -> Self;
     /// `tanh x`.
     fn tanh(self) -> Self;
+    /// The angle of the point `(x, self)`; not differentiable at the origin.
+    fn atan2(self, x: Self) -> Self;
 }
 
 impl Scalar for f64 {
@@ -117,6 +119,10 @@ impl Scalar for f64 {
     #[inline(always)]
     fn tanh(self) -> Self {
         libm::tanh(self)
+    }
+    #[inline(always)]
+    fn atan2(self, x: Self) -> Self {
+        libm::atan2(self, x)
     }
 }
 
@@ -168,6 +174,12 @@ impl<S: Scalar> Scalar for Dual<S> {
     fn tanh(self) -> Self {
         let t = self.re.tanh();
         Self::new(t, self.eps * (S::ONE - t * t))
+    }
+    #[inline(always)]
+    fn atan2(self, x: Self) -> Self {
+        let inverse = (self.re * self.re + x.re * x.re).recip();
+        let turned = self.eps * x.re - self.re * x.eps;
+        Self::new(self.re.atan2(x.re), turned * inverse)
     }
 }
 
@@ -243,6 +255,10 @@ impl Scalar for Lanes {
     #[inline(always)]
     fn tanh(self) -> Self {
         self.each(libm::tanh)
+    }
+    #[inline(always)]
+    fn atan2(self, x: Self) -> Self {
+        self.with(x, libm::atan2)
     }
 }
 
@@ -359,5 +375,14 @@ mod tests {
             [(-2.0, 1.0 / 12.0), (-1.0, -2.0 / 3.0), (1.0, 2.0 / 3.0), (2.0, -1.0 / 12.0)];
         let mixed: f64 = stencil.iter().map(|(k, w)| w / delta * g(x, y + k * delta)).sum();
         assert!((value.eps.eps - mixed).abs() < 1e-12);
+        for (x, y) in [(0.7, -0.4), (-0.2, 1.5), (-1.0, -0.3)] {
+            let xx = Dual::new(Dual::new(x, 1.0), Dual::new(0.0, 0.0));
+            let angle = Dual::new(Dual::new(y, 0.0), Dual::new(1.0, 0.0)).atan2(xx);
+            let square = x * x + y * y;
+            assert_eq!(angle.re.re, y.atan2(x));
+            assert!((angle.re.eps + y / square).abs() < 1e-15);
+            assert!((angle.eps.re - x / square).abs() < 1e-15);
+            assert!((angle.eps.eps - (y * y - x * x) / (square * square)).abs() < 1e-15);
+        }
     }
 }

@@ -82,12 +82,16 @@ pub enum Force {
         /// N·s²/m².
         coefficient: f64,
     },
-    /// `f = −coefficient · |v| v` on a coordinate of velocity `v`.
+    /// `f = −(coefficient + cubic · |v|) |v| v` on a coordinate of velocity `v`.
     CoordinateDrag {
         /// Coordinate.
         coordinate: String,
         /// N·s²/m² or N·m·s²/rad².
+        #[serde(default, skip_serializing_if = "is_zero")]
         coefficient: f64,
+        /// N·s³/m³ or N·m·s³/rad³.
+        #[serde(default, skip_serializing_if = "is_zero")]
+        cubic: f64,
     },
     /// `f_i = −damping · u · coefficient_i · Σ coefficient_j v_j` on the coordinates of a sum, `u` an input, or 1.
     LinearDamper {
@@ -131,10 +135,19 @@ pub enum Force {
         #[serde(default, skip_serializing_if = "is_zero")]
         constant: f64,
     },
-    /// `f = −force · tanh(v / velocity)` on a coordinate of velocity `v`: dry friction without a jump.
+    /// `f = −force · tanh(v / velocity)` on a coordinate of velocity `v`, on a sum of coordinates or along a
+    /// path: dry friction without a jump.
     Friction {
-        /// Coordinate.
-        coordinate: String,
+        /// Coordinate; or else `terms` or `points`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        coordinate: Option<String>,
+        /// Terms of a sum, each of another coordinate: `f_i = −coefficient_i · force · tanh(ṡ / velocity)` with
+        /// `ṡ = Σ coefficient_j v_j`.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        terms: Vec<LinearTerm>,
+        /// Two or more points of a path, in its order: it resists a change of the length.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        points: Vec<Point>,
         /// Friction of sliding, N or N·m.
         force: f64,
         /// Velocity at which 76 % of it are reached, m/s or rad/s.
@@ -224,11 +237,10 @@ impl Force {
             | Self::HybridWrench { frame, .. } => of(frame, [0.0; 3]),
             Self::Thruster { frame, at, .. } | Self::Drag { frame, at, .. } => of(frame, *at),
             Self::TwoPointDamper { a, b, .. } => vec![a.clone(), b.clone()],
-            Self::PathDamper { points, .. } => points.clone(),
-            Self::CoordinateDrag { .. }
-            | Self::Friction { .. }
-            | Self::LinearDamper { .. }
-            | Self::Servo { .. } => Vec::new(),
+            Self::PathDamper { points, .. } | Self::Friction { points, .. } => points.clone(),
+            Self::CoordinateDrag { .. } | Self::LinearDamper { .. } | Self::Servo { .. } => {
+                Vec::new()
+            }
         }
     }
 

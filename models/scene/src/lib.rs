@@ -22,16 +22,17 @@ mod words;
 pub use crate::forces::{Component, Force, ScaledInput};
 pub use crate::inputs::{Input, InputTerm};
 pub use crate::limits::{
-    MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FILE_BYTES, MAX_FORCES, MAX_FRAMES,
-    MAX_INPUTS, MAX_KNOTS, MAX_LINEAR_TERMS, MAX_NAME_BYTES, MAX_OPERATING_POINTS, MAX_PATH_POINTS,
-    MAX_POWER, MAX_SIGNAL_POINTS, MAX_SIGNALS, MAX_SPRINGS, MAX_TEXT_BYTES, MAX_VISUALS,
+    MAX_ARMATURE_TERMS, MAX_CONSTRAINTS, MAX_COORDINATES, MAX_COUPLING_TERMS, MAX_FILE_BYTES,
+    MAX_FORCES, MAX_FRAMES, MAX_INPUTS, MAX_KNOTS, MAX_LINEAR_TERMS, MAX_NAME_BYTES,
+    MAX_OPERATING_POINTS, MAX_PATH_POINTS, MAX_POWER, MAX_SIGNAL_POINTS, MAX_SIGNALS, MAX_SPRINGS,
+    MAX_TEXT_BYTES, MAX_VISUALS,
 };
 pub use crate::linear_term::LinearTerm;
 pub use crate::point::Point;
 pub use crate::rotation::Rotation;
 pub use crate::scene::{
-    Axis, Body, Constraint, Coordinate, CoordinateKind, CouplingTerm, Frame, Joint, Length, Motion,
-    OperatingPoint, Plane, Problem, Scene, SceneError, Spring,
+    Armature, Axis, Body, Constraint, Coordinate, CoordinateKind, CouplingTerm, Frame, Joint,
+    Length, Motion, OperatingPoint, Plane, Problem, Scene, SceneError, Spring,
 };
 pub use crate::signals::{Interpolation, Signal};
 pub use crate::time_function::TimeFunction;

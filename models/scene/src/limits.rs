@@ -26,9 +26,11 @@ pub const MAX_KNOTS: usize = 4096;
 pub const MAX_PATH_POINTS: usize = 4096;
 /// Most terms of all couplings together.
 pub const MAX_COUPLING_TERMS: usize = 4096;
-/// Most terms of all springs on sums together, of all forces on sums together, and of all inputs
-/// together.
+/// Most terms of all armatures together, of all springs on sums together, of all forces on sums together, and of
+/// all inputs together.
 pub const MAX_LINEAR_TERMS: usize = 4096;
+/// Most terms of an armature of a sum.
+pub const MAX_ARMATURE_TERMS: usize = 64;
 /// Highest power of a coupling.
 pub const MAX_POWER: usize = 16;
 /// Most operating points.

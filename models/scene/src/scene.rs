@@ -41,6 +41,9 @@ pub struct Scene {
     /// dynamic ones only if they need a setting: their order is that of the frames, depth first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub coordinates: Vec<Coordinate>,
+    /// Inertias of what moves with sums of coordinates.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub armatures: Vec<Armature>,
     /// Springs.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub springs: Vec<Spring>,
@@ -233,6 +236,17 @@ pub enum CoordinateKind {
     Prescribed,
 }
 
+/// Inertia of what turns or slides with a sum of coordinates, such as a rotor behind a differential:
+/// `T += ½ armature (Σ coefficient_i v_i)²`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Armature {
+    /// One or more terms, each of another dynamic coordinate.
+    pub terms: Vec<LinearTerm>,
+    /// kg or kg·m², as the coefficients make it.
+    pub armature: f64,
+}
+
 /// A spring.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "type", rename_all = "snake_case", deny_unknown_fields)]
@@ -287,6 +301,17 @@ pub enum Spring {
         #[serde(default)]
         rest: f64,
     },
+    /// `V = ½ stiffness |φ|²` with the rotation vector `φ` by which a ball joint, or the rotation of a free
+    /// joint, is turned from where the spring is at rest, the shorter way round.
+    Orientation {
+        /// Frame that has the joint.
+        frame: String,
+        /// N·m/rad.
+        stiffness: f64,
+        /// The joint's rotation at which it is at rest; none if not given.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        rest: Option<Rotation>,
+    },
     /// A one-sided spring and damper where a coordinate, or the length of a path, leaves its range:
     /// `f = −stiffness · F(x) − damping · w(x) · dx/dt` at a depth `x` beyond it, with `F' = w`, and `w`
     /// rising smoothly from 0 at the range's end to 1 at the depth `transition`.
@@ -326,7 +351,10 @@ impl Spring {
         match self {
             Self::TwoPoint { a, b, .. } => vec![a, b],
             Self::Path { points, .. } | Self::Stop { points, .. } => points.iter().collect(),
-            Self::Coordinate { .. } | Self::Spline { .. } | Self::LinearSpring { .. } => Vec::new(),
+            Self::Coordinate { .. }
+            | Self::Spline { .. }
+            | Self::LinearSpring { .. }
+            | Self::Orientation { .. } => Vec::new(),
         }
     }
 }

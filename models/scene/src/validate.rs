@@ -34,6 +34,7 @@ impl Scene {
         check.header();
         check.frames();
         check.coordinates();
+        check.armatures();
         check.springs();
         check.inputs();
         check.forces();
@@ -84,6 +85,7 @@ impl<'a> Check<'a> {
         let joints: usize = scene.frames.iter().map(|f| f.motions().len()).sum();
         let signal_points: usize = scene.signals.iter().map(Signal::points).sum();
         let equations: usize = scene.constraints.iter().map(Constraint::equations).sum();
+        let armature_terms = scene.armatures.iter().map(|armature| armature.terms.len()).sum();
         let (mut cord_points, mut spring_terms) = (0, 0);
         for spring in &scene.springs {
             match spring {
@@ -109,6 +111,10 @@ impl<'a> Check<'a> {
                     force_terms += terms.len();
                 }
                 Force::PathDamper { points, .. } => force_points += points.len(),
+                Force::Friction { terms, points, .. } => {
+                    force_terms += terms.len();
+                    force_points += points.len();
+                }
                 _ => {}
             }
         }
@@ -120,6 +126,7 @@ impl<'a> Check<'a> {
             ("frames", "frames", scene.frames.len(), MAX_FRAMES),
             ("frames", "joints", joints, MAX_COORDINATES),
             ("coordinates", "coordinates", scene.coordinates.len(), MAX_COORDINATES),
+            ("armatures", "terms of sums", armature_terms, MAX_LINEAR_TERMS),
             ("springs", "springs", scene.springs.len(), MAX_SPRINGS),
             ("springs", "points of paths", cord_points, MAX_PATH_POINTS),
             ("springs", "terms of sums", spring_terms, MAX_LINEAR_TERMS),

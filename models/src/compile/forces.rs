@@ -8,8 +8,8 @@ use plantd_scene::{Component, Scene};
 
 use crate::compile::scene::{Layout, Places, settings};
 use crate::model::mechanism::{
-    Coordinate, CoordinateForce, CoordinateInput, CoordinateLaw, Forces, LinearDamper, PathForce,
-    PointForce, PointLaw, Resistance, Wrench, WrenchKind,
+    Coordinate, CoordinateForce, CoordinateInput, CoordinateLaw, Forces, LinearDamper, LinearLaw,
+    PathForce, PointForce, PointLaw, Resistance, Wrench, WrenchKind,
 };
 use crate::model::signal::{Signal, Target};
 use crate::model::tree::{Attachment, Tree, WORLD};
@@ -98,7 +98,7 @@ impl Places<'_> {
             | scene::Force::LinearDamper { damping: 0.0, .. }
             | scene::Force::PathDamper { damping: 0.0, .. }
             | scene::Force::Drag { coefficient: 0.0, .. }
-            | scene::Force::CoordinateDrag { coefficient: 0.0, .. }
+            | scene::Force::CoordinateDrag { coefficient: 0.0, cubic: 0.0, .. }
             | scene::Force::Friction { force: 0.0, .. } => {}
             scene::Force::BodyWrench { frame, force, torque } => {
                 forces.wrenches.push(self.wrench(WrenchKind::Body, frame, force, torque));
@@ -132,14 +132,16 @@ impl Places<'_> {
                 let law = PointLaw::Drag(*coefficient);
                 forces.point_forces.push(PointForce { ends, law });
             }
-            scene::Force::CoordinateDrag { coordinate, coefficient } => {
-                let (coordinate, law) = (index[coordinate], CoordinateLaw::Drag(*coefficient));
+            scene::Force::CoordinateDrag { coordinate, coefficient, cubic } => {
+                let law = CoordinateLaw::Drag([*coefficient, *cubic]);
+                let coordinate = index[coordinate];
                 forces.coordinate_forces.push(CoordinateForce { coordinate, law });
             }
             scene::Force::LinearDamper { terms, damping, input } => {
                 let terms = layout.linear(terms);
                 let input = input.as_ref().map(|name| layout.inputs[name.as_str()]);
-                forces.linear_dampers.push(LinearDamper { terms, damping: *damping, input });
+                let law = LinearLaw::Damper { damping: *damping, input };
+                forces.linear_dampers.push(LinearDamper { terms, law });
             }
             scene::Force::PathDamper { points, damping } => forces.path_forces.push(PathForce {
                 segments: self.segments(points),
@@ -149,12 +151,9 @@ impl Places<'_> {
             scene::Force::Servo { terms, damping, constant, .. } => {
                 // Its input, its spring and the damping of one coordinate are among those of coordinates.
                 if !terms.is_empty() && *damping > 0.0 {
-                    let terms = layout.linear(terms);
-                    forces.linear_dampers.push(LinearDamper {
-                        terms,
-                        damping: *damping,
-                        input: None,
-                    });
+                    let (terms, damping) = (layout.linear(terms), *damping);
+                    let law = LinearLaw::Damper { damping, input: None };
+                    forces.linear_dampers.push(LinearDamper { terms, law });
                 }
                 if *constant != 0.0 {
                     let terms = layout.servo_terms(force).into_iter();
@@ -164,10 +163,23 @@ impl Places<'_> {
                     }));
                 }
             }
-            scene::Force::Friction { coordinate, force, velocity } => {
-                let law = CoordinateLaw::Friction { force: *force, velocity: *velocity };
-                let coordinate = index[coordinate];
-                forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+            scene::Force::Friction { coordinate, terms, points, force, velocity } => {
+                let (force, velocity) = (*force, *velocity);
+                if let Some(name) = coordinate {
+                    let law = CoordinateLaw::Friction { force, velocity };
+                    let coordinate = index[name];
+                    forces.coordinate_forces.push(CoordinateForce { coordinate, law });
+                } else if points.is_empty() {
+                    let law = LinearLaw::Friction { force, velocity };
+                    let terms = layout.linear(terms);
+                    forces.linear_dampers.push(LinearDamper { terms, law });
+                } else {
+                    forces.path_forces.push(PathForce {
+                        segments: self.segments(points),
+                        inputs: Vec::new(),
+                        resistance: Resistance::Friction { force, velocity },
+                    });
+                }
             }
         }
     }

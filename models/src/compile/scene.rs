@@ -15,9 +15,9 @@ use crate::compile::pattern::{couplings, joint_pairs};
 use crate::compile::{inertia, pattern, settling};
 use crate::model::conditioning::Conditioning;
 use crate::model::mechanism::{
-    Alignment, AlongAxis, Carries, Constraint, ConstraintKind, Coordinate, Coupling, Dimensions,
-    Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance, PointPair, Polynomial,
-    Product, Solver, Vector,
+    Alignment, AlongAxis, Armature, Carries, Constraint, ConstraintKind, Coordinate, Coupling,
+    Dimensions, Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance, PointPair,
+    Polynomial, Product, Solver, Vector,
 };
 use crate::model::planar_tree::planar;
 use crate::model::site::Site;
@@ -91,10 +91,11 @@ fn compile(scene: &Scene) -> Model {
     let mut potentials = layout.potentials(scene, &dynamics, &in_dynamics);
     let armature = layout.armature(scene);
     potentials.any |= !armature.is_empty();
+    potentials.couple_branches |= armature.iter().any(|a| a.row != a.column);
     let equations = layout.equations(scene, &closure, &in_closure);
 
     let forces = layout.forces(scene, &dynamics, &in_dynamics);
-    let couplings = couplings(dynamic, &dynamics, &potentials, forces.as_ref());
+    let couplings = couplings(dynamic, &dynamics, &potentials, &armature, forces.as_ref());
     let elimination = SymbolicElimination::new(&couplings);
     let (pairs, mixed_pairs) = joint_pairs(dynamic, &dynamics, &elimination);
 
@@ -326,16 +327,29 @@ impl Layout {
         self.frames[frame].rotation.apply(direction)
     }
 
-    /// Coordinates with an armature.
-    fn armature(&self, scene: &Scene) -> Vec<(usize, f64)> {
-        let with = scene.coordinates.iter().filter(|coordinate| coordinate.armature > 0.0);
-        with.map(|coordinate| (self.index[&coordinate.name], coordinate.armature)).collect()
+    /// What armatures of coordinates and of sums add to the mass matrix.
+    fn armature(&self, scene: &Scene) -> Vec<Armature> {
+        let mut entries: BTreeMap<(usize, usize), f64> = BTreeMap::new();
+        for coordinate in scene.coordinates.iter().filter(|c| c.armature > 0.0) {
+            let i = self.index[&coordinate.name];
+            *entries.entry((i, i)).or_default() += coordinate.armature;
+        }
+        for sum in scene.armatures.iter().filter(|sum| sum.armature > 0.0) {
+            let terms = self.linear(&sum.terms);
+            for (&(i, row), &(j, column)) in
+                terms.iter().flat_map(|row| terms.iter().map(move |column| (row, column)))
+            {
+                *entries.entry((i, j)).or_default() += sum.armature * row * column;
+            }
+        }
+        let entry = |((row, column), inertia)| Armature { row, column, inertia };
+        entries.into_iter().map(entry).collect()
     }
 
     /// Which joints the walks of the dynamics and of the constraints need: a joint is needed where it, or a joint below it, carries what the walk evaluates.
     fn needs(&self, scene: &Scene) -> [Vec<bool>; 2] {
         let has_body = |joint: &Joint| !matches!(joint.body.inertia, Rotational::None);
-        let armature: BTreeSet<usize> = self.armature(scene).into_iter().map(|(i, _)| i).collect();
+        let armature: BTreeSet<usize> = self.armature(scene).into_iter().map(|a| a.row).collect();
         let resists = |joint: &Joint| has_body(joint) || armature.contains(&joint.coordinate);
         let mut dynamics: Vec<bool> = self.joints.iter().map(resists).collect();
         let mut closure = vec![false; self.joints.len()];
@@ -346,6 +360,11 @@ impl Layout {
         };
         for point in scene.springs.iter().flat_map(scene::Spring::points) {
             mark(&mut dynamics, &point.frame);
+        }
+        for spring in &scene.springs {
+            if let scene::Spring::Orientation { frame, .. } = spring {
+                mark(&mut dynamics, frame);
+            }
         }
         for force in &scene.forces {
             force.points().iter().for_each(|point| mark(&mut dynamics, &point.frame));

@@ -4,10 +4,10 @@ use plantd_math::spline::Spline;
 use plantd_scene as scene;
 use plantd_scene::{LinearTerm, Scene};
 
-use crate::compile::scene::{Layout, Places};
+use crate::compile::scene::{Layout, Places, rotation};
 use crate::model::mechanism::{
-    CoordinateSpring, CoordinateStop, LinearSpring, PathLaw, PathSpring, PointSpring, Potentials,
-    SplineSpring, Spring, Stop,
+    CoordinateSpring, CoordinateStop, LinearSpring, OrientationSpring, PathLaw, PathSpring,
+    PointSpring, Potentials, SplineSpring, Spring, Stop,
 };
 use crate::model::tree::Tree;
 
@@ -70,6 +70,15 @@ impl Layout {
                     terms: self.linear(terms),
                     stiffness: *stiffness,
                     rest: *rest,
+                })
+            }
+            scene::Spring::Orientation { frame, stiffness, rest } => {
+                let joint = places.index[self.frames[frame].joint - 2];
+                Spring::Orientation(OrientationSpring {
+                    joint,
+                    coordinate: places.tree.joints[joint].coordinate,
+                    stiffness: *stiffness,
+                    back: rotation(rest.as_ref()).transpose(),
                 })
             }
         })

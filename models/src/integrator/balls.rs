@@ -21,6 +21,7 @@ use plantd_math::spatial::{Mat3, Vec3, three};
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Tangents, Workspace};
+use crate::lagrangian::armature;
 use crate::lagrangian::generators::{Flanks, Generators, MatrixKind, Step, Vertical, dot, of_ball};
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::{Turning, Weights};
@@ -174,10 +175,11 @@ impl Workspace {
                 }
             }
         }
-        for &(i, a) in &model.armature {
-            if let Some((o, axis)) = balls.of(i) {
+        for a in &model.armature {
+            // Sums have no component of an orientation.
+            if let Some((o, axis)) = balls.of(a.row) {
                 let weights = &mut kkt.balls[o];
-                weights.own.0[axis] += weights.momentum.0[axis] * (-a / h);
+                weights.own.0[axis] += weights.momentum.0[axis] * (-a.inertia / h);
             }
         }
     }
@@ -264,11 +266,12 @@ impl Workspace {
                 }
             });
         }
-        let masses = model.armature.iter().map(|&(i, mass)| (i, mass / h));
-        let dampers = model.damping.iter().enumerate().map(|(i, c)| (i, a * c));
-        for (i, value) in masses.chain(dampers).filter(|(i, _)| balls.of(*i).is_none()) {
+        for entry in model.armature.iter().filter(|entry| balls.of(entry.row).is_none()) {
+            armature::add_to(matrix, model, entry, -1.0 / h);
+        }
+        for (i, c) in model.damping.iter().enumerate().filter(|(i, _)| balls.of(*i).is_none()) {
             let slot = model.elimination.offsets[i + 1] - 1;
-            matrix.add_to_diagonal(slot, -value);
+            matrix.add_to_diagonal(slot, -a * c);
         }
     }
 

@@ -7,6 +7,7 @@ use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::schur::{SchurComplement, fill_schur};
 use crate::kkt::system::{Factors, Linearized};
+use crate::lagrangian::armature;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
@@ -85,8 +86,8 @@ impl Workspace {
     pub(super) fn factor_masses(&mut self, model: &Model, settings: &Settings) -> bool {
         self.kkt.diagonal.fill(0.0);
         self.kkt.balls.fill(Weights::REST);
-        for &(i, a) in &model.armature {
-            let added = -a / settings.time_step_s;
+        for armature in &model.armature {
+            let (i, added) = (armature.row, -armature.inertia / settings.time_step_s);
             match self.balls.of(i) {
                 Some((o, axis)) => self.kkt.balls[o].own.0[axis].0[axis] = added,
                 None => self.kkt.diagonal[i] = added,
@@ -127,9 +128,8 @@ impl Workspace {
                     matrix.add(&model.elimination, i, j, -0.25 * h * value);
                 }
             });
-            for &(i, a) in &model.armature {
-                let slot = model.elimination.offsets[i + 1] - 1;
-                self.kkt.tree.add_to_diagonal(slot, -a / h);
+            for entry in &model.armature {
+                armature::add_to(&mut self.kkt.tree, model, entry, -1.0 / h);
             }
         }
         for (i, c) in model.damping.iter().enumerate() {
@@ -162,7 +162,7 @@ impl Workspace {
             let poses = &self.mid.mechanics.poses;
             let add = |i: usize, _, value| diagonal[i] -= 0.25 * h * value;
             model.for_each_spring_derivative(poses, &self.mid.q, add);
-            model.armature.iter().for_each(|&(i, a)| diagonal[i] -= a / h);
+            model.armature.iter().for_each(|a| diagonal[a.row] -= a.inertia / h);
         }
         let a = settings.force_split.at_start();
         for (entry, c) in diagonal.iter_mut().zip(&model.damping) {

@@ -1,25 +1,37 @@
-//! Armature: inertia of what a coordinate alone moves, such as a geared rotor.
+//! Armature: inertia of what a coordinate alone moves, such as a geared rotor, or a sum of coordinates.
 //!
 //! ```text
-//! T += ½ a v²    L_v += a v    L_vv += a
+//! T += ½ a (Σ c_i v_i)²    (L_v)_i += a c_i Σ c_j v_j    (L_vv)_ij += a c_i c_j
 //! ```
 //!
-//! `v` is the coordinate's velocity; of a ball joint that is a component of the angular velocity in its own
+//! `v` is a coordinate's velocity; of a ball joint that is a component of the angular velocity in its own
 //! axes.
 
 use plantd_math::scalar::Scalar;
+use plantd_math::tree_lu::TreeLu;
 
-/// A dynamic coordinate and its armature, kg or kg·m².
-pub(crate) type Armature = (usize, f64);
+use crate::model::mechanism::{Armature, Model};
 
-/// Adds `a v` to `L_v`.
+/// Adds what they make of velocities to `L_v`.
 pub(crate) fn add_momentum<S: Scalar>(armature: &[Armature], velocity: &[S], l_v: &mut [S]) {
-    for &(i, a) in armature {
-        l_v[i] += velocity[i] * a;
+    for &Armature { row, column, inertia } in armature {
+        l_v[row] += velocity[column] * inertia;
     }
 }
 
-/// `a v²`, J.
+/// Twice their kinetic energy, J.
 pub(crate) fn twice_kinetic_energy(armature: &[Armature], velocity: &[f64]) -> f64 {
-    armature.iter().map(|&(i, a)| a * velocity[i] * velocity[i]).sum()
+    let entry = |a: &Armature| a.inertia * velocity[a.row] * velocity[a.column];
+    armature.iter().map(entry).sum()
+}
+
+/// Adds so many times an entry to a matrix.
+#[inline]
+pub(crate) fn add_to(matrix: &mut TreeLu, model: &Model, entry: &Armature, times: f64) {
+    let &Armature { row, column, inertia } = entry;
+    if row == column {
+        matrix.add_to_diagonal(model.elimination.offsets[row + 1] - 1, times * inertia);
+    } else {
+        matrix.add(&model.elimination, row, column, times * inertia);
+    }
 }

@@ -151,6 +151,8 @@ impl<S: Scalar> Derivatives<S> {
         self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta);
         let n = model.dimensions.coordinates();
         self.l_qq.fill(S::ZERO);
+        // Where no pair of joints has an entry.
+        model.armature.iter().for_each(|a| self.l_vv[a.row * n + a.column] = S::ZERO);
         for &[above, below, i, j] in &self.pairs {
             let second = self.curvature.pair(&self.momenta, model.gravity, above, below);
             for (row, column, entry) in second.entries(i, j) {
@@ -170,8 +172,8 @@ impl<S: Scalar> Derivatives<S> {
             let l_qq = &mut self.l_qq;
             model
                 .for_each_spring_derivative(&self.poses, q, |i, j, value| l_qq[i * n + j] -= value);
-            for &(i, a) in &model.armature {
-                self.l_vv[i * (n + 1)] += S::constant(a);
+            for a in &model.armature {
+                self.l_vv[a.row * n + a.column] += S::constant(a.inertia);
             }
         }
     }

@@ -42,6 +42,19 @@ impl<S: Scalar> Poses<S> {
         }
     }
 
+    /// The rotation of a ball joint, by the first of its three joints.
+    pub(crate) fn of_ball(&self, tree: &Tree, first: usize) -> Mat3<S> {
+        // The last of the three has the axes of the body in their order.
+        let body = &self.rotation[first + 2];
+        let joint = &tree.joints[first];
+        let own = Mat3::lift(joint.rotation);
+        let before = match joint.parent {
+            WORLD => own,
+            parent => self.rotation[parent].times(&own),
+        };
+        before.transpose().times(body)
+    }
+
     /// World-axes direction of the axis of a joint.
     #[inline(always)]
     pub(crate) fn axis(&self, joint: usize) -> Vec3<S> {

@@ -7,6 +7,7 @@
 pub(crate) mod coordinate_spring;
 pub(crate) mod coordinate_stop;
 pub(crate) mod linear_spring;
+pub(crate) mod orientation_spring;
 pub(crate) mod path_spring;
 pub(crate) mod point_spring;
 pub(crate) mod spline_spring;
@@ -54,6 +55,7 @@ macro_rules! of_each_kind {
             Spring::Path($spring) => $value,
             Spring::Linear($spring) => $value,
             Spring::Stop($spring) => $value,
+            Spring::Orientation($spring) => $value,
         }
     };
 }

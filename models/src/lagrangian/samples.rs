@@ -60,12 +60,18 @@ fn random_scene(seed: u64) -> Scene {
     const FRAMES: usize = 6;
     let mut random = Numbers(seed);
     let mut text = format!("format = 1\ngravity = [0.0, 0.0, 0.0]\nname = \"random-{seed}\"\n");
+    let mut springs = String::new();
     for i in 0..FRAMES {
         let (parent, axis) = (random.frame(i), random.vector());
         let joint = match random.below(5) {
             0 => format!("type = \"prismatic\", axis = {axis}"),
             1 => format!("type = \"screw\", pitch = 0.3, axis = {axis}"),
-            2 => "type = \"ball\"".to_owned(),
+            2 => {
+                springs += &format!(
+                    "[[springs]]\ntype = \"orientation\"\nframe = \"f{i}\"\nstiffness = 2.0\nrest = {{ rpy = [0.5, -0.2, {i}.0] }}\n"
+                );
+                "type = \"ball\"".to_owned()
+            }
             _ => format!("type = \"revolute\", axis = {axis}"),
         };
         let [translation, rpy, center] = [0; 3].map(|_| random.vector());
@@ -119,6 +125,7 @@ fn random_scene(seed: u64) -> Scene {
         name = "weld"
         a = "f5"
         b = "f2"
+        {springs}
         "#
     );
     Scene::from_toml(&text).unwrap()

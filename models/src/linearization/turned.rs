@@ -263,8 +263,8 @@ impl Workspace {
                 }
             });
         }
-        for &(i, mass) in &model.armature {
-            sink.add(i, i, Entry { momentum: [0.0, mass], ..Entry::default() });
+        for a in &model.armature {
+            sink.add(a.row, a.column, Entry { momentum: [0.0, a.inertia], ..Entry::default() });
         }
         for (i, c) in model.damping.iter().enumerate() {
             sink.add(i, i, Entry { force: [0.0, -c], ..Entry::default() });

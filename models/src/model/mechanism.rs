@@ -1,7 +1,7 @@
 //! Models: compiled scenes.
 
 use plantd_math::elimination::SymbolicElimination;
-use plantd_math::spatial::{Force, Vec3};
+use plantd_math::spatial::{Force, Mat3, Vec3};
 use plantd_math::spline::Spline;
 use plantd_scene::{CoordinateKind, Problem, Scene};
 
@@ -41,8 +41,8 @@ pub struct Model {
     pub(crate) forces: Option<Forces>,
     pub(crate) signals: Vec<Signal>,
     pub(crate) potentials: Potentials,
-    /// Dynamic coordinates with an armature, kg or kg·m².
-    pub(crate) armature: Vec<(usize, f64)>,
+    /// What armatures add to the mass matrix.
+    pub(crate) armature: Vec<Armature>,
     /// Joints that points of constraints depend on: what a step walks at its ends.
     pub(crate) closure: Tree,
     pub(crate) constraints: Vec<Constraint>,
@@ -157,12 +157,13 @@ pub(crate) enum Spring {
     Path(PathSpring),
     Linear(LinearSpring),
     Stop(CoordinateStop),
+    Orientation(OrientationSpring),
 }
 
 impl Spring {
     /// What kinds are called, in the order in which they are evaluated.
-    const KINDS: [&'static str; 6] =
-        ["coordinate", "two-point", "spline", "path", "linear", "stop"];
+    const KINDS: [&'static str; 7] =
+        ["coordinate", "two-point", "spline", "path", "linear", "stop", "orientation"];
 
     /// Place of its kind among [`Self::KINDS`].
     pub(crate) fn kind(&self) -> usize {
@@ -173,6 +174,7 @@ impl Spring {
             Self::Path(_) => 3,
             Self::Linear(_) => 4,
             Self::Stop(_) => 5,
+            Self::Orientation(_) => 6,
         }
     }
 }
@@ -184,6 +186,16 @@ impl Potentials {
         let counts = Spring::KINDS.iter().enumerate();
         counts.map(|(kind, name)| format!("{} {name}", count(kind))).collect::<Vec<_>>().join(", ")
     }
+}
+
+/// What armatures add to the mass matrix in the row and the column of two dynamic coordinates, or of one; the
+/// entry mirrored is another one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Armature {
+    pub(crate) row: usize,
+    pub(crate) column: usize,
+    /// kg or kg·m².
+    pub(crate) inertia: f64,
 }
 
 /// `f = gain u` on a coordinate.
@@ -263,8 +275,8 @@ pub(crate) struct CoordinateForce {
 /// The force on a coordinate of velocity `v`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum CoordinateLaw {
-    /// `f = −c |v| v`.
-    Drag(f64),
+    /// `f = −(c + d |v|) |v| v`, `[c, d]`.
+    Drag([f64; 2]),
     /// `f = −force tanh(v / velocity)`.
     Friction { force: f64, velocity: f64 },
     /// `f = −c(q) v`, the damper of a stop.
@@ -305,6 +317,11 @@ pub(crate) enum Resistance {
     Constant(f64),
     /// That of the damper of a stop.
     Stop(Stop),
+    /// `c L̇ = force tanh(L̇ / velocity)`.
+    Friction {
+        force: f64,
+        velocity: f64,
+    },
 }
 
 /// `V = ½ k (q − rest)²`.
@@ -357,13 +374,33 @@ pub(crate) struct LinearSpring {
     pub(crate) rest: f64,
 }
 
-/// `f_i = −d u c_i Σ c_j v_j`, `u` an input, or 1.
+/// `V = ½ k |log(rest⁻¹ R)|²` with the rotation `R` of a ball joint.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OrientationSpring {
+    /// First of the three joints of the ball joint, in `dynamics`.
+    pub(crate) joint: usize,
+    /// First of its coordinates.
+    pub(crate) coordinate: usize,
+    pub(crate) stiffness: f64,
+    /// The inverse of its rotation at rest.
+    pub(crate) back: Mat3,
+}
+
+/// A force against the rate `s = Σ c_j v_j` of a sum of coordinates.
 #[derive(Clone, Debug)]
 pub(crate) struct LinearDamper {
     /// Coordinates `i` and their `c_i`.
     pub(crate) terms: Vec<(usize, f64)>,
-    pub(crate) damping: f64,
-    pub(crate) input: Option<usize>,
+    pub(crate) law: LinearLaw,
+}
+
+/// What it is.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum LinearLaw {
+    /// `f_i = −d u c_i s`, `u` an input, or 1.
+    Damper { damping: f64, input: Option<usize> },
+    /// `f_i = −force c_i tanh(s / velocity)`.
+    Friction { force: f64, velocity: f64 },
 }
 
 /// Two points and the joints that move one against the other.

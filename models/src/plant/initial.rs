@@ -384,9 +384,8 @@ impl Workspace {
             &self.mid.mechanics.momenta,
             &mut self.kkt.tree,
         );
-        for &(i, a) in &model.armature {
-            let slot = model.elimination.offsets[i + 1] - 1;
-            self.kkt.tree.add_to_diagonal(slot, a);
+        for entry in &model.armature {
+            armature::add_to(&mut self.kkt.tree, model, entry, 1.0);
         }
         let pivot = self.kkt.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.dynamics.iter_mut().enumerate() {

@@ -124,6 +124,7 @@ pub(crate) fn random_tree(seed: u64) -> Scene {
         damping: random.between(0.0, 0.3),
         frames: Vec::new(),
         coordinates: Vec::new(),
+        armatures: Vec::new(),
         springs: Vec::new(),
         inputs: Vec::new(),
         forces: Vec::new(),
@@ -253,8 +254,14 @@ pub(crate) fn forced_tree(seed: u64) -> Scene {
             damping: 1.0,
         },
         Force::Drag { frame: frame(&mut random), at: vector(&mut random), coefficient: 0.8 },
-        Force::CoordinateDrag { coordinate: dynamic[0].clone(), coefficient: 0.5 },
-        Force::Friction { coordinate: dynamic[0].clone(), force: 0.4, velocity: 0.5 },
+        Force::CoordinateDrag { coordinate: dynamic[0].clone(), coefficient: 0.5, cubic: 0.2 },
+        Force::Friction {
+            coordinate: Some(dynamic[0].clone()),
+            terms: Vec::new(),
+            points: Vec::new(),
+            force: 0.4,
+            velocity: 0.5,
+        },
     ];
     // What a prescribed root carries does not give way.
     for force in forces {

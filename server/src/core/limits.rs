@@ -70,7 +70,7 @@ limits! {
     message_s = 20 in 1..=86_400;
     /// Bytes of a scene.
     scene_bytes = 4_194_304 in 64..=1_073_741_824;
-    /// Frames, springs, inputs, forces, signals, constraints, coordinate settings or operating points of a scene, each.
+    /// Frames, armatures, springs, inputs, forces, signals, constraints, coordinate settings or operating points of a scene, each.
     scene_items = 4096 in 1..=1_000_000;
     /// Coordinates of a model.
     coordinates = 1024 in 1..=65_536;

@@ -90,6 +90,46 @@ async fn a_model_in_mjcf_is_uploaded_and_driven() {
     assert!(answer.problems[0].message.contains("plantctl import"), "{:?}", answer.problems);
 }
 
+/// A block that is described by its mesh alone, and an arm that another file describes: both in `files`.
+#[tokio::test]
+async fn files_of_a_robot_come_with_it() {
+    let (_server, client) = server().await;
+    let block = r#"<mujoco model="block"><compiler meshdir="parts"/><asset><mesh name="m" file="block.obj"/><model name="A" file="arm.xml"/></asset>
+      <worldbody><body name="block"><joint name="slide" type="slide"/><geom type="mesh" mesh="m" density="500"/>
+        <attach model="A" body="arm" prefix="l_"/></body></worldbody></mujoco>"#;
+    let arm = r#"<mujoco><compiler angle="radian"/><worldbody><body name="arm"><joint name="hinge" axis="0 1 0" range="-1 1"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody></mujoco>"#;
+    // 1 by 2 by 3 m.
+    let corners = (0..8).map(|i| format!("v {} {} {}\n", i & 1, i & 2, 3 * (i >> 2)));
+    let faces = "f 1 3 4 2\nf 5 6 8 7\nf 1 2 6 5\nf 3 7 8 4\nf 1 5 7 3\nf 2 4 8 6\n";
+    let mesh = corners.collect::<String>() + faces;
+    let mut request = v1::CreateModelRequest { scene: block.to_owned(), ..Default::default() };
+    let refusal = client.import_model(request.clone()).await.unwrap_err().to_string();
+    assert!(refusal.contains("read the file with `plantctl import`"), "{refusal}");
+    request.files.insert("arm.xml".to_owned(), arm.as_bytes().to_vec());
+    let refusal = client.import_model(request.clone()).await.unwrap_err().to_string();
+    assert!(refusal.contains("mesh file `parts/block.obj`"), "{refusal}");
+    request.files.insert("parts/block.obj".to_owned(), mesh.clone().into_bytes());
+    let answer = client.import_model(request.clone()).await.unwrap();
+    let model = answer.model.unwrap();
+    let names: Vec<_> = model.coordinates.iter().map(|c| c.name.as_str()).collect();
+    assert_eq!(names, ["slide", "l_hinge"]);
+    let report = answer.import_report.unwrap();
+    assert_eq!((report.exact["inertia from a mesh"], report.exact["attached model"]), (1, 1));
+    let state = v1::MechanicalState { model: model.name, ..Default::default() };
+    let question = v1::DynamicsRequest { state: Some(state), ..Default::default() };
+    let mass = client.dynamics(question).await.unwrap().mass_matrix.unwrap();
+    assert!((mass.data[0] - 3001.0).abs() < 1e-9, "{:?}", mass.data);
+    // Bytes that are no mesh, and none at all.
+    for bytes in [b"f 1 2 99\n".to_vec(), Vec::new(), vec![0xff; 1000]] {
+        request.name = "torn".to_owned();
+        request.files.insert("parts/block.obj".to_owned(), bytes);
+        let error = client.import_model(request.clone()).await.unwrap_err();
+        assert_eq!(error.code(), Some(Code::InvalidArgument));
+        assert!(error.to_string().contains("mesh file `parts/block.obj`"), "{error}");
+    }
+}
+
 #[tokio::test]
 async fn a_faulty_robot_is_refused_with_lines() {
     let (_server, client) = server().await;

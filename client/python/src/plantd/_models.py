@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -82,24 +83,47 @@ def _with_includes(text: str, folder: Path, seen: list[str]) -> str:
     return re.sub(r"""<include\s+file=["']([^"']*)["']\s*(?:/>|>\s*</include>)""", included, text)
 
 
+#: Models that are attached to one another at most, as the importer has it.
+_DEPTH = 32
+
+
 def _mesh_files(scene: str | PathLike[str], text: str) -> dict[str, Path]:
-    """Files of the meshes of an MJCF, by their paths as the importer names them."""
+    """Files of the meshes of an MJCF, and models that it attaches, by their paths as the importer names them."""
     if not is_file(scene) or "<mujoco" not in text:
         return {}
+    names: dict[str, None] = {}
+    _name_files(text, Path(scene).parent, "", names)
+    return {path: Path(scene).parent / path for path in names}
+
+
+def _name_files(text: str, folder: Path, base: str, names: dict[str, None], depth: int = 0) -> None:
+    """Adds the files that a model names, which stands in ``base``, and those of the models that it attaches."""
     found = {kind: path for kind, path in re.findall(r"""\b(meshdir|assetdir)=["']([^"']*)""", text)}
-    folder = found.get("meshdir", found.get("assetdir", "")).rstrip("/")
-    names = re.findall(r"""<mesh\b[^>]*?\bfile=["']([^"']+)["']""", text)
-    paths = [name if not folder or name.startswith("/") else f"{folder}/{name}" for name in names]
-    return {path: Path(scene).parent / path for path in paths}
+    meshes = found.get("meshdir", found.get("assetdir", "")).rstrip("/")
+    meshes = meshes if meshes.startswith("/") else posixpath.join(base, meshes)
+    for name in re.findall(r"""<mesh\b[^>]*?\bfile=["']([^"']+)["']""", text):
+        names.setdefault(posixpath.join(meshes, name))
+    if "<attach" not in text or depth == _DEPTH:
+        return
+    for name in re.findall(r"""<model\b[^>]*?\bfile=["']([^"']+)["']""", text):
+        path = posixpath.join(base, name)
+        if path not in names and (folder / path).is_file():
+            names.setdefault(path)
+            inner = (folder / path).read_text(encoding="utf-8")
+            _name_files(inner, folder, posixpath.dirname(path), names, depth + 1)
 
 
-def _missing(problems: str, meshes: Mapping[str, Path], known: Mapping[str, bytes]) -> dict[str, bytes]:
-    """The meshes that a refusal names and that are there, but were not sent."""
-    asked = {file: place for file, place in meshes.items() if f"mesh file `{file}`" in problems}
+def _missing(problems: str, files: Mapping[str, Path], known: Mapping[str, bytes]) -> dict[str, bytes]:
+    """The files that a refusal names and that are there, but were not sent."""
+
+    def is_asked(file: str) -> bool:
+        is_model = file.endswith(".xml") and "`attach`" in problems
+        return is_model or any(words in problems for words in (f"mesh file `{file}`", f"`{file}` cannot be read"))
+
     return {
         file: place.read_bytes()
-        for file, place in asked.items()
-        if file not in known and place.is_file()
+        for file, place in files.items()
+        if file not in known and is_asked(file) and place.is_file()
     }
 
 

@@ -6,14 +6,13 @@ use roxmltree::Node;
 
 use crate::document::Reader;
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::{MAIN, SWITCH, is_on};
+use crate::mjcf::classes::{SWITCH, is_on};
 use crate::mjcf::frames::frame_at;
 use crate::mjcf::rope::Rope;
+use crate::mjcf::rotors::TAKEN;
 use crate::mjcf::tendons::{Course, Tendons, Term, linear};
 use crate::report::Kind;
 
-/// Kinds of actuators that are taken, all of the same law.
-const TAKEN: [&str; 5] = ["general", "motor", "position", "velocity", "damper"];
 /// What an actuator acts on.
 const TARGETS: [&str; 7] =
     ["joint", "jointinparent", "tendon", "site", "body", "slidersite", "cranksite"];
@@ -146,13 +145,8 @@ impl Actuator {
         if let Some(text) = node.attribute("gear") {
             reader.first_numbers(node, "gear", text, &mut self.gear);
         }
-        for name in ["damping", "armature", "delay"] {
-            let text = node.attribute(name).unwrap_or("0");
-            if reader.all_numbers(node, name, text).iter().any(|number| *number != 0.0) {
-                self.refused = Some(
-                    "its own `damping` or `armature` belongs to the joint, a `delay` to the channel of the input",
-                );
-            }
+        if reader.number_or(node, "delay", 0.0) != 0.0 {
+            self.refused = Some("a `delay` belongs to the channel of the input");
         }
     }
 
@@ -241,16 +235,21 @@ impl<'a> Build<'_, 'a, '_> {
             return Vec::new();
         }
         let mut controls = Vec::new();
-        for node in Build::section(self.root, "actuator") {
+        for (node, ending) in self.elements("actuator") {
+            self.ending = ending;
             let is_taken = TAKEN.contains(&node.tag_name().name());
             controls.push(if is_taken { self.add_actuator(node, tendons) } else { None });
         }
+        self.ending.clear();
         self.draft.changed.append(&mut self.inputs.changed);
         controls
     }
 
     fn add_actuator(&mut self, node: Node<'a, 'a>, tendons: &Tendons<'a>) -> Option<String> {
-        let class = self.classes.named(self.reader, node, "class").unwrap_or(MAIN);
+        let class = self
+            .classes
+            .named(self.reader, node, "class")
+            .unwrap_or_else(|| self.classes.root(self.reader, node));
         let mut actuator = Actuator::default();
         let defaults = self.classes.chain(class, |name| TAKEN.contains(&name));
         for default in &defaults {
@@ -501,8 +500,9 @@ impl<'a> Build<'_, 'a, '_> {
         around: Option<[f64; 2]>,
     ) -> String {
         let default = format!("input_{}", self.draft.scene.inputs.len() + 1);
-        let name = self.inputs.add(node.attribute("name").unwrap_or(&default), &[""]);
-        let by_range = self.compiler.limits_by_range;
+        let name = self.name_of(node, &default);
+        let name = self.inputs.add(&name, &[""]);
+        let by_range = self.compilers.of(self.reader, node).limits_by_range;
         let mut limits = actuator.control.limits(by_range);
         if let Some([low, high]) = around.filter(|_| actuator.inherits > 0.0) {
             let (middle, half) = ((low + high) / 2.0, (high - low) / 2.0 * actuator.inherits);

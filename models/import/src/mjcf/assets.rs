@@ -8,8 +8,8 @@ use roxmltree::Node;
 
 use crate::document::Reader;
 use crate::inertia::Inertia;
-use crate::mjcf::classes::{Classes, MAIN};
-use crate::mjcf::settings::TINY;
+use crate::mjcf::classes::Classes;
+use crate::mjcf::settings::{Compilers, TINY};
 use crate::mjcf::solids::{Placement, RULES, Rule, solid};
 use crate::source::Files;
 use crate::surface::Surface;
@@ -39,19 +39,19 @@ impl<'a> Meshes<'a> {
         reader: &mut Reader<'_>,
         root: Node<'a, 'a>,
         classes: &Classes<'a>,
-        folder: &str,
+        compilers: &Compilers,
     ) -> Self {
         let sections = root.children().filter(|node| node.has_tag_name("asset"));
         let meshes = sections.flat_map(|node| node.children());
         let mut all = BTreeMap::new();
         for node in meshes.filter(|node| node.has_tag_name("mesh")) {
-            let settings = classes.settings(reader, node, MAIN, "mesh");
+            let settings = classes.settings(reader, node, classes.root(reader, node), "mesh");
             let file = node.attribute("file");
             let stem = file.unwrap_or_default().rsplit(['/', '\\']).next().unwrap_or_default();
             let stem = stem.rsplit_once('.').map_or(stem, |(stem, _)| stem);
             let origin = match (file, node.attribute("vertex")) {
                 (Some(file), _) => {
-                    let folder = folder.trim_end_matches('/');
+                    let folder = compilers.of(reader, node).meshes.trim_end_matches('/');
                     let is_alone = folder.is_empty() || file.starts_with('/');
                     Origin::File(if is_alone {
                         file.to_owned()

@@ -9,7 +9,7 @@ use crate::document::Reader;
 /// Top-level `default` elements that are read at most.
 const SECTIONS_MAX: usize = 64;
 
-/// The class that has no parent.
+/// The outermost class of the model itself.
 pub(super) const MAIN: usize = 0;
 
 /// What a range can be switched by.
@@ -28,6 +28,8 @@ pub(super) fn is_on(switch: Option<usize>, is_automatic: bool, range: [f64; 2]) 
 pub(super) struct Classes<'a> {
     classes: Vec<Class<'a>>,
     names: BTreeMap<&'a str, usize>,
+    /// Outermost classes of the models that there are.
+    roots: Vec<usize>,
 }
 
 #[derive(Default)]
@@ -39,18 +41,28 @@ struct Class<'a> {
 
 impl<'a> Classes<'a> {
     pub(super) fn read(reader: &mut Reader<'_>, root: Node<'a, 'a>) -> Self {
-        let mut all = Self { classes: vec![Class::default()], names: BTreeMap::new() };
-        all.names.insert("main", MAIN);
+        let models = reader.models().len();
+        let classes = (0..models).map(|_| Class::default()).collect();
+        let roots = (0..models).collect();
+        let mut all = Self { classes, names: BTreeMap::from([("main", MAIN)]), roots };
         let sections = root.children().filter(|node| node.has_tag_name("default"));
         for (i, section) in sections.enumerate() {
-            if i == SECTIONS_MAX {
+            if i == SECTIONS_MAX * models {
                 reader.fail(section, format!("more than {SECTIONS_MAX} sections `default`"));
                 break;
             }
-            if section.attribute("class").is_some_and(|name| name != "main") {
-                reader.fail(section, "the class of the outermost `default` is `main`");
+            let model = reader.model_of(section);
+            match section.attribute("class") {
+                // What attaches it has put a prefix before.
+                Some(name) if model != 0 => {
+                    all.names.insert(name, model);
+                }
+                Some(name) if name != "main" => {
+                    reader.fail(section, "the class of the outermost `default` is `main`");
+                }
+                _ => {}
             }
-            all.fill(reader, section, MAIN);
+            all.fill(reader, section, model);
         }
         all
     }
@@ -75,6 +87,11 @@ impl<'a> Classes<'a> {
                 self.classes[class].settings.push(node);
             }
         }
+    }
+
+    /// The outermost class for an element.
+    pub(super) fn root(&self, reader: &Reader<'_>, node: Node<'_, '_>) -> usize {
+        self.roots[reader.model_of(node)]
     }
 
     /// The class that an attribute names.

@@ -5,7 +5,6 @@ use plantd_models::scene::{Axis, Constraint, CouplingTerm, Length, Point};
 use roxmltree::Node;
 
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::MAIN;
 use crate::mjcf::frames::frame_at;
 use crate::mjcf::settings::TINY;
 use crate::mjcf::tendons::{Course, Tendons};
@@ -18,16 +17,23 @@ type Place = (Option<usize>, Isometry3<f64>);
 impl<'a> Build<'_, 'a, '_> {
     pub(super) fn constrain(&mut self, tendons: &Tendons<'a>) {
         let mut names = Names::new("constraint", &[]);
-        for node in Build::section(self.root, "equality") {
-            let settings = self.classes.settings(self.reader, node, MAIN, "equality");
+        for (node, ending) in self.elements("equality") {
+            self.ending = ending;
+            let settings = self.classes.settings(
+                self.reader,
+                node,
+                self.classes.root(self.reader, node),
+                "equality",
+            );
             let is_active = settings.keyword(self.reader, "active", &["false", "true"]) != Some(0);
             if !is_active || !self.physics.has("equality") {
                 self.reader.note(Kind::NoEffect, node, "an equality that is switched off");
                 continue;
             }
             let tag = node.tag_name().name();
+            let own = self.name_of(node, "");
             let mut name =
-                |default: &str| names.add(node.attribute("name").unwrap_or(default), &[""]);
+                |default: &str| names.add(if own.is_empty() { default } else { &own }, &[""]);
             let constraint =
                 match tag {
                     "connect" => self.connect(node).map(|(a, b)| Constraint::PointToPoint {
@@ -56,6 +62,7 @@ impl<'a> Build<'_, 'a, '_> {
                 self.draft.scene.constraints.push(constraint);
             }
         }
+        self.ending.clear();
         self.draft.changed.append(&mut names.changed);
     }
 

@@ -44,14 +44,19 @@ impl Build<'_, '_, '_> {
         for (k, &j) in body.joints.iter().enumerate() {
             let (at, moves, rest) = self.place_joint(j, place);
             place = rest;
+            let carrier;
             if k + 1 == body.joints.len() && place == Isometry3::identity() {
                 (joint, place) = (Some(moves), at);
+                carrier = self.frames[b].clone();
             } else {
                 let frame = Frame { joint: Some(moves), ..frame_at(&parent, &at) };
                 let name = &self.coordinates[j][0];
                 let name = name.strip_suffix("_x").unwrap_or(name).to_owned();
                 parent = self.draft.frame(&name, frame);
+                carrier = parent.clone();
             }
+            self.carriers[j] = carrier;
+            self.spring(j);
         }
         let name = self.frames[b].clone();
         let is_moved = body.is_mocap || tree.is_moved(Some(b));
@@ -154,11 +159,12 @@ impl Build<'_, '_, '_> {
             }
             if self.physics.has("damper") && joint.spring_damper.is_none() {
                 self.draft.damp(self.reader, coordinate, damping[0]);
-                if damping[1] > 0.0 {
-                    let (coordinate, coefficient) = (coordinate.clone(), damping[1]);
-                    let drag = Force::CoordinateDrag { coordinate, coefficient };
+                let [_, coefficient, cubic] = *damping;
+                if coefficient > 0.0 || cubic > 0.0 {
+                    let coordinate = coordinate.clone();
+                    let drag = Force::CoordinateDrag { coordinate, coefficient, cubic };
                     self.draft.scene.forces.push(drag);
-                    self.reader.exact("damping with the square of the velocity");
+                    self.reader.exact("damping with powers of the velocity");
                 }
             }
             if *friction > 0.0 && self.physics.has("frictionloss") {
@@ -169,12 +175,9 @@ impl Build<'_, '_, '_> {
                 self.draft.limit(self.reader, who, coordinate, limits);
             }
         }
-        if damping[2] != 0.0 || damping.iter().any(|d| *d < 0.0) {
-            let message =
-                format!("`damping` of joint `{name}` has negative numbers or a third one");
-            self.reader.refuse(*node, message);
+        if damping.iter().any(|d| *d < 0.0) {
+            self.reader.refuse(*node, format!("`damping` of joint `{name}` is negative"));
         }
-        self.spring(j);
     }
 
     fn spring(&mut self, j: usize) {
@@ -185,10 +188,13 @@ impl Build<'_, '_, '_> {
             return;
         }
         if !kind.is_single() {
-            let message = format!(
-                "`stiffness` of joint `{name}`: an orientation has no spring here; write one between points"
-            );
-            return self.reader.refuse(*node, message);
+            if first < 0.0 || [second, third] != [0.0; 2] {
+                let message = format!(
+                    "`stiffness` of joint `{name}`: that of an orientation must be one number, not negative"
+                );
+                return self.reader.refuse(*node, message);
+            }
+            return self.turn_back(j, first);
         }
         let coordinate = self.coordinates[j][0].clone();
         if [second, third] == [0.0; 2] && first > 0.0 {
@@ -212,6 +218,26 @@ impl Build<'_, '_, '_> {
         self.reader.exact("spring with several stiffnesses");
         let knots = vec![knot(-REACH), knot(0.0), knot(REACH)];
         self.draft.scene.springs.push(Spring::Spline { coordinate, knots });
+    }
+
+    /// A spring of a ball joint, or of all of a free one, which is at rest where it is in the file.
+    fn turn_back(&mut self, j: usize, stiffness: f64) {
+        let joint = &self.tree.joints[j];
+        let mut rest = None;
+        if joint.kind == JointKind::Free {
+            let home = &self.tree.bodies[joint.body].pose;
+            rest = rotation(&home.rotation);
+            let slides = self.coordinates[j].iter().zip(home.translation.vector.iter());
+            let springs = slides.map(|(coordinate, &rest)| Spring::Coordinate {
+                coordinate: coordinate.clone(),
+                stiffness,
+                rest,
+            });
+            self.draft.scene.springs.extend(springs);
+        }
+        let frame = self.carriers[j].clone();
+        self.draft.scene.springs.push(Spring::Orientation { frame, stiffness, rest });
+        self.reader.exact("spring of an orientation");
     }
 
     /// Springs and dampers that are given by a time constant `τ` and a damping ratio `ζ`: with the inertia
@@ -238,10 +264,7 @@ impl Build<'_, '_, '_> {
                     stiffness,
                     rest: joint.rest,
                 }),
-                _ => self.reader.refuse(
-                    joint.node,
-                    "`springdamper`: an orientation has no spring here; write one between points",
-                ),
+                _ => self.turn_back(j, stiffness),
             }
             self.reader.exact("spring and damper by time constant");
         }

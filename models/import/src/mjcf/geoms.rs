@@ -15,7 +15,7 @@ impl<'a> Walk<'_, 'a, '_> {
     /// Reads a site.
     pub(super) fn site(&mut self, node: Node<'a, 'a>, place: &Place) {
         let settings = self.classes.settings(self.reader, node, place.class, "site");
-        let mut pose = self.compiler.pose(self.reader, &settings);
+        let mut pose = self.compiler(node).pose(self.reader, &settings);
         if let Some(ends) = settings.numbers::<6>(self.reader, "fromto") {
             pose = self.between(node, ends).0;
         }
@@ -46,7 +46,7 @@ impl<'a> Walk<'_, 'a, '_> {
         if ["contype", "conaffinity"].iter().any(|name| bit(self.reader, name) != 0.0) {
             self.tree.touching.get_or_insert((node, 0)).1 += 1;
         }
-        let mut pose = self.compiler.pose(self.reader, &settings);
+        let mut pose = self.compiler(node).pose(self.reader, &settings);
         let mut size: [f64; 3] = settings.first_numbers(self.reader, "size");
         const KINDS: [&str; 9] =
             ["sphere", "capsule", "cylinder", "ellipsoid", "box", "mesh", "plane", "hfield", "sdf"];
@@ -93,7 +93,7 @@ impl<'a> Walk<'_, 'a, '_> {
         pose: &Isometry3<f64>,
     ) {
         let group = settings.number(self.reader, "group").unwrap_or_default();
-        let [least, most] = self.compiler.inertia_groups;
+        let [least, most] = self.compiler(settings.node()).inertia_groups;
         let mass = settings.number(self.reader, "mass");
         let density = settings.number(self.reader, "density").unwrap_or(1000.0);
         let is_shell = settings.is_true(self.reader, "shellinertia");

@@ -13,6 +13,12 @@ const MOVES: [f64; 3] = [1e-12, 1e-11, 1e-10];
 /// Least volume of the first tetrahedron, of the cube of the size.
 const FLAT: f64 = 1e-8;
 
+/// Different points that are taken at most.
+const POINTS_MAX: usize = 1 << 18;
+/// Most comparisons of a point with a face for each point, on average. Points of a sphere take less; where each one
+/// that is taken in sees a good part of the others' faces, it would be as many as there are points.
+const WORK_MAX: usize = 1 << 10;
+
 struct Face {
     /// Counter-clockwise when seen from outside.
     corners: [u32; 3],
@@ -27,6 +33,16 @@ struct Face {
 struct Hull {
     points: Vec<Vector3<f64>>,
     faces: Vec<Face>,
+    /// Comparisons that may still be made.
+    work: usize,
+}
+
+/// Why there is no hull.
+enum Spoiled {
+    /// By rounding.
+    Torn,
+    /// It takes too much work.
+    Endless,
 }
 
 /// Triangles of the convex hull, which look outwards.
@@ -35,17 +51,31 @@ pub(super) fn hull(points: &[Vector3<f64>]) -> Result<Vec<[u32; 3]>, String> {
     let bits = |i: &u32| points[*i as usize].map(f64::to_bits);
     order.sort_by_key(|i| <[u64; 3]>::from(bits(i)));
     order.dedup_by_key(|i| bits(i));
+    if order.len() > POINTS_MAX {
+        let count = order.len();
+        return Err(format!(
+            "its convex hull is that of {count} points; at most {POINTS_MAX} are taken: use `inertia=\"exact\"`"
+        ));
+    }
     let origin = points.first().copied().unwrap_or_default();
     let size = points.iter().map(|p| (p - origin).amax()).fold(0.0, f64::max);
     let tetrahedron = tetrahedron(points, &order, size)
         .ok_or("it has no volume; `inertia=\"shell\"` gives a thin one mass")?;
-    let found = MOVES.iter().find_map(|by| {
-        let mut hull = Hull { points: moved(points, by * size), faces: Vec::new() };
+    for by in MOVES {
+        let points = moved(points, by * size);
+        let mut hull = Hull { points, faces: Vec::new(), work: WORK_MAX * order.len() };
         hull.begin(tetrahedron, &order);
-        hull.grow()
-    });
-    found
-        .ok_or_else(|| "its convex hull is spoiled by rounding: use `inertia=\"exact\"`".to_owned())
+        match hull.grow() {
+            Ok(found) => return Ok(found),
+            Err(Spoiled::Torn) => {}
+            Err(Spoiled::Endless) => {
+                return Err(
+                    "its convex hull takes too long to find: use `inertia=\"exact\"`".to_owned()
+                );
+            }
+        }
+    }
+    Err("its convex hull is spoiled by rounding: use `inertia=\"exact\"`".to_owned())
 }
 
 /// Points that are moved by numbers which look random, up to so much.
@@ -110,25 +140,31 @@ impl Hull {
     fn share(&mut self, points: Vec<u32>, faces: std::ops::Range<usize>) {
         for point in points {
             let sees = faces.clone().find(|face| self.height(*face, point) > 0.0);
+            let compared = sees.map_or(faces.len(), |face| face - faces.start + 1);
+            self.work = self.work.saturating_sub(compared);
             if let Some(face) = sees {
                 self.faces[face].outside.push(point);
             }
         }
     }
 
-    /// Takes in the farthest point of one face after the other; none if rounding has torn the surface.
-    fn grow(mut self) -> Option<Vec<[u32; 3]>> {
+    /// Takes in the farthest point of one face after the other.
+    fn grow(mut self) -> Result<Vec<[u32; 3]>, Spoiled> {
         let mut face = 0;
         while face < self.faces.len() {
+            self.work = self.work.saturating_sub(self.faces[face].outside.len());
             let heights = self.faces[face].outside.iter().map(|i| (*i, self.height(face, *i)));
             let top = heights.max_by(|(_, a), (_, b)| a.total_cmp(b));
             match top.filter(|_| !self.faces[face].is_gone) {
                 // New faces come at the end.
-                Some((point, _)) => self.take_in(face, point)?,
+                Some((point, _)) => self.take_in(face, point).ok_or(Spoiled::Torn)?,
                 None => face += 1,
             }
+            if self.work == 0 {
+                return Err(Spoiled::Endless);
+            }
         }
-        Some(self.faces.iter().filter(|face| !face.is_gone).map(|face| face.corners).collect())
+        Ok(self.faces.iter().filter(|face| !face.is_gone).map(|face| face.corners).collect())
     }
 
     /// Replaces the faces that a point sees by a cone over their rim.
@@ -138,6 +174,7 @@ impl Hull {
         let mut edges = 0;
         self.faces[from].is_gone = true;
         while let Some(face) = open.pop() {
+            self.work = self.work.saturating_sub(3);
             points.append(&mut self.faces[face].outside);
             let Face { corners, neighbors, .. } = self.faces[face];
             for (i, beyond) in neighbors.into_iter().enumerate() {
@@ -224,6 +261,33 @@ mod tests {
         assert!(edges.iter().all(|(a, b)| edges.contains(&(*b, *a))));
         assert_eq!(corners.len() + hull.len(), edges.len() / 2 + 2);
         assert!(volume(&points, &hull) < 4.0 / 3.0 * std::f64::consts::PI);
+    }
+
+    /// Points on a sphere, and on curves of which each point is a corner that sees many others, in time that grows
+    /// with their count: within the work that is allowed.
+    #[test]
+    fn hulls_of_many_corners_are_bounded() {
+        let sphere = |count: usize| -> Vec<Vector3<f64>> {
+            moved(&vec![Vector3::zeros(); count], 1.0).into_iter().map(|p| p.normalize()).collect()
+        };
+        assert_eq!(hull(&sphere(5000)).unwrap().len(), 2 * 5000 - 4);
+        let error = hull(&sphere(POINTS_MAX + 1)).unwrap_err();
+        assert!(error.contains("at most 262144 are taken"), "{error}");
+        // Two circles that interlock: of each, all points see all edges of the other.
+        let count = 1000;
+        let rings = (0..2 * count).map(|i| {
+            let (sin, cos) =
+                (f64::from(i / 2) / f64::from(count) * std::f64::consts::TAU).sin_cos();
+            match i % 2 {
+                0 => Vector3::new(cos, sin, 0.0),
+                _ => Vector3::new(1.0 + cos, 0.0, sin),
+            }
+        });
+        let rings: Vec<_> = rings.collect();
+        match hull(&rings) {
+            Ok(found) => assert!(found.len() <= 2 * rings.len() - 4),
+            Err(error) => assert!(error.contains("too long"), "{error}"),
+        }
     }
 
     #[test]

@@ -18,7 +18,8 @@ impl<'a> Walk<'_, 'a, '_> {
         } else {
             self.classes.settings(self.reader, node, place.class, "joint")
         };
-        let (reader, compiler) = (&mut *self.reader, self.compiler);
+        let compiler = self.compiler(node);
+        let reader = &mut *self.reader;
         const KINDS: [&str; 4] = ["free", "ball", "slide", "hinge"];
         let kind = match settings.keyword(reader, "type", &KINDS) {
             _ if is_free => JointKind::Free,

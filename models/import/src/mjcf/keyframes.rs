@@ -9,6 +9,7 @@ use crate::mjcf::build::Build;
 use crate::mjcf::settings::TINY;
 use crate::mjcf::tree::JointKind;
 use crate::names::Names;
+use crate::report::Kind;
 
 impl<'a> Build<'_, 'a, '_> {
     /// `controls` are the inputs of the actuators in the order of the file; none where an actuator was left out.
@@ -16,6 +17,11 @@ impl<'a> Build<'_, 'a, '_> {
         let mut names = Names::new("operating point", &["initial"]);
         for node in Build::section(self.root, "keyframe") {
             if !node.has_tag_name("key") {
+                continue;
+            }
+            if self.reader.model_of(node) != 0 {
+                let message = "a keyframe of what is attached: it is not taken along";
+                self.reader.note(Kind::NoEffect, node, message);
                 continue;
             }
             if self.draft.scene.operating_points.len() == MAX_OPERATING_POINTS {

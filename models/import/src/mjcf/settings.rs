@@ -36,6 +36,25 @@ pub(super) struct Compiler {
     pub(super) aligns: bool,
 }
 
+/// How the model is meant, and each that it attaches.
+pub(super) struct Compilers(Vec<Compiler>);
+
+impl Compilers {
+    pub(super) fn read(reader: &mut Reader<'_>, root: Node<'_, '_>) -> Self {
+        Self((0..reader.models().len()).map(|model| Compiler::read(reader, root, model)).collect())
+    }
+
+    /// Of the model itself.
+    pub(super) fn main(&self) -> &Compiler {
+        &self.0[0]
+    }
+
+    /// How an element is meant.
+    pub(super) fn of(&self, reader: &Reader<'_>, node: Node<'_, '_>) -> &Compiler {
+        &self.0[reader.model_of(node)]
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum FromGeoms {
     Never,
@@ -45,7 +64,8 @@ pub(super) enum FromGeoms {
 }
 
 impl Compiler {
-    pub(super) fn read(reader: &mut Reader<'_>, root: Node<'_, '_>) -> Self {
+    /// As one of the models says it.
+    fn read(reader: &mut Reader<'_>, root: Node<'_, '_>, model: usize) -> Self {
         let mut all = Self {
             degrees: true,
             sequence: "xyz".to_owned(),
@@ -59,7 +79,13 @@ impl Compiler {
             aligns: false,
         };
         for node in root.children().filter(|node| node.has_tag_name("compiler")) {
-            all.take(reader, node);
+            if reader.model_of(node) == model {
+                all.take(reader, node);
+            }
+        }
+        let folder = &reader.models()[model];
+        if !folder.is_empty() && !all.meshes.starts_with('/') {
+            all.meshes = format!("{folder}/{}", all.meshes);
         }
         all
     }
@@ -217,6 +243,11 @@ impl Physics {
     pub(super) fn read(reader: &mut Reader<'_>, root: Node<'_, '_>, options: &Options) -> Self {
         let mut all = Self { gravity: EARTH, time_step_s: 0.002, off: Vec::new() };
         for node in root.children().filter(|node| node.has_tag_name("option")) {
+            if reader.model_of(node) != 0 {
+                let message = "`option` of what is attached: that of the model itself counts";
+                reader.note(Kind::NoEffect, node, message);
+                continue;
+            }
             all.gravity = reader.vector_or(node, "gravity", all.gravity);
             all.time_step_s = reader.number_or(node, "timestep", all.time_step_s);
             if all.time_step_s <= 0.0 {

@@ -24,6 +24,7 @@ impl Mobility {
             gravity: Some([0.0; 3]),
             frames: scene.frames.clone(),
             coordinates: scene.coordinates.clone(),
+            armatures: scene.armatures.clone(),
             ..Scene::default()
         };
         let prescribed = scene.coordinates.iter().filter(|c| c.kind == CoordinateKind::Prescribed);

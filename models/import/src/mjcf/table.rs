@@ -113,12 +113,14 @@ const SITE: Element = Element::new(
 const FREE_JOINT: Element =
     Element::new("freejoint", &[(Read, "name align"), (NoEffect(USER), "group")], &[]);
 
+const ATTACH: Element = Element::new("attach", &[(Read, "model body frame prefix")], &[]);
+
 /// What may be in a body, a frame or a replication.
-static CONTENT: [&Element; 8] =
-    [&BODY, &FRAME, &REPLICATE, &INERTIAL, &JOINT, &FREE_JOINT, &GEOM, &SITE];
+static CONTENT: [&Element; 9] =
+    [&BODY, &FRAME, &REPLICATE, &INERTIAL, &JOINT, &FREE_JOINT, &GEOM, &SITE, &ATTACH];
 const NOT_CONTENT: Treatments = &[
     (NoEffect(SEEN), "camera light"),
-    (Refused(SAVED), "attach composite plugin"),
+    (Refused(SAVED), "composite plugin"),
     (Refused(DEFORMABLE), "flexcomp"),
 ];
 
@@ -224,10 +226,19 @@ pub(super) static MUJOCO: Element = Element::new(
         &COMPILER,
         &OPTION,
         &DEFAULT,
-        &Element::new("asset", &[], &[&MESH]).without(&[
-            (NoEffect(SEEN), "hfield skin texture material"),
-            (NoEffect("what attaches it is refused itself"), "model"),
-        ]),
+        &Element::new(
+            "asset",
+            &[],
+            &[
+                &MESH,
+                &Element::new(
+                    "model",
+                    &[(Read, "name file"), (NoEffect(SEEN), "content_type")],
+                    &[],
+                ),
+            ],
+        )
+        .without(&[(NoEffect(SEEN), "hfield skin texture material")]),
         &WORLD,
         &Element::new("contact", &[], &[])
             .without(&[(Contact, "pair"), (NoEffect(TOUCH), "exclude")]),

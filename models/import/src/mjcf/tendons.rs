@@ -7,7 +7,7 @@ use plantd_models::scene::{Force, LinearTerm, Spring};
 use roxmltree::Node;
 
 use crate::mjcf::build::Build;
-use crate::mjcf::classes::{MAIN, Settings};
+use crate::mjcf::classes::Settings;
 use crate::mjcf::rope::{Branch, Rope, Stop};
 use crate::mjcf::tree::Joint;
 use crate::report::Kind;
@@ -15,12 +15,12 @@ use crate::report::Kind;
 /// Tendons by name.
 pub(super) struct Tendons<'a> {
     all: Vec<Tendon<'a>>,
-    names: BTreeMap<&'a str, usize>,
+    names: BTreeMap<String, usize>,
 }
 
 pub(super) struct Tendon<'a> {
     settings: Settings<'a>,
-    pub(super) name: &'a str,
+    pub(super) name: String,
     /// None where it cannot be taken over.
     pub(super) course: Option<Course>,
     pub(super) limits: Option<[f64; 2]>,
@@ -62,21 +62,31 @@ pub(super) fn linear(terms: &[Term]) -> Vec<LinearTerm> {
 impl<'a> Tendons<'a> {
     pub(super) fn read(build: &mut Build<'_, 'a, '_>) -> Self {
         let mut all = Self { all: Vec::new(), names: BTreeMap::new() };
-        for node in Build::section(build.root, "tendon") {
-            let name = node.attribute("name").unwrap_or_default();
-            if !name.is_empty() && all.names.insert(name, all.all.len()).is_some() {
+        for (node, ending) in build.elements("tendon") {
+            if let Some(own) = node.attribute("name").filter(|_| !ending.is_empty()) {
+                build.copied_tendons.entry(own).or_default().push(ending.clone());
+            }
+            build.ending = ending;
+            let name = build.name_of(node, "");
+            if !name.is_empty() && all.names.insert(name.clone(), all.all.len()).is_some() {
                 build.reader.fail(node, format!("there are two tendons `{name}`"));
             }
-            let settings = build.classes.settings(build.reader, node, MAIN, "tendon");
+            let settings = build.classes.settings(
+                build.reader,
+                node,
+                build.classes.root(build.reader, node),
+                "tendon",
+            );
             let course = match node.tag_name().name() {
                 "fixed" => build.sum(node),
                 "spatial" => build.path(node),
                 _ => continue,
             };
-            let by_range = build.compiler.limits_by_range;
+            let by_range = build.compilers.of(build.reader, node).limits_by_range;
             let limits = settings.range(build.reader, "range", "limited", by_range);
             all.all.push(Tendon { settings, name, course, limits });
         }
+        build.ending.clear();
         all
     }
 
@@ -169,28 +179,34 @@ impl<'a> Build<'_, 'a, '_> {
                     format!("tendon `{name}` moves past its limits, which nothing enforces");
                 self.reader.note(Kind::Approximated, node, message);
             }
-            self.load(settings, name, course);
-            let [stiffness, damping] = ["stiffness", "damping"].map(|what| {
-                let all: [f64; 3] = settings.first_numbers(self.reader, what);
-                if all[0] < 0.0 || all[1..] != [0.0; 2] {
-                    let message =
-                        format!("`{what}` of tendon `{name}` must be one number, not negative");
-                    self.reader.refuse(node, message);
-                    return 0.0;
-                }
-                all[0]
-            });
-            if damping > 0.0 && self.physics.has("damper") {
-                self.reader.exact("damper of a tendon");
-                self.draft.scene.forces.push(match course {
-                    Course::Sum(terms) => {
-                        Force::LinearDamper { terms: linear(terms), damping, input: None }
+            let damping: [f64; 3] = settings.first_numbers(self.reader, "damping");
+            let all: [f64; 3] = settings.first_numbers(self.reader, "stiffness");
+            let several = all[1..] != [0.0; 2];
+            let is_path = matches!(course, Course::Path(_));
+            if all[0] < 0.0 || several || damping.iter().any(|d| *d < 0.0) {
+                let message = format!(
+                    "`stiffness` of tendon `{name}` must be one number, and no number of `damping` negative"
+                );
+                self.reader.refuse(node, message);
+                continue;
+            }
+            if is_path && damping[1..] != [0.0; 2] {
+                let message = format!("`damping` of tendon `{name}`, a path, must be one number");
+                self.reader.refuse(node, message);
+            }
+            let stiffness = all[0];
+            if self.physics.has("damper") {
+                match course {
+                    Course::Sum(terms) => self.add_damper(node, terms, damping),
+                    Course::Path(rope) if damping[0] > 0.0 => {
+                        self.reader.exact("damper of a tendon");
+                        self.draft.scene.forces.push(Force::PathDamper {
+                            points: rope.points(),
+                            damping: damping[0] / (rope.times * rope.times),
+                        });
                     }
-                    Course::Path(rope) => Force::PathDamper {
-                        points: rope.points(),
-                        damping: damping / (rope.times * rope.times),
-                    },
-                });
+                    Course::Path(_) => {}
+                }
             }
             if stiffness > 0.0 && self.physics.has("spring") {
                 let natural = course.length(&at_rest, |joint| self.tree.joints[joint].rest);
@@ -200,37 +216,49 @@ impl<'a> Build<'_, 'a, '_> {
         }
     }
 
-    /// Armature and dry friction of a tendon. Over one joint they are the joint's own, `L = c q`.
-    fn load(&mut self, settings: &Settings<'a>, name: &str, course: &Course) {
-        let node = settings.node();
-        let armature = settings.amount(self.reader, "armature");
-        let mut friction = settings.amount(self.reader, "frictionloss");
-        if !self.physics.has("frictionloss") {
-            friction = 0.0;
-        }
-        let single = match course {
-            Course::Sum(terms) if terms.len() == 1 => Some(&terms[0]),
-            _ => None,
-        };
-        for (what, amount) in [("armature", armature), ("frictionloss", friction)] {
-            if amount > 0.0 && single.is_none() {
-                let message = format!(
-                    "`{what}` of tendon `{name}` couples joints, which it does not here: write it of joints"
-                );
-                self.reader.refuse(node, message);
+    /// Armature and dry friction of tendons.
+    pub(super) fn load(&mut self, tendons: &Tendons<'a>) {
+        for Tendon { settings, name, course, .. } in &tendons.all {
+            let Some(course) = course else { continue };
+            let armature = settings.amount(self.reader, "armature");
+            match course {
+                Course::Sum(terms) => self.add_armature(terms, armature),
+                Course::Path(_) if armature > 0.0 => {
+                    let message = format!(
+                        "`armature` of tendon `{name}`, a path: its inertia is another in each configuration, which it is not here"
+                    );
+                    self.reader.refuse(settings.node(), message);
+                }
+                Course::Path(_) => {}
+            }
+            let friction = settings.amount(self.reader, "frictionloss");
+            if friction > 0.0 && self.physics.has("frictionloss") {
+                self.rub(settings.node(), name, course, friction);
             }
         }
-        let Some(Term { joint, coordinate, coefficient }) = single else { return };
-        if armature > 0.0 {
-            self.draft.setting(coordinate).armature += armature * coefficient * coefficient;
-            self.reader.exact("armature");
-        }
-        if friction > 0.0 {
-            let c = coefficient.abs();
-            let law = [friction * c, self.options.friction_velocity / c];
-            let joint = self.tree.joints[*joint].name.clone();
-            self.draft.rub(self.reader, (&joint, node), coordinate, law);
-        }
+    }
+
+    /// Dry friction of a tendon, made smooth. Over one joint it is the joint's own, `L = c q`.
+    fn rub(&mut self, node: Node<'a, 'a>, name: &str, course: &Course, friction: f64) {
+        let velocity = self.options.friction_velocity;
+        let (terms, points, times) = match course {
+            Course::Sum(terms) if terms.len() == 1 => {
+                let Term { joint, coordinate, coefficient } = &terms[0];
+                let c = coefficient.abs();
+                let joint = self.tree.joints[*joint].name.clone();
+                let law = [friction * c, velocity / c];
+                return self.draft.rub(self.reader, (&joint, node), coordinate, law);
+            }
+            Course::Sum(terms) => (linear(terms), Vec::new(), 1.0),
+            Course::Path(rope) => (Vec::new(), rope.points(), rope.times),
+        };
+        let message = format!(
+            "dry friction of tendon `{name}` is {friction} tanh(v / {velocity}): it creeps under load"
+        );
+        self.reader.note(Kind::Approximated, node, message);
+        let (force, velocity) = (friction / times, velocity * times);
+        let friction = Force::Friction { coordinate: None, terms, points, force, velocity };
+        self.draft.scene.forces.push(friction);
     }
 
     /// Lengths between which a tendon's spring is slack, if they are given.

@@ -1,6 +1,6 @@
 //! Bodies of an MJCF with what they carry, frames and replications unfolded.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, Matrix3, Translation3, Unit, UnitQuaternion, Vector3};
 use plantd_models::scene::{MAX_FRAMES, Rotation, Visual};
@@ -10,7 +10,7 @@ use crate::document::Reader;
 use crate::inertia::Inertia;
 use crate::mjcf::assets::Meshes;
 use crate::mjcf::classes::{Classes, MAIN, Settings};
-use crate::mjcf::settings::{Compiler, FromGeoms};
+use crate::mjcf::settings::{Compiler, Compilers, FromGeoms};
 use crate::source::Files;
 
 /// Geoms, sites and copies of replications that are made at most.
@@ -26,8 +26,8 @@ pub(super) struct Tree<'a> {
     pub(super) touching: Option<(Node<'a, 'a>, usize)>,
     /// Bodies, joints and sites by name.
     names: [BTreeMap<String, usize>; 3],
-    /// Names of what is replicated, without what that appends.
-    copied: BTreeSet<&'a str>,
+    /// What replications append to names, in the order of the copies.
+    copied: [BTreeMap<&'a str, Vec<String>>; 3],
 }
 
 pub(super) struct Body<'a> {
@@ -120,9 +120,11 @@ impl Tree<'_> {
         self.names[2].get(name).map(|site| &self.sites[*site])
     }
 
-    /// Whether a name is that of several copies.
-    pub(super) fn is_copied(&self, name: &str) -> bool {
-        self.copied.contains(name)
+    /// What is appended to a name that copies have, and nothing else of their kind: of bodies, joints or sites.
+    pub(super) fn endings(&self, kind: usize, name: &str) -> Option<&[String]> {
+        let is_alone = self.names[kind].contains_key(name);
+        let endings = self.copied[kind].get(name).filter(|_| !is_alone);
+        endings.map(Vec::as_slice)
     }
 
     /// Whether a joint moves a body.
@@ -160,11 +162,11 @@ pub(super) fn read<'a>(
     reader: &mut Reader<'_>,
     root: Node<'a, 'a>,
     classes: &Classes<'a>,
-    compiler: &Compiler,
+    compilers: &Compilers,
     files: Option<&mut Files<'_>>,
 ) -> Tree<'a> {
-    let meshes = Meshes::read(reader, root, classes, &compiler.meshes);
-    let mut walk = Walk { reader, classes, compiler, meshes, tree: Tree::default(), items: 0 };
+    let meshes = Meshes::read(reader, root, classes, compilers);
+    let mut walk = Walk { reader, classes, compilers, meshes, tree: Tree::default(), items: 0 };
     for world in root.children().filter(|node| node.has_tag_name("worldbody")) {
         let place =
             Place { body: None, class: MAIN, frame: Isometry3::identity(), ending: String::new() };
@@ -175,7 +177,7 @@ pub(super) fn read<'a>(
         walk.settle(body);
     }
     let mut tree = walk.tree;
-    if let Some(total) = compiler.total_mass {
+    if let Some(total) = compilers.main().total_mass {
         let mass: f64 = tree.bodies.iter().filter_map(|body| body.inertia).map(|i| i.mass).sum();
         if mass > 0.0 {
             for inertia in tree.bodies.iter_mut().filter_map(|body| body.inertia.as_mut()) {
@@ -202,19 +204,33 @@ pub(super) struct Place {
 pub(super) struct Walk<'r, 'a, 'd> {
     pub(super) reader: &'r mut Reader<'d>,
     pub(super) classes: &'r Classes<'a>,
-    pub(super) compiler: &'r Compiler,
+    pub(super) compilers: &'r Compilers,
     pub(super) meshes: Meshes<'a>,
     pub(super) tree: Tree<'a>,
     /// Geoms, sites and copies so far.
     pub(super) items: usize,
 }
 
-impl<'a> Walk<'_, 'a, '_> {
+impl<'r, 'a> Walk<'r, 'a, '_> {
+    /// How an element is meant.
+    pub(super) fn compiler(&self, node: Node<'_, '_>) -> &'r Compiler {
+        let compilers = self.compilers;
+        compilers.of(self.reader, node)
+    }
+
     /// Reads what is in a body, a frame or a replication.
     fn fill(&mut self, node: Node<'a, 'a>, place: &Place) {
         for child in node.children().filter(Node::is_element) {
             if self.is_full() {
                 return;
+            }
+            let own;
+            let mut place = place;
+            if self.reader.model_of(child) != self.reader.model_of(node) {
+                // What is attached has default classes of its own.
+                self.reader.exact("attached model");
+                own = Place { class: self.classes.root(self.reader, child), ..place.clone() };
+                place = &own;
             }
             match (child.tag_name().name(), place.body) {
                 ("inertial", Some(body)) => self.inertial(body, child),
@@ -226,7 +242,7 @@ impl<'a> Walk<'_, 'a, '_> {
                 ("site", _) => self.site(child, place),
                 ("frame", _) => {
                     let settings = Settings::alone(child);
-                    let pose = self.compiler.pose(self.reader, &settings);
+                    let pose = self.compiler(child).pose(self.reader, &settings);
                     let class = self.class_in(child, place);
                     self.fill(child, &Place { class, frame: place.frame * pose, ..place.clone() });
                 }
@@ -261,7 +277,7 @@ impl<'a> Walk<'_, 'a, '_> {
             if self.is_full() {
                 return;
             }
-            let turn = self.compiler.euler(euler.map(|angle| angle * i as f64));
+            let turn = self.compiler(node).euler(euler.map(|angle| angle * i as f64));
             let pose = position * turn;
             let ending = format!("{separator}{i:0digits$}{}", place.ending);
             let frame = place.frame * pose;
@@ -277,7 +293,7 @@ impl<'a> Walk<'_, 'a, '_> {
             self.reader.fail(node, message);
         }
         let settings = Settings::alone(node);
-        let own = self.compiler.pose(self.reader, &settings);
+        let own = self.compiler(node).pose(self.reader, &settings);
         let name = named(node.attribute("name").unwrap_or_default(), place);
         self.register(0, node, &name, body);
         self.tree.bodies.push(Body {
@@ -291,7 +307,7 @@ impl<'a> Walk<'_, 'a, '_> {
             is_mocap: settings.is_true(self.reader, "mocap"),
             visuals: Vec::new(),
             inertial: None,
-            is_weighed: match self.compiler.inertia_from_geoms {
+            is_weighed: match self.compiler(node).inertia_from_geoms {
                 FromGeoms::Never => false,
                 FromGeoms::Always => true,
                 FromGeoms::Else => !has_inertial(node),
@@ -320,7 +336,8 @@ impl<'a> Walk<'_, 'a, '_> {
     fn weigh_meshes(&mut self, mut files: Option<&mut Files<'_>>) {
         for body in 0..self.tree.bodies.len() {
             let meshed = std::mem::take(&mut self.tree.bodies[body].meshed);
-            let counts = self.compiler.total_mass.is_some() || self.tree.is_moved(Some(body));
+            let counts =
+                self.compilers.main().total_mass.is_some() || self.tree.is_moved(Some(body));
             for Geom { node, mesh, pose, mass, density } in meshed.into_iter().filter(|_| counts) {
                 let Some(mesh) = mesh else {
                     let message = "the inertia of a shape that is fitted to a mesh, or of its shell: give its body an `inertial`";
@@ -350,20 +367,21 @@ impl<'a> Walk<'_, 'a, '_> {
     fn settle(&mut self, body: usize) {
         let Body { inertial, geoms, node, own, .. } = &mut self.tree.bodies[body];
         let (inertial, geoms, node, own) = (*inertial, std::mem::take(geoms), *node, *own);
+        let compiler = self.compiler(node);
         let inertia = if !geoms.is_empty() {
             self.reader.exact("inertia from shapes");
             Some(Inertia::sum(geoms.into_iter()))
         } else if let Some(node) = inertial {
             self.reader.exact("inertia as it is given");
             Some(self.given_inertia(node))
-        } else if self.compiler.least != [0.0; 2] {
+        } else if compiler.least != [0.0; 2] {
             // MuJoCo takes the body's own place in its parent for its centre of mass then.
             let center = own.translation.vector;
             Some(Inertia { mass: 0.0, center, tensor: Matrix3::zeros() })
         } else {
             None
         };
-        let inertia = inertia.map(|inertia| self.compiler.bounded(inertia));
+        let inertia = inertia.map(|inertia| compiler.bounded(inertia));
         if let Some(bad) = inertia.filter(|inertia| !inertia.is_possible()) {
             let message = format!(
                 "no body has the inertia of `{}`: {:?} kg·m² violate a + b ≥ c; `balanceinertia` mends it",
@@ -378,7 +396,7 @@ impl<'a> Walk<'_, 'a, '_> {
     fn given_inertia(&mut self, node: Node<'a, 'a>) -> Inertia {
         let settings = Settings::alone(node);
         self.reader.required(node, "pos");
-        let pose = self.compiler.pose(self.reader, &settings);
+        let pose = self.compiler(node).pose(self.reader, &settings);
         let mass = self.reader.number(node, "mass");
         if mass < 0.0 {
             self.reader.fail(node, format!("the mass is {mass} kg; must not be negative"));
@@ -399,7 +417,10 @@ impl<'a> Walk<'_, 'a, '_> {
     pub(super) fn register(&mut self, kind: usize, node: Node<'a, 'a>, name: &str, index: usize) {
         let is_new =
             name.is_empty() || self.tree.names[kind].insert(name.to_owned(), index).is_none();
-        self.tree.copied.extend(node.attribute("name").filter(|own| *own != name));
+        let own = node.attribute("name").filter(|own| *own != name);
+        if let Some((own, ending)) = own.and_then(|own| Some((own, name.strip_prefix(own)?))) {
+            self.tree.copied[kind].entry(own).or_default().push(ending.to_owned());
+        }
         if !is_new {
             let kind = ["bodies", "joints", "sites"][kind];
             self.reader.fail(node, format!("there are two {kind} `{name}`"));

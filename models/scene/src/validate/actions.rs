@@ -55,7 +55,32 @@ impl Check<'_> {
                         self.report(path, "its points do not move relative to each other");
                     }
                 }
+                Spring::Orientation { frame, stiffness, rest } => {
+                    self.oriented(format!("{path}.frame"), frame);
+                    self.not_negative(format!("{path}.stiffness"), *stiffness);
+                    if let Some(rest) = rest {
+                        self.rotation(&format!("{path}.rest"), rest);
+                    }
+                }
                 Spring::Stop { .. } => self.stop(&path, spring),
+            }
+        }
+    }
+
+    /// That a frame has a joint with an orientation that the dynamics turns.
+    fn oriented(&mut self, path: String, name: &str) {
+        let Some(carrier) = self.carrier(path.clone(), name) else { return };
+        let motions = carrier.map(|frame| self.scene.frames[frame].motions()).unwrap_or_default();
+        let turn = motions.iter().find(|(_, motion)| matches!(motion, Motion::Ball(_)));
+        match turn {
+            None => self.report(path, format!("`{name}` has no ball joint and no free joint")),
+            Some((turn, _)) => {
+                if self.kinds.get(turn) == Some(&CoordinateKind::Prescribed) {
+                    let message = format!(
+                        "the orientation of `{name}` is prescribed; a spring has no effect on it"
+                    );
+                    self.report(path, message);
+                }
             }
         }
     }

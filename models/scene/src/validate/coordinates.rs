@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::forces::Force;
 use crate::inputs::Input;
+use crate::limits::MAX_ARMATURE_TERMS;
 use crate::linear_term::LinearTerm;
 use crate::point::Point;
 use crate::scene::{Constraint, CoordinateKind, Motion};
@@ -56,6 +57,26 @@ impl<'a> Check<'a> {
                 };
                 self.report(format!("{path}.name"), message);
             }
+        }
+    }
+
+    /// Sums of coordinates that carry inertia.
+    pub(super) fn armatures(&mut self) {
+        for (i, armature) in self.scene.armatures.iter().enumerate() {
+            let path = format!("armatures[{i}]");
+            self.linear_terms(&path, &armature.terms);
+            let count = armature.terms.len();
+            if count > MAX_ARMATURE_TERMS {
+                let message = format!("has {count} entries; at most {MAX_ARMATURE_TERMS}");
+                self.report(format!("{path}.terms"), message);
+            }
+            for (k, term) in armature.terms.iter().enumerate() {
+                if self.kinds.get(&term.coordinate) == Some(&CoordinateKind::Prescribed) {
+                    let message = format!("coordinate `{}` is prescribed", term.coordinate);
+                    self.report(format!("{path}.terms[{k}].coordinate"), message);
+                }
+            }
+            self.not_negative(format!("{path}.armature"), armature.armature);
         }
     }
 

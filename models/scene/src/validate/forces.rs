@@ -38,9 +38,10 @@ impl Check<'_> {
                     self.finite_all(&format!("{path}.at"), at);
                     self.not_negative(format!("{path}.coefficient"), *coefficient);
                 }
-                Force::CoordinateDrag { coordinate, coefficient } => {
+                Force::CoordinateDrag { coordinate, coefficient, cubic } => {
                     self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
                     self.not_negative(format!("{path}.coefficient"), *coefficient);
+                    self.not_negative(format!("{path}.cubic"), *cubic);
                 }
                 Force::LinearDamper { terms, damping, input } => {
                     self.linear_terms(&path, terms);
@@ -68,8 +69,20 @@ impl Check<'_> {
                     self.not_negative(format!("{path}.damping"), *damping);
                     self.finite(format!("{path}.constant"), *constant);
                 }
-                Force::Friction { coordinate, force, velocity } => {
-                    self.dynamic_coordinate(format!("{path}.coordinate"), coordinate);
+                Force::Friction { coordinate, terms, points, force, velocity } => {
+                    match coordinate {
+                        Some(name) if terms.is_empty() && points.is_empty() => {
+                            self.dynamic_coordinate(format!("{path}.coordinate"), name);
+                        }
+                        None if !terms.is_empty() && points.is_empty() => {
+                            self.linear_terms(&path, terms);
+                        }
+                        None if terms.is_empty() && !points.is_empty() => {
+                            self.moved_along(&path, points);
+                        }
+                        _ => self
+                            .report(&path, "must have one of `coordinate`, `terms` and `points`"),
+                    }
                     self.not_negative(format!("{path}.force"), *force);
                     self.positive(format!("{path}.velocity"), *velocity);
                 }

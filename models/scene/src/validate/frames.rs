@@ -170,7 +170,10 @@ impl Check<'_> {
         });
         let coordinates = self.scene.coordinates.iter();
         let with_armature = coordinates.filter(|coordinate| coordinate.armature > 0.0);
-        let armatures: BTreeSet<_> = with_armature.map(|c| c.name.as_str()).collect();
+        let sums = self.scene.armatures.iter().filter(|sum| sum.armature > 0.0);
+        let in_sums = sums.flat_map(|sum| &sum.terms).map(|term| term.coordinate.as_str());
+        let armatures: BTreeSet<_> =
+            with_armature.map(|c| c.name.as_str()).chain(in_sums).collect();
         for (i, frame) in frames.iter().enumerate() {
             for (name, motion) in frame.motions() {
                 if self.kinds.get(&name) != Some(&CoordinateKind::Dynamic)

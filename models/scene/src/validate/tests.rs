@@ -615,6 +615,28 @@ name = "arm"
 joint = { type = "revolute", axis = [0.0, 1.0, 0.0] }
 body = { mass = 1.0, inertia = [0.1, 0.1, 0.1] }
 visuals = [{ shape = { type = "sphere", radius = 0.1 }, color = [0.1, 0.2, 0.3, 1.0] }]
+[[frames]]
+name = "hand"
+parent = "arm"
+joint = { type = "ball" }
+body = { mass = 1.0, inertia = [0.1, 0.1, 0.1] }
+[[armatures]]
+terms = [{ coordinate = "arm", coefficient = 3.0 }]
+armature = 0.125
+[[springs]]
+type = "orientation"
+frame = "hand"
+stiffness = 6.0
+rest = { rpy = [0.1, 0.0, 0.0] }
+[[forces]]
+type = "friction"
+terms = [{ coordinate = "arm", coefficient = 2.0 }]
+force = 1.0
+velocity = 0.1
+[[forces]]
+type = "coordinate_drag"
+coordinate = "arm"
+cubic = 1.0
 [[coordinates]]
 name = "arm"
 armature = 0.25
@@ -649,9 +671,28 @@ fn faults_of_elements_of_robots_are_found() {
     let cases: &[(&str, &str, &[&str])] = &[
         ("gravity = [0.0, 0.0, 0.0]\n", "", &["gravity"]),
         ("armature = 0.25", "armature = -0.25", &["coordinates[0].armature"]),
+        ("armature = 0.125", "armature = nan", &["armatures[0].armature"]),
+        ("coefficient = 3.0", "coefficient = 0.0", &["armatures[0].terms[0].coefficient"]),
+        (
+            "\"arm\", coefficient = 3.0",
+            "\"hand_rx\", coefficient = 3.0",
+            &["armatures[0].terms[0].coordinate"],
+        ),
+        ("frame = \"hand\"", "frame = \"arm\"", &["springs[0].frame"]),
+        ("frame = \"hand\"", "frame = \"world\"", &["springs[0].frame"]),
+        ("stiffness = 6.0", "stiffness = -6.0", &["springs[0].stiffness"]),
+        ("rpy = [0.1,", "rpy = [nan,", &["springs[0].rest.rpy[0]"]),
+        ("force = 1.0\n", "force = 1.0\ncoordinate = \"arm\"\n", &["forces[0]"]),
+        ("force = 1.0\n", "force = -1.0\n", &["forces[0].force"]),
+        ("cubic = 1.0", "cubic = -1.0", &["forces[1].cubic"]),
+        (
+            "[[coordinates]]",
+            "[[coordinates]]\nname = \"hand_rx\"\nkind = \"prescribed\"\n[[coordinates]]\nname = \"hand_ry\"\nkind = \"prescribed\"\n[[coordinates]]\nname = \"hand_rz\"\nkind = \"prescribed\"\n[[coordinates]]",
+            &["springs[0].frame"],
+        ),
         ("limits = [-1.0, 2.0]", "limits = [2.0, -1.0]", &["coordinates[0].limits"]),
         ("limits = [-1.0, 2.0]", "limits = [-inf, 2.0]", &["coordinates[0].limits[0]"]),
-        ("limits = [-1.0, 2.0]", "", &["springs[0].range"]),
+        ("limits = [-1.0, 2.0]", "", &["springs[1].range"]),
         ("limits = [-3.0, 3.0]", "limits = [3.0, 3.0]", &["inputs[0].limits"]),
         ("gain = 0.75", "gain = 0.0", &["inputs[0].terms[0].gain"]),
         (
@@ -669,21 +710,21 @@ fn faults_of_elements_of_robots_are_found() {
         ),
         ("radius = 0.1", "radius = 0.0", &["frames[0].visuals[0].shape.radius"]),
         ("[0.1, 0.2, 0.3, 1.0]", "[0.1, 0.2, 0.3, 1.5]", &["frames[0].visuals[0].color[3]"]),
-        ("stiffness = 50.0", "stiffness = -50.0", &["springs[0].stiffness"]),
-        ("stiffness = 50.0", "", &["springs[0]"]),
-        ("stiffness = 50.0", "settling_depth = 0.1", &["springs[0]"]),
+        ("stiffness = 50.0", "stiffness = -50.0", &["springs[1].stiffness"]),
+        ("stiffness = 50.0", "", &["springs[1]"]),
+        ("stiffness = 50.0", "settling_depth = 0.1", &["springs[1]"]),
         (
             "stiffness = 50.0",
             "settling_depth = 0.1\nsettling_time_s = 0.0",
-            &["springs[0].settling_time_s"],
+            &["springs[1].settling_time_s"],
         ),
-        ("stiffness = 50.0", "stiffness = 50.0\ntransition = 0.0", &["springs[0].transition"]),
-        ("stiffness = 50.0", "stiffness = 50.0\nrange = [1.0, nan]", &["springs[0].range[1]"]),
-        ("coordinate = \"arm\"\ninput", "input", &["forces[0]"]),
-        ("input = \"target\"", "input = \"aim\"", &["inputs[2]", "forces[0].input"]),
-        ("stiffness = 8.0", "stiffness = -8.0", &["forces[0].stiffness"]),
-        ("damping = 2.5", "damping = -2.5", &["forces[1].damping"]),
-        ("at = [0.25, 0.0, 0.0]", "at = [0.25, inf, 0.0]", &["forces[1].points[1].at[1]"]),
+        ("stiffness = 50.0", "stiffness = 50.0\ntransition = 0.0", &["springs[1].transition"]),
+        ("stiffness = 50.0", "stiffness = 50.0\nrange = [1.0, nan]", &["springs[1].range[1]"]),
+        ("coordinate = \"arm\"\ninput", "input", &["forces[2]"]),
+        ("input = \"target\"", "input = \"aim\"", &["inputs[2]", "forces[2].input"]),
+        ("stiffness = 8.0", "stiffness = -8.0", &["forces[2].stiffness"]),
+        ("damping = 2.5", "damping = -2.5", &["forces[3].damping"]),
+        ("at = [0.25, 0.0, 0.0]", "at = [0.25, inf, 0.0]", &["forces[3].points[1].at[1]"]),
     ];
     let wrong: Vec<_> = cases
         .iter()

@@ -78,8 +78,8 @@ impl Hessian {
                     qq[(i * n + j) * width + stage] -= k;
                 }
             });
-            for &(i, a) in &model.armature {
-                vv[(i * n + i) * width + stage] += a;
+            for a in &model.armature {
+                vv[(a.row * n + a.column) * width + stage] += a.inertia;
             }
         }
         if let Some(forces) = &model.forces {

@@ -13,7 +13,7 @@ impl GeneralizedForce for CoordinateForce {
     fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
         let v = at.velocity[self.coordinate];
         force[self.coordinate] += match self.law {
-            CoordinateLaw::Drag(c) => magnitude(v) * v * -c,
+            CoordinateLaw::Drag([c, d]) => (magnitude(v) * -d - c) * magnitude(v) * v,
             CoordinateLaw::Friction { force, velocity } => (v * (1.0 / velocity)).tanh() * -force,
             CoordinateLaw::Stop(stop) => -(stop.resistance(at.q[self.coordinate]).0 * v),
             CoordinateLaw::Constant(force) => S::constant(force),
@@ -34,7 +34,7 @@ impl GeneralizedForce for CoordinateForce {
                 by_q = -(by_position * v);
                 -c
             }
-            CoordinateLaw::Drag(c) => magnitude(v) * (-2.0 * c),
+            CoordinateLaw::Drag([c, d]) => (magnitude(v) * (-3.0 * d) - 2.0 * c) * magnitude(v),
             CoordinateLaw::Friction { force, velocity } => {
                 let t = (v * (1.0 / velocity)).tanh();
                 (S::ONE - t * t) * (-force / velocity)

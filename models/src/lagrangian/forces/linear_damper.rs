@@ -1,22 +1,40 @@
-//! A damper on a sum of coordinates: `f_i = −d u c_i Σ c_j v_j`, `∂f_i/∂v_j = −d u c_i c_j`,
-//! `∂f_i/∂u = −d c_i Σ c_j v_j`; `u` is an input, or 1.
+//! Forces against the rate `s = Σ c_j v_j` of a sum of coordinates.
+//!
+//! ```text
+//! f_i = −c_i g(s)    ∂f_i/∂v_j = −g' c_i c_j    ∂f_i/∂u = −c_i ∂g/∂u
+//! damper    g = d u s                    g' = d u    u is an input, or 1
+//! friction  g = force tanh(s / velocity)    g' = force / velocity (1 − tanh²)
+//! ```
 
 use plantd_math::scalar::Scalar;
 
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
-use crate::model::mechanism::LinearDamper;
+use crate::model::mechanism::{LinearDamper, LinearLaw};
+
+/// `force tanh(s / velocity)` and its slope.
+pub(super) fn friction<S: Scalar>(force: f64, velocity: f64, rate: S) -> (S, S) {
+    let t = (rate * (1.0 / velocity)).tanh();
+    (t * force, (S::ONE - t * t) * (force / velocity))
+}
 
 impl LinearDamper {
-    /// `Σ c_j v_j`
+    /// `s`
     fn rate<S: Scalar>(&self, at: &Instant<'_, S>) -> S {
         self.terms.iter().fold(S::ZERO, |sum, &(j, c)| sum + at.velocity[j] * c)
     }
 
-    /// `d u`
-    fn damping<S: Scalar>(&self, at: &Instant<'_, S>) -> S {
-        match self.input {
-            Some(input) => at.inputs[input] * self.damping,
-            None => S::constant(self.damping),
+    /// `g` and `g'`
+    fn resistance<S: Scalar>(&self, at: &Instant<'_, S>) -> (S, S) {
+        let rate = self.rate(at);
+        match self.law {
+            LinearLaw::Damper { damping, input } => {
+                let damping = match input {
+                    Some(input) => at.inputs[input] * damping,
+                    None => S::constant(damping),
+                };
+                (rate * damping, damping)
+            }
+            LinearLaw::Friction { force, velocity } => friction(force, velocity, rate),
         }
     }
 }
@@ -27,7 +45,7 @@ impl GeneralizedForce for LinearDamper {
     }
 
     fn add<S: Scalar>(&self, at: &Instant<'_, S>, force: &mut [S]) {
-        let resistance = self.rate(at) * self.damping(at);
+        let (resistance, _) = self.resistance(at);
         for &(i, c) in &self.terms {
             if let Some(entry) = force.get_mut(i) {
                 *entry -= resistance * c;
@@ -40,10 +58,10 @@ impl GeneralizedForce for LinearDamper {
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S, S),
     ) {
-        let damping = self.damping(at);
+        let (_, slope) = self.resistance(at);
         for &(i, row) in &self.terms {
             for &(j, column) in &self.terms {
-                entry(i, j, S::ZERO, damping * (-row * column));
+                entry(i, j, S::ZERO, slope * (-row * column));
             }
         }
     }
@@ -53,10 +71,10 @@ impl GeneralizedForce for LinearDamper {
         at: &Instant<'_, S>,
         entry: &mut impl FnMut(usize, usize, S),
     ) {
-        let Some(input) = self.input else { return };
+        let LinearLaw::Damper { damping, input: Some(input) } = self.law else { return };
         let rate = self.rate(at);
         for &(i, c) in &self.terms {
-            entry(i, input, rate * (-self.damping * c));
+            entry(i, input, rate * (-damping * c));
         }
     }
 }

@@ -1,7 +1,8 @@
-//! Forces along a path: of inputs, of a damper, and of the damper of a stop.
+//! Forces along a path: of inputs, of a damper, of the damper of a stop, and of dry friction.
 //!
 //! ```text
 //! f_i = T L_i,  T = Σ g_k u_k − c(L) L̇,  L̇ = Σ L_k v_k
+//! or, with friction, T = Σ g_k u_k − force tanh(L̇ / velocity), and c is its slope:
 //! ∂f_i/∂q_j = T L_ij − L_i (c' L̇ L_j + c Σ_k L_kj v_k)    ∂f_i/∂v_j = −c L_i L_j    ∂f_i/∂u_k = g_k L_i
 //! ```
 //!
@@ -9,6 +10,7 @@
 
 use plantd_math::scalar::Scalar;
 
+use crate::lagrangian::forces::linear_damper::friction;
 use crate::lagrangian::forces::{GeneralizedForce, Instant};
 use crate::lagrangian::vectors::Distance;
 use crate::model::mechanism::{PathForce, PointPair, Resistance};
@@ -39,12 +41,17 @@ impl PathForce {
             length += segment.length;
             segment.for_each_derivative(|i, slope| rate += slope * at.velocity[i]);
         }
-        let resistance = match &self.resistance {
-            Resistance::Constant(c) => (S::constant(*c), S::ZERO),
-            Resistance::Stop(stop) => stop.resistance(length),
+        let viscous = |resistance: (S, S)| (resistance.0 * rate, resistance);
+        let (held, resistance) = match self.resistance {
+            Resistance::Constant(c) => viscous((S::constant(c), S::ZERO)),
+            Resistance::Stop(stop) => viscous(stop.resistance(length)),
+            Resistance::Friction { force, velocity } => {
+                let (held, slope) = friction(force, velocity, rate);
+                (held, (slope, S::ZERO))
+            }
         };
         let driven = self.inputs.iter().fold(S::ZERO, |sum, &(k, g)| sum + at.inputs[k] * g);
-        Moving { rate, resistance, tension: driven - resistance.0 * rate }
+        Moving { rate, resistance, tension: driven - held }
     }
 }
 

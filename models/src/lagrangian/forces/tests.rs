@@ -104,6 +104,17 @@ coefficient = 1.5
 type = "coordinate_drag"
 coordinate = "d"
 coefficient = 0.5
+cubic = 0.3
+[[forces]]
+type = "friction"
+terms = [{ coordinate = "shaken", coefficient = 0.4 }, { coordinate = "d", coefficient = -2 }, { coordinate = "c", coefficient = 1.5 }]
+force = 0.7
+velocity = 0.8
+[[forces]]
+type = "friction"
+points = [{ frame = "tool" }, { frame = "d", at = [0.1, 0.2, 0] }, { frame = "world", at = [1, 0, 2] }]
+force = 0.7
+velocity = 0.8
 [[forces]]
 type = "linear_damper"
 damping = 0.6

@@ -42,6 +42,7 @@ pub fn scene(
     };
     for (what, count) in [
         ("frames", scene.frames.len()),
+        ("armatures", scene.armatures.len()),
         ("springs", scene.springs.len()),
         ("inputs", scene.inputs.len()),
         ("forces", scene.forces.len()),
