@@ -293,6 +293,7 @@ impl Mechanism {
             damping: 0.0,
             frames: Vec::new(),
             coordinates: self.coordinates(),
+            armatures: Vec::new(),
             springs: Vec::new(),
             inputs: Vec::new(),
             forces: Vec::new(),

@@ -360,8 +360,8 @@ impl<S: Scalar> Turn<S> {
         // Twice the slopes of e1, e2, e3.
         let (by_e1, by_e2, by_e3) = (e3 - e2, e4 + e4 - e3, e5 * 3.0 - e4);
         let inverse = e1.recip() * (1.0 / 32.0);
-        let c = (by_e2 - by_e3 - by_e1 * self.c * 4.0) * inverse;
-        let k = (by_e2 - by_e1 * self.k) * (inverse + inverse);
+        let c = (by_e2 - by_e3 - by_e1 * (self.c * 4.0)) * inverse;
+        let k = (by_e2 - by_e1 * (self.k + self.k)) * (inverse + inverse);
         [c, k]
     }
 }
