@@ -1,4 +1,4 @@
-//! The recordings in a directory. Those of a tenant lie in a folder of its own, see [`crate::wire::record::folders`];
+//! The recordings in a directory. Those of a tenant lie in a folder of its own, see `folders.rs`;
 //! names are taken for all tenants together.
 
 use std::collections::BTreeMap;
