@@ -31,24 +31,8 @@ impl Quaternion {
     }
 
     /// Of a rotation matrix: from its largest component, which loses no digits.
-    pub fn of_matrix(Mat3([x, y, z]): &Mat3) -> Self {
-        let squares = [
-            1.0 + x[0] + y[1] + z[2],
-            1.0 + x[0] - y[1] - z[2],
-            1.0 - x[0] + y[1] - z[2],
-            1.0 - x[0] - y[1] + z[2],
-        ];
-        let largest = (1..4).fold(0, |m, i| if squares[i] > squares[m] { i } else { m });
-        let square = squares[largest];
-        let (a, b, c) = (y[2] - z[1], z[0] - x[2], x[1] - y[0]);
-        let (d, e, f) = (x[1] + y[0], z[0] + x[2], y[2] + z[1]);
-        let components = match largest {
-            0 => [square, a, b, c],
-            1 => [a, square, d, e],
-            2 => [b, d, square, f],
-            _ => [c, e, f, square],
-        };
-        Self(components).normalized()
+    pub fn of_matrix(matrix: &Mat3) -> Self {
+        Self(along_quaternion(matrix).0).normalized()
     }
 
     /// The rotation vector, at most half a turn long.
@@ -217,13 +201,22 @@ pub fn log<S: Scalar>(rotation: &Mat3<S>) -> Vec3<S> {
     vector * (sine.atan2(w) * 2.0 * sine.recip())
 }
 
-/// The unit quaternion of a rotation matrix whose first component is not negative, from its largest component.
-fn quaternion<S: Scalar>(Mat3([x, y, z]): &Mat3<S>) -> [S; 4] {
+/// The unit quaternion of a rotation matrix whose first component is not negative.
+fn quaternion<S: Scalar>(rotation: &Mat3<S>) -> [S; 4] {
+    let (components, square) = along_quaternion(rotation);
+    let half = square.sqrt().recip() * 0.5;
+    let sign = if components[0].value() < 0.0 { -half } else { half };
+    components.map(|component| component * sign)
+}
+
+/// A multiple of the quaternion of a rotation matrix, and its largest component, from which it is found
+/// without loss of digits: four times the square of that of the unit quaternion.
+fn along_quaternion<S: Scalar>(Mat3([x, y, z]): &Mat3<S>) -> ([S; 4], S) {
     let squares = [
-        x[0] + y[1] + z[2] + 1.0,
-        x[0] - y[1] - z[2] + 1.0,
-        y[1] - x[0] - z[2] + 1.0,
-        z[2] - x[0] - y[1] + 1.0,
+        S::ONE + x[0] + y[1] + z[2],
+        S::ONE + x[0] - y[1] - z[2],
+        S::ONE - x[0] + y[1] - z[2],
+        S::ONE - x[0] - y[1] + z[2],
     ];
     let larger = |m: usize, i: usize| squares[i].value() > squares[m].value();
     let largest = (1..4).fold(0, |m, i| if larger(m, i) { i } else { m });
@@ -236,9 +229,7 @@ fn quaternion<S: Scalar>(Mat3([x, y, z]): &Mat3<S>) -> [S; 4] {
         2 => [b, d, square, f],
         _ => [c, e, f, square],
     };
-    let half = square.sqrt().recip() * 0.5;
-    let sign = if components[0].value() < 0.0 { -half } else { half };
-    components.map(|component| component * sign)
+    (components, square)
 }
 
 /// `dexp₋y`: how `exp(y)` turns in its own axes as `y` changes, `exp(−y) d exp(y) = (dexp₋y dy)^`.
@@ -324,27 +315,11 @@ impl<S: Scalar> Turn<S> {
         torque + self.xi.cross(torque) * self.k
     }
 
-    /// How `N⁻ m` and `T⁻ τ` change with `ξ`: for a change `δ`, with `c'` and `k'` by `t²`,
-    ///
-    /// ```text
-    /// ½ δ×m + c (δ×(ξ×m) + ξ×(δ×m)) + 2c' (ξ·δ) ξ×(ξ×m)      k δ×τ + 2k' (ξ·δ) ξ×τ
-    /// ```
-    #[inline]
-    pub fn changes(&self, m: Vec3<S>, torque: Vec3<S>) -> [Mat3<S>; 2] {
-        let (xi, [c_slope, k_slope]) = (self.xi, self.slopes());
-        let (turned, along) = (xi.cross(m), xi.dot(m));
-        let twice = xi.cross(turned) * (c_slope + c_slope) - m * (self.c + self.c);
-        // δ×(ξ×m) + ξ×(δ×m) = ξ (m·δ) + δ (ξ·m) − 2 m (ξ·δ)
-        let (weight, along) = (m * self.c, along * self.c);
-        let mut momentum = crossed(m.scaled(0.5));
-        let turned = xi.cross(torque) * (k_slope + k_slope);
-        let mut of_torque = crossed(torque * self.k);
-        for (b, column) in momentum.0.iter_mut().enumerate() {
-            *column += xi * weight[b] + twice * xi[b];
-            column.0[b] += along;
-            of_torque.0[b] += turned * xi[b];
-        }
-        [momentum, of_torque]
+    /// How the maps change with `ξ`.
+    #[inline(always)]
+    pub fn changes(&self) -> Changes<'_, S> {
+        let [c, k] = self.slopes();
+        Changes { turn: self, c, k }
     }
 
     /// `c'` and `k'` by `t²`, from `e_n' = ½ (n e_n+2 − e_n+1)`.
@@ -363,6 +338,43 @@ impl<S: Scalar> Turn<S> {
         let c = (by_e2 - by_e3 - by_e1 * (self.c * 4.0)) * inverse;
         let k = (by_e2 - by_e1 * (self.k + self.k)) * (inverse + inverse);
         [c, k]
+    }
+}
+
+/// How the maps of a ball joint change with its turn, with `c'` and `k'` by `t²`.
+#[derive(Clone, Copy, Debug)]
+pub struct Changes<'a, S = f64> {
+    turn: &'a Turn<S>,
+    c: S,
+    k: S,
+}
+
+impl<S: Scalar> Changes<'_, S> {
+    /// Of `N⁻ m`: `½ δ×m + c (δ×(ξ×m) + ξ×(δ×m)) + 2c' (ξ·δ) ξ×(ξ×m)` for a change `δ`.
+    #[inline]
+    pub fn of_momentum(&self, m: Vec3<S>) -> Mat3<S> {
+        let Turn { xi, c, .. } = *self.turn;
+        let (turned, along) = (xi.cross(m), xi.dot(m));
+        let twice = xi.cross(turned) * (self.c + self.c) - m * (c + c);
+        // δ×(ξ×m) + ξ×(δ×m) = ξ (m·δ) + δ (ξ·m) − 2 m (ξ·δ)
+        let (mut change, weight, along) = (crossed(m.scaled(0.5)), m * c, along * c);
+        for (b, column) in change.0.iter_mut().enumerate() {
+            *column += xi * weight[b] + twice * xi[b];
+            column.0[b] += along;
+        }
+        change
+    }
+
+    /// Of `T⁻ τ`: `k δ×τ + 2k' (ξ·δ) ξ×τ` for a change `δ`.
+    #[inline]
+    pub fn of_torque(&self, torque: Vec3<S>) -> Mat3<S> {
+        let Turn { xi, k, .. } = *self.turn;
+        let twice = xi.cross(torque) * (self.k + self.k);
+        let mut change = crossed(torque * k);
+        for (b, column) in change.0.iter_mut().enumerate() {
+            *column += twice * xi[b];
+        }
+        change
     }
 }
 
@@ -479,10 +491,12 @@ mod tests {
         let lifted = Vec3(v.0.map(Dual::constant));
         for xi in vectors() {
             let dual = Vec3([0, 1, 2].map(|i| Dual::new(xi[i], direction[i])));
-            let (along, [momentum, torque]) = (Turn::new(dual), Turn::new(xi).changes(v, v));
-            for (map, change) in
-                [(along.momentum_at_start(), momentum), (along.torque_at_start(), torque)]
-            {
+            let (along, turn) = (Turn::new(dual), Turn::new(xi));
+            let changes = turn.changes();
+            for (map, change) in [
+                (along.momentum_at_start(), changes.of_momentum(v)),
+                (along.torque_at_start(), changes.of_torque(v)),
+            ] {
                 let rate = Vec3(map.apply(lifted).0.map(|x| x.eps));
                 assert!((rate - change.apply(direction)).norm() < 1e-14, "{xi:?}");
             }

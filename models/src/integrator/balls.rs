@@ -167,8 +167,9 @@ impl Workspace {
             *weights = Weights::of_rows(turn);
             weights.column = turn.dexp_of_half();
             let impulse = three(&mid.l_q, i) * (0.5 * h) + three(&mid.force, i) * (a * h);
-            let [carried, turned] = turn.changes(three(&mid.l_v, i), impulse);
-            weights.own = turned.minus(&carried);
+            let changes = turn.changes();
+            weights.own =
+                changes.of_torque(impulse).minus(&changes.of_momentum(three(&mid.l_v, i)));
             if let Some(damping) = model.damping.get(i..i + 3) {
                 for (b, c) in damping.iter().enumerate() {
                     weights.own.0[b] += weights.torque.0[b] * (-a * c);

@@ -70,8 +70,9 @@ impl<S: Scalar> Turning<S> {
         momentum: Vec3<S>,
         force: Vec3<S>,
     ) -> [Mat3<S>; 2] {
-        let [carried, turned] = self.turn.changes(momentum, impulse);
-        [turned.minus(&carried), self.turn.changes(momentum, force)[1]]
+        let changes = self.turn.changes();
+        let residual = changes.of_torque(impulse).minus(&changes.of_momentum(momentum));
+        [residual, changes.of_torque(force)]
     }
 }
 

@@ -16,7 +16,7 @@
 
 use plantd_math::rotation;
 use plantd_math::simd::wide;
-use plantd_math::spatial::{Mat3, Vec3, three};
+use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::balls::BallJoints;
 use crate::integrator::workspace::{StepContext, Tangents, Workspace};
@@ -237,7 +237,7 @@ impl Workspace {
             if joint.kind == JointKind::Ball(0) && joint.coordinate < sink.nd {
                 let i = joint.coordinate;
                 let turning = &sink.turnings[joint.orientation];
-                let forces = turning.by_turn(Vec3::ZERO, Vec3::ZERO, three(&mid.force, i))[1];
+                let forces = turning.turn.changes().of_torque(three(&mid.force, i));
                 let momentum = three(&mid.l_v, i);
                 let turned = rotation::crossed(-momentum);
                 let turned = turned.plus(&forces.scaled(sink.skew));

@@ -150,15 +150,7 @@ async fn streams_end_when_their_token_is_revoked() {
         tokio::spawn(async move { client.run(request).await })
     };
     assert_eq!(lab.tokens(&["revoke", "anna"]), "1 revoked");
-    let ended = soon(async {
-        loop {
-            match states.next().await {
-                Ok(Some(_)) => {}
-                ended => break ended.map(drop),
-            }
-        }
-    })
-    .await;
+    let ended = end_of(&mut states).await;
     assert_refused(ended, Code::Unauthenticated, "CREDENTIALS_REVOKED");
     let ended = soon(async {
         loop {
@@ -186,15 +178,7 @@ async fn streams_end_when_their_token_expires() {
     let client = somebody(&lab, &server, &token).await;
     plant(&client, "p1").await;
     let mut states = client.watch(watch_request("p1")).await.unwrap();
-    let ended = soon(async {
-        loop {
-            match states.next().await {
-                Ok(Some(_)) => {}
-                ended => break ended.map(drop),
-            }
-        }
-    })
-    .await;
+    let ended = end_of(&mut states).await;
     assert_refused(ended, Code::Unauthenticated, "CREDENTIALS_EXPIRED");
     assert_refused(client.list_plants().await, Code::Unauthenticated, "CREDENTIALS_EXPIRED");
     let again = connect(server.address(), lab.with_token(&token)).await;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;
 
-use plantd_client::{Client, Code, ConnectOptions, Credentials, Error, v1};
+use plantd_client::{Answers, Client, Code, ConnectOptions, Credentials, Error, v1};
 use plantd_tests::server::{ServerProcess, binary};
 use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
 
@@ -141,6 +141,19 @@ pub(crate) async fn somebody(lab: &Lab, server: &ServerProcess, token: &str) -> 
 /// Waits for what must come, but not for ever.
 pub(crate) async fn soon<T>(work: impl Future<Output = T>) -> T {
     tokio::time::timeout(Duration::from_secs(60), work).await.expect("an answer within 60 s")
+}
+
+/// How a watch ends.
+pub(crate) async fn end_of(states: &mut Answers<v1::WatchResponse>) -> Result<(), Error> {
+    soon(async {
+        loop {
+            match states.next().await {
+                Ok(Some(_)) => {}
+                ended => break ended.map(drop),
+            }
+        }
+    })
+    .await
 }
 
 pub(crate) async fn plant(client: &Client, id: &str) -> v1::PlantInfo {

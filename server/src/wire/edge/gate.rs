@@ -86,15 +86,21 @@ fn check(names: &Names, request: &Request<Body>) -> Result<(), Foreign> {
 /// 403; with PERMISSION_DENIED for gRPC, and as text for others.
 fn refusal(request: &Request<Body>, foreign: Foreign) -> Response<Body> {
     tracing::debug!(path = request.uri().path(), %foreign, "refused");
+    let mut response = answer(request, Status::from(RpcError::from(foreign)));
+    *response.status_mut() = StatusCode::FORBIDDEN;
+    response
+}
+
+/// A status as gRPC has it, and as text for others.
+pub(super) fn answer(request: &Request<Body>, status: Status) -> Response<Body> {
     let kind = request.headers().get(CONTENT_TYPE).filter(|_| is_grpc(request));
     let (mut response, kind) = match kind {
-        Some(kind) => (Status::from(RpcError::from(foreign)).into_http(), kind.clone()),
+        Some(kind) => (status.into_http(), kind.clone()),
         None => {
-            let text = Body::new(format!("{foreign}\n"));
+            let text = Body::new(format!("{}\n", status.message()));
             (Response::new(text), HeaderValue::from_static("text/plain; charset=utf-8"))
         }
     };
-    *response.status_mut() = StatusCode::FORBIDDEN;
     response.headers_mut().insert(CONTENT_TYPE, kind);
     response
 }

@@ -7,7 +7,7 @@ use std::task::{Context, Poll};
 use futures::future::{Either, Ready, ready};
 use plantd_viewer::PARTS;
 use tonic::body::Body;
-use tonic::codegen::http::header::{AUTHORIZATION, CONTENT_TYPE, WWW_AUTHENTICATE};
+use tonic::codegen::http::header::{AUTHORIZATION, WWW_AUTHENTICATE};
 use tonic::codegen::http::{HeaderValue, Request, Response, StatusCode};
 use tonic::{Code, Status};
 use tower::{Layer, Service};
@@ -16,7 +16,7 @@ use crate::core::metrics::registry::Metrics;
 use crate::wire::edge::admission::Place;
 use crate::wire::edge::auth::door::Door;
 use crate::wire::edge::auth::role;
-use crate::wire::edge::gate::is_grpc;
+use crate::wire::edge::gate::{answer, is_grpc};
 use crate::wire::edge::methods::method_label;
 
 /// The layer.
@@ -99,22 +99,18 @@ where
 
 /// The status for gRPC; 401, 403 or 429 and a text for others.
 fn refusal(request: &Request<Body>, status: Status) -> Response<Body> {
-    let kind = request.headers().get(CONTENT_TYPE).filter(|_| is_grpc(request));
-    if let Some(kind) = kind {
-        let mut response = status.into_http();
-        response.headers_mut().insert(CONTENT_TYPE, kind.clone());
+    let code = status.code();
+    let mut response = answer(request, status);
+    if is_grpc(request) {
         return response;
     }
-    let mut response = Response::new(Body::new(format!("{}\n", status.message())));
-    *response.status_mut() = match status.code() {
+    *response.status_mut() = match code {
         Code::Unauthenticated => StatusCode::UNAUTHORIZED,
         Code::ResourceExhausted => StatusCode::TOO_MANY_REQUESTS,
         _ => StatusCode::FORBIDDEN,
     };
-    let headers = response.headers_mut();
-    headers.insert(CONTENT_TYPE, HeaderValue::from_static("text/plain; charset=utf-8"));
-    if status.code() == Code::Unauthenticated {
-        headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
+    if code == Code::Unauthenticated {
+        response.headers_mut().insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
     }
     response
 }
