@@ -291,7 +291,7 @@ fn step_count() -> PathBuf {
     let build = || {
         let test = std::env::current_exe().expect("a test has a path");
         let target = test.ancestors().nth(3).expect("the test is target/PROFILE/deps/NAME");
-        let status = Command::new(env!("CARGO"))
+        let status = plantd_launch::cargo()
             .args(["build", "--quiet", "--release", "--locked", "-p", "plantd-control"])
             .args(["--example", "step_count", "--target-dir"])
             .arg(target)

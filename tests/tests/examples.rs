@@ -17,8 +17,7 @@ fn example(name: &str) -> PathBuf {
             Some("debug") => "dev",
             other => other.unwrap(),
         };
-        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-        let status = Command::new(cargo)
+        let status = plantd_launch::cargo()
             .current_dir(env!("CARGO_MANIFEST_DIR"))
             .args(["build", "--quiet", "--workspace", "--bins", "--examples"])
             .args(["--profile", profile, "--target-dir"])

@@ -99,8 +99,7 @@ fn packages() -> Result<usize, String> {
 }
 
 fn cargo(arguments: &[&str]) -> Command {
-    let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let mut command = Command::new(program);
+    let mut command = plantd_launch::cargo();
     command.args(arguments).stdin(Stdio::null());
     command
 }

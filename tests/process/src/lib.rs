@@ -211,10 +211,9 @@ fn build() -> Result<PathBuf> {
         None => bail!("{} is not a target directory", directory.display()),
     };
     let target = directory.parent().context("the target directory has no parent")?;
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     // With the binaries of the packages that ask, so that Cargo sees the same dependencies as for the
     // running program and builds none of them a second time.
-    let output = Command::new(cargo)
+    let output = plantd_launch::cargo()
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .args(["build", "--quiet", "--bins", "--lib"])
         .args(["-p", "plantd-server", "-p", "plantd-client", "-p", "plantd-tests"])

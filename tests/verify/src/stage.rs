@@ -67,6 +67,7 @@ pub(crate) fn run(command: &mut Command) -> Outcome {
     println!("$ {line}");
     let _ = std::io::stdout().flush();
     die_with_parent(command);
+    plantd_launch::leave_package(command);
     match command.status() {
         Ok(status) if status.success() => Ok(()),
         Ok(status) => Err(Failure::Failed(format!("`{line}`: {status}"))),
