@@ -19,7 +19,7 @@ const BUILD: [&str; 8] =
     ["--profile", PROFILE, "--locked", "--bins", "-p", "plantd-server", "-p", "plantd-demo"];
 const PROFILE: &str = "release";
 /// What a first build has taken elsewhere, without the time to fetch crates.
-const BUILD_TIME: &str = "about 5 minutes on two cores";
+const BUILD_TIME: &str = "five to seven minutes on two cores";
 /// How often the bar is drawn anew.
 const REFRESH: Duration = Duration::from_millis(200);
 
