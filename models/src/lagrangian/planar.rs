@@ -439,9 +439,7 @@ impl<A: Arrangement> Joints<A> {
             if joint.has_branches {
                 sum = add4(sum, std::mem::replace(&mut self.branches[i].sums, Below::NONE.sums));
             }
-            if joint.descendants > 0 {
-                self.sums[i] = sum;
-            }
+            self.sums[i] = sum;
             let [x, y] = one2::<A>(&self.links[i / A::COUNT].lever, i % A::COUNT);
             let sum = [sum[0], sum[1], sum[2] + x, sum[3] + y];
             match joint.parent {
