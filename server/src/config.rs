@@ -192,7 +192,7 @@ impl fmt::Display for Listen {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LogConfig {
-    /// What is logged, in the notation of `RUST_LOG`: `info`, `plantd_server=debug,info`.
+    /// What is logged: a level, or levels of targets: `info`, `plantd_server=debug,info`.
     pub filter: String,
     /// How.
     pub format: LogFormat,

@@ -8,7 +8,10 @@ use anyhow::{Context as _, Result};
 use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{fmt, registry};
 
 use crate::config::{Config, LogConfig, LogFormat};
 use crate::core::modes::Mode;
@@ -19,15 +22,15 @@ const LEFTOVERS_MAX: Duration = Duration::from_secs(1);
 
 /// Sets up logging to standard error.
 pub fn start_log(config: &LogConfig) -> Result<()> {
-    let filter = EnvFilter::try_new(&config.filter)
-        .with_context(|| format!("log filter `{}`", config.filter))?;
-    let log = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let filter: Targets =
+        config.filter.parse().with_context(|| format!("log filter `{}`", config.filter))?;
+    let lines = fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
+    let log = registry().with(filter);
     match config.format {
-        LogFormat::Text => log.init(),
-        LogFormat::Json => log.json().init(),
+        LogFormat::Text => log.with(lines).init(),
+        LogFormat::Json => log.with(lines.json()).init(),
     }
     Ok(())
 }

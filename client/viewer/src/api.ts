@@ -9,15 +9,16 @@ import { RecordingService } from "./gen/plantd/v1/recording_service_pb.js";
 import { complain } from "./state.js";
 import { askForToken } from "./token.js";
 
-/** A call that the server refuses because it does not know who asks is made once more when it does. */
+/** A call that the server refuses because it does not know who asks is made again when it does. */
 const known: Interceptor = (next) => async (request) => {
-  try {
-    return await next(request);
-  } catch (error) {
-    const { code, rawMessage } = ConnectError.from(error);
-    if (code !== Code.Unauthenticated || request.stream) throw error;
-    await askForToken(rawMessage);
-    return next(request);
+  for (;;) {
+    try {
+      return await next(request);
+    } catch (error) {
+      const { code, rawMessage } = ConnectError.from(error);
+      if (code !== Code.Unauthenticated || request.stream) throw error;
+      await askForToken(rawMessage);
+    }
   }
 };
 

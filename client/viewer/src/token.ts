@@ -62,7 +62,10 @@ export function askForToken(why: string): Promise<void> {
     button.addEventListener("click", done);
     input.addEventListener("keydown", (event) => {
       event.stopPropagation();
-      if (event.key === "Enter") done();
+      if (event.key !== "Enter") return;
+      // The key is used up: what has the focus when the dialog is closed is not pressed by it.
+      event.preventDefault();
+      done();
     });
     dialog.addEventListener("close", () => {
       asking = undefined;

@@ -1,7 +1,7 @@
 // Chromium as Debian has it, and a real server.
 
 import { spawn } from "node:child_process";
-import { existsSync, mkdtempSync, rmSync } from "node:fs";
+import { existsSync, mkdtempSync, rmSync, writeFileSync } from "node:fs";
 import { createServer } from "node:net";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
@@ -33,10 +33,12 @@ function freePort() {
 
 /** A server of a binary, which can be stopped and started anew on the same port. */
 export class Server {
-  static async start(binary) {
+  /** `configuration` is text of its configuration file. */
+  static async start(binary, configuration = "") {
     const server = new Server();
     server.binary = binary;
     server.folder = mkdtempSync(join(tmpdir(), "plantd-viewer-"));
+    writeFileSync(join(server.folder, "plantd.toml"), configuration);
     server.port = await freePort();
     server.url = `http://127.0.0.1:${server.port}`;
     await server.again();
@@ -44,7 +46,7 @@ export class Server {
   }
 
   async again() {
-    const args = ["serve", "--grpc", `127.0.0.1:${this.port}`, "--metrics", "off", "--link", "off", "--recordings", join(this.folder, "recordings")];
+    const args = ["serve", "--config", join(this.folder, "plantd.toml"), "--grpc", `127.0.0.1:${this.port}`, "--metrics", "off", "--link", "off", "--recordings", join(this.folder, "recordings")];
     this.process = spawn(this.binary, args, { stdio: ["ignore", "ignore", "inherit"] });
     for (let attempt = 0; attempt < 600; attempt++) {
       if (this.process.exitCode !== null) throw new Error(`the server ended with ${this.process.exitCode}`);

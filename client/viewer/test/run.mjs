@@ -15,6 +15,7 @@ import { chromium, launch, Server } from "./browser.mjs";
 import { commandTests } from "./command.mjs";
 import { small } from "./png.mjs";
 import { robotTests } from "./robots.mjs";
+import { tokenTests } from "./token.mjs";
 import { windowTests } from "./windows.mjs";
 
 const SKIPPED = 77;
@@ -329,6 +330,7 @@ const tests = {
 
   ...commandTests(context),
   ...robotTests(context),
+  ...tokenTests(context),
   ...windowTests(context),
 
   // The last one: the plants of the others end with the server.
