@@ -274,9 +274,13 @@ impl Client {
         Ok(self.plants().snapshot(self.limited(request)).await?.into_inner().snapshot)
     }
 
-    /// Restores a snapshot of a plant of the same model and settings, step count included.
+    /// Restores a snapshot of a plant of the same model, settings, channels and faults, step count included.
     pub async fn restore(&self, id: impl Into<String>, snapshot: Vec<u8>) -> Result<v1::State> {
-        let request = v1::RestoreRequest { id: id.into(), snapshot };
+        self.restore_by(v1::RestoreRequest { id: id.into(), snapshot, state_alone: false }).await
+    }
+
+    /// [`restore`](Self::restore), by a request: also the state alone, where channels and faults are others.
+    pub async fn restore_by(&self, request: v1::RestoreRequest) -> Result<v1::State> {
         let answer = self.plants().restore(self.limited(request)).await?.into_inner();
         answer.state.ok_or(Error::Protocol("an answer without a state"))
     }

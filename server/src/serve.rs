@@ -2,6 +2,7 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::PathBuf;
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -53,7 +54,7 @@ use crate::wire::record::directory::Recordings;
 use crate::wire::shared::hub::Hub;
 use crate::wire::shared::state_directory::StateDirectory;
 
-/// Longest wait at the end for plants to be saved on a disk that does not answer.
+/// Longest wait at the end for a disk that does not answer while plants are saved.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
 
 /// How often plants are looked at that are kept for a time.
@@ -402,9 +403,7 @@ impl RunningServer {
         self.memory.abort();
         self.reaper.abort();
         self.lookouts.abort_all();
-        if tokio::time::timeout(SAVE_WAIT_MAX, save_once(&self.hub)).await.is_err() {
-            tracing::error!("the disk does not answer: not all plants were saved");
-        }
+        save_at_the_end(&self.hub).await;
         if let Some(metrics) = &self.metrics {
             metrics.abort();
         }
@@ -428,6 +427,23 @@ async fn delete_expired(hub: Arc<Hub>) {
         tokio::time::sleep(EXPIRY_PERIOD).await;
         hub.delete_expired().await;
     }
+}
+
+/// Saves the plants for the next server: as long as it takes, unless the disk does not answer at all.
+async fn save_at_the_end(hub: &Arc<Hub>) {
+    let Some(state) = &hub.state else { return };
+    let mut saving = pin!(save_once(hub));
+    let mut before = state.progress();
+    while tokio::time::timeout(SAVE_WAIT_MAX, &mut saving).await.is_err() {
+        let now = state.progress();
+        if now == before {
+            let plants = now.0;
+            tracing::error!(plants, "the disk does not answer: these are not saved, or more");
+            return;
+        }
+        before = now;
+    }
+    state.release();
 }
 
 async fn save_once(hub: &Arc<Hub>) {

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use plantd_client::{Client, MatrixExt as _, diagonal, operating_point, v1, weights};
@@ -446,4 +447,64 @@ async fn a_plant_that_ran_runs_again_and_one_that_was_paused_does_not() {
         assert!(started.elapsed() < Duration::from_secs(30), "it does not move");
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
+}
+
+/// Each of two servers would overwrite what the other has saved.
+#[tokio::test]
+async fn a_second_server_on_the_same_directory_is_refused() {
+    let state = tempfile::tempdir().unwrap();
+    let mut first = serve(state.path());
+    let on_it = |command: &mut Command| {
+        command.arg("--state-directory").arg(state.path());
+    };
+    let refused = ServerProcess::start_with(on_it).err().expect("a second server").to_string();
+    for part in ["another server", &first.pid().to_string(), state.path().to_str().unwrap()] {
+        assert!(refused.contains(part), "{refused}");
+    }
+    // One that was killed holds nothing.
+    first.kill().unwrap();
+    assert!(ServerProcess::start_with(on_it).unwrap().stop().unwrap().success());
+}
+
+/// As a disk that takes its time.
+const SLOW_SYNC: &str = "\
+#include <time.h>
+int fdatasync(int file) {
+    struct timespec a_while = { 0, 40000000 };
+    nanosleep(&a_while, 0);
+    return (void)file, 0;
+}
+";
+
+/// One after the other the plants of this test would take 40 s to save.
+#[tokio::test]
+async fn a_slow_disk_loses_no_plant_at_the_end() {
+    const PLANTS: usize = 1000;
+    let folder = tempfile::tempdir().unwrap();
+    let [state, source, library] =
+        ["plants", "slow.c", "slow.so"].map(|name| folder.path().join(name));
+    std::fs::write(&source, SLOW_SYNC).unwrap();
+    let compiled =
+        Command::new("cc").args(["-shared", "-fPIC", "-o"]).args([&library, &source]).status();
+    assert!(compiled.unwrap().success());
+    let serve = |interval: &str, preload: Option<&Path>| {
+        ServerProcess::start_with(|command| {
+            command.arg("--state-directory").arg(&state).args(["--state-interval-s", interval]);
+            command.envs(preload.map(|library| ("LD_PRELOAD", library)));
+        })
+        .unwrap()
+    };
+    let mut server = serve("1000", Some(&library));
+    let client = server.client().await;
+    for i in 0..PLANTS {
+        create(&client, &format!("p{i}"), "pendulum").await;
+    }
+    step(&client, "p0", 0, 10).await;
+    assert!(server.stop().unwrap().success(), "{}", server.log());
+    let mut server = serve("1000", None);
+    let client = server.client().await;
+    assert_eq!(client.list_plants().await.unwrap().len(), PLANTS, "{}", server.log());
+    let first = client.get_plant("p0").await.unwrap().plant.unwrap();
+    assert_eq!(first.state.unwrap().step, 10);
+    assert!(server.stop().unwrap().success());
 }

@@ -52,6 +52,11 @@ impl Mode {
         }
     }
 
+    /// A file for writing: the one that is there, or a new one.
+    pub fn open_or_create(self, path: &Path) -> io::Result<File> {
+        OpenOptions::new().write(true).create(true).truncate(false).mode(self.0).open(path)
+    }
+
     /// A directory for such files, with those above it. One that is there stays as it is.
     pub fn create_directory(self, path: &Path) -> io::Result<()> {
         fs::DirBuilder::new().recursive(true).mode(self.of_directory()).create(path)

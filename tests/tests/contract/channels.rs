@@ -347,16 +347,26 @@ async fn a_restored_plant_goes_on_with_what_was_under_way() {
         client.reset_to(v1::ResetRequest { id: a.clone(), initial }).await.unwrap();
         assert_eq!(seen(&drive(&client, &a, 60).await), ahead);
     }
-    // Channels that the snapshot does not know begin where the plant is; faults that it does not know, too.
+    // With other channels, or without its faults, the motion would be another one: the state alone can be had.
     drive(&client, &a, 8).await;
     let snapshot = client.snapshot(&a).await.unwrap();
     let late = v1::OutputChannel { latency_s: 7.0 * H, ..theta("late") };
     client.clear_fault(&a, 0).await.unwrap();
+    let refused = client.restore(&a, snapshot.clone()).await.unwrap_err();
+    assert_eq!(refused.reason(), "SNAPSHOT_MISMATCH");
+    assert!(refused.to_string().contains("another set of faults"), "{refused}");
     client.set_channels(&a, outputs(vec![late])).await.unwrap();
+    let refused = client.restore(&a, snapshot.clone()).await.unwrap_err();
+    assert!(refused.to_string().contains("another set of channels"), "{refused}");
+    let bare = plant(&client, "cart-pole").await.id;
+    let refused = client.restore(&bare, snapshot.clone()).await.unwrap_err();
+    assert_eq!(refused.reason(), "SNAPSHOT_MISMATCH");
+    assert_eq!(client.get_plant(&bare).await.unwrap().plant.unwrap().state.unwrap().step, 0);
     let fault = on_output("late", Kind::Delay(v1::ExtraDelay { delay_s: H }));
     client.inject_fault(&a, fault).await.unwrap();
     drive(&client, &a, 20).await;
-    client.restore(&a, snapshot).await.unwrap();
+    let request = v1::RestoreRequest { id: a.clone(), snapshot, state_alone: true };
+    client.restore_by(request).await.unwrap();
     let theta = client.get_plant(&a).await.unwrap().plant.unwrap().state.unwrap().q[1];
     let steps = drive(&client, &a, 8).await;
     assert!(steps.iter().all(|step| y(step) == [theta]), "{theta}");

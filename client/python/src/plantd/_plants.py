@@ -392,9 +392,15 @@ class PlantCalls(Calls):
         answer: plant_service_pb2.SnapshotResponse = self._call(self.plants.Snapshot, request)
         return answer.snapshot
 
-    def restore(self, id: str, snapshot: bytes) -> State:
-        """Restores a snapshot of a plant of the same model and settings, step count included."""
-        request = build(plant_service_pb2.RestoreRequest, id=id, snapshot=snapshot)
+    def restore(self, id: str, snapshot: bytes, *, state_alone: bool = False) -> State:
+        """Restores a snapshot of a plant of the same model and settings, step count included.
+
+        What was under way in channels and faults goes on; these must be the plant's. With ``state_alone``
+        they may be others, and begin at the restored state.
+        """
+        request = build(
+            plant_service_pb2.RestoreRequest, id=id, snapshot=snapshot, state_alone=state_alone
+        )
         return State._from(self._call(self.plants.Restore, request).state)
 
     def set_parameters(

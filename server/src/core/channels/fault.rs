@@ -353,11 +353,14 @@ impl Injected {
         FaultMemory { id: self.id, fault, numbers, active, beginnings }
     }
 
+    /// Whether this is what this fault kept.
+    pub(super) fn is_of(&self, memory: &FaultMemory) -> bool {
+        (self.id, self.hash ^ self.schedule.start) == (memory.id, memory.fault)
+    }
+
     /// Goes on with what it kept, if it was this one.
     pub(super) fn recall(&mut self, memory: &FaultMemory) {
-        if (self.id, self.hash ^ self.schedule.start) != (memory.id, memory.fault)
-            || self.numbers_mut().count() != memory.numbers.len()
-        {
+        if !self.is_of(memory) || self.numbers_mut().count() != memory.numbers.len() {
             return;
         }
         (self.is_active, self.beginnings) = (memory.active, memory.beginnings);

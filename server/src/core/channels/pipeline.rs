@@ -165,6 +165,15 @@ impl Channels {
         }
     }
 
+    /// Whether this was under way in these channels and faults; if not, in what else.
+    pub(crate) fn check(&self, memory: &ChannelMemory) -> Result<(), &'static str> {
+        if self.hash != memory.declared {
+            return Err("set of channels");
+        }
+        let is_here = |kept: &FaultMemory| self.faults.iter().any(|fault| fault.is_of(kept));
+        if memory.faults.iter().all(is_here) { Ok(()) } else { Err("set of faults") }
+    }
+
     /// Goes on with what was under way, in the channels and faults that are those of then.
     pub(crate) fn recall(&mut self, memory: &ChannelMemory) {
         if self.hash == memory.declared && self.numbers_mut().count() == memory.numbers.len() {

@@ -398,6 +398,16 @@ impl Core {
         }
     }
 
+    /// Whether channels and faults are those in which this was under way; if not, what is another one.
+    pub(crate) fn check(&self, memory: &ChannelMemory) -> Result<(), &'static str> {
+        match &self.channels {
+            Some(channels) => channels.check(memory),
+            None if !memory.faults.is_empty() => Err("set of faults"),
+            None if !memory.numbers.is_empty() => Err("set of channels"),
+            None => Ok(()),
+        }
+    }
+
     /// Puts a copy of the plant in its place that is in another state, and what was under way there in its
     /// channels, as far as it is known.
     pub(crate) fn replace_plant(&mut self, plant: Plant, memory: Option<&ChannelMemory>) -> Spare {

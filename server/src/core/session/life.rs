@@ -1,10 +1,20 @@
-//! How long a plant lives that nobody uses.
+//! How long a plant lives that nobody uses, and what is kept of it beyond its server.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
+use plantd_models::Model;
 use plantd_proto::link::monotonic_ns;
+
+/// What the file holds in which a plant survives its server.
+#[derive(Clone, Debug)]
+pub struct Kept {
+    /// The model in force when it was written.
+    pub model: Arc<Model>,
+    /// Hash of everything else.
+    pub hash: u64,
+}
 
 /// When a plant was used last, and how long it is kept after that.
 #[derive(Debug)]

@@ -27,7 +27,7 @@ use crate::core::publish::ring::{RING_RECORDS, Ring};
 use crate::core::publish::subscription::Subscription;
 use crate::core::realtime::loops::RealTime;
 use crate::core::session::creation::{Accuracy, Creation, Origin};
-use crate::core::session::life::Life;
+use crate::core::session::life::{Kept, Life};
 use crate::core::session::place::Place;
 use crate::core::session::run::RunControl;
 use crate::core::tenant::Tenant;
@@ -36,6 +36,7 @@ use crate::core::tenant::Tenant;
 pub struct Session {
     pub(super) creation: Creation,
     life: Arc<Life>,
+    kept: Mutex<Option<Kept>>,
     pub(super) place: Mutex<Place>,
     /// Held by whoever replaces the plant; taken before the core's lock.
     replacing: Mutex<()>,
@@ -76,6 +77,7 @@ impl Session {
         let in_force = watch::Sender::new(None);
         Arc::new(Self {
             life: Arc::new(Life::new(origin.expires)),
+            kept: Mutex::default(),
             creation: Creation::of(&plant, origin),
             place: Mutex::new(Place::Rest(Box::new(Core::new(plant, Arc::clone(&events))))),
             replacing: Mutex::default(),
@@ -110,6 +112,11 @@ impl Session {
     /// names and sizes.
     pub fn model(&self) -> &Arc<Model> {
         &self.creation.model
+    }
+
+    /// What the file holds in which it survives its server; held by whoever writes or removes the file.
+    pub fn kept(&self) -> MutexGuard<'_, Option<Kept>> {
+        lock(&self.kept)
     }
 
     /// How long it lives when nobody uses it.
@@ -344,14 +351,18 @@ impl Session {
         put
     }
 
-    /// Puts the plant into the state of a snapshot: one of the same parameters and time step. The caller
-    /// holds the lease.
+    /// Puts the plant into the state of a snapshot: one of the same parameters, time step, channels and faults.
+    /// The caller holds the lease.
     pub(crate) fn restore(
         self: &Arc<Self>,
         snapshot: PlantSnapshot,
     ) -> Result<Frame, SnapshotError> {
         let _replacing = lock(&self.replacing);
         let plant = self.plant_of(&snapshot.plant)?;
+        if let Some(memory) = snapshot.channels.clone() {
+            let checked = self.with_core(move |core| core.check(&memory));
+            checked.map_err(SnapshotError::Mismatch)?;
+        }
         Ok(self.replace_plant(plant, snapshot.channels))
     }
 

@@ -391,9 +391,12 @@ impl v1::plant_service_server::PlantService for PlantService {
         &self,
         request: Request<v1::RestoreRequest>,
     ) -> Result<Response<v1::RestoreResponse>, Status> {
-        let v1::RestoreRequest { id, snapshot } = request.into_inner();
+        let v1::RestoreRequest { id, snapshot, state_alone } = request.into_inner();
         let change = move |lease: &mut Lease| {
-            let snapshot = PlantSnapshot::from_bytes(&snapshot)?;
+            let mut snapshot = PlantSnapshot::from_bytes(&snapshot)?;
+            if state_alone {
+                snapshot.channels = None;
+            }
             Ok(lease.restore(snapshot)?)
         };
         let state = Some(self.put(&id, change).await?);

@@ -5,7 +5,8 @@
 
 use std::collections::HashMap;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
 use std::{fs, io};
 
 use anyhow::{Context as _, Result, bail};
@@ -15,7 +16,9 @@ use prost::Message as _;
 
 use crate::core::channels::noise::hash;
 use crate::core::connection::Connection;
+use crate::core::mutex::lock;
 use crate::core::plant::view::PlantSnapshot;
+use crate::core::session::life::Kept;
 use crate::core::session::shared::Session;
 use crate::core::tenant::Tenant;
 use crate::wire::message::run_info::run_info;
@@ -25,8 +28,11 @@ use crate::wire::plants::feedback::set_feedback;
 use crate::wire::plants::run::{protect, run};
 use crate::wire::record::folders::folders;
 use crate::wire::shared::hub::Hub;
-use crate::wire::shared::state_directory::{EXTENSION, Saved, StateDirectory};
+use crate::wire::shared::state_directory::{Changed, EXTENSION, StateDirectory};
 use crate::wire::status::RpcError;
+
+/// Plants that are written side by side.
+const WRITERS: usize = 16;
 
 impl StateDirectory {
     /// Makes the plants anew that the directory holds. What cannot be used is named in the log and
@@ -46,24 +52,25 @@ impl StateDirectory {
         paths.sort();
         for path in paths {
             let Some(id) = path.file_stem().and_then(|stem| stem.to_str()) else { continue };
-            let saved = match load(hub, id, &path).await {
+            match load(hub, id, &path).await {
                 Ok(session) => {
                     tracing::info!(plant = id, step = session.step_index(), "plant restored");
-                    Saved::Plant { model: Arc::clone(session.model()), hash: 0 }
+                    let model = Arc::clone(session.model());
+                    *session.kept() = Some(Kept { model, hash: 0 });
                 }
                 Err(error) => {
                     let error = format!("{error:#}");
                     tracing::error!(path = %path.display(), error, "plant not restored");
-                    Saved::Broken
+                    self.note_broken(id);
                 }
-            };
-            self.saved().insert(id.to_owned(), saved);
+            }
         }
         Ok(())
     }
 
     /// Saves all plants that have changed since they were saved.
     pub fn save(&self, hub: &Hub) {
+        let _saving = lock(&self.saving);
         Connection::server(Tenant::NONE).scope(|| self.save_all(hub));
     }
 
@@ -71,20 +78,42 @@ impl StateDirectory {
         let mut after = String::new();
         loop {
             let (sessions, has_more) = hub.page(&after, 100);
-            for session in &sessions {
-                if let Err(error) = self.save_plant(hub, session) {
-                    let error = format!("{error:#}");
-                    tracing::error!(plant = session.id(), error, "plant not saved");
-                }
-            }
-            match sessions.last() {
-                Some(last) if has_more => after = last.id().to_owned(),
-                _ => return,
+            let Some(last) = sessions.last() else { return };
+            after = last.id().to_owned();
+            self.save_changed(sessions.iter().filter_map(|each| self.changed(hub, each)).collect());
+            if !has_more {
+                return;
             }
         }
     }
 
-    fn save_plant(&self, hub: &Hub, session: &Session) -> Result<()> {
+    /// Writes plants side by side: each waits for the disk, which serves many as fast as one.
+    fn save_changed(&self, changed: Vec<Changed>) {
+        self.left.store(changed.len(), Ordering::Relaxed);
+        let write = |changed: Changed| {
+            let id = changed.session.id().to_owned();
+            if let Err(error) = self.write(changed) {
+                let error = format!("{error:#}");
+                tracing::error!(plant = id, error, "plant not saved");
+            }
+            self.answers.fetch_add(1, Ordering::Relaxed);
+            self.left.fetch_sub(1, Ordering::Relaxed);
+        };
+        let writers = changed.len().min(WRITERS);
+        let queue = Mutex::new(changed);
+        let next = || lock(&queue).pop();
+        if writers <= 1 {
+            return next().into_iter().for_each(write);
+        }
+        std::thread::scope(|scope| {
+            for _ in 0..writers {
+                scope.spawn(|| std::iter::from_fn(next).for_each(write));
+            }
+        });
+    }
+
+    /// What is to be written of a plant; nothing if it is as it was saved.
+    fn changed(&self, hub: &Hub, session: &Arc<Session>) -> Option<Changed> {
         let (mut record, model) = session.saved();
         if let Some(plant) = &mut record.plant {
             let mut run = run_info(session);
@@ -93,19 +122,13 @@ impl StateDirectory {
             }
             plant.run = Some(run);
         }
-        let bytes = record.encode_to_vec();
-        let hash = hash(&bytes);
-        // Whoever deletes the plant waits here, and removes what is written.
-        let mut saved = self.saved();
-        match saved.get(session.id()) {
-            Some(Saved::Broken) => bail!("its file is that of another plant, which is broken"),
-            Some(Saved::Plant { model: before, hash: of_before })
-                if Arc::ptr_eq(before, &model) && *of_before == hash =>
-            {
-                return Ok(());
-            }
-            _ if session.is_closed() => return Ok(()),
-            _ => {}
+        let hash = hash(&record.encode_to_vec());
+        let is_kept =
+            session.kept().as_ref().is_some_and(|Kept { model: before, hash: of_before }| {
+                Arc::ptr_eq(before, &model) && *of_before == hash
+            });
+        if is_kept {
+            return None;
         }
         let name = session.model_name();
         let entry = hub.catalog.get(name).ok();
@@ -118,9 +141,8 @@ impl StateDirectory {
         record.model = Some(message(&model));
         let start = session.model();
         record.start_model = (start.digest() != model.digest()).then(|| message(start));
-        self.write(session, record.encode_to_vec())?;
-        saved.insert(session.id().to_owned(), Saved::Plant { model, hash });
-        Ok(())
+        let (session, bytes) = (Arc::clone(session), record.encode_to_vec());
+        Some(Changed { session, kept: Kept { model, hash }, bytes })
     }
 }
 
@@ -129,7 +151,7 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     let record = decode(&fs::read(path)?)?;
     let v1::PlantRecord { plant, model, start_model, start_settings, feedback, channels, .. } =
         record;
-    let snapshot = PlantSnapshot::from_bytes(&record.snapshot)?;
+    let mut snapshot = PlantSnapshot::from_bytes(&record.snapshot)?;
     let (info, model) = (plant.context("no plant in it")?, model.context("no model in it")?);
     if info.id != id {
         bail!("the plant in it is `{}`", info.id);
@@ -175,6 +197,7 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
         && let Err(fault) = session.set_channels(channels, &hub.limits)
     {
         warn("its channels are not restored", fault);
+        snapshot.channels = None;
     }
     resume_feedback(hub, &session, feedback, info.feedback).await;
     let v1::SafetyInfo { watchdogs, on_step_failure, frozen } = info.safety.unwrap_or_default();
@@ -183,6 +206,7 @@ async fn load(hub: &Arc<Hub>, id: &str, path: &Path) -> Result<Arc<Session>> {
     }
     if let Err(fault) = session.resume_faults(record.faults, record.fault_count, &hub.limits) {
         warn("its faults are not restored", fault);
+        snapshot.channels = None;
     }
     if let Err(error) = session.restore(snapshot) {
         hub.delete(id).await.map_err(sentence)?;

@@ -203,13 +203,12 @@ impl Hub {
                 links.close(session.id());
             }
             session.pause();
-            let mut plants = hub.plants();
-            plants.remove(session.id());
-            hub.metrics.set_plants(plants.len());
-            drop(plants);
             if let Some(state) = &hub.state {
                 state.remove(&session);
             }
+            let mut plants = hub.plants();
+            plants.remove(session.id());
+            hub.metrics.set_plants(plants.len());
         });
         end.await.map_err(|error| RpcError::internal(error.to_string()))
     }

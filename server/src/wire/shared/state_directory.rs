@@ -1,53 +1,78 @@
 //! The directory in which plants survive their server: its files, and what is known of them. Plants of a tenant lie
 //! in a folder of its own, `tenants/NAME`.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
-use std::io::{self, Write as _};
+use std::collections::BTreeSet;
+use std::fs::{self, File, TryLockError};
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-
-use anyhow::Result;
-use plantd_models::Model;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use crate::core::channels::noise::hash;
 use crate::core::modes::Mode;
+use crate::core::mutex::lock;
+use crate::core::session::life::Kept;
 use crate::core::session::shared::Session;
 use crate::core::tenant::Tenants;
 use crate::wire::message::run_info::run_info;
 use crate::wire::record::folders::folder_of;
+use anyhow::{Result, bail};
 
 pub(crate) const EXTENSION: &str = "plant";
+
+/// Locked by the server whose plants are in the directory; its process is named in it.
+const LOCK: &str = "lock";
 
 /// A directory in which plants survive their server.
 pub struct StateDirectory {
     pub(crate) path: PathBuf,
     pub(crate) mode: Mode,
     pub(crate) tenants: Arc<Tenants>,
-    pub(crate) saved: Mutex<BTreeMap<String, Saved>>,
+    /// Ids of plants whose files cannot be used, and stay as they are.
+    broken: Mutex<BTreeSet<String>>,
+    /// Held while plants are saved: what was looked at earlier is also written earlier.
+    pub(crate) saving: Mutex<()>,
+    /// How often the disk has answered.
+    pub(crate) answers: AtomicUsize,
+    /// Plants that are still to be written.
+    pub(crate) left: AtomicUsize,
     /// Ids of the plants that were not paused when the server began to pause them all.
     pub(crate) running: OnceLock<BTreeSet<String>>,
+    lock: File,
 }
 
-/// What is known of a file.
-pub(crate) enum Saved {
-    /// It holds a plant of this server.
-    Plant {
-        /// Model in force when it was written.
-        model: Arc<Model>,
-        /// Hash of everything else.
-        hash: u64,
-    },
-    /// It cannot be used and stays as it is.
-    Broken,
+/// A plant that has changed since it was saved.
+pub(crate) struct Changed {
+    pub(crate) session: Arc<Session>,
+    pub(crate) kept: Kept,
+    pub(crate) bytes: Vec<u8>,
 }
 
 impl StateDirectory {
-    /// The directory at a path, made if there is none; the mode is that of its files.
-    pub fn open(path: &Path, mode: Mode, tenants: Arc<Tenants>) -> io::Result<Self> {
+    /// The directory at a path, made if there is none; the mode is that of its files. Refuses one that another
+    /// server uses: each would overwrite the plants of the other.
+    pub fn open(path: &Path, mode: Mode, tenants: Arc<Tenants>) -> Result<Self> {
         mode.create_directory(path)?;
         let path = path.to_owned();
-        Ok(Self { path, mode, tenants, saved: Mutex::default(), running: OnceLock::new() })
+        let lock = take(&path.join(LOCK), mode)?;
+        Ok(Self {
+            path,
+            mode,
+            tenants,
+            broken: Mutex::default(),
+            saving: Mutex::default(),
+            answers: AtomicUsize::new(0),
+            left: AtomicUsize::new(0),
+            running: OnceLock::new(),
+            lock,
+        })
+    }
+
+    /// Leaves the directory to other servers.
+    pub fn release(&self) {
+        if let Err(error) = self.lock.unlock() {
+            tracing::error!(%error, "{} stays locked", self.path.join(LOCK).display());
+        }
     }
 
     /// Notes which plants are not paused: they go on with the next server.
@@ -57,7 +82,23 @@ impl StateDirectory {
         let _ = self.running.set(ids.collect());
     }
 
-    pub(crate) fn write(&self, session: &Session, mut bytes: Vec<u8>) -> Result<()> {
+    /// Writes a plant, unless it was deleted meanwhile.
+    pub(crate) fn write(&self, changed: Changed) -> Result<()> {
+        let Changed { session, kept, bytes } = changed;
+        // Whoever deletes the plant waits here, and removes what is written.
+        let mut file = session.kept();
+        if session.is_closed() {
+            return Ok(());
+        }
+        if lock(&self.broken).contains(session.id()) {
+            bail!("its file is that of another plant, which is broken");
+        }
+        self.write_file(&session, bytes)?;
+        *file = Some(kept);
+        Ok(())
+    }
+
+    fn write_file(&self, session: &Session, mut bytes: Vec<u8>) -> Result<()> {
         bytes.extend(hash(&bytes).to_le_bytes());
         let folder = folder_of(&self.path, &self.tenants, session.owner());
         self.mode.create_directory(&folder)?;
@@ -70,16 +111,18 @@ impl StateDirectory {
         Ok(fs::rename(aside, path)?)
     }
 
-    /// Forgets a plant that was deleted.
+    /// Forgets a plant that was deleted, while its id is still taken.
     pub fn remove(&self, session: &Session) {
-        let id = session.id();
-        let mut saved = self.saved();
-        if let Some(Saved::Plant { .. }) = saved.get(id) {
-            saved.remove(id);
-            if let Err(error) = fs::remove_file(self.file(session)) {
-                tracing::error!(plant = id, %error, "saved plant not removed");
-            }
+        if session.kept().take().is_some()
+            && let Err(error) = fs::remove_file(self.file(session))
+        {
+            tracing::error!(plant = session.id(), %error, "saved plant not removed");
         }
+    }
+
+    /// Notes a file that cannot be used.
+    pub(crate) fn note_broken(&self, id: &str) {
+        lock(&self.broken).insert(id.to_owned());
     }
 
     fn file(&self, session: &Session) -> PathBuf {
@@ -87,7 +130,28 @@ impl StateDirectory {
         folder.join(session.id()).with_extension(EXTENSION)
     }
 
-    pub(crate) fn saved(&self) -> MutexGuard<'_, BTreeMap<String, Saved>> {
-        self.saved.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Plants that are still to be written, and how often the disk has answered.
+    pub fn progress(&self) -> (usize, usize) {
+        (self.left.load(Ordering::Relaxed), self.answers.load(Ordering::Relaxed))
     }
+}
+
+/// Locks a file, as long as the process lives, and names the process in it.
+fn take(path: &Path, mode: Mode) -> Result<File> {
+    let mut file = mode.open_or_create(path)?;
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => {
+            let holder = fs::read_to_string(path).unwrap_or_default();
+            bail!(
+                "another server (process {}) keeps its plants there, and each would overwrite those of the other: \
+                 name another state_directory",
+                holder.trim()
+            );
+        }
+        Err(TryLockError::Error(error)) => return Err(error.into()),
+    }
+    file.set_len(0)?;
+    writeln!(file, "{}", std::process::id())?;
+    Ok(file)
 }

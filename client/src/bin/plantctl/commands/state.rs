@@ -37,6 +37,9 @@ pub(crate) struct Restore {
     id: String,
     /// File.
     file: PathBuf,
+    /// The state alone: the plant's channels and faults, which may be others than the snapshot's, begin there.
+    #[arg(long)]
+    state_alone: bool,
 }
 
 impl Reset {
@@ -62,7 +65,8 @@ impl Restore {
         let client = context.connect().await?;
         let snapshot = std::fs::read(&self.file)
             .with_context(|| format!("cannot read {}", self.file.display()))?;
-        let state = client.restore(self.id, snapshot).await?;
+        let request = v1::RestoreRequest { id: self.id, snapshot, state_alone: self.state_alone };
+        let state = client.restore_by(request).await?;
         context.output.message("State", &state, || plant::state(&state))
     }
 }
