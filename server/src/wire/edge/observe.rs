@@ -17,6 +17,7 @@ use tower::{Layer, Service};
 use crate::core::connection::{Caller, Connection};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::metrics::registry::Metrics;
+use crate::core::tenant::Tenant;
 use crate::wire::edge::admission::{OpenCall, Peer, Place};
 use crate::wire::edge::auth::credential::{Over, Pass};
 use crate::wire::edge::auth::role;
@@ -111,7 +112,9 @@ where
             None => Connection::numbered(place.map_or(0, |place| place.id() + 1)).into(),
         };
         let unfinished = &self.layer.unfinished;
-        let response = self.inner.call(request.map(|body| unfinished.follow(call.method, body)));
+        let rate = pass.as_ref().map(|pass| pass.messages());
+        let follow = |body| unfinished.follow(call.method, body, rate);
+        let response = self.inner.call(request.map(follow));
         Box::pin(async move {
             let mut watch = pass.map(Watch::new);
             let answered = caller.clone().work(response);
@@ -159,7 +162,8 @@ impl Drop for Call {
     fn drop(&mut self) {
         // Without a status the client went away first.
         let code = self.code.unwrap_or(Code::Cancelled);
-        self.metrics.rpc_ended(self.method, code_name(code));
+        let tenant = self.pass.as_ref().map_or(Tenant::NONE, |pass| pass.principal().tenant);
+        self.metrics.rpc_ended(self.method, code_name(code), tenant);
         if let Some(pass) = &self.pass
             && role::changes(self.method)
         {
