@@ -57,8 +57,14 @@ impl StateDirectory {
         let _ = self.running.set(ids.collect());
     }
 
-    pub(crate) fn write(&self, session: &Session, mut bytes: Vec<u8>) -> Result<()> {
+    /// What a plant is written as: its bytes and their hash, by which damage is found.
+    pub fn sealed(mut bytes: Vec<u8>) -> Vec<u8> {
         bytes.extend(hash(&bytes).to_le_bytes());
+        bytes
+    }
+
+    pub(crate) fn write(&self, session: &Session, bytes: Vec<u8>) -> Result<()> {
+        let bytes = Self::sealed(bytes);
         let folder = folder_of(&self.path, &self.tenants, session.owner());
         self.mode.create_directory(&folder)?;
         let path = self.file(session);
