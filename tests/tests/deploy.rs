@@ -54,6 +54,7 @@ fn the_annotated_configuration_has_every_key() {
     assert!(config.unix.is_some() && config.scenes.is_some() && config.ready_file.is_some());
     assert!(config.link.root.is_some());
     assert!(config.state_directory.is_some() && config.recordings.is_some());
+    assert!(config.telemetry.otlp.is_some());
     let tls = config.tls.as_ref().expect("it has TLS");
     assert!(tls.client_ca.is_some() && tls.client != ClientCertificates::default());
     let auth = config.auth.as_ref().expect("it asks who calls");

@@ -16,7 +16,7 @@ Runs every check of the workspace.
 Usage: cargo verify [--quick] [--long] [--only STAGE[,STAGE...]] [--list]
 
   --quick    formatting, lints and tests only
-  --long     a minute for each target of the fuzzers
+  --long     a minute for each target of the fuzzers; the server with traces, too
   --only     these stages only
   --list     print the stages
 ";
@@ -33,6 +33,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "tests", quick: true, run: tests },
     Stage { name: "doctests", quick: false, run: doctests },
     Stage { name: "stress", quick: false, run: stress },
+    Stage { name: "traces", quick: false, run: traces },
     Stage { name: "fuzz", quick: false, run: fuzz },
     Stage { name: "wheel", quick: false, run: python::try_wheel },
     Stage { name: "python", quick: false, run: python::test_client },
@@ -169,6 +170,16 @@ fn doctests(context: &mut Context) -> Outcome {
 fn stress(context: &mut Context) -> Outcome {
     context.must_build()?;
     run(Command::new(context.binaries().join("stress")).current_dir(&context.root))
+}
+
+/// The server with the feature `otlp`, which is built for nothing else.
+fn traces(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    if !context.is_long {
+        return Err(Failure::Skipped("traces over OTLP: with --long".to_owned()));
+    }
+    let test = ["test", "--locked", "-p", "plantd-server", "--features", "otlp", "--test", "otlp"];
+    run(&mut context.cargo(&test))
 }
 
 /// Feeds all that reads what comes from strangers with nonsense, for a few seconds each.

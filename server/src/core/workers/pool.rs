@@ -17,6 +17,7 @@ use crate::core::limits::LimitExceeded;
 use crate::core::mutex::lock;
 use crate::core::priority::Priority;
 use crate::core::tenant::{Tenant, Tenants};
+use crate::core::workers::SPANS;
 use crate::core::workers::queue::{Admission, Baton, Lane, May, Queue, Ticket, Work};
 
 /// How long a job keeps its turn while others wait for one.
@@ -192,12 +193,14 @@ impl Workers {
         let work = {
             let (token, pool) = (token.clone(), Arc::clone(&self.pool));
             let caller = Caller::current();
+            let span = tracing::trace_span!(target: SPANS, "job", workers = self.pool.name);
             Box::new(move |id| {
                 let turn_began = Cell::new(Instant::now());
                 // Nobody may wait any more.
                 let abandoned = Abandoned { token, pool, id, turn_began };
                 let began_ms = thread_ms();
-                let outcome = caller.scope(|| job(&abandoned));
+                let outcome = span.in_scope(|| caller.scope(|| job(&abandoned)));
+                drop(span);
                 account.rates.worker_ms_per_s.spend(thread_ms() - began_ms);
                 let _ = sender.send(outcome);
             })

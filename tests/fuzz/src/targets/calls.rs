@@ -21,7 +21,7 @@ use crate::mutate::{Rng, mutated};
 use crate::targets::{BYTES_MAX, Target, seeds};
 
 /// Longest wait for an answer; what takes longer is cancelled by going away.
-const PATIENCE: Duration = Duration::from_millis(100);
+const PATIENCE: Duration = Duration::from_millis(20);
 /// Answers of a stream that are read.
 const ANSWERS_MAX: usize = 4;
 /// Inputs after which the plants of the fuzzer are made anew.
@@ -148,7 +148,7 @@ struct Calls {
 }
 
 impl Calls {
-    fn new(mutates: bool) -> Result<Box<dyn Target>> {
+    fn open(mutates: bool) -> Result<Box<dyn Target>> {
         let texts = seeds("scene", &["models/scenes", "models/scenes/elements"], "toml")?;
         let methods = methods()?;
         anyhow::ensure!((50..256).contains(&methods.len()), "{} methods", methods.len());
@@ -172,11 +172,11 @@ impl Calls {
 }
 
 pub(super) fn messages() -> Result<Box<dyn Target>> {
-    Calls::new(false)
+    Calls::open(false)
 }
 
 pub(super) fn bytes() -> Result<Box<dyn Target>> {
-    Calls::new(true)
+    Calls::open(true)
 }
 
 impl Target for Calls {

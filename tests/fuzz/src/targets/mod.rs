@@ -23,8 +23,11 @@ pub(crate) trait Target {
     fn run(&mut self, input: &[u8]);
 }
 
+/// Makes a target.
+type Open = fn() -> Result<Box<dyn Target>>;
+
 /// Names of all of them, with what makes them.
-pub(crate) const TARGETS: [(&str, fn() -> Result<Box<dyn Target>>); 10] = [
+pub(crate) const TARGETS: [(&str, Open); 10] = [
     ("scene", texts::scene),
     ("urdf", texts::urdf),
     ("mjcf", texts::mjcf),
