@@ -81,6 +81,8 @@ pub struct Config {
     pub drain_s: f64,
     /// Logging.
     pub log: LogConfig,
+    /// Traces.
+    pub telemetry: TelemetrySettings,
     /// TLS of gRPC over TCP; without it nothing is encrypted.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tls: Option<TlsSettings>,
@@ -122,6 +124,7 @@ impl Default for Config {
             shutdown_grace_s: 5.0,
             drain_s: 5.0,
             log: LogConfig::default(),
+            telemetry: TelemetrySettings::default(),
             tls: None,
             auth: None,
             tenants: BTreeMap::new(),
@@ -202,6 +205,15 @@ impl Default for LogConfig {
     fn default() -> Self {
         Self { filter: "info".to_owned(), format: LogFormat::Text }
     }
+}
+
+/// Where traces go.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TelemetrySettings {
+    /// Collector of OTLP over gRPC, `http://host:port`; none means no traces. Takes the feature `otlp`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub otlp: Option<String>,
 }
 
 /// Notation of log lines.

@@ -8,31 +8,52 @@ use anyhow::{Context as _, Result};
 use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
+use tracing_subscriber::Layer as _;
 use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
-use tracing_subscriber::{fmt, registry};
 
-use crate::config::{Config, LogConfig, LogFormat};
+use crate::config::{Config, LogFormat};
 use crate::core::modes::Mode;
 use crate::serve::{Addresses, Shutdown, run};
 
 /// Time for computations that nobody waits for any more to notice that the server has ended.
 const LEFTOVERS_MAX: Duration = Duration::from_secs(1);
 
-/// Sets up logging to standard error.
-pub fn start_log(config: &LogConfig) -> Result<()> {
-    let filter: Targets =
-        config.filter.parse().with_context(|| format!("log filter `{}`", config.filter))?;
-    let lines =
-        fmt::layer().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
-    let log = registry().with(filter);
-    match config.format {
-        LogFormat::Text => log.with(lines).init(),
-        LogFormat::Json => log.with(lines.json()).init(),
+/// Sets up logging to standard error, and traces. Within the runtime that sends them, until the result is dropped.
+fn start_log(config: &Config) -> Result<Option<Export>> {
+    let filter = &config.log.filter;
+    let filter: Targets = filter.parse().with_context(|| format!("log filter `{filter}`"))?;
+    let log = tracing_subscriber::fmt::layer()
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal());
+    let log = match config.log.format {
+        LogFormat::Text => log.boxed(),
+        LogFormat::Json => log.json().boxed(),
+    };
+    let log = tracing_subscriber::registry().with(log.with_filter(filter));
+    let Some(endpoint) = &config.telemetry.otlp else {
+        log.init();
+        return Ok(None);
+    };
+    #[cfg(feature = "otlp")]
+    {
+        let (traces, export) = crate::telemetry::layer(endpoint)?;
+        log.with(traces).init();
+        Ok(Some(export))
     }
-    Ok(())
+    #[cfg(not(feature = "otlp"))]
+    anyhow::bail!(
+        "`telemetry.otlp` is `{endpoint}`, but plantd was built without the feature `otlp`"
+    )
 }
+
+#[cfg(feature = "otlp")]
+use crate::telemetry::Export;
+
+/// Without the feature `otlp` there is none.
+#[cfg(not(feature = "otlp"))]
+enum Export {}
 
 /// Serves, on threads of its own, until SIGTERM or SIGINT, or until standard input ends where that is asked
 /// for. A second signal cuts short what open calls and balancers are given to end.
@@ -44,7 +65,10 @@ pub fn serve(config: Config, until_stdin_ends: bool) -> Result<()> {
         .enable_all()
         .build()
         .context("threads")?;
-    let outcome = runtime.block_on(serve_until_told(config, until_stdin_ends));
+    let outcome = {
+        let _export = runtime.block_on(async { start_log(&config) })?;
+        runtime.block_on(serve_until_told(config, until_stdin_ends))
+    };
     runtime.shutdown_timeout(LEFTOVERS_MAX);
     outcome
 }

@@ -22,5 +22,7 @@ pub mod listen;
 mod memory;
 mod scenes;
 pub mod serve;
+#[cfg(feature = "otlp")]
+mod telemetry;
 pub mod tls;
 pub mod wire;

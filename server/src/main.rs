@@ -35,7 +35,6 @@ fn serve(settings: Settings) -> Result<()> {
         print!("{}", config.to_toml()?);
         return Ok(());
     }
-    daemon::start_log(&config.log)?;
     daemon::serve(config, until_stdin_ends)
 }
 

@@ -6,6 +6,7 @@ use std::process::Command;
 use plantd_server::config::{Config, Listen, LogFormat};
 use plantd_server::core::limits::Limits;
 use plantd_server::core::metrics::registry::Metrics;
+use plantd_server::core::tenant::Tenant;
 use plantd_server::tls::ClientCertificates;
 
 fn root() -> PathBuf {
@@ -53,10 +54,16 @@ fn the_annotated_configuration_has_every_key() {
     assert!(config.unix.is_some() && config.scenes.is_some() && config.ready_file.is_some());
     assert!(config.link.root.is_some());
     assert!(config.state_directory.is_some() && config.recordings.is_some());
+    assert!(config.telemetry.otlp.is_some());
     let tls = config.tls.as_ref().expect("it has TLS");
     assert!(tls.client_ca.is_some() && tls.client != ClientCertificates::default());
     let auth = config.auth.as_ref().expect("it asks who calls");
-    assert!(auth.tokens.is_some() && !auth.certificates.is_empty() && auth.peers[0].name.is_some());
+    assert!(
+        auth.tokens.is_some()
+            && auth.rules.is_some()
+            && !auth.certificates.is_empty()
+            && auth.peers[0].name.is_some()
+    );
     config.check().expect("it is in range");
     let known: toml::Table = config.to_toml().expect("it is written").parse().expect("as TOML");
     let annotated: toml::Table = text.parse().expect("it is TOML");
@@ -102,7 +109,7 @@ fn the_list_of_metrics_is_complete() {
     let metrics = Metrics::default();
     // A family without members is not written.
     metrics.step_failed("NOT_CONVERGED");
-    metrics.rpc_ended("GetPlant", "OK");
+    metrics.rpc_ended("GetPlant", "OK", Tenant::NONE);
     let metrics = metrics.encode().expect("metrics are text");
     let list = read("deploy/prometheus.yml");
     let mut described: Vec<&str> =
@@ -110,16 +117,85 @@ fn the_list_of_metrics_is_complete() {
     let mut registered: Vec<String> = metrics
         .lines()
         .filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' '))
-        // Counters are exposed with the suffix `_total`.
-        .map(
-            |(name, kind)| {
-                if kind == "counter" { format!("{name}_total") } else { name.to_owned() }
-            },
-        )
+        // Counters are exposed with the suffix `_total`, what does not change with `_info`.
+        .map(|(name, kind)| match kind {
+            "counter" => format!("{name}_total"),
+            "info" => format!("{name}_info"),
+            _ => name.to_owned(),
+        })
         .collect();
     described.sort_unstable();
     registered.sort();
     assert_eq!(described, registered);
+}
+
+/// Runs promtool; none, and a message, if it is not installed.
+fn promtool(arguments: &[&str]) -> Option<(bool, String)> {
+    let program = std::env::var_os("PROMTOOL").unwrap_or_else(|| "promtool".into());
+    match Command::new(program).args(arguments).current_dir(root().join("deploy")).output() {
+        Ok(output) => {
+            let text = [output.stdout, output.stderr].concat();
+            Some((output.status.success(), String::from_utf8_lossy(&text).into_owned()))
+        }
+        Err(error) => {
+            eprintln!("skipped: promtool does not run: {error}");
+            None
+        }
+    }
+}
+
+#[test]
+fn alerts_are_raised_when_they_should_be() {
+    for arguments in [
+        ["check", "config", "--syntax-only", "prometheus.yml"].as_slice(),
+        &["check", "rules", "alerts.yml"],
+        &["test", "rules", "alerts.test.yml"],
+    ] {
+        let Some((correct, messages)) = promtool(arguments) else { return };
+        assert!(correct, "{messages}");
+    }
+    // No alert is without a test.
+    let tests = read("deploy/alerts.test.yml");
+    let alerts = read("deploy/alerts.yml");
+    let mut alerts = alerts.lines().filter_map(|line| line.trim().strip_prefix("- alert: "));
+    assert!(alerts.all(|alert| tests.contains(&format!("alertname: {alert}\n"))));
+}
+
+/// Queries of the dashboard's panels.
+fn queries(value: &serde_json::Value, found: &mut Vec<String>) {
+    match value {
+        serde_json::Value::Object(fields) => {
+            if let Some(query) = fields.get("expr").and_then(|query| query.as_str()) {
+                found.push(query.to_owned());
+            }
+            fields.values().for_each(|value| queries(value, found));
+        }
+        serde_json::Value::Array(values) => values.iter().for_each(|value| queries(value, found)),
+        _ => {}
+    }
+}
+
+#[test]
+fn the_queries_of_the_dashboard_are_correct() {
+    let dashboard = serde_json::from_str(&read("deploy/grafana.json")).expect("it is JSON");
+    let mut found = Vec::new();
+    queries(&dashboard, &mut found);
+    assert!(found.len() > 20, "{found:?}");
+    // What Grafana fills in.
+    let filled = found.iter().map(|query| query.replace("$__rate_interval", "1m"));
+    let rules: Vec<_> = filled
+        .map(|query| serde_json::json!({ "record": "a", "expr": query.replace("$instance", ".*") }))
+        .collect();
+    let rules = serde_json::json!({ "groups": [{ "name": "dashboard", "rules": rules }] });
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("rules.yml");
+    // JSON is YAML, too.
+    std::fs::write(&path, rules.to_string()).expect("it is written");
+    let path = path.to_str().expect("a path of text");
+    let Some((correct, messages)) = promtool(&["check", "rules", "--lint=none", path]) else {
+        return;
+    };
+    assert!(correct, "{messages}");
 }
 
 /// Priorities that the documents recommend, and those that the unit grants.

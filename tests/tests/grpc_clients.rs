@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 
 use plantd_models::Plant;
 use plantd_tests::links::new_plant;
-use plantd_tests::server::ServerProcess;
+use plantd_tests::server::{ServerProcess, binary};
 
 const STEPS: usize = 100;
 
@@ -31,8 +31,11 @@ fn folder(name: &str) -> PathBuf {
 
 /// Runs an example, which takes the server's address and a number of steps.
 fn assert_same_motion(program: &mut Command) {
-    let server = ServerProcess::start().unwrap();
-    let address = server.address().trim_start_matches("http://");
+    assert_same_motion_of(&ServerProcess::start().unwrap(), program);
+}
+
+fn assert_same_motion_of(server: &ServerProcess, program: &mut Command) {
+    let (_, address) = server.address().split_once("://").unwrap();
     let text = run(program.arg(address).arg(STEPS.to_string()));
     let mut plant = new_plant("pendulum").unwrap();
     let step = |plant: &mut Plant| {
@@ -85,5 +88,26 @@ fn cpp() {
     configure.arg("-S").arg(folder("client/c/grpc")).arg("-B").arg(directory.path());
     run(&mut configure);
     run(Command::new("cmake").arg("--build").arg(directory.path()).args(["--parallel", "2"]));
-    assert_same_motion(&mut Command::new(directory.path().join("pendulum")));
+    let program = directory.path().join("pendulum");
+    assert_same_motion(&mut Command::new(&program));
+
+    // The same with TLS and a token.
+    let own = rcgen::generate_simple_self_signed(vec!["127.0.0.1".to_owned()]).unwrap();
+    let path = |name: &str| directory.path().join(name);
+    std::fs::write(path("own.pem"), own.cert.pem()).unwrap();
+    std::fs::write(path("own.key"), own.signing_key.serialize_pem()).unwrap();
+    let mut make = Command::new(binary("plantctl").unwrap());
+    make.args(["token", "new", "anna", "--role", "driver", "--file"]).arg(path("tokens.toml"));
+    let token = run(&mut make).trim().to_owned();
+    let configuration = format!(
+        "[tls]\ncertificate = \"{0}/own.pem\"\nkey = \"{0}/own.key\"\n[auth]\ntokens = \"{0}/tokens.toml\"\n",
+        directory.path().display()
+    );
+    std::fs::write(path("plantd.toml"), configuration).unwrap();
+    let server = ServerProcess::start_with(|command| {
+        command.arg("--config").arg(path("plantd.toml"));
+    });
+    let mut program = Command::new(program);
+    program.env("PLANTD_CA", path("own.pem")).env("PLANTD_TOKEN", token);
+    assert_same_motion_of(&server.unwrap(), &mut program);
 }

@@ -1,6 +1,10 @@
 // Holds a pendulum where it hangs, over gRPC: pendulum [HOST:PORT [STEPS]]
+// PLANTD_CA, a file, is for servers with TLS; PLANTD_TOKEN, and the files PLANTD_CERT and PLANTD_KEY say who calls.
 #include <cstdio>
 #include <cstdlib>
+#include <fstream>
+#include <iterator>
+#include <memory>
 #include <stdexcept>
 #include <string>
 
@@ -14,11 +18,34 @@ static void check(const grpc::Status &status) {
     if (!status.ok()) throw std::runtime_error(status.error_message());
 }
 
+// What is in the file that a variable of the environment names; nothing without one.
+static std::string content(const char *variable) {
+    const char *path = std::getenv(variable);
+    if (!path) return {};
+    std::ifstream file(path, std::ios::binary);
+    if (!file) throw std::runtime_error(std::string(variable) + ": cannot read " + path);
+    return {std::istreambuf_iterator<char>(file), {}};
+}
+
+static std::shared_ptr<grpc::ChannelCredentials> credentials() {
+    const char *token = std::getenv("PLANTD_TOKEN");
+    if (!std::getenv("PLANTD_CA")) {
+        if (token) throw std::runtime_error("a token is for TLS: give PLANTD_CA");
+        return grpc::InsecureChannelCredentials();
+    }
+    grpc::SslCredentialsOptions options;
+    options.pem_root_certs = content("PLANTD_CA");
+    options.pem_cert_chain = content("PLANTD_CERT");
+    options.pem_private_key = content("PLANTD_KEY");
+    auto tls = grpc::SslCredentials(options);
+    return token ? grpc::CompositeChannelCredentials(tls, grpc::AccessTokenCredentials(token)) : tls;
+}
+
 int main(int argc, char **argv) try {
     const std::string address = argc > 1 ? argv[1] : "127.0.0.1:50051";
     const long steps = argc > 2 ? std::atol(argv[2]) : 100;
     auto plants = v1::PlantService::NewStub(
-        grpc::CreateChannel(address, grpc::InsecureChannelCredentials()));
+        grpc::CreateChannel(address, credentials()));
 
     grpc::ClientContext create;
     v1::CreatePlantRequest request;

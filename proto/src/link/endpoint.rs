@@ -136,6 +136,21 @@ impl Endpoint {
         parts: &[&[f64]],
         peer_poll_end_ns: u64,
     ) -> Result<(), DomainError> {
+        header.pid = self.own.pid;
+        header.process_start = self.own.start;
+        header.poll_ns = self.poll_ns;
+        header.stamp_ns = monotonic_ns();
+        self.poll_end_ns = header.poll_end_ns();
+        self.send_as_it_is(header, parts, peer_poll_end_ns)
+    }
+
+    /// Sends a header as it is, as a program does that does not keep to the protocol.
+    pub fn send_as_it_is(
+        &mut self,
+        header: Header,
+        parts: &[&[f64]],
+        peer_poll_end_ns: u64,
+    ) -> Result<(), DomainError> {
         let len = parts.iter().map(|part| part.len()).sum();
         let mut sample = match self.spare.take() {
             Some(sample) if sample.payload().len() == len => sample,
@@ -151,11 +166,6 @@ impl Endpoint {
             head.copy_from_slice(part);
             rest = tail;
         }
-        header.pid = self.own.pid;
-        header.process_start = self.own.start;
-        header.poll_ns = self.poll_ns;
-        header.stamp_ns = monotonic_ns();
-        self.poll_end_ns = header.poll_end_ns();
         *sample.user_header_mut() = header;
         sample.send().map_err(transport("sending"))?;
         // The message must be visible before the clock is read: a receiver that has missed it has

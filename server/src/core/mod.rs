@@ -18,6 +18,7 @@ pub mod origin;
 pub mod plant;
 pub mod priority;
 pub mod publish;
+pub mod rate;
 pub mod realtime;
 pub mod room;
 pub mod session;

@@ -3,6 +3,7 @@
 //! Where nobody is asked who they are there is one tenant only, [`Tenant::NONE`], and nobody is kept from anything.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
 
 use serde::{Deserialize, Serialize};
@@ -10,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::core::connection::Connection;
 use crate::core::limits::LimitExceeded;
 use crate::core::mutex::lock;
+use crate::core::rate::Rate;
 use crate::core::room::{Reservation, Room};
 
 /// Stands in the configuration for every tenant that is not named.
@@ -25,17 +27,21 @@ impl Tenant {
 }
 
 macro_rules! tenant_limits {
-    ($($(#[doc = $doc:literal])+ $name:ident: $what:literal;)+) => {
+    (
+        rooms { $($(#[doc = $doc:literal])+ $name:ident: $what:literal;)+ }
+        rates { $($(#[doc = $rate_doc:literal])+ $rate:ident: $rate_what:literal;)+ }
+    ) => {
         /// What a tenant may use at a time, besides the limits of the server, which hold for all together.
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
         #[serde(default, deny_unknown_fields)]
         pub struct TenantLimits {
             $($(#[doc = $doc])+ #[serde(skip_serializing_if = "Option::is_none")] pub $name: Option<u64>,)+
+            $($(#[doc = $rate_doc])+ #[serde(skip_serializing_if = "Option::is_none")] pub $rate: Option<u64>,)+
         }
 
         impl TenantLimits {
             /// Names of all of them.
-            pub const NAMES: &[&str] = &[$(stringify!($name)),+];
+            pub const NAMES: &[&str] = &[$(stringify!($name),)+ $(stringify!($rate)),+];
         }
 
         /// What is left to a tenant.
@@ -55,30 +61,58 @@ macro_rules! tenant_limits {
                 }
             }
         }
+
+        /// How much a tenant may have in a second.
+        #[derive(Debug)]
+        pub struct Rates {
+            $($(#[doc = $rate_doc])+ pub $rate: Arc<Rate>,)+
+        }
+
+        impl Rates {
+            fn new(limits: &TenantLimits) -> Self {
+                Self {
+                    $($rate: Rate::new(
+                        concat!("tenant.", stringify!($rate)),
+                        $rate_what,
+                        limits.$rate,
+                    ),)+
+                }
+            }
+        }
     };
 }
 
 tenant_limits! {
-    /// Plants.
-    plants: "plants of this tenant";
-    /// Plants that run by themselves.
-    running_plants: "plants of this tenant that run by themselves";
-    /// Uploaded models.
-    models: "uploaded models of this tenant";
-    /// Open streams and calls.
-    streams: "open streams and calls of this tenant";
-    /// Open Watch, WatchGains and WatchEvents streams.
-    watchers: "watchers of this tenant";
-    /// Numbers held in the queues of its watchers (8 bytes each).
-    watch_numbers: "numbers in the queues of this tenant's watchers";
-    /// Numbers held by the feedbacks of its plants (8 bytes each).
-    feedback_numbers: "numbers in the feedbacks of this tenant's plants";
-    /// Trajectory regulators, filters and optimisations.
-    trajectory_solves: "regulators, filters and optimisations of this tenant";
-    /// Recordings in progress.
-    active_recordings: "recordings of this tenant in progress";
-    /// Bytes of all its recordings.
-    recording_bytes: "bytes of this tenant's recordings";
+    rooms {
+        /// Plants.
+        plants: "plants of this tenant";
+        /// Plants that run by themselves.
+        running_plants: "plants of this tenant that run by themselves";
+        /// Uploaded models.
+        models: "uploaded models of this tenant";
+        /// Open streams and calls.
+        streams: "open streams and calls of this tenant";
+        /// Open Watch, WatchGains and WatchEvents streams.
+        watchers: "watchers of this tenant";
+        /// Numbers held in the queues of its watchers (8 bytes each).
+        watch_numbers: "numbers in the queues of this tenant's watchers";
+        /// Numbers held by the feedbacks of its plants (8 bytes each).
+        feedback_numbers: "numbers in the feedbacks of this tenant's plants";
+        /// Trajectory regulators, filters and optimisations.
+        trajectory_solves: "regulators, filters and optimisations of this tenant";
+        /// Recordings in progress.
+        active_recordings: "recordings of this tenant in progress";
+        /// Bytes of all its recordings.
+        recording_bytes: "bytes of this tenant's recordings";
+        /// Numbers in the matrices of its regulators, filters and optimisations (8 bytes each).
+        trajectory_numbers: "numbers in the matrices of this tenant's regulators, filters and optimisations";
+    }
+    rates {
+        /// Messages to the server in a second, over all of its connections.
+        messages_per_s: "messages in a second";
+        /// Milliseconds of processor time of workers in a second.
+        worker_ms_per_s: "milliseconds of workers in a second";
+    }
 }
 
 /// What the configuration says of a tenant.
@@ -100,6 +134,31 @@ pub struct Account {
     pub limits: TenantLimits,
     /// What is left of it.
     pub rooms: Rooms,
+    /// What it may have in a second.
+    pub rates: Rates,
+    /// What has happened.
+    pub counts: TenantCounts,
+}
+
+/// What is counted of a tenant.
+#[derive(Debug, Default)]
+pub struct TenantCounts {
+    /// Calls that ended, by the name of their code.
+    calls: Mutex<BTreeMap<&'static str, u64>>,
+    /// Steps of its plants that ended after the next one was due.
+    pub overruns: Arc<AtomicU64>,
+}
+
+impl TenantCounts {
+    /// A call ended.
+    pub fn call_ended(&self, code: &'static str) {
+        *lock(&self.calls).entry(code).or_default() += 1;
+    }
+
+    /// Calls that ended, by the name of their code.
+    pub fn calls(&self) -> BTreeMap<&'static str, u64> {
+        lock(&self.calls).clone()
+    }
 }
 
 /// All tenants that have been heard of since the start.
@@ -145,7 +204,14 @@ impl Tenants {
         ] {
             *room = room.part_of(whole);
         }
-        Arc::new(Account { tenant, name: name.to_owned(), limits, rooms })
+        Arc::new(Account {
+            tenant,
+            name: name.to_owned(),
+            rates: Rates::new(&limits),
+            limits,
+            rooms,
+            counts: TenantCounts::default(),
+        })
     }
 
     /// The tenant of that name, which is in the configuration, in a file of tokens or the name of a folder.
@@ -165,6 +231,11 @@ impl Tenants {
     pub fn account(&self, tenant: Tenant) -> Arc<Account> {
         let accounts = lock(&self.accounts);
         Arc::clone(accounts.get(tenant.0 as usize).unwrap_or(&accounts[0]))
+    }
+
+    /// All that have been heard of, without [`Tenant::NONE`].
+    pub fn accounts(&self) -> Vec<Arc<Account>> {
+        lock(&self.accounts)[1..].to_vec()
     }
 
     /// What is known of the tenant for which the present task works.

@@ -2,6 +2,7 @@
 //! real processes, tokens and certificates.
 
 mod identities;
+mod metrics;
 mod support;
 mod tenants;
 mod transport;

@@ -1,6 +1,8 @@
 //! What the drills share: an authority that issues certificates, servers with people, their clients.
 
 use std::fmt::Debug;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;
@@ -187,4 +189,15 @@ pub(crate) async fn until_log_says(server: &ServerProcess, words: &str, count: u
 pub(crate) fn watch_request(id: &str) -> v1::WatchRequest {
     let fields = vec![v1::WatchField::State.into()];
     v1::WatchRequest { id: id.to_owned(), fields, ..Default::default() }
+}
+
+/// What a server answers at the port of gRPC to a browser with these header lines.
+pub(crate) fn get(server: &ServerProcess, path: &str, fields: &str) -> String {
+    let host = server.address().strip_prefix("http://").unwrap();
+    let mut stream = TcpStream::connect(host).unwrap();
+    let head = format!("GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n{fields}\r\n");
+    stream.write_all(head.as_bytes()).unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    String::from_utf8_lossy(&answer).into_owned()
 }

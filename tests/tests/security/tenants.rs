@@ -286,3 +286,61 @@ async fn one_tenants_excess_costs_another_nothing() {
     );
     excess.shutdown().await;
 }
+
+/// Of messages and of time of workers in a second.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_comes_by_the_second_is_bounded_too() {
+    let limits = "[tenants.red.limits]\nmessages_per_s = 30\n\
+                  [tenants.blue.limits]\nworker_ms_per_s = 0\n\
+                  [tenants.office.limits]\ntrajectory_numbers = 10\n";
+    let two = Two::new(limits);
+    let (_server, [red, blue, root]) = two.start().await;
+    let excess = async |client: &Client| {
+        loop {
+            if let Err(error) = client.get_plant("red-1").await
+                && error.code() != Some(Code::NotFound)
+            {
+                break error;
+            }
+        }
+    };
+    assert_used_up(Err::<(), _>(soon(excess(&red)).await), "messages_per_s");
+    // The next second has its own.
+    let created = async || {
+        let request = || v1::CreatePlantRequest {
+            id: "red-1".to_owned(),
+            model: "pendulum".to_owned(),
+            ..Default::default()
+        };
+        while red.create_plant(request()).await.is_err() {
+            tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+        }
+    };
+    soon(created()).await;
+    // A stream that sends too much ends.
+    let driven = async || {
+        let mut driver = loop {
+            match red.drive("red-1").await {
+                Ok(driver) => break driver,
+                Err(_) => tokio::time::sleep(std::time::Duration::from_millis(50)).await,
+            }
+        };
+        loop {
+            if let Err(error) = driver.step(&[0.0]).await {
+                break error;
+            }
+        }
+    };
+    assert_used_up(Err::<(), _>(soon(driven()).await), "messages_per_s");
+
+    assert_used_up(blue.get_model("pendulum").await, "worker_ms_per_s");
+    let u = v1::Matrix { rows: 5, cols: 1, data: vec![0.0; 5] };
+    let trajectory = v1::Trajectory { u: Some(u), ..Default::default() };
+    let request = v1::SolveTrajectoryLqrRequest {
+        model: "pendulum".to_owned(),
+        trajectory: Some(trajectory),
+        ..Default::default()
+    };
+    let refused = root.solve_trajectory_lqr(request).await.map(drop);
+    assert_used_up(refused, "trajectory_numbers");
+}

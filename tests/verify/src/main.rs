@@ -13,9 +13,10 @@ use stage::{Failure, Outcome, Stage, run};
 const USAGE: &str = "\
 Runs every check of the workspace.
 
-Usage: cargo verify [--quick] [--only STAGE[,STAGE...]] [--list]
+Usage: cargo verify [--quick] [--long] [--only STAGE[,STAGE...]] [--list]
 
   --quick    formatting, lints and tests only
+  --long     a minute for each target of the fuzzers; the server with traces, too
   --only     these stages only
   --list     print the stages
 ";
@@ -25,12 +26,15 @@ const STAGES: &[Stage] = &[
     Stage { name: "format", quick: true, run: format },
     Stage { name: "tools", quick: false, run: tools::install_missing },
     Stage { name: "proto-lint", quick: false, run: python::lint_proto },
+    Stage { name: "deny", quick: false, run: python::check_dependencies },
     Stage { name: "clippy", quick: true, run: clippy },
     Stage { name: "docs", quick: false, run: docs },
     Stage { name: "build", quick: true, run: build },
     Stage { name: "tests", quick: true, run: tests },
     Stage { name: "doctests", quick: false, run: doctests },
     Stage { name: "stress", quick: false, run: stress },
+    Stage { name: "traces", quick: false, run: traces },
+    Stage { name: "fuzz", quick: false, run: fuzz },
     Stage { name: "wheel", quick: false, run: python::try_wheel },
     Stage { name: "python", quick: false, run: python::test_client },
     Stage { name: "book", quick: false, run: python::make_book },
@@ -45,6 +49,8 @@ struct Context {
     root: PathBuf,
     /// Cargo's target folder.
     target: PathBuf,
+    /// Whether what gets better with time gets more of it.
+    is_long: bool,
     /// Whether an earlier stage found that the workspace does not build.
     broken: bool,
     /// Whether an earlier stage has built it.
@@ -65,8 +71,8 @@ impl Context {
 }
 
 fn main() -> ExitCode {
-    let stages = match selection(std::env::args().skip(1)) {
-        Ok(Some(stages)) => stages,
+    let (stages, is_long) = match selection(std::env::args().skip(1)) {
+        Ok(Some(selected)) => selected,
         Ok(None) => return ExitCode::SUCCESS,
         Err(message) => {
             eprintln!("{message}\n\n{USAGE}");
@@ -77,18 +83,20 @@ fn main() -> ExitCode {
     let root = root.canonicalize().unwrap_or(root);
     let target = std::env::var_os("CARGO_TARGET_DIR")
         .map_or_else(|| root.join("target"), |dir| root.join(dir));
-    let mut context = Context { root, target, broken: false, is_built: false };
+    let mut context = Context { root, target, is_long, broken: false, is_built: false };
     if stage::run_all(&stages, &mut context) { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// The stages that the command line asks for; none if it only asks for help.
+/// The stages that the command line asks for, and whether for long ones; none if it only asks for help.
 fn selection(
     mut arguments: impl Iterator<Item = String>,
-) -> Result<Option<Vec<&'static Stage>>, String> {
+) -> Result<Option<(Vec<&'static Stage>, bool)>, String> {
     let mut stages: Vec<&Stage> = STAGES.iter().collect();
+    let mut is_long = false;
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
             "--quick" => stages.retain(|stage| stage.quick),
+            "--long" => is_long = true,
             "--only" => {
                 let names = arguments.next().ok_or("--only needs a list of stages")?;
                 let names: Vec<&str> = names.split(',').collect();
@@ -108,7 +116,7 @@ fn selection(
             other => return Err(format!("unknown argument `{other}`")),
         }
     }
-    Ok(Some(stages))
+    Ok(Some((stages, is_long)))
 }
 
 fn format(context: &mut Context) -> Outcome {
@@ -147,6 +155,9 @@ fn tests(context: &mut Context) -> Outcome {
         command.args(["--lib", "--bins", "--tests", "--examples"]);
         command
     };
+    if let Some(promtool) = tools::promtool(context) {
+        command.env("PROMTOOL", promtool);
+    }
     run(command.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 
@@ -159,6 +170,25 @@ fn doctests(context: &mut Context) -> Outcome {
 fn stress(context: &mut Context) -> Outcome {
     context.must_build()?;
     run(Command::new(context.binaries().join("stress")).current_dir(&context.root))
+}
+
+/// The server with the feature `otlp`, which is built for nothing else.
+fn traces(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    if !context.is_long {
+        return Err(Failure::Skipped("traces over OTLP: with --long".to_owned()));
+    }
+    let test = ["test", "--locked", "-p", "plantd-server", "--features", "otlp", "--test", "otlp"];
+    run(&mut context.cargo(&test))
+}
+
+/// Feeds all that reads what comes from strangers with nonsense, for a few seconds each.
+fn fuzz(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    let seconds = if context.is_long { "60" } else { "3" };
+    let mut command = Command::new(context.binaries().join("plantd-fuzz"));
+    command.args(["--seconds", seconds]).arg("--failures").arg(context.target.join("fuzz"));
+    run(command.current_dir(&context.root))
 }
 
 /// Shows the demo, which compares its numbers with the paper's.

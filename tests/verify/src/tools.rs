@@ -1,5 +1,6 @@
 //! Tools beyond Rust that some checks use.
 
+use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
 use crate::Context;
@@ -50,7 +51,7 @@ pub(crate) fn has(program: &str, arguments: &[&str]) -> bool {
 }
 
 /// Installs what is missing if it may; what stays missing is told, and its tests skip themselves.
-pub(crate) fn install_missing(_context: &mut Context) -> Outcome {
+pub(crate) fn install_missing(context: &mut Context) -> Outcome {
     let missing = || TOOLS.iter().filter(|tool| !has(tool.probe.0, tool.probe.1));
     if missing().next().is_some() && rustix::process::getuid().is_root() && has("apt-get", &["-v"])
     {
@@ -64,10 +65,27 @@ pub(crate) fn install_missing(_context: &mut Context) -> Outcome {
             println!("apt-get could not install {}", packages.join(", "));
         }
     }
-    let absent: Vec<String> = missing()
+    let mut absent: Vec<String> = missing()
         .map(|tool| format!("no {} (package {}): {}", tool.probe.0, tool.package, tool.purpose))
         .collect();
+    if promtool(context).is_none() && unpack_promtool(context).is_err() {
+        absent.push("no promtool (package prometheus): dashboard and alert rules".to_owned());
+    }
     if absent.is_empty() { Ok(()) } else { Err(Failure::Skipped(absent.join("; "))) }
+}
+
+/// Where the checker of alert rules is, if it is there.
+pub(crate) fn promtool(context: &Context) -> Option<PathBuf> {
+    let works = |path: &PathBuf| path.to_str().is_some_and(|path| has(path, &["--version"]));
+    let unpacked = context.scratch().join("prometheus/usr/bin/promtool");
+    [PathBuf::from("promtool"), unpacked].into_iter().find(works)
+}
+
+/// Unpacks it from Debian's package: to install that would start a Prometheus.
+fn unpack_promtool(context: &Context) -> Outcome {
+    let folder = context.scratch().join("prometheus");
+    let script = "mkdir -p $0 && cd $0 && apt-get -qq download prometheus && dpkg -x *.deb .";
+    run(Command::new("sh").args(["-c", script]).arg(folder))
 }
 
 fn apt_get(verb: &[&str], packages: &[&str]) -> Outcome {

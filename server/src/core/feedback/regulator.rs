@@ -189,9 +189,9 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// Refuses a trajectory whose matrices would need too much memory: A, B, the gain, the tangent
+    /// The numbers that a trajectory's matrices need; refuses too many: A, B, the gain, the tangent
     /// space twice, weights, what pulls them back and what it makes of them, and value functions.
-    pub fn check(self, limits: &Limits, model: &Model) -> Result<(), RegulatorError> {
+    pub fn check(self, limits: &Limits, model: &Model) -> Result<usize, RegulatorError> {
         let d = model.dimensions();
         let (nx, nu) = (d.state(), d.input());
         let tangents = if d.constraints > 0 { 2 * nx * nx } else { 0 };
@@ -204,7 +204,8 @@ impl Memory {
         let (name, limit) = ("trajectory_numbers", limits.trajectory_numbers);
         let (what, numbers) =
             ("numbers in the trajectory's matrices", numbers.saturating_add(weights));
-        Ok(LimitExceeded::check(name, limit, what, numbers)?)
+        LimitExceeded::check(name, limit, what, numbers)?;
+        Ok(numbers)
     }
 }
 

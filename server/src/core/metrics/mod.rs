@@ -2,4 +2,6 @@
 
 pub mod counts;
 pub mod histogram;
+pub mod process;
 pub mod registry;
+pub mod tenants;

@@ -19,6 +19,12 @@
 //! | `plantd_loop_steps_total`, `_overruns_total`, `_slips_total` | counters | |
 //! | `plantd_loop_late_inputs_total`, `_safe_inputs_total` | counters | |
 //! | `plantd_rpcs_total` | counter of finished calls | `method`, `code` |
+//! | `plantd_tenant_plants`, `_running_plants`, `_streams` | gauges | `tenant` |
+//! | `plantd_tenant_overruns_total` | counter | `tenant` |
+//! | `plantd_tenant_rpcs_total` | counter of finished calls | `tenant`, `code` |
+//! | `plantd_build_info` | 1 | `version`, `arch`, `profile` |
+//! | `process_cpu_seconds_total` | counter | |
+//! | `process_resident_memory_bytes`, `process_open_fds`, `process_max_fds`, `process_start_time_seconds` | gauges | |
 //!
 //! No plant's id is ever a label: the number of time series is bounded.
 
@@ -34,10 +40,14 @@ use prometheus_client::metrics::counter::{ConstCounter, Counter};
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
+use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
 use crate::core::driver::DriverKind;
 use crate::core::metrics::counts::TimingCounts;
+use crate::core::metrics::process::Process;
+use crate::core::metrics::tenants::TenantCounters;
+use crate::core::tenant::{Tenant, Tenants};
 
 /// Shortest step that the histogram tells apart, s, and its number of buckets, each twice as wide:
 /// up to half a second.
@@ -69,6 +79,7 @@ struct DriverMetrics {
 /// Everything that the server counts.
 pub struct Metrics {
     registry: Registry,
+    tenants: Arc<Tenants>,
     plants: Gauge,
     /// Uploaded models.
     pub(crate) models: Gauge,
@@ -88,7 +99,13 @@ pub struct Metrics {
 
 impl Default for Metrics {
     fn default() -> Self {
-        let mut registry = Registry::with_prefix("plantd");
+        Self::new(Arc::default())
+    }
+}
+
+impl Metrics {
+    /// Nothing counted yet.
+    pub fn new(tenants: Arc<Tenants>) -> Self {
         let steps = Family::<DriverLabel, Counter>::default();
         let drivers = Family::<DriverLabel, Gauge>::default();
         let by_driver = [DriverKind::Step, DriverKind::Drive, DriverKind::Link].map(|kind| {
@@ -114,8 +131,13 @@ impl Default for Metrics {
             running: Gauge::default(),
             loops: Arc::default(),
             rpcs: Family::default(),
+            tenants,
             registry: Registry::default(),
         };
+        let mut whole = Registry::default();
+        whole.register_collector(Box::new(Process::starts_now()));
+        let registry = whole.sub_registry_with_prefix("plantd");
+        registry.register("build", "The server's version", build_info());
         registry.register("plants", "Plants", metrics.plants.clone());
         registry.register("models", "Uploaded models", metrics.models.clone());
         registry.register("links", "Open shared-memory links", metrics.links.clone());
@@ -150,15 +172,26 @@ impl Default for Metrics {
         }
         registry.register_collector(Box::new(LoopCounters(Arc::clone(loops))));
         registry.register("rpcs", "Calls that ended", metrics.rpcs.clone());
-        Self { registry, ..metrics }
+        let tenants = Arc::clone(&metrics.tenants);
+        registry.register_collector(Box::new(TenantCounters { tenants, only: None }));
+        Self { registry: whole, ..metrics }
     }
-}
 
-impl Metrics {
     /// All metrics as text.
     pub fn encode(&self) -> Result<String, fmt::Error> {
         let mut text = String::new();
         encode(&mut text, &self.registry)?;
+        Ok(text)
+    }
+
+    /// What one tenant may know: what is counted of it alone.
+    pub fn encode_of(&self, tenant: Tenant) -> Result<String, fmt::Error> {
+        let mut registry = Registry::with_prefix("plantd");
+        registry.register("build", "The server's version", build_info());
+        let tenants = Arc::clone(&self.tenants);
+        registry.register_collector(Box::new(TenantCounters { tenants, only: Some(tenant) }));
+        let mut text = String::new();
+        encode(&mut text, &registry)?;
         Ok(text)
     }
 
@@ -219,9 +252,12 @@ impl Metrics {
         }
     }
 
-    /// A call ended.
-    pub fn rpc_ended(&self, method: &'static str, code: &'static str) {
+    /// A call ended, which was a tenant's, or nobody's who is known.
+    pub fn rpc_ended(&self, method: &'static str, code: &'static str, tenant: Tenant) {
         self.rpcs.get_or_create(&RpcLabel { method, code }).inc();
+        if tenant != Tenant::NONE {
+            self.tenants.account(tenant).counts.call_ended(code);
+        }
     }
 
     fn of(&self, kind: DriverKind) -> &DriverMetrics {
@@ -253,6 +289,14 @@ impl Collector for LoopCounters {
         }
         Ok(())
     }
+}
+
+fn build_info() -> Info<[(&'static str, &'static str); 3]> {
+    Info::new([
+        ("version", env!("CARGO_PKG_VERSION")),
+        ("arch", std::env::consts::ARCH),
+        ("profile", if cfg!(debug_assertions) { "debug" } else { "release" }),
+    ])
 }
 
 fn gauge_value(count: usize) -> i64 {

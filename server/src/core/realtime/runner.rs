@@ -1,7 +1,7 @@
 //! A plant in a loop: when its steps are due, with which input, and why they end.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use plantd_proto::link::monotonic_ns;
 
@@ -61,6 +61,8 @@ pub(crate) struct Shared {
     pub(crate) closing: Arc<Closing>,
     /// What all loops have counted together.
     pub(crate) all: Arc<TimingCounts>,
+    /// Overruns of all plants of the same tenant.
+    pub(crate) overruns: Arc<AtomicU64>,
 }
 
 /// A plant that a loop runs.
@@ -204,6 +206,7 @@ impl Runner {
                 counts.slips.fetch_add(u64::from(behind_ns > CATCH_UP_NS), Ordering::Relaxed);
             }
             if behind_ns > 0 {
+                self.shared.overruns.fetch_add(1, Ordering::Relaxed);
                 self.tell_overrun(ended_ns);
             }
             if behind_ns > CATCH_UP_NS {

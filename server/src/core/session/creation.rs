@@ -1,6 +1,7 @@
 //! What a session began with.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::Duration;
 
 use plantd_models::{Model, Plant, Settings, Snapshot, State};
@@ -42,6 +43,8 @@ pub struct Owner {
     pub room: Option<Reservation>,
     /// Its room for plants that run by themselves.
     pub running: Option<Arc<Room>>,
+    /// Where steps are counted that ended after the next one was due.
+    pub overruns: Arc<AtomicU64>,
 }
 
 impl Origin {

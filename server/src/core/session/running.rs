@@ -146,6 +146,7 @@ impl Session {
                 leases: Arc::clone(&self.leases),
                 closing: Arc::clone(&self.closing),
                 all: Arc::clone(&self.realtime.counts),
+                overruns: Arc::clone(&self.creation.owner.overruns),
             };
             let owner: Arc<dyn Owner> = Arc::clone(self) as _;
             handle.run(Runner::new(key, core, owner, shared, settings, steps));

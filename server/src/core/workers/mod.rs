@@ -20,5 +20,8 @@
 //! Threads have the priority of their pool ([`crate::core::priority`]), and so have the threads that a job
 //! starts.
 
+/// Target of the spans that are traces: of calls and computations.
+pub(crate) const SPANS: &str = "plantd::trace";
+
 pub mod pool;
 pub(crate) mod queue;

@@ -7,6 +7,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use rustix::time::{ClockId, clock_gettime};
 use tokio::runtime::{Handle, RuntimeFlavor};
 use tokio::sync::oneshot;
 use tokio_util::sync::CancellationToken;
@@ -15,7 +16,8 @@ use crate::core::connection::{Caller, Connection};
 use crate::core::limits::LimitExceeded;
 use crate::core::mutex::lock;
 use crate::core::priority::Priority;
-use crate::core::tenant::Tenant;
+use crate::core::tenant::{Tenant, Tenants};
+use crate::core::workers::SPANS;
 use crate::core::workers::queue::{Admission, Baton, Lane, May, Queue, Ticket, Work};
 
 /// How long a job keeps its turn while others wait for one.
@@ -39,6 +41,12 @@ pub(crate) fn beside_other_tasks<R>(compute: impl FnOnce() -> R) -> R {
         Ok(RuntimeFlavor::MultiThread) => tokio::task::block_in_place(compute),
         _ => compute(),
     }
+}
+
+/// Processor time of this thread.
+fn thread_ms() -> f64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6
 }
 
 /// Why a computation has no result.
@@ -106,9 +114,17 @@ pub struct Workers {
 }
 
 impl Workers {
-    /// A pool in which `count` jobs run at a time, behind a queue of `queued_jobs`.
-    pub fn new(name: &'static str, count: usize, queued_jobs: u64, priority: Priority) -> Self {
+    /// A pool in which `count` jobs run at a time, behind a queue of `queued_jobs`, for tenants whose time of
+    /// workers is bounded.
+    pub fn new(
+        name: &'static str,
+        count: usize,
+        queued_jobs: u64,
+        priority: Priority,
+        tenants: Arc<Tenants>,
+    ) -> Self {
         let pool = Arc::new(Pool {
+            tenants,
             name,
             count: count.max(1),
             queued_jobs,
@@ -168,16 +184,25 @@ impl Workers {
         lane: Lane,
         job: impl FnOnce(&Abandoned) -> Result<T, E> + Send + 'static,
     ) -> Result<T, E> {
+        let account = self.pool.tenants.current();
+        if admission == Admission::Bounded {
+            account.rates.worker_ms_per_s.check().map_err(WorkError::from)?;
+        }
         let token = CancellationToken::new();
         let (sender, mut receiver) = oneshot::channel();
         let work = {
             let (token, pool) = (token.clone(), Arc::clone(&self.pool));
             let caller = Caller::current();
+            let span = tracing::trace_span!(target: SPANS, "job", workers = self.pool.name);
             Box::new(move |id| {
                 let turn_began = Cell::new(Instant::now());
                 // Nobody may wait any more.
                 let abandoned = Abandoned { token, pool, id, turn_began };
-                let _ = sender.send(caller.scope(|| job(&abandoned)));
+                let began_ms = thread_ms();
+                let outcome = span.in_scope(|| caller.scope(|| job(&abandoned)));
+                drop(span);
+                account.rates.worker_ms_per_s.spend(thread_ms() - began_ms);
+                let _ = sender.send(outcome);
             })
         };
         let id = self.pool.submit(admission, lane, work).map_err(WorkError::from)?;
@@ -224,6 +249,7 @@ impl Drop for End {
 }
 
 struct Pool {
+    tenants: Arc<Tenants>,
     name: &'static str,
     count: usize,
     queued_jobs: u64,
@@ -440,7 +466,7 @@ mod tests {
     use super::*;
 
     fn workers(count: usize, queued_jobs: u64) -> Workers {
-        Workers::new("test", count, queued_jobs, Priority::Idle)
+        Workers::new("test", count, queued_jobs, Priority::Idle, Arc::default())
     }
 
     /// Computes until `stop` is set, asking whether somebody waits.

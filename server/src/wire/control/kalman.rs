@@ -108,7 +108,7 @@ impl TrajectoryFilter {
     pub(crate) fn solve(
         hub: &Hub,
         request: v1::SolveTrajectoryKalmanRequest,
-        permit: TrajectoryPermit,
+        mut permit: TrajectoryPermit,
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;
@@ -120,7 +120,8 @@ impl TrajectoryFilter {
         let size = model.dimensions().state();
         let initial = weights::weight("initial_covariance", request.initial_covariance, size)?;
         let values = if request.covariances { Values::Keep } else { Values::Drop };
-        check_memory(hub, &model, inputs.count(), outputs.x.nrows(), request.covariances)?;
+        let (steps, rows) = (inputs.count(), outputs.x.nrows());
+        permit.hold(check_memory(hub, &model, steps, rows, request.covariances)?)?;
         let path = Path::follow(plant, &inputs, Momentum::State, constraints, abandoned)?;
         let (samples, c) = (&path.samples, [outputs.x.clone()]);
         let solution = if path.tangents.is_empty() {
@@ -154,7 +155,7 @@ fn check_memory(
     steps: usize,
     outputs: usize,
     covariances: bool,
-) -> Result<(), RpcError> {
+) -> Result<usize, RpcError> {
     let d = model.dimensions();
     let (nx, nu) = (d.state(), d.input());
     let tangents = if d.constraints > 0 { 2 * nx * nx } else { 0 };
@@ -162,7 +163,8 @@ fn check_memory(
     let of_state = nx * nx + nx * nu + nx * outputs + tangents + covariances;
     let numbers = (steps + 1).saturating_mul(of_state);
     let (name, limit) = ("trajectory_numbers", hub.limits.trajectory_numbers);
-    Ok(LimitExceeded::check(name, limit, "numbers in the trajectory's matrices", numbers)?)
+    LimitExceeded::check(name, limit, "numbers in the trajectory's matrices", numbers)?;
+    Ok(numbers)
 }
 
 impl Iterator for TrajectoryFilter {

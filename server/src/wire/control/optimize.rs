@@ -41,7 +41,7 @@ impl Search {
     pub(crate) fn new(
         hub: &Hub,
         request: v1::OptimizeTrajectoryRequest,
-        permit: TrajectoryPermit,
+        mut permit: TrajectoryPermit,
     ) -> Result<Self, RpcError> {
         let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
         let (given, checkpoint_every) = given_options(hub, request.options, &model)?;
@@ -49,7 +49,7 @@ impl Search {
         let steps = start.steps();
         let cost = request.cost.ok_or_else(|| RpcError::field("cost", "is missing"))?;
         let uses_newton = [Some(given.method), given.first_method].contains(&Some(Method::Newton));
-        check_memory(hub, &model, steps, &cost, uses_newton)?;
+        permit.hold(check_memory(hub, &model, steps, &cost, uses_newton)?)?;
         let cost = trajectory_cost(cost, steps, &model)?;
         let bounds = bounds(request.bounds.unwrap_or_default(), &model)?;
         let free = request.free_initial.map(|free| free_initial(free, &model)).transpose()?;
@@ -268,7 +268,7 @@ fn check_memory(
     steps: usize,
     cost: &v1::TrajectoryCost,
     uses_newton: bool,
-) -> Result<(), RpcError> {
+) -> Result<usize, RpcError> {
     let d = model.dimensions();
     let (nx, nu) = (d.state(), d.input());
     let result = (steps + 1).saturating_mul(nx).saturating_add(steps.saturating_mul(nu));
@@ -282,7 +282,8 @@ fn check_memory(
     let of_stage = nx * nx + nu * nu + nx * nu + nx + nu;
     let numbers = (steps + 1).saturating_mul(of_step).saturating_add(cost.stages.len() * of_stage);
     let (name, limit) = ("trajectory_numbers", hub.limits.trajectory_numbers);
-    Ok(LimitExceeded::check(name, limit, "numbers in the search's matrices", numbers)?)
+    LimitExceeded::check(name, limit, "numbers in the search's matrices", numbers)?;
+    Ok(numbers)
 }
 
 fn trajectory_cost(

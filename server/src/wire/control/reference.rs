@@ -37,7 +37,7 @@ impl Projection {
     pub(crate) fn new(
         hub: &Hub,
         request: v1::ProjectReferenceRequest,
-        permit: TrajectoryPermit,
+        mut permit: TrajectoryPermit,
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;
@@ -55,7 +55,8 @@ impl Projection {
         let numbers = steps.saturating_mul(2 * d.input());
         LimitExceeded::check(name, limit, "numbers in the report's inputs", numbers)?;
         let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
-        Memory { steps, stages: 0, momentum, values: Values::Drop }.check(&hub.limits, &model)?;
+        let memory = Memory { steps, stages: 0, momentum, values: Values::Drop };
+        permit.hold(memory.check(&hub.limits, &model)?)?;
         let u =
             request.u.map(|u| matrices::matrix_of("u", &u, Some(steps), d.input())).transpose()?;
         let pull = match request.projection {

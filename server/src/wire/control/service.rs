@@ -194,7 +194,7 @@ impl TrajectoryRegulator {
     fn solve(
         hub: &Hub,
         request: v1::SolveTrajectoryLqrRequest,
-        permit: TrajectoryPermit,
+        mut permit: TrajectoryPermit,
         abandoned: &Abandoned,
     ) -> Result<Self, RpcError> {
         let constraints = Constraints::new(request.constraints)?;
@@ -204,7 +204,8 @@ impl TrajectoryRegulator {
         let values = if request.values { Values::Keep } else { Values::Drop };
         let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
         let (steps, stages) = (inputs.count(), request.stages.len());
-        Memory { steps, stages, momentum, values }.check(&hub.limits, &model)?;
+        let memory = Memory { steps, stages, momentum, values };
+        permit.hold(memory.check(&hub.limits, &model)?)?;
         let fields = WeightFields::default();
         let (weights, stages) = (request.weights, request.stages);
         let weights = weights::trajectory_weights(fields, weights, stages, steps, &model)?;

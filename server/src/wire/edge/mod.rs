@@ -10,4 +10,5 @@ pub mod metrics_http;
 pub mod observe;
 pub mod page;
 pub(crate) mod parts;
+pub(crate) mod trace;
 pub(crate) mod unfinished;

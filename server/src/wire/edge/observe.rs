@@ -13,14 +13,17 @@ use tonic::body::Body;
 use tonic::codegen::http::{HeaderMap, Request, Response};
 use tonic::{Code, Status};
 use tower::{Layer, Service};
+use tracing::{Instrument as _, Span};
 
 use crate::core::connection::{Caller, Connection};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::metrics::registry::Metrics;
+use crate::core::tenant::Tenant;
 use crate::wire::edge::admission::{OpenCall, Peer, Place};
 use crate::wire::edge::auth::credential::{Over, Pass};
 use crate::wire::edge::auth::role;
 use crate::wire::edge::methods::method_label;
+use crate::wire::edge::trace;
 use crate::wire::edge::unfinished::Budget;
 use crate::wire::status::RpcError;
 
@@ -96,9 +99,12 @@ where
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         let pass = request.extensions().get::<Arc<Pass>>().cloned();
+        let method = method_label(request.uri().path());
+        let span = trace::of_call(method, request.headers());
         let mut call = Call {
+            span: span.clone(),
             metrics: Arc::clone(&self.layer.metrics),
-            method: method_label(request.uri().path()),
+            method,
             code: None,
             pass: pass.clone(),
             peer: request.extensions().get::<Arc<Place>>().map(|place| place.peer()),
@@ -111,8 +117,10 @@ where
             None => Connection::numbered(place.map_or(0, |place| place.id() + 1)).into(),
         };
         let unfinished = &self.layer.unfinished;
-        let response = self.inner.call(request.map(|body| unfinished.follow(call.method, body)));
-        Box::pin(async move {
+        let rate = pass.as_ref().map(|pass| pass.messages());
+        let follow = |body| unfinished.follow(call.method, body, rate);
+        let response = self.inner.call(request.map(follow));
+        let answer = async move {
             let mut watch = pass.map(Watch::new);
             let answered = caller.clone().work(response);
             let mut response = match &mut watch {
@@ -131,12 +139,15 @@ where
             }
             Ok(response
                 .map(|body| Body::new(Observed { body, call, caller, watch, has_ended: false })))
-        })
+        };
+        Box::pin(answer.instrument(span))
     }
 }
 
 /// A call on its way; counted when dropped.
 struct Call {
+    /// Lasts as long as the call.
+    span: Span,
     metrics: Arc<Metrics>,
     method: &'static str,
     code: Option<Code>,
@@ -159,7 +170,9 @@ impl Drop for Call {
     fn drop(&mut self) {
         // Without a status the client went away first.
         let code = self.code.unwrap_or(Code::Cancelled);
-        self.metrics.rpc_ended(self.method, code_name(code));
+        self.span.record("rpc.code", code_name(code));
+        let tenant = self.pass.as_ref().map_or(Tenant::NONE, |pass| pass.principal().tenant);
+        self.metrics.rpc_ended(self.method, code_name(code), tenant);
         if let Some(pass) = &self.pass
             && role::changes(self.method)
         {
@@ -221,7 +234,10 @@ impl HttpBody for Observed {
         let caller = &this.caller;
         let frame = match is_over {
             true => Poll::Pending,
-            false => caller.clone().scope(|| Pin::new(&mut this.body).poll_frame(context)),
+            false => this
+                .call
+                .span
+                .in_scope(|| caller.clone().scope(|| Pin::new(&mut this.body).poll_frame(context))),
         };
         if frame.is_pending()
             && let Some(watch) = &mut this.watch

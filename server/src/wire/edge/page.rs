@@ -5,7 +5,7 @@
 //! | --- | --- |
 //! | `GET /`, `/viewer.js`, `/viewer.css` | the page, compiled into the program |
 //! | `GET /models/NAME/files/PATH` | a file of a model, as it was given to the server |
-//! | `GET /metrics` | the metrics, where callers are asked who they are |
+//! | `GET /metrics` | the metrics, where callers are asked who they are; of the own tenant alone, but for administrators |
 //! | another `GET` | 404 |
 //! | gRPC, gRPC-Web | the services' |
 //! | any other method | 405 |
@@ -28,6 +28,7 @@ use tonic::codegen::http::header::{
 use tonic::codegen::http::{HeaderMap, HeaderValue, Method, Request, Response, StatusCode};
 use tower::{Layer, Service};
 
+use crate::core::connection::Connection;
 use crate::core::files::{File, tag};
 use crate::core::metrics::registry::Metrics;
 use crate::wire::edge::admission::{OpenCall, Place};
@@ -206,9 +207,13 @@ impl<S> Page<S> {
     }
 }
 
+/// All metrics for administrators, and for others those of their own tenant.
 fn metrics_text(metrics: &Metrics) -> Answer {
     let text = Answer::text(StatusCode::OK, "");
-    match metrics.encode() {
+    let caller = Connection::current();
+    let shown =
+        if caller.sees_all() { metrics.encode() } else { metrics.encode_of(caller.tenant()) };
+    match shown {
         Ok(metrics) => Answer { kind: OPEN_METRICS, bytes: Bytes::from(metrics), ..text },
         Err(_) => Answer { status: StatusCode::INTERNAL_SERVER_ERROR, ..text },
     }

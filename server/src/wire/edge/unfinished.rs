@@ -19,6 +19,7 @@ use tonic::body::Body;
 use tonic::{Code, Status};
 
 use crate::core::limits::{LimitExceeded, Limits};
+use crate::core::rate::Rate;
 use crate::wire::edge::parts::{self, Malformed, PART_BYTES_MIN, Walk};
 use crate::wire::status::RpcError;
 
@@ -43,11 +44,17 @@ impl Budget {
         }
     }
 
-    /// The body of a request to this path, which keeps to the budget.
-    pub(crate) fn follow(self: &Arc<Self>, path: &str, body: Body) -> Body {
+    /// The body of a request to this path, which keeps to the budget, and to the rate of messages of its tenant.
+    pub(crate) fn follow(
+        self: &Arc<Self>,
+        path: &str,
+        body: Body,
+        rate: Option<Arc<Rate>>,
+    ) -> Body {
         Body::new(Followed {
             body,
             budget: Arc::clone(self),
+            rate,
             position: Position::of(parts::request_of(path), self.parts),
             held: 0,
             times: None,
@@ -126,7 +133,9 @@ impl Position {
         Self { request, parts, head: [0; 5], in_head: 0, came: 0, lacks: 0, walk: None }
     }
 
-    fn advance(&mut self, mut piece: &[u8]) -> Result<(), Refused> {
+    /// Goes on by what has come; how many messages are whole by that.
+    fn advance(&mut self, mut piece: &[u8]) -> Result<u64, Refused> {
+        let mut whole = 0;
         while !piece.is_empty() {
             if self.in_head < self.head.len() {
                 let count = piece.len().min(self.head.len() - self.in_head);
@@ -155,9 +164,10 @@ impl Position {
             }
             if self.in_head == self.head.len() && self.lacks == 0 {
                 *self = Self::of(self.request, self.parts);
+                whole += 1;
             }
         }
-        Ok(())
+        Ok(whole)
     }
 }
 
@@ -165,6 +175,7 @@ impl Position {
 struct Followed {
     body: Body,
     budget: Arc<Budget>,
+    rate: Option<Arc<Rate>>,
     position: Position,
     /// Bytes reserved.
     held: u64,
@@ -175,7 +186,10 @@ struct Followed {
 
 impl Followed {
     fn take(&mut self, piece: &[u8]) -> Result<(), Refused> {
-        self.position.advance(piece)?;
+        let whole = self.position.advance(piece)?;
+        if let Some(rate) = &self.rate {
+            rate.take(whole)?;
+        }
         let came = self.position.came;
         if came == 0 {
             self.times = None;
@@ -277,6 +291,7 @@ mod tests {
         Followed {
             body: Body::empty(),
             budget: Arc::clone(budget),
+            rate: None,
             position: Position::of(None, 0),
             held: 0,
             times: None,

@@ -330,7 +330,8 @@ impl Worker {
             .ok_or(Failure::new(Code::NotAttached))?;
         driver.last_heard_ns = monotonic_ns();
         driver.poll_end_ns = request.poll_end_ns();
-        let expected = driver.sequence + 1;
+        // The driver chooses where it begins, also at the end.
+        let expected = driver.sequence.wrapping_add(1);
         driver.sequence = request.sequence;
         if request.sequence != expected {
             return Err(Failure { a: expected, ..Failure::new(Code::Sequence) });

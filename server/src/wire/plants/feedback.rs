@@ -131,14 +131,13 @@ pub(crate) async fn set_feedback(
     request: v1::SetFeedbackRequest,
 ) -> Result<v1::SetFeedbackResponse, RpcError> {
     let session = hub.session(&request.id)?;
-    let permit = match request.reference {
+    let mut permit = match request.reference {
         Some(Form::Trajectory(_)) => Some(hub.trajectory_permit()?),
         _ => None,
     };
     let job = {
         let (hub, session) = (Arc::clone(hub), Arc::clone(&session));
         move |abandoned: &Abandoned| {
-            let _permit = permit;
             let mode = mode(request.mode)?;
             let guard = guard(&request.guard, mode, session.model())?;
             let first_step = request.first_step;
@@ -161,7 +160,8 @@ pub(crate) async fn set_feedback(
                     let (steps, stages) = (inputs.count(), request.stages);
                     let (count, values) = (stages.len(), Values::Drop);
                     let memory = Memory { steps, stages: count, momentum, values };
-                    memory.check(&hub.limits, model)?;
+                    let numbers = memory.check(&hub.limits, model)?;
+                    permit.iter_mut().try_for_each(|permit| permit.hold(numbers))?;
                     let (fields, weights) = (WeightFields::default(), request.weights);
                     let all = weights::trajectory_weights(fields, weights, stages, steps, model)?;
                     (None, Some(all))

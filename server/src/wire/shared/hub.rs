@@ -78,11 +78,6 @@ impl Hub {
         links: Option<LinkHost>,
         tenants: Option<BTreeMap<String, TenantSettings>>,
     ) -> Self {
-        let metrics = Arc::new(Metrics::default());
-        let realtime = RealTime::new(realtime, &metrics);
-        let pool = |name, priority| {
-            Jobs::new(Workers::new(name, worker_count, limits.queued_jobs, priority))
-        };
         let feedback_room = Room::new(
             "feedback_numbers",
             "numbers in the feedbacks of all plants",
@@ -96,6 +91,12 @@ impl Hub {
         let are_apart = tenants.is_some();
         let tenants = tenants.unwrap_or_default();
         let tenants = Arc::new(Tenants::new(are_apart, tenants, &watch_room, &feedback_room));
+        let metrics = Arc::new(Metrics::new(Arc::clone(&tenants)));
+        let realtime = RealTime::new(realtime, &metrics);
+        let pool = |name, priority| {
+            let (limit, tenants) = (limits.queued_jobs, Arc::clone(&tenants));
+            Jobs::new(Workers::new(name, worker_count, limit, priority, tenants))
+        };
         Self {
             workers: pool("worker", priority),
             attendants: pool("attendant", Priority::Normal),
@@ -176,6 +177,7 @@ impl Hub {
             tenant: account.tenant,
             room: Some(account.rooms.plants.reserve(1)?),
             running: Some(Arc::clone(&account.rooms.running_plants)),
+            overruns: Arc::clone(&account.counts.overruns),
         };
         let mut plants = self.plants();
         let id = if id.is_empty() { free_id(&plants) } else { id };
@@ -268,7 +270,8 @@ impl Hub {
         let (what, actual) = ("regulators, filters and optimisations at a time", limit + 1);
         let of_all = Arc::clone(&self.trajectory_solves).try_acquire_owned();
         let of_all = of_all.map_err(|_| LimitExceeded { name, limit, what, actual })?;
-        Ok(TrajectoryPermit { _of_all: of_all, _own: own })
+        let room = Arc::clone(&self.tenants.current().rooms.trajectory_numbers);
+        Ok(TrajectoryPermit { _of_all: of_all, _own: own, room, held: None })
     }
 
     /// A stream that ends, unfinished, when the server begins to shut down.
@@ -311,6 +314,17 @@ impl Hub {
 pub struct TrajectoryPermit {
     _of_all: OwnedSemaphorePermit,
     _own: Reservation,
+    /// The tenant's room for numbers.
+    room: Arc<Room>,
+    held: Option<Reservation>,
+}
+
+impl TrajectoryPermit {
+    /// Takes room for so many numbers, until the permit ends.
+    pub(crate) fn hold(&mut self, numbers: usize) -> Result<(), LimitExceeded> {
+        self.held = Some(self.room.reserve(numbers)?);
+        Ok(())
+    }
 }
 
 /// An id that no plant has. Random, so that ids differ between runs of a server.

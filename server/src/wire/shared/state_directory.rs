@@ -98,8 +98,14 @@ impl StateDirectory {
         Ok(())
     }
 
-    fn write_file(&self, session: &Session, mut bytes: Vec<u8>) -> Result<()> {
+    /// What a plant is written as: its bytes and their hash, by which damage is found.
+    pub fn sealed(mut bytes: Vec<u8>) -> Vec<u8> {
         bytes.extend(hash(&bytes).to_le_bytes());
+        bytes
+    }
+
+    fn write_file(&self, session: &Session, bytes: Vec<u8>) -> Result<()> {
+        let bytes = Self::sealed(bytes);
         let folder = folder_of(&self.path, &self.tenants, session.owner());
         self.mode.create_directory(&folder)?;
         let path = self.file(session);

@@ -8,6 +8,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::Code;
 
 use crate::core::connection::{Caller, Connection};
+use crate::core::rate::Rate;
 use crate::core::room::Reservation;
 use crate::core::tenant::Tenant;
 use crate::wire::edge::auth::role::Role;
@@ -96,6 +97,7 @@ pub struct Pass {
     credential: Arc<Credential>,
     connection: Connection,
     subject: Arc<OnceLock<String>>,
+    messages: Arc<Rate>,
     /// Its tenant's room for open calls, and for watchers if it is one.
     _rooms: [Option<Reservation>; 2],
 }
@@ -105,16 +107,23 @@ impl Pass {
     pub(super) fn new(
         credential: Arc<Credential>,
         number: u64,
+        messages: Arc<Rate>,
         rooms: [Option<Reservation>; 2],
     ) -> Arc<Self> {
         let Principal { tenant, role, .. } = credential.principal;
         let connection = Connection::of_tenant(number, tenant, role.sight());
-        Arc::new(Self { credential, connection, subject: Arc::default(), _rooms: rooms })
+        let subject = Arc::default();
+        Arc::new(Self { credential, connection, subject, messages, _rooms: rooms })
     }
 
     /// Who calls.
     pub fn principal(&self) -> &Principal {
         &self.credential.principal
+    }
+
+    /// How many messages its tenant may send.
+    pub fn messages(&self) -> Arc<Rate> {
+        Arc::clone(&self.messages)
     }
 
     /// For whom the call is worked.

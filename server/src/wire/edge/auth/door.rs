@@ -12,15 +12,17 @@ use tonic::codegen::http::HeaderMap;
 use tonic::codegen::http::header::AUTHORIZATION;
 
 use crate::core::mutex::lock;
-use crate::core::tenant::Tenants;
+use crate::core::room::Reservation;
+use crate::core::tenant::{Tenant, Tenants};
 use crate::wire::edge::admission::Place;
-use crate::wire::edge::auth::credential::{Credential, Pass, Principal};
+use crate::wire::edge::auth::credential::{Credential, Over, Pass, Principal};
 use crate::wire::edge::auth::role::{Needs, Role, needs, watches};
-use crate::wire::edge::auth::settings::{ANY_SUBJECT, AuthSettings};
+use crate::wire::edge::auth::rules::{Identity, Rules, RulesError};
+use crate::wire::edge::auth::settings::AuthSettings;
 use crate::wire::edge::auth::tokens::{Tokens, TokensError};
 use crate::wire::status::RpcError;
 
-/// How often the file of tokens and the time are looked at.
+/// How often the files of tokens and rules and the time are looked at.
 pub const LOOK_PERIOD: Duration = Duration::from_secs(1);
 
 /// Longest token, bytes.
@@ -49,8 +51,33 @@ pub struct Door {
     tenants: Arc<Tenants>,
     tokens: RwLock<Tokens>,
     stamp: Mutex<Option<Stamp>>,
+    rules: RwLock<Rules>,
+    rules_stamp: Mutex<Option<Stamp>>,
     /// Credentials of connections, by the connection's number: they live as long as it does or is used.
-    of_connections: Mutex<HashMap<u64, Weak<Credential>>>,
+    of_connections: Mutex<HashMap<u64, Known>>,
+}
+
+/// A connection that has made a call.
+struct Known {
+    credential: Weak<Credential>,
+    identity: Identity,
+}
+
+impl Known {
+    fn credential(&self) -> Option<Arc<Credential>> {
+        self.credential.upgrade()
+    }
+}
+
+/// Why a door cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum DoorError {
+    /// No tokens.
+    #[error(transparent)]
+    Tokens(#[from] TokensError),
+    /// No rules.
+    #[error(transparent)]
+    Rules(#[from] RulesError),
 }
 
 /// Why somebody is not let in.
@@ -61,6 +88,14 @@ enum Stranger {
     UnknownToken,
     UnknownCertificate,
     UnknownUser(u32),
+}
+
+/// A call that is not let in.
+pub(super) struct Refused {
+    /// Of whom, if that is known.
+    pub(super) tenant: Tenant,
+    /// Why.
+    pub(super) error: RpcError,
 }
 
 impl From<Stranger> for RpcError {
@@ -93,18 +128,43 @@ impl From<Stranger> for RpcError {
 
 impl Door {
     /// A door as the configuration has it.
-    pub fn new(settings: AuthSettings, tenants: Arc<Tenants>) -> Result<Self, TokensError> {
+    pub fn new(settings: AuthSettings, tenants: Arc<Tenants>) -> Result<Self, DoorError> {
         let door = Self {
             settings,
             tenants,
             tokens: RwLock::default(),
             stamp: Mutex::default(),
+            rules: RwLock::default(),
+            rules_stamp: Mutex::default(),
             of_connections: Mutex::default(),
         };
         if let Some(path) = &door.settings.tokens {
             door.read_tokens(path)?;
         }
+        door.read_rules()?;
         Ok(door)
+    }
+
+    /// Whoever is somebody else by the new rules, or nobody, is let in no more as who they were.
+    fn read_rules(&self) -> Result<(), RulesError> {
+        *lock(&self.rules_stamp) = self.stamp_of_rules();
+        let new = Rules::read(&self.settings)?;
+        let mut rules = self.rules.write().unwrap_or_else(PoisonError::into_inner);
+        *rules = new;
+        lock(&self.of_connections).retain(|_, known| {
+            let Some(credential) = known.credential() else { return false };
+            let principal = rules.principal(&known.identity, &self.tenants);
+            let is_same = principal.as_ref() == Some(&credential.principal);
+            if !is_same {
+                credential.end(Over::Revoked);
+            }
+            is_same
+        });
+        Ok(())
+    }
+
+    fn stamp_of_rules(&self) -> Option<Stamp> {
+        self.settings.rules.as_deref().and_then(Stamp::of)
     }
 
     fn read_tokens(&self, path: &Path) -> Result<(), TokensError> {
@@ -117,7 +177,7 @@ impl Door {
         Ok(())
     }
 
-    /// Looks over and over whether the file of tokens has changed, and who has expired.
+    /// Looks over and over whether the files of tokens and rules have changed, and who has expired.
     pub async fn look_after(self: Arc<Self>) {
         loop {
             tokio::time::sleep(LOOK_PERIOD).await;
@@ -134,10 +194,18 @@ impl Door {
         {
             tracing::error!(%error, "the tokens that were known before stay in force");
         }
+        if self.stamp_of_rules() != *lock(&self.rules_stamp) {
+            match self.read_rules() {
+                Ok(()) => tracing::info!("rules of identities read"),
+                Err(error) => {
+                    tracing::error!(%error, "the rules that were known before stay in force")
+                }
+            }
+        }
         let now = SystemTime::now();
         self.tokens.read().unwrap_or_else(PoisonError::into_inner).end_expired(now);
         lock(&self.of_connections).retain(|_, credential| {
-            let credential = credential.upgrade();
+            let credential = credential.credential();
             credential.iter().for_each(|credential| credential.end_if_expired(now));
             credential.is_some()
         });
@@ -150,13 +218,31 @@ impl Door {
         is_call: bool,
         headers: &HeaderMap,
         place: Option<&Arc<Place>>,
-    ) -> Result<Option<Arc<Pass>>, RpcError> {
+    ) -> Result<Option<Arc<Pass>>, Refused> {
         let role = match needs(path) {
             Needs::Nothing if is_call => return Ok(None),
             Needs::Role(role) if is_call => role,
             _ => Role::Viewer,
         };
-        let credential = self.identify(headers, place)?;
+        let credential = self
+            .identify(headers, place)
+            .map_err(|stranger| Refused { tenant: Tenant::NONE, error: stranger.into() })?;
+        let tenant = credential.principal.tenant;
+        let rooms = self.check(&credential, role, path, is_call);
+        let rooms = rooms.map_err(|error| Refused { tenant, error })?;
+        let number = place.map_or(0, |place| place.id() + 1);
+        let messages = Arc::clone(&self.tenants.account(tenant).rates.messages_per_s);
+        Ok(Some(Pass::new(credential, number, messages, rooms)))
+    }
+
+    /// Whether somebody may make this call; what it takes of the tenant's room.
+    fn check(
+        &self,
+        credential: &Credential,
+        role: Role,
+        path: &str,
+        is_call: bool,
+    ) -> Result<[Option<Reservation>; 2], RpcError> {
         credential.end_if_expired(SystemTime::now());
         if let Some(over) = credential.over() {
             return Err(over.into());
@@ -171,8 +257,7 @@ impl Door {
         let stream = is_call.then(|| account.rooms.streams.reserve(1)).transpose()?;
         let is_watcher = is_call && watches(path);
         let watcher = is_watcher.then(|| account.rooms.watchers.reserve(1)).transpose()?;
-        let number = place.map_or(0, |place| place.id() + 1);
-        Ok(Some(Pass::new(credential, number, [stream, watcher])))
+        Ok([stream, watcher])
     }
 
     fn identify(
@@ -188,41 +273,27 @@ impl Door {
             return tokens.find(token).map(Arc::clone).ok_or(Stranger::UnknownToken);
         }
         let place = place.ok_or(Stranger::Nameless)?;
-        let known = lock(&self.of_connections).get(&place.id()).and_then(Weak::upgrade);
+        let identity = Identity::of(place).ok_or(Stranger::Nameless)?;
+        let known = lock(&self.of_connections).get(&place.id()).and_then(Known::credential);
         if let Some(credential) = known {
             return Ok(credential);
         }
-        let credential = self.of_connection(place)?;
+        let credential = self.of_connection(&identity)?;
         let kept: Arc<Credential> = Arc::clone(&credential);
         place.keep(kept);
-        lock(&self.of_connections).insert(place.id(), Arc::downgrade(&credential));
+        let known = Known { credential: Arc::downgrade(&credential), identity };
+        lock(&self.of_connections).insert(place.id(), known);
         Ok(credential)
     }
 
     /// Who is at the other end of a connection.
-    fn of_connection(&self, place: &Place) -> Result<Arc<Credential>, Stranger> {
-        let principal = |name: &str, tenant: &str, role| Principal {
-            name: name.to_owned(),
-            tenant: self.tenants.named(tenant),
-            tenant_name: tenant.to_owned(),
-            role,
-        };
-        if let Some(certificate) = place.certificate() {
-            for rule in &self.settings.certificates {
-                let mut names = certificate.names.iter();
-                let is_it = |name: &&String| rule.subject == ANY_SUBJECT || **name == rule.subject;
-                if let Some(name) = names.find(is_it) {
-                    let principal = principal(name, &rule.tenant, rule.role);
-                    return Ok(Credential::new(principal, Some(certificate.expires)));
-                }
-            }
-            return Err(Stranger::UnknownCertificate);
+    fn of_connection(&self, identity: &Identity) -> Result<Arc<Credential>, Stranger> {
+        let rules = self.rules.read().unwrap_or_else(PoisonError::into_inner);
+        match (rules.principal(identity, &self.tenants), identity) {
+            (Some(principal), _) => Ok(Credential::new(principal, identity.expires())),
+            (None, Identity::Certificate(_)) => Err(Stranger::UnknownCertificate),
+            (None, Identity::User(uid)) => Err(Stranger::UnknownUser(*uid)),
         }
-        let Some(uid) = place.uid() else { return Err(Stranger::Nameless) };
-        let rule = self.settings.peers.iter().find(|rule| rule.uid == uid);
-        let rule = rule.ok_or(Stranger::UnknownUser(uid))?;
-        let name = rule.name.clone().unwrap_or_else(|| format!("uid {uid}"));
-        Ok(Credential::new(principal(&name, &rule.tenant, rule.role), None))
     }
 }
 

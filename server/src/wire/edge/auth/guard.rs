@@ -14,7 +14,7 @@ use tower::{Layer, Service};
 
 use crate::core::metrics::registry::Metrics;
 use crate::wire::edge::admission::Place;
-use crate::wire::edge::auth::door::Door;
+use crate::wire::edge::auth::door::{Door, Refused};
 use crate::wire::edge::auth::role;
 use crate::wire::edge::gate::{answer, is_grpc};
 use crate::wire::edge::methods::method_label;
@@ -79,13 +79,13 @@ where
                 request.extensions_mut().insert(Arc::clone(&pass));
                 Either::Right(pass.caller().scope(|| self.inner.call(request)))
             }
-            Err(fault) => {
+            Err(Refused { tenant, error: fault }) => {
                 let status = Status::from(fault.clone());
                 let peer = place.map(|place| place.peer());
                 let (reason, code) = (fault.reason(), plantd_proto::code_name(status.code()));
                 tracing::debug!(path, ?peer, reason, "refused");
                 if is_call {
-                    self.layer.metrics.rpc_ended(method_label(path), code);
+                    self.layer.metrics.rpc_ended(method_label(path), code, tenant);
                 }
                 if status.code() == Code::PermissionDenied && role::changes(path) {
                     let why = status.message();

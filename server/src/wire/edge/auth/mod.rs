@@ -6,6 +6,7 @@
 //! | `role` | the table from methods to roles |
 //! | `credential` | by what somebody is known, and until when |
 //! | `tokens` | the file of bearer tokens |
+//! | `rules` | who the holders of certificates and the users of this machine are |
 //! | `door` | who somebody is, by token, certificate or user; credentials that are over |
 //! | `guard` | the layer through which every request passes |
 
@@ -13,5 +14,6 @@ pub mod credential;
 pub mod door;
 pub mod guard;
 pub mod role;
+pub mod rules;
 pub mod settings;
 pub mod tokens;

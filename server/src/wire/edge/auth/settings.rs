@@ -20,6 +20,9 @@ pub struct AuthSettings {
     /// File of bearer tokens, which `plantctl token` writes; read again when it changes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tokens: Option<PathBuf>,
+    /// File of further rules, the lists `certificates` and `peers`; read again when it changes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rules: Option<PathBuf>,
     /// Who the holders of client certificates are; the first rule that fits counts.
     pub certificates: Vec<CertificateRule>,
     /// Who the users are whose processes connect to the unix-domain socket; the first rule that fits counts.

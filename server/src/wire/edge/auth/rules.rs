@@ -1,0 +1,162 @@
+//! Rules that say who the holders of certificates and the users of this machine are: those of the configuration, then
+//! those of a file that is read again when it changes.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use serde::Deserialize;
+
+use crate::core::tenant::{Tenants, is_tenant_name};
+use crate::wire::edge::admission::Place;
+use crate::wire::edge::auth::credential::Principal;
+use crate::wire::edge::auth::role::Role;
+use crate::wire::edge::auth::settings::{ANY_SUBJECT, AuthSettings, CertificateRule, PeerRule};
+use crate::wire::edge::certificate::Certificate;
+
+/// Longest file of rules, bytes.
+const FILE_BYTES_MAX: u64 = 16 << 20;
+
+/// Why there are no rules.
+#[derive(Debug, thiserror::Error)]
+#[error("file of rules `{path}`: {problem}")]
+pub struct RulesError {
+    /// Path.
+    pub path: PathBuf,
+    /// What is wrong.
+    pub problem: String,
+}
+
+/// By what the other end of a connection is known.
+#[derive(Clone, Debug)]
+pub(super) enum Identity {
+    /// The certificate that it has shown.
+    Certificate(Arc<Certificate>),
+    /// The user whose process it is.
+    User(u32),
+}
+
+impl Identity {
+    /// That of a connection, if it has one.
+    pub(super) fn of(place: &Place) -> Option<Self> {
+        let certificate = place.certificate().map(|known| Self::Certificate(Arc::clone(known)));
+        certificate.or_else(|| place.uid().map(Self::User))
+    }
+
+    /// Until when it counts; none for ever.
+    pub(super) fn expires(&self) -> Option<SystemTime> {
+        match self {
+            Self::Certificate(certificate) => Some(certificate.expires),
+            Self::User(_) => None,
+        }
+    }
+}
+
+/// The rules in force; the first that fits counts.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct Rules {
+    certificates: Vec<CertificateRule>,
+    peers: Vec<PeerRule>,
+}
+
+impl Rules {
+    /// Those of the configuration, and of its file if there is one.
+    pub(super) fn read(settings: &AuthSettings) -> Result<Self, RulesError> {
+        let mut rules =
+            Self { certificates: settings.certificates.clone(), peers: settings.peers.clone() };
+        if let Some(path) = &settings.rules {
+            let problem = |problem| RulesError { path: path.clone(), problem };
+            let more = Self::in_file(path).map_err(problem)?;
+            rules.certificates.extend(more.certificates);
+            rules.peers.extend(more.peers);
+        }
+        Ok(rules)
+    }
+
+    fn in_file(path: &Path) -> Result<Self, String> {
+        let bytes = std::fs::metadata(path).map_err(|error| error.to_string())?.len();
+        if bytes > FILE_BYTES_MAX {
+            return Err(format!("it has {bytes} bytes"));
+        }
+        let text = std::fs::read_to_string(path).map_err(|error| error.to_string())?;
+        let rules: Self = toml::from_str(&text).map_err(|error| {
+            let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
+            let line = before.matches('\n').count() + 1;
+            format!("line {line}: {}", error.message())
+        })?;
+        let certificates = rules.certificates.iter().map(|rule| &rule.tenant);
+        let mut tenants = certificates.chain(rules.peers.iter().map(|rule| &rule.tenant));
+        match tenants.find(|tenant| !is_tenant_name(tenant)) {
+            Some(wrong) => Err(format!("`{wrong}` is no name of a tenant")),
+            None => Ok(rules),
+        }
+    }
+
+    /// Who that is, if a rule says so.
+    pub(super) fn principal(&self, identity: &Identity, tenants: &Tenants) -> Option<Principal> {
+        let principal = |name: &str, tenant: &str, role: Role| Principal {
+            name: name.to_owned(),
+            tenant: tenants.named(tenant),
+            tenant_name: tenant.to_owned(),
+            role,
+        };
+        match identity {
+            Identity::Certificate(certificate) => self.certificates.iter().find_map(|rule| {
+                let is_it = |name: &&String| rule.subject == ANY_SUBJECT || **name == rule.subject;
+                let name = certificate.names.iter().find(is_it)?;
+                Some(principal(name, &rule.tenant, rule.role))
+            }),
+            Identity::User(uid) => {
+                let rule = self.peers.iter().find(|rule| rule.uid == *uid)?;
+                let name = rule.name.clone().unwrap_or_else(|| format!("uid {uid}"));
+                Some(principal(&name, &rule.tenant, rule.role))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<Rules, String> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rules.toml");
+        std::fs::write(&path, text).unwrap();
+        let own = PeerRule { uid: 7, name: None, tenant: "own".to_owned(), role: Role::Admin };
+        let settings =
+            AuthSettings { rules: Some(path), peers: vec![own], ..AuthSettings::default() };
+        Rules::read(&settings).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn the_configuration_comes_before_the_file() {
+        let text = "[[peers]]\nuid = 7\nrole = \"viewer\"\n[[peers]]\nuid = 8\nname = \"eve\"\n\
+                    tenant = \"lab\"\nrole = \"driver\"\n\
+                    [[certificates]]\nsubject = \"*\"\nrole = \"viewer\"\n";
+        let (rules, tenants) = (read(text).unwrap(), Tenants::default());
+        let of = |uid| rules.principal(&Identity::User(uid), &tenants);
+        assert_eq!(of(7).unwrap().role, Role::Admin);
+        let eve = of(8).unwrap();
+        assert_eq!((eve.name.as_str(), eve.tenant_name.as_str()), ("eve", "lab"));
+        assert_eq!(of(9), None);
+        let names = vec!["robot".to_owned()];
+        let certificate = Certificate { names, expires: SystemTime::UNIX_EPOCH };
+        let robot = Identity::Certificate(Arc::new(certificate));
+        assert_eq!(rules.principal(&robot, &tenants).unwrap().name, "robot");
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        for (text, word) in [
+            ("peers = 3", "line 1"),
+            ("\n[[peers]]\nuid = 1\nrole = \"king\"", "line 4"),
+            ("[[peers]]\nuid = 1\nrole = \"admin\"\ntenant = \"../x\"", "../x"),
+            ("other = 1", "other"),
+        ] {
+            let error = read(text).unwrap_err();
+            assert!(error.contains(word) && error.contains("rules.toml"), "{error}");
+        }
+    }
+}
