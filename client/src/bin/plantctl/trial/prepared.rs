@@ -178,7 +178,7 @@ pub(crate) fn first_step(event: &Event, time_step_s: f64) -> u64 {
 
 /// A message of the contract from its fields as the file has them.
 fn message<M: prost::Message + Default>(name: &str, fields: &toml::Table) -> Result<M> {
-    json::read(name, &serde_json::to_string(fields)?)
+    json::read_value(name, serde_json::to_value(fields)?)
 }
 
 /// Names of the numbers that output channels deliver.
