@@ -18,7 +18,8 @@ use crate::server::context::Context;
 pub(crate) struct Analyze {
     #[command(flatten)]
     point: Point,
-    /// Outputs, comma-separated entries of x such as `theta` or `p(theta)`; all if not given.
+    /// Outputs, comma-separated: entries of x such as `theta` or `p(theta)`, velocities `v(theta)`; all of x if not
+    /// given.
     #[arg(long, value_delimiter = ',')]
     outputs: Vec<String>,
     /// Frequencies of the response, comma-separated, Hz.

@@ -13,9 +13,8 @@ use crate::input::files::read_result;
 use crate::input::point::space;
 use crate::input::weights::RegulatorWeights;
 use crate::output::page::{Page, matrix};
-use crate::output::plant::feedback;
+use crate::output::plant::{feedback, listed};
 use crate::output::printer::Output;
-use crate::output::text::numbers;
 use crate::server::context::{Context, for_each, model_of, plant};
 
 /// Gives a plant a reference with its regulator, or takes it away.
@@ -185,16 +184,17 @@ fn watched(message: &v1::WatchGainsResponse, model: &v1::Model) -> Page {
     }
     if let Some(law) = &message.gain {
         let _ = writeln!(text, "from step {} on, revision {}", law.step, message.revision);
+        let (x, u) = (names::state(model), names::input(model));
         let lines = [
-            ("x_reference", &law.x_reference),
-            ("u_reference", &law.u_reference),
-            ("feedforward", &law.feedforward),
+            ("x_reference", &x, &law.x_reference),
+            ("u_reference", &u, &law.u_reference),
+            ("feedforward", &u, &law.feedforward),
         ];
-        for (name, values) in lines.into_iter().filter(|(_, values)| !values.is_empty()) {
-            let _ = writeln!(text, "  {name}: {}", numbers(values));
+        for (name, entries, values) in lines.into_iter().filter(|(.., values)| !values.is_empty()) {
+            let _ = writeln!(text, "  {name}: {}", listed(entries, values));
         }
         if let Some(k) = &law.k {
-            text.table(matrix("K", k, &names::input(model), &names::state(model)));
+            text.table(matrix("K", k, &u, &x));
         }
     }
     text

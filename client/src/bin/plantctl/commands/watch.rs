@@ -4,6 +4,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use plantd_client::{Client, v1};
 
+use crate::contract::names;
 use crate::input::weights::RegulatorWeights;
 use crate::output::page::Page;
 use crate::output::text::numbers;
@@ -133,7 +134,8 @@ fn watched(message: &v1::WatchResponse, model: &v1::Model, frames: &[String]) ->
     };
     let lost = (message.dropped > 0).then(|| format!("  {} messages lost\n", message.dropped));
     let failure = message.failure.as_ref().map(|f| format!("  {}: {}\n", f.reason, f.message));
-    let input = (!message.u.is_empty()).then(|| format!("  u: {}\n", numbers(&message.u)));
+    let u = || plant::listed(&names::input(model), &message.u);
+    let input = (!message.u.is_empty()).then(|| format!("  u: {}\n", u()));
     let parts: [Option<Page>; 11] = [
         Some(head),
         input.map(Page::from),

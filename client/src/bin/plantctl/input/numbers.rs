@@ -1,17 +1,20 @@
 //! Numbers on the command line.
 
-use std::collections::HashMap;
+use std::borrow::Cow;
+use std::collections::{BTreeMap, HashMap};
 
 use anyhow::{Result, bail};
 use plantd_client::v1;
 use plantd_scene::UnknownName;
+use schemars::JsonSchema;
+use serde::Deserialize;
 
 /// Comma-separated numbers.
 #[derive(Clone, Debug)]
 pub(crate) struct Numbers(pub(crate) Vec<f64>);
 
 /// A diagonal weight; one number stands for all entries.
-pub(crate) fn diagonal(values: &[f64], count: usize) -> v1::Weight {
+fn diagonal(values: &[f64], count: usize) -> v1::Weight {
     match values {
         [value] => plantd_client::diagonal(vec![*value; count]),
         values => plantd_client::diagonal(values),
@@ -44,10 +47,40 @@ pub(crate) fn assignment(text: &str) -> Result<Assignment, String> {
 }
 
 /// A vector: all its numbers, or some of them by their names.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Deserialize)]
+#[serde(from = "Entries")]
 pub(crate) enum Vector {
     All(Vec<f64>),
     Named(Vec<Assignment>),
+}
+
+/// A vector in a file: a list of all numbers, or a table of some by their names.
+#[derive(Deserialize, JsonSchema)]
+#[serde(untagged, expecting = "a list of numbers, or a table of numbers by their names, is needed")]
+enum Entries {
+    All(Vec<f64>),
+    Named(BTreeMap<String, f64>),
+}
+
+impl From<Entries> for Vector {
+    fn from(entries: Entries) -> Self {
+        match entries {
+            Entries::All(numbers) => Self::All(numbers),
+            Entries::Named(named) => Self::Named(
+                named.into_iter().map(|(name, value)| Assignment(name, value)).collect(),
+            ),
+        }
+    }
+}
+
+impl JsonSchema for Vector {
+    fn schema_name() -> Cow<'static, str> {
+        "Vector".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        Entries::json_schema(generator)
+    }
 }
 
 /// Reads comma-separated numbers, or `name=value` with commas between.

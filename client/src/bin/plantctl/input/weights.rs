@@ -5,7 +5,7 @@ use clap::Args;
 use plantd_client::{WeightsExt as _, v1};
 
 use crate::contract::names;
-use crate::input::numbers::{Vector, diagonal, vector};
+use crate::input::numbers::{Vector, vector};
 
 /// Weights of a regulator.
 #[derive(Debug, Args)]
@@ -22,9 +22,7 @@ pub(crate) struct Weights {
 impl Weights {
     /// The weights for a model; lengths are for the server to judge.
     pub(crate) fn for_model(&self, model: &v1::Model) -> Result<v1::LqrWeights> {
-        let q = self.q.diagonal("q", &names::state(model), 1.0)?;
-        let r = self.r.diagonal("r", &names::input(model), 1.0)?;
-        Ok(plantd_client::weights(q, r))
+        diagonals(&self.q, &self.r, model)
     }
 }
 
@@ -46,8 +44,9 @@ impl RegulatorWeights {
     }
 }
 
-/// Diagonal weights for a model; one number stands for all entries.
-pub(crate) fn diagonals(q: &[f64], r: &[f64], model: &v1::Model) -> v1::LqrWeights {
-    let (states, inputs) = (names::state(model).len(), names::input(model).len());
-    plantd_client::weights(diagonal(q, states), diagonal(r, inputs))
+/// Diagonal weights for a model; one number stands for all entries, and those that are not named have 1.
+pub(crate) fn diagonals(q: &Vector, r: &Vector, model: &v1::Model) -> Result<v1::LqrWeights> {
+    let q = q.diagonal("q", &names::state(model), 1.0)?;
+    let r = r.diagonal("r", &names::input(model), 1.0)?;
+    Ok(plantd_client::weights(q, r))
 }

@@ -75,6 +75,12 @@ fn named(names: &[(String, String)], values: &[f64]) -> String {
     names.iter().zip(values).map(one).collect::<Vec<_>>().join(", ")
 }
 
+/// Numbers with their names; without where the names are those of something else.
+pub(crate) fn listed(names: &[String], values: &[f64]) -> String {
+    let names: Vec<_> = names.iter().map(|name| (name.clone(), String::new())).collect();
+    named(&names, values)
+}
+
 /// A state as a row under the names that recordings have for its numbers.
 fn row(state: &v1::State, model: &v1::Model) -> Table {
     let (x, velocity) = (names::recorded(model), names::velocity(model));

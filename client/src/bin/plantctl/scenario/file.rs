@@ -8,6 +8,7 @@ use plantd_scene::in_plain_words;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use crate::input::numbers::Vector;
 use crate::scenario::distribution::{Distribution, case_seed};
 use crate::scenario::expectation::Expectation;
 use crate::scenario::expression::Expression;
@@ -177,10 +178,11 @@ pub(crate) struct Inputs {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Lqr {
-    /// Diagonal of the state weight; one number stands for all.
-    pub(crate) q: Vec<f64>,
-    /// Diagonal of the input weight; one number stands for all.
-    pub(crate) r: Vec<f64>,
+    /// Diagonal of the state weight: a list, in which one number stands for all, or a table by name, in which what is
+    /// not named has 1.
+    pub(crate) q: Vector,
+    /// Diagonal of the input weight, in the same way.
+    pub(crate) r: Vector,
     /// Compute the gain anew when parameters change. Along a trajectory it always is.
     #[serde(default)]
     pub(crate) adapts: bool,

@@ -266,7 +266,7 @@ pub(crate) async fn feedback(
     id: &str,
 ) -> Result<v1::SetFeedbackRequest> {
     use v1::set_feedback_request::Reference as Form;
-    let mut weights = diagonals(&lqr.q, &lqr.r, model);
+    let mut weights = diagonals(&lqr.q, &lqr.r, model)?;
     if lqr.projected_momentum {
         weights = weights.on_projected_momentum();
     }
