@@ -6,7 +6,7 @@ use plantd_proto::v1::{
     plant_service_client::PlantServiceClient, recording_service_client::RecordingServiceClient,
 };
 
-use crate::connection::{ConnectOptions, MAX_RECEIVE_BYTES, connect};
+use crate::connection::{ConnectOptions, MAX_RECEIVE_BYTES, connect, is_serving};
 use crate::credentials::AuthorizedChannel;
 use crate::driver::Driver;
 use crate::error::{Error, Result};
@@ -37,6 +37,15 @@ impl Client {
     pub async fn connect_with(address: impl AsRef<str>, options: ConnectOptions) -> Result<Self> {
         let channel = connect(address.as_ref(), &options).await?;
         Ok(Self { channel, options })
+    }
+
+    /// Whether the server at an address serves, by gRPC's health service, which needs no token. A server that is
+    /// about to end does not.
+    ///
+    /// # Errors
+    /// As of [`Client::connect`].
+    pub async fn is_serving(address: impl AsRef<str>, options: &ConnectOptions) -> Result<bool> {
+        is_serving(address.as_ref(), options).await
     }
 
     // ---- the generated stubs, for what is not wrapped ----

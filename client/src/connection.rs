@@ -8,6 +8,9 @@ use std::time::Duration;
 
 use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::Endpoint;
+use tonic_health::pb::HealthCheckRequest;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::health_client::HealthClient;
 
 use crate::credentials::{AuthorizedChannel, Credentials};
 use crate::error::{ConnectProblem, Error, Result, root_cause};
@@ -53,10 +56,26 @@ impl Default for ConnectOptions {
 
 /// Opens a channel to `http://host:port`, `https://host:port`, `host:port` or `unix:/path`.
 pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<AuthorizedChannel> {
+    let channel = open(address, options).await?;
+    let failed = |problem| Error::Connect { address: address.to_owned(), problem };
+    let limit = options.connect_timeout;
+    match tokio::time::timeout(limit, speaks_grpc(channel.clone())).await {
+        Ok(Ok(Some(stranger))) => Err(stranger.into()),
+        Ok(Ok(None)) => Ok(channel),
+        Ok(Err(problem)) if address.starts_with("https://") => {
+            let said = refusal(address, &options.credentials, limit).await;
+            Err(failed(said.and_then(|said| tls_problem(&said)).unwrap_or(problem)))
+        }
+        Ok(Err(problem)) => Err(failed(problem)),
+        Err(_) => Err(failed(ConnectProblem::Silent(limit))),
+    }
+}
+
+/// Opens a channel without asking what is at its other end.
+async fn open(address: &str, options: &ConnectOptions) -> Result<AuthorizedChannel> {
     let authorization = options.credentials.header()?;
     let endpoint = endpoint(address)?;
-    let is_secured = address.starts_with("https://");
-    let endpoint = match is_secured {
+    let endpoint = match address.starts_with("https://") {
         true => secured(endpoint, &options.credentials)?,
         false => endpoint,
     };
@@ -77,17 +96,15 @@ pub(crate) async fn connect(address: &str, options: &ConnectOptions) -> Result<A
         Ok(Err(error)) => return Err(failed(problem(address, &error, limit))),
         Err(_) => return Err(failed(ConnectProblem::TimedOut(limit))),
     };
-    let channel = AuthorizedChannel::new(channel, authorization);
-    match tokio::time::timeout(limit, speaks_grpc(channel.clone())).await {
-        Ok(Ok(Some(stranger))) => Err(stranger.into()),
-        Ok(Ok(None)) => Ok(channel),
-        Ok(Err(problem)) if is_secured => {
-            let said = refusal(address, &options.credentials, limit).await;
-            Err(failed(said.and_then(|said| tls_problem(&said)).unwrap_or(problem)))
-        }
-        Ok(Err(problem)) => Err(failed(problem)),
-        Err(_) => Err(failed(ConnectProblem::Silent(limit))),
-    }
+    Ok(AuthorizedChannel::new(channel, authorization))
+}
+
+/// Asks the health service of gRPC whether a server serves; it answers everybody, whoever they are.
+pub(crate) async fn is_serving(address: &str, options: &ConnectOptions) -> Result<bool> {
+    let mut health = HealthClient::new(open(address, options).await?);
+    let ask = health.check(HealthCheckRequest::default());
+    let answer = within(options.connect_timeout, ask).await?.into_inner();
+    Ok(answer.status() == ServingStatus::Serving)
 }
 
 /// Why a connection could not be made.

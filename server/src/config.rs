@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr, ToSocketAddrs as _};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
@@ -31,7 +31,7 @@ const DURATION_MAX_S: f64 = 86_400.0;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// gRPC over TCP: `address:port`, port 0 for any free one, or `off`.
+    /// gRPC over TCP: `address:port` or `name:port`, port 0 for any free one, or `off`.
     pub grpc: Listen,
     /// gRPC over a unix-domain socket at this path; not given means none.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -152,10 +152,18 @@ impl Listen {
     }
 }
 
-/// Not an address.
+/// Why there is nowhere to listen.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is neither `off` nor an address like 127.0.0.1:50051 or [::]:50051")]
-pub struct ListenError(String);
+pub enum ListenError {
+    /// It is no address.
+    #[error(
+        "`{0}` is neither `off` nor an address like 127.0.0.1:50051, [::]:50051 or localhost:50051"
+    )]
+    NotAnAddress(String),
+    /// Nothing has that name.
+    #[error("`{0}` has the name of no machine: {1}")]
+    Unknown(String, String),
+}
 
 impl FromStr for Listen {
     type Err = ListenError;
@@ -163,9 +171,26 @@ impl FromStr for Listen {
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         match text {
             "off" => Ok(Self::Off),
-            _ => text.parse().map(Self::At).map_err(|_| ListenError(text.to_owned())),
+            _ => match text.parse() {
+                Ok(address) => Ok(Self::At(address)),
+                Err(_) => by_name(text).map(Self::At),
+            },
         }
     }
+}
+
+/// The address of `name:port`, of IPv4 where there is one.
+fn by_name(text: &str) -> Result<SocketAddr, ListenError> {
+    let is_named = text.rsplit_once(':').is_some_and(|(name, port)| {
+        !name.is_empty() && !name.contains([':', '/', ' ']) && port.parse::<u16>().is_ok()
+    });
+    if !is_named {
+        return Err(ListenError::NotAnAddress(text.to_owned()));
+    }
+    let unknown = |problem: String| ListenError::Unknown(text.to_owned(), problem);
+    let found = text.to_socket_addrs().map_err(|error| unknown(error.to_string()))?;
+    let first = found.min_by_key(|address| !address.is_ipv4());
+    first.ok_or_else(|| unknown("it has no address".to_owned()))
 }
 
 impl TryFrom<String> for Listen {
@@ -551,6 +576,18 @@ mod tests {
         let config = Config { unix: Some("/run/plantd.sock".into()), ..Config::default() };
         let text = config.to_toml().unwrap();
         assert_eq!(toml::from_str::<Config>(&text).unwrap(), config);
+    }
+
+    #[test]
+    fn a_name_of_a_machine_is_an_address() {
+        let at = |text: &str| text.parse::<Listen>();
+        assert_eq!(at("127.0.0.1:5").unwrap(), at("localhost:5").unwrap());
+        assert!(matches!(at("[::1]:5"), Ok(Listen::At(_))) && at("off") == Ok(Listen::Off));
+        for wrong in ["localhost", "localhost:", ":5", "http://localhost:5", "a b:5", "a:99999"] {
+            assert_eq!(at(wrong), Err(ListenError::NotAnAddress(wrong.to_owned())));
+        }
+        let unknown = at("no-such-host.invalid:5").unwrap_err().to_string();
+        assert!(unknown.contains("`no-such-host.invalid:5`"), "{unknown}");
     }
 
     #[test]

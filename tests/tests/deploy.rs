@@ -259,6 +259,21 @@ fn the_container_is_built_from_what_is_here_and_not_run_by_root() {
     }
 }
 
+/// Versions agree, the changelog has the section, `cargo binstall` finds what is packed, and the parts can be listed.
+#[test]
+fn a_release_can_be_made() {
+    let mut check = Command::new("python3");
+    check.arg("deploy/release.py").arg("--check").current_dir(root());
+    let output = check.output().expect("python3 runs");
+    let told = String::from_utf8_lossy(&output.stderr);
+    if told.contains("No module named 'tomllib'") {
+        println!("skipped: releases are made with Python 3.11 or later");
+        return;
+    }
+    assert!(output.status.success(), "{told}");
+    assert!(read("deploy/Containerfile").contains("[\"/usr/local/bin/plantctl\", \"health\"]"));
+}
+
 /// Runs systemd-analyze; none, and a message, if it is not installed.
 fn systemd_analyze(arguments: &[&str]) -> Option<(bool, String)> {
     match Command::new("systemd-analyze").args(arguments).output() {

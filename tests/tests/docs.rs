@@ -40,7 +40,7 @@ fn read(path: &str) -> String {
 #[test]
 fn examples_in_documents_are_files_that_are_tested() {
     for (document, language, file) in [
-        ("README.md", "python", "client/python/examples/pendulum_lqr.py"),
+        ("README.md", "python", "client/python/examples/balance.py"),
         ("docs/control.md", "python", "client/python/examples/swing_up.py"),
     ] {
         let block = format!("```{language}\n{}\n```", read(file).trim());

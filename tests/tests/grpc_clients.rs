@@ -71,6 +71,34 @@ fn node() {
     assert_same_motion(&mut node);
 }
 
+/// With Go's packages where Debian puts them: others come over the network.
+#[test]
+fn go() {
+    const PACKAGES: &str = "/usr/share/gocode";
+    let tools = [
+        ("go", &["version"][..]),
+        ("protoc", &["--version"]),
+        ("sh", &["-c", "command -v protoc-gen-go && command -v protoc-gen-go-grpc"]),
+        ("test", &["-d", "/usr/share/gocode/src/google.golang.org/grpc"]),
+    ];
+    if let Some((tool, probe)) = tools.iter().find(|(tool, probe)| !has(tool, probe)) {
+        println!("skipped: {tool} {} fails", probe.join(" "));
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let package = directory.path().join("src/plantd-example");
+    std::fs::create_dir_all(&package).unwrap();
+    let example = folder("client/go");
+    std::fs::copy(example.join("pendulum.go"), package.join("pendulum.go")).unwrap();
+    run(Command::new(example.join("generate.sh")).arg(&package));
+    let program = directory.path().join("pendulum");
+    let paths = format!("{}:{PACKAGES}", directory.path().display());
+    let mut build = Command::new("go");
+    build.args(["build", "-o"]).arg(&program).arg(".").current_dir(&package);
+    run(build.env("GO111MODULE", "off").env("GOPATH", paths));
+    assert_same_motion(&mut Command::new(program));
+}
+
 #[test]
 fn cpp() {
     let tools = [

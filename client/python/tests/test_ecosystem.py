@@ -1,5 +1,7 @@
 """What other packages make of plants: control, scipy, gymnasium, pandas, matplotlib."""
 
+import dataclasses
+
 import numpy as np
 import plantd
 import pytest
@@ -122,6 +124,16 @@ def test_motions_and_analyses_are_drawn(own):
     assert sum(len(line.get_xdata()) for line in poles.lines[1:]) == len(analysis.modes)
     assert magnitude.lines[0].get_label() == "theta / force"
     assert len(own.analyze("cart-pole", at="upright").plot().axes) == 1
+    law = own.solve_lqr("cart-pole", at="upright", q=[1, 1, 1, 1], r=[1])
+    names = ["x", "theta", "p(x)", "p(theta)"]
+    axis, _ = law.plot(names, ["force"]).axes
+    assert [tick.get_text() for tick in axis.get_xticklabels()] == names and len(axis.texts) == 4
+    with pytest.raises(ValueError, match="1 names are given; 4 are needed"):
+        law.plot(["x"])
+    later = plantd.Gain.from_matrix(2 * law.k, law.x_reference, law.u_reference)
+    schedule = plantd.GainSchedule([law, dataclasses.replace(later, step=5)])
+    (axis,) = schedule.plot().axes
+    assert len(axis.lines) == 4 and list(axis.lines[1].get_ydata()) == [law.k[0, 1], 2 * law.k[0, 1]]
 
 
 def test_progress_is_shown_where_somebody_asked_and_nowhere_else(own, capsys):

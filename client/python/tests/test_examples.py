@@ -1,5 +1,6 @@
 """The examples run, and close their loops in fewer than 50 lines."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -13,6 +14,13 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 def run(name, *arguments):
     command = [sys.executable, str(EXAMPLES / name), *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=200).stdout
+
+
+def test_balance(tmp_path):
+    environment = {**os.environ, "PLANTD": os.environ["PLANTD_SERVER"], "MPLBACKEND": "Agg"}
+    command = [sys.executable, str(EXAMPLES / "balance.py")]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True, timeout=200)
+    assert (tmp_path / "cart-pole.png").stat().st_size > 10_000
 
 
 def test_pendulum_lqr(addresses):

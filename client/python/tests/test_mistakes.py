@@ -1,6 +1,11 @@
 """Mistakes that people make: each is answered with the name of the culprit and what is allowed or near, and never
 with words of the libraries underneath."""
 
+import os
+import re
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import plantd
 import pytest
@@ -122,7 +127,9 @@ CALLS = [
     (lambda c: c.create_plant("pendulum", expires=0.1), "expires_s: is 0.1; it must be 0 or lie between 1 and"),
     (lambda c: c.create_plant("pendulum", expires="1 h"), "`expires` is '1 h'; a number"),
     # Steps and inputs.
-    (lambda c: c.step(PLANT), "no step is asked for"),
+    (lambda c: c.step(PLANT, count=0), "`count` is 0; a whole number from 1"),
+    (lambda c: c.step(PLANT, [[1.0], [2.0]], count=1), "`count` is 1; `u` has 2 rows"),
+    (lambda c: c.step(PLANT, count=2, hold=1), "give one of `count` and `hold`"),
     (lambda c: c.step(PLANT, [[1.0, 2.0]]), "has 2 columns; 1 are needed"),
     (lambda c: c.step(PLANT, [1.0]), r"`u` has the shape \(1,\); a matrix is needed, with one row per step"),
     (lambda c: c.step(PLANT, [["a"]]), r"`u` is \[\['a'\]\]; numbers are needed"),
@@ -295,8 +302,80 @@ def test_a_wrong_scene_says_what_is_wrong(own, good, wrong, said):
     check(lambda: own.create_model(SCENE.replace(good, wrong, 1)), said)
 
 
+SCENARIO = """
+duration_s = 1.0
+[plant]
+model = "pendulum"
+time_step_s = 0.02
+[[expect]]
+settles = { signal = "theta", to = 0, within = 0.1, by_s = 0.5 }
+"""
+
+#: What is changed in the scenario, and what is said of it.
+SCENARIOS = [
+    ("duration_s = 1.0", "duration = 1.0", "there is no key `duration`; did you mean `duration_s`?"),
+    ("duration_s = 1.0", "", "`duration_s` is missing"),
+    ("duration_s = 1.0", 'duration_s = "1"', 'duration_s: string "1" is given; a number is needed'),
+    ("duration_s = 1.0", "duration_s = -1.0", "duration_s is -1; it must be greater than zero"),
+    ("duration_s = 1.0", 'duration_s = 1.0\npace = "pacd"', "pace: there is no `pacd`; did you mean `paced`?"),
+    ('model = "pendulum"', "", "plant: give either `model` or `scene`"),
+    ('model = "pendulum"', 'modell = "pendulum"', "plant.modell: there is no key `modell`; did you mean `model`?"),
+    ("[plant]", "[plnt]", "there is no key `plnt`; did you mean `plant`?"),
+    ("settles", "setles", r"expect\[0\]: there is no `setles`; did you mean `settles`?"),
+    ("by_s = 0.5", "by = 0.5", r"expect\[0\].settles.by: there is no key `by`; there are `signal`, `to`, `within`, `by_s`"),
+    ("by_s = 0.5", "by_s = 2.0", r"expect\[0\].settles: by_s is 2"),
+    ('signal = "theta"', 'signal = "speed(theta)"', "there is no function `speed` at character 1"),
+    ('signal = "theta"', "signal = [1]", "a number or an expression is needed"),
+    ("within = 0.1, ", "", "`within` is missing"),
+    ("time_step_s = 0.02", "time_step_s = 0.02\ndt = 0.02", "time_step_s"),
+    ("[[expect]]", "[controller.lqr]\nq = [1]\nr = [1]\n[[expect]]", "controller.lqr: a `reference` is needed"),
+    ("[[expect]]", "[controller.pid]\nk = 1\n[[expect]]", "controller: there is no `pid`"),
+]
+
+#: A configuration, and what is said of it.
+CONFIGURATIONS = [
+    ('gprc = "off"', "line 1: there is no key `gprc`; did you mean `grpc`?"),
+    ('grpc = "nowhere"', "`nowhere` is neither `off` nor an address like"),
+    ("threads = -1", "line 1: number `-1` is given; a whole number that is not negative is needed"),
+    ('\nthreads = "many"', 'line 2: string "many" is given'),
+    ("[log]\nformat = 'jsn'", "there is no `jsn`; did you mean `json`?"),
+    ("[limits]\nplant = 3", "there is no key `plant`; did you mean `plants`?"),
+    ("shutdown_grace_s = -1", "shutdown_grace_s is -1; it must lie between 0 and"),
+    ("grpc = ", "line 1"),
+]
+
+
+def said_by(program, *arguments):
+    """What a program says that refuses; not twice the same."""
+    folder = Path(os.environ["PLANTD_SERVER"]).parent
+    run = subprocess.run([folder / program, *arguments], capture_output=True, text=True, timeout=60)
+    assert run.returncode != 0, run.stdout
+    text = run.stdout + run.stderr
+    assert [word for word in STRANGE if word in text] == [], text
+    return text
+
+
+def test_a_wrong_scenario_says_what_is_wrong(tmp_path):
+    for number, (good, wrong, _) in enumerate(SCENARIOS):
+        assert good in SCENARIO
+        (tmp_path / f"{number:02}.toml").write_text(SCENARIO.replace(good, wrong, 1))
+    lines = said_by("plantctl", "test", "--list", str(tmp_path)).splitlines()
+    assert len(lines) == len(SCENARIOS)
+    for number, (_, _, said) in enumerate(SCENARIOS):
+        (line,) = [line for line in lines if f"{number:02}.toml" in line]
+        assert re.search(said, line), f"{said}: {line}"
+
+
+@pytest.mark.parametrize("text, said", CONFIGURATIONS)
+def test_a_wrong_configuration_says_once_what_is_wrong(tmp_path, text, said):
+    file = tmp_path / "plantd.toml"
+    file.write_text(text)
+    told = said_by("plantd", "serve", "--config", str(file))
+    assert len(told.strip().splitlines()) == 1 and re.search(said, told), told
+
+
 def test_the_list_is_long():
-    assert len(CALLS) + len(SCENES) >= 140
+    assert len(CALLS) + len(SCENES) + len(SCENARIOS) + len(CONFIGURATIONS) >= 140
 
 
 @pytest.mark.parametrize("address, said", [

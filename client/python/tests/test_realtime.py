@@ -14,6 +14,15 @@ def test_a_run_of_some_steps_is_waited_for(client):
     assert client.timing(id).steps == 0
 
 
+def test_a_run_that_a_step_ends_raises_what_the_plant_says(client):
+    # A guess of one iteration, of a step in which the pendulum turns over.
+    hard = {"dt": 1.0, "newton_iterations": 1, "halvings": 0}
+    with client.plant("double-pendulum", q=[1.0, 2.0], velocity=[9.0, -9.0], **hard) as plant:
+        with pytest.raises(plantd.StepError) as failed:
+            plant.run("free", steps=20, wait=True)
+        assert failed.value.reason == "NOT_CONVERGED" and plant.state.step < 20
+
+
 def test_the_same_loop_drives_a_plant_that_runs_by_itself(client):
     id = client.create_plant("cart-pole").id
     client.run(id, "paced", speed=10, timeout=0.5, action="ramp", ramp=0.1, safe=[0.0])

@@ -81,8 +81,7 @@ def over_local(server, folder):
 
 def over_shared_memory(server, folder):
     link = pytest.importorskip("plantd.link", reason="there is no iceoryx2 wheel for this platform")
-    plant = server.create_plant("pendulum", open_link=True)
-    with link.LinkDriver(plant.id, root=server.server.link_root) as driver:
+    with server.plant("pendulum") as plant, link.LinkDriver(plant) as driver:
         state, rows = driver.state, []
         for _ in range(STEPS):
             state = driver.step([torque(state.q[0], state.p[0])])
@@ -129,6 +128,20 @@ def in_node(server, folder):
     return printed("node", folder / "pendulum.js", tcp(server), str(STEPS), PLANTD_PROTO=str(ROOT / "proto"))
 
 
+def in_go(server, folder):
+    packages = Path("/usr/share/gocode")
+    needs("go", "protoc", "protoc-gen-go", "protoc-gen-go-grpc")
+    if not (packages / "src/google.golang.org/grpc").exists():
+        pytest.skip("gRPC for Go is not where Debian puts it")
+    package = folder / "src/plantd-example"
+    package.mkdir(parents=True)
+    shutil.copy(ROOT / "client/go/pendulum.go", package)
+    subprocess.run([ROOT / "client/go/generate.sh", package], check=True)
+    go = {**os.environ, "GO111MODULE": "off", "GOPATH": f"{folder}:{packages}"}
+    subprocess.run(["go", "build", "-o", folder / "pendulum", "."], cwd=package, env=go, check=True)
+    return printed(folder / "pendulum", tcp(server), str(STEPS))
+
+
 def in_rust(server, folder):
     """The example of the Rust library, which the build has made."""
     program = binaries() / "examples" / "pendulum"
@@ -161,6 +174,7 @@ WAYS = {
     "python in process": over_local,
     "fmu": through_the_fmu,
     "node": in_node,
+    "go": in_go,
     "rust": in_rust,
     "c": compiled("cc", "c11", "pendulum.c"),
     "c++": compiled("c++", "c++20", "pendulum.cpp"),

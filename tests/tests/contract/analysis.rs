@@ -212,3 +212,58 @@ async fn assert_pole(client: &Client) {
     let (w, magnitude) = (TAU * 1e-3, response.magnitude.unwrap().at(0, 0));
     assert!((magnitude * 2.0 * w * w - 1.0).abs() < 1e-6, "{magnitude}");
 }
+
+/// The response of a velocity is that of its coordinate times the frequency: of the map, the midpoint's.
+#[tokio::test]
+async fn velocities_are_outputs_of_points_at_rest() {
+    let (_server, client) = server().await;
+    for (model, point, coordinate) in [
+        ("cart-pole", "hanging", "x"),
+        ("cart-pole", "upright", "theta"),
+        ("four-bar", "rest", "crank"),
+    ] {
+        let at = client.get_model(model).await.unwrap();
+        let frequency = 0.2;
+        let request = v1::AnalyzeRequest {
+            outputs: vec![coordinate.to_owned(), format!("v({coordinate})")],
+            frequencies_hz: vec![frequency],
+            ..analyze(model, point)
+        };
+        let answer = client.analyze(request).await.unwrap();
+        assert_eq!(answer.outputs[1], format!("v({coordinate})"));
+        let magnitude = answer.responses[0].magnitude.as_ref().unwrap();
+        let ratio = magnitude.at(1, 0) / magnitude.at(0, 0);
+        let h = at.time_step_s;
+        let expected = 2.0 / h * (std::f64::consts::PI * frequency * h).tan();
+        assert!((ratio / expected - 1.0).abs() < 1e-3, "{model}: {ratio} is not {expected}");
+    }
+    let wrong = v1::AnalyzeRequest {
+        outputs: vec!["v(tetha)".to_owned()],
+        ..analyze("cart-pole", "hanging")
+    };
+    assert_refused(
+        client.analyze(wrong).await,
+        Code::InvalidArgument,
+        "INVALID_ARGUMENT",
+        "outputs[0]",
+    );
+    let id = plant(&client, "pendulum").await.id;
+    let push = v1::StepRequest {
+        id: id.clone(),
+        u: Some(v1::Matrix::from_rows(&[[1.0]])),
+        ..Default::default()
+    };
+    client.step(push).await.unwrap();
+    let moving = v1::AnalyzeRequest {
+        model: "pendulum".to_owned(),
+        point: Some(present_state(&id)),
+        outputs: vec!["v(theta)".to_owned()],
+        ..Default::default()
+    };
+    assert_refused(
+        client.analyze(moving).await,
+        Code::InvalidArgument,
+        "INVALID_ARGUMENT",
+        "outputs",
+    );
+}

@@ -131,7 +131,7 @@ async fn streams_end_when_their_token_is_revoked() {
         let request = v1::RunRequest { id: "p1".to_owned(), wait: true, ..Default::default() };
         tokio::spawn(async move { client.run(request).await })
     };
-    assert_eq!(lab.tokens(&["revoke", "anna"]), "1 revoked");
+    assert_eq!(lab.tokens(&["revoke", "anna", "--json"]), r#"{"revoked":1}"#);
     let ended = end_of(&mut states).await;
     assert_refused(ended, Code::Unauthenticated, "CREDENTIALS_REVOKED");
     let ended = soon(async {

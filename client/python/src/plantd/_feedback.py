@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
 import numpy.typing as npt
 
 from plantd.v1 import plant_service_pb2
@@ -18,6 +19,7 @@ from ._calls import Calls
 from ._check import build, one_of, shown
 from ._errors import PlantdError, translated
 from ._gains import Gain
+from ._plots import plot_entries
 from ._requests import (
     Bounds,
     bounds,
@@ -137,6 +139,10 @@ class GainSchedule:
         if self._final is not None and state.step > self._steps[-1]:
             gain = replace(gain, x_reference=self._final)
         return gain(state)
+
+    def plot(self, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Any:
+        """A figure of the entries of ``k`` over the steps. Needs ``matplotlib``."""
+        return plot_entries(self._steps, np.array([gain.k for gain in self.gains]), inputs, states)
 
 
 class Follower:

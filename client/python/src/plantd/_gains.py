@@ -12,6 +12,7 @@ import numpy.typing as npt
 from plantd.v1 import common_pb2, control_service_pb2
 
 from ._arrays import Array, Vector, array, complexes, matrix, matrix_message, numbers, vector
+from ._plots import plot_matrix
 from ._rotation import difference
 from ._states import State, state_vector
 
@@ -69,6 +70,11 @@ class Gain:
             self._check_origin(state)
         error = difference(self.x_reference, x, self.rotations)
         return self.u_reference + self.feedforward - self.k @ error
+
+    def plot(self, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Any:
+        """A figure of ``k``, a colour for each entry, with the names of the states and inputs where they are given.
+        Needs ``matplotlib``."""
+        return plot_matrix(self.k, inputs, states, "gain")
 
     def _check_origin(self, state: State) -> None:
         """Refuses the state of a plant that the gain was not computed for."""

@@ -15,7 +15,7 @@ from plantd.v1 import common_pb2, drawing_pb2, plant_service_pb2, realtime_pb2
 from ._arrays import Array, Vector, array, complexes, failure_text, matrix_message, numbers
 from ._calls import Calls
 from ._channels import Outputs
-from ._check import build, mapping, one_of, texts
+from ._check import build, mapping, one_of, shown, texts
 from ._feedback import Feedback
 from ._gains import Gain
 from ._linearize import Linearization
@@ -318,13 +318,27 @@ class PlantCalls(Calls):
         """Ends a plant; whoever drives or watches it gets ``NOT_FOUND``."""
         self._call(self.plants.DeletePlant, build(plant_service_pb2.DeletePlantRequest, id=id))
 
-    def step(self, id: str, u: npt.ArrayLike = (), *, hold: int = 0) -> list[State]:
-        """Takes one step per row of ``u`` and ``hold`` more with the last row; all their states.
+    def step(
+        self, id: str, u: npt.ArrayLike = (), *, count: int | None = None, hold: int = 0
+    ) -> list[State]:
+        """Takes one step per row of ``u``, ``count`` in all, as ``plantctl step`` does; all their states.
 
-        Without rows there are no input forces and prescribed coordinates stay where they are.
+        Steps after the last row repeat it. Without rows there are no input forces, prescribed coordinates stay
+        where they are, and one step is taken. ``hold``, steps after the last row, says the same as ``count``.
         To close a loop use `drive`: it is faster and keeps others from stepping in between.
         """
         rows = numbers(u, "u")
+        given = len(rows) if rows.size else 0
+        if count is not None:
+            if hold:
+                raise ValueError("give one of `count` and `hold`")
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(f"`count` is {shown(count)}; a whole number from 1 on is needed")
+            if count < given:
+                raise ValueError(f"`count` is {count}; `u` has {given} rows")
+            hold = count - given
+        elif not given and hold == 0:
+            hold = 1
         request = build(
             plant_service_pb2.StepRequest,
             id=id,

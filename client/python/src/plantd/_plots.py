@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ._arrays import Array
 from ._extras import needed
 
 if TYPE_CHECKING:
@@ -37,6 +39,48 @@ def plot_table(table: Any) -> Any:
         axis.grid(True, alpha=0.3)
         axis.legend(loc="upper right", fontsize="small")
     axes[-1, 0].set_xlabel("time, s")
+    return figure
+
+
+def _names(names: Sequence[str], count: int, letter: str) -> list[str]:
+    if names and len(names) != count:
+        raise ValueError(f"{len(names)} names are given; {count} are needed")
+    return list(names) or [f"{letter}[{i}]" for i in range(count)]
+
+
+def plot_matrix(k: Array, rows: Sequence[str], columns: Sequence[str], title: str) -> Any:
+    """A figure of a matrix, a colour for each entry, with its number where there are few."""
+    plt = needed("matplotlib.pyplot", "plot")
+    height, width = k.shape
+    figure, axis = plt.subplots(figsize=(2 + 0.9 * width, 1.5 + 0.6 * height), layout="constrained")
+    bound = float(np.max(np.abs(k), initial=0.0)) or 1.0
+    image = axis.imshow(k, cmap="RdBu_r", vmin=-bound, vmax=bound, aspect="auto")
+    axis.set_xticks(range(width), _names(columns, width, "x"), rotation=45, ha="right")
+    axis.set_yticks(range(height), _names(rows, height, "u"))
+    axis.set_title(title)
+    if k.size <= 64:
+        for (row, column), value in np.ndenumerate(k):
+            dark = abs(value) > 0.6 * bound
+            axis.text(column, row, f"{value:.3g}", ha="center", va="center", color="w" if dark else "k")
+    figure.colorbar(image)
+    return figure
+
+
+def plot_entries(steps: Sequence[int], k: Array, rows: Sequence[str], columns: Sequence[str]) -> Any:
+    """A figure of the entries of matrices over steps, one part for each row."""
+    plt = needed("matplotlib.pyplot", "plot")
+    _, height, width = k.shape
+    labels = _names(columns, width, "x")
+    figure, axes = plt.subplots(
+        height, 1, sharex=True, squeeze=False, figsize=(8, 1 + 2 * height), layout="constrained"
+    )
+    for row, (name, axis) in enumerate(zip(_names(rows, height, "u"), axes[:, 0])):
+        for column, label in enumerate(labels):
+            axis.plot(steps, k[:, row, column], label=label)
+        axis.set_ylabel(f"gain of {name}")
+        axis.grid(True, alpha=0.3)
+        axis.legend(loc="upper right", fontsize="small")
+    axes[-1, 0].set_xlabel("step")
     return figure
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 
 class _Quiet:
-    def update(self, count: int = 1) -> None:
+    def update(self, count: float = 1) -> None:
         """Nothing is shown."""
 
     def set_postfix_str(self, text: str) -> None:

@@ -11,6 +11,7 @@ from plantd.v1 import realtime_pb2
 from ._arrays import Vector, vector
 from ._calls import Calls
 from ._check import build, one_of, shown
+from ._errors import from_failure
 from ._states import State
 
 #: How a plant is run: when its driver steps it, by the wall clock, or as fast as possible.
@@ -98,7 +99,8 @@ class RealtimeCalls(Calls):
     ) -> realtime_pb2.RunInfo:
         """Runs a plant: ``"paced"`` by the wall clock, ``"free"`` as fast as possible, or in
         ``"lockstep"``; without a pace as before. ``steps`` of 0 means until it is paused. With
-        ``wait`` it returns when the plant stands still again, however long that takes.
+        ``wait`` it returns when the plant stands still again, however long that takes, and raises the
+        `StepError` that has stopped it before its steps were taken.
 
         A plant that runs by itself waits for nobody: its driver's latest input acts. ``timeout``
         (seconds on the plant's clock, 0 for never), ``action`` (``"hold"``, ``"safe"``, ``"ramp"``
@@ -124,6 +126,8 @@ class RealtimeCalls(Calls):
             )
         request = build(realtime_pb2.RunRequest, id=id, settings=settings, steps=steps, wait=wait)
         answer: realtime_pb2.RunResponse = self._call(self.plants.Run, request, limited=not wait)
+        if wait and answer.run.HasField("stopped_by"):
+            raise from_failure(answer.run.stopped_by)
         return answer.run
 
     def pause(self, id: str) -> State:

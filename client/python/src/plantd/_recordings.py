@@ -10,6 +10,7 @@ from plantd.v1 import recording_service_pb2
 from ._calls import Calls
 from ._check import build
 from ._errors import translate
+from ._progress import progress_bar
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,13 @@ class RecordingCalls(Calls):
                 return recordings
 
     @translate
-    def get_recording(self, name: str, path: str | PathLike[str]) -> None:
-        """Fetches the file of a recording, which is MCAP."""
+    def get_recording(self, name: str, path: str | PathLike[str], *, progress: bool | None = None) -> None:
+        """Fetches the file of a recording, which is MCAP. ``progress`` shows a bar; by default on a terminal."""
         request = build(recording_service_pb2.GetRecordingRequest, name=name)
-        with open(path, "wb") as file:
+        with open(path, "wb") as file, progress_bar("recording, KiB", None, progress) as bar:
             for piece in self.recordings.GetRecording(request):
                 file.write(piece.data)
+                bar.update(len(piece.data) / 1024)
 
     def delete_recording(self, name: str) -> None:
         """Deletes a recording that has ended."""

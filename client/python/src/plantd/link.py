@@ -23,7 +23,7 @@ import shutil
 import stat
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import iceoryx2 as iox2
 import numpy as np
@@ -32,6 +32,9 @@ import numpy.typing as npt
 from ._arrays import Array, Vector, vector
 from ._errors import PlantdError, StepError
 from ._states import State, StepReport
+
+if TYPE_CHECKING:
+    from ._handle import PlantHandle
 
 LAYOUT_VERSION = 5
 MAGIC = int.from_bytes(b"plnt", "little")
@@ -216,17 +219,20 @@ class LinkDriver:
 
     def __init__(
         self,
-        plant: str,
+        plant: str | PlantHandle,
         *,
         root: os.PathLike[str] | str | None = None,
         poll_s: float | None = 50e-6,
         timeout_s: float = 1.0,
         connect_timeout_s: float = 1.0,
     ) -> None:
-        """Connects to a plant whose link is open, and takes its lease.
+        """Connects to a plant and takes its lease. Of a plant in hand, `Client.plant`, the link is opened, and
+        the server says where it is; of one by its id it is open, below ``root``.
 
         A wait for an answer polls for ``poll_s`` (``None``: all the time), then sleeps.
         """
+        if not isinstance(plant, str):
+            root, plant = root or plant.open_link().root_path, plant.id
         self._plant = plant
         self._root = Path(root) if root is not None else default_root()
         self._poll_ns = POLL_FOREVER_NS if poll_s is None else round(poll_s * 1e9)

@@ -20,12 +20,12 @@ use plantd_client::Credentials;
 
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, fmu, guard,
-    import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot, record,
-    reference, render, replay, run, scene, settle, shell, state, step, test, timing, token, top,
-    view, watch,
+    health, import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot,
+    record, reference, render, replay, run, scene, settle, shell, state, step, test, timing, token,
+    top, view, watch,
 };
 use crate::output::failure;
-use crate::output::printer::Output;
+use crate::output::printer::{self, Format, Output};
 use crate::server::context::Context;
 use crate::server::known::{KnownServer, read_token};
 use crate::server::names;
@@ -64,11 +64,13 @@ Examples:
   plantctl --address unix:/run/plantd/plantd.sock list plants";
 
 const EXIT_CODES: &str = "\
-Data goes to standard output, messages to standard error.
+Data goes to standard output, messages to standard error. Colours are for terminals; NO_COLOR=1 turns them off.
+Vectors are numbers in the contract's order, or some of them by name: --q theta=0.1,x=0.
 
 Exit codes:
   0  done; where things already were as asked for, a message says so
   1  refused by the server, or failed; `validate`: the scene has errors; `replay`: a step differs;
+     `health`: it does not serve;
      `run --wait`: something else has stopped the plant
   2  wrong usage
   3  no server at the address
@@ -100,9 +102,22 @@ struct Args {
     /// Key of that certificate, PEM.
     #[arg(long, global = true, value_name = "FILE", env = "PLANTD_KEY")]
     key: Option<PathBuf>,
-    /// Print JSON, in the field names of the contract; streams print one object per line.
-    #[arg(long, global = true)]
+    /// How results are written.
+    #[arg(
+        long,
+        global = true,
+        value_enum,
+        value_name = "FORMAT",
+        default_value_t,
+        env = "PLANTD_OUTPUT"
+    )]
+    output: Format,
+    /// The same as `--output json`.
+    #[arg(long, global = true, conflicts_with = "output")]
     json: bool,
+    /// Do not say in a line what has been done.
+    #[arg(long, short = 'q', global = true)]
+    quiet: bool,
     #[command(subcommand)]
     command: Command,
 }
@@ -153,6 +168,7 @@ enum Command {
     Test(test::Test),
     Delete(inventory::Delete),
     Top(top::Top),
+    Health(health::Health),
     Token(token::Token),
     Completions(shell::Completions),
     Man(shell::Man),
@@ -167,7 +183,7 @@ fn main() -> ExitCode {
 
 #[tokio::main(flavor = "current_thread")]
 async fn answer(args: Args) -> ExitCode {
-    let json = args.json;
+    let is_json = args.json || args.output == Format::Json;
     let outcome = async {
         let (command, context) = args.resolve()?;
         run(command, &context).await
@@ -177,10 +193,10 @@ async fn answer(args: Args) -> ExitCode {
         // Whoever reads our output has seen enough (`plantctl watch ... | head`).
         Err(error) if failure::is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            if json {
+            if is_json {
                 eprintln!("{}", failure::as_json(&error));
             } else {
-                eprintln!("plantctl: {error:#}");
+                printer::complain(&error);
             }
             ExitCode::from(failure::code(&error))
         }
@@ -190,7 +206,9 @@ async fn answer(args: Args) -> ExitCode {
 impl Args {
     /// What is to be done, and where: flags and environment variables win over the file of servers.
     fn resolve(self) -> Result<(Command, Context)> {
-        let Self { address, on, token, token_file, ca, cert, key, json, command } = self;
+        let Self { address, on, token, token_file, ca, cert, key, output, json, quiet, command } =
+            self;
+        let format = if json { Format::Json } else { output };
         let known = on.map(|name| KnownServer::named(&name)).transpose()?;
         let there = known.as_ref().map(KnownServer::credentials).transpose()?.unwrap_or_default();
         let token = match (token, token_file) {
@@ -204,7 +222,7 @@ impl Args {
             key: key.or(there.key),
         };
         let address = address.or(known.map(|known| known.address));
-        Ok((command, Context { address, credentials, output: Output { json } }))
+        Ok((command, Context { address, credentials, output: Output::new(format, quiet) }))
     }
 }
 
@@ -255,9 +273,10 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Test(command) => return command.run(context).await,
         Command::Delete(command) => command.run(context).await?,
         Command::Top(command) => command.run(context).await?,
+        Command::Health(command) => return command.run(context).await,
         Command::Token(command) => command.run(context)?,
         Command::Completions(command) => command.run()?,
-        Command::Man(command) => command.run(Args::command(), context.output)?,
+        Command::Man(command) => command.run(Args::command(), &context.output)?,
     }
     Ok(ExitCode::SUCCESS)
 }

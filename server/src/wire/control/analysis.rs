@@ -1,9 +1,11 @@
 //! Analysis of the linearized map: ranks, modes and frequency responses.
 
+use std::sync::Arc;
+
 use nalgebra::DMatrix;
 use plantd_control::{self as control, Mode, Tangent, TransferFunction};
 use plantd_models::scene::UnknownName;
-use plantd_models::{Linearization, Model, Plant};
+use plantd_models::{Continuous, ContinuousPoint, Linearization, Model, Plant};
 use plantd_proto::v1;
 
 use crate::core::feedback::regulator::Constraints;
@@ -14,6 +16,9 @@ use crate::wire::message::{checks, matrices, states};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
+/// Velocity up to which a point counts as one at rest, m/s or rad/s.
+const REST: f64 = 1e-9;
+
 /// Answers an Analyze call.
 pub(crate) fn analyze(
     hub: &Hub,
@@ -22,13 +27,8 @@ pub(crate) fn analyze(
 ) -> Result<v1::AnalyzeResponse, RpcError> {
     let constraints = Constraints::new(request.constraints)?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
-    let outputs = Outputs::new(
-        "",
-        request.outputs,
-        request.output_x.as_ref(),
-        request.output_u.as_ref(),
-        plant.model(),
-    )?;
+    let (x, u_matrix) = (request.output_x.as_ref(), request.output_u.as_ref());
+    let outputs = Outputs::with_velocities(request.outputs, x, u_matrix, &mut plant)?;
     check_frequencies(hub, &request.frequencies_hz, &outputs)?;
     let mut linearization = Linearization::new(plant.model());
     plant.linearize(&u, &mut linearization)?;
@@ -119,6 +119,38 @@ impl Outputs {
         Ok(Self { names, x, u })
     }
 
+    /// The same, where an output may also be the velocity `v(theta)` of a dynamic coordinate.
+    fn with_velocities(
+        names: Vec<String>,
+        x: Option<&v1::Matrix>,
+        u: Option<&v1::Matrix>,
+        plant: &mut Plant,
+    ) -> Result<Self, RpcError> {
+        let model = Arc::clone(plant.model());
+        let dynamic = &model.coordinates()[..model.dimensions().dynamic];
+        let index = |name: &String| {
+            let of = name.strip_prefix("v(")?.strip_suffix(')')?;
+            dynamic.iter().position(|coordinate| coordinate.name == of)
+        };
+        let moving: Vec<Option<usize>> = names.iter().map(index).collect();
+        if moving.iter().all(Option::is_none) || x.is_some() {
+            return Self::new("", names, x, u, &model);
+        }
+        let entry = |(name, moving): (&String, &Option<usize>)| match moving {
+            Some(index) => dynamic[*index].name.clone(),
+            None => name.clone(),
+        };
+        let entries = names.iter().zip(&moving).map(entry).collect();
+        let mut outputs = Self::new("", entries, x, u, &model)?;
+        let velocities = velocities(plant)?;
+        for (row, index) in moving.iter().enumerate() {
+            if let Some(index) = index {
+                outputs.x.row_mut(row).copy_from(&velocities.row(*index));
+            }
+        }
+        Ok(Self { names, ..outputs })
+    }
+
     /// Entries of x by name; all of them when there are no names.
     fn named(prefix: &str, names: Vec<String>, model: &Model) -> Result<Self, RpcError> {
         let d = model.dimensions();
@@ -143,6 +175,31 @@ impl Outputs {
         let u = DMatrix::zeros(names.len(), d.input());
         Ok(Self { names, x, u })
     }
+}
+
+/// The derivatives of the velocities of the dynamic coordinates by `x = (q, p, v)`, at rest, where the mass matrix does
+/// not change: `M_d⁻¹ (dp̃ − M_k dv)`, of the momentum p̃ projected onto the constraints.
+fn velocities(plant: &mut Plant) -> Result<DMatrix<f64>, RpcError> {
+    let d = plant.model().dimensions();
+    if plant.velocity().iter().any(|v| v.abs() > REST) {
+        return Err(RpcError::field("outputs", "velocities are outputs of points at rest alone"));
+    }
+    let (nd, nk) = (d.dynamic, d.prescribed);
+    let point = ContinuousPoint {
+        q: plant.q().to_vec(),
+        v: vec![0.0; nd + nk],
+        inputs: vec![0.0; d.inputs],
+        prescribed_acceleration: vec![0.0; nk],
+    };
+    let mass = Continuous::new(Arc::clone(plant.model())).terms(&point)?.mass_matrix;
+    let mut momentum = plant.projected_momentum_by_state();
+    let mut by_prescribed = momentum.columns_mut(d.state() - nk, nk);
+    by_prescribed -= mass.view((0, nd), (nd, nk));
+    let factors = mass.view((0, 0), (nd, nd)).into_owned().cholesky();
+    let factors = factors.ok_or_else(|| {
+        RpcError::field("outputs", "the mass matrix is singular: momenta give no velocities")
+    })?;
+    Ok(factors.solve(&momentum))
 }
 
 /// Refuses more frequencies than the limits allow, and those that are no numbers.

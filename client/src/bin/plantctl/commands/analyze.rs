@@ -9,7 +9,8 @@ use plantd_client::v1;
 use crate::contract::names;
 use crate::input::numbers::{Numbers, numbers, or_empty};
 use crate::input::point::{Point, space};
-use crate::output::text::{matrix, number, table};
+use crate::output::page::{Page, matrix, table};
+use crate::output::text::number;
 use crate::server::context::Context;
 
 /// Controllability, observability, modes and frequency response of the linearized map.
@@ -17,7 +18,8 @@ use crate::server::context::Context;
 pub(crate) struct Analyze {
     #[command(flatten)]
     point: Point,
-    /// Outputs, comma-separated entries of x such as `theta` or `p(theta)`; all if not given.
+    /// Outputs, comma-separated: entries of x such as `theta` or `p(theta)`, velocities `v(theta)`; all of x if not
+    /// given.
     #[arg(long, value_delimiter = ',')]
     outputs: Vec<String>,
     /// Frequencies of the response, comma-separated, Hz.
@@ -47,33 +49,38 @@ impl Analyze {
 }
 
 /// Ranks, modes and responses.
-fn text(answer: &v1::AnalyzeResponse, model: &v1::Model) -> String {
-    let mut text = format!(
+fn text(answer: &v1::AnalyzeResponse, model: &v1::Model) -> Page {
+    let mut text = Page::from(format!(
         "order {}\ncontrollability rank: {}\nobservability rank: {}\nspectral radius: {}\n",
         answer.order,
         answer.controllability_rank,
         answer.observability_rank,
         number(answer.spectral_radius)
-    );
+    ));
     // Of a conjugate pair one stands for both.
     let shown = answer.modes.iter().filter(|mode| mode.imaginary >= 0.0);
-    let rows: Vec<_> = shown
-        .map(|mode| {
-            let eigenvalue = match mode.imaginary {
-                0.0 => number(mode.real),
-                imaginary => format!("{} ± {}i", number(mode.real), number(imaginary)),
-            };
-            vec![
-                eigenvalue,
-                number(mode.modulus),
-                number(mode.natural_frequency_hz),
-                number(mode.damping_ratio),
-                number(mode.time_constant_s),
-            ]
-        })
-        .collect();
+    let rows = shown.map(|mode| {
+        let eigenvalue = match mode.imaginary {
+            0.0 => number(mode.real),
+            imaginary => format!("{} ± {}i", number(mode.real), number(imaginary)),
+        };
+        vec![
+            eigenvalue,
+            number(mode.modulus),
+            number(mode.natural_frequency_hz),
+            number(mode.damping_ratio),
+            number(mode.time_constant_s),
+        ]
+    });
     let head = ["eigenvalue", "modulus", "frequency/Hz", "damping ratio", "time constant/s"];
-    let _ = write!(text, "\n{}", table(&head, &rows));
+    let _ = write!(text, "\n{}", table(&head, rows));
+    let numbers = answer.modes.iter().map(|mode| {
+        let v1::Mode { real, imaginary, modulus, .. } = *mode;
+        let times = [mode.natural_frequency_hz, mode.damping_ratio, mode.time_constant_s];
+        [real, imaginary, modulus].into_iter().chain(times).collect()
+    });
+    let head = ["real", "imaginary", "modulus", "frequency/Hz", "damping ratio", "time constant/s"];
+    text.data(table::<f64>(&head, numbers));
     let inputs = names::input(model);
     for response in &answer.responses {
         let title = format!("response at {} Hz", number(response.frequency_hz));
@@ -82,7 +89,7 @@ fn text(answer: &v1::AnalyzeResponse, model: &v1::Model) -> String {
         {
             if let Some(block) = block {
                 let title = format!("{title}: {what}");
-                let _ = write!(text, "\n{}", matrix(&title, block, &answer.outputs, &inputs));
+                text.next_table(matrix(&title, block, &answer.outputs, &inputs));
             }
         }
     }

@@ -9,7 +9,7 @@ use plantd_client::v1;
 use serde_json::json;
 
 use crate::input::files::{parse_message, read_text};
-use crate::output::text::number;
+use crate::output::page::{Cell, Page, table};
 use crate::server::context::Context;
 
 const CHANNELS: &str = "\
@@ -71,11 +71,17 @@ enum ChannelsCommand {
 impl Channels {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let output = context.output;
+        let output = &context.output;
         match self.command {
             ChannelsCommand::Set { id, file } => {
                 let channels: v1::Channels = parse_message("Channels", &read_text(&file)?)?;
+                let said = format!(
+                    "plant `{id}` has {} output and {} input channels",
+                    channels.outputs.len(),
+                    channels.inputs.len()
+                );
                 let answer = client.set_channels(id, channels).await?;
+                output.success(&said);
                 let outputs = v1::Outputs { y: answer.y.clone(), lost: Vec::new() };
                 let as_text = || declared(answer.info.as_ref(), &outputs);
                 output.message("SetChannelsResponse", &answer, as_text)
@@ -89,31 +95,35 @@ impl Channels {
             ChannelsCommand::Clear { id } => {
                 let had = client.get_channels(&id).await?.info.and_then(|info| info.channels);
                 client.set_channels(&id, v1::Channels::default()).await?;
-                if had.is_none_or(|had| had.outputs.is_empty() && had.inputs.is_empty()) {
+                let had = had.is_some_and(|had| !(had.outputs.is_empty() && had.inputs.is_empty()));
+                if !had {
                     output.nothing_to_do(&format!("plant `{id}` has no channels"));
                 }
-                output.done(json!({ "cleared": { "plant": id } }))
+                let said = format!("plant `{id}` has no channels any more");
+                output.confirm(had, json!({ "cleared": { "plant": id } }), &said)
             }
         }
     }
 }
 
 /// The outputs with their numbers, and the inputs, a line each.
-fn declared(info: Option<&v1::ChannelsInfo>, outputs: &v1::Outputs) -> String {
-    let mut text = String::new();
+fn declared(info: Option<&v1::ChannelsInfo>, outputs: &v1::Outputs) -> Page {
+    let mut text = Page::default();
     let Some(v1::ChannelsInfo { channels: Some(channels), names }) = info else {
-        return "no channels\n".to_owned();
+        return "no channels\n".to_owned().into();
     };
     let _ = writeln!(text, "seed {}", channels.seed);
-    for (name, y) in names.iter().zip(&outputs.y) {
-        let _ = writeln!(text, "output  {name:<24} {}", number(*y));
+    if !names.is_empty() {
+        let row = |(name, y): (&String, &f64)| vec![Cell::from(name.as_str()), (*y).into()];
+        text.table(table(&["output", "value"], names.iter().zip(&outputs.y).map(row)));
     }
     for index in &outputs.lost {
         let name = channels.outputs.get(*index as usize).map_or("", |output| &output.name);
-        let _ = writeln!(text, "lost    {name}");
+        let _ = writeln!(text, "lost: {name}");
     }
-    for input in &channels.inputs {
-        let _ = writeln!(text, "input   {:<24} {} s late", input.input, input.delay_s);
+    if !channels.inputs.is_empty() {
+        let row = |i: &v1::InputChannel| vec![Cell::from(i.input.as_str()), i.delay_s.into()];
+        text.table(table(&["input", "delay/s"], channels.inputs.iter().map(row)));
     }
     text
 }

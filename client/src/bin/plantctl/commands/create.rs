@@ -4,8 +4,9 @@ use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
-use crate::input::point::Initial;
+use crate::input::point::{Initial, Of};
 use crate::input::settings::Settings;
+use crate::output::page::Page;
 use crate::output::plant;
 use crate::server::context::Context;
 
@@ -35,18 +36,22 @@ pub(crate) struct Create {
 impl Create {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
+        let initial = self.initial.resolve(&client, Of::Model(&self.model)).await?;
         let tolerance = self.tolerance.unwrap_or(0.0);
         let request = v1::CreatePlantRequest {
             id: self.id.unwrap_or_default(),
             model: self.model,
             settings: Some(v1::PlantSettings { tolerance, ..self.settings.into() }),
-            initial: self.initial.into(),
+            initial,
             open_link: self.link,
             expires_s: self.expires,
         };
         let plant = client.create_plant(request).await?;
+        context.output.success(&format!("there is a plant `{}` now", plant.id));
         context.output.message("PlantInfo", &plant, || {
-            plant::list(std::slice::from_ref(&plant)) + &plant::stepping(&plant)
+            let mut page = Page::from(plant::list(std::slice::from_ref(&plant)));
+            page.append(plant::stepping(&plant));
+            page
         })
     }
 }

@@ -6,6 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
+use crate::output::page::Page;
 use crate::output::plant;
 use crate::output::text::{number, numbers};
 use crate::server::context::{Context, model_of};
@@ -46,7 +47,7 @@ impl Diagnose {
 }
 
 /// What can be said of a state.
-fn text(answer: &v1::DiagnoseResponse, model: &v1::Model) -> String {
+fn text(answer: &v1::DiagnoseResponse, model: &v1::Model) -> Page {
     let redundant = match answer.redundant_constraints.as_slice() {
         [] => "none".to_owned(),
         names => names.join(", "),
@@ -71,6 +72,9 @@ fn text(answer: &v1::DiagnoseResponse, model: &v1::Model) -> String {
         number(answer.mass_matrix_reciprocal_condition),
         number(answer.constraint_reciprocal_condition),
     );
-    text += &plant::forces(&answer.constraint_forces, model);
-    text
+    let mut page = Page::from(text);
+    if !answer.constraint_forces.is_empty() {
+        page.next_table(plant::forces(&answer.constraint_forces, model));
+    }
+    page
 }

@@ -1,15 +1,14 @@
 //! `dynamics`: accelerations of continuous time.
 
-use std::fmt::Write as _;
-
 use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
 use crate::contract::names;
-use crate::input::numbers::{Numbers, numbers, or_empty};
+use crate::input::numbers::{Vector, given, vector};
+use crate::input::point::configuration;
 use crate::output::derivatives::slices;
-use crate::output::text::{matrix, number, table};
+use crate::output::page::{Cell, Page, matrix, table};
 use crate::server::context::Context;
 
 /// Accelerations and constraint forces of continuous time, and their derivatives.
@@ -20,18 +19,18 @@ pub(crate) struct Dynamics {
     /// Operating point whose configuration and inputs hold where others are not given.
     #[arg(long, value_name = "POINT", default_value = "initial")]
     at: String,
-    /// Configuration, comma-separated, dynamic coordinates first.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    q: Option<Numbers>,
-    /// Velocity, comma-separated; zero if not given.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    v: Option<Numbers>,
-    /// Input forces, comma-separated.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    inputs: Option<Numbers>,
-    /// Accelerations of the prescribed coordinates, comma-separated; zero if not given.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    prescribed_acceleration: Option<Numbers>,
+    /// Configuration, comma-separated, dynamic coordinates first; or some of it, `theta=0.1`.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    q: Option<Vector>,
+    /// Velocity, comma-separated or by name; zero if not given.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    v: Option<Vector>,
+    /// Input forces, comma-separated or by name.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    inputs: Option<Vector>,
+    /// Accelerations of the prescribed coordinates, comma-separated or by name; zero if not given.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    prescribed_acceleration: Option<Vector>,
     /// Highest order of the derivatives to print.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(0..=2))]
     order: u32,
@@ -42,12 +41,16 @@ impl Dynamics {
         let client = context.connect().await?;
         let model = client.get_model(&self.model).await?;
         let request = v1::EvaluateDynamicsRequest {
+            q: configuration(&client, self.q.as_ref(), &model, &self.at).await?,
+            v: given(self.v.as_ref(), "v", &names::coordinates(&model))?,
+            inputs: given(self.inputs.as_ref(), "inputs", &model.inputs)?,
+            prescribed_acceleration: given(
+                self.prescribed_acceleration.as_ref(),
+                "prescribed-acceleration",
+                &names::prescribed(&model).collect::<Vec<_>>(),
+            )?,
             model: self.model,
             operating_point: self.at,
-            q: or_empty(self.q),
-            v: or_empty(self.v),
-            inputs: or_empty(self.inputs),
-            prescribed_acceleration: or_empty(self.prescribed_acceleration),
             order: self.order,
         };
         let answer = client.evaluate_dynamics(request).await?;
@@ -56,18 +59,17 @@ impl Dynamics {
 }
 
 /// Accelerations, constraint forces, and their derivatives where there are any.
-fn text(answer: &v1::EvaluateDynamicsResponse, model: &v1::Model) -> String {
+fn text(answer: &v1::EvaluateDynamicsResponse, model: &v1::Model) -> Page {
     let all = || model.coordinates.iter();
     let dynamic: Vec<_> = names::dynamic(model).cloned().collect();
     let forces = answer.multipliers.iter().zip(&model.constraints);
-    let rows: Vec<_> = answer
+    let rows = answer
         .acceleration
         .iter()
         .zip(&dynamic)
-        .map(|(value, name)| vec![format!("d²({name})/dt²"), number(*value)])
-        .chain(forces.map(|(value, name)| vec![format!("λ({name})"), number(*value)]))
-        .collect();
-    let mut text = table(&["", "value"], &rows);
+        .map(|(value, name)| vec![Cell::from(format!("d²({name})/dt²")), (*value).into()])
+        .chain(forces.map(|(value, name)| vec![format!("λ({name})").into(), (*value).into()]));
+    let mut text = Page::from(table(&["", "value"], rows));
     let outputs: Vec<_> = dynamic.iter().chain(&model.constraints).cloned().collect();
     let rates = all().map(|c| format!("d({})/dt", c.name));
     let accelerations = names::prescribed(model).map(|name| format!("d²({name})/dt²"));
@@ -78,7 +80,7 @@ fn text(answer: &v1::EvaluateDynamicsResponse, model: &v1::Model) -> String {
         .chain(accelerations)
         .collect();
     if let Some(jacobian) = &answer.jacobian {
-        let _ = write!(text, "\n{}", matrix("derivatives", jacobian, &outputs, &parameters));
+        text.next_table(matrix("derivatives", jacobian, &outputs, &parameters));
     }
     if answer.hessian.is_some() {
         let hessian = slices(
@@ -88,7 +90,7 @@ fn text(answer: &v1::EvaluateDynamicsResponse, model: &v1::Model) -> String {
             &parameters,
             &parameters,
         );
-        let _ = write!(text, "\n{hessian}");
+        hessian.into_iter().for_each(|slice| text.next_table(slice));
     }
     text
 }

@@ -4,6 +4,7 @@ use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
+use crate::output::page::{Cell, Page, table};
 use crate::server::context::Context;
 
 /// Prints what happens to a plant besides its steps. Ends with Ctrl-C or after `--count`.
@@ -35,8 +36,19 @@ impl Events {
     }
 }
 
-fn text(event: &v1::Event) -> String {
+/// An event: a line for people, a row for programs.
+fn text(event: &v1::Event) -> Page {
     let kind = event.kind().as_str_name().trim_start_matches("EVENT_KIND_").to_lowercase();
     let kind = kind.replace('_', " ");
-    format!("{:6}  step {:8}  {kind} {} {}\n", event.number, event.step, event.subject, event.value)
+    let v1::Event { number, step, subject, value, .. } = event;
+    let mut page = Page::from(format!("{number:6}  step {step:8}  {kind} {subject} {value}\n"));
+    let row = vec![
+        Cell::from(*number),
+        (*step).into(),
+        kind.into(),
+        subject.as_str().into(),
+        (*value).into(),
+    ];
+    page.data(table(&["event", "step", "kind", "subject", "value"], [row]));
+    page
 }

@@ -71,9 +71,8 @@ impl Export {
         sink.flush().with_context(cannot_write)?;
         drop(sink);
         if csv.to_str() != Some("-") {
-            context
-                .output
-                .done(json!({ "file": csv, "steps": steps, "cut_short": recording.is_cut() }))?;
+            let done = json!({ "file": csv, "steps": steps, "cut_short": recording.is_cut() });
+            context.output.done(done, &format!("{steps} steps are in {}", csv.display()))?;
         }
         Ok(())
     }

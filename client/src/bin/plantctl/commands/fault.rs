@@ -1,7 +1,5 @@
 //! `fault`: what goes wrong on a plant.
 
-use std::fmt::Write as _;
-
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use plantd_client::v1;
@@ -9,6 +7,7 @@ use serde_json::json;
 
 use crate::contract::json;
 use crate::input::files::parse_message;
+use crate::output::page::{Cell, Page, Table, table};
 use crate::server::context::Context;
 
 const FAULTS: &str = "\
@@ -62,19 +61,21 @@ enum FaultCommand {
 impl Fault {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let output = context.output;
+        let output = &context.output;
         match self.command {
             FaultCommand::Inject { id, fault } => {
-                let fault =
-                    client.inject_fault(id, parse_message("FaultSpec", &fault.join("\n"))?).await?;
+                let said = format!("the fault of plant `{id}` has the number");
+                let fault = parse_message("FaultSpec", &fault.join("\n"))?;
+                let fault = client.inject_fault(id, fault).await?;
+                output.success(&format!("{said} {}", fault.id));
                 let as_text = || faults(std::slice::from_ref(&fault));
                 output.message("FaultInfo", &fault, as_text)
             }
             FaultCommand::List { id } => {
                 let all = client.list_faults(id).await?;
                 let as_text = || match all.as_slice() {
-                    [] => "no faults\n".to_owned(),
-                    all => faults(all),
+                    [] => Page::from("no faults\n".to_owned()),
+                    all => faults(all).into(),
                 };
                 output.print(|| json::messages("FaultInfo", &all), as_text)
             }
@@ -83,7 +84,12 @@ impl Fault {
                 if cleared == 0 {
                     output.nothing_to_do(&format!("plant `{id}` has no faults"));
                 }
-                output.done(json!({ "cleared": { "plant": id, "faults": cleared } }))
+                let said = match cleared {
+                    1 => format!("a fault of plant `{id}` has ended"),
+                    count => format!("{count} faults of plant `{id}` have ended"),
+                };
+                let cleared_json = json!({ "cleared": { "plant": id, "faults": cleared } });
+                output.confirm(cleared > 0, cleared_json, &said)
             }
         }
     }
@@ -102,10 +108,9 @@ fn assignment(given: &str) -> Result<String, String> {
     Ok(quoted)
 }
 
-/// Faults, a line each.
-fn faults(faults: &[v1::FaultInfo]) -> String {
-    let mut text = String::new();
-    for info in faults {
+/// Faults, a row each.
+fn faults(faults: &[v1::FaultInfo]) -> Table {
+    let row = |info: &v1::FaultInfo| {
         let fault = info.fault.clone().unwrap_or_default();
         use v1::fault_spec::{Kind, Start, Target};
         let target = match &fault.target {
@@ -130,7 +135,7 @@ fn faults(faults: &[v1::FaultInfo]) -> String {
         };
         let length = match fault.duration_s {
             0.0 => "until cleared".to_owned(),
-            time_s => format!("for {time_s} s"),
+            time_s => format!("{time_s} s"),
         };
         let phase = match info.phase() {
             v1::FaultPhase::Unspecified => "",
@@ -139,13 +144,10 @@ fn faults(faults: &[v1::FaultInfo]) -> String {
             v1::FaultPhase::Paused => "paused",
             v1::FaultPhase::Over => "over",
         };
-        let _ = writeln!(
-            text,
-            "{:>4}  {phase:<8} {kind:<11} {target:<16} from step {start} {length}",
-            info.id
-        );
-    }
-    text
+        let (id, start, length) = (info.id.to_string(), start.to_string(), length.as_str());
+        [id.as_str(), phase, kind, target, start.as_str(), length].map(Cell::from).to_vec()
+    };
+    table(&["fault", "phase", "kind", "target", "from step", "for"], faults.iter().map(row))
 }
 
 #[cfg(test)]

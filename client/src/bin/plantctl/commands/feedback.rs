@@ -12,9 +12,9 @@ use crate::contract::names;
 use crate::input::files::read_result;
 use crate::input::point::space;
 use crate::input::weights::RegulatorWeights;
-use crate::output::plant::feedback;
+use crate::output::page::{Page, matrix};
+use crate::output::plant::{feedback, listed};
 use crate::output::printer::Output;
-use crate::output::text::{matrix, numbers};
 use crate::server::context::{Context, for_each, model_of, plant};
 
 /// Gives a plant a reference with its regulator, or takes it away.
@@ -110,21 +110,22 @@ impl Feedback {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
         match self.command {
-            FeedbackCommand::Set(set) => set.run(&client, context.output).await,
+            FeedbackCommand::Set(set) => set.run(&client, &context.output).await,
             FeedbackCommand::Clear { id } => {
                 let had = plant(&client, &id).await?.feedback;
                 client.clear_feedback(&id).await?;
                 if had.is_none() {
                     context.output.nothing_to_do(&format!("plant `{id}` has no feedback"));
                 }
-                context.output.done(json!({ "cleared": { "plant": id } }))
+                let said = format!("plant `{id}` has no feedback any more");
+                context.output.confirm(had.is_some(), json!({ "cleared": { "plant": id } }), &said)
             }
         }
     }
 }
 
 impl Set {
-    async fn run(self, client: &Client, output: Output) -> Result<()> {
+    async fn run(self, client: &Client, output: &Output) -> Result<()> {
         use v1::set_feedback_request::Reference as Form;
         let form = match self.reference {
             Reference { trajectory: Some(file), .. } => {
@@ -137,7 +138,7 @@ impl Set {
         let model = model_of(client, &self.id).await?;
         let request = v1::SetFeedbackRequest {
             id: self.id,
-            weights: Some(self.weights.for_model(&model)),
+            weights: Some(self.weights.for_model(&model)?),
             constraints: space(self.full).into(),
             mode: v1::FeedbackMode::from(self.mode).into(),
             first_step: self.first_step,
@@ -145,7 +146,9 @@ impl Set {
             reference: Some(form),
             ..Default::default()
         };
+        let said = format!("plant `{}` has a feedback", request.id);
         let info = client.set_feedback(request).await?;
+        output.success(&said);
         output.message("FeedbackInfo", &info, || feedback(&info))
     }
 }
@@ -174,23 +177,24 @@ fn bound(text: &str) -> Result<v1::Bound, String> {
 }
 
 /// One message of a stream of gains.
-fn watched(message: &v1::WatchGainsResponse, model: &v1::Model) -> String {
-    let mut text = String::new();
+fn watched(message: &v1::WatchGainsResponse, model: &v1::Model) -> Page {
+    let mut text = Page::default();
     if let Some(failure) = &message.failure {
         let _ = writeln!(text, "{}: {}", failure.reason, failure.message);
     }
     if let Some(law) = &message.gain {
         let _ = writeln!(text, "from step {} on, revision {}", law.step, message.revision);
+        let (x, u) = (names::state(model), names::input(model));
         let lines = [
-            ("x_reference", &law.x_reference),
-            ("u_reference", &law.u_reference),
-            ("feedforward", &law.feedforward),
+            ("x_reference", &x, &law.x_reference),
+            ("u_reference", &u, &law.u_reference),
+            ("feedforward", &u, &law.feedforward),
         ];
-        for (name, values) in lines.into_iter().filter(|(_, values)| !values.is_empty()) {
-            let _ = writeln!(text, "  {name}: {}", numbers(values));
+        for (name, entries, values) in lines.into_iter().filter(|(.., values)| !values.is_empty()) {
+            let _ = writeln!(text, "  {name}: {}", listed(entries, values));
         }
         if let Some(k) = &law.k {
-            text += &matrix("K", k, &names::input(model), &names::state(model));
+            text.table(matrix("K", k, &u, &x));
         }
     }
     text

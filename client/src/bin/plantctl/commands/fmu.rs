@@ -28,8 +28,8 @@ pub(crate) struct Fmu {
     /// built-in model; with `--address` that of any model of the server.
     scene: String,
     /// File to write; the scene's name with `.fmu` if not given.
-    #[arg(long, short)]
-    output: Option<PathBuf>,
+    #[arg(long, short, value_name = "FILE")]
+    out: Option<PathBuf>,
     /// Operating point at which it starts; the scene's initial configuration if not given.
     #[arg(long)]
     at: Option<String>,
@@ -81,14 +81,12 @@ impl Fmu {
                 std::fs::read(&file).with_context(|| format!("cannot read {}", file.display()))?;
             contents.push((format!("binaries/{platform}/{identifier}.{end}"), bytes));
         }
-        let output = self.output.unwrap_or_else(|| PathBuf::from(format!("{identifier}.fmu")));
+        let out = self.out.unwrap_or_else(|| PathBuf::from(format!("{identifier}.fmu")));
         let fmu = archive(&contents)?;
-        write(&output, &fmu)?;
-        let (path, bytes) = (output.display().to_string(), fmu.len());
-        context.output.print(
-            || json!({ "fmu": &path, "bytes": bytes }),
-            || format!("{path}: {bytes} bytes, model identifier {identifier}\n"),
-        )
+        write(&out, &fmu)?;
+        let (path, bytes) = (out.display().to_string(), fmu.len());
+        let said = format!("{path}: {bytes} bytes, model identifier {identifier}");
+        context.output.done(json!({ "fmu": &path, "bytes": bytes }), &said)
     }
 
     async fn scene_text(&self, context: &Context) -> Result<String> {

@@ -30,12 +30,19 @@ impl Guard {
         let client = context.connect().await?;
         let Self { id, bounds: watchdogs } = self;
         let count = watchdogs.len();
-        if count == 0 && plant(&client, &id).await?.safety.is_none() {
-            context.output.nothing_to_do(&format!("nothing protects plant `{id}`"));
-        }
+        let is_bare = count == 0 && plant(&client, &id).await?.safety.is_none();
         let request = v1::SetSafetyRequest { id: id.clone(), watchdogs, on_step_failure: 0 };
         client.set_safety(request).await?;
-        context.output.done(json!({ "guarded": { "plant": id, "watchdogs": count } }))
+        let output = &context.output;
+        let said = match count {
+            0 => format!("nothing protects plant `{id}` any more"),
+            1 => format!("a bound protects plant `{id}`"),
+            count => format!("{count} bounds protect plant `{id}`"),
+        };
+        if is_bare {
+            output.nothing_to_do(&format!("nothing protects plant `{id}`"));
+        }
+        output.confirm(!is_bare, json!({ "guarded": { "plant": id, "watchdogs": count } }), &said)
     }
 }
 

@@ -33,8 +33,8 @@ pub(crate) struct Import {
     #[arg(long, value_name = "X,Y,Z", value_parser = numbers, allow_hyphen_values = true)]
     gravity: Option<Numbers>,
     /// Time step that the scene suggests, s; if not given that of the file, or 0.001.
-    #[arg(long, value_name = "S")]
-    time_step: Option<f64>,
+    #[arg(long, value_name = "SECONDS", visible_alias = "time-step", alias = "time-step-s")]
+    dt: Option<f64>,
     /// Velocity at which 76 % of dry friction are reached, m/s or rad/s.
     #[arg(long, value_name = "V", default_value_t = 0.01)]
     friction_velocity: f64,
@@ -79,7 +79,7 @@ impl Import {
                 Inputs::None => plantd_import::Inputs::None,
             },
             gravity: gravity.ok().context("--gravity takes three numbers")?,
-            time_step_s: self.time_step,
+            time_step_s: self.dt,
             friction_velocity: self.friction_velocity,
             stops: stops.ok().context("--stops takes two numbers")?,
             packages: self.package.into_iter().collect(),

@@ -8,6 +8,7 @@ use plantd_client::{Client, Code, v1};
 use serde_json::{Map, Value, json};
 
 use crate::contract::json;
+use crate::output::page::Page;
 use crate::output::printer::Output;
 use crate::output::text::number;
 use crate::output::{model, plant};
@@ -76,8 +77,10 @@ impl List {
             Value::Object(object)
         };
         let as_text = || {
-            let tables = [models.as_deref().map(model::list), plants.as_deref().map(plant::list)];
-            tables.into_iter().flatten().collect::<Vec<_>>().join("\n")
+            let mut page = Page::default();
+            models.iter().for_each(|models| page.next_table(model::list(models)));
+            plants.iter().for_each(|plants| page.next_table(plant::list(plants)));
+            page
         };
         context.output.print(as_json, as_text)
     }
@@ -91,7 +94,7 @@ impl Show {
                 let model = client.get_model(self.name).await?;
                 context.output.message("Model", &model, || model::known(&model))
             }
-            Singular::Plant => show_plant(&client, context.output, self.name).await,
+            Singular::Plant => show_plant(&client, context, self.name).await,
         }
     }
 }
@@ -100,7 +103,7 @@ impl Delete {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
         let Some(name) = self.name else {
-            return self.what.delete_all(&client, context.output).await;
+            return self.what.delete_all(&client, &context.output).await;
         };
         let kind = match self.what {
             Singular::Model => {
@@ -112,13 +115,15 @@ impl Delete {
                 "plant"
             }
         };
-        context.output.done(json!({ "deleted": { kind: name } }))
+        context
+            .output
+            .done(json!({ "deleted": { kind: name } }), &format!("{kind} `{name}` is deleted"))
     }
 }
 
 impl Singular {
     /// Deletes all that there are; what somebody else deletes meanwhile is gone as well.
-    async fn delete_all(self, client: &Client, output: Output) -> Result<()> {
+    async fn delete_all(self, client: &Client, output: &Output) -> Result<()> {
         let (kind, names) = match self {
             Self::Model => {
                 let models = client.list_models().await?.into_iter();
@@ -140,29 +145,31 @@ impl Singular {
                 deleted => deleted?,
             }
         }
-        output.done(json!({ "deleted": { kind: names } }))
+        let said = format!("{} {kind} are deleted", names.len());
+        output.done(json!({ "deleted": { kind: names } }), &said)
     }
 }
 
-async fn show_plant(client: &Client, output: Output, id: String) -> Result<()> {
+async fn show_plant(client: &Client, context: &Context, id: String) -> Result<()> {
+    let model = context.names_of(client, &id).await?;
     let answer = client.get_plant(id).await?;
     let as_text = || {
         let info = answer.plant.as_ref();
         let state = info.and_then(|p| p.state.as_ref());
         [
-            info.map(|p| plant::list(std::slice::from_ref(p))),
-            info.map(plant::stepping),
-            state.map(plant::state),
-            answer.energy.as_ref().map(plant::energy),
-            info.map(plant::parameters),
-            info.and_then(|p| p.feedback.as_ref()).map(plant::feedback),
-            info.and_then(|p| p.safety.as_ref()).map(safety),
+            info.map(|p| plant::list(std::slice::from_ref(p)).into()),
+            info.map(|p| plant::stepping(p).into()),
+            state.map(|s| plant::state(s, &model)),
+            answer.energy.as_ref().map(|e| plant::energy(e).into()),
+            info.map(|p| plant::parameters(p).into()),
+            info.and_then(|p| p.feedback.as_ref()).map(|f| plant::feedback(f).into()),
+            info.and_then(|p| p.safety.as_ref()).map(|s| safety(s).into()),
         ]
         .into_iter()
         .flatten()
-        .collect()
+        .collect::<Page>()
     };
-    output.message("GetPlantResponse", &answer, as_text)
+    context.output.message("GetPlantResponse", &answer, as_text)
 }
 
 /// The bounds that protect a plant, and which of them holds it.

@@ -1,14 +1,16 @@
 //! `linearize` and `second-order`: derivatives of the discrete map.
 
+use std::fmt::Write as _;
+
 use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
 use crate::contract::names;
-use crate::input::numbers::{Numbers, numbers, or_empty};
+use crate::input::numbers::{Vector, given, vector};
 use crate::input::point::Point;
 use crate::output::derivatives::{linearization, slices};
-use crate::output::text::matrix;
+use crate::output::page::{Page, matrix};
 use crate::server::context::Context;
 
 /// Linearizes the discrete map of a model: `dx[k+1] = A dx[k] + B du[k]`.
@@ -23,12 +25,12 @@ pub(crate) struct Linearize {
 pub(crate) struct SecondOrder {
     #[command(flatten)]
     point: Point,
-    /// Weights of the entries of x[k+1], comma-separated: print the contraction.
-    #[arg(long, value_name = "Z", value_parser = numbers, allow_hyphen_values = true)]
-    weights: Option<Numbers>,
-    /// Weights of the constraint multipliers, comma-separated: print the contraction.
-    #[arg(long, value_name = "Z", value_parser = numbers, allow_hyphen_values = true)]
-    multiplier_weights: Option<Numbers>,
+    /// Weights of the entries of x[k+1], comma-separated or by name: print the contraction.
+    #[arg(long, value_name = "Z", value_parser = vector, allow_hyphen_values = true)]
+    weights: Option<Vector>,
+    /// Weights of the constraint multipliers, comma-separated or by name: print the contraction.
+    #[arg(long, value_name = "Z", value_parser = vector, allow_hyphen_values = true)]
+    multiplier_weights: Option<Vector>,
 }
 
 impl Linearize {
@@ -45,7 +47,9 @@ impl Linearize {
             let rank = answer.controllability_rank;
             let order = 2 * model.coordinates.len();
             let matrices = answer.linearization.as_ref().map(|l| linearization(l, &model));
-            format!("{}\ncontrollability rank: {rank} of {order}\n", matrices.unwrap_or_default())
+            let mut page = matrices.unwrap_or_default();
+            let _ = write!(page, "\ncontrollability rank: {rank} of {order}\n");
+            page
         })
     }
 }
@@ -56,8 +60,12 @@ impl SecondOrder {
         let (model, settings, point) = self.point.resolve(&client).await?;
         let is_contracted = self.weights.is_some() || self.multiplier_weights.is_some();
         let weights = v1::ContractionWeights {
-            x: or_empty(self.weights),
-            multipliers: or_empty(self.multiplier_weights),
+            x: given(self.weights.as_ref(), "weights", &names::state(&model))?,
+            multipliers: given(
+                self.multiplier_weights.as_ref(),
+                "multiplier-weights",
+                &model.constraints,
+            )?,
         };
         let request = v1::LinearizeSecondOrderRequest {
             model: model.name.clone(),
@@ -75,7 +83,7 @@ impl SecondOrder {
 }
 
 /// Second derivatives, block by block and output by output.
-fn second_order(tensors: &v1::SecondOrder, model: &v1::Model) -> String {
+fn second_order(tensors: &v1::SecondOrder, model: &v1::Model) -> Page {
     let (x, u, c) = (names::state(model), names::input(model), &model.constraints);
     let blocks = [
         slices("d²/dxdx", tensors.xx.as_ref(), &x, &x, &x),
@@ -85,11 +93,13 @@ fn second_order(tensors: &v1::SecondOrder, model: &v1::Model) -> String {
         slices("d²/dxdu", tensors.multipliers_xu.as_ref(), c, &x, &u),
         slices("d²/dudu", tensors.multipliers_uu.as_ref(), c, &u, &u),
     ];
-    blocks.into_iter().filter(|block| !block.is_empty()).collect::<Vec<_>>().join("\n")
+    let mut page = Page::default();
+    blocks.into_iter().flatten().for_each(|slice| page.next_table(slice));
+    page
 }
 
 /// A Hessian of a weighted sum of outputs.
-fn contraction(contraction: &v1::Contraction, model: &v1::Model) -> String {
+fn contraction(contraction: &v1::Contraction, model: &v1::Model) -> Page {
     let (x, u) = (names::state(model), names::input(model));
     let blocks = [
         ("d²/dxdx", &contraction.xx, &x, &x),
@@ -99,5 +109,7 @@ fn contraction(contraction: &v1::Contraction, model: &v1::Model) -> String {
     let filled = blocks.into_iter().filter_map(|(title, block, rows, cols)| {
         Some(matrix(title, block.as_ref().filter(|m| !m.data.is_empty())?, rows, cols))
     });
-    filled.collect::<Vec<_>>().join("\n")
+    let mut page = Page::default();
+    filled.for_each(|block| page.next_table(block));
+    page
 }

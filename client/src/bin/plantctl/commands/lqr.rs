@@ -1,5 +1,7 @@
 //! `lqr`: the regulator about an equilibrium.
 
+use std::fmt::Write as _;
+
 use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
@@ -30,18 +32,20 @@ impl Lqr {
             model: model.name.clone(),
             settings: Some(settings),
             point: Some(point),
-            weights: Some(self.weights.for_model(&model)),
+            weights: Some(self.weights.for_model(&model)?),
             constraints: space(self.full).into(),
         };
         let answer = client.solve_lqr(request).await?;
         context.output.message("SolveLqrResponse", &answer, || {
             let gain = answer.gain.as_ref().map(|g| derivatives::gain(g, &model));
-            format!(
-                "{}\nspectral radius of the closed loop: {}\nRiccati residual: {}\n",
-                gain.unwrap_or_default(),
+            let mut page = gain.unwrap_or_default();
+            let _ = write!(
+                page,
+                "\nspectral radius of the closed loop: {}\nRiccati residual: {}\n",
                 number(answer.spectral_radius),
                 number(answer.residual),
-            )
+            );
+            page
         })
     }
 }

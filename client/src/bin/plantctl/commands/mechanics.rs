@@ -1,16 +1,18 @@
 //! `kinematics` and `forces`: frames and the equation of motion at a state.
 
-use std::fmt::Write as _;
 use std::iter;
 
 use anyhow::Result;
 use clap::Args;
-use plantd_client::v1;
+use plantd_client::{Client, v1};
 
-use crate::input::numbers::{Numbers, numbers, or_empty};
+use crate::contract::names;
+use crate::input::numbers::{Vector, given, numbers, vector};
+use crate::input::point::configuration;
+use crate::output::page::{Cell, Page, Table, matrix, table};
 use crate::output::plant;
-use crate::output::text::{self, matrix, number, table};
-use crate::server::context::Context;
+use crate::output::text::{self, number};
+use crate::server::context::{Context, plant as plant_now};
 
 /// A configuration and a velocity of a model, or of a plant that stays where it is.
 #[derive(Debug, Args)]
@@ -24,27 +26,38 @@ struct At {
     /// Instead: the model and the present state of this plant.
     #[arg(long, value_name = "ID", conflicts_with_all = ["model", "at"])]
     plant: Option<String>,
-    /// Configuration, comma-separated, dynamic coordinates first.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    q: Option<Numbers>,
-    /// Velocity, comma-separated; zero if not given, of a plant without `--q` its present one.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    v: Option<Numbers>,
+    /// Configuration, comma-separated, dynamic coordinates first; or some of it, `theta=0.1`.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    q: Option<Vector>,
+    /// Velocity, comma-separated or by name; zero if not given, of a plant without `--q` its present one.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    v: Option<Vector>,
 }
 
 impl At {
-    fn message(self) -> v1::MechanicalState {
-        let (q, v) = (or_empty(self.q), or_empty(self.v));
-        match self.plant {
-            Some(plant) => v1::MechanicalState { plant, q, v, ..Default::default() },
-            None => v1::MechanicalState {
-                model: self.model.unwrap_or_default(),
-                operating_point: self.at,
-                q,
-                v,
-                ..Default::default()
-            },
-        }
+    /// The state, and the model that it is one of. What is not named is that of the operating point or the plant.
+    async fn resolve(self, client: &Client) -> Result<(v1::MechanicalState, v1::Model)> {
+        let Some(id) = self.plant else {
+            let model = client.get_model(self.model.unwrap_or_default()).await?;
+            let q = configuration(client, self.q.as_ref(), &model, &self.at).await?;
+            let v = given(self.v.as_ref(), "v", &names::coordinates(&model))?;
+            let (name, operating_point) = (model.name.clone(), self.at);
+            let state =
+                v1::MechanicalState { model: name, operating_point, q, v, ..Default::default() };
+            return Ok((state, model));
+        };
+        let now = plant_now(client, &id).await?;
+        let model = client.get_model(&now.model).await?;
+        let state = now.state.unwrap_or_default();
+        let over = |vector: Option<&Vector>, what: &str, rest: &[f64]| match vector {
+            Some(vector) => vector.over(what, &names::coordinates(&model), rest),
+            None => Ok(Vec::new()),
+        };
+        let at_rest = vec![0.0; state.q.len()];
+        let velocity = if self.q.is_some() { &at_rest } else { &state.velocity };
+        let q = over(self.q.as_ref(), "q", &state.q)?;
+        let v = over(self.v.as_ref(), "v", velocity)?;
+        Ok((v1::MechanicalState { plant: id, q, v, ..Default::default() }, model))
     }
 }
 
@@ -69,15 +82,15 @@ pub(crate) struct Kinematics {
 pub(crate) struct Forces {
     #[command(flatten)]
     at: At,
-    /// Input forces, comma-separated; those of the operating point, or of the plant, if not given.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    inputs: Option<Numbers>,
-    /// Accelerations of the dynamic coordinates, comma-separated: print the forces that they take.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    acceleration: Option<Numbers>,
-    /// Accelerations of the prescribed coordinates, comma-separated; zero if not given.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true)]
-    prescribed_acceleration: Option<Numbers>,
+    /// Input forces, comma-separated or by name; those of the operating point, or of the plant, if not given.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    inputs: Option<Vector>,
+    /// Accelerations of the dynamic coordinates, comma-separated or by name: print the forces that they take.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    acceleration: Option<Vector>,
+    /// Accelerations of the prescribed coordinates, comma-separated or by name; zero if not given.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true)]
+    prescribed_acceleration: Option<Vector>,
     /// Print the accelerations that follow from the inputs, too.
     #[arg(long)]
     forward: bool,
@@ -94,7 +107,7 @@ impl Kinematics {
         let client = context.connect().await?;
         let points = self.points.clone();
         let request = v1::KinematicsRequest {
-            state: Some(self.at.message()),
+            state: Some(self.at.resolve(&client).await?.0),
             frames: self.frames,
             points: self.points,
             jacobians: self.jacobians,
@@ -107,11 +120,19 @@ impl Kinematics {
 impl Forces {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
+        let (state, model) = self.at.resolve(&client).await?;
+        let dynamic: Vec<_> = names::dynamic(&model).collect();
+        let prescribed: Vec<_> = names::prescribed(&model).collect();
+        let prescribed_acceleration = self.prescribed_acceleration.as_ref();
         let request = v1::DynamicsRequest {
-            state: Some(self.at.message()),
-            inputs: or_empty(self.inputs),
-            acceleration: or_empty(self.acceleration),
-            prescribed_acceleration: or_empty(self.prescribed_acceleration),
+            state: Some(state),
+            inputs: given(self.inputs.as_ref(), "inputs", &model.inputs)?,
+            acceleration: given(self.acceleration.as_ref(), "acceleration", &dynamic)?,
+            prescribed_acceleration: given(
+                prescribed_acceleration,
+                "prescribed-acceleration",
+                &prescribed,
+            )?,
             forward: self.forward,
         };
         let answer = client.dynamics(request).await?;
@@ -120,7 +141,7 @@ impl Forces {
 }
 
 /// Frames, points and the centre of mass, then the Jacobians that there are.
-fn motions(answer: &v1::KinematicsResponse, points: &[v1::FramePoint]) -> String {
+fn motions(answer: &v1::KinematicsResponse, points: &[v1::FramePoint]) -> Page {
     let named = |name: &String, values: [&[f64]; 4]| {
         iter::once(name.clone()).chain(values.map(text::numbers)).collect()
     };
@@ -143,20 +164,20 @@ fn motions(answer: &v1::KinematicsResponse, points: &[v1::FramePoint]) -> String
     let label = format!("centre of {} kg", number(center.mass_kg));
     rows.push(named(&label, [&center.position, &[], &center.velocity, &[]]));
     let head = ["", "position/m", "orientation w, x, y, z", "velocity/m/s", "turning/rad/s"];
-    let mut out = table(&head, &rows);
+    let mut out = Page::from(table(&head, rows));
     let axes: Vec<String> = ["vx", "vy", "vz", "wx", "wy", "wz"].map(str::to_owned).to_vec();
     let of_frames = answer.frames.iter().map(|frame| (&frame.frame, &frame.jacobian));
     let of_points = labels.iter().zip(answer.points.iter().map(|point| &point.jacobian));
     let jacobians = of_frames.chain(of_points).chain([(&label, &center.jacobian)]);
     for (name, jacobian) in jacobians.filter_map(|(name, j)| Some((name, j.as_ref()?))) {
         let title = format!("Jacobian of {name}");
-        let _ = write!(out, "\n{}", matrix(&title, jacobian, &axes, &answer.coordinates));
+        out.next_table(matrix(&title, jacobian, &axes, &answer.coordinates));
     }
     out
 }
 
 /// The terms by coordinate, with forward and inverse dynamics where they were asked for, and the matrices.
-fn forces(answer: &v1::DynamicsResponse) -> String {
+fn forces(answer: &v1::DynamicsResponse) -> Page {
     let (names, constraints) = (&answer.coordinates, &answer.constraints);
     let (forward, inverse) = (answer.forward.as_ref(), answer.inverse.as_ref());
     let mut terms = vec![
@@ -167,31 +188,31 @@ fn forces(answer: &v1::DynamicsResponse) -> String {
     ];
     terms.extend(forward.map(|forward| ("acceleration", &forward.acceleration)));
     terms.extend(inverse.map(|inverse| ("tau", &inverse.force)));
-    let mut out = columns(names, &terms);
-    out += &answer.energy.as_ref().map(plant::energy).unwrap_or_default();
+    let mut out = Page::from(columns(names, &terms));
+    answer.energy.iter().for_each(|energy| out.append(plant::energy(energy)));
     if let Some(mass) = &answer.mass_matrix {
-        let _ = write!(out, "\n{}", matrix("mass matrix", mass, names, names));
+        out.next_table(matrix("mass matrix", mass, names, names));
     }
     let Some(dh) = answer.constraint_jacobian.as_ref().filter(|_| !constraints.is_empty()) else {
         return out;
     };
-    let _ = write!(out, "\n{}", matrix("Jacobian of the constraints", dh, constraints, names));
+    out.next_table(matrix("Jacobian of the constraints", dh, constraints, names));
     let mut terms = Vec::new();
     terms.extend(forward.map(|forward| ("λ with tau = 0", &forward.multipliers)));
     terms.extend(inverse.map(|inverse| ("λ with tau", &inverse.multipliers)));
     terms.extend(inverse.map(|inverse| ("d²h/dt²", &inverse.constraint_acceleration)));
     if !terms.is_empty() {
-        let _ = write!(out, "\n{}", columns(constraints, &terms));
+        out.next_table(columns(constraints, &terms));
     }
     out
 }
 
 /// A table of named columns, a row for each name.
-fn columns(names: &[String], columns: &[(&str, &Vec<f64>)]) -> String {
+fn columns(names: &[String], columns: &[(&str, &Vec<f64>)]) -> Table {
     let head: Vec<&str> = iter::once("").chain(columns.iter().map(|(title, _)| *title)).collect();
     let row = |(i, name): (usize, &String)| {
-        let values = columns.iter().map(|(_, values)| number(values[i]));
-        iter::once(name.clone()).chain(values).collect()
+        let values = columns.iter().map(|(_, values)| values[i].into());
+        iter::once(Cell::from(name.as_str())).chain(values).collect()
     };
-    table(&head, &names.iter().enumerate().map(row).collect::<Vec<_>>())
+    table(&head, names.iter().enumerate().map(row))
 }

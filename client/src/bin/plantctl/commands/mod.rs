@@ -12,6 +12,7 @@ pub(crate) mod fault;
 pub(crate) mod feedback;
 pub(crate) mod fmu;
 pub(crate) mod guard;
+pub(crate) mod health;
 pub(crate) mod import;
 pub(crate) mod inventory;
 pub(crate) mod kalman;

@@ -5,6 +5,7 @@ use clap::Args;
 use plantd_client::v1;
 
 use crate::input::numbers::{Assignment, assignment};
+use crate::output::page::Page;
 use crate::output::plant;
 use crate::server::context::Context;
 
@@ -17,7 +18,7 @@ pub(crate) struct SetParameter {
     #[arg(value_name = "PATH=VALUE", value_parser = assignment, required_unless_present = "dt")]
     parameters: Vec<Assignment>,
     /// Time step, seconds.
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", visible_alias = "time-step", alias = "time-step-s")]
     dt: Option<f64>,
 }
 
@@ -31,8 +32,11 @@ impl SetParameter {
             time_step_s: self.dt.unwrap_or(0.0),
         };
         let plant = client.set_parameters(request).await?;
+        context.output.success(&format!("plant `{}` has them from its next step on", plant.id));
         context.output.message("PlantInfo", &plant, || {
-            plant::list(std::slice::from_ref(&plant)) + &plant::parameters(&plant)
+            let mut page = Page::from(plant::list(std::slice::from_ref(&plant)));
+            page.append(plant::parameters(&plant));
+            page
         })
     }
 }

@@ -14,7 +14,7 @@ use crate::figure::axis::Axis;
 use crate::figure::browser;
 use crate::figure::chart::{self, Curve};
 use crate::figure::terminal;
-use crate::output::text::table;
+use crate::output::page::{Page, table};
 use crate::scenario::samples::{Columns, Sample, Samples};
 use crate::server::context::Context;
 
@@ -59,8 +59,8 @@ impl Plot {
                 recording.names.iter().map(|(name, unit)| json!({ "name": name, "unit": unit }));
             let json = || json!({ "signals": rows.collect::<Vec<_>>() });
             let row = |(name, unit): &(String, String)| vec![name.clone(), unit.clone()];
-            let rows: Vec<_> = recording.names.iter().map(row).collect();
-            return context.output.print(json, || table(&["signal", "unit"], &rows));
+            let table = || table(&["signal", "unit"], recording.names.iter().map(row));
+            return context.output.print(json, table);
         }
         let range = self.from.unwrap_or(f64::NEG_INFINITY)..=self.until.unwrap_or(f64::INFINITY);
         let curves = self.signals.iter().map(|name| {
@@ -86,7 +86,8 @@ impl Plot {
             }
             _ => bail!("{}: plots are written as .svg or .png", path.display()),
         }
-        context.output.done(json!({ "file": path, "signals": self.signals }))
+        let said = format!("{} curves are drawn in {}", curves.len(), path.display());
+        context.output.done(json!({ "file": path, "signals": self.signals }), &said)
     }
 }
 
@@ -112,7 +113,12 @@ fn show(curves: &[Curve], context: &Context) -> Result<()> {
         let times = Axis::over(curves.iter().flat_map(|curve| &curve.time_s).copied());
         let rows = ROWS[(curves.len() - 1).min(ROWS.len() - 1)];
         let panels = curves.iter().map(|curve| terminal::panel(curve, &times, width(), rows));
-        panels.collect::<Vec<_>>().join("\n")
+        let mut page = Page::from(panels.collect::<Vec<_>>().join("\n"));
+        for curve in curves {
+            let points = curve.time_s.iter().zip(&curve.values);
+            page.data(table(&["time_s", &curve.name], points.map(|(t, y)| vec![*t, *y])));
+        }
+        page
     };
     context.output.print(json, text)
 }

@@ -11,7 +11,7 @@ use plantd_client::v1;
 use serde_json::json;
 
 use crate::contract::json;
-use crate::output::text::table;
+use crate::output::page::{Cell, Page, table};
 use crate::server::context::Context;
 
 /// Records plants into files of the server.
@@ -58,7 +58,7 @@ enum RecordCommand {
 impl Record {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let output = context.output;
+        let output = &context.output;
         let print = |recording: &v1::Recording| {
             let one = std::slice::from_ref(recording);
             output.message("Recording", recording, || text(one))
@@ -70,9 +70,16 @@ impl Record {
                     name: name.unwrap_or_default(),
                     checkpoint_interval_s: checkpoint_interval,
                 };
-                print(&client.start_recording(request).await?)?;
+                let recording = client.start_recording(request).await?;
+                let (plant, name) = (&recording.plant, &recording.name);
+                output.success(&format!("plant `{plant}` is recorded as `{name}`"));
+                print(&recording)?;
             }
-            RecordCommand::Stop { name } => print(&client.stop_recording(name).await?)?,
+            RecordCommand::Stop { name } => {
+                let recording = client.stop_recording(name).await?;
+                output.success(&format!("recording `{}` is done", recording.name));
+                print(&recording)?;
+            }
             RecordCommand::List => {
                 let all = client.list_recordings().await?;
                 output.print(|| json::messages("Recording", &all), || text(&all))?;
@@ -88,11 +95,13 @@ impl Record {
                     bytes += piece.data.len();
                 }
                 file.flush().with_context(cannot_write)?;
-                output.done(json!({ "recording": name, "file": path, "bytes": bytes }))?;
+                let said = format!("recording `{name}` is in {}: {bytes} bytes", path.display());
+                output.done(json!({ "recording": name, "file": path, "bytes": bytes }), &said)?;
             }
             RecordCommand::Delete { name } => {
                 client.delete_recording(&name).await?;
-                output.done(json!({ "deleted": { "recording": name } }))?;
+                let said = format!("recording `{name}` is deleted");
+                output.done(json!({ "deleted": { "recording": name } }), &said)?;
             }
         }
         Ok(())
@@ -100,7 +109,7 @@ impl Record {
 }
 
 /// Recordings as a table, with the reasons of those that failed.
-fn text(recordings: &[v1::Recording]) -> String {
+fn text(recordings: &[v1::Recording]) -> Page {
     let row = |r: &v1::Recording| {
         let status = match r.status() {
             v1::RecordingStatus::Unspecified => "-",
@@ -110,16 +119,16 @@ fn text(recordings: &[v1::Recording]) -> String {
         };
         let plant = if r.plant.is_empty() { "-" } else { &r.plant };
         vec![
-            r.name.clone(),
-            plant.to_owned(),
-            status.to_owned(),
-            r.steps.to_string(),
-            r.lost.to_string(),
-            r.bytes.to_string(),
+            Cell::from(r.name.as_str()),
+            plant.into(),
+            status.into(),
+            r.steps.into(),
+            r.lost.into(),
+            r.bytes.into(),
         ]
     };
     let head = ["recording", "plant", "status", "steps", "lost", "bytes"];
-    let mut text = table(&head, &recordings.iter().map(row).collect::<Vec<_>>());
+    let mut text = Page::from(table(&head, recordings.iter().map(row)));
     for recording in recordings.iter().filter(|recording| !recording.failure.is_empty()) {
         let _ = writeln!(text, "{}: {}", recording.name, recording.failure);
     }

@@ -11,6 +11,7 @@ use crate::contract::names;
 use crate::input::files::read_table;
 use crate::input::settings::Settings;
 use crate::input::weights::Weights;
+use crate::output::page::{Page, table};
 use crate::output::text::number;
 use crate::server::context::Context;
 
@@ -44,7 +45,7 @@ impl ProjectReference {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         use v1::project_reference_response::Response;
         let client = context.connect().await?;
-        let output = context.output;
+        let output = &context.output;
         let q = Some(read_table(&self.reference)?);
         let u = self.u.as_deref().map(read_table).transpose()?;
         let model = client.get_model(&self.model).await?;
@@ -53,21 +54,22 @@ impl ProjectReference {
             settings: Some(self.settings.into()),
             q,
             u,
-            projection: Some(self.weights.for_model(&model)),
+            projection: Some(self.weights.for_model(&model)?),
             tolerance: self.tolerance,
             strict: self.strict,
             ..Default::default()
         };
         let mut messages = client.project_reference(request).await?;
         let (x, u) = (names::state(&model), names::input(&model));
+        let head: Vec<_> = x.into_iter().chain(u.iter().map(|name| format!("u({name})"))).collect();
+        let names: Vec<&str> = head.iter().map(String::as_str).collect();
         while let Some(message) = messages.next().await? {
             let text = match &message.response {
                 Some(Response::Report(report)) => {
-                    if !output.json {
+                    if output.is_for_people() {
                         eprint!("{}", text(report));
                     }
-                    let u = u.iter().map(|name| format!("u({name})"));
-                    x.iter().cloned().chain(u).collect::<Vec<_>>()
+                    head.clone()
                 }
                 Some(Response::Step(step)) => {
                     // The last state has no input.
@@ -77,7 +79,12 @@ impl ProjectReference {
                 }
                 None => continue,
             };
-            let row = || format!("{}\n", text.join(","));
+            let is_row = matches!(message.response, Some(Response::Step(_)));
+            let row = || {
+                let mut page = Page::from(format!("{}\n", text.join(",")));
+                page.data(table(&names, is_row.then_some(text)));
+                page
+            };
             output.message("ProjectReferenceResponse", &message, row)?;
         }
         Ok(())

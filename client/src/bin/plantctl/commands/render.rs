@@ -105,7 +105,8 @@ impl Render {
         };
         std::fs::write(&self.out, bytes)
             .with_context(|| format!("cannot write {}", self.out.display()))?;
-        context.output.done(json!({ "file": self.out, "pictures": film.len() }))
+        let said = format!("{} pictures are in {}", film.len(), self.out.display());
+        context.output.done(json!({ "file": self.out, "pictures": film.len() }), &said)
     }
 
     /// Checks what was asked for, before anything is started.

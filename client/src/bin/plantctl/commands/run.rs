@@ -4,10 +4,11 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use plantd_client::{Client, Error, v1};
 
-use crate::input::numbers::{Numbers, numbers, or_empty};
+use crate::contract::names;
+use crate::input::numbers::{Vector, vector};
 use crate::output::plant::state;
 use crate::output::printer::Output;
-use crate::server::context::{Context, plant};
+use crate::server::context::{Context, model_of, plant, resting};
 
 const RUN: &str = "\
 Examples:
@@ -45,9 +46,9 @@ pub(crate) struct Run {
     /// Duration of a ramp, seconds on the plant's clock.
     #[arg(long, value_name = "SECONDS", requires = "action")]
     ramp: Option<f64>,
-    /// The safe input, comma-separated.
-    #[arg(long, value_parser = numbers, allow_hyphen_values = true, requires = "pace")]
-    safe: Option<Numbers>,
+    /// The safe input, comma-separated, or some of it, `tau=0`.
+    #[arg(long, value_parser = vector, allow_hyphen_values = true, requires = "pace")]
+    safe: Option<Vector>,
     /// Once the safe input acts, it acts until `run` is called again.
     #[arg(long, requires = "pace")]
     latch: bool,
@@ -93,18 +94,27 @@ impl Run {
             Pace::Paced => v1::Pace::Paced,
             Pace::Free => v1::Pace::Free,
         });
+        let has_policy = action.is_some() || timeout.is_some() || safe.is_some() || latch;
         let action = action.map(|action| match action {
             InputAction::Hold => v1::InputAction::Hold,
             InputAction::Safe => v1::InputAction::Safe,
             InputAction::Ramp => v1::InputAction::Ramp,
             InputAction::Stop => v1::InputAction::Stop,
         });
-        let has_policy = action.is_some() || timeout.is_some() || safe.is_some() || latch;
+        let safe = match safe {
+            None => Vec::new(),
+            Some(safe) if safe.is_named() => {
+                let model = model_of(&client, &id).await?;
+                let rest = resting(&plant(&client, &id).await?, &model);
+                safe.over("safe", &names::input(&model), &rest)?
+            }
+            Some(safe) => safe.over("safe", &[""], &[])?,
+        };
         let policy = has_policy.then(|| v1::InputPolicy {
             timeout_s: timeout.unwrap_or(0.0),
             action: action.unwrap_or_default().into(),
             ramp_s: ramp.unwrap_or(0.0),
-            safe: or_empty(safe),
+            safe,
             latch,
         });
         // Without a pace the settings stay as they are.
@@ -114,10 +124,12 @@ impl Run {
             input: policy,
         });
         if settings.is_none() && steps.is_none() {
-            say_if_it_runs(&client, context.output, &id).await?;
+            say_if_it_runs(&client, &context.output, &id).await?;
         }
+        let name = id.clone();
         let request = v1::RunRequest { id, settings, steps: steps.unwrap_or(0), wait };
         let run = client.run(request).await?;
+        context.output.success(&said(&name, &run));
         context.output.message("RunInfo", &run, String::new)?;
         match run.stopped_by {
             Some(failure) if wait => Err(Error::Rpc(Box::new(failure.into())).into()),
@@ -137,14 +149,32 @@ impl Pause {
                 None => format!("plant `{id}` is paused already"),
             });
         }
-        let paused = client.pause(id).await?;
-        let as_text = || paused.state.as_ref().map(state).unwrap_or_default();
+        let model = context.names_of(&client, &id).await?;
+        let paused = client.pause(&id).await?;
+        if run.running {
+            context.output.success(&format!("plant `{id}` is paused"));
+        }
+        let as_text = || paused.state.as_ref().map(|s| state(s, &model)).unwrap_or_default();
         context.output.message("PauseResponse", &paused, as_text)
     }
 }
 
+/// What becomes of a plant that was told to run.
+fn said(id: &str, run: &v1::RunInfo) -> String {
+    let pace = match run.settings.clone().unwrap_or_default().pace() {
+        v1::Pace::Unspecified | v1::Pace::Lockstep => "waits for its driver's inputs",
+        v1::Pace::Paced => "runs by the wall clock",
+        v1::Pace::Free => "runs as fast as it can",
+    };
+    match (run.running, run.steps_left) {
+        (false, _) => format!("plant `{id}` stands still again"),
+        (true, 0) => format!("plant `{id}` {pace}"),
+        (true, steps) => format!("plant `{id}` {pace} for {steps} steps"),
+    }
+}
+
 /// `run` without more lets a plant go on that stands still; any other stays as it is.
-async fn say_if_it_runs(client: &Client, output: Output, id: &str) -> Result<()> {
+async fn say_if_it_runs(client: &Client, output: &Output, id: &str) -> Result<()> {
     let plant = plant(client, id).await?;
     let run = plant.run.unwrap_or_default();
     let is_frozen = plant.safety.is_some_and(|safety| safety.frozen.is_some());

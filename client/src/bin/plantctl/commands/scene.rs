@@ -13,6 +13,7 @@ use crate::input::files::{read_scene, read_text};
 use crate::input::meshes::Meshes;
 use crate::output::failure::FAILED;
 use crate::output::model;
+use crate::output::page::{Page, table};
 use crate::server::context::Context;
 
 /// Uploads a scene (TOML, JSON) or a robot (URDF, MJCF) as a model, with the meshes that show it.
@@ -64,6 +65,7 @@ impl Upload {
         let model = answer.model.context("an answer without a model")?;
         let folder = self.scene.parent().unwrap_or(Path::new(""));
         Meshes::new(folder, self.package).send(&client, &model.name).await?;
+        context.output.success(&format!("model `{}` is uploaded", model.name));
         context.output.message("Model", &model, || model::known(&model))
     }
 }
@@ -88,7 +90,7 @@ impl Validate {
 impl Explain {
     pub(crate) async fn run(self, context: &Context) -> Result<ExitCode> {
         let client = context.connect().await?;
-        let output = context.output;
+        let output = &context.output;
         let print_plan = |plan: &str| {
             output.print(|| json!({ "plan": plan }), || format!("{}\n", plan.trim_end()))
         };
@@ -113,6 +115,11 @@ fn verdict(answer: &v1::ValidateSceneResponse) -> ExitCode {
     if answer.problems.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(FAILED) }
 }
 
-fn problems(problems: &[v1::SceneProblem]) -> String {
-    problems.iter().map(|p| format!("{}: {}\n", p.path, p.message)).collect()
+/// The problems of a scene, a line each.
+fn problems(problems: &[v1::SceneProblem]) -> Page {
+    let mut page = Page::default();
+    problems.iter().for_each(|p| page.append(format!("{}: {}\n", p.path, p.message)));
+    let rows = problems.iter().map(|p| vec![p.path.clone(), p.message.clone()]);
+    page.data(table(&["path", "problem"], rows));
+    page
 }

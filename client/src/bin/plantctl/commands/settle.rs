@@ -6,9 +6,11 @@ use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
+use crate::contract::names;
 use crate::input::numbers::{Assignment, assignment, by_name, numbers};
+use crate::output::page::{Cell, Page, table};
 use crate::output::plant;
-use crate::output::text::{number, table};
+use crate::output::text::number;
 use crate::server::context::Context;
 
 /// Finds a configuration in which a model rests, from a guess.
@@ -55,7 +57,7 @@ impl Settle {
         };
         let answer = client.settle(request).await?;
         context.output.message("SettleResponse", &answer, || match self.toml {
-            true => operating_point(&answer, &model),
+            true => operating_point(&answer, &model).into(),
             false => settled(&answer, &model),
         })
     }
@@ -77,15 +79,14 @@ fn target(text: &str) -> Result<v1::SettleTarget, String> {
 }
 
 /// A settled configuration.
-fn settled(answer: &v1::SettleResponse, model: &v1::Model) -> String {
-    let coordinates = model.coordinates.iter().map(|c| c.name.as_str());
-    let inputs = model.inputs.iter().map(String::as_str);
-    let rows: Vec<_> = coordinates
+fn settled(answer: &v1::SettleResponse, model: &v1::Model) -> Page {
+    let coordinates = model.coordinates.iter().map(|c| (c.name.as_str(), names::unit(c)));
+    let inputs = model.inputs.iter().map(|name| (name.as_str(), ""));
+    let rows = coordinates
         .zip(&answer.q)
         .chain(inputs.zip(&answer.u))
-        .map(|(name, value)| vec![name.to_owned(), number(*value)])
-        .collect();
-    let mut text = table(&["coordinate or input", "value"], &rows);
+        .map(|((name, unit), value)| vec![Cell::from(name), (*value).into(), unit.into()]);
+    let mut text = Page::from(table(&["coordinate or input", "value", "unit"], rows));
     if let Some(equilibrium) = &answer.equilibrium {
         let kind = if equilibrium.stable { "stable" } else { "unstable" };
         let _ = write!(
@@ -96,7 +97,9 @@ fn settled(answer: &v1::SettleResponse, model: &v1::Model) -> String {
             number(equilibrium.smallest_stiffness),
             number(equilibrium.residual)
         );
-        let _ = write!(text, "{}", plant::forces(&equilibrium.constraint_forces, model));
+        if !equilibrium.constraint_forces.is_empty() {
+            text.next_table(plant::forces(&equilibrium.constraint_forces, model));
+        }
     }
     text
 }

@@ -49,11 +49,12 @@ impl Completions {
 }
 
 impl Man {
-    pub(crate) fn run(self, command: Command, output: Output) -> Result<()> {
+    pub(crate) fn run(self, command: Command, output: &Output) -> Result<()> {
         let folder = self.folder.join("man1");
         let cannot = || format!("cannot write manual pages into {}", folder.display());
         std::fs::create_dir_all(&folder).with_context(cannot)?;
         clap_mangen::generate_to(command, &folder).with_context(cannot)?;
-        output.done(json!({ "written": folder }))
+        let said = format!("manual pages are in {}", folder.display());
+        output.done(json!({ "written": folder }), &said)
     }
 }

@@ -8,7 +8,7 @@ use plantd_client::v1;
 use serde_json::json;
 
 use crate::input::files;
-use crate::input::point::Initial;
+use crate::input::point::{Initial, Of};
 use crate::output::plant;
 use crate::server::context::Context;
 
@@ -45,9 +45,12 @@ pub(crate) struct Restore {
 impl Reset {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let request = v1::ResetRequest { id: self.id, initial: self.initial.into() };
+        let model = context.names_of(&client, &self.id).await?;
+        let initial = self.initial.resolve(&client, Of::Plant(&self.id)).await?;
+        let request = v1::ResetRequest { id: self.id.clone(), initial };
         let state = client.reset_to(request).await?;
-        context.output.message("State", &state, || plant::state(&state))
+        context.output.success(&format!("plant `{}` is at step 0 again", self.id));
+        context.output.message("State", &state, || plant::state(&state, &model))
     }
 }
 
@@ -56,7 +59,13 @@ impl Snapshot {
         let client = context.connect().await?;
         let snapshot = client.snapshot(&self.id).await?;
         files::write(&self.file, &snapshot)?;
-        context.output.done(json!({ "plant": self.id, "bytes": snapshot.len() }))
+        let bytes = snapshot.len();
+        let said = format!(
+            "a snapshot of plant `{}` is in {}: {bytes} bytes",
+            self.id,
+            self.file.display()
+        );
+        context.output.done(json!({ "plant": self.id, "bytes": bytes }), &said)
     }
 }
 
@@ -65,8 +74,10 @@ impl Restore {
         let client = context.connect().await?;
         let snapshot = std::fs::read(&self.file)
             .with_context(|| format!("cannot read {}", self.file.display()))?;
-        let request = v1::RestoreRequest { id: self.id, snapshot, state_alone: self.state_alone };
-        let state = client.restore_by(request).await?;
-        context.output.message("State", &state, || plant::state(&state))
+        let model = context.names_of(&client, &self.id).await?;
+        let (id, state_alone) = (self.id.clone(), self.state_alone);
+        let state = client.restore_by(v1::RestoreRequest { id, snapshot, state_alone }).await?;
+        context.output.success(&format!("plant `{}` is at step {}", self.id, state.step));
+        context.output.message("State", &state, || plant::state(&state, &model))
     }
 }

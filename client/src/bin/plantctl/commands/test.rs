@@ -14,7 +14,8 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use crate::input::files::write;
 use crate::output::failure::FAILED;
-use crate::output::printer::Output;
+use crate::output::page::{Page, table};
+use crate::output::printer::{Output, complain};
 use crate::report::results::{Replay, Report, ScenarioResult, UnusableFile};
 use crate::report::text::{print_case, print_summary, print_unusable, title};
 use crate::report::{html, junit};
@@ -112,7 +113,7 @@ impl Test {
         let status = self.run_suites(context).await;
         status.or_else(|error| {
             // Whatever keeps a suite from being run is none of its expectations.
-            eprintln!("plantctl: {error:#}");
+            complain(&error);
             Ok(ExitCode::from(NOT_RUN))
         })
     }
@@ -126,8 +127,8 @@ impl Test {
         let count: usize = scenarios.iter().map(|(_, scenario)| self.cases(scenario).len()).sum();
         ensure!(count > 0 || !unusable.is_empty(), "no case has such a name");
         if self.list {
-            self.print_cases(context.output, &scenarios)?;
-            print_unusable(context.output, &unusable)?;
+            self.print_cases(&context.output, &scenarios)?;
+            print_unusable(&context.output, &unusable)?;
             return Ok(ExitCode::from(if unusable.is_empty() { 0 } else { NOT_RUN }));
         }
         let (own, address) = match &context.address {
@@ -146,7 +147,7 @@ impl Test {
         };
         let replay = Replay { address: context.address.as_deref(), server: self.server.as_deref() };
         let mut terminated = signal(SignalKind::terminate())?;
-        let all = self.run_all(&server, scenarios, context.output, &replay);
+        let all = self.run_all(&server, scenarios, &context.output, &replay);
         let tested = tokio::select! {
             tested = all => Some(tested?),
             _ = tokio::signal::ctrl_c() => None,
@@ -164,9 +165,9 @@ impl Test {
             bail!("interrupted");
         };
         unusable.extend(more);
-        print_unusable(context.output, &unusable)?;
+        print_unusable(&context.output, &unusable)?;
         let report = Report { tested, unusable };
-        print_summary(context.output, &report)?;
+        print_summary(&context.output, &report)?;
         if let Some(file) = &self.junit {
             write(file, junit::document(&report, &replay))?;
         }
@@ -175,7 +176,7 @@ impl Test {
         }
         let status = report.status();
         if let Some(own) = own {
-            if status == Status::Error && !context.output.json {
+            if status == Status::Error && context.output.is_for_people() {
                 print_errors(&own.log());
             }
             own.stop().await;
@@ -210,11 +211,17 @@ impl Test {
         cases
     }
 
-    fn print_cases(&self, output: Output, scenarios: &[Suite]) -> Result<()> {
+    fn print_cases(&self, output: &Output, scenarios: &[Suite]) -> Result<()> {
         for (file, scenario) in scenarios {
             for case in self.cases(scenario) {
                 let name = title(&file.to_string_lossy(), &case.name);
-                output.print(|| json!({ "file": file, "case": case.name }), || name + "\n")?;
+                let json = || json!({ "file": file, "case": case.name });
+                let row = || vec![file.display().to_string(), case.name.clone()];
+                output.print(json, || {
+                    let mut page = Page::from(name + "\n");
+                    page.data(table(&["file", "case"], [row()]));
+                    page
+                })?;
             }
         }
         Ok(())
@@ -225,7 +232,7 @@ impl Test {
         &self,
         server: &TestServer,
         scenarios: Vec<Suite>,
-        output: Output,
+        output: &Output,
         replay: &Replay<'_>,
     ) -> Result<(Vec<ScenarioResult>, Vec<UnusableFile>)> {
         let jobs = self.jobs.map_or_else(

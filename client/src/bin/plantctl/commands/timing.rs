@@ -6,6 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use plantd_client::v1;
 
+use crate::output::page::{Cell, Page, table};
 use crate::server::context::Context;
 
 /// Prints what the loop of a plant that runs by itself has counted.
@@ -26,29 +27,21 @@ impl Timing {
     }
 }
 
-fn text(timing: &v1::GetTimingResponse) -> String {
-    let mut text = format!(
-        "{:12} {:>10} {:>10} {:>10} {:>10} {:>10}\n",
-        "us", "mean", "p50", "p99", "p99.9", "max"
-    );
-    for (name, times) in [
+fn text(timing: &v1::GetTimingResponse) -> Page {
+    let times = [
         ("lateness", &timing.lateness),
         ("step", &timing.step),
         ("input age", &timing.input_age),
         ("round trip", &timing.round_trip),
-    ] {
-        let Some(times) = times.as_ref().filter(|times| times.count > 0) else { continue };
-        let us = |time_ns: u64| time_ns as f64 * 1e-3;
-        let _ = writeln!(
-            text,
-            "{name:12} {:10.1} {:10.1} {:10.1} {:10.1} {:10.1}",
-            us(times.mean_ns),
-            us(times.p50_ns),
-            us(times.p99_ns),
-            us(times.p999_ns),
-            us(times.max_ns)
-        );
-    }
+    ];
+    let row = |(name, times): (&str, &Option<v1::TimeSummary>)| {
+        let times = times.as_ref().filter(|times| times.count > 0)?;
+        let us = |time_ns: u64| Cell::from(format!("{:.1}", time_ns as f64 * 1e-3));
+        let spread = [times.p50_ns, times.p99_ns, times.p999_ns, times.max_ns].map(us);
+        Some([name.into(), us(times.mean_ns)].into_iter().chain(spread).collect())
+    };
+    let head = ["us", "mean", "p50", "p99", "p99.9", "max"];
+    let mut text = Page::from(table(&head, times.into_iter().filter_map(row)));
     let _ = writeln!(
         text,
         "{} steps, {} overruns, {} slips, {} late inputs, {} safe inputs, {} unused inputs",

@@ -15,6 +15,8 @@ use serde_json::json;
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
+use crate::input::files::from_toml;
+use crate::output::page::{Cell, Page, Table, table};
 use crate::server::context::Context;
 
 /// Random bytes of a token.
@@ -116,11 +118,18 @@ impl Token {
         match self.action {
             Action::New { name, role, tenant, days, file } => {
                 let token = make(&file.file, name, role, tenant, days)?;
-                context.output.print(|| json!({ "token": token }), || format!("{token}\n"))
+                context.output.print(
+                    || json!({ "token": token }),
+                    || {
+                        let mut page = Page::from(format!("{token}\n"));
+                        page.data(table(&["token"], [vec![token.as_str()]]));
+                        page
+                    },
+                )
             }
             Action::List { file } => {
                 let tokens = Tokens::read(&file.file)?;
-                context.output.print(|| tokens.to_json(), || tokens.to_text())
+                context.output.print(|| tokens.to_json(), || tokens.to_table())
             }
             Action::Revoke { name, file } => {
                 let mut tokens = Tokens::read(&file.file)?;
@@ -129,9 +138,8 @@ impl Token {
                 let count = before - tokens.tokens.len();
                 ensure!(count > 0, "there is no token `{name}` in {}", file.file.display());
                 tokens.write(&file.file)?;
-                context
-                    .output
-                    .print(|| json!({ "revoked": count }), || format!("{count} revoked\n"))
+                let said = format!("{count} revoked");
+                context.output.done(json!({ "revoked": count }), &said)
             }
         }
     }
@@ -184,7 +192,7 @@ fn make(
 impl Tokens {
     fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
-        toml::from_str(&text).with_context(|| path.display().to_string())
+        from_toml(&text).with_context(|| path.display().to_string())
     }
 
     /// Writes beside the file and renames: whoever reads sees all or nothing. Owner and mode stay.
@@ -218,9 +226,8 @@ impl Tokens {
         json!({ "tokens": self.tokens.iter().map(entry).collect::<Vec<_>>() })
     }
 
-    fn to_text(&self) -> String {
-        let mut text = format!("{:<24} {:<16} {:<8} EXPIRES\n", "NAME", "TENANT", "ROLE");
-        for entry in &self.tokens {
+    fn to_table(&self) -> Table {
+        let row = |entry: &Entry| {
             let role = match entry.role {
                 Role::Viewer => "viewer",
                 Role::Driver => "driver",
@@ -228,10 +235,9 @@ impl Tokens {
             };
             let tenant = entry.tenant.as_deref().unwrap_or("default");
             let expires = entry.expires().unwrap_or_else(|| "never".to_owned());
-            // Writing to a text does not fail.
-            let _ = writeln!(text, "{:<24} {tenant:<16} {role:<8} {expires}", entry.name);
-        }
-        text
+            [entry.name.as_str(), tenant, role, expires.as_str()].map(Cell::from).to_vec()
+        };
+        table(&["token", "tenant", "role", "expires"], self.tokens.iter().map(row))
     }
 }
 

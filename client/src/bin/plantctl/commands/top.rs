@@ -1,7 +1,7 @@
 //! `top`: what the plants of a server are doing, again and again.
 
 use std::collections::HashMap;
-use std::io::IsTerminal as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -9,7 +9,7 @@ use clap::Args;
 use plantd_client::{Client, v1};
 use serde_json::{Value, json};
 
-use crate::output::text::{number, table};
+use crate::output::page::{Cell, Table, table};
 use crate::server::context::Context;
 
 /// Cursor to the corner, and the screen empty.
@@ -46,7 +46,7 @@ struct Row {
 impl Top {
     pub(crate) async fn run(self, context: &Context) -> Result<()> {
         let client = context.connect().await?;
-        let is_screen = std::io::stdout().is_terminal() && !context.output.json;
+        let is_screen = std::io::stdout().is_terminal() && context.output.is_for_people();
         let mut last: HashMap<String, (Instant, u64)> = HashMap::new();
         let mut ticks = tokio::time::interval(Duration::from_secs_f64(self.interval));
         let mut looks = 0;
@@ -56,8 +56,11 @@ impl Top {
                 _ = tokio::signal::ctrl_c() => break,
             }
             let rows = look(&client, &mut last).await?;
-            let clear = if is_screen { CLEAR } else { "" };
-            context.output.print(|| as_json(&rows), || format!("{clear}{}", as_text(&rows)))?;
+            if is_screen {
+                // Not by way of what takes colours away: this is no colour.
+                std::io::stdout().write_all(CLEAR.as_bytes())?;
+            }
+            context.output.print(|| as_json(&rows), || as_table(&rows))?;
             looks += 1;
         }
         Ok(())
@@ -109,18 +112,18 @@ fn late_us(row: &Row) -> Option<(f64, f64)> {
     Some((lateness.p50_ns as f64 * 1e-3, lateness.p99_ns as f64 * 1e-3))
 }
 
-fn as_text(rows: &[Row]) -> String {
+fn as_table(rows: &[Row]) -> Table {
     let cells = |row: &Row| {
         let plant = &row.plant;
         let state = plant.state.as_ref();
-        let or_none = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
+        let or_none = |text: Option<String>| Cell::from(text.unwrap_or_else(|| "-".to_owned()));
         let late = late_us(row);
         vec![
-            plant.id.clone(),
-            plant.model.clone(),
-            doing(plant),
-            if plant.driver.is_empty() { "-".to_owned() } else { plant.driver.clone() },
-            number(state.map_or(0.0, |state| state.time_s)),
+            plant.id.as_str().into(),
+            plant.model.as_str().into(),
+            doing(plant).into(),
+            if plant.driver.is_empty() { "-" } else { plant.driver.as_str() }.into(),
+            state.map_or(0.0, |state| state.time_s).into(),
             or_none(row.rate.map(|rate| format!("{rate:.0}"))),
             or_none(late.map(|(p50, _)| format!("{p50:.1}"))),
             or_none(late.map(|(_, p99)| format!("{p99:.1}"))),
@@ -129,7 +132,7 @@ fn as_text(rows: &[Row]) -> String {
     };
     let head =
         ["plant", "model", "run", "driver", "time/s", "steps/s", "late/us", "p99", "overruns"];
-    table(&head, &rows.iter().map(cells).collect::<Vec<_>>())
+    table(&head, rows.iter().map(cells))
 }
 
 fn as_json(rows: &[Row]) -> Value {

@@ -4,7 +4,9 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use plantd_client::{Client, v1};
 
+use crate::contract::names;
 use crate::input::weights::RegulatorWeights;
+use crate::output::page::Page;
 use crate::output::text::numbers;
 use crate::output::{derivatives, plant};
 use crate::server::context::{Context, for_each, model_of};
@@ -74,18 +76,23 @@ impl Watch {
             true => drawn(&client, &id).await?,
             false => Vec::new(),
         };
-        let named = fields.iter().any(|f| matches!(f, Field::Linearization | Field::Gain));
-        let model = if named { model_of(&client, &id).await? } else { v1::Model::default() };
         let has_gain = fields.contains(&Field::Gain);
+        let mut model = match has_gain {
+            true => model_of(&client, &id).await?,
+            false => context.names_of(&client, &id).await?,
+        };
         let request = v1::WatchRequest {
             fields: fields.into_iter().map(|f| v1::WatchField::from(f).into()).collect(),
-            weights: has_gain.then(|| weights.for_model(&model)),
+            weights: has_gain.then(|| weights.for_model(&model)).transpose()?,
             id,
             every,
             coordinates,
             queue,
             at_most_hz,
         };
+        if !request.coordinates.is_empty() {
+            model.coordinates.retain(|c| request.coordinates.contains(&c.name));
+        }
         for_each(client.watch(request).await?, count, |message| {
             context.output.message("WatchResponse", &message, || watched(&message, &model, &frames))
         })
@@ -120,26 +127,27 @@ fn poles(poles: &v1::Poles) -> String {
 }
 
 /// A message of a watch as text.
-fn watched(message: &v1::WatchResponse, model: &v1::Model, frames: &[String]) -> String {
+fn watched(message: &v1::WatchResponse, model: &v1::Model, frames: &[String]) -> Page {
     let head = match &message.state {
-        Some(state) => plant::state(state),
-        None => format!("step {}\n", message.step),
+        Some(state) => plant::state(state, model),
+        None => format!("step {}\n", message.step).into(),
     };
     let lost = (message.dropped > 0).then(|| format!("  {} messages lost\n", message.dropped));
     let failure = message.failure.as_ref().map(|f| format!("  {}: {}\n", f.reason, f.message));
-    let input = (!message.u.is_empty()).then(|| format!("  u: {}\n", numbers(&message.u)));
-    let parts = [
+    let u = || plant::listed(&names::input(model), &message.u);
+    let input = (!message.u.is_empty()).then(|| format!("  u: {}\n", u()));
+    let parts: [Option<Page>; 11] = [
         Some(head),
-        input,
-        message.outputs.as_ref().map(plant::outputs),
-        message.report.as_ref().map(plant::report),
-        message.energy.as_ref().map(plant::energy),
+        input.map(Page::from),
+        message.outputs.as_ref().map(|o| plant::outputs(o).into()),
+        message.report.as_ref().map(|r| plant::report(r).into()),
+        message.energy.as_ref().map(|e| plant::energy(e).into()),
         message.linearization.as_ref().map(|l| derivatives::linearization(l, model)),
         message.gain.as_ref().map(|g| derivatives::gain(g, model)),
-        message.poses.as_ref().map(|p| poses(p, frames)),
-        message.poles.as_ref().map(poles),
-        failure,
-        lost,
+        message.poses.as_ref().map(|p| poses(p, frames).into()),
+        message.poles.as_ref().map(|p| poles(p).into()),
+        failure.map(Page::from),
+        lost.map(Page::from),
     ];
     parts.into_iter().flatten().collect()
 }

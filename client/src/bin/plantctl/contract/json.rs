@@ -2,9 +2,12 @@
 
 use std::sync::LazyLock;
 
-use anyhow::Result;
+use anyhow::{Result, anyhow};
+use plantd_scene::in_plain_words;
 use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor, SerializeOptions};
 use serde_json::Value;
+
+use crate::contract::mistakes;
 
 static CONTRACT: LazyLock<DescriptorPool> = LazyLock::new(|| {
     DescriptorPool::decode(plantd_proto::FILE_DESCRIPTOR_SET).expect("the contract is well-formed")
@@ -33,10 +36,19 @@ pub(crate) fn message(name: &str, message: &impl prost::Message) -> Value {
 
 /// Reads a message back from JSON.
 pub(crate) fn read<M: prost::Message + Default>(name: &str, text: &str) -> Result<M> {
-    let mut deserializer = serde_json::Deserializer::from_str(text);
-    let dynamic = DynamicMessage::deserialize(descriptor(name), &mut deserializer)?;
-    deserializer.end()?;
-    Ok(dynamic.transcode_to()?)
+    let given: Value = serde_json::from_str(text).map_err(|error| anyhow!("no JSON: {error}"))?;
+    read_value(name, given)
+}
+
+/// Reads a message from its fields.
+///
+/// # Errors
+/// The first mistake, by its path.
+pub(crate) fn read_value<M: prost::Message + Default>(name: &str, given: Value) -> Result<M> {
+    let descriptor = descriptor(name);
+    mistakes::check(&descriptor, &given).map_err(anyhow::Error::msg)?;
+    let dynamic = DynamicMessage::deserialize(descriptor, given);
+    Ok(dynamic.map_err(|error| anyhow!(in_plain_words(&error.to_string())))?.transcode_to()?)
 }
 
 /// Messages of one kind as a JSON array.
@@ -60,6 +72,36 @@ mod tests {
         // As other writers of JSON have it.
         assert_eq!(read::<v1::State>("State", r#"{"step": "7"}"#).unwrap().step, 7);
         assert!(read::<v1::State>("State", "{} x").is_err());
+    }
+
+    #[test]
+    fn mistakes_are_told_in_the_words_of_those_who_make_them() {
+        for (name, given, said) in [
+            ("Channels", json!({"sed": 1}), "there is no key `sed`; did you mean `seed`?"),
+            ("Channels", json!({"seed": -1}), "seed: -1 is given; a whole number that is not neg"),
+            ("Channels", json!({"outputs": {}}), "outputs: a table is given; a list is needed"),
+            (
+                "Channels",
+                json!({"outputs": [{"name": "a", "noise": "big"}]}),
+                "outputs[0].noise: \"big\" is given; a number is needed",
+            ),
+            (
+                "Channels",
+                json!({"inputs": [{"input": "tau", "hold": "HOLD_FRST_ORDER"}]}),
+                "inputs[0].hold: there is no `HOLD_FRST_ORDER`; did you mean `HOLD_FIRST_ORDER`?",
+            ),
+            ("FaultSpec", json!({"input": 3}), "input: 3 is given; a text is needed"),
+            ("FaultSpec", json!({"stuck": true, "off": true}), "give one of `stuck` and `off`"),
+            ("FaultSpec", json!([1]), "a list of 1 is given; a table is needed"),
+        ] {
+            let error = match name {
+                "Channels" => read_value::<v1::Channels>(name, given).unwrap_err(),
+                _ => read_value::<v1::FaultSpec>(name, given).unwrap_err(),
+            };
+            assert!(error.to_string().starts_with(said), "{error}");
+        }
+        let error = read::<v1::State>("State", "{").unwrap_err().to_string();
+        assert!(error.starts_with("no JSON: "), "{error}");
     }
 
     #[test]

@@ -2,6 +2,11 @@
 
 use plantd_client::v1;
 
+/// Names of all coordinates.
+pub(crate) fn coordinates(model: &v1::Model) -> Vec<&str> {
+    model.coordinates.iter().map(|c| c.name.as_str()).collect()
+}
+
 /// Names of the prescribed coordinates.
 pub(crate) fn prescribed(model: &v1::Model) -> impl Iterator<Item = &String> {
     model.coordinates.iter().filter(|c| c.prescribed).map(|c| &c.name)
@@ -22,6 +27,24 @@ pub(crate) fn state(model: &v1::Model) -> Vec<String> {
 /// Names of the entries of `u`.
 pub(crate) fn input(model: &v1::Model) -> Vec<String> {
     model.inputs.iter().chain(prescribed(model)).cloned().collect()
+}
+
+/// Unit of a coordinate.
+pub(crate) fn unit(coordinate: &v1::Coordinate) -> &'static str {
+    match coordinate.unit() {
+        v1::Unit::Metre => "m",
+        v1::Unit::Radian => "rad",
+        v1::Unit::Unspecified => "",
+    }
+}
+
+/// Unit of its momentum.
+pub(crate) fn momentum_unit(coordinate: &v1::Coordinate) -> &'static str {
+    match coordinate.unit() {
+        v1::Unit::Metre => "N s",
+        v1::Unit::Radian => "N m s",
+        v1::Unit::Unspecified => "",
+    }
 }
 
 /// Names of the velocities of all coordinates.

@@ -4,9 +4,11 @@ use std::collections::HashMap;
 use std::io::Read as _;
 use std::path::Path;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, anyhow, ensure};
 use plantd_client::{MatrixExt as _, v1};
 use plantd_import::Options;
+use plantd_scene::in_plain_words;
+use serde::de::DeserializeOwned;
 
 use crate::contract::json;
 
@@ -54,9 +56,19 @@ pub(crate) fn parse_message<M: prost::Message + Default>(name: &str, text: &str)
     if text.trim_start().starts_with('{') {
         return json::read(name, text);
     }
-    let table: toml::Table = toml::from_str(text)?;
-    let text = serde_json::to_string(&table)?;
-    json::read(name, &text).with_context(|| format!("not a {name} of the contract"))
+    json::read_value(name, serde_json::to_value(from_toml::<toml::Table>(text)?)?)
+}
+
+/// Reads TOML that a person has written.
+///
+/// # Errors
+/// What is wrong, in plain words, and the line.
+pub(crate) fn from_toml<T: DeserializeOwned>(text: &str) -> Result<T> {
+    toml::from_str(text).map_err(|error: toml::de::Error| {
+        let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
+        let line = before.matches('\n').count() + 1;
+        anyhow!("line {line}: {}", in_plain_words(error.message()))
+    })
 }
 
 /// A result from its file; a checkpoint counts as a result that holds it.

@@ -7,8 +7,8 @@ use plantd_client::v1;
 /// their own, are turned into it.
 #[derive(Debug, Default, Args)]
 pub(crate) struct Settings {
-    /// Time step in seconds; the scene's if not given.
-    #[arg(long, value_name = "SECONDS")]
+    /// Time step in seconds; the scene's if not given. `time_step_s` in files and in the contract.
+    #[arg(long, value_name = "SECONDS", visible_alias = "time-step", alias = "time-step-s")]
     pub(crate) dt: Option<f64>,
     /// Put all forces at the start of a step, as the paper does.
     #[arg(long)]

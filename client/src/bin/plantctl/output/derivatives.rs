@@ -3,10 +3,11 @@
 use plantd_client::v1;
 
 use crate::contract::names;
-use crate::output::text::{label, matrix};
+use crate::output::page::{Page, Table, matrix};
+use crate::output::text::label;
 
 /// A and B of a linearization, and the multipliers' rows where there are constraints.
-pub(crate) fn linearization(linearization: &v1::Linearization, model: &v1::Model) -> String {
+pub(crate) fn linearization(linearization: &v1::Linearization, model: &v1::Model) -> Page {
     let (x, u) = (names::state(model), names::input(model));
     let blocks = [
         ("A = df/dx", &linearization.a, &x, &x),
@@ -18,7 +19,9 @@ pub(crate) fn linearization(linearization: &v1::Linearization, model: &v1::Model
         let block = block.as_ref().filter(|m| !m.data.is_empty())?;
         Some(matrix(title, block, rows, cols))
     });
-    filled.collect::<Vec<_>>().join("\n")
+    let mut page = Page::default();
+    filled.for_each(|block| page.next_table(block));
+    page
 }
 
 /// One matrix per output of a tensor that has any, under a title with the output's name.
@@ -28,21 +31,22 @@ pub(crate) fn slices(
     outputs: &[String],
     first: &[String],
     second: &[String],
-) -> String {
-    let Some(tensor) = tensor.filter(|t| !t.data.is_empty()) else { return String::new() };
+) -> Vec<Table> {
+    let Some(tensor) = tensor.filter(|t| !t.data.is_empty()) else { return Vec::new() };
     let (rows, cols) = (tensor.first, tensor.second);
     let slices = tensor.data.chunks(rows as usize * cols as usize).enumerate();
     let slice = |(output, data): (usize, &[f64])| {
         let block = v1::Matrix { rows, cols, data: data.to_vec() };
         matrix(&format!("{title} of {}", label(outputs, output)), &block, first, second)
     };
-    slices.map(slice).collect::<Vec<_>>().join("\n")
+    slices.map(slice).collect()
 }
 
 /// A feedback law.
-pub(crate) fn gain(gain: &v1::Gain, model: &v1::Model) -> String {
+pub(crate) fn gain(gain: &v1::Gain, model: &v1::Model) -> Page {
     let (x, u) = (names::state(model), names::input(model));
-    let k = gain.k.as_ref().map_or(String::new(), |k| matrix("K", k, &u, &x));
     let forward = if gain.feedforward.is_empty() { "" } else { " + feedforward" };
-    format!("u = u_reference{forward} - K (x - x_reference)\n\n{k}")
+    let mut page = Page::from(format!("u = u_reference{forward} - K (x - x_reference)\n"));
+    gain.k.iter().for_each(|k| page.next_table(matrix("K", k, &u, &x)));
+    page
 }

@@ -22,12 +22,20 @@ pub(crate) struct SearchStopped {
     pub(crate) help: String,
 }
 
+/// A result that has no table.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "there is no table to print as comma-separated values; `--output table` and `json` print it"
+)]
+pub(crate) struct NoTable;
+
 /// The exit code of an error.
 pub(crate) fn code(error: &anyhow::Error) -> u8 {
     match error.downcast_ref::<Error>() {
         Some(Error::Address { .. }) => WRONG_USAGE,
         Some(Error::Connect { .. }) => NO_SERVER,
         _ if error.is::<SearchStopped>() => STOPPED_EARLY,
+        _ if error.is::<NoTable>() => WRONG_USAGE,
         _ => FAILED,
     }
 }

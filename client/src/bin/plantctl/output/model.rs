@@ -4,27 +4,29 @@ use std::fmt::Write as _;
 
 use plantd_client::v1;
 
-use crate::output::text::{number, table};
+use crate::contract::names;
+use crate::output::page::{Cell, Page, Table, table};
+use crate::output::text::number;
 
 /// A model of the server.
-pub(crate) fn known(model: &v1::Model) -> String {
+pub(crate) fn known(model: &v1::Model) -> Page {
     described(model, if model.builtin { "built in" } else { "uploaded" })
 }
 
 /// The model of a scene that was only looked at.
-pub(crate) fn validated(model: &v1::Model) -> String {
+pub(crate) fn validated(model: &v1::Model) -> Page {
     described(model, "valid, not uploaded")
 }
 
-fn described(model: &v1::Model, origin: &str) -> String {
-    let mut text = format!("{}: {}\n", model.name, model.description);
+fn described(model: &v1::Model, origin: &str) -> Page {
+    let mut text = Page::from(format!("{}: {}\n", model.name, model.description));
     let _ = writeln!(text, "{origin}, time step {} s", number(model.time_step_s));
     let has_limits = model.coordinates.iter().any(|c| c.limits.is_some());
     let columns = if has_limits { 5 } else { 4 };
     let row = |c| coordinate(c).into_iter().take(columns).collect();
-    let rows: Vec<_> = model.coordinates.iter().map(row).collect();
+    let rows: Vec<Vec<Cell>> = model.coordinates.iter().map(row).collect();
     let titles = ["coordinate", "kind", "unit", "initial", "limits"];
-    let _ = write!(text, "\n{}", table(&titles[..columns], &rows));
+    text.next_table(table(&titles[..columns], rows));
     let inputs = (0..).zip(&model.inputs).map(|(index, name)| {
         let own = model.input_limits.iter().find(|own| own.u_index == index);
         own.map_or_else(|| name.clone(), |own| format!("{name} ({})", limits(own.limits.as_ref())))
@@ -42,10 +44,10 @@ fn described(model: &v1::Model, origin: &str) -> String {
             let effect = if s.replaces { "replaces u" } else { "added to u" };
             vec![s.drives.clone(), s.kind.clone(), format!("{effect}[{}]", s.u_index)]
         };
-        let rows: Vec<_> = model.signals.iter().map(row).collect();
-        let _ = write!(text, "\n{}", table(&["signal drives", "kind", "effect"], &rows));
+        let rows = model.signals.iter().map(row);
+        text.next_table(table(&["signal drives", "kind", "effect"], rows));
     }
-    text.push_str(&guess(&model.initial_violations));
+    let _ = text.write_str(&guess(&model.initial_violations));
     text
 }
 
@@ -66,18 +68,15 @@ fn guess(violations: &[v1::ConstraintViolation]) -> String {
     )
 }
 
-fn coordinate(c: &v1::Coordinate) -> Vec<String> {
+fn coordinate(c: &v1::Coordinate) -> Vec<Cell> {
     let kind = if c.prescribed { "prescribed" } else { "dynamic" };
-    let unit = match c.unit() {
-        v1::Unit::Metre => "m",
-        v1::Unit::Radian => "rad",
-        v1::Unit::Unspecified => "",
-    };
+    let unit = names::unit(c);
     let unit = match c.rotation_group.as_str() {
         "" => unit.to_owned(),
         joint => format!("{unit}, rotation vector of {joint}"),
     };
-    vec![c.name.clone(), kind.to_owned(), unit, number(c.initial), limits(c.limits.as_ref())]
+    let name = c.name.as_str();
+    vec![name.into(), kind.into(), unit.into(), c.initial.into(), limits(c.limits.as_ref()).into()]
 }
 
 fn limits(limits: Option<&v1::Limits>) -> String {
@@ -85,7 +84,7 @@ fn limits(limits: Option<&v1::Limits>) -> String {
 }
 
 /// Models, one per row.
-pub(crate) fn list(models: &[v1::Model]) -> String {
+pub(crate) fn list(models: &[v1::Model]) -> Table {
     let row = |m: &v1::Model| {
         let prescribed = m.coordinates.iter().filter(|c| c.prescribed).count();
         vec![
@@ -98,5 +97,5 @@ pub(crate) fn list(models: &[v1::Model]) -> String {
         ]
     };
     let head = ["model", "dynamic", "prescribed", "inputs", "constraints", "description"];
-    table(&head, &models.iter().map(row).collect::<Vec<_>>())
+    table(&head, models.iter().map(row))
 }

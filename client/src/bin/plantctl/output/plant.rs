@@ -4,27 +4,29 @@ use std::fmt::Write as _;
 
 use plantd_client::v1;
 
-use crate::output::text::{number, numbers, table};
+use crate::contract::names;
+use crate::output::page::{Cell, Page, Table, table};
+use crate::output::text::{number, numbers};
 
 /// Plants, one per row.
-pub(crate) fn list(plants: &[v1::PlantInfo]) -> String {
+pub(crate) fn list(plants: &[v1::PlantInfo]) -> Table {
     let row = |p: &v1::PlantInfo| {
         let state = p.state.as_ref();
         let dt = p.settings.as_ref().map_or(0.0, |s| s.time_step_s);
         let driver = if p.driver.is_empty() { "-" } else { &p.driver };
         let link = if p.link_open { "open" } else { "-" };
         vec![
-            p.id.clone(),
-            p.model.clone(),
-            number(dt),
-            state.map_or(0, |s| s.step).to_string(),
-            number(state.map_or(0.0, |s| s.time_s)),
-            driver.to_owned(),
-            link.to_owned(),
+            Cell::from(p.id.as_str()),
+            p.model.as_str().into(),
+            dt.into(),
+            state.map_or(0, |s| s.step).into(),
+            state.map_or(0.0, |s| s.time_s).into(),
+            driver.into(),
+            link.into(),
         ]
     };
     let head = ["plant", "model", "dt/s", "step", "time/s", "driver", "link"];
-    table(&head, &plants.iter().map(row).collect::<Vec<_>>())
+    table(&head, plants.iter().map(row))
 }
 
 /// By which method a plant is stepped.
@@ -40,21 +42,63 @@ pub(crate) fn stepping(plant: &v1::PlantInfo) -> String {
     )
 }
 
-/// A state; vectors that the model does not have are left out.
-pub(crate) fn state(state: &v1::State) -> String {
-    let mut text = format!("step {}, time {} s\n", state.step, number(state.time_s));
-    for (name, values) in [
-        ("q", &state.q),
-        ("p", &state.p),
-        ("v", &state.v),
-        ("velocity", &state.velocity),
-        ("multipliers", &state.multipliers),
+/// A state, with the names and units of its model; vectors that the model does not have are left out.
+pub(crate) fn state(state: &v1::State, model: &v1::Model) -> Page {
+    let mut page = Page::from(format!("step {}, time {} s\n", state.step, number(state.time_s)));
+    let all = || model.coordinates.iter();
+    let dynamic = || all().filter(|c| !c.prescribed);
+    let with = |c: &v1::Coordinate, unit: &str| (c.name.clone(), unit.to_owned());
+    let per_second = |c| with(c, &format!("{}/s", names::unit(c)));
+    let impulses = model.constraints.iter().map(|name| (name.clone(), String::new()));
+    for (what, values, names) in [
+        ("q", &state.q, all().map(|c| with(c, names::unit(c))).collect::<Vec<_>>()),
+        ("velocity", &state.velocity, all().map(per_second).collect()),
+        ("p", &state.p, dynamic().map(|c| with(c, names::momentum_unit(c))).collect()),
+        ("impulses", &state.multipliers, impulses.collect()),
     ] {
         if !values.is_empty() {
-            let _ = writeln!(text, "  {name}: {}", numbers(values));
+            let _ = writeln!(page, "  {what}: {}", named(&names, values));
         }
     }
-    text
+    page.data(row(state, model));
+    page
+}
+
+/// Numbers with their names and units; without where the names are those of something else.
+fn named(names: &[(String, String)], values: &[f64]) -> String {
+    if names.len() != values.len() {
+        return numbers(values);
+    }
+    let one = |((name, unit), value): (&(String, String), &f64)| {
+        format!("{name} = {} {unit}", number(*value)).trim_end().to_owned()
+    };
+    names.iter().zip(values).map(one).collect::<Vec<_>>().join(", ")
+}
+
+/// Numbers with their names; without where the names are those of something else.
+pub(crate) fn listed(names: &[String], values: &[f64]) -> String {
+    let names: Vec<_> = names.iter().map(|name| (name.clone(), String::new())).collect();
+    named(&names, values)
+}
+
+/// A state as a row under the names that recordings have for its numbers.
+fn row(state: &v1::State, model: &v1::Model) -> Table {
+    let (x, velocity) = (names::recorded(model), names::velocity(model));
+    let head: Vec<String> = ["step", "time_s"]
+        .map(str::to_owned)
+        .into_iter()
+        .chain(x.clone())
+        .chain(velocity)
+        .collect();
+    let head: Vec<&str> = head.iter().map(String::as_str).collect();
+    // Before the first step there are no impulses.
+    let nothing = || std::iter::repeat(Cell::from("-"));
+    let filled =
+        |values: Vec<f64>, count| values.into_iter().map(Cell::from).chain(nothing()).take(count);
+    let start = [Cell::from(state.step), state.time_s.into()].into_iter();
+    let numbers = filled(names::recorded_numbers(state), x.len());
+    let velocity = filled(state.velocity.clone(), model.coordinates.len());
+    table(&head, [start.chain(numbers).chain(velocity).collect()])
 }
 
 /// An energy.
@@ -124,12 +168,8 @@ pub(crate) fn feedback(feedback: &v1::FeedbackInfo) -> String {
     text
 }
 
-/// Constraint forces, one per row; nothing without constraints.
-pub(crate) fn forces(forces: &[f64], model: &v1::Model) -> String {
-    if forces.is_empty() {
-        return String::new();
-    }
-    let row = |(name, force): (&String, &f64)| vec![name.clone(), number(*force)];
-    let rows: Vec<_> = model.constraints.iter().zip(forces).map(row).collect();
-    format!("\n{}", table(&["constraint", "force"], &rows))
+/// Constraint forces, one per row.
+pub(crate) fn forces(forces: &[f64], model: &v1::Model) -> Table {
+    let row = |(name, force): (&String, &f64)| vec![Cell::from(name.as_str()), (*force).into()];
+    table(&["constraint", "force"], model.constraints.iter().zip(forces).map(row))
 }

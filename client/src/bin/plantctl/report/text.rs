@@ -5,7 +5,8 @@ use std::fmt::Write as _;
 use anyhow::Result;
 use serde_json::json;
 
-use crate::output::printer::Output;
+use crate::output::page::{Cell, Page, Table, table};
+use crate::output::printer::{GOOD, Output, WRONG};
 use crate::report::results::{Report, UnusableFile};
 use crate::scenario::verdict::Verdict;
 use crate::trial::outcome::{Outcome, Status};
@@ -18,24 +19,45 @@ pub(crate) fn title(scenario: &str, case: &str) -> String {
 
 /// Prints what came of a case.
 pub(crate) fn print_case(
-    output: Output,
+    output: &Output,
     prepared: &PreparedScenario,
     outcome: &Outcome,
     replay: &str,
 ) -> Result<()> {
-    output.print(|| json(prepared, outcome, replay), || text(prepared, outcome, replay))
+    output.print(
+        || json(prepared, outcome, replay),
+        || {
+            let mut page = Page::from(text(prepared, outcome, replay));
+            page.data(row(prepared, outcome));
+            page
+        },
+    )
+}
+
+/// What came of a case, as a row.
+fn row(prepared: &PreparedScenario, outcome: &Outcome) -> Table {
+    let cells = vec![
+        prepared.name.as_str().into(),
+        outcome.case.as_str().into(),
+        format!("{:?}", outcome.status()).to_lowercase().into(),
+        outcome.steps.into(),
+        outcome.elapsed.as_secs_f64().into(),
+        Cell::from(outcome.problems().join("; ")),
+    ];
+    table(&["scenario", "case", "status", "steps", "elapsed_s", "problems"], [cells])
 }
 
 /// A line for a case, and what went wrong in it.
 fn text(prepared: &PreparedScenario, outcome: &Outcome, replay: &str) -> String {
-    let word = match outcome.status() {
-        Status::Passed => "pass ",
-        Status::Failed => "FAIL ",
-        Status::Error => "ERROR",
+    let (style, word) = match outcome.status() {
+        Status::Passed => (GOOD, "pass "),
+        Status::Failed => (WRONG, "FAIL "),
+        Status::Error => (WRONG, "ERROR"),
     };
     let name = title(&prepared.name, &outcome.case);
     let elapsed = outcome.elapsed.as_secs_f64();
-    let mut text = format!("{word}  {name}  {} steps, {elapsed:.2} s\n", outcome.steps);
+    let mut text =
+        format!("{style}{word}{style:#}  {name}  {} steps, {elapsed:.2} s\n", outcome.steps);
     if outcome.status() == Status::Passed {
         return text;
     }
@@ -80,18 +102,23 @@ fn json(prepared: &PreparedScenario, outcome: &Outcome, replay: &str) -> serde_j
 }
 
 /// Prints the files that could not be run.
-pub(crate) fn print_unusable(output: Output, unusable: &[UnusableFile]) -> Result<()> {
+pub(crate) fn print_unusable(output: &Output, unusable: &[UnusableFile]) -> Result<()> {
     for UnusableFile { file, error } in unusable {
         output.print(
             || json!({ "file": file, "status": "error", "error": error }),
-            || format!("ERROR  {error}\n"),
+            || {
+                let mut page = Page::from(format!("{WRONG}ERROR{WRONG:#}  {error}\n"));
+                let row = vec![file.display().to_string(), error.clone()];
+                page.data(table(&["file", "error"], [row]));
+                page
+            },
         )?;
     }
     Ok(())
 }
 
 /// Prints how many cases passed.
-pub(crate) fn print_summary(output: Output, report: &Report) -> Result<()> {
+pub(crate) fn print_summary(output: &Output, report: &Report) -> Result<()> {
     let [passed, failed, errors] =
         [Status::Passed, Status::Failed, Status::Error].map(|status| report.count(status));
     output.print(

@@ -21,7 +21,7 @@ pub(crate) struct Expression {
 
 /// A number, or an expression over the signals of the plant.
 #[derive(Deserialize, JsonSchema)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "a number or an expression is needed")]
 enum NumberOrText {
     Number(f64),
     Text(String),
@@ -91,7 +91,7 @@ impl Function {
 }
 
 /// Quantities that name what they belong to, as in `p(theta)`.
-const QUANTITIES: [&str; 6] = ["q", "p", "v", "u", "force", "y"];
+const QUANTITIES: [&str; 7] = ["q", "p", "v", "velocity", "u", "force", "y"];
 
 impl Expression {
     /// Reads an expression.

@@ -4,9 +4,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
+use plantd_scene::in_plain_words;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use crate::input::numbers::Vector;
 use crate::scenario::distribution::{Distribution, case_seed};
 use crate::scenario::expectation::Expectation;
 use crate::scenario::expression::Expression;
@@ -95,7 +97,8 @@ pub(crate) struct Plant {
     pub(crate) model: Option<String>,
     /// Instead: file of a scene, beside the scenario.
     pub(crate) scene: Option<PathBuf>,
-    /// Time step, s; the scene's if not given.
+    /// Time step, s; the scene's if not given. `dt` is the same.
+    #[serde(alias = "dt")]
     pub(crate) time_step_s: Option<f64>,
     /// All forces at the start of a step.
     pub(crate) paper: bool,
@@ -175,10 +178,11 @@ pub(crate) struct Inputs {
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Lqr {
-    /// Diagonal of the state weight; one number stands for all.
-    pub(crate) q: Vec<f64>,
-    /// Diagonal of the input weight; one number stands for all.
-    pub(crate) r: Vec<f64>,
+    /// Diagonal of the state weight: a list, in which one number stands for all, or a table by name, in which what is
+    /// not named has 1.
+    pub(crate) q: Vector,
+    /// Diagonal of the input weight, in the same way.
+    pub(crate) r: Vector,
     /// Compute the gain anew when parameters change. Along a trajectory it always is.
     #[serde(default)]
     pub(crate) adapts: bool,
@@ -463,9 +467,10 @@ impl Scenario {
 /// An error of the text, with its key and its place.
 fn located(key: &str, error: &toml::de::Error, text: &str) -> anyhow::Error {
     let key = if key.is_empty() || key == "." { String::new() } else { format!("{key}: ") };
-    let Some(span) = error.span() else { return anyhow::anyhow!("{key}{}", error.message()) };
+    let problem = in_plain_words(error.message());
+    let Some(span) = error.span() else { return anyhow::anyhow!("{key}{problem}") };
     let line = text[..span.start.min(text.len())].matches('\n').count() + 1;
-    anyhow::anyhow!("{key}{} at line {line}", error.message())
+    anyhow::anyhow!("line {line}: {key}{problem}")
 }
 
 #[cfg(test)]
@@ -484,9 +489,12 @@ mod tests {
     fn errors_name_their_key() {
         Scenario::parse(&format!("{LEAST}{EXPECT}")).unwrap();
         for (rest, part) in [
-            ("durations = 3", "unknown field `durations`"),
-            ("plant.modell = 'a'", "plant.modell: unknown field `modell`"),
-            ("plant.order = 'two'", "plant.order: invalid type"),
+            ("durations = 3", "there is no key `durations`"),
+            ("plant.modell = 'a'", "plant.modell: there is no key `modell`; did you mean `model`?"),
+            (
+                "plant.order = 'two'",
+                "plant.order: string \"two\" is given; a whole number that is not negative is needed",
+            ),
             ("plant.scene = 'a.toml'", "plant: give either"),
             ("speed = 0", "speed is 0"),
             ("timeout_s = inf", "timeout_s is inf"),
@@ -494,8 +502,8 @@ mod tests {
             ("plant.initial = { v = { a = 1 }, project = true }", "plant.initial.project"),
             ("controller.lqr = { q = [1], r = [1] }", "a `reference` is needed"),
             ("controller.command = { run = [] }", "a program is needed"),
-            ("controller.pid = { k = 1 }", "unknown variant `pid`"),
-            ("pace = 'slow'", "pace: unknown variant"),
+            ("controller.pid = { k = 1 }", "there is no `pid`"),
+            ("pace = 'slow'", "pace: there is no `slow`; there are `lockstep`, `paced`"),
             ("pace = 'paced'\ntimeout_s = 2", "the run takes 2 s"),
             ("speed = 0.01", "the run takes 200 s"),
             ("input_policy = { timeout_s = 1 }", "input_policy: is for paced"),

@@ -42,7 +42,10 @@ impl Samples {
             _ => (String::new(), name),
         };
         let candidates = BARE.map(|quantity| format!("{group}{quantity}({bare})"));
-        let column = candidates.iter().chain([&name.to_owned()]).find_map(|n| self.columns.get(n));
+        // The velocity of a prescribed coordinate over the last step goes before.
+        let velocity = name.strip_prefix("v(").map(|rest| format!("velocity({rest}"));
+        let candidates = candidates.into_iter().chain([name.to_owned()]).chain(velocity);
+        let column = candidates.filter_map(|candidate| self.columns.get(&candidate)).next();
         column.cloned().ok_or_else(|| self.no_signal(name))
     }
 
@@ -256,6 +259,7 @@ mod tests {
             ("p(theta)", 3.0),
             ("v(lift)", 4.0),
             ("velocity(theta)", 3.5),
+            ("v(theta)", 3.5),
             ("force(pin.x)", 50.0),
             ("pin.x", 50.0),
             ("tau", 8.0),

@@ -21,6 +21,14 @@ impl Context {
         self.connect_to(self.address.as_deref().unwrap_or(DEFAULT_ADDRESS)).await
     }
 
+    /// The model of a plant, whose names people see beside its numbers; programs know them.
+    pub(crate) async fn names_of(&self, client: &Client, id: &str) -> Result<v1::Model> {
+        match self.output.is_json() {
+            true => Ok(v1::Model::default()),
+            false => model_of(client, id).await,
+        }
+    }
+
     /// Connects to a server at an address, as the same user.
     pub(crate) async fn connect_to(&self, address: &str) -> Result<Client> {
         let credentials = self.credentials.clone();
@@ -37,6 +45,13 @@ pub(crate) async fn plant(client: &Client, id: &str) -> Result<v1::PlantInfo> {
 /// The model of a plant.
 pub(crate) async fn model_of(client: &Client, id: &str) -> Result<v1::Model> {
     Ok(client.get_model(plant(client, id).await?.model).await?)
+}
+
+/// The input under which nothing happens to a plant: no forces, prescribed coordinates where they are.
+pub(crate) fn resting(plant: &v1::PlantInfo, model: &v1::Model) -> Vec<f64> {
+    let q = plant.state.as_ref().map_or(&[][..], |state| &state.q);
+    let here = model.coordinates.iter().zip(q).filter(|(c, _)| c.prescribed).map(|(_, q)| *q);
+    model.inputs.iter().map(|_| 0.0).chain(here).collect()
 }
 
 /// Hands over the messages of a stream until it ends, Ctrl-C is pressed, or there were `count`.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail};
 use plantd_client::Credentials;
+use plantd_scene::{UnknownName, in_plain_words};
 use serde::Deserialize;
 
 /// A server of the file.
@@ -31,11 +32,13 @@ impl KnownServer {
             .with_context(|| format!("servers with names: {}", path.display()))?;
         let servers: Result<BTreeMap<String, Self>, _> = toml::from_str(&text);
         // The parser would show the line, which may be that of a token.
-        let mut servers =
-            servers.map_err(|error| anyhow::anyhow!("{}: {}", path.display(), error.message()))?;
+        let mut servers = servers.map_err(|error| {
+            anyhow::anyhow!("{}: {}", path.display(), in_plain_words(error.message()))
+        })?;
         let Some(server) = servers.remove(name) else {
             let names: Vec<_> = servers.keys().map(String::as_str).collect();
-            bail!("there is no server `{name}` in {}; it has {}", path.display(), names.join(", "));
+            let name = UnknownName::among(name, &names);
+            bail!("{}: there is no server {name}", path.display());
         };
         Ok(server)
     }
@@ -82,7 +85,7 @@ mod tests {
             ("https://lab:50051", Some("abc"))
         );
         let error = KnownServer::find("home", file.path()).unwrap_err().to_string();
-        assert!(error.contains("`home`") && error.contains("it has lab"), "{error}");
+        assert!(error.ends_with("there is no server `home`; there is `lab`"), "{error}");
         std::fs::write(file.path(), "[lab]\naddress = 3\ntoken = \"abc\"\n").unwrap();
         let error = format!("{:#}", KnownServer::find("lab", file.path()).unwrap_err());
         assert!(!error.contains("abc"), "{error}");

@@ -178,7 +178,7 @@ pub(crate) fn first_step(event: &Event, time_step_s: f64) -> u64 {
 
 /// A message of the contract from its fields as the file has them.
 fn message<M: prost::Message + Default>(name: &str, fields: &toml::Table) -> Result<M> {
-    json::read(name, &serde_json::to_string(fields)?)
+    json::read_value(name, serde_json::to_value(fields)?)
 }
 
 /// Names of the numbers that output channels deliver.
@@ -266,7 +266,7 @@ pub(crate) async fn feedback(
     id: &str,
 ) -> Result<v1::SetFeedbackRequest> {
     use v1::set_feedback_request::Reference as Form;
-    let mut weights = diagonals(&lqr.q, &lqr.r, model);
+    let mut weights = diagonals(&lqr.q, &lqr.r, model)?;
     if lqr.projected_momentum {
         weights = weights.on_projected_momentum();
     }

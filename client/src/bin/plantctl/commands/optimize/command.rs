@@ -11,6 +11,7 @@ use crate::commands::optimize::problem::{HELP, Method, Problem};
 use crate::contract::json;
 use crate::input::files::{read_result, read_text, write};
 use crate::output::failure::SearchStopped;
+use crate::output::page::{Cell, Page, table};
 use crate::output::printer::Output;
 use crate::output::text::number;
 use crate::server::context::Context;
@@ -56,7 +57,7 @@ impl Optimize {
             None => Some(problem.first_guess(&client).await?),
         };
         let request = problem.request(guess, resume)?;
-        let result = search(&client, context.output, request).await?;
+        let result = search(&client, &context.output, request).await?;
         if let Some(file) = &self.save {
             write(file, format!("{}\n", json::message("OptimizationResult", &result)))?;
         }
@@ -88,7 +89,7 @@ fn stopped(result: v1::OptimizationResult, saved: Option<&Path>) -> SearchStoppe
 
 async fn search(
     client: &Client,
-    output: Output,
+    output: &Output,
     request: v1::OptimizeTrajectoryRequest,
 ) -> Result<v1::OptimizationResult> {
     use v1::optimize_trajectory_response::Response;
@@ -98,8 +99,11 @@ async fn search(
         const NAME: &str = "OptimizeTrajectoryResponse";
         match &message.response {
             Some(Response::Progress(progress)) => output.message(NAME, &message, || {
-                let head = if is_first { ITERATIONS } else { "" };
-                head.to_owned() + &iteration(progress)
+                let mut page = iteration(progress);
+                if is_first {
+                    page = [ITERATIONS.to_owned().into(), page].into_iter().collect();
+                }
+                page
             })?,
             Some(Response::Result(result)) => {
                 output.message(NAME, &message, || optimum(result))?;
@@ -113,7 +117,7 @@ async fn search(
 }
 
 /// One iteration of a search, as a row of a table under [`ITERATIONS`].
-fn iteration(progress: &v1::OptimizationProgress) -> String {
+fn iteration(progress: &v1::OptimizationProgress) -> Page {
     let mut text = format!(
         "{:>9}  {:<12}  {:>14}  {:>14}  {:>12}  {:>12}\n",
         progress.iteration,
@@ -126,7 +130,18 @@ fn iteration(progress: &v1::OptimizationProgress) -> String {
     if !progress.fallback.is_empty() {
         let _ = writeln!(text, "           {}", progress.fallback);
     }
-    text
+    let row = [
+        progress.cost,
+        progress.directional_derivative,
+        progress.step_length,
+        progress.bound_violation,
+    ];
+    let start = [Cell::from(u64::from(progress.iteration)), method(progress.method()).into()];
+    let row = start.into_iter().chain(row.map(Cell::from)).collect();
+    let head = ["iteration", "method", "cost", "derivative", "step_length", "out_of_bounds"];
+    let mut page = Page::from(text);
+    page.data(table(&head, [row]));
+    page
 }
 
 /// Head of a table of iterations.

@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, anyhow, ensure};
 use clap::ValueEnum;
 use plantd_client::{Client, MatrixExt as _, WeightsExt as _, diagonal, full, v1};
+use plantd_scene::in_plain_words;
 use serde::Deserialize;
 
+use crate::input::files::from_toml;
 use crate::input::settings::Settings;
 
 /// What a problem may say.
@@ -15,7 +17,7 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
 
   model = \"pendulum\"
   steps = 100
-  time_step_s = 0.1                 # the scene's if not given
+  time_step_s = 0.1                 # or `dt`; the scene's if not given
   paper = false                     # all forces at the start of a step
   order = 2                         # of accuracy
   substeps = 1                      # steps in a time step
@@ -59,7 +61,7 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
 pub(crate) struct Problem {
     model: String,
     steps: usize,
-    #[serde(default)]
+    #[serde(default, alias = "dt")]
     time_step_s: f64,
     #[serde(default)]
     paper: bool,
@@ -163,7 +165,7 @@ struct Projection {
 
 /// A diagonal, or rows.
 #[derive(Debug, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "a list of numbers, or of rows of them, is needed")]
 enum Weight {
     Diagonal(Vec<f64>),
     Full(Vec<Vec<f64>>),
@@ -206,9 +208,10 @@ impl Problem {
     /// Reads a problem, TOML or JSON.
     pub(crate) fn parse(text: &str) -> Result<Self> {
         if text.trim_start().starts_with('{') {
-            return Ok(serde_json::from_str(text)?);
+            let read = serde_json::from_str(text);
+            return read.map_err(|error| anyhow!(in_plain_words(&error.to_string())));
         }
-        Ok(toml::from_str(text)?)
+        from_toml(text)
     }
 
     fn cost(&self) -> Result<v1::TrajectoryCost> {
