@@ -24,9 +24,8 @@ const LEFTOVERS_MAX: Duration = Duration::from_secs(1);
 pub fn start_log(config: &LogConfig) -> Result<()> {
     let filter: Targets =
         config.filter.parse().with_context(|| format!("log filter `{}`", config.filter))?;
-    let lines = fmt::layer()
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal());
+    let lines =
+        fmt::layer().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
     let log = registry().with(filter);
     match config.format {
         LogFormat::Text => log.with(lines).init(),
