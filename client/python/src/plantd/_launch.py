@@ -164,8 +164,9 @@ def _find(program: str | PathLike[str] | None) -> Path:
     looked = ", ".join(f"`{place}`" for place in _places())
     raise PlantdError(
         "UNAVAILABLE",
-        f"there is no program `plantd` in PATH, nor {looked}: build it with `cargo build --release "
-        "-p plantd-server` and give its path to `plantd.launch` or in the variable PLANTD",
+        f"there is no program `plantd` in PATH, nor {looked}: install the package with it in "
+        "it (`python3 client/python/wheel.py` makes one), or build it with `cargo build --release -p plantd-server` "
+        "and give its path to `plantd.launch` or in the variable PLANTD",
     )
 
 
