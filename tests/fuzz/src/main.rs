@@ -19,6 +19,12 @@ mod contract {
     pub(crate) mod names;
 }
 
+#[path = "../../../client/src/bin/plantctl/input"]
+mod input {
+    #[expect(dead_code, reason = "see above")]
+    pub(crate) mod numbers;
+}
+
 #[path = "../../../client/src/bin/plantctl/output"]
 mod output {
     #[expect(dead_code, reason = "see above")]
