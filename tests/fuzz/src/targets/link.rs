@@ -46,7 +46,7 @@ struct Link {
 }
 
 pub(super) fn link() -> Result<Box<dyn Target>> {
-    let folder = tempfile::Builder::new().prefix("plantd-fuzz-").tempdir()?;
+    let folder = tempfile::Builder::new().prefix("fuzz-").tempdir()?;
     let root = folder.path().join("link");
     let host = LinkHost::new(LinkConfig { root: root.clone(), ..LinkConfig::default() })?;
     let scene = builtin::scene("marionette").context("a built-in scene")?;
