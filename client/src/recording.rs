@@ -80,9 +80,12 @@ impl RecordingReader {
     pub fn open(path: impl Into<PathBuf>) -> Result<Self> {
         let path = path.into();
         let file = File::open(&path).map_err(|error| problem(&path, error))?;
+        // No record is longer than its file: room for one whose length is damaged would be made for nothing.
+        let bytes = file.metadata().map_err(|error| problem(&path, error))?.len();
+        let limit = usize::try_from(bytes).unwrap_or(usize::MAX).min(RECORD_BYTES_MAX);
         let options = LinearReaderOptions::default()
             .with_validate_chunk_crcs(true)
-            .with_record_length_limit(RECORD_BYTES_MAX);
+            .with_record_length_limit(limit);
         let mut messages = MessageReader::new_with_options(BufReader::new(file), options);
         let first = messages.next().ok_or_else(|| problem(&path, "there is nothing in it"))?;
         let first = first.map_err(|error| problem(&path, error))?;
@@ -111,7 +114,12 @@ impl RecordingReader {
         for message in &mut self.messages {
             let message = match message {
                 Ok(message) => message,
-                Err(McapError::UnexpectedEof | McapError::UnexpectedEoc) => {
+                Err(
+                    McapError::UnexpectedEof
+                    | McapError::UnexpectedEoc
+                    | McapError::RecordTooLarge { .. }
+                    | McapError::ChunkTooLarge(_),
+                ) => {
                     self.is_cut = true;
                     return Ok(None);
                 }

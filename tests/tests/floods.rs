@@ -17,7 +17,7 @@ const KEPT_KIB: u64 = 32 << 10;
 /// What may be taken while it lasts, KiB.
 const TAKEN_KIB: u64 = 128 << 10;
 /// Steps of the paced plant for which a flood lasts, at a thousand a second.
-const STEPS: u64 = 1500;
+const STEPS: u64 = 1000;
 /// Connections that flood at a time.
 const OFFENDERS: usize = 2;
 

@@ -19,6 +19,12 @@ mod contract {
     pub(crate) mod names;
 }
 
+#[path = "../../../client/src/bin/plantctl/input"]
+mod input {
+    #[expect(dead_code, reason = "see above")]
+    pub(crate) mod numbers;
+}
+
 #[path = "../../../client/src/bin/plantctl/output"]
 mod output {
     #[expect(dead_code, reason = "see above")]
@@ -118,7 +124,7 @@ impl Run {
             |name: &&str| self.targets.is_empty() || self.targets.iter().any(|t| t == name);
         let mut waiting: Vec<&str> = TARGETS.iter().map(|(name, _)| *name).filter(chosen).collect();
         waiting.reverse();
-        let folder = tempfile::Builder::new().prefix("plantd-fuzz-").tempdir()?;
+        let folder = tempfile::Builder::new().prefix("fuzz-").tempdir()?;
         let (mut running, mut is_well): (Vec<Running>, _) = (Vec::new(), true);
         while !waiting.is_empty() || !running.is_empty() {
             while running.len() < self.jobs.max(1)
@@ -149,6 +155,8 @@ impl Run {
         let child = Command::new(std::env::current_exe()?)
             .args(["work", target, "--seed", &self.seed.to_string()])
             .args(["--seconds", &self.seconds.to_string(), "--inputs", &self.inputs.to_string()])
+            // However it ends, what it leaves goes with the folder.
+            .env("TMPDIR", folder)
             .arg("--current")
             .arg(&current)
             .spawn()

@@ -136,6 +136,7 @@ impl Work {
         ensure!(count > 0 || self.inputs == 0, "no time for one input");
         let (time, resident) = (start.elapsed().as_secs_f64(), resident_mib());
         println!("{:<14}{count:>9} inputs {time:>7.1} s {resident:>5} MiB", self.target);
+        drop(target);
         // Threads of servers are not waited for.
         std::process::exit(0);
     }

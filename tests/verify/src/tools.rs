@@ -84,7 +84,8 @@ pub(crate) fn promtool(context: &Context) -> Option<PathBuf> {
 /// Unpacks it from Debian's package: to install that would start a Prometheus.
 fn unpack_promtool(context: &Context) -> Outcome {
     let folder = context.scratch().join("prometheus");
-    let script = "mkdir -p $0 && cd $0 && apt-get -qq download prometheus && dpkg -x *.deb .";
+    let script =
+        "mkdir -p $0 && cd $0 && rm -f *.deb && apt-get -qq download prometheus && dpkg -x *.deb .";
     run(Command::new("sh").args(["-c", script]).arg(folder))
 }
 

@@ -55,7 +55,7 @@ pub(super) struct Inside {
 
 impl Inside {
     pub(super) fn new() -> Result<Self> {
-        let folder = tempfile::Builder::new().prefix("plantd-fuzz-").tempdir()?;
+        let folder = tempfile::Builder::new().prefix("fuzz-").tempdir()?;
         let recordings = Some(folder.path().join("recordings"));
         let mut config = Config {
             grpc: Listen::Off,

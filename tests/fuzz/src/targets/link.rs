@@ -4,7 +4,9 @@ use std::sync::Arc;
 
 use anyhow::{Context as _, Result};
 use plantd_models::{Model, Plant, Settings, builtin};
-use plantd_proto::link::{Domain, Endpoint, Header, Kind, ProcessIdentity, Wait, monotonic_ns};
+use plantd_proto::link::{
+    Code, Domain, Endpoint, Header, Kind, ProcessIdentity, Wait, monotonic_ns,
+};
 use plantd_server::core::metrics::registry::Metrics;
 use plantd_server::core::realtime::loops::RealTime;
 use plantd_server::core::realtime::settings::RealTimeSettings;
@@ -19,6 +21,8 @@ use crate::targets::Target;
 const PLANT: &str = "p";
 /// Number of the driver.
 const DRIVER: u64 = 7;
+/// How often the lease is asked for that the driver may hold itself.
+const ATTEMPTS: usize = 8;
 /// Messages of one input.
 const MESSAGES_MAX: usize = 3;
 /// By so many numbers an input may be too long.
@@ -42,7 +46,7 @@ struct Link {
 }
 
 pub(super) fn link() -> Result<Box<dyn Target>> {
-    let folder = tempfile::Builder::new().prefix("plantd-fuzz-").tempdir()?;
+    let folder = tempfile::Builder::new().prefix("fuzz-").tempdir()?;
     let root = folder.path().join("link");
     let host = LinkHost::new(LinkConfig { root: root.clone(), ..LinkConfig::default() })?;
     let scene = builtin::scene("marionette").context("a built-in scene")?;
@@ -101,18 +105,24 @@ impl Link {
     /// The link still serves: it gives the lease to a driver that asks in good order.
     fn attach(&mut self) -> Result<()> {
         while self.listen(0) {}
-        self.sequence = 0;
-        // Under another number it may have got the lease itself.
-        if self.holder != DRIVER {
-            let header = Header { driver: self.holder, ..self.header(Kind::Detach) };
+        for _ in 0..ATTEMPTS {
+            self.sequence = 0;
+            // Under another number it may have got the lease itself, also while it asks.
+            if self.holder != DRIVER {
+                let header = Header { driver: self.holder, ..self.header(Kind::Detach) };
+                self.endpoint.send_as_it_is(header, &[], 0)?;
+            }
+            let header = Header { server: 0, ..self.header(Kind::Attach) };
             self.endpoint.send_as_it_is(header, &[], 0)?;
-        }
-        let header = Header { server: 0, ..self.header(Kind::Attach) };
-        self.endpoint.send_as_it_is(header, &[], 0)?;
-        let until_ns = monotonic_ns() + ANSWER_NS;
-        while self.listen(until_ns) {
-            if self.answer.kind == Kind::Attached as u32 && self.answer.driver == DRIVER {
-                return Ok(());
+            let until_ns = monotonic_ns() + ANSWER_NS;
+            while self.listen(until_ns) {
+                let Header { kind, code, driver, .. } = self.answer;
+                if kind == Kind::Attached as u32 && driver == DRIVER {
+                    return Ok(());
+                }
+                if kind == Kind::Failure as u32 && code == Code::LeaseHeld as u32 {
+                    break;
+                }
             }
         }
         anyhow::bail!("the link does not answer any more: {:?}", self.answer)
