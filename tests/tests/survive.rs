@@ -457,7 +457,7 @@ async fn a_second_server_on_the_same_directory_is_refused() {
     let on_it = |command: &mut Command| {
         command.arg("--state-directory").arg(state.path());
     };
-    let refused = ServerProcess::start_with(on_it).err().expect("a second server").to_string();
+    let refused = ServerProcess::start_with(on_it).expect_err("a second server").to_string();
     for part in ["another server", &first.pid().to_string(), state.path().to_str().unwrap()] {
         assert!(refused.contains(part), "{refused}");
     }
