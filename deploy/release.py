@@ -37,7 +37,7 @@ PACKAGES = ("plantd-server", "plantd-client", "plantd-fmi", "plantd-python", "pl
 PROGRAMS = {"server": "plantd", "client": "plantctl"}
 #: What the archive of programs has beside them.
 BESIDE = ("README.md", "CHANGELOG.md", "LICENSE-APACHE", "LICENSE-MIT", "SECURITY.md")
-DEPLOYED = ("plantd.service", "plantd.sysusers", "plantd.toml", "prometheus.yml")
+DEPLOYED = ("plantd.service", "plantd.sysusers", "plantd.toml", "prometheus.yml", "alerts.yml", "grafana.json")
 SHELLS = {"bash": "plantctl", "zsh": "_plantctl", "fish": "plantctl.fish"}
 
 
