@@ -260,8 +260,13 @@ const tests = {
       section.querySelector("select").value = "upright";
     });
     await api.plants.reset({ id, initial: { form: { case: "operatingPoint", value: "upright" } } });
-    await page.click("#regulate");
-    await until(page, "the closed loop", () => /Closed loop ○none outside/.test(document.getElementById("pole-list").textContent));
+    await page.evaluate(() => document.getElementById("regulate").click());
+    await eventually("the regulator", async () => (await api.plants.getPlant({ id })).plant.feedback);
+    // Poles come with states, and those of the new loop with one of the next.
+    await eventually("the closed loop", async () => {
+      await api.plants.step({ id, hold: 1 });
+      return page.evaluate(() => /Closed loop ○none outside/.test(document.getElementById("pole-list").textContent));
+    });
     await until(page, "gains", () => /Gain K/.test(document.getElementById("section-feedback").textContent));
     await page.close();
   },
