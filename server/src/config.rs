@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
-use plantd_models::scene::in_plain_words;
+use plantd_models::scene::{in_plain_words, line_of};
 use plantd_proto::link::Wait;
 use serde::{Deserialize, Serialize};
 
@@ -391,13 +391,9 @@ impl Config {
         let text = std::fs::read_to_string(path)
             .map_err(|cause| ConfigError::Read { path: path.to_owned(), cause })?;
         toml::from_str(&text).map_err(|error: toml::de::Error| {
-            let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
-            let line = before.matches('\n').count() + 1;
-            ConfigError::Parse {
-                path: path.to_owned(),
-                line,
-                problem: in_plain_words(error.message()),
-            }
+            let line = line_of(&text, error.span().map_or(0, |span| span.start));
+            let problem = in_plain_words(error.message());
+            ConfigError::Parse { path: path.to_owned(), line, problem }
         })
     }
 

@@ -7,6 +7,8 @@
 
 use std::time::Duration;
 
+use crate::core::metrics::process;
+
 /// How often the process looks at its size.
 const PERIOD: Duration = Duration::from_secs(2);
 /// The longest pause after there was nothing to give back.
@@ -36,9 +38,7 @@ pub(crate) async fn give_back() {
 
 /// Memory of the process that is in use or kept; 0 where that cannot be told.
 fn resident_bytes() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:")?.strip_suffix("kB"));
-    resident.and_then(|kib| kib.trim().parse::<u64>().ok()).map_or(0, |kib| kib << 10)
+    process::resident_bytes().unwrap_or(0)
 }
 
 #[cfg(target_env = "gnu")]

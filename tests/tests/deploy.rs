@@ -129,19 +129,23 @@ fn the_list_of_metrics_is_complete() {
     assert_eq!(described, registered);
 }
 
-/// Runs promtool; none, and a message, if it is not installed.
-fn promtool(arguments: &[&str]) -> Option<(bool, String)> {
-    let program = std::env::var_os("PROMTOOL").unwrap_or_else(|| "promtool".into());
-    match Command::new(program).args(arguments).current_dir(root().join("deploy")).output() {
+/// Whether a program goes well, and what it says; none, and a message, if it is not installed.
+fn told_by(command: &mut Command) -> Option<(bool, String)> {
+    match command.output() {
         Ok(output) => {
             let text = [output.stdout, output.stderr].concat();
             Some((output.status.success(), String::from_utf8_lossy(&text).into_owned()))
         }
         Err(error) => {
-            eprintln!("skipped: promtool does not run: {error}");
+            eprintln!("skipped: {} does not run: {error}", command.get_program().display());
             None
         }
     }
+}
+
+fn promtool(arguments: &[&str]) -> Option<(bool, String)> {
+    let program = std::env::var_os("PROMTOOL").unwrap_or_else(|| "promtool".into());
+    told_by(Command::new(program).args(arguments).current_dir(root().join("deploy")))
 }
 
 #[test]
@@ -274,18 +278,8 @@ fn a_release_can_be_made() {
     assert!(read("deploy/Containerfile").contains("[\"/usr/local/bin/plantctl\", \"health\"]"));
 }
 
-/// Runs systemd-analyze; none, and a message, if it is not installed.
 fn systemd_analyze(arguments: &[&str]) -> Option<(bool, String)> {
-    match Command::new("systemd-analyze").args(arguments).output() {
-        Ok(output) => {
-            let text = [output.stdout, output.stderr].concat();
-            Some((output.status.success(), String::from_utf8_lossy(&text).into_owned()))
-        }
-        Err(error) => {
-            eprintln!("skipped: systemd-analyze does not run: {error}");
-            None
-        }
-    }
+    told_by(Command::new("systemd-analyze").args(arguments))
 }
 
 #[test]

@@ -37,5 +37,5 @@ pub use crate::scene::{
 pub use crate::signals::{Interpolation, Signal};
 pub use crate::time_function::TimeFunction;
 pub use crate::visuals::{Shape, Visual};
-pub use crate::words::{UnknownName, in_plain_words};
+pub use crate::words::{UnknownName, in_plain_words, line_of};
 pub use plantd_math::spline::Knot;

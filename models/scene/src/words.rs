@@ -53,6 +53,11 @@ fn nearest<'a, N: AsRef<str>>(name: &str, names: &'a [N]) -> Option<&'a str> {
     (lower.chars().count() > 1 && distance(&near) <= bound).then_some(near)
 }
 
+/// The line, counted from 1, in which a text has its byte `at`.
+pub fn line_of(text: &str, at: usize) -> usize {
+    text.bytes().take(at).filter(|byte| *byte == b'\n').count() + 1
+}
+
 /// The message of a reader of text in the words of a person who writes it: a key or a kind that there is
 /// not, one that is missing, and a value of another type. What is none of these stays as it is.
 pub fn in_plain_words(message: &str) -> String {

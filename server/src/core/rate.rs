@@ -69,9 +69,16 @@ impl Rate {
         if store.level >= 0.0 && per_second > 0 { Ok(()) } else { Err(self.exceeded(per_second)) }
     }
 
-    /// Takes what was used already, be there as much or not.
-    pub fn spend(&self, amount: f64) {
-        self.spend_at(amount, Instant::now());
+    /// Takes what some work has used, be there as much or not; `meter` tells how much was used until now, and is not
+    /// asked without a limit.
+    pub fn spent_by<T>(&self, meter: impl Fn() -> f64, work: impl FnOnce() -> T) -> T {
+        if self.per_second.is_none() {
+            return work();
+        }
+        let before = meter();
+        let outcome = work();
+        self.spend_at(meter() - before, Instant::now());
+        outcome
     }
 
     fn spend_at(&self, amount: f64, now: Instant) {
@@ -123,7 +130,8 @@ mod tests {
     fn without_a_limit_nothing_is_refused() {
         let rate = Rate::new("tenant.messages_per_s", "messages", None);
         rate.take(u64::MAX).unwrap();
-        rate.spend(1e12);
+        rate.spend_at(1e12, Instant::now());
+        assert_eq!(rate.spent_by(|| panic!("nobody asks"), || 7), 7);
         rate.check().unwrap();
         Rate::new("tenant.worker_ms_per_s", "milliseconds", Some(0)).check().unwrap_err();
     }

@@ -9,6 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
+use plantd_server::core::metrics::process::resident_bytes;
 use rustix::process::{Resource, Rlimit, setrlimit};
 
 use crate::mutate::Rng;
@@ -53,9 +54,7 @@ impl Watched {
 }
 
 fn resident_mib() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")?.strip_suffix("kB"));
-    line.and_then(|kib| kib.trim().parse::<u64>().ok()).map_or(0, |kib| kib >> 10)
+    resident_bytes().unwrap_or(0) >> 20
 }
 
 /// Ends the process when an input takes too long or too much.

@@ -29,12 +29,12 @@ fn cpu_s() -> f64 {
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// Bytes of memory in use; none where `/proc` is closed.
-fn resident_bytes() -> Option<f64> {
+/// Bytes of memory that are in use or kept; none where `/proc` is closed.
+pub fn resident_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let size = status.lines().find_map(|line| line.strip_prefix("VmRSS:")?.strip_suffix("kB"));
-    let kilobytes: f64 = size?.trim().parse().ok()?;
-    Some(kilobytes * 1024.0)
+    let kib: u64 = size?.trim().parse().ok()?;
+    Some(kib << 10)
 }
 
 /// Files, sockets and the like that are open; the folder itself is one of them while it is read.
@@ -54,7 +54,7 @@ impl Collector for Process {
         let start = ConstGauge::new(self.start_s);
         write("process_start_time_seconds", "When the server started, Unix time", &start)?;
         if let Some(bytes) = resident_bytes() {
-            let bytes = ConstGauge::new(bytes);
+            let bytes = ConstGauge::new(bytes as f64);
             write("process_resident_memory_bytes", "Memory in use", &bytes)?;
         }
         if let Some(count) = open_files() {

@@ -359,11 +359,12 @@ impl Session {
     ) -> Result<Frame, SnapshotError> {
         let _replacing = lock(&self.replacing);
         let plant = self.plant_of(&snapshot.plant)?;
-        if let Some(memory) = snapshot.channels.clone() {
-            let checked = self.with_core(move |core| core.check(&memory));
-            checked.map_err(SnapshotError::Mismatch)?;
-        }
-        Ok(self.replace_plant(plant, snapshot.channels))
+        let memory = snapshot.channels;
+        let (checked, memory) = self.with_core(move |core| {
+            (memory.as_ref().map_or(Ok(()), |memory| core.check(memory)), memory)
+        });
+        checked.map_err(SnapshotError::Mismatch)?;
+        Ok(self.replace_plant(plant, memory))
     }
 
     /// Tells watchers of a core at rest.

@@ -198,10 +198,11 @@ impl Workers {
                 let turn_began = Cell::new(Instant::now());
                 // Nobody may wait any more.
                 let abandoned = Abandoned { token, pool, id, turn_began };
-                let began_ms = thread_ms();
-                let outcome = span.in_scope(|| caller.scope(|| job(&abandoned)));
+                let outcome = account
+                    .rates
+                    .worker_ms_per_s
+                    .spent_by(thread_ms, || span.in_scope(|| caller.scope(|| job(&abandoned))));
                 drop(span);
-                account.rates.worker_ms_per_s.spend(thread_ms() - began_ms);
                 let _ = sender.send(outcome);
             })
         };

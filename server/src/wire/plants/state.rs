@@ -102,9 +102,6 @@ impl StateDirectory {
         let writers = changed.len().min(WRITERS);
         let queue = Mutex::new(changed);
         let next = || lock(&queue).pop();
-        if writers <= 1 {
-            return next().into_iter().for_each(write);
-        }
         std::thread::scope(|scope| {
             for _ in 0..writers {
                 scope.spawn(|| std::iter::from_fn(next).for_each(write));

@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
+use anyhow::{Result, bail};
+
 use crate::core::channels::noise::hash;
 use crate::core::modes::Mode;
 use crate::core::mutex::lock;
@@ -16,7 +18,6 @@ use crate::core::session::shared::Session;
 use crate::core::tenant::Tenants;
 use crate::wire::message::run_info::run_info;
 use crate::wire::record::folders::folder_of;
-use anyhow::{Result, bail};
 
 pub(crate) const EXTENSION: &str = "plant";
 

@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result, anyhow, ensure};
 use plantd_client::{MatrixExt as _, v1};
 use plantd_import::Options;
-use plantd_scene::in_plain_words;
+use plantd_scene::{in_plain_words, line_of};
 use serde::de::DeserializeOwned;
 
 use crate::contract::json;
@@ -65,8 +65,7 @@ pub(crate) fn parse_message<M: prost::Message + Default>(name: &str, text: &str)
 /// What is wrong, in plain words, and the line.
 pub(crate) fn from_toml<T: DeserializeOwned>(text: &str) -> Result<T> {
     toml::from_str(text).map_err(|error: toml::de::Error| {
-        let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
-        let line = before.matches('\n').count() + 1;
+        let line = line_of(text, error.span().map_or(0, |span| span.start));
         anyhow!("line {line}: {}", in_plain_words(error.message()))
     })
 }

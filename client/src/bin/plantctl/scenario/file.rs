@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
-use plantd_scene::in_plain_words;
+use plantd_scene::{in_plain_words, line_of};
 use schemars::JsonSchema;
 use serde::Deserialize;
 
@@ -469,8 +469,7 @@ fn located(key: &str, error: &toml::de::Error, text: &str) -> anyhow::Error {
     let key = if key.is_empty() || key == "." { String::new() } else { format!("{key}: ") };
     let problem = in_plain_words(error.message());
     let Some(span) = error.span() else { return anyhow::anyhow!("{key}{problem}") };
-    let line = text[..span.start.min(text.len())].matches('\n').count() + 1;
-    anyhow::anyhow!("line {line}: {key}{problem}")
+    anyhow::anyhow!("line {}: {key}{problem}", line_of(text, span.start))
 }
 
 #[cfg(test)]

@@ -16,10 +16,11 @@ use crate::core::room::Reservation;
 use crate::core::tenant::{Tenant, Tenants};
 use crate::wire::edge::admission::Place;
 use crate::wire::edge::auth::credential::{Credential, Over, Pass, Principal};
+use crate::wire::edge::auth::file::FileError;
 use crate::wire::edge::auth::role::{Needs, Role, needs, watches};
-use crate::wire::edge::auth::rules::{Identity, Rules, RulesError};
+use crate::wire::edge::auth::rules::{Identity, Rules};
 use crate::wire::edge::auth::settings::AuthSettings;
-use crate::wire::edge::auth::tokens::{Tokens, TokensError};
+use crate::wire::edge::auth::tokens::Tokens;
 use crate::wire::status::RpcError;
 
 /// How often the files of tokens and rules and the time are looked at.
@@ -67,17 +68,6 @@ impl Known {
     fn credential(&self) -> Option<Arc<Credential>> {
         self.credential.upgrade()
     }
-}
-
-/// Why a door cannot be made.
-#[derive(Debug, thiserror::Error)]
-pub enum DoorError {
-    /// No tokens.
-    #[error(transparent)]
-    Tokens(#[from] TokensError),
-    /// No rules.
-    #[error(transparent)]
-    Rules(#[from] RulesError),
 }
 
 /// Why somebody is not let in.
@@ -128,7 +118,7 @@ impl From<Stranger> for RpcError {
 
 impl Door {
     /// A door as the configuration has it.
-    pub fn new(settings: AuthSettings, tenants: Arc<Tenants>) -> Result<Self, DoorError> {
+    pub fn new(settings: AuthSettings, tenants: Arc<Tenants>) -> Result<Self, FileError> {
         let door = Self {
             settings,
             tenants,
@@ -146,7 +136,7 @@ impl Door {
     }
 
     /// Whoever is somebody else by the new rules, or nobody, is let in no more as who they were.
-    fn read_rules(&self) -> Result<(), RulesError> {
+    fn read_rules(&self) -> Result<(), FileError> {
         *lock(&self.rules_stamp) = self.stamp_of_rules();
         let new = Rules::read(&self.settings)?;
         let mut rules = self.rules.write().unwrap_or_else(PoisonError::into_inner);
@@ -167,7 +157,7 @@ impl Door {
         self.settings.rules.as_deref().and_then(Stamp::of)
     }
 
-    fn read_tokens(&self, path: &Path) -> Result<(), TokensError> {
+    fn read_tokens(&self, path: &Path) -> Result<(), FileError> {
         // Before it is read: what is written meanwhile is found the next time.
         let stamp = Stamp::of(path);
         let mut tokens = self.tokens.write().unwrap_or_else(PoisonError::into_inner);

@@ -5,6 +5,7 @@
 //! | `settings` | what the configuration says of it |
 //! | `role` | the table from methods to roles |
 //! | `credential` | by what somebody is known, and until when |
+//! | `file` | files of TOML that are read again |
 //! | `tokens` | the file of bearer tokens |
 //! | `rules` | who the holders of certificates and the users of this machine are |
 //! | `door` | who somebody is, by token, certificate or user; credentials that are over |
@@ -12,6 +13,7 @@
 
 pub mod credential;
 pub mod door;
+pub mod file;
 pub mod guard;
 pub mod role;
 pub mod rules;

@@ -1,7 +1,7 @@
 //! Rules that say who the holders of certificates and the users of this machine are: those of the configuration, then
 //! those of a file that is read again when it changes.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -10,22 +10,10 @@ use serde::Deserialize;
 use crate::core::tenant::{Tenants, is_tenant_name};
 use crate::wire::edge::admission::Place;
 use crate::wire::edge::auth::credential::Principal;
+use crate::wire::edge::auth::file::{self, FileError};
 use crate::wire::edge::auth::role::Role;
 use crate::wire::edge::auth::settings::{ANY_SUBJECT, AuthSettings, CertificateRule, PeerRule};
 use crate::wire::edge::certificate::Certificate;
-
-/// Longest file of rules, bytes.
-const FILE_BYTES_MAX: u64 = 16 << 20;
-
-/// Why there are no rules.
-#[derive(Debug, thiserror::Error)]
-#[error("file of rules `{path}`: {problem}")]
-pub struct RulesError {
-    /// Path.
-    pub path: PathBuf,
-    /// What is wrong.
-    pub problem: String,
-}
 
 /// By what the other end of a connection is known.
 #[derive(Clone, Debug)]
@@ -62,11 +50,11 @@ pub(super) struct Rules {
 
 impl Rules {
     /// Those of the configuration, and of its file if there is one.
-    pub(super) fn read(settings: &AuthSettings) -> Result<Self, RulesError> {
+    pub(super) fn read(settings: &AuthSettings) -> Result<Self, FileError> {
         let mut rules =
             Self { certificates: settings.certificates.clone(), peers: settings.peers.clone() };
         if let Some(path) = &settings.rules {
-            let problem = |problem| RulesError { path: path.clone(), problem };
+            let problem = |problem| FileError { what: "rules", path: path.clone(), problem };
             let more = Self::in_file(path).map_err(problem)?;
             rules.certificates.extend(more.certificates);
             rules.peers.extend(more.peers);
@@ -75,16 +63,7 @@ impl Rules {
     }
 
     fn in_file(path: &Path) -> Result<Self, String> {
-        let bytes = std::fs::metadata(path).map_err(|error| error.to_string())?.len();
-        if bytes > FILE_BYTES_MAX {
-            return Err(format!("it has {bytes} bytes"));
-        }
-        let text = std::fs::read_to_string(path).map_err(|error| error.to_string())?;
-        let rules: Self = toml::from_str(&text).map_err(|error| {
-            let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
-            let line = before.matches('\n').count() + 1;
-            format!("line {line}: {}", error.message())
-        })?;
+        let rules: Self = file::read(path)?;
         let certificates = rules.certificates.iter().map(|rule| &rule.tenant);
         let mut tenants = certificates.chain(rules.peers.iter().map(|rule| &rule.tenant));
         match tenants.find(|tenant| !is_tenant_name(tenant)) {

@@ -1,7 +1,7 @@
 //! The file of bearer tokens. It has their SHA-256, from which nobody can find them.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::SystemTime;
 
@@ -12,34 +12,11 @@ use time::OffsetDateTime;
 
 use crate::core::tenant::{Tenants, is_tenant_name};
 use crate::wire::edge::auth::credential::{Credential, Over, Principal};
+use crate::wire::edge::auth::file::{self, FileError};
 use crate::wire::edge::auth::role::Role;
 use crate::wire::edge::auth::settings::DEFAULT_TENANT;
 
 type Hash = [u8; SHA256_OUTPUT_LEN];
-
-/// Longest file of tokens, bytes.
-const FILE_BYTES_MAX: u64 = 16 << 20;
-
-/// Why there are no tokens.
-#[derive(Debug, thiserror::Error)]
-pub enum TokensError {
-    /// The file cannot be read.
-    #[error("file of tokens `{path}`: {cause}")]
-    Read {
-        /// Path.
-        path: PathBuf,
-        /// Cause.
-        cause: std::io::Error,
-    },
-    /// What is in it are no tokens.
-    #[error("file of tokens `{path}`: {problem}")]
-    Wrong {
-        /// Path.
-        path: PathBuf,
-        /// What is wrong.
-        problem: String,
-    },
-}
 
 /// The file, as it is written.
 #[derive(Debug, Default, Serialize, Deserialize)]
@@ -69,22 +46,9 @@ pub(super) struct Tokens {
 
 impl Tokens {
     /// Reads a file. What was known before and has not changed stays what it is; what is no more is ended.
-    pub(super) fn read(path: &Path, tenants: &Tenants, former: &Self) -> Result<Self, TokensError> {
-        let read = || {
-            let bytes = std::fs::metadata(path)?.len();
-            if bytes > FILE_BYTES_MAX {
-                return Err(std::io::Error::other(format!("it has {bytes} bytes")));
-            }
-            std::fs::read_to_string(path)
-        };
-        let text = read().map_err(|cause| TokensError::Read { path: path.to_owned(), cause })?;
-        let wrong = |problem| TokensError::Wrong { path: path.to_owned(), problem };
-        // An error of the parser shows what is in the file, which is nothing that opens a door.
-        let file: TokenFile = toml::from_str(&text).map_err(|error| {
-            let before = error.span().map_or("", |span| text.get(..span.start).unwrap_or(""));
-            let line = before.matches('\n').count() + 1;
-            wrong(format!("line {line}: {}", error.message()))
-        })?;
+    pub(super) fn read(path: &Path, tenants: &Tenants, former: &Self) -> Result<Self, FileError> {
+        let wrong = |problem| FileError { what: "tokens", path: path.to_owned(), problem };
+        let file: TokenFile = file::read(path).map_err(wrong)?;
         let mut tokens = Self::default();
         for entry in file.tokens {
             let name = entry.name.clone();
@@ -188,7 +152,7 @@ mod tests {
         format!("[[tokens]]\nname = \"{name}\"\nsha256 = \"{hash}\"\n{rest}\n")
     }
 
-    fn read(text: &str, former: &Tokens, tenants: &Tenants) -> Result<Tokens, TokensError> {
+    fn read(text: &str, former: &Tokens, tenants: &Tenants) -> Result<Tokens, FileError> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), text).unwrap();
         Tokens::read(file.path(), tenants, former)
