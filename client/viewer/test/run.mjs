@@ -262,11 +262,8 @@ const tests = {
     await api.plants.reset({ id, initial: { form: { case: "operatingPoint", value: "upright" } } });
     await page.evaluate(() => document.getElementById("regulate").click());
     await eventually("the regulator", async () => (await api.plants.getPlant({ id })).plant.feedback);
-    // Poles come with states, and those of the new loop with one of the next.
-    await eventually("the closed loop", async () => {
-      await api.plants.step({ id, hold: 1 });
-      return page.evaluate(() => /Closed loop ○none outside/.test(document.getElementById("pole-list").textContent));
-    });
+    // The plant stands still: nothing but the new loop brings poles.
+    await until(page, "the closed loop", () => /Closed loop ○none outside/.test(document.getElementById("pole-list").textContent));
     await until(page, "gains", () => /Gain K/.test(document.getElementById("section-feedback").textContent));
     await page.close();
   },

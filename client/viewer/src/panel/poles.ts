@@ -5,6 +5,9 @@ import { PolePlot } from "../poles.js";
 import { app } from "../state.js";
 import { section } from "./section.js";
 
+/** From one picture to the next, ms. */
+const PERIOD_MS = 150;
+
 /** Adds the section. */
 export function poles(): void {
   const part = section("poles", "Poles", true);
@@ -21,12 +24,16 @@ export function poles(): void {
     app.wantsPoles.set(open);
     if (open) plot.draw();
   });
-  let drawn = 0;
-  app.shown.on((moment) => {
+  let waits = false;
+  app.shown.on(() => {
     part.root.hidden = app.subject.get() !== null && !app.subject.get()?.plant;
-    // A few times a second: it is read, not watched.
-    if (!part.root.open || performance.now() - drawn < 150) return;
-    drawn = performance.now();
-    plot.show(moment?.poles, app.subject.get()?.timeStep ?? 0.01);
+    if (!part.root.open || waits) return;
+    // A few times a second: it is read, not watched. What is drawn is the state of that moment, so that the last one
+    // of a plant that stands still is seen, too.
+    waits = true;
+    setTimeout(() => {
+      waits = false;
+      plot.show(app.shown.get()?.poles, app.subject.get()?.timeStep ?? 0.01);
+    }, PERIOD_MS);
   });
 }
