@@ -1,10 +1,8 @@
 //! Built-in scenes against solutions of the continuous equations of motion, and second order.
 
-mod common;
-
 use std::f64::consts::{FRAC_PI_2, TAU};
 
-use common::{builtin, plant};
+use crate::common::{builtin, plant};
 use plantd_models::scene::{Signal, Spring};
 use plantd_models::{Initial, Linearization, Scene, Settings};
 

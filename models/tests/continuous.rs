@@ -1,11 +1,9 @@
 //! Continuous-time dynamics against closed forms, Lagrange's equations, the discrete map, and
 //! differences.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::{
+use crate::common::{
     Numbers, builtin, elements_with_coordinates, floating, model, plant, random_tree, slope, wave,
 };
 use nalgebra::{DMatrix, DVector};

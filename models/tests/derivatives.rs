@@ -1,9 +1,7 @@
 //! The linearization against sixth-order central differences of the step itself.
 
-mod common;
-
-use common::linearization::{check, check_with};
-use common::{builtin, floating, methods, random_tree};
+use crate::common::linearization::{check, check_with};
+use crate::common::{builtin, floating, methods, random_tree};
 
 #[test]
 fn unconstrained_builtin_scenes() {

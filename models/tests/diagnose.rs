@@ -1,8 +1,6 @@
 //! What is said of a plant agrees with what is conserved and with closed forms.
 
-mod common;
-
-use common::{builtin, floating, plant, wave};
+use crate::common::{builtin, floating, plant, wave};
 use plantd_models::{Initial, Plant};
 
 fn close(x: [f64; 3], y: [f64; 3], tolerance: f64) -> bool {

@@ -1,18 +1,16 @@
 //! Drawings: poses against kinematics, boxes against inertias, and arrows against the generalized forces that
 //! they stand for.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::{Numbers, builtin, floating, forced_tree, model, plant, random_tree, wave};
+use crate::common::{Numbers, builtin, floating, forced_tree, model, plant, random_tree, wave};
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3, Vector6};
 use plantd_models::drawing::{Arrow, ArrowKind, Drawing, Form, Instant, LineKind, Poses};
 use plantd_models::scene::{Constraint, Force, Frame, Point};
 use plantd_models::{Continuous, ContinuousPoint, Kinematics, Model, Scene};
 
 fn elements() -> Vec<Scene> {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/elements");
     let mut paths: Vec<_> =
         std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.sort();

@@ -1,16 +1,14 @@
 //! Every element: its scene in `scenes/elements`, its section in `scenes/ELEMENTS.md`, derivatives,
 //! conservation, and closed forms.
 
-mod common;
-
 use std::path::Path;
 
-use common::{linearization, plant, wave};
+use crate::common::{linearization, plant, wave};
 use nalgebra::DMatrix;
 use plantd_models::scene::{CoordinateKind, Spring};
 use plantd_models::{Initial, InitialError, Linearization, Plant, Scene};
 
-const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/elements");
 const PAGE: &str = include_str!("../scenes/ELEMENTS.md");
 
 /// Definitions of the schema whose variants are elements, and their chapters.
@@ -406,7 +404,7 @@ fn an_armature_is_inertia_about_its_axis() {
 fn armatures_are_in_every_solver() {
     for name in ["chain-8", "tree-7", "scissor-4", "marionette", "four-bar"] {
         let mut scene = plantd_models::builtin::scene(name).unwrap();
-        let model = common::model(&scene);
+        let model = crate::common::model(&scene);
         for (i, c) in model.coordinates().iter().enumerate() {
             if c.kind == CoordinateKind::Prescribed {
                 continue;

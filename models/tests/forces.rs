@@ -1,8 +1,6 @@
 //! Forces: closed forms, balances of momentum and power, and their derivatives.
 
-mod common;
-
-use common::{SPLITS, forced_tree, plant, wave, waving_input};
+use crate::common::{SPLITS, forced_tree, plant, wave, waving_input};
 use plantd_models::scene::Scene;
 use plantd_models::{ForceSplit, Initial, Plant};
 
@@ -343,10 +341,10 @@ fn derivatives_of_forces() {
     for seed in 100..124 {
         let scene = forced_tree(seed);
         kinds += scene.forces.len();
-        common::linearization::check_within(&scene, 0.02);
+        crate::common::linearization::check_within(&scene, 0.02);
     }
     assert!(kinds > 150, "{kinds}");
-    common::linearization::check_within(&dampened(DAMPER), 0.02);
+    crate::common::linearization::check_within(&dampened(DAMPER), 0.02);
 }
 
 /// Every force alone, on the body that flies: what goes wrong has a name.
@@ -363,7 +361,7 @@ fn derivatives_of_each_force() {
         let input = if force.contains("\"u\"") { "[[inputs]]\nname = \"u\"\n" } else { "" };
         let mut scene = scene(&format!("{FLYING}\n{input}[[forces]]\n{force}"));
         scene.gravity = Some([1.0, -3.0, -9.0]);
-        common::linearization::check_within(&scene, 0.02);
+        crate::common::linearization::check_within(&scene, 0.02);
     }
 }
 

@@ -1,10 +1,8 @@
 //! Scenes whose initial configuration is only a guess.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::builtin;
+use crate::common::builtin;
 use plantd_models::{Initial, InitialError, Model, Plant, Settings, SettleRequest, Spare};
 
 /// The four-bar with a coupler that does not meet the rocker.
@@ -12,7 +10,7 @@ fn model() -> Arc<Model> {
     let mut scene = builtin("four-bar");
     let coupler = scene.coordinates.iter_mut().find(|c| c.name == "coupler").unwrap();
     coupler.initial = 0.0;
-    common::model(&scene)
+    crate::common::model(&scene)
 }
 
 fn initial(model: &Model) -> Vec<f64> {
@@ -33,7 +31,7 @@ fn the_model_says_by_how_much_each_equation_is_violated() {
         assert_eq!(violation.constraint, name);
         assert!((violation.value - expected).abs() < 1e-12, "{violation:?}, {expected}");
     }
-    assert_eq!(common::model(&builtin("four-bar")).initial_violations(), []);
+    assert_eq!(crate::common::model(&builtin("four-bar")).initial_violations(), []);
 }
 
 #[test]
@@ -67,7 +65,7 @@ fn only_what_starts_at_the_guess_is_refused() {
 
     // The mechanism is the same as that of the scene that starts on its constraints.
     let mut usual = Plant::at(
-        common::model(&builtin("four-bar")),
+        crate::common::model(&builtin("four-bar")),
         settings,
         &Initial::Projection { q, hold: vec![] },
     )
@@ -107,7 +105,7 @@ fn redundant_equations_are_found_from_a_guess() {
         let head = "format = 1\nname = \"cranks\"\ngravity = [0.0, 0.0, -9.8]\n";
         let parts = [crank(0.0), bar.to_owned(), crank(1.0), crank(2.0), pin(1.0), pin(2.0)];
         let text = format!("{head}{}{}", parts.concat(), initial(crank2));
-        let model = common::model(&plantd_models::Scene::from_toml(&text).unwrap());
+        let model = crate::common::model(&plantd_models::Scene::from_toml(&text).unwrap());
         let settings = Settings::new(&model);
         let q = model.coordinates().iter().map(|c| c.initial).collect();
         Plant::at(model, settings, &Initial::Projection { q, hold: vec![] }).unwrap()

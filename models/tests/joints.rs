@@ -1,8 +1,6 @@
 //! Joints beyond hinges and slides: closed forms, conservation, derivatives on the manifold.
 
-mod common;
-
-use common::{SPLITS, builtin, plant, slope, wave, waving_input};
+use crate::common::{SPLITS, builtin, plant, slope, wave, waving_input};
 use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
 use plantd_models::{
     Continuous, ContinuousPoint, Contraction, ForceSplit, Initial, Linearization, Plant, Scene,
@@ -10,7 +8,7 @@ use plantd_models::{
 };
 
 fn element(name: &str) -> Scene {
-    let path = format!("{}/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+    let path = format!("{}/../scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"));
     Scene::from_toml(&std::fs::read_to_string(path).unwrap()).unwrap()
 }
 

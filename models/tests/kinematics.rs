@@ -1,11 +1,11 @@
 //! Kinematics of frames and the terms of the equation of motion against differences, energies, closed forms
 //! and forward dynamics.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::{Numbers, builtin, floating, forced_tree, model, plant, random_tree, slope, wave};
+use crate::common::{
+    Numbers, builtin, floating, forced_tree, model, plant, random_tree, slope, wave,
+};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::{
     Continuous, ContinuousError, ContinuousPoint, Diagnostics, FrameMotion, Initial, Kinematics,
@@ -13,7 +13,7 @@ use plantd_models::{
 };
 
 fn elements() -> Vec<Scene> {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/elements");
     let mut paths: Vec<_> =
         std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.sort();

@@ -1,10 +1,8 @@
 //! Properties of motions: what a variational integrator conserves, and what must not matter.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::{SPLITS, builtin, floating, plant, random_tree, wave, waving_input};
+use crate::common::{SPLITS, builtin, floating, plant, random_tree, wave, waving_input};
 use nalgebra::DMatrix;
 use plantd_models::scene::{Axis, Constraint, Point, Spring};
 use plantd_models::{Initial, Linearization, Model, Plant, Scene, Settings};

@@ -1,12 +1,10 @@
 //! Control periods of several steps: substeps, higher orders, and halving.
 
-mod common;
-
 use std::f64::consts::FRAC_PI_2;
 use std::sync::Arc;
 
-use common::linearization::check_with;
-use common::{builtin, methods, model, plant, waving_input};
+use crate::common::linearization::check_with;
+use crate::common::{builtin, methods, model, plant, waving_input};
 use plantd_models::{
     Initial, InitialError, Linearization, Plant, Precision, Scene, Settings, Snapshot, State,
     StepError,
@@ -57,12 +55,12 @@ fn snapshots_continue_bit_for_bit() {
         let scene = builtin(name);
         for settings in methods(&scene) {
             let mut first = plant(&scene, |s| *s = settings);
-            common::wave(&mut first, 12);
+            crate::common::wave(&mut first, 12);
             let bytes = first.snapshot().to_bytes();
             let mut second = plant(&scene, |s| *s = settings);
             second.restore(&Snapshot::from_bytes(&bytes).unwrap()).unwrap();
-            common::wave(&mut first, 12);
-            common::wave(&mut second, 12);
+            crate::common::wave(&mut first, 12);
+            crate::common::wave(&mut second, 12);
             assert_eq!(first.snapshot().to_bytes(), second.snapshot().to_bytes());
         }
     }
@@ -142,7 +140,7 @@ fn halved_periods_have_exact_derivatives() {
             let at = |s: f64, end: &mut dyn FnMut(f64, f64, f64) -> [f64; 2]| {
                 end(0.3 + s * dq, 90.0 + s * dp, 0.2 + s * du)[row]
             };
-            let sum = common::STENCIL.iter().map(|(k, w)| w * at(k * delta, &mut end));
+            let sum = crate::common::STENCIL.iter().map(|(k, w)| w * at(k * delta, &mut end));
             sum.sum::<f64>() / delta
         };
         for (found, expected) in
@@ -163,7 +161,7 @@ fn failed_periods_change_nothing() {
     let scene = builtin("chain-8");
     for settings in methods(&scene) {
         let mut plant = plant(&scene, |s| *s = Settings { halvings: 2, ..settings });
-        common::wave(&mut plant, 5);
+        crate::common::wave(&mut plant, 5);
         let before = plant.snapshot().to_bytes();
         let mut u = vec![0.0; plant.model().dimensions().input()];
         u.fill(1e9);
@@ -180,7 +178,7 @@ fn failed_periods_change_nothing() {
             );
             assert_eq!(plant.snapshot().to_bytes(), before, "{settings:?}");
         }
-        common::wave(&mut plant, 5);
+        crate::common::wave(&mut plant, 5);
     }
 }
 
@@ -236,7 +234,7 @@ fn settings_out_of_range_are_refused() {
 #[test]
 fn ball_joints_turn_in_any_order() {
     let read = |name: &str| {
-        let path = format!("{}/scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+        let path = format!("{}/../scenes/elements/{name}.toml", env!("CARGO_MANIFEST_DIR"));
         Scene::from_toml(&std::fs::read_to_string(path).unwrap()).unwrap()
     };
     for name in ["ball", "free"] {
@@ -253,7 +251,7 @@ fn ball_joints_turn_in_any_order() {
 fn projected_momenta_have_exact_derivatives() {
     for name in ["four-bar", "scissor-3", "marionette"] {
         let mut plant = plant(&builtin(name), |_| ());
-        common::wave(&mut plant, 20);
+        crate::common::wave(&mut plant, 20);
         let State { q, p, v, .. } = plant.state();
         let d = plant.model().dimensions();
         let n = d.coordinates();
@@ -274,14 +272,14 @@ fn projected_momenta_have_exact_derivatives() {
         for i in 0..n {
             let mut dx = vec![0.0; 2 * n];
             dx[n + i] = 1.0;
-            let found = common::slope(1e-3, |s| {
+            let found = crate::common::slope(1e-3, |s| {
                 let (mut p, mut v) = (p.clone(), v.clone());
                 *p.iter_mut().chain(&mut v).nth(i).unwrap() += s;
                 at(&q, &p, &v)
             });
             compare(&format!("p, v {i}"), &dx, &found);
         }
-        let mut on_manifold = common::plant(&builtin(name), |_| ());
+        let mut on_manifold = crate::common::plant(&builtin(name), |_| ());
         for i in 0..n {
             let mut curve = |s: f64| {
                 let mut q = q.clone();
@@ -289,8 +287,8 @@ fn projected_momenta_have_exact_derivatives() {
                 on_manifold.initialize(&Initial::Projection { q, hold: Vec::new() }).unwrap();
                 on_manifold.q().to_vec()
             };
-            let mut dx = common::slope(1e-3, &mut curve);
-            let found = common::slope(1e-3, |s| at(&curve(s), &p, &v));
+            let mut dx = crate::common::slope(1e-3, &mut curve);
+            let found = crate::common::slope(1e-3, |s| at(&curve(s), &p, &v));
             dx.resize(2 * n, 0.0);
             compare(&format!("direction {i}"), &dx, &found);
         }

@@ -1,12 +1,10 @@
 //! Thousands of random scenes of every kind of joint, spring, force and constraint: derivatives of
 //! first and second order along random directions, the symplectic form, momenta, energy.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::Numbers;
-use common::random_scene::{Kind, scene};
+use crate::common::Numbers;
+use crate::common::random_scene::{Kind, scene};
 use nalgebra::{DMatrix, DVector, Vector3};
 use plantd_models::{
     Continuous, ContinuousPoint, Contraction, ForceSplit, Initial, Linearization, Model, Plant,

@@ -1,8 +1,6 @@
 //! Constraints that say again what others say: the motion stays, multipliers have least norm.
 
-mod common;
-
-use common::{SPLITS, builtin, model, plant, wave, waving_input};
+use crate::common::{SPLITS, builtin, model, plant, wave, waving_input};
 use nalgebra::{DMatrix, DVector};
 use plantd_models::scene::{Axis, Constraint};
 use plantd_models::{

@@ -1,8 +1,6 @@
 //! Inputs, steps and snapshots that are refused leave a plant as it was.
 
-mod common;
-
-use common::{builtin, plant, random_tree, wave, waving_input};
+use crate::common::{builtin, plant, random_tree, wave, waving_input};
 use plantd_models::{
     Initial, InitialError, Linearization, Plant, Settings, Snapshot, SnapshotError, StepError,
 };
@@ -47,7 +45,7 @@ fn inputs_that_are_not_finite_or_do_not_fit() {
             assert_eq!(error, StepError::Dimension { expected, actual: length }, "{scene}");
         }
         // It goes on as if nothing had been tried.
-        let mut untouched = common::plant(&builtin(scene), |_| ());
+        let mut untouched = crate::common::plant(&builtin(scene), |_| ());
         wave(&mut untouched, 6);
         wave(&mut plant, 1);
         assert_eq!(plant.state(), untouched.state(), "{scene}");
@@ -144,9 +142,9 @@ fn snapshots_of_others_and_damaged_ones() {
     wave(&mut plant, 5);
     let bytes = plant.snapshot().to_bytes();
     for other in [
-        common::plant(&random_tree(2), |_| ()),
-        common::plant(&random_tree(1), |s| s.time_step_s = 0.02),
-        common::plant(&random_tree(1), |s| s.force_split = plantd_models::ForceSplit::Paper),
+        crate::common::plant(&random_tree(2), |_| ()),
+        crate::common::plant(&random_tree(1), |s| s.time_step_s = 0.02),
+        crate::common::plant(&random_tree(1), |s| s.force_split = plantd_models::ForceSplit::Paper),
     ] {
         let snapshot = other.snapshot();
         let error = refused(&mut plant, |p| p.restore(&snapshot));
@@ -164,7 +162,7 @@ fn snapshots_of_others_and_damaged_ones() {
 
 #[test]
 fn settings_out_of_range() {
-    let model = common::model(&builtin("pendulum"));
+    let model = crate::common::model(&builtin("pendulum"));
     for time_step_s in [0.0, -0.1, f64::NAN, f64::INFINITY] {
         let settings = Settings { time_step_s, ..Settings::new(&model) };
         let error = Plant::new(model.clone(), settings).unwrap_err();

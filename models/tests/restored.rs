@@ -1,12 +1,10 @@
 //! A restored plant goes on bit for bit, whatever it and the one it was taken from did before: random
 //! mechanisms of every kind, with every way to step.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::random_scene::{self, Kind};
-use common::{builtin, methods};
+use crate::common::random_scene::{self, Kind};
+use crate::common::{builtin, methods};
 use plantd_models::{Initial, Linearization, Model, Plant, Precision, Scene, Settings, Snapshot};
 
 /// Steps after a snapshot.

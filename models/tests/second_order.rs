@@ -1,9 +1,7 @@
 //! The second-order linearization against sixth-order central differences of the first-order one, and
 //! its contraction against its tensors.
 
-mod common;
-
-use common::{
+use crate::common::{
     SPLITS, builtin, elements_with_coordinates, floating, methods, plant, random_tree, slope, wave,
     waving_input,
 };
@@ -279,7 +277,7 @@ fn random_trees() {
 #[test]
 fn random_trees_with_forces() {
     for seed in 100..108 {
-        let mut check = Check::new(&common::forced_tree(seed), ForceSplit::Symmetric);
+        let mut check = Check::new(&crate::common::forced_tree(seed), ForceSplit::Symmetric);
         check.symmetry();
         check.contraction();
     }
@@ -326,7 +324,7 @@ fn spring_whose_ends_meet() {
 
 #[test]
 fn large_models_are_refused_by_size() {
-    let model = common::model(&builtin("chain-300"));
+    let model = crate::common::model(&builtin("chain-300"));
     let error = SecondOrder::new(&model).unwrap_err();
     assert!(error.entries > 1 << 27, "{error}");
     let mut plant = plant(&builtin("chain-300"), |_| ());

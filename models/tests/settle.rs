@@ -1,11 +1,9 @@
 //! Equilibria: what settles is at rest, and a minimum.
 
-mod common;
-
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use common::{Numbers, builtin, floating, plant, random_tree};
+use crate::common::{Numbers, builtin, floating, plant, random_tree};
 use nalgebra::DVector;
 use plantd_models::scene::{Constraint, Coordinate, CoordinateKind, Spring};
 use plantd_models::{
@@ -335,7 +333,7 @@ fn loops_settle_under_inputs_and_with_held_coordinates() {
 /// Every element's scene settles and rests there, or says why not.
 #[test]
 fn scenes_of_all_elements() {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/elements");
     let mut settled = 0;
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();

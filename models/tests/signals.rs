@@ -1,10 +1,8 @@
 //! Signals: when they act, and on what.
 
-mod common;
-
 use std::f64::consts::TAU;
 
-use common::{builtin, plant};
+use crate::common::{builtin, plant};
 use plantd_models::scene::{CoordinateKind, Scene, Signal};
 use plantd_models::{Initial, Linearization, Plant, Snapshot};
 

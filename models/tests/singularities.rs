@@ -1,11 +1,9 @@
 //! Singularities, section VI of the paper: where the Newton matrix or the constraints lose rank.
 
-mod common;
-
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use common::exact::Mechanism;
-use common::{Numbers, builtin, plant, wave};
+use crate::common::exact::Mechanism;
+use crate::common::{Numbers, builtin, plant, wave};
 use nalgebra::{DMatrix, Matrix2};
 use plantd_models::{Initial, Linearization, Plant, Scene, StepError};
 

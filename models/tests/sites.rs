@@ -1,13 +1,11 @@
 //! Sites and pushes: derivatives of poses, balances of momentum, and equivalent forces.
 
-mod common;
-
-use common::{builtin, plant, wave};
+use crate::common::{builtin, plant, wave};
 use plantd_models::scene::{Constraint, Scene};
 use plantd_models::{Initial, InitialError, Pose, StepError};
 
 fn scenes() -> Vec<Scene> {
-    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements");
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/elements");
     let mut paths: Vec<_> =
         std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.sort();
@@ -211,7 +209,7 @@ fn looking_at_the_energy_does_not_change_the_motion() {
     for scene in scenes() {
         let (mut looked, mut plain) = (plant(&scene, |_| ()), plant(&scene, |_| ()));
         for k in 0..20 {
-            let u = common::waving_input(&plain, k);
+            let u = crate::common::waving_input(&plain, k);
             looked.energy();
             looked.velocity();
             assert_eq!(looked.step(&u).is_ok(), plain.step(&u).is_ok());
@@ -233,7 +231,7 @@ fn a_plant_takes_over_a_state() {
         wave(&mut same, 5);
         assert_eq!(same.snapshot(), former.snapshot(), "{}", scene.name);
     }
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/scenes/elements/distance.toml");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../scenes/elements/distance.toml");
     let scene = Scene::from_toml(&std::fs::read_to_string(path).unwrap()).unwrap();
     let mut former = plant(&scene, |_| ());
     wave(&mut former, 20);

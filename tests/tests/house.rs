@@ -54,6 +54,26 @@ fn the_core_of_the_server_knows_no_wire() {
 }
 
 #[test]
+fn no_test_is_left_out_of_its_program() {
+    let mut faults = String::new();
+    let mut files = 0;
+    for tests in ["models/tests", "models/control/tests"].map(|path| workspace().join(path)) {
+        let main = std::fs::read_to_string(tests.join("main.rs")).unwrap();
+        for entry in std::fs::read_dir(&tests).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_stem().unwrap().to_str().unwrap();
+            if path.extension().is_some_and(|end| end == "rs") && name != "main" {
+                files += 1;
+                if !main.lines().any(|line| line == format!("mod {name};")) {
+                    let _ = writeln!(faults, "{} is not in main.rs", path.display());
+                }
+            }
+        }
+    }
+    assert!(faults.is_empty() && files > 20, "{files} files\n{faults}");
+}
+
+#[test]
 fn arrows_are_seen_wherever_they_hide() {
     let sources = [
         ("", "mod a; mod b; mod c; mod d;"),

@@ -4,13 +4,10 @@
 //! On a linear oscillator the midpoint rule is Cayley's transform: a root `s` of the equation of
 //! motion becomes `z = (1 + sh/2) / (1 - sh/2)`.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
 use std::f64::consts::{PI, TAU};
 
-use common::oracle::{matrix, oracle};
-use common::{model, plant};
+use crate::common::{model, plant};
+use crate::oracle::{matrix, oracle};
 use nalgebra::{Complex, DMatrix};
 use plantd_control::{
     AnalysisError, Mode, Tangent, TransferFunction, controllability_rank, modes, observability_rank,
@@ -210,7 +207,7 @@ fn constraints_gauge_and_prescribed_coordinates_make_no_modes() {
 
 #[test]
 fn a_four_bar_swings_in_one_mode() {
-    let mut plant = plant(&common::builtin("four-bar"), |_| {});
+    let mut plant = plant(&crate::common::builtin("four-bar"), |_| {});
     let (a, b) = linearized(&mut plant);
     let jacobian = plant.constraint_jacobian();
     let tangent = Tangent::new(&jacobian, 3);

@@ -1,10 +1,7 @@
 //! Filters against independent solutions (`tests/oracles/kalman.py`: mpmath, scipy, python-control)
 //! and against what defines them.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
-use common::oracle::{matrix, oracle, relative_error};
+use crate::oracle::{matrix, oracle, relative_error};
 use nalgebra::{DMatrix, DVector};
 use plantd_control::{
     Kalman, KalmanError, NoiseCovariances, NoiseError, RiccatiError, Sample, Tangent, Values,

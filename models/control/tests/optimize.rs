@@ -1,8 +1,5 @@
 //! Trajectory optimisation against the paper's reference implementation.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
 use std::path::Path;
 use std::sync::Arc;
 

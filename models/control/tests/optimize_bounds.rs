@@ -1,12 +1,9 @@
 //! Searches with bounded inputs: each ends at an optimum, whatever the limit and the tolerance, as an
 //! adjoint of the tests' own says.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
 use std::f64::consts::PI;
 
-use common::{builtin, plant};
+use crate::common::{builtin, plant};
 use nalgebra::{DMatrix, DVector};
 use plantd_control::optimize::{
     Bound, Bounds, Fallback, Method, Optimizer, Options, Progress, Status, Stuck, TrajectoryCost,

@@ -1,12 +1,9 @@
 //! Searches against what is known of their ends: closed forms, optimality conditions, themselves.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use common::{builtin, plant, waving_input};
+use crate::common::{builtin, plant, waving_input};
 use nalgebra::{DMatrix, DVector};
 use plantd_control::optimize::{
     Bound, BoundFault, BoundState, Bounds, FreeInitialState, Method, OptimizeError, Optimizer,

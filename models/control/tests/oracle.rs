@@ -5,7 +5,7 @@ use serde_json::Value;
 
 /// The file of that name.
 pub(crate) fn oracle(name: &str) -> Value {
-    let path = super::folder().join("../tests/oracles").join(name);
+    let path = crate::common::folder().join("../tests/oracles").join(name);
     serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
 }
 

@@ -1,9 +1,6 @@
 //! Costs on the projected momentum: against differences, motions, and the orders of their accuracy.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
-use common::{builtin, plant, slope, wave, waving_input};
+use crate::common::{builtin, plant, slope, wave, waving_input};
 use nalgebra::{DMatrix, DVector};
 use plantd_control::optimize::{Bounds, OptimizeError, Optimizer, Options, Status, TrajectoryCost};
 use plantd_control::{

@@ -1,9 +1,6 @@
 //! References from outside: what is a motion of the plant is found to be one, what is not is named.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
-use common::{builtin, plant, waving_input};
+use crate::common::{builtin, plant, waving_input};
 use nalgebra::DMatrix;
 use plantd_control::reference::{ReferenceError, check_reference, project};
 use plantd_models::{ForceSplit, Spare};

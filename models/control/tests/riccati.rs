@@ -1,10 +1,7 @@
 //! Regulators against independent solutions (`tests/oracles/riccati.py`: mpmath, scipy,
 //! python-control) and against what defines them.
 
-#[path = "../../tests/common/mod.rs"]
-mod common;
-
-use common::oracle::{matrix, oracle, relative_error};
+use crate::oracle::{matrix, oracle, relative_error};
 use nalgebra::{DMatrix, DVector};
 use plantd_control::{
     Regulator, RiccatiError, Sample, StageWeights, Tangent, TrajectoryWeights, Values, Weights,

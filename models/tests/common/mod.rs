@@ -1,10 +1,8 @@
 //! Mechanisms and helpers that the tests of motion share.
-#![allow(dead_code, reason = "each test program uses some of it")]
 
 pub(crate) mod exact;
 pub(crate) mod linearization;
 mod numbers;
-pub(crate) mod oracle;
 pub(crate) mod random_scene;
 
 use std::f64::consts::PI;

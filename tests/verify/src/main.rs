@@ -133,14 +133,14 @@ fn docs(context: &mut Context) -> Outcome {
     run(command.env("RUSTDOCFLAGS", "-D warnings"))
 }
 
-/// Builds all targets at once: binaries, which the tests start, see the same features as the tests,
-/// so nothing is compiled twice.
+/// Builds all that runs at once: binaries, which the tests start, see the same features as the tests, so nothing is
+/// compiled twice. That benchmarks compile is seen by the lints.
 fn build(context: &mut Context) -> Outcome {
-    let built = run(&mut context.cargo(&["build", "--workspace", "--all-targets", "--locked"]))
-        .and_then(|()| {
-            let counter = ["build", "--release", "--locked", "-p", "plantd-control"];
-            run(context.cargo(&counter).args(["--example", "step_count"]))
-        });
+    let all = ["build", "--workspace", "--lib", "--bins", "--tests", "--examples", "--locked"];
+    let built = run(&mut context.cargo(&all)).and_then(|()| {
+        let counter = ["build", "--release", "--locked", "-p", "plantd-control"];
+        run(context.cargo(&counter).args(["--example", "step_count"]))
+    });
     (context.broken, context.is_built) = (built.is_err(), built.is_ok());
     built
 }
