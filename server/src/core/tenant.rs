@@ -227,6 +227,12 @@ impl Tenants {
         tenant
     }
 
+    /// Whether a tenant has been heard of, or there are fewer than so many.
+    pub fn has_room_for(&self, name: &str, tenants_max: usize) -> bool {
+        let accounts = lock(&self.accounts);
+        accounts.len() < tenants_max || accounts.iter().any(|account| account.name == name)
+    }
+
     /// What is known of a tenant.
     pub fn account(&self, tenant: Tenant) -> Arc<Account> {
         let accounts = lock(&self.accounts);

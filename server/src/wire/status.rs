@@ -41,6 +41,7 @@
 //! | FAILED_PRECONDITION | `RECORDING_ACTIVE` | PreconditionFailure | the plant is being recorded, or the recording is in progress |
 //! | PERMISSION_DENIED | `FOREIGN_HOST`, `FOREIGN_ORIGIN` | | with HTTP status 403: the request comes from a page of a stranger, see [`crate::wire::names`] |
 //! | UNAUTHENTICATED | `NO_CREDENTIALS`, `TOKEN_UNKNOWN`, `CERTIFICATE_UNKNOWN`, `USER_UNKNOWN` | | the server wants to know who calls, and does not |
+//! | UNAUTHENTICATED | `GATEWAY_HEADER` | | a gateway speaks for somebody, in a header that cannot be used |
 //! | UNAUTHENTICATED | `CREDENTIALS_EXPIRED`, `CREDENTIALS_REVOKED` | | token or certificate are not in force any more; open streams end so |
 //! | PERMISSION_DENIED | `ROLE` | | the caller is known, and may not do this, see [`crate::wire::edge::auth`] |
 //! | RESOURCE_EXHAUSTED | `LIMIT_EXCEEDED` | QuotaFailure; metadata `limit`, `value`, `actual` | a limit of the server, see [`crate::core::limits`], or `tenant.NAME`, one of the caller's tenant |

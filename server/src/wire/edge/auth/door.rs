@@ -1,5 +1,5 @@
-//! Who somebody is: by the token of the request, else by the certificate of the connection, else by the user at the
-//! other end of the unix-domain socket.
+//! Who somebody is: by what a gateway says of the caller, else by the token of the request, else by the certificate of
+//! the connection, else by the user at the other end of the unix-domain socket.
 
 use std::collections::HashMap;
 use std::os::unix::fs::MetadataExt as _;
@@ -17,6 +17,7 @@ use crate::core::tenant::{Tenant, Tenants};
 use crate::wire::edge::admission::Place;
 use crate::wire::edge::auth::credential::{Credential, Over, Pass, Principal};
 use crate::wire::edge::auth::file::FileError;
+use crate::wire::edge::auth::gateway::{HeaderError, Said};
 use crate::wire::edge::auth::role::{Needs, Role, needs, watches};
 use crate::wire::edge::auth::rules::{Identity, Rules};
 use crate::wire::edge::auth::settings::AuthSettings;
@@ -28,6 +29,9 @@ pub const LOOK_PERIOD: Duration = Duration::from_secs(1);
 
 /// Longest token, bytes.
 const TOKEN_BYTES_MAX: usize = 512;
+
+/// Most tenants with those that gateways name.
+const TENANTS_MAX: usize = 10_000;
 
 /// What a file was when it was read. Another one of the same name differs in one of these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,8 +58,9 @@ pub struct Door {
     stamp: Mutex<Option<Stamp>>,
     rules: RwLock<Rules>,
     rules_stamp: Mutex<Option<Stamp>>,
-    /// Credentials of connections, by the connection's number: they live as long as it does or is used.
-    of_connections: Mutex<HashMap<u64, Known>>,
+    /// Credentials of connections, by the connection's number and what a gateway has said of the caller. They live as
+    /// long as the connection, those of a gateway's callers as long as they are used.
+    of_connections: Mutex<HashMap<(u64, Option<Said>), Known>>,
 }
 
 /// A connection that has made a call.
@@ -71,13 +76,16 @@ impl Known {
 }
 
 /// Why somebody is not let in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 enum Stranger {
     Nameless,
     BadHeader,
     UnknownToken,
     UnknownCertificate,
     UnknownUser(u32),
+    Unnamed,
+    WrongGatewayHeader(HeaderError),
+    TooManyTenants,
 }
 
 /// A call that is not let in.
@@ -111,6 +119,15 @@ impl From<Stranger> for RpcError {
                 "USER_UNKNOWN",
                 format!("no rule of the server says who the user with number {uid} is: see `auth.peers`, or give a token"),
             ),
+            Stranger::Unnamed => (
+                "NO_CREDENTIALS",
+                "the gateway has not said who calls, in the header `plantd-user`".to_owned(),
+            ),
+            Stranger::WrongGatewayHeader(error) => ("GATEWAY_HEADER", error.to_string()),
+            Stranger::TooManyTenants => (
+                "GATEWAY_HEADER",
+                format!("the gateway's header `plantd-tenant` names another tenant, and there are {TENANTS_MAX} already"),
+            ),
         };
         Self::new(Code::Unauthenticated, reason, sentence)
     }
@@ -141,9 +158,10 @@ impl Door {
         let new = Rules::read(&self.settings)?;
         let mut rules = self.rules.write().unwrap_or_else(PoisonError::into_inner);
         *rules = new;
-        lock(&self.of_connections).retain(|_, known| {
+        lock(&self.of_connections).retain(|(_, said), known| {
             let Some(credential) = known.credential() else { return false };
-            let principal = rules.principal(&known.identity, &self.tenants);
+            let rule = rules.of(&known.identity);
+            let principal = rule.and_then(|rule| rule.principal(said.as_ref(), &self.tenants));
             let is_same = principal.as_ref() == Some(&credential.principal);
             if !is_same {
                 credential.end(Over::Revoked);
@@ -255,6 +273,14 @@ impl Door {
         headers: &HeaderMap,
         place: Option<&Arc<Place>>,
     ) -> Result<Arc<Credential>, Stranger> {
+        if Said::is_in(headers)
+            && let Some(place) = place
+            && let Some(identity) = Identity::of(place)
+            && self.is_gateway(&identity)
+        {
+            let said = Said::read(headers).map_err(Stranger::WrongGatewayHeader)?;
+            return self.of_connection(place, identity, Some(said));
+        }
         let mut values = headers.get_all(AUTHORIZATION).iter();
         if let Some(value) = values.next() {
             let token = bearer(value.as_bytes()).filter(|_| values.next().is_none());
@@ -264,26 +290,55 @@ impl Door {
         }
         let place = place.ok_or(Stranger::Nameless)?;
         let identity = Identity::of(place).ok_or(Stranger::Nameless)?;
-        let known = lock(&self.of_connections).get(&place.id()).and_then(Known::credential);
+        self.of_connection(place, identity, None)
+    }
+
+    /// Who calls over a connection.
+    fn of_connection(
+        &self,
+        place: &Place,
+        identity: Identity,
+        said: Option<Said>,
+    ) -> Result<Arc<Credential>, Stranger> {
+        let key = (place.id(), said);
+        let known = lock(&self.of_connections).get(&key).and_then(Known::credential);
         if let Some(credential) = known {
             return Ok(credential);
         }
-        let credential = self.of_connection(&identity)?;
-        let kept: Arc<Credential> = Arc::clone(&credential);
-        place.keep(kept);
+        let credential = self.credential(&identity, key.1.as_ref())?;
+        if key.1.is_none() {
+            let kept: Arc<Credential> = Arc::clone(&credential);
+            place.keep(kept);
+        }
         let known = Known { credential: Arc::downgrade(&credential), identity };
-        lock(&self.of_connections).insert(place.id(), known);
+        lock(&self.of_connections).insert(key, known);
         Ok(credential)
     }
 
-    /// Who is at the other end of a connection.
-    fn of_connection(&self, identity: &Identity) -> Result<Arc<Credential>, Stranger> {
-        let rules = self.rules.read().unwrap_or_else(PoisonError::into_inner);
-        match (rules.principal(identity, &self.tenants), identity) {
-            (Some(principal), _) => Ok(Credential::new(principal, identity.expires())),
-            (None, Identity::Certificate(_)) => Err(Stranger::UnknownCertificate),
-            (None, Identity::User(uid)) => Err(Stranger::UnknownUser(*uid)),
+    fn credential(
+        &self,
+        identity: &Identity,
+        said: Option<&Said>,
+    ) -> Result<Arc<Credential>, Stranger> {
+        let tenant = said.and_then(|said| said.tenant.as_deref());
+        if tenant.is_some_and(|tenant| !self.tenants.has_room_for(tenant, TENANTS_MAX)) {
+            return Err(Stranger::TooManyTenants);
         }
+        let rules = self.rules.read().unwrap_or_else(PoisonError::into_inner);
+        let stranger = match identity {
+            Identity::Certificate(_) => Stranger::UnknownCertificate,
+            Identity::User(uid) => Stranger::UnknownUser(*uid),
+        };
+        let rule = rules.of(identity).ok_or(stranger)?;
+        let principal = rule.principal(said, &self.tenants).ok_or(Stranger::Unnamed)?;
+        let expires = [identity.expires(), said.and_then(Said::expires)];
+        Ok(Credential::new(principal, expires.into_iter().flatten().min()))
+    }
+
+    /// Whether the other end of a connection speaks for others.
+    fn is_gateway(&self, identity: &Identity) -> bool {
+        let rules = self.rules.read().unwrap_or_else(PoisonError::into_inner);
+        rules.of(identity).is_some_and(|rule| rule.is_gateway)
     }
 }
 

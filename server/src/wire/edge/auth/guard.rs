@@ -15,7 +15,7 @@ use tower::{Layer, Service};
 use crate::core::metrics::registry::Metrics;
 use crate::wire::edge::admission::Place;
 use crate::wire::edge::auth::door::{Door, Refused};
-use crate::wire::edge::auth::role;
+use crate::wire::edge::auth::{gateway, role};
 use crate::wire::edge::gate::{answer, is_grpc};
 use crate::wire::edge::methods::method_label;
 
@@ -76,6 +76,7 @@ where
             Ok(Some(pass)) => {
                 // It has done its work, and nobody behind here is to know it.
                 request.headers_mut().remove(AUTHORIZATION);
+                gateway::strip(request.headers_mut());
                 request.extensions_mut().insert(Arc::clone(&pass));
                 Either::Right(pass.caller().scope(|| self.inner.call(request)))
             }

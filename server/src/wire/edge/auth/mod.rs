@@ -8,12 +8,14 @@
 //! | `file` | files of TOML that are read again |
 //! | `tokens` | the file of bearer tokens |
 //! | `rules` | who the holders of certificates and the users of this machine are |
+//! | `gateway` | whom a proxy in front speaks for |
 //! | `door` | who somebody is, by token, certificate or user; credentials that are over |
 //! | `guard` | the layer through which every request passes |
 
 pub mod credential;
 pub mod door;
 pub mod file;
+pub mod gateway;
 pub mod guard;
 pub mod role;
 pub mod rules;

@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::core::connection::Sight;
 
 /// What somebody may do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
     /// Look.
@@ -26,6 +26,11 @@ pub enum Role {
 }
 
 impl Role {
+    /// The one of that name.
+    pub(super) fn named(name: &str) -> Option<Self> {
+        [Self::Viewer, Self::Driver, Self::Admin].into_iter().find(|role| role.as_str() == name)
+    }
+
     /// Its name in files.
     pub fn as_str(self) -> &'static str {
         match self {

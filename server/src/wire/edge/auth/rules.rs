@@ -11,6 +11,7 @@ use crate::core::tenant::{Tenants, is_tenant_name};
 use crate::wire::edge::admission::Place;
 use crate::wire::edge::auth::credential::Principal;
 use crate::wire::edge::auth::file::{self, FileError};
+use crate::wire::edge::auth::gateway::Said;
 use crate::wire::edge::auth::role::Role;
 use crate::wire::edge::auth::settings::{ANY_SUBJECT, AuthSettings, CertificateRule, PeerRule};
 use crate::wire::edge::certificate::Certificate;
@@ -72,26 +73,46 @@ impl Rules {
         }
     }
 
-    /// Who that is, if a rule says so.
-    pub(super) fn principal(&self, identity: &Identity, tenants: &Tenants) -> Option<Principal> {
-        let principal = |name: &str, tenant: &str, role: Role| Principal {
-            name: name.to_owned(),
-            tenant: tenants.named(tenant),
-            tenant_name: tenant.to_owned(),
-            role,
-        };
+    /// What is said of whoever has that identity.
+    pub(super) fn of(&self, identity: &Identity) -> Option<Rule<'_>> {
         match identity {
             Identity::Certificate(certificate) => self.certificates.iter().find_map(|rule| {
                 let is_it = |name: &&String| rule.subject == ANY_SUBJECT || **name == rule.subject;
-                let name = certificate.names.iter().find(is_it)?;
-                Some(principal(name, &rule.tenant, rule.role))
+                let name = certificate.names.iter().find(is_it)?.clone();
+                let (tenant, role, is_gateway) = (&rule.tenant, rule.role, rule.gateway);
+                Some(Rule { name, tenant, role, is_gateway })
             }),
             Identity::User(uid) => {
                 let rule = self.peers.iter().find(|rule| rule.uid == *uid)?;
                 let name = rule.name.clone().unwrap_or_else(|| format!("uid {uid}"));
-                Some(principal(&name, &rule.tenant, rule.role))
+                let (tenant, role, is_gateway) = (&rule.tenant, rule.role, rule.gateway);
+                Some(Rule { name, tenant, role, is_gateway })
             }
         }
+    }
+}
+
+/// What a rule says of whoever is at the other end of a connection.
+pub(super) struct Rule<'a> {
+    name: String,
+    tenant: &'a str,
+    role: Role,
+    pub(super) is_gateway: bool,
+}
+
+impl Rule<'_> {
+    /// Who calls: a gateway is nobody itself, and nobody else speaks for others.
+    pub(super) fn principal(self, said: Option<&Said>, tenants: &Tenants) -> Option<Principal> {
+        let (name, tenant, role) = match said.filter(|_| self.is_gateway) {
+            None if self.is_gateway => return None,
+            None => (self.name, self.tenant, self.role),
+            Some(said) => {
+                let tenant = said.tenant.as_deref().unwrap_or(self.tenant);
+                (said.name.clone(), tenant, said.role.unwrap_or(self.role).min(self.role))
+            }
+        };
+        let tenant_name = tenant.to_owned();
+        Some(Principal { name, tenant: tenants.named(tenant), tenant_name, role })
     }
 }
 
@@ -103,7 +124,13 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rules.toml");
         std::fs::write(&path, text).unwrap();
-        let own = PeerRule { uid: 7, name: None, tenant: "own".to_owned(), role: Role::Admin };
+        let own = PeerRule {
+            uid: 7,
+            name: None,
+            tenant: "own".to_owned(),
+            role: Role::Admin,
+            gateway: false,
+        };
         let settings =
             AuthSettings { rules: Some(path), peers: vec![own], ..AuthSettings::default() };
         Rules::read(&settings).map_err(|error| error.to_string())
@@ -115,7 +142,7 @@ mod tests {
                     tenant = \"lab\"\nrole = \"driver\"\n\
                     [[certificates]]\nsubject = \"*\"\nrole = \"viewer\"\n";
         let (rules, tenants) = (read(text).unwrap(), Tenants::default());
-        let of = |uid| rules.principal(&Identity::User(uid), &tenants);
+        let of = |uid| rules.of(&Identity::User(uid))?.principal(None, &tenants);
         assert_eq!(of(7).unwrap().role, Role::Admin);
         let eve = of(8).unwrap();
         assert_eq!((eve.name.as_str(), eve.tenant_name.as_str()), ("eve", "lab"));
@@ -123,7 +150,7 @@ mod tests {
         let names = vec!["robot".to_owned()];
         let certificate = Certificate { names, expires: SystemTime::UNIX_EPOCH };
         let robot = Identity::Certificate(Arc::new(certificate));
-        assert_eq!(rules.principal(&robot, &tenants).unwrap().name, "robot");
+        assert_eq!(rules.of(&robot).unwrap().principal(None, &tenants).unwrap().name, "robot");
     }
 
     #[test]

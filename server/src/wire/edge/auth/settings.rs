@@ -40,6 +40,10 @@ pub struct CertificateRule {
     pub tenant: String,
     /// What they may do.
     pub role: Role,
+    /// They are a gateway, which says in headers for whom it calls. Then `tenant` is that of callers of whom it names
+    /// none, and `role` the highest that it can give.
+    #[serde(default)]
+    pub gateway: bool,
 }
 
 /// Who a user of this machine is.
@@ -56,6 +60,10 @@ pub struct PeerRule {
     pub tenant: String,
     /// What they may do.
     pub role: Role,
+    /// They are a gateway, which says in headers for whom it calls. Then `tenant` is that of callers of whom it names
+    /// none, and `role` the highest that it can give.
+    #[serde(default)]
+    pub gateway: bool,
 }
 
 fn default_tenant() -> String {
