@@ -8,7 +8,7 @@ mod viewer;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-use stage::{Failure, Outcome, Stage, run};
+use stage::{Failure, Lane, Outcome, Stage, run, say};
 
 const USAGE: &str = "\
 Runs every check of the workspace.
@@ -21,29 +21,30 @@ Usage: cargo verify [--quick] [--long] [--only STAGE[,STAGE...]] [--list]
   --list     print the stages
 ";
 
-/// Every stage, in order: cheap ones first, so that a slip shows early.
+/// Every stage, in order: cheap ones first, so that a slip shows early; alone what measures times.
 const STAGES: &[Stage] = &[
-    Stage { name: "format", quick: true, run: format },
-    Stage { name: "tools", quick: false, run: tools::install_missing },
-    Stage { name: "proto-lint", quick: false, run: python::lint_proto },
-    Stage { name: "deny", quick: false, run: python::check_dependencies },
-    Stage { name: "clippy", quick: true, run: clippy },
-    Stage { name: "docs", quick: false, run: docs },
-    Stage { name: "build", quick: true, run: build },
-    Stage { name: "tests", quick: true, run: tests },
-    Stage { name: "doctests", quick: false, run: doctests },
-    Stage { name: "stress", quick: false, run: stress },
-    Stage { name: "traces", quick: false, run: traces },
-    Stage { name: "fuzz", quick: false, run: fuzz },
-    Stage { name: "wheel", quick: false, run: python::try_wheel },
-    Stage { name: "python", quick: false, run: python::test_client },
-    Stage { name: "book", quick: false, run: python::make_book },
-    Stage { name: "viewer", quick: false, run: viewer::test_page },
-    Stage { name: "robots", quick: false, run: python::compare_robots },
-    Stage { name: "demo", quick: false, run: demo },
+    Stage { name: "format", quick: true, lane: Lane::Main, run: format },
+    Stage { name: "tools", quick: false, lane: Lane::Aside, run: tools::install_missing },
+    Stage { name: "proto-lint", quick: false, lane: Lane::Aside, run: python::lint_proto },
+    Stage { name: "deny", quick: false, lane: Lane::Aside, run: python::check_dependencies },
+    Stage { name: "clippy", quick: true, lane: Lane::Main, run: clippy },
+    Stage { name: "build", quick: true, lane: Lane::Main, run: build },
+    Stage { name: "tests", quick: true, lane: Lane::Alone, run: tests },
+    Stage { name: "wheel", quick: false, lane: Lane::Aside, run: python::try_wheel },
+    Stage { name: "python", quick: false, lane: Lane::Aside, run: python::test_client },
+    Stage { name: "book", quick: false, lane: Lane::Aside, run: python::make_book },
+    Stage { name: "robots", quick: false, lane: Lane::Aside, run: python::compare_robots },
+    Stage { name: "docs", quick: false, lane: Lane::Main, run: docs },
+    Stage { name: "doctests", quick: false, lane: Lane::Main, run: doctests },
+    Stage { name: "stress", quick: false, lane: Lane::Main, run: stress },
+    Stage { name: "traces", quick: false, lane: Lane::Main, run: traces },
+    Stage { name: "fuzz", quick: false, lane: Lane::Main, run: fuzz },
+    Stage { name: "demo", quick: false, lane: Lane::Main, run: demo },
+    Stage { name: "viewer", quick: false, lane: Lane::Alone, run: viewer::test_page },
 ];
 
 /// What the stages need to know.
+#[derive(Clone)]
 struct Context {
     /// Top folder of the workspace.
     root: PathBuf,
@@ -150,7 +151,7 @@ fn tests(context: &mut Context) -> Outcome {
     let mut command = if tools::has("cargo", &["nextest", "--version"]) {
         context.cargo(&["nextest", "run", "--workspace", "--locked"])
     } else {
-        println!("cargo-nextest is not installed: cargo test runs the tests");
+        say("cargo-nextest is not installed: cargo test runs the tests");
         let mut command = context.cargo(&["test", "--workspace", "--locked", "--no-fail-fast"]);
         command.args(["--lib", "--bins", "--tests", "--examples"]);
         command

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
 use crate::Context;
-use crate::stage::{Failure, Outcome, run};
+use crate::stage::{Failure, Outcome, run, say};
 
 /// A tool, how to see that it is there, and the Debian package that brings it.
 struct Tool {
@@ -62,7 +62,7 @@ pub(crate) fn install_missing(context: &mut Context) -> Outcome {
             apt_get(&["install"], &packages)
         });
         if installed.is_err() {
-            println!("apt-get could not install {}", packages.join(", "));
+            say(&format!("apt-get could not install {}", packages.join(", ")));
         }
     }
     let mut absent: Vec<String> = missing()
