@@ -47,6 +47,7 @@ impl Optimize {
         let mut problem = Problem::parse(&text).with_context(named)?;
         problem.options.method = self.method.or(problem.options.method);
         problem.options.max_iterations = self.iterations.unwrap_or(problem.options.max_iterations);
+        let model = problem.model(&client).await?;
         let resume = match &self.resume {
             Some(file) => Some(read_result(file)?.checkpoint.context("no checkpoint in the file")?),
             None => None,
@@ -54,9 +55,9 @@ impl Optimize {
         let guess = match &self.guess {
             Some(file) => read_result(file)?.checkpoint.and_then(|c| c.trajectory),
             None if resume.is_some() => None,
-            None => Some(problem.first_guess(&client).await?),
+            None => Some(problem.first_guess(&client, &model).await?),
         };
-        let request = problem.request(guess, resume)?;
+        let request = problem.request(&model, guess, resume)?;
         let result = search(&client, &context.output, request).await?;
         if let Some(file) = &self.save {
             write(file, format!("{}\n", json::message("OptimizationResult", &result)))?;

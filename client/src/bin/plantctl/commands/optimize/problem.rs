@@ -4,16 +4,20 @@ use std::collections::BTreeMap;
 
 use anyhow::{Context as _, Result, anyhow, ensure};
 use clap::ValueEnum;
-use plantd_client::{Client, MatrixExt as _, WeightsExt as _, diagonal, full, v1};
+use plantd_client::{Client, MatrixExt as _, WeightsExt as _, full, v1};
 use plantd_scene::in_plain_words;
 use serde::Deserialize;
 
+use crate::contract::names;
 use crate::input::files::from_toml;
+use crate::input::numbers::Vector;
 use crate::input::settings::Settings;
 
 /// What a problem may say.
 pub(crate) const HELP: &str = "\
-The problem, here the swing-up of a pendulum; only model, steps and cost must be there:
+The problem, here the swing-up of a pendulum; only model, steps and cost must be there. A list of numbers can also be
+a table of some by their names, { theta = 3.14 }: entries that are not named are zero, in `initial` those of the
+scene, of a diagonal 1; a diagonal of one number stands for all:
 
   model = \"pendulum\"
   steps = 100
@@ -34,7 +38,7 @@ The problem, here the swing-up of a pendulum; only model, steps and cost must be
   projected_momentum = false        # weigh it in place of the state's own
   x = [[0.0, 0.0]]                  # desired states, one row per step; the last one holds on
   u = [[0.0]]                       # desired inputs, the same way; zero if not given
-  changes = [{ step = 50, x = [3.141592653589793, 0.0] }]   # other desired states from there on
+  changes = [{ step = 50, x = { theta = 3.141592653589793 } }]   # other desired states from there on
 
   [guess]
   u = [[0.0]]                       # inputs, the last row holds on; if not given no forces, and
@@ -88,9 +92,9 @@ pub(crate) struct Problem {
 #[serde(deny_unknown_fields, default)]
 struct Initial {
     at: Option<String>,
-    q: Option<Vec<f64>>,
-    p: Vec<f64>,
-    v: Vec<f64>,
+    q: Option<Vector>,
+    p: Option<Vector>,
+    v: Option<Vector>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -102,9 +106,9 @@ struct Cost {
     s: Option<Vec<Vec<f64>>>,
     #[serde(default)]
     projected_momentum: bool,
-    x: Vec<Vec<f64>>,
+    x: Vec<Vector>,
     #[serde(default)]
-    u: Vec<Vec<f64>>,
+    u: Vec<Vector>,
     #[serde(default)]
     changes: Vec<Change>,
 }
@@ -114,13 +118,13 @@ struct Cost {
 #[serde(deny_unknown_fields)]
 struct Change {
     step: usize,
-    x: Vec<f64>,
+    x: Vector,
 }
 
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Guess {
-    u: Vec<Vec<f64>>,
+    u: Vec<Vector>,
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -165,18 +169,22 @@ struct Projection {
 
 /// A diagonal, or rows.
 #[derive(Debug, Deserialize)]
-#[serde(untagged, expecting = "a list of numbers, or of rows of them, is needed")]
+#[serde(
+    untagged,
+    expecting = "a list of numbers, a table of them by name, or a list of rows is needed"
+)]
 enum Weight {
-    Diagonal(Vec<f64>),
+    Diagonal(Vector),
     Full(Vec<Vec<f64>>),
 }
 
 impl Weight {
-    fn message(&self, name: &str) -> Result<v1::Weight> {
-        Ok(match self {
-            Self::Diagonal(values) => diagonal(values.as_slice()),
-            Self::Full(rows) => full(matrix(name, rows)?),
-        })
+    /// The weight of entries with these names.
+    fn message<N: AsRef<str>>(&self, what: &str, names: &[N]) -> Result<v1::Weight> {
+        match self {
+            Self::Diagonal(values) => values.diagonal(what, names, 1.0),
+            Self::Full(rows) => Ok(full(matrix(what, rows)?)),
+        }
     }
 }
 
@@ -187,12 +195,26 @@ fn matrix(name: &str, rows: &[Vec<f64>]) -> Result<v1::Matrix> {
 }
 
 /// Rows for `steps` steps, of which the last given one holds on.
-fn held(name: &str, rows: &[Vec<f64>], steps: usize) -> Result<Vec<Vec<f64>>> {
-    let last = rows.last().with_context(|| format!("{name}: a row is needed"))?;
-    ensure!(rows.len() <= steps, "{name}: {} rows for {steps}", rows.len());
-    let mut rows = rows.to_vec();
-    rows.resize(steps, last.clone());
+fn held(what: &str, rows: &[Vector], names: &[String], steps: usize) -> Result<Vec<Vec<f64>>> {
+    ensure!(!rows.is_empty(), "{what}: a row is needed");
+    ensure!(rows.len() <= steps, "{what}: {} rows for {steps}", rows.len());
+    let rows = rows.iter().map(|row| row.over(what, names, &[]));
+    let mut rows = rows.collect::<Result<Vec<_>>>()?;
+    rows.resize(steps, rows[rows.len() - 1].clone());
     Ok(rows)
+}
+
+/// Names of what a problem speaks of.
+pub(crate) struct Names {
+    state: Vec<String>,
+    input: Vec<String>,
+}
+
+impl Names {
+    /// Those of a model.
+    fn of(model: &v1::Model) -> Self {
+        Self { state: names::state(model), input: names::input(model) }
+    }
 }
 
 fn bounds(given: &BTreeMap<String, [f64; 2]>) -> Vec<v1::Bound> {
@@ -214,17 +236,18 @@ impl Problem {
         from_toml(text)
     }
 
-    fn cost(&self) -> Result<v1::TrajectoryCost> {
+    fn cost(&self, names: &Names) -> Result<v1::TrajectoryCost> {
+        let Names { state, input } = names;
         let cost = &self.cost;
-        let mut x = held("cost.x", &cost.x, self.steps + 1)?;
+        let mut x = held("cost.x", &cost.x, state, self.steps + 1)?;
         for Change { step, x: desired } in &cost.changes {
             ensure!(*step <= self.steps, "cost.changes: there is no step {step}");
-            x[*step..].fill(desired.clone());
+            x[*step..].fill(desired.over("cost.changes.x", state, &[])?);
         }
-        let mut weights =
-            plantd_client::weights(cost.q.message("cost.q")?, cost.r.message("cost.r")?);
+        let (q, r) = (cost.q.message("cost.q", state)?, cost.r.message("cost.r", input)?);
+        let mut weights = plantd_client::weights(q, r);
         if let Some(q_final) = &cost.q_final {
-            weights = weights.with_final(q_final.message("cost.q_final")?);
+            weights = weights.with_final(q_final.message("cost.q_final", state)?);
         }
         if let Some(s) = &cost.s {
             weights = weights.with_cross(matrix("cost.s", s)?);
@@ -234,7 +257,7 @@ impl Problem {
         }
         let u = match cost.u.as_slice() {
             [] => None,
-            rows => Some(matrix("cost.u", &held("cost.u", rows, self.steps)?)?),
+            rows => Some(matrix("cost.u", &held("cost.u", rows, input, self.steps)?)?),
         };
         Ok(v1::TrajectoryCost {
             x: Some(matrix("cost.x", &x)?),
@@ -244,7 +267,7 @@ impl Problem {
         })
     }
 
-    fn options(&self) -> Result<v1::OptimizationOptions> {
+    fn options(&self, names: &Names) -> Result<v1::OptimizationOptions> {
         let given = &self.options;
         let method = |method: Option<Method>| {
             method.map_or(v1::DescentMethod::Unspecified, v1::DescentMethod::from).into()
@@ -252,8 +275,8 @@ impl Problem {
         let projection = match &given.projection {
             None => None,
             Some(Projection { q, r }) => Some(plantd_client::weights(
-                q.message("options.projection.q")?,
-                r.message("options.projection.r")?,
+                q.message("options.projection.q", &names.state)?,
+                r.message("options.projection.r", &names.input)?,
             )),
         };
         Ok(v1::OptimizationOptions {
@@ -285,8 +308,17 @@ impl Problem {
         settings.into()
     }
 
+    /// The model that it is about.
+    pub(crate) async fn model(&self, client: &Client) -> Result<v1::Model> {
+        Ok(client.get_model(&self.model).await?)
+    }
+
     /// Where the search begins: the file's inputs, from its initial state.
-    pub(crate) async fn first_guess(&self, client: &Client) -> Result<v1::Trajectory> {
+    pub(crate) async fn first_guess(
+        &self,
+        client: &Client,
+        model: &v1::Model,
+    ) -> Result<v1::Trajectory> {
         let point = match &self.initial {
             Initial { at: Some(point), .. } => point.clone(),
             Initial { .. } => "initial".to_owned(),
@@ -297,38 +329,43 @@ impl Problem {
             point: Some(plantd_client::operating_point(point)),
         };
         let mut state = client.linearize(request).await?.state.context("no state in the answer")?;
-        let mut held_u = Vec::new();
         if let Initial { at: None, q: Some(q), p, v } = &self.initial {
-            let filled = |given: &[f64], rest: &[f64]| match given {
-                [] => vec![0.0; rest.len()],
-                given => given.to_vec(),
+            let coordinates = names::coordinates(model);
+            let (dynamic, prescribed) = coordinates.split_at(state.p.len());
+            let filled = |given: &Option<Vector>, what, names: &[_]| match given {
+                None => Ok(vec![0.0; names.len()]),
+                Some(given) => given.over(what, names, &[]),
             };
-            state.p = filled(p, &state.p);
-            state.v = filled(v, &state.v);
-            state.q = q.clone();
+            state.p = filled(p, "initial.p", dynamic)?;
+            state.v = filled(v, "initial.v", prescribed)?;
+            state.q = q.over("initial.q", &coordinates, &state.q)?;
         }
-        if self.guess.u.is_empty() {
-            let model = client.get_model(&self.model).await?;
-            held_u.resize(model.inputs.len(), 0.0);
-            held_u.extend_from_slice(state.q.get(state.p.len()..).unwrap_or_default());
-        }
-        let rows = if self.guess.u.is_empty() { vec![held_u] } else { self.guess.u.clone() };
-        let u = held("guess.u", &rows, self.steps)?;
+        let inputs = Names::of(model).input;
+        let u = match self.guess.u.as_slice() {
+            [] => {
+                let mut held = vec![0.0; model.inputs.len()];
+                held.extend_from_slice(state.q.get(state.p.len()..).unwrap_or_default());
+                vec![held; self.steps]
+            }
+            rows => held("guess.u", rows, &inputs, self.steps)?,
+        };
         Ok(v1::Trajectory { initial: Some(state), u: Some(matrix("guess.u", &u)?) })
     }
 
     /// The search that the problem asks for, begun with `guess` or gone on with from `resume`.
     pub(crate) fn request(
         &self,
+        model: &v1::Model,
         guess: Option<v1::Trajectory>,
         resume: Option<v1::OptimizationCheckpoint>,
     ) -> Result<v1::OptimizeTrajectoryRequest> {
+        let names = Names::of(model);
         let free_initial = match &self.free_initial {
             None => None,
             Some(FreeInitial { entries, weight }) => Some(v1::FreeInitialState {
                 entries: entries.clone(),
                 weight: match weight {
-                    Some(weight) => Some(weight.message("free_initial.weight")?),
+                    Some(weight) => Some(weight.message("free_initial.weight", entries)?),
                     None => None,
                 },
             }),
@@ -336,7 +373,7 @@ impl Problem {
         Ok(v1::OptimizeTrajectoryRequest {
             model: self.model.clone(),
             settings: Some(self.settings()),
-            cost: Some(self.cost()?),
+            cost: Some(self.cost(&names)?),
             guess,
             resume,
             bounds: Some(v1::TrajectoryBounds {
@@ -346,7 +383,7 @@ impl Problem {
                 model_limits: self.bounds.model_limits,
             }),
             free_initial,
-            options: Some(self.options()?),
+            options: Some(self.options(&names)?),
         })
     }
 }
@@ -377,16 +414,23 @@ impl From<Method> for v1::DescentMethod {
 mod tests {
     use super::*;
 
+    fn names() -> Names {
+        Names {
+            state: ["theta", "p(theta)"].map(str::to_owned).to_vec(),
+            input: vec!["tau".to_owned()],
+        }
+    }
+
     #[test]
     fn the_problem_in_the_help_is_one() {
         let (_, text) = HELP.split_once(":\n\n").unwrap();
         let problem = Problem::parse(text).unwrap();
-        let cost = problem.cost().unwrap();
+        let cost = problem.cost(&names()).unwrap();
         let x = cost.x.unwrap();
         assert_eq!((x.rows, x.cols, cost.u.unwrap().rows), (101, 2, 100));
         assert_eq!((x.at(49, 0), x.at(50, 0), x.at(100, 0)), (0.0, x.at(50, 0), x.at(50, 0)));
         assert_eq!(x.at(50, 0), std::f64::consts::PI);
-        let options = problem.options().unwrap();
+        let options = problem.options(&names()).unwrap();
         assert_eq!(options.first_method(), v1::DescentMethod::QuasiNewton);
         assert_eq!(options.first_iterations, 4);
         assert_eq!(bounds(&problem.bounds.input)[0].max, Some(5.0));
@@ -397,12 +441,15 @@ mod tests {
     #[test]
     fn a_problem_names_its_errors() {
         let least = "model = \"m\"\nsteps = 2\n[cost]\nq = [1]\nr = [[1.0]]\n";
-        let cost = |rest: &str| Problem::parse(&format!("{least}{rest}")).unwrap().cost();
+        let cost = |rest: &str| Problem::parse(&format!("{least}{rest}")).unwrap().cost(&names());
         assert!(cost("x = [[0.0]]").is_ok());
+        let named = cost("x = [{ theta = 1.0 }, { \"p(theta)\" = 2.0 }]").unwrap().x.unwrap();
+        assert_eq!(named.data, [1.0, 0.0, 0.0, 2.0, 0.0, 2.0]);
         for (rest, part) in [
             ("x = []", "cost.x: a row is needed"),
             ("x = [[0.0], [1.0], [2.0], [3.0]]", "cost.x: 4 rows for 3"),
             ("x = [[0.0], [1.0, 2.0]]", "cost.x: rows differ"),
+            ("x = [{ tetha = 1.0 }]", "cost.x: there is no `tetha`; did you mean `theta`?"),
             ("x = [[0.0]]\nchanges = [{ step = 3, x = [1.0] }]", "no step 3"),
         ] {
             let error = cost(rest).unwrap_err().to_string();
