@@ -9,6 +9,7 @@ pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod collocation;
 pub(crate) mod explain;
+pub(crate) mod foresight;
 pub(crate) mod matrix;
 pub(crate) mod midpoint;
 pub(crate) mod newton;

@@ -6,6 +6,7 @@
 
 use plantd_math::norms::{larger, largest};
 
+use crate::integrator::foresight::{BOUND, NEGLIGIBLE, Strayed};
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
@@ -41,6 +42,8 @@ struct Chord {
     patience: u32,
     always_factor: bool,
     previous: f64,
+    /// The residual over the one before.
+    rate: f64,
     /// The Jacobian is that of this residual.
     is_fresh: bool,
     /// The last correction was no more than round-off of the coordinates.
@@ -50,8 +53,8 @@ struct Chord {
 impl Chord {
     fn new(settings: &Settings, patience: u32, always_factor: bool) -> Self {
         let enough = settings.precision.residual();
-        let previous = f64::INFINITY;
-        Self { enough, patience, always_factor, previous, is_fresh: false, is_idle: false }
+        let (previous, rate) = (f64::INFINITY, f64::INFINITY);
+        Self { enough, patience, always_factor, previous, rate, is_fresh: false, is_idle: false }
     }
 
     /// Whether the correction of a residual is the last; `is_fresh` says whether it takes a new Jacobian.
@@ -69,8 +72,15 @@ impl Chord {
         // another step would be memory beside the state.
         self.is_fresh = self.previous.is_infinite()
             || (!converged && (self.always_factor || later > self.enough));
+        self.rate = if self.previous.is_infinite() { f64::INFINITY } else { rate };
         self.previous = size;
         converged
+    }
+
+    /// What the correction of the last residual leaves over, from how the residual has fallen: kept factors
+    /// get no better, and those of a new Jacobian are off by twice as much as their first correction shows.
+    fn expected(&self) -> f64 {
+        8.0 * self.previous * self.rate
     }
 }
 
@@ -224,6 +234,7 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
         let mut chord = Chord::new(settings, self.kkt.corrections(), always_factor);
+        let mut strayed = Strayed::default();
         while report.iterations < settings.max_iterations {
             report.iterations += 1;
             // Residual: r1 = p0 + D1Ld + F⁻ − Dh(q0)ᵀ λ, r2 = h(q1).
@@ -238,6 +249,7 @@ impl Workspace {
             if chord.is_fresh {
                 self.factor(model, settings, state)?;
                 report.factorizations += 1;
+                strayed = Strayed::default();
             }
             if report.iterations == 1 && size <= CONVERGED {
                 // Nothing to correct, but what is singular has not passed for solved.
@@ -246,6 +258,15 @@ impl Workspace {
             // Correct: x += dx, λ += dλ.
             self.correct(model);
             // Accept: p1 = D2Ld + F⁺.
+            if model.is_foreseen(settings) {
+                let left = self.foresee(model, settings, &mut strayed);
+                let expected = chord.expected();
+                if left <= BOUND || expected <= NEGLIGIBLE {
+                    report.residual = left.min(expected);
+                    self.step.is_evaluated = false;
+                    return self.accept(model, settings, report);
+                }
+            }
             if converged {
                 if size > STALE {
                     self.evaluate(model, settings, state);
@@ -307,6 +328,9 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         model.check_turns(&self.step.increment)?;
         self.find_impulse(model, settings);
+        if !self.step.is_evaluated {
+            self.nudge_impulse(model, settings);
+        }
         if model.dimensions.constraints > 0 {
             // The extrapolated guess has the least norm of other configurations.
             self.kkt.remove_null(&mut self.step.multipliers);

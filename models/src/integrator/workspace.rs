@@ -9,6 +9,7 @@ use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::generators::Flanks;
+use crate::lagrangian::nudge::Nudge;
 use crate::model::mechanism::Model;
 
 /// What a step is taken of.
@@ -32,6 +33,8 @@ pub(crate) struct Workspace {
     pub(crate) constraints: ConstraintPair,
     pub(crate) kkt: KktSystem,
     pub(crate) tangents: Tangents,
+    /// How the last correction changes the gradient.
+    pub(crate) nudge: Nudge,
 }
 
 /// The unknowns of a step, and where they lead.
@@ -45,6 +48,8 @@ pub(crate) struct StepIncrement {
     pub(crate) impulse: Vec<f64>,
     /// `q[k+1]`.
     pub(crate) q_end: Vec<f64>,
+    /// Whether the last evaluation was at the increment.
+    pub(crate) is_evaluated: bool,
 }
 
 /// What a step's equations leave over; a correction takes its place.
@@ -114,6 +119,7 @@ impl Workspace {
                 multipliers: zeros(nc),
                 impulse: zeros(nd),
                 q_end: zeros(n),
+                is_evaluated: false,
             },
             mid: Midpoint::new(model),
             balls: BallJoints::new(model),
@@ -136,6 +142,7 @@ impl Workspace {
                 ],
                 terms: Vec::with_capacity(nd.max(nc)),
             },
+            nudge: Nudge::new(model),
         }
     }
 

@@ -22,6 +22,9 @@ impl Workspace {
         out.kind = Kind::Step;
         out.time_step_s = at.settings.time_step_s;
         out.at_start = at.settings.force_split.at_start();
+        if !self.step.is_evaluated {
+            self.evaluate(at.model, at.settings, at.state);
+        }
         let is_done = match self.kkt.recursion {
             Recursion::Planar(_) => self.linearize_planar(at, out)?,
             Recursion::Loops(_) => self.linearize_loops(at, out)?,
