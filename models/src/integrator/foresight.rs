@@ -37,13 +37,18 @@ pub(crate) struct Strayed {
 }
 
 impl Model {
-    /// Whether the bodies in space are all there is: then the estimate holds, and the impulse has a derivative
-    /// that is as cheap as a correction.
-    pub(crate) fn is_foreseen(&self, settings: &Settings) -> bool {
+    /// Whether bodies in space, with damping, armatures and inputs on coordinates, are all there is.
+    pub(crate) fn is_of_bodies(&self) -> bool {
         self.constraints.is_empty()
             && self.planar.is_none()
             && self.forces.is_none()
             && self.potentials.springs.is_empty()
+    }
+
+    /// Whether the bodies in space are all there is: then the estimate holds, and the impulse has a derivative
+    /// that is as cheap as a correction.
+    pub(crate) fn is_foreseen(&self, settings: &Settings) -> bool {
+        self.is_of_bodies()
             && (self.orientations.is_empty() || settings.force_split == ForceSplit::Symmetric)
     }
 }

@@ -14,6 +14,7 @@ pub(crate) mod matrix;
 pub(crate) mod midpoint;
 pub(crate) mod newton;
 pub(crate) mod predictor;
+pub(crate) mod push;
 pub(crate) mod report;
 pub(crate) mod residual;
 pub(crate) mod scheme;

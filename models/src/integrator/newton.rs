@@ -91,6 +91,7 @@ impl Workspace {
         self.prepare(at);
         if state.past.predict(settings.time_step_s, &mut self.step.increment) {
             // The equations are linear in the multipliers: any guess is as good.
+            self.push(at);
             self.step.multipliers.copy_from_slice(&state.multipliers);
             let report = self.iterate(model, settings, state, false);
             if report.is_ok() {
@@ -247,7 +248,11 @@ impl Workspace {
             // Factor: K = D2D1Ld + D2F⁻ and S = A1 K⁻¹ A0ᵀ.
             let converged = chord.judge(size, report.constraint_residual);
             if chord.is_fresh {
+                self.response.save_first(&mut self.kkt);
                 self.factor(model, settings, state)?;
+                if report.factorizations == 0 {
+                    self.note_point(StepContext { model, settings, state, u: &[] });
+                }
                 report.factorizations += 1;
                 strayed = Strayed::default();
             }

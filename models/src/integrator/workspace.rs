@@ -5,6 +5,7 @@ use plantd_math::rows::{Term, padded, spread};
 use crate::constraints::closure::Closure;
 use crate::integrator::balls::BallJoints;
 use crate::integrator::midpoint::Midpoint;
+use crate::integrator::push::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::system::KktSystem;
@@ -35,6 +36,7 @@ pub(crate) struct Workspace {
     pub(crate) tangents: Tangents,
     /// How the last correction changes the gradient.
     pub(crate) nudge: Nudge,
+    pub(crate) response: Response,
 }
 
 /// The unknowns of a step, and where they lead.
@@ -113,7 +115,9 @@ impl Workspace {
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
         let has_balls = !model.orientations.is_empty();
         let zeros = |len: usize| vec![0.0; len];
+        let kkt = KktSystem::new(model, spread(padded(2 * n)));
         Self {
+            response: Response::new(model, &kkt),
             step: StepIncrement {
                 increment: zeros(nd),
                 multipliers: zeros(nc),
@@ -130,7 +134,7 @@ impl Workspace {
                 round_off: 0.0,
             },
             constraints: ConstraintPair { start: Closure::new(model), end: Closure::new(model) },
-            kkt: KktSystem::new(model, spread(padded(2 * n))),
+            kkt,
             tangents: Tangents {
                 diagonals: [zeros(nd), zeros(nd)],
                 constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
@@ -154,5 +158,6 @@ impl Workspace {
     /// The end of this step is the start of the next.
     pub(crate) fn move_on(&mut self) {
         self.constraints.move_on(!self.balls.turns.is_empty());
+        self.response.move_on(&mut self.kkt);
     }
 }

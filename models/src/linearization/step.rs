@@ -25,7 +25,8 @@ impl Workspace {
         if !self.step.is_evaluated {
             self.evaluate(at.model, at.settings, at.state);
         }
-        let is_done = match self.kkt.recursion {
+        self.response.save_first(&mut self.kkt);
+        let is_done = match self.kkt.factored.recursion {
             Recursion::Planar(_) => self.linearize_planar(at, out)?,
             Recursion::Loops(_) => self.linearize_loops(at, out)?,
             Recursion::None | Recursion::Spatial(_) => false,
@@ -43,7 +44,13 @@ impl Workspace {
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
         let units = at.model.dimensions.coordinates();
         let elimination = &at.model.elimination;
-        self.kkt.tree.solve_units(elimination, &mut out.increment, out.stride, columns, units);
+        self.kkt.factored.tree.solve_units(
+            elimination,
+            &mut out.increment,
+            out.stride,
+            columns,
+            units,
+        );
         if d.constraints > 0 {
             self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
@@ -68,7 +75,7 @@ impl Workspace {
         self.fill_inputs(at, out);
         let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
         let (Some(tree), Some(joints), Recursion::Planar(recursion)) =
-            (tree, &model.planar, &mut self.kkt.recursion)
+            (tree, &model.planar, &mut self.kkt.factored.recursion)
         else {
             return Ok(false);
         };
@@ -122,7 +129,7 @@ impl Workspace {
             tree,
             &self.constraints.start.in_plane,
             &self.constraints.end.in_plane,
-            &mut self.kkt.recursion,
+            &mut self.kkt.factored.recursion,
         ) else {
             return Ok(false);
         };
