@@ -24,7 +24,7 @@ use crate::model::mechanism::Model;
 
 /// What may be left of the residual unseen, in units of its round-off: as much as is expected, and the estimate
 /// that is too large by far.
-pub(crate) const NEGLIGIBLE: f64 = 0.1;
+pub(crate) const NEGLIGIBLE: f64 = 0.2;
 pub(crate) const BOUND: f64 = 0.5;
 
 /// How far corrections have gone from the increment of the Jacobian.
@@ -45,7 +45,7 @@ impl Model {
             && self.potentials.springs.is_empty()
     }
 
-    /// Whether the bodies in space are all there is: then the estimate holds, and the impulse has a derivative
+    /// Whether the bodies are all there is: then the estimate holds, and the impulse has a derivative
     /// that is as cheap as a correction.
     pub(crate) fn is_foreseen(&self, settings: &Settings) -> bool {
         self.is_of_bodies()

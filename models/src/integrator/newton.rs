@@ -91,7 +91,9 @@ impl Workspace {
         self.prepare(at);
         if state.past.predict(settings.time_step_s, &mut self.step.increment) {
             // The equations are linear in the multipliers: any guess is as good.
-            self.push(at);
+            if !state.past.point.is_empty() {
+                self.push(at);
+            }
             self.step.multipliers.copy_from_slice(&state.multipliers);
             let report = self.iterate(model, settings, state, false);
             if report.is_ok() {
@@ -250,7 +252,7 @@ impl Workspace {
             if chord.is_fresh {
                 self.response.save_first(&mut self.kkt);
                 self.factor(model, settings, state)?;
-                if report.factorizations == 0 {
+                if report.factorizations == 0 && !state.past.point.is_empty() {
                     self.note_point(StepContext { model, settings, state, u: &[] });
                 }
                 report.factorizations += 1;

@@ -160,14 +160,10 @@ impl Past {
                 let rows = rows.iter_mut().zip(increments).zip(inertia);
                 for (i, ((differences, increment), weight)) in rows.enumerate() {
                     let mut difference = *increment;
-                    let (first, others) = differences.split_at_mut(2);
-                    let (first_errors, other_errors) = errors.split_at_mut(2);
-                    for (kept, error) in first.iter_mut().zip(first_errors) {
-                        *error += difference * difference * weight;
-                        (*kept, difference) = (difference, difference - *kept);
-                    }
-                    difference -= pushed.get(i).copied().unwrap_or_default();
-                    for (kept, error) in others.iter_mut().zip(other_errors) {
+                    for (m, (kept, error)) in differences.iter_mut().zip(&mut errors).enumerate() {
+                        if m == 2 && !pushed.is_empty() {
+                            difference -= pushed[i];
+                        }
                         *error += difference * difference * weight;
                         (*kept, difference) = (difference, difference - *kept);
                     }

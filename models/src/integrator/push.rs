@@ -169,9 +169,6 @@ impl Workspace {
         let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
         self.response.place = Place::Nowhere;
         let last = &state.past.point;
-        if last.is_empty() {
-            return;
-        }
         self.response.pushed.fill(0.0);
         if !last.is_of_length(h) {
             return;
@@ -243,9 +240,6 @@ impl Workspace {
         let StepContext { model, settings, state, .. } = at;
         let (h, a) = (settings.time_step_s, settings.force_split.at_start());
         let Self { response, mid, step, .. } = self;
-        if response.point.is_empty() {
-            return;
-        }
         response.place = Place::System;
         let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
         let end = response.point.numbers.len() - nd;
@@ -268,6 +262,75 @@ impl Workspace {
         put(&mid.velocity[nd..]);
         for Mat3([x, y, z]) in &mid.orientations {
             [x, y, z].into_iter().for_each(|Vec3(column)| put(column));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use crate::integrator::settings::Settings;
+    use crate::linearization::linearize::Linearization;
+    use crate::model::mechanism::Model;
+    use crate::plant::facade::Plant;
+    use crate::plant::initial::Initial;
+    use crate::plant::snapshot::Snapshot;
+    use plantd_scene::builtin;
+
+    /// Moves from a posture in which all joints move, with torques that change at each step.
+    fn pushed(name: &str, torque: f64) -> (Plant, impl FnMut(u32) -> Vec<f64>) {
+        let model = Arc::new(Model::compile(&builtin::scene(name).unwrap()).unwrap());
+        let settings = Settings { time_step_s: 0.002, ..Settings::new(&model) };
+        let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+        let n = model.dimensions.coordinates();
+        let (q, v) = (plant.q().to_vec(), (0..n).map(|i| 0.5 * (1.7 * i as f64).sin()).collect());
+        plant.initialize(&Initial::Velocity { q, v }).unwrap();
+        let inputs = model.dimensions.input();
+        let input = move |k: u32| -> Vec<f64> {
+            (0..inputs).map(|i| torque * f64::from(k * k + 7 * i as u32).sin()).collect()
+        };
+        (plant, input)
+    }
+
+    #[test]
+    fn guesses_follow_from_the_state_alone() {
+        for name in ["tree-15", "tree-127", "walker-4"] {
+            let (mut plant, mut input) = pushed(name, 0.3);
+            let mut out = Linearization::new(plant.model());
+            for k in 0..40 {
+                let u = input(k);
+                let bytes = plant.snapshot().to_bytes();
+                // Factors of nothing, of another step, and of this one at its solution.
+                let mut restored =
+                    Plant::new(Arc::clone(plant.model()), *plant.settings()).unwrap();
+                restored.restore(&Snapshot::from_bytes(&bytes).unwrap()).unwrap();
+                let mut linearized = plant.clone();
+                linearized.linearize(&input(k + 3), &mut out).unwrap();
+                plant.step(&u).unwrap();
+                restored.step(&u).unwrap();
+                linearized.step_and_linearize(&u, &mut out).unwrap();
+                assert_eq!(plant.snapshot(), restored.snapshot(), "{name} {k}");
+                assert_eq!(plant.snapshot(), linearized.snapshot(), "{name} {k}");
+                if k % 3 == 0 {
+                    plant = restored;
+                } else if k % 3 == 1 {
+                    plant = linearized;
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn torques_that_change_are_guessed() {
+        for name in ["tree-15", "walker-9"] {
+            let (mut plant, mut input) = pushed(name, 0.3);
+            let (mut evaluations, steps) = (0, 40);
+            for k in 0..steps + 10 {
+                let report = plant.step(&input(k)).unwrap();
+                evaluations += if k < 10 { 0 } else { report.iterations };
+            }
+            assert!(evaluations <= 3 * steps, "{name}: {evaluations}");
         }
     }
 }

@@ -146,3 +146,56 @@ impl Nudge {
 fn over(above: &[Above], parent: usize) -> Above {
     if parent == WORLD { Above::default() } else { above[parent] }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lagrangian::derivatives::Derivatives;
+    use crate::lagrangian::samples::{assert_close, configuration, random_models};
+    use plantd_scene::builtin;
+
+    /// What comes of one pass is what the matrices make of the change.
+    #[test]
+    fn changes_are_products_with_the_second_derivatives() {
+        let names = ["tree-7", "walker-3", "balls-7", "spherical-pendulum"];
+        let built_in = names.map(|name| Model::compile(&builtin::scene(name).unwrap()).unwrap());
+        let random = random_models(40).into_iter().map(|mut model| {
+            // Of bodies alone.
+            model.potentials.springs.clear();
+            model.armature.clear();
+            model.planar = None;
+            model
+        });
+        for model in built_in.into_iter().chain(random) {
+            let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
+            let (at, velocity) = configuration(&model, 1);
+            let mut mechanics = Mechanics::new(&model);
+            let [mut l_q, mut l_v] = [0; 2].map(|_| vec![0.0; nd]);
+            let gradient = [&mut l_q[..], &mut l_v[..]];
+            mechanics.gradient(&model, &at.q, &at.orientations, &velocity, gradient);
+            mechanics.differentiate(&model);
+            let mut dense = Derivatives::new(&model);
+            let inputs = vec![0.0; model.dimensions.inputs];
+            dense.evaluate(&model, (&at.q, &at.orientations), &velocity, &inputs);
+
+            let mut nudge = Nudge::new(&model);
+            for i in 0..nd {
+                nudge.position[i] = (0.7 * i as f64 + 0.2).sin();
+                nudge.velocity[i] = (1.1 * i as f64 + 0.4).cos();
+            }
+            nudge.find(&model, &mechanics);
+            let Nudge { position: a, velocity: b, .. } = &nudge;
+            let sum = |i: usize, entry: &dyn Fn(usize, usize) -> [f64; 2]| -> f64 {
+                (0..nd).map(|j| entry(i, j)[0] * a[j] + entry(i, j)[1] * b[j]).sum()
+            };
+            let of = |i: usize| sum(i, &|i, j| [dense.l_qq[i * n + j], dense.l_qv[i * n + j]]);
+            let expected: Vec<f64> = (0..nd).map(of).collect();
+            assert_close("torque", &nudge.l_q, &expected);
+            let of = |i: usize| sum(i, &|i, j| [dense.l_qv[j * n + i], dense.l_vv[i * n + j]]);
+            for &i in model.orientations.iter().filter(|i| **i < nd) {
+                let expected: Vec<f64> = (i..i + 3).map(of).collect();
+                assert_close("momentum", &nudge.l_v[i..i + 3], &expected);
+            }
+        }
+    }
+}
