@@ -9,8 +9,8 @@
 //! |r1| ≲ √I_max (1 + Σ |x|) α σ / h      α = Σ |x'_i|      σ² = Σ I_i x'_i²
 //! ```
 //!
-//! With the Jacobian of an increment that is `y` away it is `α_y σ + α σ_y + α σ` in place of `α σ`. In motions of
-//! many joints less than a hundredth of it is left. Metres count as radians: of slides that is more than it need
+//! With the Jacobian of an increment that is `y` away it is `α_y σ + α σ_y + α σ` in place of `α σ`. In motions
+//! of many joints less than a tenth of it is left. Metres count as radians: of slides that is more than it need
 //! be. A second estimate is [`Chord::expected`](super::newton), from how the residual has fallen so far.
 //!
 //! `p[k+1] = p[k] + h (τ + f)` has been found before the correction; what the correction makes of it is linear,
@@ -22,10 +22,12 @@ use crate::integrator::settings::{ForceSplit, Settings};
 use crate::integrator::workspace::Workspace;
 use crate::model::mechanism::Model;
 
-/// What may be left of the residual unseen, in units of its round-off: as much as is expected, and the estimate
-/// that is too large by far.
-pub(crate) const NEGLIGIBLE: f64 = 0.2;
-pub(crate) const BOUND: f64 = 0.5;
+/// What may be left of the residual unseen, in units of its round-off, as it is estimated.
+const UNSEEN: f64 = 0.5;
+/// The same where the residual has fallen accordingly, and what may be expected from that. By itself the fall says
+/// little: what is linear falls at once, and hides what is not.
+const BORNE_OUT: f64 = 16.0;
+const EXPECTED: f64 = 0.2;
 
 /// How far corrections have gone from the increment of the Jacobian.
 #[derive(Clone, Copy, Debug, Default)]
@@ -53,8 +55,14 @@ impl Model {
     }
 }
 
+/// Whether a residual that is estimated and expected to be left may stay unseen.
+pub(crate) fn is_negligible(left: f64, expected: f64) -> bool {
+    left <= UNSEEN || (left <= BORNE_OUT && expected <= EXPECTED)
+}
+
 impl Workspace {
     /// What the last correction leaves of the residual, in units of its round-off.
+    #[inline(never)]
     pub(crate) fn foresee(&self, model: &Model, settings: &Settings, strayed: &mut Strayed) -> f64 {
         let corrections = &self.residual.dynamics[..];
         let (mut turned, mut moved, mut square, mut largest) = (0.0, 0.0, 0.0, 0.0_f64);
@@ -74,6 +82,7 @@ impl Workspace {
     }
 
     /// Moves the impulse on by the last correction, at the last factorization.
+    #[inline(never)]
     pub(crate) fn nudge_impulse(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
         let Self { step, mid, balls, residual, kkt, nudge, .. } = self;
@@ -120,6 +129,7 @@ mod tests {
 
     use super::*;
     use crate::integrator::workspace::StepContext;
+    use crate::model::mechanism::Solver;
     use crate::plant::facade::Plant;
     use crate::plant::initial::Initial;
     use plantd_math::norms::largest;
@@ -130,10 +140,22 @@ mod tests {
     #[test]
     fn what_is_left_unseen_is_round_off() {
         let mut unseen = 0;
-        let names = ["spherical-pendulum", "tree-15", "walker-9", "balls-1", "balls-2", "balls-31"];
+        let names = [
+            "spherical-pendulum",
+            "tree-15",
+            "walker-9",
+            "balls-1",
+            "balls-2",
+            "balls-31",
+            "chain-8",
+        ];
         for name in names {
             let Some(scene) = builtin::scene(name) else { panic!("{name}") };
-            let model = Arc::new(Model::compile(&scene).unwrap());
+            let mut model = Model::compile(&scene).unwrap();
+            if model.planar.take().is_some() {
+                model.solver = Solver::Spatial;
+            }
+            let model = Arc::new(model);
             let settings = Settings { time_step_s: 0.002, ..Settings::new(&model) };
             let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
             let n = model.dimensions.coordinates();
@@ -152,7 +174,7 @@ mod tests {
                     let impulse = workspace.step.impulse.clone();
                     let at = StepContext { model, settings: &settings, state, u: &u };
                     let size = workspace.evaluate(at.model, at.settings, at.state);
-                    assert!(report.residual <= BOUND && size < 16.0, "{name}: {size}");
+                    assert!(report.residual <= UNSEEN && size < 64.0, "{name}: {size}");
                     workspace.find_impulse(model, &settings);
                     let apart: Vec<f64> =
                         impulse.iter().zip(&workspace.step.impulse).map(|(a, b)| a - b).collect();

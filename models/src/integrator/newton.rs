@@ -6,7 +6,7 @@
 
 use plantd_math::norms::{larger, largest};
 
-use crate::integrator::foresight::{BOUND, NEGLIGIBLE, Strayed};
+use crate::integrator::foresight::{Strayed, is_negligible};
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
@@ -268,7 +268,7 @@ impl Workspace {
             if model.is_foreseen(settings) {
                 let left = self.foresee(model, settings, &mut strayed);
                 let expected = chord.expected();
-                if left <= BOUND || expected <= NEGLIGIBLE {
+                if is_negligible(left, expected) {
                     report.residual = left.min(expected);
                     self.step.is_evaluated = false;
                     return self.accept(model, settings, report);

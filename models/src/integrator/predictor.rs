@@ -52,6 +52,26 @@ const NODES: usize = 5;
 /// Velocities closer in time than this, relative to the step, count as one.
 const APART: f64 = 0.1;
 
+/// Takes new increments into the differences of past ones, those from `∇²` on less what was pushed, and sums up
+/// their squares, weighed.
+#[inline(always)]
+fn difference<'a>(
+    rows: impl Iterator<Item = (&'a mut [f64; LENGTH], f64, f64, f64)>,
+) -> [f64; LENGTH] {
+    let mut errors = [0.0; LENGTH];
+    for (differences, increment, pushed, weight) in rows {
+        let mut difference = increment;
+        for (m, (kept, error)) in differences.iter_mut().zip(&mut errors).enumerate() {
+            if m == 2 {
+                difference -= pushed;
+            }
+            *error += difference * difference * weight;
+            (*kept, difference) = (difference, difference - *kept);
+        }
+    }
+    errors
+}
+
 impl Past {
     pub(crate) fn new(scheme: Scheme, model: &Model) -> Self {
         let mut past = Self::of_size(scheme, model.dimensions.dynamic);
@@ -156,18 +176,13 @@ impl Past {
         let rows = self.numbers.as_chunks_mut::<LENGTH>().0;
         match self.kind {
             Kind::Increments => {
-                let mut errors = [0.0; LENGTH];
                 let rows = rows.iter_mut().zip(increments).zip(inertia);
-                for (i, ((differences, increment), weight)) in rows.enumerate() {
-                    let mut difference = *increment;
-                    for (m, (kept, error)) in differences.iter_mut().zip(&mut errors).enumerate() {
-                        if m == 2 && !pushed.is_empty() {
-                            difference -= pushed[i];
-                        }
-                        *error += difference * difference * weight;
-                        (*kept, difference) = (difference, difference - *kept);
-                    }
-                }
+                let errors = if pushed.is_empty() {
+                    difference(rows.map(|((row, x), weight)| (row, *x, 0.0, *weight)))
+                } else {
+                    let rows = rows.zip(pushed);
+                    difference(rows.map(|(((row, x), weight), push)| (row, *x, *push, *weight)))
+                };
                 // Of the differences, as many mean something as there were increments before.
                 let known = usize::from(self.known).clamp(1, LENGTH - 1);
                 let better =

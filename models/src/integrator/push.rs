@@ -163,6 +163,7 @@ impl Response {
 
 impl Workspace {
     /// Adds to the guess what the change of inputs does.
+    #[inline(never)]
     pub(crate) fn push(&mut self, at: StepContext<'_>) {
         let StepContext { model, settings, state, .. } = at;
         let (h, a) = (settings.time_step_s, settings.force_split.at_start());
@@ -236,6 +237,7 @@ impl Workspace {
     }
 
     /// Takes note of the point where the step has just been factored for the first time.
+    #[inline(never)]
     pub(crate) fn note_point(&mut self, at: StepContext<'_>) {
         let StepContext { model, settings, state, .. } = at;
         let (h, a) = (settings.time_step_s, settings.force_split.at_start());
