@@ -2,7 +2,8 @@
 //!
 //! Corrections solve the KKT system of [`crate::kkt::system`] with `A0 = Dh(q[k])` and `A1 = Dh(q[k+1])`.
 //! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
-//! measured in units of its own round-off; the solver stops where arithmetic does.
+//! measured in units of its own round-off; the solver stops where arithmetic does, or where it is foreseen
+//! to ([`foresight`](super::foresight)).
 
 use plantd_math::norms::{larger, largest};
 

@@ -12,7 +12,7 @@
 //! Steps of uneven length interpolate velocities nearby ([`Kind::Trail`]); collocation goes on with its
 //! polynomial ([`Kind::Stages`]).
 
-use crate::integrator::push::Point;
+use crate::integrator::point::Point;
 use crate::integrator::scheme::{STAGES_MAX, Scheme, Tableau};
 use crate::model::mechanism::Model;
 
@@ -272,7 +272,7 @@ impl Past {
     pub(crate) fn is_like(&self, other: &Self) -> bool {
         std::mem::discriminant(&self.kind) == std::mem::discriminant(&other.kind)
             && self.numbers.len() == other.numbers.len()
-            && self.point.numbers().len() == other.point.numbers().len()
+            && self.point.numbers.len() == other.point.numbers.len()
     }
 
     /// There is no past to guess from.
@@ -291,7 +291,7 @@ impl Past {
 
     /// All numbers that it keeps.
     pub(crate) fn numbers(&mut self) -> impl Iterator<Item = &mut f64> {
-        self.numbers.iter_mut().chain(self.point.numbers_mut())
+        self.numbers.iter_mut().chain(&mut self.point.numbers)
     }
 }
 

@@ -10,96 +10,10 @@
 use plantd_math::rotation::Turn;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
+use crate::integrator::point::{Parts, Point};
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::system::{Factored, KktSystem};
-use crate::model::mechanism::{Dimensions, Model};
-
-/// The point where a step was factored: its length, forces of inputs, increments, angles, velocities of
-/// prescribed coordinates, orientations. In a state its `w` comes last.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Point {
-    /// Empty where no input pushes, or more than bodies is pushed.
-    numbers: Vec<f64>,
-}
-
-/// The parts of a point.
-struct Parts<'a> {
-    force: &'a [f64],
-    increment: &'a [f64],
-    angles: &'a [f64],
-    prescribed: &'a [f64],
-    orientations: &'a [f64],
-    weighed: &'a [f64],
-}
-
-impl Point {
-    /// Numbers of a point in a state, with so many dynamic and prescribed coordinates and orientations.
-    pub(crate) fn length(nd: usize, nk: usize, orientations: usize) -> usize {
-        1 + 4 * nd + 2 * nk + 9 * orientations
-    }
-
-    pub(crate) fn zeros(length: usize) -> Self {
-        Self { numbers: vec![0.0; length] }
-    }
-
-    /// Of the plants of a model.
-    pub(crate) fn of(model: &Model) -> Self {
-        let Dimensions { dynamic, prescribed, .. } = model.dimensions;
-        let pushes = model.is_of_bodies() && !model.coordinate_inputs.is_empty();
-        let length = Self::length(dynamic, prescribed, model.orientations.len());
-        if pushes { Self::zeros(length) } else { Self::default() }
-    }
-
-    pub(crate) fn numbers(&self) -> &[f64] {
-        &self.numbers
-    }
-
-    pub(crate) fn numbers_mut(&mut self) -> &mut [f64] {
-        &mut self.numbers
-    }
-
-    pub(crate) fn is_empty(&self) -> bool {
-        self.numbers.is_empty()
-    }
-
-    /// There was no step.
-    pub(crate) fn forget(&mut self) {
-        self.numbers.iter_mut().take(1).for_each(|h| *h = 0.0);
-    }
-
-    /// Whether there was a step.
-    fn is_known(&self) -> bool {
-        self.numbers.first().is_some_and(|h| *h != 0.0)
-    }
-
-    /// Whether it is of a step of that length.
-    fn is_of_length(&self, h: f64) -> bool {
-        self.numbers.first() == Some(&h)
-    }
-
-    /// Whether the factors are the same.
-    fn is_factored_as(&self, other: &Self, nd: usize) -> bool {
-        let end = self.numbers.len().saturating_sub(nd);
-        self.numbers[..end] == other.numbers[..end]
-    }
-
-    fn parts(&self, nd: usize, n: usize) -> Parts<'_> {
-        let (_, rest) = self.numbers.split_at(1);
-        let (force, rest) = rest.split_at(nd);
-        let (increment, rest) = rest.split_at(nd);
-        let (angles, rest) = rest.split_at(n);
-        let (prescribed, rest) = rest.split_at(n - nd);
-        let (orientations, weighed) = rest.split_at(rest.len() - nd);
-        Parts { force, increment, angles, prescribed, orientations, weighed }
-    }
-
-    /// Becomes the point of the step that was taken.
-    pub(crate) fn follow(&mut self, next: &Self) {
-        if !self.is_empty() {
-            self.numbers.copy_from_slice(&next.numbers);
-        }
-    }
-}
+use crate::model::mechanism::Model;
 
 /// `a f[k] + (1 − a) f[k−1]`.
 #[inline(always)]
