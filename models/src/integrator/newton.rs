@@ -266,6 +266,9 @@ impl Workspace {
             // Correct: x += dx, λ += dλ.
             self.correct(model);
             // Accept: p1 = D2Ld + F⁺.
+            if converged && size <= STALE {
+                return self.accept(model, settings, report);
+            }
             if model.is_foreseen(settings) {
                 let left = self.foresee(model, settings, &mut strayed);
                 let expected = chord.expected();
@@ -276,9 +279,7 @@ impl Workspace {
                 }
             }
             if converged {
-                if size > STALE {
-                    self.evaluate(model, settings, state);
-                }
+                self.evaluate(model, settings, state);
                 return self.accept(model, settings, report);
             }
             chord.is_idle = self.is_round_off_of_coordinates();
