@@ -191,7 +191,7 @@ impl Workspace {
         self.mid.mechanics.differentiate(model);
         self.weigh_balls(model, settings);
         let Self { mid, kkt, balls, .. } = self;
-        let (matrix, weights) = (&mut kkt.tree, &kkt.balls);
+        let (matrix, weights) = (&mut kkt.factored.tree, &kkt.balls);
         wide!({
             let step = Step::new(&balls.vertical, h, MatrixKind::Newton);
             let generators = &mut balls.generators[..];
@@ -236,7 +236,7 @@ impl Workspace {
         let (h, a) = (settings.time_step_s, settings.force_split.at_start());
         let nd = model.dimensions.dynamic;
         let Self { mid, kkt, balls, .. } = self;
-        let (matrix, weights) = (&mut kkt.tree, &kkt.balls);
+        let (matrix, weights) = (&mut kkt.factored.tree, &kkt.balls);
         let (torque, column) = (|o: usize| weights[o].torque, |o: usize| weights[o].column);
         let mut add_turned = |i: usize, j: usize, value: f64| {
             balls.for_each_row(i, torque, |row, t| {

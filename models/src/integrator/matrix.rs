@@ -102,7 +102,7 @@ impl Workspace {
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
         let h = settings.time_step_s;
         if model.potentials.couple_branches || model.forces.is_some() {
-            self.kkt.tree.clear();
+            self.kkt.factored.tree.clear();
         }
         if !model.orientations.is_empty() {
             self.fill_turned_newton_matrix(model, settings);
@@ -110,18 +110,18 @@ impl Workspace {
         }
         self.mid.mechanics.differentiate(model);
         if let (Some(planar), Some(joints)) = (&mut self.mid.mechanics.planar, &model.planar) {
-            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.kkt.tree);
+            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.kkt.factored.tree);
         } else {
             self.mid.mechanics.curvature.fill_newton_matrix(
                 &model.pairs,
                 &self.mid.mechanics.momenta,
                 model.gravity,
                 h,
-                &mut self.kkt.tree,
+                &mut self.kkt.factored.tree,
             );
         }
         if model.potentials.any {
-            let (dynamic, matrix) = (model.dimensions.dynamic, &mut self.kkt.tree);
+            let (dynamic, matrix) = (model.dimensions.dynamic, &mut self.kkt.factored.tree);
             let poses = &self.mid.mechanics.poses;
             model.for_each_spring_derivative(poses, &self.mid.q, |i, j, value| {
                 if i < dynamic && j < dynamic {
@@ -129,12 +129,12 @@ impl Workspace {
                 }
             });
             for entry in &model.armature {
-                armature::add_to(&mut self.kkt.tree, model, entry, -1.0 / h);
+                armature::add_to(&mut self.kkt.factored.tree, model, entry, -1.0 / h);
             }
         }
         for (i, c) in model.damping.iter().enumerate() {
             let slot = model.elimination.offsets[i + 1] - 1;
-            self.kkt.tree.add_to_diagonal(slot, -settings.force_split.at_start() * c);
+            self.kkt.factored.tree.add_to_diagonal(slot, -settings.force_split.at_start() * c);
         }
         if let Some(forces) = &model.forces {
             self.add_forces_to_newton_matrix(model, forces, settings);
@@ -175,7 +175,7 @@ impl Workspace {
         let (a, half) = (settings.force_split.at_start(), 0.5 * settings.time_step_s);
         let dynamic = model.dimensions.dynamic;
         let instant = self.mid.instant(model);
-        let matrix = &mut self.kkt.tree;
+        let matrix = &mut self.kkt.factored.tree;
         forces.for_each_derivative(&instant, |i, j, by_q, by_v| {
             if i < dynamic && j < dynamic {
                 matrix.add(&model.elimination, i, j, a * (half * by_q + by_v));
@@ -190,7 +190,7 @@ impl Workspace {
         settings: &Settings,
         state: &PreciseState,
     ) -> Result<(), StepError> {
-        if self.kkt.valid == Factors::Tree {
+        if self.kkt.factored.valid == Factors::Tree {
             return Ok(());
         }
         self.prepare_start(model, state);

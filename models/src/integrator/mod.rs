@@ -1,6 +1,6 @@
 //! The variational integrator: one step of the forced, constrained discrete Euler-Lagrange equations.
 //!
-//! Read [`residual`] first: it has the equations. [`newton`] solves them, from the guess of [`predictor`], at
+//! Read [`residual`] first: it has the equations. [`newton`] solves them, from the guess of [`predictor`] and [`push`], at
 //! the [`midpoint`], with matrices that [`matrix`] fills and [`crate::kkt`] factors; [`balls`] replaces
 //! coordinates of ball joints by orientations. [`collocation`] is the method of higher orders, of which
 //! [`scheme`] has the coefficients.
@@ -9,10 +9,13 @@ pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod collocation;
 pub(crate) mod explain;
+pub(crate) mod foresight;
 pub(crate) mod matrix;
 pub(crate) mod midpoint;
 pub(crate) mod newton;
+pub(crate) mod point;
 pub(crate) mod predictor;
+pub(crate) mod push;
 pub(crate) mod report;
 pub(crate) mod residual;
 pub(crate) mod scheme;

@@ -2,10 +2,12 @@
 //!
 //! Corrections solve the KKT system of [`crate::kkt::system`] with `A0 = Dh(q[k])` and `A1 = Dh(q[k+1])`.
 //! `K` and `S` are factored at the guess and kept while the residual falls fast. The residual is
-//! measured in units of its own round-off; the solver stops where arithmetic does.
+//! measured in units of its own round-off; the solver stops where arithmetic does, or where it is foreseen
+//! to ([`foresight`](super::foresight)).
 
 use plantd_math::norms::{larger, largest};
 
+use crate::integrator::foresight::{Strayed, is_negligible};
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::{Precision, Settings};
 use crate::integrator::state::PreciseState;
@@ -41,6 +43,8 @@ struct Chord {
     patience: u32,
     always_factor: bool,
     previous: f64,
+    /// The residual over the one before.
+    rate: f64,
     /// The Jacobian is that of this residual.
     is_fresh: bool,
     /// The last correction was no more than round-off of the coordinates.
@@ -50,8 +54,8 @@ struct Chord {
 impl Chord {
     fn new(settings: &Settings, patience: u32, always_factor: bool) -> Self {
         let enough = settings.precision.residual();
-        let previous = f64::INFINITY;
-        Self { enough, patience, always_factor, previous, is_fresh: false, is_idle: false }
+        let (previous, rate) = (f64::INFINITY, f64::INFINITY);
+        Self { enough, patience, always_factor, previous, rate, is_fresh: false, is_idle: false }
     }
 
     /// Whether the correction of a residual is the last; `is_fresh` says whether it takes a new Jacobian.
@@ -69,8 +73,15 @@ impl Chord {
         // another step would be memory beside the state.
         self.is_fresh = self.previous.is_infinite()
             || (!converged && (self.always_factor || later > self.enough));
+        self.rate = if self.previous.is_infinite() { f64::INFINITY } else { rate };
         self.previous = size;
         converged
+    }
+
+    /// What the correction of the last residual leaves over, from how the residual has fallen: kept factors
+    /// get no better, and those of a new Jacobian are off by twice as much as their first correction shows.
+    fn expected(&self) -> f64 {
+        8.0 * self.previous * self.rate
     }
 }
 
@@ -81,6 +92,9 @@ impl Workspace {
         self.prepare(at);
         if state.past.predict(settings.time_step_s, &mut self.step.increment) {
             // The equations are linear in the multipliers: any guess is as good.
+            if !state.past.point.is_empty() {
+                self.push(at);
+            }
             self.step.multipliers.copy_from_slice(&state.multipliers);
             let report = self.iterate(model, settings, state, false);
             if report.is_ok() {
@@ -224,6 +238,7 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
         let mut chord = Chord::new(settings, self.kkt.corrections(), always_factor);
+        let mut strayed = Strayed::default();
         while report.iterations < settings.max_iterations {
             report.iterations += 1;
             // Residual: r1 = p0 + D1Ld + F⁻ − Dh(q0)ᵀ λ, r2 = h(q1).
@@ -236,8 +251,13 @@ impl Workspace {
             // Factor: K = D2D1Ld + D2F⁻ and S = A1 K⁻¹ A0ᵀ.
             let converged = chord.judge(size, report.constraint_residual);
             if chord.is_fresh {
+                self.response.save_first(&mut self.kkt);
                 self.factor(model, settings, state)?;
+                if report.factorizations == 0 && !state.past.point.is_empty() {
+                    self.note_point(StepContext { model, settings, state, u: &[] });
+                }
                 report.factorizations += 1;
+                strayed = Strayed::default();
             }
             if report.iterations == 1 && size <= CONVERGED {
                 // Nothing to correct, but what is singular has not passed for solved.
@@ -246,10 +266,20 @@ impl Workspace {
             // Correct: x += dx, λ += dλ.
             self.correct(model);
             // Accept: p1 = D2Ld + F⁺.
-            if converged {
-                if size > STALE {
-                    self.evaluate(model, settings, state);
+            if converged && size <= STALE {
+                return self.accept(model, settings, report);
+            }
+            if model.is_foreseen(settings) {
+                let left = self.foresee(model, settings, &mut strayed);
+                let expected = chord.expected();
+                if is_negligible(left, expected) {
+                    report.residual = left.min(expected);
+                    self.step.is_evaluated = false;
+                    return self.accept(model, settings, report);
                 }
+            }
+            if converged {
+                self.evaluate(model, settings, state);
                 return self.accept(model, settings, report);
             }
             chord.is_idle = self.is_round_off_of_coordinates();
@@ -307,6 +337,9 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         model.check_turns(&self.step.increment)?;
         self.find_impulse(model, settings);
+        if !self.step.is_evaluated {
+            self.nudge_impulse(model, settings);
+        }
         if model.dimensions.constraints > 0 {
             // The extrapolated guess has the least norm of other configurations.
             self.kkt.remove_null(&mut self.step.multipliers);

@@ -6,10 +6,15 @@
 //! step takes the best. A smooth motion is predicted to many digits, and one that is pushed around is not
 //! extrapolated far.
 //!
+//! What a change of the inputs does to an increment is no part of the differences from `∇²` on, and is guessed by
+//! itself ([`push`](super::push)).
+//!
 //! Steps of uneven length interpolate velocities nearby ([`Kind::Trail`]); collocation goes on with its
 //! polynomial ([`Kind::Stages`]).
 
+use crate::integrator::point::Point;
 use crate::integrator::scheme::{STAGES_MAX, Scheme, Tableau};
+use crate::model::mechanism::Model;
 
 /// What the next step is guessed from.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,6 +30,8 @@ pub(crate) struct Past {
     order: u8,
     /// Stages: whether the next step is as long.
     is_even: bool,
+    /// Increments: where the last step was factored, if inputs push.
+    pub(crate) point: Point,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,16 +52,50 @@ const NODES: usize = 5;
 /// Velocities closer in time than this, relative to the step, count as one.
 const APART: f64 = 0.1;
 
+/// Takes new increments into the differences of past ones, those from `∇²` on less what was pushed, and sums up
+/// their squares, weighed.
+#[inline(always)]
+fn difference<'a>(
+    rows: impl Iterator<Item = (&'a mut [f64; LENGTH], f64, f64, f64)>,
+) -> [f64; LENGTH] {
+    let mut errors = [0.0; LENGTH];
+    for (differences, increment, pushed, weight) in rows {
+        let mut difference = increment;
+        for (m, (kept, error)) in differences.iter_mut().zip(&mut errors).enumerate() {
+            if m == 2 {
+                difference -= pushed;
+            }
+            *error += difference * difference * weight;
+            (*kept, difference) = (difference, difference - *kept);
+        }
+    }
+    errors
+}
+
 impl Past {
-    pub(crate) fn new(scheme: Scheme, coordinates: usize) -> Self {
+    pub(crate) fn new(scheme: Scheme, model: &Model) -> Self {
+        let mut past = Self::of_size(scheme, model.dimensions.dynamic);
+        if past.kind == Kind::Increments {
+            past.point = Point::of(model);
+        }
+        past
+    }
+
+    fn of_size(scheme: Scheme, coordinates: usize) -> Self {
         let kind = match scheme {
             Scheme::Midpoint => Kind::Increments,
             Scheme::Composition(_) => Kind::Trail,
             Scheme::Gauss(stages) => Kind::Stages(stages as u8),
         };
-        let mut past = Self { kind, numbers: Vec::new(), known: 0, order: 0, is_even: true };
-        past.make_room(coordinates);
+        let (numbers, point) = (Vec::new(), Point::default());
+        let mut past = Self { kind, numbers, known: 0, order: 0, is_even: true, point };
+        past.numbers.resize(past.length(coordinates), 0.0);
         past
+    }
+
+    /// Whether a guess goes on with the last change of the increments.
+    pub(crate) fn extrapolates(&self) -> bool {
+        self.kind == Kind::Increments && self.order >= 2
     }
 
     /// Writes the increments of the next step, of length `h`; false if there is nothing to guess from.
@@ -128,21 +169,20 @@ impl Past {
         true
     }
 
-    /// Takes note of a step of length `h`. The error of all coordinates is weighed by their `inertia`.
+    /// Takes note of a step of length `h`. The error of all coordinates is weighed by their `inertia`; `pushed`,
+    /// if it is not empty, is what was guessed of the change of the inputs.
     #[inline(never)]
-    pub(crate) fn record(&mut self, h: f64, increments: &[f64], inertia: &[f64]) {
+    pub(crate) fn record(&mut self, h: f64, increments: &[f64], inertia: &[f64], pushed: &[f64]) {
         let rows = self.numbers.as_chunks_mut::<LENGTH>().0;
         match self.kind {
             Kind::Increments => {
-                let mut errors = [0.0; LENGTH];
                 let rows = rows.iter_mut().zip(increments).zip(inertia);
-                for ((differences, increment), weight) in rows {
-                    let mut difference = *increment;
-                    for (kept, error) in differences.iter_mut().zip(&mut errors) {
-                        *error += difference * difference * weight;
-                        (*kept, difference) = (difference, difference - *kept);
-                    }
-                }
+                let errors = if pushed.is_empty() {
+                    difference(rows.map(|((row, x), weight)| (row, *x, 0.0, *weight)))
+                } else {
+                    let rows = rows.zip(pushed);
+                    difference(rows.map(|(((row, x), weight), push)| (row, *x, *push, *weight)))
+                };
                 // Of the differences, as many mean something as there were increments before.
                 let known = usize::from(self.known).clamp(1, LENGTH - 1);
                 let better =
@@ -185,18 +225,19 @@ impl Past {
     /// Its kind and its counts, for snapshots.
     pub(crate) fn code(&self) -> [u8; 3] {
         match self.kind {
-            Kind::Increments => [0, self.known, self.order],
+            Kind::Increments => [if self.point.is_empty() { 0 } else { 3 }, self.known, self.order],
             Kind::Trail => [1, self.known, 0],
             Kind::Stages(stages) => [2, self.known + 2 * u8::from(self.is_even), stages],
         }
     }
 
-    /// The past with that code, without its numbers; `None` if the code
-    /// has no meaning. Nothing is allocated before [`Past::make_room`].
-    pub(crate) fn from_code(code: [u8; 3]) -> Option<Self> {
+    /// The past with that code, without its numbers, and how many it has with so many dynamic and prescribed
+    /// coordinates and orientations; `None` if the code has no meaning. Nothing is allocated before
+    /// [`Past::make_room`].
+    pub(crate) fn from_code(code: [u8; 3], [nd, nk, no]: [usize; 3]) -> Option<(Self, [usize; 2])> {
         let longest = LENGTH as u8;
         let (kind, known, order, is_even) = match code {
-            [0, known, order] if known <= longest && order <= known => {
+            [0 | 3, known, order] if known <= longest && order <= known => {
                 (Kind::Increments, known, order, true)
             }
             [1, known, 0] if known <= longest => (Kind::Trail, known, 0, true),
@@ -205,11 +246,15 @@ impl Past {
             }
             _ => return None,
         };
-        Some(Self { kind, numbers: Vec::new(), known, order, is_even })
+        let (numbers, point) = (Vec::new(), Point::default());
+        let past = Self { kind, numbers, known, order, is_even, point };
+        let of_point = if code[0] == 3 { Point::length(nd, nk, no) } else { 0 };
+        let lengths = [past.length(nd), of_point];
+        Some((past, lengths))
     }
 
-    /// Numbers that it keeps for so many coordinates.
-    pub(crate) fn length(&self, coordinates: usize) -> usize {
+    /// Numbers that it keeps for so many coordinates, but for the point.
+    fn length(&self, coordinates: usize) -> usize {
         match self.kind {
             Kind::Increments => LENGTH * coordinates,
             Kind::Trail => LENGTH * (1 + coordinates),
@@ -218,31 +263,35 @@ impl Past {
     }
 
     /// Makes room for its numbers.
-    pub(crate) fn make_room(&mut self, coordinates: usize) {
-        self.numbers.resize(self.length(coordinates), 0.0);
+    pub(crate) fn make_room(&mut self, [own, point]: [usize; 2]) {
+        self.numbers.resize(own, 0.0);
+        self.point = Point::zeros(point);
     }
 
     /// Whether the other is of the same method and size.
-    pub(crate) fn is_like(&self, other: &Self, coordinates: usize) -> bool {
+    pub(crate) fn is_like(&self, other: &Self) -> bool {
         std::mem::discriminant(&self.kind) == std::mem::discriminant(&other.kind)
-            && self.length(coordinates) == other.length(coordinates)
+            && self.numbers.len() == other.numbers.len()
+            && self.point.numbers.len() == other.point.numbers.len()
     }
 
     /// There is no past to guess from.
     pub(crate) fn forget(&mut self) {
         (self.known, self.order) = (0, 0);
+        self.point.forget();
     }
 
     /// Becomes another past of the same kind and size; allocates nothing.
     pub(crate) fn copy_from(&mut self, other: &Self) {
         self.numbers.clone_from(&other.numbers);
+        self.point.clone_from(&other.point);
         let Self { kind, known, order, is_even, .. } = *other;
         (self.kind, self.known, self.order, self.is_even) = (kind, known, order, is_even);
     }
 
     /// All numbers that it keeps.
-    pub(crate) fn numbers(&mut self) -> &mut [f64] {
-        &mut self.numbers
+    pub(crate) fn numbers(&mut self) -> impl Iterator<Item = &mut f64> {
+        self.numbers.iter_mut().chain(&mut self.point.numbers)
     }
 }
 
@@ -252,12 +301,12 @@ mod tests {
 
     /// Predictions and increments of a motion, one coordinate.
     fn run(motion: impl Fn(f64) -> f64, steps: usize) -> Vec<(f64, f64, u8)> {
-        let mut predictor = Past::new(Scheme::Midpoint, 1);
+        let mut predictor = Past::of_size(Scheme::Midpoint, 1);
         let step = |k| {
             let mut predicted = [0.0];
             predictor.predict(1.0, &mut predicted);
             let order = predictor.order;
-            predictor.record(1.0, &[motion(k as f64)], &[1.0]);
+            predictor.record(1.0, &[motion(k as f64)], &[1.0], &[]);
             (predicted[0], motion(k as f64), order)
         };
         (0..steps).map(step).collect()
@@ -280,7 +329,7 @@ mod tests {
     #[test]
     fn uneven_steps_forward_and_backward_follow_a_polynomial() {
         let velocity = |t: f64| 2.0 - t + 3.0 * t * t - 0.5 * t * t * t;
-        let mut trail = Past::new(Scheme::Composition(&[]), 1);
+        let mut trail = Past::of_size(Scheme::Composition(&[]), 1);
         let mut time = 0.3;
         for (k, h) in
             [0.1, 0.17, -0.09, 0.2, 0.11, -0.21, 0.13].into_iter().cycle().take(30).enumerate()
@@ -289,7 +338,7 @@ mod tests {
             trail.predict(h, &mut guess);
             let actual = h * velocity(time + 0.5 * h);
             assert!(k < 6 || (guess[0] - actual).abs() < 1e-10, "{} {actual}", guess[0]);
-            trail.record(h, &[actual], &[]);
+            trail.record(h, &[actual], &[], &[]);
             time += h;
         }
     }

@@ -13,7 +13,8 @@ pub struct StepReport {
     pub iterations: u32,
     /// Factorizations of the Newton matrix.
     pub factorizations: u32,
-    /// Final residual in units of its own round-off.
+    /// Final residual in units of its own round-off; where it is foreseen to be no more than that and not
+    /// evaluated again, as it is foreseen.
     pub residual: f64,
     /// Final constraint violation in units of its own round-off.
     pub constraint_residual: f64,

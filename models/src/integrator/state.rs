@@ -103,7 +103,7 @@ impl PreciseState {
         let d = model.dimensions();
         let no = model.orientations.len();
         let q = model.coordinates().iter().map(|c| c.initial).collect();
-        let past = Past::new(scheme, d.dynamic);
+        let past = Past::new(scheme, model);
         let sizes = [d.dynamic, d.prescribed, d.constraints, no];
         let mut state = Self { q, ..Self::zeros(sizes, past) };
         state.orient(model);

@@ -5,10 +5,12 @@ use plantd_math::rows::{Term, padded, spread};
 use crate::constraints::closure::Closure;
 use crate::integrator::balls::BallJoints;
 use crate::integrator::midpoint::Midpoint;
+use crate::integrator::push::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::system::KktSystem;
 use crate::lagrangian::generators::Flanks;
+use crate::lagrangian::nudge::Nudge;
 use crate::model::mechanism::Model;
 
 /// What a step is taken of.
@@ -32,6 +34,9 @@ pub(crate) struct Workspace {
     pub(crate) constraints: ConstraintPair,
     pub(crate) kkt: KktSystem,
     pub(crate) tangents: Tangents,
+    /// How the last correction changes the gradient.
+    pub(crate) nudge: Nudge,
+    pub(crate) response: Response,
 }
 
 /// The unknowns of a step, and where they lead.
@@ -45,6 +50,8 @@ pub(crate) struct StepIncrement {
     pub(crate) impulse: Vec<f64>,
     /// `q[k+1]`.
     pub(crate) q_end: Vec<f64>,
+    /// Whether the last evaluation was at the increment.
+    pub(crate) is_evaluated: bool,
 }
 
 /// What a step's equations leave over; a correction takes its place.
@@ -108,12 +115,15 @@ impl Workspace {
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
         let has_balls = !model.orientations.is_empty();
         let zeros = |len: usize| vec![0.0; len];
+        let kkt = KktSystem::new(model, spread(padded(2 * n)));
         Self {
+            response: Response::new(model, &kkt),
             step: StepIncrement {
                 increment: zeros(nd),
                 multipliers: zeros(nc),
                 impulse: zeros(nd),
                 q_end: zeros(n),
+                is_evaluated: false,
             },
             mid: Midpoint::new(model),
             balls: BallJoints::new(model),
@@ -124,7 +134,7 @@ impl Workspace {
                 round_off: 0.0,
             },
             constraints: ConstraintPair { start: Closure::new(model), end: Closure::new(model) },
-            kkt: KktSystem::new(model, spread(padded(2 * n))),
+            kkt,
             tangents: Tangents {
                 diagonals: [zeros(nd), zeros(nd)],
                 constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
@@ -136,6 +146,7 @@ impl Workspace {
                 ],
                 terms: Vec::with_capacity(nd.max(nc)),
             },
+            nudge: Nudge::new(model),
         }
     }
 
@@ -147,5 +158,6 @@ impl Workspace {
     /// The end of this step is the start of the next.
     pub(crate) fn move_on(&mut self) {
         self.constraints.move_on(!self.balls.turns.is_empty());
+        self.response.move_on(&mut self.kkt);
     }
 }

@@ -62,6 +62,8 @@ pub(crate) struct SpatialRecursion {
     inverse_blocks: Vec<Mat3>,
     /// Where the sums of each joint are.
     places: Vec<usize>,
+    /// Whether a joint carries others: below one that carries none `A` is zero.
+    carries: Vec<bool>,
     /// `A` by rows; zero but for joints whose elimination has begun.
     sums: Vec<[Block; 8]>,
     /// Flows of right-hand sides, and twists that belong to solutions.
@@ -97,6 +99,21 @@ fn product(a: &[Block; 8], v: &Block) -> Block {
         *out = dot(line, v);
     }
     out
+}
+
+/// `A` times three vectors, as [`product`] finds them one by one: with its columns side by side once.
+#[inline(always)]
+fn products(a: &[Block; 8], vectors: [&Block; 3]) -> [Block; 3] {
+    let mut columns = [Block::ZERO; 8];
+    for (i, line) in a.iter().enumerate() {
+        for (column, entry) in columns.iter_mut().zip(line.0) {
+            column.0[i] = entry;
+        }
+    }
+    vectors.map(|v| {
+        let pair = |k: usize| columns[k].times(v.0[k]).plus(columns[k + 4].times(v.0[k + 4]));
+        (pair(0).plus(pair(1))).plus(pair(2).plus(pair(3)))
+    })
 }
 
 /// `start + Aᵀ v`.
@@ -157,7 +174,14 @@ impl SpatialRecursion {
         let joints = model.dynamics.joints.len();
         let places = places(&model.dynamics);
         let most = places.iter().max().map_or(0, |most| most + 1);
+        let mut carries = vec![false; joints];
+        for joint in &model.dynamics.joints {
+            if let Some(parent) = carries.get_mut(joint.parent) {
+                *parent = true;
+            }
+        }
         Self {
+            carries,
             eliminated: vec![Eliminated::default(); joints],
             inverse_d: vec![0.0; joints],
             inverse_blocks: vec![Mat3::ZERO; model.orientations.len()],
@@ -213,9 +237,12 @@ impl SpatialRecursion {
             let (sums, own) = self.sums.split_at_mut(place);
             let own = &mut own[0];
             // U = upper + A plus,  W = lower + Aᵀ minus,  D = K_jj + minusᵀ A plus.
-            let a_plus = product(own, &plus);
+            let [mut a_plus, mut w] = [Block::ZERO, lower];
+            if self.carries[row] {
+                a_plus = product(own, &plus);
+                w = transposed(lower, own, &minus);
+            }
             let u = upper.plus(a_plus);
-            let w = transposed(lower, own, &minus);
             let k_jj = dot(&minus, &upper) + added.diagonal[row];
             let d = k_jj + dot(&minus, &a_plus);
             let inertia = model.conditioning.inertia[row] * step.inverse.abs();
@@ -251,16 +278,19 @@ impl SpatialRecursion {
         let place = self.places[first];
         let (sums, own) = self.sums.split_at_mut(place);
         let own = &mut own[0];
-        let [mut a_plus, mut w] = [[Block::ZERO; 3]; 2];
-        for (generators, (a_plus, w)) in generators.iter().zip(a_plus.iter_mut().zip(&mut w)) {
-            *a_plus = product(own, &generators.plus);
-            *w = transposed(generators.lower, own, &generators.minus);
-        }
+        let [p, q, r] = &*generators;
+        let [mut a_plus, mut w] = [[Block::ZERO; 3], [p.lower, q.lower, r.lower]];
         let k = step.within_ball(mechanics, model.gravity, first, weights);
         let mut d = k;
-        for (column, a_plus) in d.0.iter_mut().zip(&a_plus) {
-            for (entry, generators) in column.0.iter_mut().zip(&*generators) {
-                *entry += dot(&generators.minus, a_plus);
+        if self.carries[first + 2] {
+            a_plus = products(own, [&p.plus, &q.plus, &r.plus]);
+            for (w, generators) in w.iter_mut().zip(&*generators) {
+                *w = transposed(*w, own, &generators.minus);
+            }
+            for (column, a_plus) in d.0.iter_mut().zip(&a_plus) {
+                for (entry, generators) in column.0.iter_mut().zip(&*generators) {
+                    *entry += dot(&generators.minus, a_plus);
+                }
             }
         }
         let (inverse_d, pivots) = inverse(&d);

@@ -27,12 +27,8 @@ const SAFE: f64 = 1e-6;
 /// The KKT system of a step, with all factors that its model may need.
 #[derive(Clone, Debug)]
 pub(crate) struct KktSystem {
-    /// `K` entry by entry.
-    pub(crate) tree: TreeLu,
+    pub(crate) factored: Factored,
     pub(crate) schur: SchurComplement,
-    pub(crate) recursion: Recursion,
-    /// Which of them were factored last.
-    pub(crate) valid: Factors,
     /// What springs, dampers and armatures of coordinates add to the diagonal of `K`, for recursions.
     pub(crate) diagonal: Vec<f64>,
     /// How ball joints weigh their rows and columns.
@@ -40,9 +36,20 @@ pub(crate) struct KktSystem {
     pub(crate) estimates: Estimates,
 }
 
+/// Factors of `K`.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Factored {
+    /// Entry by entry.
+    pub(crate) tree: TreeLu,
+    pub(crate) recursion: Recursion,
+    /// Which of them were factored last.
+    pub(crate) valid: Factors,
+}
+
 /// Factors in O(n), in place of the tree LU.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) enum Recursion {
+    #[default]
     None,
     Planar(Box<PlanarRecursion>),
     /// With the constraints.
@@ -51,9 +58,10 @@ pub(crate) enum Recursion {
 }
 
 /// Which factors are valid.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Factors {
     /// The tree LU, with the Schur complement where there are constraints.
+    #[default]
     Tree,
     Recursion,
 }
@@ -90,10 +98,12 @@ impl KktSystem {
             (Solver::Tree | Solver::Loops, _) => Recursion::None,
         };
         Self {
-            tree: TreeLu::new(&model.elimination),
+            factored: Factored {
+                tree: TreeLu::new(&model.elimination),
+                recursion,
+                valid: Factors::Tree,
+            },
             schur: SchurComplement::new(model, stride),
-            recursion,
-            valid: Factors::Tree,
             diagonal: vec![0.0; nd],
             balls: vec![Weights::REST; model.orientations.len()],
             estimates: Estimates { matrix: 1.0, constraints: 1.0, redundant: 0 },
@@ -106,7 +116,7 @@ impl KktSystem {
     }
 
     pub(crate) fn has_recursion(&self) -> bool {
-        !matches!(self.recursion, Recursion::None)
+        !matches!(self.factored.recursion, Recursion::None)
     }
 
     /// Factors by the recursion: false where there is none or its pivots are not sound, and the tree has to
@@ -119,43 +129,46 @@ impl KktSystem {
         let Linearized { model, mechanics, constraints, time_step_s, singular_below } = at;
         let (conditioning, diagonal) = (&model.conditioning, &self.diagonal);
         let inertia = &conditioning.inertia;
-        self.valid = Factors::Tree;
-        let pivot = match (&mut self.recursion, mechanics.planar.as_deref_mut(), &model.planar) {
-            (Recursion::Planar(recursion), Some(PlanarTree::Many(tree)), Some(joints)) => {
-                tree.differentiate(joints);
-                recursion.factor(tree, joints, diagonal, inertia, time_step_s, kind)
-            }
-            (Recursion::Loops(fronts), Some(PlanarTree::Many(tree)), Some(joints)) => {
-                let [start, end] = constraints.map(|closure| closure.in_plane.as_deref());
-                let (Some(loops), Some(start), Some(end)) = (&model.loops, start, end) else {
-                    return Ok(false);
-                };
-                tree.differentiate(joints);
-                let at = Mechanism { loops, joints, tree, start, end };
-                let scales = Scales { inertia, weight: &conditioning.weight };
-                let pivots = fronts.factor(at, diagonal, scales, time_step_s, kind);
-                if pivots.joints.relative < SAFE
-                    || pivots.equations < SAFE
-                    || pivots.steepness < singular_below
-                {
+        self.factored.valid = Factors::Tree;
+        let pivot =
+            match (&mut self.factored.recursion, mechanics.planar.as_deref_mut(), &model.planar) {
+                (Recursion::Planar(recursion), Some(PlanarTree::Many(tree)), Some(joints)) => {
+                    tree.differentiate(joints);
+                    recursion.factor(tree, joints, diagonal, inertia, time_step_s, kind)
+                }
+                (Recursion::Loops(fronts), Some(PlanarTree::Many(tree)), Some(joints)) => {
+                    let [start, end] = constraints.map(|closure| closure.in_plane.as_deref());
+                    let (Some(loops), Some(start), Some(end)) = (&model.loops, start, end) else {
+                        return Ok(false);
+                    };
+                    tree.differentiate(joints);
+                    let at = Mechanism { loops, joints, tree, start, end };
+                    let scales = Scales { inertia, weight: &conditioning.weight };
+                    let pivots = fronts.factor(at, diagonal, scales, time_step_s, kind);
+                    if pivots.joints.relative < SAFE
+                        || pivots.equations < SAFE
+                        || pivots.steepness < singular_below
+                    {
+                        return Ok(false);
+                    }
+                    self.factored.valid = Factors::Recursion;
+                    self.estimates = Estimates {
+                        matrix: pivots.joints.relative,
+                        constraints: pivots.equations.min(pivots.steepness),
+                        redundant: (model.constraints.len() - loops.equations.len()) as u32,
+                    };
+                    return Ok(true);
+                }
+                (Recursion::Spatial(recursion), ..) => {
+                    mechanics.differentiate(model);
+                    let added = Added { diagonal, balls: &self.balls };
+                    recursion.factor(model, mechanics, added, time_step_s, kind)
+                }
+                (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => {
                     return Ok(false);
                 }
-                self.valid = Factors::Recursion;
-                self.estimates = Estimates {
-                    matrix: pivots.joints.relative,
-                    constraints: pivots.equations.min(pivots.steepness),
-                    redundant: (model.constraints.len() - loops.equations.len()) as u32,
-                };
-                return Ok(true);
-            }
-            (Recursion::Spatial(recursion), ..) => {
-                mechanics.differentiate(model);
-                let added = Added { diagonal, balls: &self.balls };
-                recursion.factor(model, mechanics, added, time_step_s, kind)
-            }
-            (Recursion::None | Recursion::Planar(_) | Recursion::Loops(_), ..) => return Ok(false),
-        };
-        self.valid = Factors::Recursion;
+            };
+        self.factored.valid = Factors::Recursion;
         if kind == MatrixKind::Mass {
             Ok(true)
         } else {
@@ -170,9 +183,9 @@ impl KktSystem {
         time_step_s: f64,
         singular_below: f64,
     ) -> Result<(), SmallestPivot> {
-        self.valid = Factors::Tree;
+        self.factored.valid = Factors::Tree;
         let inertia = &model.conditioning.inertia;
-        let pivot = self.tree.factor(&model.elimination, inertia, 1.0 / time_step_s.abs());
+        let pivot = self.factored.tree.factor(&model.elimination, inertia, 1.0 / time_step_s.abs());
         self.judge(pivot, singular_below)
     }
 
@@ -190,7 +203,7 @@ impl KktSystem {
         time_step_s: f64,
         singular_below: f64,
     ) -> bool {
-        self.schur.factor(model, &mut self.tree, constraints);
+        self.schur.factor(model, &mut self.factored.tree, constraints);
         let lu = &self.schur.lu;
         self.estimates.constraints =
             lu.reciprocal_condition(model.constraint_rank(), time_step_s.abs());
@@ -206,7 +219,7 @@ impl KktSystem {
         x: &mut [f64],
         lambda: &mut [f64],
     ) {
-        match (&mut self.recursion, self.valid, &model.planar) {
+        match (&mut self.factored.recursion, self.factored.valid, &model.planar) {
             (Recursion::Planar(recursion), Factors::Recursion, Some(joints)) => {
                 recursion.solve(joints, x);
             }
@@ -220,7 +233,7 @@ impl KktSystem {
                 recursion.solve(&model.dynamics, x);
             }
             _ => {
-                self.tree.solve(&model.elimination, x);
+                self.factored.tree.solve(&model.elimination, x);
                 if !lambda.is_empty() {
                     self.schur.close(model, end, x, lambda);
                 }
@@ -230,7 +243,7 @@ impl KktSystem {
 
     /// Takes away from multipliers what redundant equations leave open; recursions leave nothing open.
     pub(crate) fn remove_null(&self, multipliers: &mut [f64]) {
-        if self.valid == Factors::Tree {
+        if self.factored.valid == Factors::Tree {
             self.schur.lu.remove_null(multipliers);
         }
     }

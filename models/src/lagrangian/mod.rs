@@ -14,6 +14,7 @@ pub(crate) mod generators;
 pub(crate) mod kinematics;
 pub(crate) mod mechanics;
 pub(crate) mod momenta;
+pub(crate) mod nudge;
 pub(crate) mod planar;
 pub(crate) mod plane;
 pub(crate) mod potentials;

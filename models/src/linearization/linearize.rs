@@ -187,7 +187,7 @@ impl SolvedStep {
         }
         if !self.multipliers.is_empty() {
             self.multipliers.copy_from_slice(&workspace.step.multipliers);
-            self.in_loops = workspace.kkt.valid == Factors::Recursion;
+            self.in_loops = workspace.kkt.factored.valid == Factors::Recursion;
             if !self.in_loops {
                 self.responses.copy_from_slice(&workspace.kkt.schur.responses);
                 self.schur.take_factors_of(&workspace.kkt.schur.lu);

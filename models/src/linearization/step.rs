@@ -22,7 +22,11 @@ impl Workspace {
         out.kind = Kind::Step;
         out.time_step_s = at.settings.time_step_s;
         out.at_start = at.settings.force_split.at_start();
-        let is_done = match self.kkt.recursion {
+        if !self.step.is_evaluated {
+            self.evaluate(at.model, at.settings, at.state);
+        }
+        self.response.save_first(&mut self.kkt);
+        let is_done = match self.kkt.factored.recursion {
             Recursion::Planar(_) => self.linearize_planar(at, out)?,
             Recursion::Loops(_) => self.linearize_loops(at, out)?,
             Recursion::None | Recursion::Spatial(_) => false,
@@ -40,7 +44,13 @@ impl Workspace {
         let columns = if moving { out.stride } else { padded(out.next_columns()) };
         let units = at.model.dimensions.coordinates();
         let elimination = &at.model.elimination;
-        self.kkt.tree.solve_units(elimination, &mut out.increment, out.stride, columns, units);
+        self.kkt.factored.tree.solve_units(
+            elimination,
+            &mut out.increment,
+            out.stride,
+            columns,
+            units,
+        );
         if d.constraints > 0 {
             self.prepare_start(at.model, at.state);
             self.finish_end(at.model, at.state);
@@ -65,7 +75,7 @@ impl Workspace {
         self.fill_inputs(at, out);
         let tree = self.mid.mechanics.planar.as_deref().and_then(PlanarTree::many);
         let (Some(tree), Some(joints), Recursion::Planar(recursion)) =
-            (tree, &model.planar, &mut self.kkt.recursion)
+            (tree, &model.planar, &mut self.kkt.factored.recursion)
         else {
             return Ok(false);
         };
@@ -119,7 +129,7 @@ impl Workspace {
             tree,
             &self.constraints.start.in_plane,
             &self.constraints.end.in_plane,
-            &mut self.kkt.recursion,
+            &mut self.kkt.factored.recursion,
         ) else {
             return Ok(false);
         };

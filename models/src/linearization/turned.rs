@@ -449,7 +449,7 @@ coefficient = 0.03
             for row in 0..nd {
                 for slot in model.elimination.offsets[row]..model.elimination.offsets[row + 1] {
                     let column = model.elimination.ancestors[slot];
-                    let tree = &workspace.kkt.tree;
+                    let tree = &workspace.kkt.factored.tree;
                     found.push(tree.upper[slot]);
                     expected.push(blocks.residual_next[column * n + row]);
                     if row != column {

@@ -85,9 +85,9 @@ impl Plant {
         for row in 0..nd {
             for slot in elimination.offsets[row]..elimination.offsets[row + 1] {
                 let ancestor = elimination.ancestors[slot];
-                matrix[(row, ancestor)] = workspace.kkt.tree.lower[slot];
+                matrix[(row, ancestor)] = workspace.kkt.factored.tree.lower[slot];
                 // The diagonal is kept in the upper triangle alone.
-                matrix[(ancestor, row)] = workspace.kkt.tree.upper[slot];
+                matrix[(ancestor, row)] = workspace.kkt.factored.tree.upper[slot];
             }
         }
         matrix

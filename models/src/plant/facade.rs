@@ -46,7 +46,7 @@ impl Plant {
     /// p[k+1] = p + h (L_q + f) − Dh(q[k])ᵀ λ
     /// ```
     ///
-    /// Two to four residual evaluations of O(n) and one factorization for a smooth motion. Methods of
+    /// One to four residual evaluations of O(n) and one factorization for a smooth motion. Methods of
     /// higher order and substeps: see [`Settings`]. A step that fails leaves the plant as it was.
     ///
     /// ```

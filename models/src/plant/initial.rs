@@ -12,7 +12,7 @@ use crate::integrator::scheme::Scheme;
 use crate::integrator::settings::{ForceSplit, HALVINGS_MAX, SUBSTEPS_MAX, Settings};
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
-use crate::kkt::system::KktSystem;
+use crate::kkt::system::{Factored, KktSystem};
 use crate::lagrangian::armature;
 use crate::lagrangian::energy::{Energy, energy};
 use crate::model::manifold::orientations;
@@ -378,20 +378,21 @@ impl Workspace {
             &self.mid.mechanics.poses,
             &self.mid.mechanics.momenta,
         );
-        self.kkt.tree.clear();
+        self.kkt.factored.tree.clear();
         self.mid.mechanics.curvature.fill_mass_matrix(
             &model.pairs,
             &self.mid.mechanics.momenta,
-            &mut self.kkt.tree,
+            &mut self.kkt.factored.tree,
         );
         for entry in &model.armature {
-            armature::add_to(&mut self.kkt.tree, model, entry, 1.0);
+            armature::add_to(&mut self.kkt.factored.tree, model, entry, 1.0);
         }
-        let pivot = self.kkt.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
+        let pivot =
+            self.kkt.factored.tree.factor(&model.elimination, &model.conditioning.inertia, 1.0);
         for (i, r) in self.residual.dynamics.iter_mut().enumerate() {
             *r = state.p[i] - self.mid.l_v[i];
         }
-        self.kkt.tree.solve(&model.elimination, &mut self.residual.dynamics);
+        self.kkt.factored.tree.solve(&model.elimination, &mut self.residual.dynamics);
         if d.constraints > 0 {
             self.project_velocity(model, state);
         }
@@ -402,7 +403,7 @@ impl Workspace {
     fn project_velocity(&mut self, model: &Model, state: &PreciseState) {
         let n = model.dimensions.coordinates();
         self.prepare_start(model, state);
-        let KktSystem { tree, schur, .. } = &mut self.kkt;
+        let KktSystem { factored: Factored { tree, .. }, schur, .. } = &mut self.kkt;
         schur.factor(model, tree, [&self.constraints.start; 2]);
         let rows = self.constraints.start.jacobian.chunks(n);
         for (rate, row) in self.residual.constraints.iter_mut().zip(rows) {

@@ -12,6 +12,7 @@
 use plantd_math::sums::two_sum;
 
 use crate::integrator::collocation::Collocation;
+use crate::integrator::push::Response;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::state::PreciseState;
@@ -163,7 +164,12 @@ impl PreciseState {
         self.multipliers.copy_from_slice(&workspace.step.multipliers);
         match collocation {
             Some(collocation) => self.past.record_stages(&collocation.motion),
-            None => self.past.record(h, &workspace.step.increment, &model.conditioning.inertia),
+            None => {
+                let inertia = &model.conditioning.inertia;
+                let Response { pushed, point, .. } = &workspace.response;
+                self.past.record(h, &workspace.step.increment, inertia, pushed);
+                self.past.point.follow(point);
+            }
         }
     }
 }

@@ -113,7 +113,7 @@ impl Plant {
             }
 
             // x'' and λ'' = −E⁻¹ (…).
-            workspace.kkt.tree.solve_rows(&model.elimination, residual, stride, columns);
+            workspace.kkt.factored.tree.solve_rows(&model.elimination, residual, stride, columns);
             for (c, row) in closing.chunks_exact_mut(stride).enumerate() {
                 let row = &mut row[..columns];
                 row.iter_mut().for_each(|entry| *entry = -*entry);

@@ -14,7 +14,7 @@ use crate::integrator::state::PreciseState;
 use crate::plant::facade::Plant;
 
 const MAGIC: &[u8; 8] = b"PLNTSNAP";
-const VERSION: u32 = 5;
+const VERSION: u32 = 6;
 
 /// Everything a plant needs to go on bit for bit.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,7 +52,7 @@ impl Plant {
                 && a.p.len() == b.p.len()
                 && a.multipliers.len() == b.multipliers.len()
                 && a.orientations.len() == b.orientations.len()
-                && a.past.is_like(&b.past, a.p.len())
+                && a.past.is_like(&b.past)
         };
         if snapshot.model_digest != self.model.digest() || !same_sizes(&snapshot.state, &self.state)
         {
@@ -158,19 +158,20 @@ impl Snapshot {
         let step = u64::from_le_bytes(take(rest)?);
         let time_origin_s = f64::from_le_bytes(take(rest)?);
         let [halvings, calm] = take(rest)?;
-        let mut past = Past::from_code(take(rest)?).ok_or(malformed("unknown kind of past"))?;
+        let past = Past::from_code(take(rest)?, [nd, nk, no]);
+        let (mut past, of_past) = past.ok_or(malformed("unknown kind of past"))?;
         if u32::from(halvings) > HALVINGS_MAX || settings.halvings > HALVINGS_MAX {
             return Err(malformed("a period was halved too often"));
         }
         let sizes = [nd, nk, nc, no];
-        let numbers = [4 * nd, 2 * nk, nc, 8 * no, past.length(nd)];
+        let numbers = [4 * nd, 2 * nk, nc, 8 * no, of_past[0], of_past[1]];
         if rest.len() / 8 != numbers.iter().sum::<usize>() || rest.len() % 8 != 0 {
             return Err(malformed("sizes do not match"));
         }
         if !time_origin_s.is_finite() {
             return Err(malformed("a number is not finite"));
         }
-        past.make_room(nd);
+        past.make_room(of_past);
         let mut state = PreciseState::zeros(sizes, past);
         (state.step, state.time_origin_s) = (step, time_origin_s);
         (state.halvings, state.calm) = (halvings, calm);

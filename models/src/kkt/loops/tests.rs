@@ -214,7 +214,7 @@ fn loops_move_and_linearize_as_with_dense_matrices() {
             slow.restore(&fast.snapshot()).unwrap();
             let report = fast.step_and_linearize(&u, &mut a).unwrap();
             assert!(
-                [&fast, &slow].map(|p| p.workspace.kkt.valid)
+                [&fast, &slow].map(|p| p.workspace.kkt.factored.valid)
                     == [Factors::Recursion, Factors::Tree]
             );
             assert!(report.constraint_reciprocal_condition > 1e-9);
@@ -244,7 +244,7 @@ fn dense_matrices_stand_in_for_loops() {
         for _ in 0..10 {
             refused.step(&u).unwrap();
             slow.step(&u).unwrap();
-            assert_eq!(refused.workspace.kkt.valid, Factors::Tree);
+            assert_eq!(refused.workspace.kkt.factored.valid, Factors::Tree);
             assert_near(refused.q(), slow.q(), 1e-9, &scene.name);
         }
         refused.linearize(&u, &mut a).unwrap();
@@ -310,7 +310,7 @@ fn the_first_guess_is_that_of_dense_matrices() {
             let Plant { settings, state, workspace, .. } = &mut plant;
             workspace.prepare(StepContext { model: &model, settings, state, u: &u });
             workspace.ballistic(&model, settings, state);
-            assert_eq!(workspace.kkt.valid == Factors::Recursion, model.loops.is_some());
+            assert_eq!(workspace.kkt.factored.valid == Factors::Recursion, model.loops.is_some());
             workspace.step.increment.clone()
         });
         assert_near(&fast, &slow, 1e-9, &scene.name);
@@ -362,7 +362,7 @@ fn wider_registers_give_the_same_bits() {
         let closures = Closures { jacobian: &end.jacobian, hessian: constraint_hessian };
         let conditioning = &model.conditioning;
         let scales = Scales { inertia: &conditioning.inertia, weight: &conditioning.weight };
-        let Recursion::Loops(fronts) = &kkt.recursion else { panic!("no fronts") };
+        let Recursion::Loops(fronts) = &kkt.factored.recursion else { panic!("no fronts") };
         let mut wide = fronts.clone();
         let mut narrow = wide.clone();
         wide.factor(at, &numbers, scales, 0.01, MatrixKind::Newton);

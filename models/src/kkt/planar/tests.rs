@@ -165,7 +165,7 @@ fn generators_stand_for_the_newton_matrix() {
         let v = (0..n).map(|i| 0.1 * wave(i + 50)).collect();
         fast.initialize(&Initial::Velocity { q, v }).unwrap();
         let mut slow = fast.clone();
-        slow.workspace.kkt.recursion = Recursion::None;
+        slow.workspace.kkt.factored.recursion = Recursion::None;
         let mut by_generators = Linearization::new(&model);
         let mut by_entries = Linearization::new(&model);
         let u: Vec<f64> = (0..model.dimensions.input()).map(wave).collect();
@@ -201,7 +201,9 @@ fn linearizations_have_the_same_bits_in_any_register() {
         let (joints, stride) = (model.planar.as_ref().unwrap(), padded(2 * n));
         let numbers: Vec<f64> = (0..n).map(wave).collect();
         let diagonal = Diagonal { residual: &numbers, momentum: &numbers };
-        let Recursion::Planar(recursion) = &plant.workspace.kkt.recursion else { panic!() };
+        let Recursion::Planar(recursion) = &plant.workspace.kkt.factored.recursion else {
+            panic!()
+        };
         let mut wide = recursion.clone();
         let mut narrow = wide.clone();
         let [mut x, mut p, mut narrow_x, mut narrow_p] = [0; 4].map(|_| vec![0.0; n * stride]);

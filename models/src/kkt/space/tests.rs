@@ -122,7 +122,7 @@ fn a_solution_satisfies_the_dense_system() {
         let settings = Settings { time_step_s: 0.02, ..Settings::new(&model) };
         let mut workspace = Workspace::new(&model);
         let generators = SpatialRecursion::new(&model);
-        workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
+        workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(generators));
         for trial in 0..5 {
             for i in 0..n {
                 workspace.mid.q[i] = wave(100 * trial + i);
@@ -131,15 +131,19 @@ fn a_solution_satisfies_the_dense_system() {
             }
             workspace.mid.evaluate(&model);
             workspace.fill_newton_matrix(&model, &settings);
-            let matrix = dense(&model, &workspace.kkt.tree);
+            let matrix = dense(&model, &workspace.kkt.factored.tree);
             assert!(workspace.factor_recursion(&model, &settings).unwrap());
             assert_solves(&mut workspace, &model, &matrix);
 
             let Workspace { mid, kkt, constraints, .. } = &mut workspace;
             let (mechanics, start) = (&mut mid.mechanics, &constraints.start);
-            kkt.tree.clear();
-            mechanics.curvature.fill_mass_matrix(&model.pairs, &mechanics.momenta, &mut kkt.tree);
-            let masses = dense(&model, &kkt.tree) * (-1.0 / settings.time_step_s);
+            kkt.factored.tree.clear();
+            mechanics.curvature.fill_mass_matrix(
+                &model.pairs,
+                &mechanics.momenta,
+                &mut kkt.factored.tree,
+            );
+            let masses = dense(&model, &kkt.factored.tree) * (-1.0 / settings.time_step_s);
             kkt.diagonal.fill(0.0);
             let at = Linearized {
                 model: &model,
@@ -169,14 +173,14 @@ fn both(model: &Arc<Model>, order: u32) -> [Plant; 2] {
     let mut fast = Plant::new(Arc::clone(model), settings).unwrap();
     assert!(order == 2 || model.solver == Solver::Spatial);
     let generators = SpatialRecursion::new(model);
-    fast.workspace.kkt.recursion = Recursion::Spatial(Box::new(generators));
+    fast.workspace.kkt.factored.recursion = Recursion::Spatial(Box::new(generators));
     let n = model.dimensions.dynamic;
     let turned = |i: usize| if i < 2 { 0.5 } else { 0.02 * (1.3 * i as f64).sin() };
     let q = (0..n).map(turned).collect();
     let v = (0..n).map(|i| 0.1 * (0.3 * i as f64).cos()).collect();
     fast.initialize(&Initial::Velocity { q, v }).unwrap();
     let mut slow = fast.clone();
-    slow.workspace.kkt.recursion = Recursion::None;
+    slow.workspace.kkt.factored.recursion = Recursion::None;
     [fast, slow]
 }
 
@@ -270,7 +274,7 @@ fn ball_joints_are_eliminated_with_their_axes() {
 
     let (workspace, settings) = (&mut fast.workspace, &fast.settings);
     workspace.fill_newton_matrix(&model, settings);
-    let matrix = dense(&model, &workspace.kkt.tree);
+    let matrix = dense(&model, &workspace.kkt.factored.tree);
     assert!(workspace.factor_recursion(&model, settings).unwrap());
     assert_solves(workspace, &model, &matrix);
     let state = fast.state.clone();

@@ -1,0 +1,189 @@
+//! The end of a step without another look: what the last correction leaves over is foreseen, and the impulse
+//! follows the correction by its derivative.
+//!
+//! After a correction `x'` with the Jacobian itself, what is left of the residual is of second order,
+//! `½ K' x' x'`. It is next to nothing but the change of the momentum with the mass matrix, whose entries change
+//! by at most `2 α √(I_i I_j)`, with the largest inertia `I` that each coordinate can have:
+//!
+//! ```text
+//! |r1| ≲ √I_max (1 + Σ |x|) α σ / h      α = Σ |x'_i|      σ² = Σ I_i x'_i²
+//! ```
+//!
+//! With the Jacobian of an increment that is `y` away it is `α_y σ + α σ_y + α σ` in place of `α σ`. In motions
+//! of many joints less than a tenth of it is left. Metres count as radians: of slides that is more than it need
+//! be. A second estimate is [`Chord::expected`](super::newton), from how the residual has fallen so far.
+//!
+//! `p[k+1] = p[k] + h (τ + f)` has been found before the correction; what the correction makes of it is linear,
+//! with an error as small as what is left of the residual.
+
+use plantd_math::spatial::three;
+
+use crate::integrator::settings::{ForceSplit, Settings};
+use crate::integrator::workspace::Workspace;
+use crate::model::mechanism::Model;
+
+/// What may be left of the residual unseen, in units of its round-off, as it is estimated.
+const UNSEEN: f64 = 0.5;
+/// The same where the residual has fallen accordingly, and what may be expected from that. By itself the fall says
+/// little: what is linear falls at once, and hides what is not.
+const BORNE_OUT: f64 = 16.0;
+const EXPECTED: f64 = 0.2;
+
+/// How far corrections have gone from the increment of the Jacobian.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Strayed {
+    /// `α`.
+    turned: f64,
+    /// `σ`.
+    weighed: f64,
+}
+
+impl Model {
+    /// Whether bodies in space, with damping, armatures and inputs on coordinates, are all there is.
+    pub(crate) fn is_of_bodies(&self) -> bool {
+        self.constraints.is_empty()
+            && self.planar.is_none()
+            && self.forces.is_none()
+            && self.potentials.springs.is_empty()
+    }
+
+    /// Whether the bodies are all there is: then the estimate holds, and the impulse has a derivative
+    /// that is as cheap as a correction.
+    pub(crate) fn is_foreseen(&self, settings: &Settings) -> bool {
+        self.is_of_bodies()
+            && (self.orientations.is_empty() || settings.force_split == ForceSplit::Symmetric)
+    }
+}
+
+/// Whether a residual that is estimated and expected to be left may stay unseen.
+pub(crate) fn is_negligible(left: f64, expected: f64) -> bool {
+    left <= UNSEEN || (left <= BORNE_OUT && expected <= EXPECTED)
+}
+
+impl Workspace {
+    /// What the last correction leaves of the residual, in units of its round-off.
+    #[inline(never)]
+    pub(crate) fn foresee(&self, model: &Model, settings: &Settings, strayed: &mut Strayed) -> f64 {
+        let corrections = &self.residual.dynamics[..];
+        let (mut turned, mut moved, mut square, mut largest) = (0.0, 0.0, 0.0, 0.0_f64);
+        let rows = corrections.iter().zip(&self.step.increment).zip(&model.conditioning.inertia);
+        for ((x, increment), inertia) in rows {
+            turned += x.abs();
+            moved += increment.abs();
+            square += x * x * inertia;
+            largest = largest.max(*inertia);
+        }
+        let weighed = square.sqrt();
+        let product = strayed.turned * weighed + turned * (strayed.weighed + weighed);
+        strayed.turned += turned;
+        strayed.weighed += weighed;
+        let unit = f64::EPSILON * self.residual.round_off * settings.time_step_s.abs();
+        product * largest.sqrt() * (1.0 + moved) / unit
+    }
+
+    /// Moves the impulse on by the last correction, at the last factorization.
+    #[inline(never)]
+    pub(crate) fn nudge_impulse(&mut self, model: &Model, settings: &Settings) {
+        let h = settings.time_step_s;
+        let Self { step, mid, balls, residual, kkt, nudge, .. } = self;
+        let corrections = &residual.dynamics[..];
+        let changes = nudge.position.iter_mut().zip(&mut nudge.velocity);
+        for ((position, velocity), x) in changes.zip(corrections) {
+            (*position, *velocity) = (-0.5 * x, -x / h);
+        }
+        let orientations = || {
+            let all = model.orientations.iter().enumerate();
+            all.filter(|(_, i)| **i < model.dimensions.dynamic).map(|(o, i)| (o, *i))
+        };
+        for (o, i) in orientations() {
+            let turned = kkt.balls[o].column.apply(three(&nudge.position, i));
+            nudge.position[i..i + 3].copy_from_slice(&turned.0);
+        }
+        nudge.find(model, &mid.mechanics);
+        for (impulse, l_q) in step.impulse.iter_mut().zip(&nudge.l_q) {
+            *impulse += h * l_q;
+        }
+        for ((impulse, c), x) in step.impulse.iter_mut().zip(&model.damping).zip(corrections) {
+            *impulse += c * x;
+        }
+        if model.orientations.is_empty() {
+            return;
+        }
+        for a in &model.armature {
+            nudge.l_v[a.row] += a.inertia * nudge.velocity[a.column];
+        }
+        // Of m × ξ.
+        for (o, i) in orientations() {
+            let (m, x) = (three(&mid.l_v, i), three(corrections, i));
+            let change = three(&nudge.l_v, i).cross(balls.turns[o].xi) - m.cross(x);
+            for (impulse, change) in step.impulse[i..i + 3].iter_mut().zip(change.0) {
+                *impulse += change;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::integrator::workspace::StepContext;
+    use crate::model::mechanism::Solver;
+    use crate::plant::facade::Plant;
+    use crate::plant::initial::Initial;
+    use plantd_math::norms::largest;
+    use plantd_scene::builtin;
+
+    /// What was not looked at is what it was taken for: residual and impulse at the solution, in motions that go
+    /// on by themselves, and in those that are pushed anew at each step.
+    #[test]
+    fn what_is_left_unseen_is_round_off() {
+        let mut unseen = 0;
+        let names = [
+            "spherical-pendulum",
+            "tree-15",
+            "walker-9",
+            "balls-1",
+            "balls-2",
+            "balls-31",
+            "chain-8",
+        ];
+        for name in names {
+            let Some(scene) = builtin::scene(name) else { panic!("{name}") };
+            let mut model = Model::compile(&scene).unwrap();
+            if model.planar.take().is_some() {
+                model.solver = Solver::Spatial;
+            }
+            let model = Arc::new(model);
+            let settings = Settings { time_step_s: 0.002, ..Settings::new(&model) };
+            let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+            let n = model.dimensions.coordinates();
+            let q = plant.state.q.clone();
+            let v = (0..n).map(|i| (1.7 * i as f64).sin()).collect();
+            plant.initialize(&Initial::Velocity { q, v }).unwrap();
+            let mut u = vec![0.0; model.dimensions.input()];
+            for k in 0..60 {
+                if k > 30 {
+                    u.iter_mut().zip(0..).for_each(|(u, i)| *u = f64::from(k * k + i).sin());
+                }
+                let report = plant.solve(&u, None).unwrap();
+                let Plant { model, state, workspace, .. } = &mut plant;
+                if !workspace.step.is_evaluated {
+                    unseen += 1;
+                    let impulse = workspace.step.impulse.clone();
+                    let at = StepContext { model, settings: &settings, state, u: &u };
+                    let size = workspace.evaluate(at.model, at.settings, at.state);
+                    assert!(report.residual <= UNSEEN && size < 64.0, "{name}: {size}");
+                    workspace.find_impulse(model, &settings);
+                    let apart: Vec<f64> =
+                        impulse.iter().zip(&workspace.step.impulse).map(|(a, b)| a - b).collect();
+                    let apart = largest(&apart) / (f64::EPSILON * workspace.residual.round_off);
+                    assert!(apart < 1.0, "{name}: {apart}");
+                }
+                plant.commit();
+            }
+        }
+        assert!(unseen > 100, "{unseen}");
+    }
+}

@@ -1,0 +1,82 @@
+//! Where a step was factored: what a state has of it, so that the factors can be made again.
+
+use crate::model::mechanism::{Dimensions, Model};
+
+/// The point where a step was factored: its length, forces of inputs, increments, angles, velocities of
+/// prescribed coordinates, orientations. In a state its `w` comes last.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Point {
+    /// Empty where no input pushes, or more than bodies is pushed.
+    pub(crate) numbers: Vec<f64>,
+}
+
+/// The parts of a point.
+pub(crate) struct Parts<'a> {
+    pub(crate) force: &'a [f64],
+    pub(crate) increment: &'a [f64],
+    pub(crate) angles: &'a [f64],
+    pub(crate) prescribed: &'a [f64],
+    pub(crate) orientations: &'a [f64],
+    pub(crate) weighed: &'a [f64],
+}
+
+impl Point {
+    /// Numbers of a point in a state, with so many dynamic and prescribed coordinates and orientations.
+    pub(crate) fn length(nd: usize, nk: usize, orientations: usize) -> usize {
+        1 + 4 * nd + 2 * nk + 9 * orientations
+    }
+
+    pub(crate) fn zeros(length: usize) -> Self {
+        Self { numbers: vec![0.0; length] }
+    }
+
+    /// Of the plants of a model.
+    pub(crate) fn of(model: &Model) -> Self {
+        let Dimensions { dynamic, prescribed, .. } = model.dimensions;
+        let pushes = model.is_of_bodies() && !model.coordinate_inputs.is_empty();
+        let length = Self::length(dynamic, prescribed, model.orientations.len());
+        if pushes { Self::zeros(length) } else { Self::default() }
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.numbers.is_empty()
+    }
+
+    /// There was no step.
+    pub(crate) fn forget(&mut self) {
+        self.numbers.iter_mut().take(1).for_each(|h| *h = 0.0);
+    }
+
+    /// Whether there was a step.
+    pub(crate) fn is_known(&self) -> bool {
+        self.numbers.first().is_some_and(|h| *h != 0.0)
+    }
+
+    /// Whether it is of a step of that length.
+    pub(crate) fn is_of_length(&self, h: f64) -> bool {
+        self.numbers.first() == Some(&h)
+    }
+
+    /// Whether the factors are the same.
+    pub(crate) fn is_factored_as(&self, other: &Self, nd: usize) -> bool {
+        let end = self.numbers.len().saturating_sub(nd);
+        self.numbers[..end] == other.numbers[..end]
+    }
+
+    pub(crate) fn parts(&self, nd: usize, n: usize) -> Parts<'_> {
+        let (_, rest) = self.numbers.split_at(1);
+        let (force, rest) = rest.split_at(nd);
+        let (increment, rest) = rest.split_at(nd);
+        let (angles, rest) = rest.split_at(n);
+        let (prescribed, rest) = rest.split_at(n - nd);
+        let (orientations, weighed) = rest.split_at(rest.len() - nd);
+        Parts { force, increment, angles, prescribed, orientations, weighed }
+    }
+
+    /// Becomes the point of the step that was taken.
+    pub(crate) fn follow(&mut self, next: &Self) {
+        if !self.is_empty() {
+            self.numbers.copy_from_slice(&next.numbers);
+        }
+    }
+}

@@ -1,0 +1,252 @@
+//! What a change of the inputs does to a step, guessed before the step is looked at.
+//!
+//! Forces of inputs enter the residual of a step `k` as `h w`, `w = a f[k] + (1 − a) f[k−1]`, beside the momentum
+//! that a motion without their last change would have had. What past increments cannot foretell of the next one
+//! is hence `−K⁻¹ h (w − w_before)`, by the Newton matrix of the last step, whose factors are still there.
+//!
+//! A guess must follow from the state alone. So the state has the point where the equations of its last step were
+//! factored first; whoever does not have those factors, after a snapshot was restored, makes them again.
+
+use plantd_math::rotation::Turn;
+use plantd_math::spatial::{Mat3, Vec3, three};
+
+use crate::integrator::point::{Parts, Point};
+use crate::integrator::workspace::{StepContext, Workspace};
+use crate::kkt::system::{Factored, KktSystem};
+use crate::model::mechanism::Model;
+
+/// `a f[k] + (1 − a) f[k−1]`.
+#[inline(always)]
+fn weigh(at_start: f64, force: f64, before: f64) -> f64 {
+    at_start * force + (1.0 - at_start) * before
+}
+
+/// Factors of steps, for guesses.
+#[derive(Clone, Debug)]
+pub(crate) struct Response {
+    /// `−K⁻¹ h (w − w_before)` of this step, as it was guessed.
+    pub(crate) pushed: Vec<f64>,
+    /// Where this step was factored first.
+    pub(crate) point: Point,
+    /// Where those factors are.
+    place: Place,
+    first: Factored,
+    /// Of another point.
+    kept: Factored,
+    kept_at: Point,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Place {
+    /// There are none yet.
+    Nowhere,
+    /// The system has factored nothing since.
+    System,
+    First,
+}
+
+impl Response {
+    pub(crate) fn new(model: &Model, kkt: &KktSystem) -> Self {
+        let point = Point::of(model);
+        let factors = || if point.is_empty() { Factored::default() } else { kkt.factored.clone() };
+        let (first, kept) = (factors(), factors());
+        let pushed = vec![0.0; if point.is_empty() { 0 } else { model.dimensions.dynamic }];
+        Self { pushed, kept_at: point.clone(), point, place: Place::Nowhere, first, kept }
+    }
+
+    /// Saves the first factors of the step from the next ones.
+    #[inline]
+    pub(crate) fn save_first(&mut self, kkt: &mut KktSystem) {
+        if self.place == Place::System {
+            std::mem::swap(&mut kkt.factored, &mut self.first);
+            self.place = Place::First;
+        }
+    }
+
+    /// The step is done: its first factors are for the guess of the next one.
+    pub(crate) fn move_on(&mut self, kkt: &mut KktSystem) {
+        match self.place {
+            Place::Nowhere => return,
+            Place::System => std::mem::swap(&mut kkt.factored, &mut self.kept),
+            Place::First => std::mem::swap(&mut self.first, &mut self.kept),
+        }
+        std::mem::swap(&mut self.kept_at, &mut self.point);
+        self.place = Place::Nowhere;
+    }
+}
+
+impl Workspace {
+    /// Adds to the guess what the change of inputs does.
+    #[inline(never)]
+    pub(crate) fn push(&mut self, at: StepContext<'_>) {
+        let StepContext { model, settings, state, .. } = at;
+        let (h, a) = (settings.time_step_s, settings.force_split.at_start());
+        let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
+        self.response.place = Place::Nowhere;
+        let last = &state.past.point;
+        self.response.pushed.fill(0.0);
+        if !last.is_of_length(h) {
+            return;
+        }
+        let Parts { force: before, weighed, .. } = last.parts(nd, n);
+        let mut is_pushed = false;
+        let rows = self.response.pushed.iter_mut().zip(&self.mid.input_force);
+        for ((pushed, force), (before, weighed)) in rows.zip(before.iter().zip(weighed)) {
+            *pushed = h * (weigh(a, *force, *before) - weighed);
+            is_pushed |= *pushed != 0.0;
+        }
+        if !is_pushed {
+            return;
+        }
+        if !self.response.kept_at.is_factored_as(last, nd) && !self.factor_again(at) {
+            self.response.pushed.fill(0.0);
+            return;
+        }
+        let Self { kkt, constraints, response, step, .. } = self;
+        std::mem::swap(&mut kkt.factored, &mut response.kept);
+        kkt.solve(model, &constraints.end, &mut response.pushed, &mut []);
+        std::mem::swap(&mut kkt.factored, &mut response.kept);
+        if !response.pushed.iter().all(|x| x.is_finite()) {
+            response.pushed.fill(0.0);
+        }
+        response.pushed.iter_mut().for_each(|x| *x = -*x);
+        if state.past.extrapolates() {
+            step.increment.iter_mut().zip(&response.pushed).for_each(|(x, pushed)| *x += pushed);
+        }
+    }
+
+    /// Makes the factors of the last step again; whether that went well.
+    #[cold]
+    fn factor_again(&mut self, at: StepContext<'_>) -> bool {
+        let StepContext { model, settings, state, .. } = at;
+        let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
+        let Parts { force, increment, angles, prescribed, orientations, .. } =
+            state.past.point.parts(nd, n);
+        let pushed = std::mem::take(&mut self.response.pushed);
+        let (mid, inverse) = (&mut self.mid, 1.0 / settings.time_step_s);
+        mid.q.copy_from_slice(angles);
+        mid.angles.copy_from_slice(angles);
+        mid.velocity[..nd].iter_mut().zip(increment).for_each(|(v, x)| *v = x * inverse);
+        mid.velocity[nd..].copy_from_slice(prescribed);
+        for (matrix, numbers) in mid.orientations.iter_mut().zip(orientations.as_chunks::<9>().0) {
+            *matrix = Mat3([0, 3, 6].map(|i| three(numbers, i)));
+        }
+        mid.input_force.copy_from_slice(force);
+        mid.force.copy_from_slice(force);
+        for (turn, &i) in self.balls.turns.iter_mut().zip(&model.orientations) {
+            if i < nd {
+                *turn = Turn::new(three(increment, i));
+            }
+        }
+        mid.evaluate(model);
+        let is_factored = self.factor(model, settings, state).is_ok();
+        if is_factored {
+            std::mem::swap(&mut self.kkt.factored, &mut self.response.kept);
+            self.response.kept_at.clone_from(&state.past.point);
+        }
+        self.response.pushed = pushed;
+        // Inputs and prescribed motion are those of this step again.
+        self.prepare(at);
+        is_factored
+    }
+
+    /// Takes note of the point where the step has just been factored for the first time.
+    #[inline(never)]
+    pub(crate) fn note_point(&mut self, at: StepContext<'_>) {
+        let StepContext { model, settings, state, .. } = at;
+        let (h, a) = (settings.time_step_s, settings.force_split.at_start());
+        let Self { response, mid, step, .. } = self;
+        response.place = Place::System;
+        let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
+        let end = response.point.numbers.len() - nd;
+        let (points, weighed) = response.point.numbers.split_at_mut(end);
+        let last = &state.past.point;
+        let before = if last.is_known() { last.parts(nd, n).force } else { &mid.input_force };
+        for (w, (force, before)) in weighed.iter_mut().zip(mid.input_force.iter().zip(before)) {
+            *w = weigh(a, *force, *before);
+        }
+        let mut rest = points;
+        let mut put = |numbers: &[f64]| {
+            let (head, tail) = std::mem::take(&mut rest).split_at_mut(numbers.len());
+            head.copy_from_slice(numbers);
+            rest = tail;
+        };
+        put(&[h]);
+        put(&mid.input_force);
+        put(&step.increment);
+        put(&mid.angles);
+        put(&mid.velocity[nd..]);
+        for Mat3([x, y, z]) in &mid.orientations {
+            [x, y, z].into_iter().for_each(|Vec3(column)| put(column));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use crate::integrator::settings::Settings;
+    use crate::linearization::linearize::Linearization;
+    use crate::model::mechanism::Model;
+    use crate::plant::facade::Plant;
+    use crate::plant::initial::Initial;
+    use crate::plant::snapshot::Snapshot;
+    use plantd_scene::builtin;
+
+    /// Moves from a posture in which all joints move, with torques that change at each step.
+    fn pushed(name: &str, torque: f64) -> (Plant, impl FnMut(u32) -> Vec<f64>) {
+        let model = Arc::new(Model::compile(&builtin::scene(name).unwrap()).unwrap());
+        let settings = Settings { time_step_s: 0.002, ..Settings::new(&model) };
+        let mut plant = Plant::new(Arc::clone(&model), settings).unwrap();
+        let n = model.dimensions.coordinates();
+        let (q, v) = (plant.q().to_vec(), (0..n).map(|i| 0.5 * (1.7 * i as f64).sin()).collect());
+        plant.initialize(&Initial::Velocity { q, v }).unwrap();
+        let inputs = model.dimensions.input();
+        let input = move |k: u32| -> Vec<f64> {
+            (0..inputs).map(|i| torque * f64::from(k * k + 7 * i as u32).sin()).collect()
+        };
+        (plant, input)
+    }
+
+    #[test]
+    fn guesses_follow_from_the_state_alone() {
+        for name in ["tree-15", "tree-127", "walker-4"] {
+            let (mut plant, mut input) = pushed(name, 0.3);
+            let mut out = Linearization::new(plant.model());
+            for k in 0..40 {
+                let u = input(k);
+                let bytes = plant.snapshot().to_bytes();
+                // Factors of nothing, of another step, and of this one at its solution.
+                let mut restored =
+                    Plant::new(Arc::clone(plant.model()), *plant.settings()).unwrap();
+                restored.restore(&Snapshot::from_bytes(&bytes).unwrap()).unwrap();
+                let mut linearized = plant.clone();
+                linearized.linearize(&input(k + 3), &mut out).unwrap();
+                plant.step(&u).unwrap();
+                restored.step(&u).unwrap();
+                linearized.step_and_linearize(&u, &mut out).unwrap();
+                assert_eq!(plant.snapshot(), restored.snapshot(), "{name} {k}");
+                assert_eq!(plant.snapshot(), linearized.snapshot(), "{name} {k}");
+                if k % 3 == 0 {
+                    plant = restored;
+                } else if k % 3 == 1 {
+                    plant = linearized;
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn torques_that_change_are_guessed() {
+        for name in ["tree-15", "walker-9"] {
+            let (mut plant, mut input) = pushed(name, 0.3);
+            let (mut evaluations, steps) = (0, 40);
+            for k in 0..steps + 10 {
+                let report = plant.step(&input(k)).unwrap();
+                evaluations += if k < 10 { 0 } else { report.iterations };
+            }
+            assert!(evaluations <= 3 * steps, "{name}: {evaluations}");
+        }
+    }
+}
