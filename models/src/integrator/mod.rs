@@ -18,6 +18,7 @@ pub(crate) mod predictor;
 pub(crate) mod push;
 pub(crate) mod report;
 pub(crate) mod residual;
+pub(crate) mod response;
 pub(crate) mod scheme;
 pub(crate) mod settings;
 pub(crate) mod state;

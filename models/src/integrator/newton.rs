@@ -238,8 +238,13 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
         let mut chord = Chord::new(settings, self.kkt.corrections(), always_factor);
-        let mut strayed = Strayed::default();
-        while report.iterations < settings.max_iterations {
+        let mut strayed = model.is_foreseen(settings).then(Strayed::default);
+        let pushes = !state.past.point.is_empty();
+        loop {
+            if report.iterations == settings.max_iterations {
+                let residual = chord.previous;
+                return Err(StepError::NotConverged { iterations: report.iterations, residual });
+            }
             report.iterations += 1;
             // Residual: r1 = p0 + D1Ld + F⁻ − Dh(q0)ᵀ λ, r2 = h(q1).
             report.residual = self.evaluate(model, settings, state);
@@ -253,39 +258,38 @@ impl Workspace {
             if chord.is_fresh {
                 self.response.save_first(&mut self.kkt);
                 self.factor(model, settings, state)?;
-                if report.factorizations == 0 && !state.past.point.is_empty() {
+                if pushes && report.factorizations == 0 {
                     self.note_point(StepContext { model, settings, state, u: &[] });
                 }
                 report.factorizations += 1;
-                strayed = Strayed::default();
+                strayed = strayed.map(|_| Strayed::default());
             }
             if report.iterations == 1 && size <= CONVERGED {
                 // Nothing to correct, but what is singular has not passed for solved.
-                return self.accept(model, settings, report);
+                break;
             }
             // Correct: x += dx, λ += dλ.
             self.correct(model);
-            // Accept: p1 = D2Ld + F⁺.
             if converged && size <= STALE {
-                return self.accept(model, settings, report);
+                break;
             }
-            if model.is_foreseen(settings) {
-                let left = self.foresee(model, settings, &mut strayed);
+            if let Some(strayed) = &mut strayed {
+                let left = self.foresee(model, settings, strayed);
                 let expected = chord.expected();
                 if is_negligible(left, expected) {
                     report.residual = left.min(expected);
                     self.step.is_evaluated = false;
-                    return self.accept(model, settings, report);
+                    break;
                 }
             }
             if converged {
                 self.evaluate(model, settings, state);
-                return self.accept(model, settings, report);
+                break;
             }
             chord.is_idle = self.is_round_off_of_coordinates();
         }
-        let residual = chord.previous;
-        Err(StepError::NotConverged { iterations: report.iterations, residual })
+        // Accept: p1 = D2Ld + F⁺.
+        self.accept(model, settings, report)
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.

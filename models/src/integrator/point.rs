@@ -73,6 +73,11 @@ impl Point {
         Parts { force, increment, angles, prescribed, orientations, weighed }
     }
 
+    /// Becomes another point of the same size; allocates nothing.
+    pub(crate) fn copy_from(&mut self, other: &Self) {
+        self.numbers.clone_from(&other.numbers);
+    }
+
     /// Becomes the point of the step that was taken.
     pub(crate) fn follow(&mut self, next: &Self) {
         if !self.is_empty() {

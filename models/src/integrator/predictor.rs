@@ -284,7 +284,7 @@ impl Past {
     /// Becomes another past of the same kind and size; allocates nothing.
     pub(crate) fn copy_from(&mut self, other: &Self) {
         self.numbers.clone_from(&other.numbers);
-        self.point.clone_from(&other.point);
+        self.point.copy_from(&other.point);
         let Self { kind, known, order, is_even, .. } = *other;
         (self.kind, self.known, self.order, self.is_even) = (kind, known, order, is_even);
     }

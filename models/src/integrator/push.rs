@@ -10,69 +10,14 @@
 use plantd_math::rotation::Turn;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
-use crate::integrator::point::{Parts, Point};
+use crate::integrator::point::Parts;
+use crate::integrator::response::Place;
 use crate::integrator::workspace::{StepContext, Workspace};
-use crate::kkt::system::{Factored, KktSystem};
-use crate::model::mechanism::Model;
 
 /// `a f[k] + (1 − a) f[k−1]`.
 #[inline(always)]
 fn weigh(at_start: f64, force: f64, before: f64) -> f64 {
     at_start * force + (1.0 - at_start) * before
-}
-
-/// Factors of steps, for guesses.
-#[derive(Clone, Debug)]
-pub(crate) struct Response {
-    /// `−K⁻¹ h (w − w_before)` of this step, as it was guessed.
-    pub(crate) pushed: Vec<f64>,
-    /// Where this step was factored first.
-    pub(crate) point: Point,
-    /// Where those factors are.
-    place: Place,
-    first: Factored,
-    /// Of another point.
-    kept: Factored,
-    kept_at: Point,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Place {
-    /// There are none yet.
-    Nowhere,
-    /// The system has factored nothing since.
-    System,
-    First,
-}
-
-impl Response {
-    pub(crate) fn new(model: &Model, kkt: &KktSystem) -> Self {
-        let point = Point::of(model);
-        let factors = || if point.is_empty() { Factored::default() } else { kkt.factored.clone() };
-        let (first, kept) = (factors(), factors());
-        let pushed = vec![0.0; if point.is_empty() { 0 } else { model.dimensions.dynamic }];
-        Self { pushed, kept_at: point.clone(), point, place: Place::Nowhere, first, kept }
-    }
-
-    /// Saves the first factors of the step from the next ones.
-    #[inline]
-    pub(crate) fn save_first(&mut self, kkt: &mut KktSystem) {
-        if self.place == Place::System {
-            std::mem::swap(&mut kkt.factored, &mut self.first);
-            self.place = Place::First;
-        }
-    }
-
-    /// The step is done: its first factors are for the guess of the next one.
-    pub(crate) fn move_on(&mut self, kkt: &mut KktSystem) {
-        match self.place {
-            Place::Nowhere => return,
-            Place::System => std::mem::swap(&mut kkt.factored, &mut self.kept),
-            Place::First => std::mem::swap(&mut self.first, &mut self.kept),
-        }
-        std::mem::swap(&mut self.kept_at, &mut self.point);
-        self.place = Place::Nowhere;
-    }
 }
 
 impl Workspace {
@@ -122,7 +67,6 @@ impl Workspace {
         let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
         let Parts { force, increment, angles, prescribed, orientations, .. } =
             state.past.point.parts(nd, n);
-        let pushed = std::mem::take(&mut self.response.pushed);
         let (mid, inverse) = (&mut self.mid, 1.0 / settings.time_step_s);
         mid.q.copy_from_slice(angles);
         mid.angles.copy_from_slice(angles);
@@ -142,9 +86,8 @@ impl Workspace {
         let is_factored = self.factor(model, settings, state).is_ok();
         if is_factored {
             std::mem::swap(&mut self.kkt.factored, &mut self.response.kept);
-            self.response.kept_at.clone_from(&state.past.point);
+            self.response.kept_at.copy_from(&state.past.point);
         }
-        self.response.pushed = pushed;
         // Inputs and prescribed motion are those of this step again.
         self.prepare(at);
         is_factored
@@ -165,11 +108,10 @@ impl Workspace {
         for (w, (force, before)) in weighed.iter_mut().zip(mid.input_force.iter().zip(before)) {
             *w = weigh(a, *force, *before);
         }
-        let mut rest = points;
+        let mut done = 0;
         let mut put = |numbers: &[f64]| {
-            let (head, tail) = std::mem::take(&mut rest).split_at_mut(numbers.len());
-            head.copy_from_slice(numbers);
-            rest = tail;
+            points[done..done + numbers.len()].copy_from_slice(numbers);
+            done += numbers.len();
         };
         put(&[h]);
         put(&mid.input_force);

@@ -5,7 +5,7 @@ use plantd_math::rows::{Term, padded, spread};
 use crate::constraints::closure::Closure;
 use crate::integrator::balls::BallJoints;
 use crate::integrator::midpoint::Midpoint;
-use crate::integrator::push::Response;
+use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::kkt::system::KktSystem;
@@ -115,9 +115,8 @@ impl Workspace {
         let (nd, n, nc) = (d.dynamic, d.coordinates(), d.constraints);
         let has_balls = !model.orientations.is_empty();
         let zeros = |len: usize| vec![0.0; len];
-        let kkt = KktSystem::new(model, spread(padded(2 * n)));
         Self {
-            response: Response::new(model, &kkt),
+            response: Response::new(model),
             step: StepIncrement {
                 increment: zeros(nd),
                 multipliers: zeros(nc),
@@ -134,7 +133,7 @@ impl Workspace {
                 round_off: 0.0,
             },
             constraints: ConstraintPair { start: Closure::new(model), end: Closure::new(model) },
-            kkt,
+            kkt: KktSystem::new(model, spread(padded(2 * n))),
             tangents: Tangents {
                 diagonals: [zeros(nd), zeros(nd)],
                 constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),

@@ -84,12 +84,13 @@ pub(crate) struct Linearized<'a> {
     pub(crate) singular_below: f64,
 }
 
-impl KktSystem {
-    /// Room for the factors, by what suits the model; columns of the Schur complement are `stride` apart.
-    pub(crate) fn new(model: &Model, stride: usize) -> Self {
-        let nd = model.dimensions.dynamic;
+impl Factored {
+    /// Room for the factors of a model.
+    pub(crate) fn new(model: &Model) -> Self {
         let recursion = match (model.solver, &model.loops) {
-            (Solver::Planar, _) => Recursion::Planar(Box::new(PlanarRecursion::new(nd))),
+            (Solver::Planar, _) => {
+                Recursion::Planar(Box::new(PlanarRecursion::new(model.dimensions.dynamic)))
+            }
             (Solver::Loops, Some(loops)) => Recursion::Loops(Box::new(Multifrontal::new(loops))),
             (Solver::Spatial, _) => {
                 let recursion = SpatialRecursion::new(model);
@@ -97,12 +98,16 @@ impl KktSystem {
             }
             (Solver::Tree | Solver::Loops, _) => Recursion::None,
         };
+        Self { tree: TreeLu::new(&model.elimination), recursion, valid: Factors::Tree }
+    }
+}
+
+impl KktSystem {
+    /// Room for the factors, by what suits the model; columns of the Schur complement are `stride` apart.
+    pub(crate) fn new(model: &Model, stride: usize) -> Self {
+        let nd = model.dimensions.dynamic;
         Self {
-            factored: Factored {
-                tree: TreeLu::new(&model.elimination),
-                recursion,
-                valid: Factors::Tree,
-            },
+            factored: Factored::new(model),
             schur: SchurComplement::new(model, stride),
             diagonal: vec![0.0; nd],
             balls: vec![Weights::REST; model.orientations.len()],

@@ -12,8 +12,8 @@
 use plantd_math::sums::two_sum;
 
 use crate::integrator::collocation::Collocation;
-use crate::integrator::push::Response;
 use crate::integrator::report::StepError;
+use crate::integrator::response::Response;
 use crate::integrator::scheme::Scheme;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
