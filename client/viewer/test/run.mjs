@@ -1,8 +1,10 @@
 // Tests of the page in a real browser against a real server.
 //
-//   npm test -- --server PATH [--pictures FOLDER] [--only WORDS]
+//   npm test -- --server PATH [--pictures FOLDER] [--only WORDS] [--measures only|none]
 //
 // `plantctl` lies beside the server.
+//
+// `--measures` leaves out what takes all of the processors to measure how fluent things are, or all else.
 //
 // Without Chromium it says so and ends with 77.
 
@@ -19,7 +21,10 @@ import { tokenTests } from "./token.mjs";
 import { windowTests } from "./windows.mjs";
 
 const SKIPPED = 77;
-const { values: options } = parseArgs({ options: { server: { type: "string" }, pictures: { type: "string" }, only: { type: "string" } } });
+/** Tests that measure how fluent things are. */
+const MEASURES = /fluently|ten windows/;
+const string = { type: "string" };
+const { values: options } = parseArgs({ options: { server: string, pictures: string, only: string, measures: string } });
 if (!options.server) {
   console.error("usage: npm test -- --server PATH [--pictures FOLDER]");
   process.exit(2);
@@ -376,6 +381,7 @@ try {
   if (options.pictures) await pictures(options.pictures);
   for (const [name, test] of Object.entries(tests)) {
     if (options.only && !name.includes(options.only)) continue;
+    if (options.measures && MEASURES.test(name) !== (options.measures === "only")) continue;
     try {
       await test();
       if (troubles.length > 0) throw new Error(troubles.splice(0).join("; "));

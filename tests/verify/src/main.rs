@@ -34,13 +34,14 @@ const STAGES: &[Stage] = &[
     Stage { name: "python", quick: false, lane: Lane::Aside, run: python::test_client },
     Stage { name: "book", quick: false, lane: Lane::Aside, run: python::make_book },
     Stage { name: "robots", quick: false, lane: Lane::Aside, run: python::compare_robots },
+    Stage { name: "viewer", quick: false, lane: Lane::Main, run: viewer::test_page },
     Stage { name: "docs", quick: false, lane: Lane::Main, run: docs },
     Stage { name: "doctests", quick: false, lane: Lane::Main, run: doctests },
     Stage { name: "stress", quick: false, lane: Lane::Main, run: stress },
     Stage { name: "traces", quick: false, lane: Lane::Main, run: traces },
     Stage { name: "fuzz", quick: false, lane: Lane::Main, run: fuzz },
     Stage { name: "demo", quick: false, lane: Lane::Main, run: demo },
-    Stage { name: "viewer", quick: false, lane: Lane::Alone, run: viewer::test_page },
+    Stage { name: "windows", quick: false, lane: Lane::Alone, run: viewer::measure_page },
 ];
 
 /// What the stages need to know.

@@ -10,23 +10,39 @@ const SKIPPED: i32 = 77;
 
 /// Builds the bundle anew and compares it with the one in the tree, then tests the page against the server.
 pub(crate) fn test_page(context: &mut Context) -> Outcome {
+    install(context)?;
+    run(&mut at(context, "npm", &["run", "--silent", "generate"]))?;
+    run(&mut at(context, "npm", &["run", "--silent", "check"]))?;
+    run(&mut at(context, "node", &["build.mjs", "--check"]))?;
+    test(context, "none")
+}
+
+/// Measures how fluent the page is, and whether many windows disturb a plant.
+pub(crate) fn measure_page(context: &mut Context) -> Outcome {
+    if !context.root.join("client/viewer/node_modules").is_dir() {
+        install(context)?;
+    }
+    test(context, "only")
+}
+
+fn at(context: &Context, program: &str, arguments: &[&str]) -> Command {
+    let mut command = Command::new(program);
+    command.args(arguments).current_dir(context.root.join("client/viewer"));
+    command
+}
+
+fn install(context: &Context) -> Outcome {
     context.must_build()?;
     if !tools::has("node", &["--version"]) || !tools::has("npm", &["--version"]) {
         return Err(Failure::Skipped("no node with npm: the page and its bundle".to_owned()));
     }
-    let folder = context.root.join("client/viewer");
-    let at = |program: &str, arguments: &[&str]| {
-        let mut command = Command::new(program);
-        command.args(arguments).current_dir(&folder);
-        command
-    };
-    run(&mut at("npm", &["ci", "--no-progress", "--loglevel=error"]))?;
-    run(&mut at("npm", &["run", "--silent", "generate"]))?;
-    run(&mut at("npm", &["run", "--silent", "check"]))?;
-    run(&mut at("node", &["build.mjs", "--check"]))?;
-    let server = context.binaries().join("plantd");
-    let mut test = at("node", &["test/run.mjs", "--server"]);
-    match test.arg(server).status() {
+    run(&mut at(context, "npm", &["ci", "--no-progress", "--loglevel=error"]))
+}
+
+fn test(context: &Context, measures: &str) -> Outcome {
+    context.must_build()?;
+    let mut test = at(context, "node", &["test/run.mjs", "--measures", measures, "--server"]);
+    match test.arg(context.binaries().join("plantd")).status() {
         Ok(status) if status.success() => Ok(()),
         Ok(status) if status.code() == Some(SKIPPED) => Err(Failure::Skipped(
             "no chromium (package chromium): the page in a browser".to_owned(),
