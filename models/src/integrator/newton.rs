@@ -43,8 +43,8 @@ struct Chord {
     patience: u32,
     always_factor: bool,
     previous: f64,
-    /// The residual over the one before.
-    rate: f64,
+    /// The residual before that.
+    before: f64,
     /// The Jacobian is that of this residual.
     is_fresh: bool,
     /// The last correction was no more than round-off of the coordinates.
@@ -54,8 +54,8 @@ struct Chord {
 impl Chord {
     fn new(settings: &Settings, patience: u32, always_factor: bool) -> Self {
         let enough = settings.precision.residual();
-        let (previous, rate) = (f64::INFINITY, f64::INFINITY);
-        Self { enough, patience, always_factor, previous, rate, is_fresh: false, is_idle: false }
+        let (previous, before) = (f64::INFINITY, f64::INFINITY);
+        Self { enough, patience, always_factor, previous, before, is_fresh: false, is_idle: false }
     }
 
     /// Whether the correction of a residual is the last; `is_fresh` says whether it takes a new Jacobian.
@@ -73,15 +73,17 @@ impl Chord {
         // another step would be memory beside the state.
         self.is_fresh = self.previous.is_infinite()
             || (!converged && (self.always_factor || later > self.enough));
-        self.rate = if self.previous.is_infinite() { f64::INFINITY } else { rate };
-        self.previous = size;
+        (self.before, self.previous) = (self.previous, size);
         converged
     }
 
     /// What the correction of the last residual leaves over, from how the residual has fallen: kept factors
     /// get no better, and those of a new Jacobian are off by twice as much as their first correction shows.
     fn expected(&self) -> f64 {
-        8.0 * self.previous * self.rate
+        if self.before.is_infinite() {
+            return f64::INFINITY;
+        }
+        8.0 * self.previous * (self.previous / self.before)
     }
 }
 
