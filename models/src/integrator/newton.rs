@@ -92,11 +92,12 @@ impl Workspace {
     pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<StepReport, StepError> {
         let StepContext { model, settings, state, .. } = at;
         self.prepare(at);
-        if state.past.predict(settings.time_step_s, &mut self.step.increment) {
+        let is_guessed = state.past.predict(settings.time_step_s, &mut self.step.increment);
+        if !state.past.point.is_empty() {
+            self.push(at);
+        }
+        if is_guessed {
             // The equations are linear in the multipliers: any guess is as good.
-            if !state.past.point.is_empty() {
-                self.push(at);
-            }
             self.step.multipliers.copy_from_slice(&state.multipliers);
             let report = self.iterate(model, settings, state, false);
             if report.is_ok() {

@@ -180,6 +180,20 @@ mod tests {
     }
 
     #[test]
+    fn a_plant_that_begins_anew_knows_of_no_push() {
+        let (mut plant, mut input) = pushed("tree-15", 0.3);
+        let (begin, mut other) = (plant.snapshot(), plant.clone());
+        for k in 0..5 {
+            plant.step(&input(k)).unwrap();
+        }
+        plant.restore(&begin).unwrap();
+        let u = input(9);
+        plant.step(&u).unwrap();
+        other.step(&u).unwrap();
+        assert_eq!(plant.snapshot(), other.snapshot());
+    }
+
+    #[test]
     fn torques_that_change_are_guessed() {
         for name in ["tree-15", "walker-9"] {
             let (mut plant, mut input) = pushed(name, 0.3);
