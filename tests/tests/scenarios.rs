@@ -199,7 +199,7 @@ fn what_cannot_be_run_is_no_failure_of_the_controller() {
         ("no-such-file.toml", &[][..]),
         ("met", &["--case", "no-such-case"]),
         ("met", &["--address", &nowhere]),
-        ("met", &["--server", "/no/such/server"]),
+        ("met", &["--plantd", "/no/such/server"]),
     ] {
         assert_eq!(test(path, arguments).status.code(), Some(2), "{path} {arguments:?}");
     }

@@ -50,6 +50,31 @@ fn measurement() -> DMatrix<f64> {
     DMatrix::from_diagonal(&nalgebra::dvector![1e-4, 2e-4])
 }
 
+/// A tachometer: what it shows follows from a step of the plant's own, and at rest it shows nothing.
+#[tokio::test]
+async fn velocities_are_measured_at_rest() {
+    let (_server, client) = server().await;
+    let mut tachometer = upright();
+    let outputs = ["v(theta)", "x"].map(str::to_owned).to_vec();
+    tachometer.measurement = Some(v1::Measurement { outputs, ..Default::default() });
+    let filter = client.solve_kalman(tachometer.clone()).await.unwrap();
+    assert_eq!(filter.outputs, ["v(theta)", "x"]);
+    let (c, a) = (dense(&filter.output_x), dense(&filter.linearization.unwrap().a));
+    assert!(filter.y_reference[0].abs() < 1e-15 && filter.y_reference[1] == filter.x_reference[0]);
+    // Velocities of a step that starts at rest, by momenta: the mean of those at both ends moves the pole.
+    let h = 0.01;
+    let mean = 0.5 * h * (c.row(0) + c.row(0) * &a);
+    let moved = a.row(1) - DMatrix::from_row_slice(1, 4, &[0.0, 1.0, 0.0, 0.0]);
+    for momentum in 2..4 {
+        let (mean, moved) = (mean[(0, momentum)], moved[(0, momentum)]);
+        assert!((mean / moved - 1.0).abs() < 0.01, "{mean} {moved}");
+    }
+    tachometer.measurement =
+        Some(v1::Measurement { outputs: vec!["v(tetha)".to_owned()], ..Default::default() });
+    let refused = client.solve_kalman(tachometer).await;
+    assert_refused(refused, Code::InvalidArgument, "INVALID_FIELD", "measurement.outputs[0]");
+}
+
 #[tokio::test]
 async fn a_steady_filter_solves_its_equations() {
     let (_server, client) = server().await;

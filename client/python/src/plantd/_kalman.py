@@ -235,9 +235,9 @@ class KalmanCalls(Calls):
     ) -> Kalman:
         """Steady-state Kalman filter about an equilibrium, ready to ``correct`` and ``predict``.
 
-        ``outputs`` are what is measured: names of entries of x such as ``theta`` or ``p(theta)``, or a
-        matrix. Noises are covariances per step, diagonals or matrices: of the measurement, of the
-        state and of the inputs.
+        ``outputs`` are what is measured: names of entries of x such as ``theta`` or ``p(theta)``,
+        velocities such as ``v(theta)`` at a point at rest, or a matrix. Noises are covariances per step,
+        diagonals or matrices: of the measurement, of the state and of the inputs.
         """
         request = build(
             control_service_pb2.SolveKalmanRequest,

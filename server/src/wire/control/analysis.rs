@@ -28,7 +28,7 @@ pub(crate) fn analyze(
     let constraints = Constraints::new(request.constraints)?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
     let (x, u_matrix) = (request.output_x.as_ref(), request.output_u.as_ref());
-    let outputs = Outputs::with_velocities(request.outputs, x, u_matrix, &mut plant)?;
+    let outputs = Outputs::with_velocities("", request.outputs, x, u_matrix, &mut plant)?;
     check_frequencies(hub, &request.frequencies_hz, &outputs)?;
     let mut linearization = Linearization::new(plant.model());
     plant.linearize(&u, &mut linearization)?;
@@ -120,7 +120,8 @@ impl Outputs {
     }
 
     /// The same, where an output may also be the velocity `v(theta)` of a dynamic coordinate.
-    fn with_velocities(
+    pub(crate) fn with_velocities(
+        prefix: &str,
         names: Vec<String>,
         x: Option<&v1::Matrix>,
         u: Option<&v1::Matrix>,
@@ -134,15 +135,16 @@ impl Outputs {
         };
         let moving: Vec<Option<usize>> = names.iter().map(index).collect();
         if moving.iter().all(Option::is_none) || x.is_some() {
-            return Self::new("", names, x, u, &model);
+            return Self::new(prefix, names, x, u, &model);
         }
         let entry = |(name, moving): (&String, &Option<usize>)| match moving {
             Some(index) => dynamic[*index].name.clone(),
             None => name.clone(),
         };
         let entries = names.iter().zip(&moving).map(entry).collect();
-        let mut outputs = Self::new("", entries, x, u, &model)?;
-        let velocities = velocities(plant)?;
+        let mut outputs = Self::new(prefix, entries, x, u, &model)?;
+        let velocities = velocities(plant)
+            .map_err(|problem| RpcError::field(format!("{prefix}outputs"), problem))?;
         for (row, index) in moving.iter().enumerate() {
             if let Some(index) = index {
                 outputs.x.row_mut(row).copy_from(&velocities.row(*index));
@@ -179,10 +181,10 @@ impl Outputs {
 
 /// The derivatives of the velocities of the dynamic coordinates by `x = (q, p, v)`, at rest, where the mass matrix does
 /// not change: `M_d⁻¹ (dp̃ − M_k dv)`, of the momentum p̃ projected onto the constraints.
-fn velocities(plant: &mut Plant) -> Result<DMatrix<f64>, RpcError> {
+fn velocities(plant: &mut Plant) -> Result<DMatrix<f64>, String> {
     let d = plant.model().dimensions();
     if plant.velocity().iter().any(|v| v.abs() > REST) {
-        return Err(RpcError::field("outputs", "velocities are outputs of points at rest alone"));
+        return Err("velocities are outputs of points at rest alone".to_owned());
     }
     let (nd, nk) = (d.dynamic, d.prescribed);
     let point = ContinuousPoint {
@@ -191,14 +193,13 @@ fn velocities(plant: &mut Plant) -> Result<DMatrix<f64>, RpcError> {
         inputs: vec![0.0; d.inputs],
         prescribed_acceleration: vec![0.0; nk],
     };
-    let mass = Continuous::new(Arc::clone(plant.model())).terms(&point)?.mass_matrix;
+    let terms = Continuous::new(Arc::clone(plant.model())).terms(&point);
+    let mass = terms.map_err(|error| error.to_string())?.mass_matrix;
     let mut momentum = plant.projected_momentum_by_state();
     let mut by_prescribed = momentum.columns_mut(d.state() - nk, nk);
     by_prescribed -= mass.view((0, nd), (nd, nk));
     let factors = mass.view((0, 0), (nd, nd)).into_owned().cholesky();
-    let factors = factors.ok_or_else(|| {
-        RpcError::field("outputs", "the mass matrix is singular: momenta give no velocities")
-    })?;
+    let factors = factors.ok_or("the mass matrix is singular: momenta give no velocities")?;
     Ok(factors.solve(&momentum))
 }
 

@@ -24,7 +24,10 @@ pub(crate) fn solve(
 ) -> Result<v1::SolveKalmanResponse, RpcError> {
     let constraints = Constraints::new(request.constraints)?;
     let (mut plant, u) = at_point(hub, &request.model, request.settings, request.point)?;
-    let outputs = outputs(request.measurement, plant.model())?;
+    let v1::Measurement { outputs, output_x, output_u } = request.measurement.unwrap_or_default();
+    let (output_x, output_u) = (output_x.as_ref(), output_u.as_ref());
+    let outputs =
+        Outputs::with_velocities("measurement.", outputs, output_x, output_u, &mut plant)?;
     let noise = noise(request.noise, &outputs, plant.model())?;
     check_equilibrium(plant.clone(), &u)?;
     let step = plant.step_index();

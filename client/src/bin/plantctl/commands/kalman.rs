@@ -18,8 +18,8 @@ use crate::server::context::Context;
 pub(crate) struct Kalman {
     #[command(flatten)]
     point: Point,
-    /// What is measured, comma-separated entries of x such as `theta` or `p(theta)`; all if not
-    /// given.
+    /// What is measured, comma-separated: entries of x such as `theta` or `p(theta)`, velocities `v(theta)`; all
+    /// of x if not given.
     #[arg(long, value_delimiter = ',')]
     outputs: Vec<String>,
     /// Variances of the measurements' noise, comma-separated, one number stands for all; or some by name.

@@ -88,9 +88,9 @@ pub(crate) struct Test {
     /// Cases at a time; as many as there are processors if not given. Paced ones run one at a time.
     #[arg(long, short, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     jobs: Option<u16>,
-    /// The server to start; the `plantd` beside this program or in PATH if not given.
-    #[arg(long, value_name = "PROGRAM")]
-    server: Option<PathBuf>,
+    /// The `plantd` to start; that beside this program or in PATH if not given.
+    #[arg(long, value_name = "PROGRAM", alias = "server")]
+    plantd: Option<PathBuf>,
     /// Write results as JUnit XML.
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
@@ -134,7 +134,7 @@ impl Test {
         let (own, address) = match &context.address {
             Some(address) => (None, address.clone()),
             None => {
-                let own = OwnServer::start(self.server.as_deref()).await?;
+                let own = OwnServer::start(self.plantd.as_deref()).await?;
                 let address = own.address().to_owned();
                 (Some(own), address)
             }
@@ -145,7 +145,7 @@ impl Test {
             address,
             plants: Mutex::new(BTreeSet::new()),
         };
-        let replay = Replay { address: context.address.as_deref(), server: self.server.as_deref() };
+        let replay = Replay { address: context.address.as_deref(), plantd: self.plantd.as_deref() };
         let mut terminated = signal(SignalKind::terminate())?;
         let all = self.run_all(&server, scenarios, &context.output, &replay);
         let tested = tokio::select! {

@@ -27,7 +27,7 @@ pub(crate) struct Report {
 /// Where the words of a command that replays a case come from.
 pub(crate) struct Replay<'a> {
     pub(crate) address: Option<&'a str>,
-    pub(crate) server: Option<&'a Path>,
+    pub(crate) plantd: Option<&'a Path>,
 }
 
 impl Replay<'_> {
@@ -40,8 +40,8 @@ impl Replay<'_> {
             flag("--address", address);
         }
         flag("test", &prepared.file.to_string_lossy());
-        if let Some(server) = self.server {
-            flag("--server", &server.to_string_lossy());
+        if let Some(plantd) = self.plantd {
+            flag("--plantd", &plantd.to_string_lossy());
         }
         flag("--seed", &outcome.seed.to_string());
         if !outcome.case.is_empty() {
