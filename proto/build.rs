@@ -14,6 +14,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "channel_service",
         "recording",
         "recording_service",
+        "server_service",
     ];
     let contract: Vec<_> = names.iter().map(|name| format!("plantd/v1/{name}.proto")).collect();
     let players = vec!["foxglove/scene.proto".to_owned()];

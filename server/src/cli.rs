@@ -38,6 +38,12 @@ pub struct Settings {
     /// Configuration file, TOML.
     #[arg(long, env = "PLANTD_CONFIG", value_name = "FILE")]
     pub config: Option<PathBuf>,
+    /// Name of this server among others; that of the machine if not given.
+    #[arg(long, env = "PLANTD_NAME")]
+    pub name: Option<String>,
+    /// Address by which clients reach it; where it listens if not given.
+    #[arg(long, env = "PLANTD_ADVERTISE", value_name = "ADDRESS")]
+    pub advertise: Option<String>,
     /// gRPC over TCP; port 0 takes any free one; `off` for none.
     #[arg(long, env = "PLANTD_GRPC", value_name = "ADDRESS:PORT")]
     pub grpc: Option<Listen>,
@@ -118,7 +124,7 @@ pub struct Settings {
     /// Seconds for open calls to end at shutdown.
     #[arg(long, env = "PLANTD_SHUTDOWN_GRACE_S", value_name = "SECONDS")]
     pub shutdown_grace_s: Option<f64>,
-    /// Seconds to serve on after SIGTERM, so that balancers that ask for health can look elsewhere.
+    /// Longest time to serve on after SIGTERM: while plants are driven, and for balancers to look elsewhere.
     #[arg(long, env = "PLANTD_DRAIN_S", value_name = "SECONDS")]
     pub drain_s: Option<f64>,
     /// What is logged, like RUST_LOG: `info`, `plantd_server=debug`.
@@ -182,6 +188,8 @@ impl Settings {
         replace(&mut config.insecure, self.insecure);
         replace(&mut config.view, self.view.map(|switch| switch == Switch::On));
         replace(&mut config.link.enabled, self.link.map(|switch| switch == Switch::On));
+        config.name = self.name.or(config.name);
+        config.advertise = self.advertise.or(config.advertise);
         config.unix = self.unix.or(config.unix);
         config.link.root = self.link_root.or(config.link.root);
         config.scenes = self.scenes.or(config.scenes);

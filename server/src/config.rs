@@ -19,7 +19,7 @@ use crate::core::tenant::{ANY_TENANT, TenantSettings, is_tenant_name};
 use crate::tls::{ClientCertificates, TlsSettings};
 use crate::wire::edge::auth::settings::AuthSettings;
 use crate::wire::link::config::LinkConfig;
-use crate::wire::names::{Names, is_host_name, is_origin};
+use crate::wire::names::{Names, is_address, is_host_name, is_origin};
 
 /// Port of gRPC over TCP unless another one is given.
 pub const DEFAULT_PORT: u16 = 50051;
@@ -31,6 +31,12 @@ const DURATION_MAX_S: f64 = 86_400.0;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
+    /// Name of this server among others, by which its plants say where they are; the machine's if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Address by which clients reach it: `https://plantd-1.lab:50051`; where it listens if not given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub advertise: Option<String>,
     /// gRPC over TCP: `address:port` or `name:port`, port 0 for any free one, or `off`.
     pub grpc: Listen,
     /// gRPC over a unix-domain socket at this path; not given means none.
@@ -76,8 +82,8 @@ pub struct Config {
     pub search_threads: usize,
     /// Time for open calls to end at shutdown before they are cut off, s.
     pub shutdown_grace_s: f64,
-    /// Seconds to serve on after SIGTERM, with health NOT_SERVING; nobody waits where nobody has asked for
-    /// the server's health.
+    /// Longest time to serve on after SIGTERM or Drain, with health NOT_SERVING and taking nothing new, s: as
+    /// long as somebody drives a plant; all of it where balancers have asked for the server's health.
     pub drain_s: f64,
     /// Logging.
     pub log: LogConfig,
@@ -103,6 +109,8 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Self {
+            name: None,
+            advertise: None,
             grpc: Listen::At(SocketAddr::from((Ipv4Addr::LOCALHOST, DEFAULT_PORT))),
             unix: None,
             unix_mode: Mode::GROUP,
@@ -133,6 +141,11 @@ impl Default for Config {
             limits: Limits::default(),
         }
     }
+}
+
+/// A name that DNS would take, too.
+fn is_server_name(name: &str) -> bool {
+    is_host_name(name) && name.len() <= 253
 }
 
 /// Where to listen.
@@ -485,6 +498,16 @@ impl Config {
     fn check_names(&self) -> Result<(), ConfigError> {
         let wrong =
             |key, value: &String, what| Err(ConfigError::Name { key, value: value.clone(), what });
+        if let Some(name) = self.name.as_ref().filter(|name| !is_server_name(name)) {
+            return wrong("name", name, "letters, digits and `-_.`, at most 253");
+        }
+        if let Some(address) = self.advertise.as_ref().filter(|text| !is_address(text)) {
+            return wrong(
+                "advertise",
+                address,
+                "http://host:port, https://host:port or unix:/path",
+            );
+        }
         if let Some(origin) = self.allowed_origins.iter().find(|text| !is_origin(text)) {
             return wrong("allowed_origins", origin, "origins such as `https://panel.example`");
         }
@@ -492,6 +515,13 @@ impl Config {
             Some(host) => wrong("allowed_hosts", host, "host names without port"),
             None => Ok(()),
         }
+    }
+
+    /// The server's name among others.
+    pub fn server_name(&self) -> String {
+        let of_machine = || std::fs::read_to_string("/proc/sys/kernel/hostname").ok();
+        let name = self.name.clone().or_else(|| of_machine().map(|name| name.trim().to_owned()));
+        name.filter(|name| is_server_name(name)).unwrap_or_else(|| "plantd".to_owned())
     }
 
     /// By which names the server may be called.
@@ -505,7 +535,7 @@ impl Config {
         Duration::from_secs_f64(self.shutdown_grace_s)
     }
 
-    /// Time to serve on after SIGTERM, where somebody asks for the server's health.
+    /// Longest time to serve on after SIGTERM or Drain.
     pub fn drain(&self) -> Duration {
         Duration::from_secs_f64(self.drain_s)
     }

@@ -14,6 +14,7 @@ use serde::Serialize;
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
+use tonic::codegen::http;
 use tonic::service::{LayerExt as _, Routes};
 use tonic::transport::Server;
 use tonic::transport::server::Router;
@@ -27,6 +28,7 @@ use v1::control_service_server::ControlServiceServer;
 use v1::model_service_server::ModelServiceServer;
 use v1::plant_service_server::PlantServiceServer;
 use v1::recording_service_server::RecordingServiceServer;
+use v1::server_service_server::ServerServiceServer;
 
 use crate::config::{Config, Listen};
 use crate::core::connection::Connection;
@@ -50,12 +52,16 @@ use crate::wire::models::model::ModelService;
 use crate::wire::plants::channels::ChannelService;
 use crate::wire::plants::plant::PlantService;
 use crate::wire::plants::recordings::RecordingService;
+use crate::wire::plants::server::ServerService;
 use crate::wire::record::directory::Recordings;
 use crate::wire::shared::hub::Hub;
 use crate::wire::shared::state_directory::StateDirectory;
 
 /// Longest wait at the end for a disk that does not answer while plants are saved.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
+
+/// How often a server that drains looks whether plants are driven.
+const DRAIN_PERIOD: Duration = Duration::from_millis(20);
 
 /// How often plants are looked at that are kept for a time.
 const EXPIRY_PERIOD: Duration = Duration::from_secs(1);
@@ -115,12 +121,14 @@ pub async fn run(
     let mut server = RunningServer::start(config).await?;
     on_ready(server.addresses());
     let hurry = hurry.shared();
+    let hub = Arc::clone(&server.hub);
     tokio::select! {
         shutdown = shutdown => {
             if shutdown == Shutdown::Drained {
                 server.drain(hurry.clone()).await;
             }
         }
+        () = hub.drain.requested() => server.drain(hurry.clone()).await,
         error = server.listener_failed() => {
             tracing::error!(%error, "a listener failed");
             server.stop().await;
@@ -136,7 +144,8 @@ pub async fn run(
 pub enum Shutdown {
     /// As soon as open calls have ended.
     Prompt,
-    /// Balancers that ask for its health are told first, and given time to look elsewhere.
+    /// Nothing new is taken, and what is driven goes on for a while; balancers that ask for its health are told, and
+    /// given time to look elsewhere.
     Drained,
 }
 
@@ -154,6 +163,7 @@ impl RunningServer {
         let links = links.context("shared-memory links (turn them off with `--link off`)")?;
         let link_root = config.link.host_config().filter(|_| links.is_some()).map(|link| link.root);
         let mut hub = Hub::new(
+            config.server_name(),
             config.limits.clone(),
             config.worker_count(),
             config.worker_priority,
@@ -196,8 +206,10 @@ impl RunningServer {
         health.set_serving::<RecordingServiceServer<RecordingService>>().await;
         let is_asked_for_health = Arc::new(AtomicBool::new(false));
         let asked = Arc::clone(&is_asked_for_health);
-        let note = MapRequestLayer::new(move |request| {
-            asked.store(true, Ordering::Relaxed);
+        // Whoever watches it is told at once, and needs no time.
+        let note = MapRequestLayer::new(move |request: http::Request<tonic::body::Body>| {
+            let is_check = request.uri().path().ends_with("/Check");
+            asked.fetch_or(is_check, Ordering::Relaxed);
             request
         });
         let health_service = ending_with(note.named_layer(health_service), hub.ending.clone());
@@ -219,7 +231,26 @@ impl RunningServer {
         };
         let router = server.router()?.add_service(health_service);
         server.listen(router).await?;
+        server.announce();
         Ok(server)
+    }
+
+    /// Says to the plants where clients reach them.
+    fn announce(&self) {
+        let Self { config, addresses, hub, .. } = self;
+        let by_name = || match config.grpc {
+            // Everywhere is no address for others.
+            Listen::At(address) if address.ip().is_unspecified() => {
+                let (scheme, _) = addresses.grpc.as_ref()?.split_once("://")?;
+                let port = addresses.grpc.as_ref()?.rsplit_once(':')?.1;
+                Some(format!("{scheme}://{}:{port}", hub.identity.name()))
+            }
+            _ => addresses.grpc.clone(),
+        };
+        let listens = || by_name().or_else(|| addresses.unix.clone());
+        if let Some(address) = config.advertise.clone().or_else(listens) {
+            hub.identity.announce(address);
+        }
     }
 
     /// Where it can be reached.
@@ -280,11 +311,13 @@ impl RunningServer {
         let control = ControlServiceServer::new(ControlService::new(hub()));
         let channels = ChannelServiceServer::new(ChannelService::new(hub()));
         let recordings = RecordingServiceServer::new(RecordingService::new(hub()));
+        let server = ServerServiceServer::new(ServerService::new(hub()));
         Routes::new(models.max_decoding_message_size(message_bytes))
             .add_service(plants.max_decoding_message_size(message_bytes))
             .add_service(control.max_decoding_message_size(message_bytes))
             .add_service(channels.max_decoding_message_size(channel_bytes))
             .add_service(recordings.max_decoding_message_size(message_bytes))
+            .add_service(server.max_decoding_message_size(message_bytes))
     }
 
     async fn listen(&mut self, router: Router<Layers>) -> Result<()> {
@@ -343,17 +376,31 @@ impl RunningServer {
         }
     }
 
-    /// Says that it is not serving any more, and serves on for the configured time, so that balancers
-    /// send nobody here who would not be let in. Nobody waits where nobody asks for its health.
+    /// Takes nothing new and says that it is not serving, but serves on: while somebody drives a plant, and so that
+    /// balancers send nobody here who would not be let in. Not longer than the configured time, nor after `hurry`.
     pub async fn drain(&mut self, hurry: impl Future<Output = ()>) {
+        self.hub.drain.begin();
+        self.hub.metrics.draining();
         self.say_not_serving().await;
-        let drain = self.config.drain();
-        if drain.is_zero() || !self.is_asked_for_health.load(Ordering::Relaxed) {
+        let limit = self.hub.drain.limit().unwrap_or(self.config.drain());
+        let has_asked = self.is_asked_for_health.load(Ordering::Relaxed);
+        let is_needed = || has_asked || self.hub.driven() > 0;
+        if limit.is_zero() || !is_needed() {
             return;
         }
-        tracing::info!("serving for {} s more, until balancers know", drain.as_secs_f64());
+        tracing::info!(
+            driven = self.hub.driven(),
+            "draining for {} s at most",
+            limit.as_secs_f64()
+        );
+        let is_over = async {
+            while is_needed() {
+                tokio::time::sleep(DRAIN_PERIOD).await;
+            }
+        };
         tokio::select! {
-            () = tokio::time::sleep(drain) => {}
+            () = is_over => {}
+            () = tokio::time::sleep(limit) => {}
             () = hurry => {}
         }
     }

@@ -9,6 +9,7 @@ pub mod driver;
 pub mod failure;
 pub mod feedback;
 pub mod files;
+pub mod identity;
 pub mod inputs;
 pub mod limits;
 pub mod metrics;

@@ -105,6 +105,20 @@ pub fn is_host_name(text: &str) -> bool {
         && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte))
 }
 
+/// Whether clients can be told that this is the address of a server: a URL without a path, or a socket.
+pub fn is_address(text: &str) -> bool {
+    if text.len() > 1024 || text.bytes().any(|byte| !byte.is_ascii_graphic()) {
+        return false;
+    }
+    match text.split_once(':') {
+        Some(("unix", path)) => path.starts_with('/'),
+        Some(("http" | "https", rest)) => rest.strip_prefix("//").is_some_and(|host| {
+            !host.contains(['/', '@', '?', '#']) && name(host).is_some_and(|name| !name.is_empty())
+        }),
+        _ => false,
+    }
+}
+
 /// Whether this is an origin as browsers send it: scheme, host, port if it is not the scheme's own.
 pub fn is_origin(text: &str) -> bool {
     text.split_once("://").is_some_and(|(scheme, host)| {

@@ -17,6 +17,9 @@
 //! | INVALID_ARGUMENT | `PROTOCOL` | | a Drive stream does not begin with `open`, or opens twice; or the bytes of a long message are none that the method takes |
 //! | NOT_FOUND | `MODEL_NOT_FOUND`, `PLANT_NOT_FOUND`, `PLANT_DELETED`, `FAULT_NOT_FOUND`, `RECORDING_NOT_FOUND` | ResourceInfo | no such thing, or deleted meanwhile |
 //! | ALREADY_EXISTS | `MODEL_EXISTS`, `PLANT_EXISTS`, `RECORDING_EXISTS` | ResourceInfo | the name is taken |
+//! | FAILED_PRECONDITION | `PLANT_ELSEWHERE` | PreconditionFailure; metadata `address` | the plant has gone to the server at that address |
+//! | FAILED_PRECONDITION | `MOVED_ON` | PreconditionFailure; metadata `step` | the plant is not at the step at which it was to be deleted |
+//! | FAILED_PRECONDITION | `OTHER_BUILD` | PreconditionFailure; metadata `record`, `server` | a record is of another build, whose motions have other bits |
 //! | FAILED_PRECONDITION | `LEASE_HELD` | PreconditionFailure; metadata `driver` | somebody else drives the plant |
 //! | FAILED_PRECONDITION | `LEASE_LOST` | PreconditionFailure | the lease that a driver wants to go on with has ended |
 //! | FAILED_PRECONDITION | `RUNNING`, `PAUSED` | PreconditionFailure | the plant runs by itself, or is paused |
@@ -132,6 +135,27 @@ impl RpcError {
     pub fn plant_not_found(id: &UnknownName) -> Self {
         let message = format!("there is no plant {id}");
         Self::resource_because(Code::NotFound, "PLANT_NOT_FOUND", "plant", &id.name, &message)
+    }
+
+    /// The plant was closed while it was used: it goes on elsewhere, or was deleted.
+    pub fn closed(session: &Session) -> Self {
+        match session.moved_to() {
+            Some(address) => Self::plant_elsewhere(session.id(), address),
+            None => Self::plant_deleted(session.id()),
+        }
+    }
+
+    /// The plant has gone to another server.
+    pub fn plant_elsewhere(id: &str, address: &str) -> Self {
+        let id = shortened(id);
+        let message = format!("plant `{id}` is on another server now, {address}");
+        Self::precondition("PLANT_ELSEWHERE", id, message).with("address", address)
+    }
+
+    /// The server is about to end.
+    pub fn draining(name: &str) -> Self {
+        let message = format!("server `{name}` is about to end and takes nothing new: ask another");
+        Self::new(Code::Unavailable, "DRAINING", message)
     }
 
     /// The plant was deleted while it was used.
@@ -343,7 +367,7 @@ impl RpcError {
     pub fn from_drive(error: DriveError, session: &Session) -> Self {
         let id = session.id();
         match error {
-            DriveError::Closed => Self::plant_deleted(id),
+            DriveError::Closed => Self::closed(session),
             DriveError::Step(error) => error.into(),
             DriveError::Running => Self::running(id),
             DriveError::Paused | DriveError::NotDue(_) => {

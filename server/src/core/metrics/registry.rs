@@ -22,6 +22,8 @@
 //! | `plantd_tenant_plants`, `_running_plants`, `_streams` | gauges | `tenant` |
 //! | `plantd_tenant_overruns_total` | counter | `tenant` |
 //! | `plantd_tenant_rpcs_total` | counter of finished calls | `tenant`, `code` |
+//! | `plantd_server_info` | 1 | `name`, `version` |
+//! | `plantd_draining` | 1 where nothing new is taken, else 0 | |
 //! | `plantd_build_info` | 1 | `version`, `arch`, `profile` |
 //! | `process_cpu_seconds_total` | counter | |
 //! | `process_resident_memory_bytes`, `process_open_fds`, `process_max_fds`, `process_start_time_seconds` | gauges | |
@@ -81,6 +83,7 @@ pub struct Metrics {
     registry: Registry,
     tenants: Arc<Tenants>,
     plants: Gauge,
+    draining: Gauge,
     /// Uploaded models.
     pub(crate) models: Gauge,
     links: Gauge,
@@ -99,13 +102,13 @@ pub struct Metrics {
 
 impl Default for Metrics {
     fn default() -> Self {
-        Self::new(Arc::default())
+        Self::new(Arc::default(), "plantd")
     }
 }
 
 impl Metrics {
-    /// Nothing counted yet.
-    pub fn new(tenants: Arc<Tenants>) -> Self {
+    /// Nothing counted yet, of the server of that name.
+    pub fn new(tenants: Arc<Tenants>, name: &str) -> Self {
         let steps = Family::<DriverLabel, Counter>::default();
         let drivers = Family::<DriverLabel, Gauge>::default();
         let by_driver = [DriverKind::Step, DriverKind::Drive, DriverKind::Link].map(|kind| {
@@ -117,6 +120,7 @@ impl Metrics {
         });
         let metrics = Self {
             plants: Gauge::default(),
+            draining: Gauge::default(),
             models: Gauge::default(),
             links: Gauge::default(),
             watchers: Gauge::default(),
@@ -138,6 +142,9 @@ impl Metrics {
         whole.register_collector(Box::new(Process::starts_now()));
         let registry = whole.sub_registry_with_prefix("plantd");
         registry.register("build", "The server's version", build_info());
+        let server = [("name", name.to_owned()), ("version", env!("CARGO_PKG_VERSION").to_owned())];
+        registry.register("server", "The server's name", Info::new(server));
+        registry.register("draining", "1 where nothing new is taken", metrics.draining.clone());
         registry.register("plants", "Plants", metrics.plants.clone());
         registry.register("models", "Uploaded models", metrics.models.clone());
         registry.register("links", "Open shared-memory links", metrics.links.clone());
@@ -193,6 +200,11 @@ impl Metrics {
         let mut text = String::new();
         encode(&mut text, &registry)?;
         Ok(text)
+    }
+
+    /// The server takes nothing new.
+    pub fn draining(&self) {
+        self.draining.set(1);
     }
 
     /// Sets the number of plants.

@@ -1,5 +1,6 @@
 //! The end of a plant.
 
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
@@ -9,6 +10,8 @@ use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
 pub(crate) struct Closing {
     is_closed: AtomicBool,
     token: CancellationToken,
+    /// Address of the server on which it goes on.
+    moved_to: OnceLock<String>,
 }
 
 impl Closing {
@@ -17,6 +20,16 @@ impl Closing {
         let was_open = !self.is_closed.swap(true, Ordering::AcqRel);
         self.token.cancel();
         was_open
+    }
+
+    /// Says where the plant goes on, before it is closed here.
+    pub(crate) fn note_move(&self, address: String) {
+        let _ = self.moved_to.set(address);
+    }
+
+    /// Address of the server on which it goes on.
+    pub(crate) fn moved_to(&self) -> Option<&str> {
+        self.moved_to.get().map(String::as_str)
     }
 
     /// The plant was deleted.

@@ -241,6 +241,16 @@ impl Session {
         self.closing.close()
     }
 
+    /// Says where the plant goes on, before it is closed here.
+    pub(crate) fn note_move(&self, address: String) {
+        self.closing.note_move(address);
+    }
+
+    /// Address of the server on which a plant goes on that was closed here.
+    pub fn moved_to(&self) -> Option<&str> {
+        self.closing.moved_to()
+    }
+
     /// The plant was deleted.
     pub fn is_closed(&self) -> bool {
         self.closing.is_closed()

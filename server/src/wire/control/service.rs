@@ -305,6 +305,7 @@ impl v1::control_service_server::ControlService for ControlService {
         request: Request<v1::RolloutRequest>,
     ) -> Result<Response<Self::RolloutStream>, Status> {
         let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        hub.check_takes_new()?;
         let job = move |_: &_| rollout::Rollout::new(&hub, request);
         let rollout = self.hub.workers.run(job).await?;
         let answers = rollout.run(self.hub.workers.clone());

@@ -19,13 +19,8 @@ pub(crate) const INLINE_INSTRUCTIONS_MAX: f64 = 1e6;
 /// How long it goes on there: not much longer than the way to a worker and back.
 pub(crate) const INLINE_TIME_MAX: Duration = Duration::from_micros(300);
 
-/// A plant as a message. Waits for a step in progress, which is long on a large model: call it on a
-/// worker unless you hold the lease.
-pub(crate) fn plant_info(session: &Session) -> v1::PlantInfo {
-    info(session, session.view())
-}
-
-pub(crate) fn info(session: &Session, view: View) -> v1::PlantInfo {
+/// A plant as a message; which server has it says [`Hub::info`](crate::wire::shared::hub::Hub::info).
+pub(crate) fn plant_info(session: &Session, view: View) -> v1::PlantInfo {
     v1::PlantInfo {
         id: session.id().to_owned(),
         model: session.model_name().to_owned(),
@@ -39,6 +34,7 @@ pub(crate) fn info(session: &Session, view: View) -> v1::PlantInfo {
         parameters: settings::parameters(&view.parameters),
         safety: safety_info(&view.safety, view.frozen, session.model()),
         expires_s: expires_s(session),
+        ..Default::default()
     }
 }
 

@@ -25,13 +25,14 @@ use v1::drive_response::Response as Answer;
 
 use crate::core::driver::DriverKind;
 use crate::core::limits::LimitExceeded;
+use crate::core::plant::core::Core;
 use crate::core::plant::error::DriveError;
 use crate::core::publish::subscription::Subscription;
 use crate::core::session::lease::Lease;
 use crate::core::session::run::RunStatus;
 use crate::core::workers::queue::{Admission, Lane};
 use crate::wire::edge::observe::with_limit_details;
-use crate::wire::message::plant_info::{INLINE_INSTRUCTIONS_MAX, plant_info};
+use crate::wire::message::plant_info::INLINE_INSTRUCTIONS_MAX;
 use crate::wire::message::report::report_message;
 use crate::wire::message::{settings, states};
 use crate::wire::shared::hub::Hub;
@@ -63,7 +64,7 @@ enum Phase {
     /// Waits for `open`.
     Waiting,
     /// Takes the lease.
-    Opening(Job<(Box<Driving>, v1::PlantInfo)>),
+    Opening(Job<(Box<Driving>, v1::DriveOpened)>),
     /// Holds the lease.
     Driving(Box<Driving>),
     /// A worker takes a step, with the lease, which is to be kept when the connection breaks or is not.
@@ -117,8 +118,8 @@ impl DriveStream {
                     let opener = Arc::clone(&hub);
                     let job = move |_: &_| {
                         let driving = Driving::open(&opener, &open)?;
-                        let plant = plant_info(driving.lease.session());
-                        Ok((Box::new(driving), plant))
+                        let opened = driving.opened(&opener);
+                        Ok((Box::new(driving), opened))
                     };
                     hub.attendants.resume(job).await
                 }));
@@ -168,7 +169,7 @@ impl DriveStream {
         }
         let Phase::Driving(driving) = &mut self.phase else { return Poll::Pending };
         if driving.deleted.as_mut().poll(context).is_ready() {
-            return Poll::Ready(Some(RpcError::plant_deleted(driving.lease.session().id())));
+            return Poll::Ready(Some(RpcError::closed(driving.lease.session())));
         }
         if driving.status.poll_next_unpin(context).is_ready() {
             let revoked = || RpcError::from_drive(DriveError::Revoked, driving.lease.session());
@@ -232,6 +233,20 @@ impl Drop for DriveStream {
     }
 }
 
+/// The last step of a plant in lockstep.
+fn step_message(core: &mut Core, sequence: u64) -> v1::DriveStep {
+    let state = states::shown(&core.published());
+    v1::DriveStep {
+        sequence,
+        clocks: Some(states::clocks(state.time_s, 0)),
+        state: Some(state),
+        report: Some(report_message(core.report())),
+        u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
+        outputs: states::core_outputs(core),
+        ..Default::default()
+    }
+}
+
 fn protocol(message: &str) -> RpcError {
     RpcError::new(Code::InvalidArgument, "PROTOCOL", message)
 }
@@ -275,6 +290,18 @@ impl Driving {
             held: None,
             states: States::None,
         })
+    }
+
+    /// What the driver is told first: the plant, and the last step of it. Blocks for as long as a step takes.
+    fn opened(&self, hub: &Hub) -> v1::DriveOpened {
+        let session = self.lease.session();
+        let last = session
+            .with_core(|core| (core.plant().step_index() > 0).then(|| step_message(core, 0)));
+        v1::DriveOpened {
+            plant: Some(hub.plant_info(session)),
+            lease_token: self.keep.as_ref().map(|(token, _)| token.clone()).unwrap_or_default(),
+            last,
+        }
     }
 
     /// An input; failures of its own are answers, those of the stream are errors. No answer yet when
@@ -341,18 +368,7 @@ impl Driving {
     fn step(&mut self, sequence: u64, u: &[f64]) -> Result<v1::DriveStep, DriveError> {
         let (lease, linearization) = (&mut self.lease, &mut self.linearization);
         let began = Instant::now();
-        let step = lease.step_and(u, linearization.as_mut(), |core| {
-            let state = states::shown(&core.published());
-            v1::DriveStep {
-                sequence,
-                clocks: Some(states::clocks(state.time_s, 0)),
-                state: Some(state),
-                report: Some(report_message(core.report())),
-                u: core.applied_input().map(<[f64]>::to_vec).unwrap_or_default(),
-                outputs: states::core_outputs(core),
-                ..Default::default()
-            }
-        });
+        let step = lease.step_and(u, linearization.as_mut(), |core| step_message(core, sequence));
         // One that failed has taken its time as well.
         self.is_slow = began.elapsed() > INLINE_STEP_MAX;
         let mut step = step?;
@@ -387,11 +403,8 @@ impl Stream for DriveStream {
                 && let Poll::Ready(opened) = job.as_mut().poll(context)
             {
                 match opened {
-                    Ok((driving, plant)) => {
-                        let token = driving.keep.as_ref().map(|(token, _)| token.clone());
-                        let lease_token = token.unwrap_or_default();
+                    Ok((driving, opened)) => {
                         this.phase = Phase::Driving(driving);
-                        let opened = v1::DriveOpened { plant: Some(plant), lease_token };
                         let response = Some(Answer::Opened(opened));
                         break Some(Ok(v1::DriveResponse { response }));
                     }

@@ -25,7 +25,7 @@ use crate::core::session::life::Use;
 use crate::core::session::shared::Session;
 use crate::core::workers::pool::{Abandoned, WorkError};
 use crate::wire::answers::{Answers, Messages};
-use crate::wire::message::plant_info::{failure_message, feedback_info, plant_info};
+use crate::wire::message::plant_info::{failure_message, feedback_info};
 use crate::wire::message::weights::{self, WeightFields};
 use crate::wire::message::{checks, matrices, start, states};
 use crate::wire::shared::hub::Hub;
@@ -53,7 +53,7 @@ pub(crate) async fn set_parameters(
         let (hub, session) = (Arc::clone(hub), Arc::clone(&session));
         move |_: &_| {
             let is_outdated = session.change_parameters(&changes, time_step_s, &hub.limits)?;
-            Ok((is_outdated, plant_info(&session)))
+            Ok((is_outdated, hub.plant_info(&session)))
         }
     };
     let (is_outdated, plant) = hub.attendants.run(job).await?;
@@ -180,7 +180,7 @@ pub(crate) async fn set_feedback(
             });
             let law = solve(&hub, &spec, &mechanics, abandoned)?;
             if session.is_closed() {
-                return Err(RpcError::plant_deleted(session.id()));
+                return Err(RpcError::closed(&session));
             }
             let feedback = Box::new(Feedback::new(spec, law, mode, guard));
             Ok(session.set_feedback(feedback, mechanics.generation, first_step))
@@ -384,7 +384,7 @@ impl Messages for Watcher {
                 return Err(RpcError::shutting_down());
             }
             if self.session.is_closed() {
-                return Err(RpcError::plant_deleted(self.session.id()));
+                return Err(RpcError::closed(&self.session));
             }
             if let Some(response) = self.ready().await? {
                 return Ok(response);
@@ -394,7 +394,7 @@ impl Messages for Watcher {
                 () = self.session.closed() => {}
                 changed = self.in_force.changed() => {
                     // The session has the sender, and this has the session.
-                    changed.map_err(|_| RpcError::plant_deleted(self.session.id()))?;
+                    changed.map_err(|_| RpcError::closed(&self.session))?;
                 }
             }
         }

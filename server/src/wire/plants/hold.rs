@@ -9,7 +9,6 @@ use crate::core::driver::DriverKind;
 use crate::core::plant::error::DriveError;
 use crate::core::session::lease::Lease;
 use crate::wire::answers::{Answers, Messages};
-use crate::wire::message::plant_info::plant_info;
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -22,7 +21,7 @@ pub(crate) fn hold(
     let lease = session.acquire(DriverKind::Drive)?;
     let lease_token = format!("{:016x}", random_instance());
     lease.set_name(lease_token.clone());
-    let plant = Some(plant_info(&session));
+    let plant = Some(hub.plant_info(&session));
     let opened = Some(v1::HoldResponse { lease_token, plant });
     Ok(Holder { hub: Arc::clone(hub), lease, opened }.into_answers())
 }
@@ -47,7 +46,7 @@ impl Messages for Holder {
         tokio::select! {
             biased;
             () = self.hub.ending.cancelled() => Err(RpcError::shutting_down()),
-            () = session.closed() => Err(RpcError::plant_deleted(session.id())),
+            () = session.closed() => Err(RpcError::closed(&session)),
             _ = status.wait_for(|_| self.lease.is_revoked()) => {
                 Err(RpcError::from_drive(DriveError::Revoked, session))
             }

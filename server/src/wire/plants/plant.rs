@@ -18,14 +18,12 @@ use crate::core::session::shared::Session;
 use crate::core::workers::pool::Abandoned;
 use crate::core::workers::queue::Admission;
 use crate::wire::answers::{Answers, cut_page};
-use crate::wire::message::plant_info::{
-    INLINE_INSTRUCTIONS_MAX, INLINE_TIME_MAX, info, plant_info,
-};
+use crate::wire::message::plant_info::{INLINE_INSTRUCTIONS_MAX, INLINE_TIME_MAX};
 use crate::wire::message::report::report_message;
 use crate::wire::message::start::{self, Start};
 use crate::wire::message::{checks, settings, states};
 use crate::wire::plants::drive::DriveStream;
-use crate::wire::plants::{feedback, hold, run, step_many, watch};
+use crate::wire::plants::{feedback, hold, run, step_many, travel, watch};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -41,7 +39,11 @@ impl PlantService {
     }
 
     async fn create(&self, request: v1::CreatePlantRequest) -> Result<Arc<Session>, RpcError> {
-        let v1::CreatePlantRequest { id, model, settings, initial, open_link, expires_s } = request;
+        if !request.record.is_empty() {
+            return travel::import(&self.hub, request).await;
+        }
+        let v1::CreatePlantRequest { id, model, settings, initial, open_link, expires_s, .. } =
+            request;
         let expires = settings::expires(expires_s)?;
         if !id.is_empty() {
             checks::check_name("id", &id)?;
@@ -269,7 +271,8 @@ impl v1::plant_service_server::PlantService for PlantService {
         request: Request<v1::CreatePlantRequest>,
     ) -> Result<Response<v1::CreatePlantResponse>, Status> {
         let session = self.create(request.into_inner()).await?;
-        let job = move |_: &_| Ok(plant_info(&session));
+        let hub = Arc::clone(&self.hub);
+        let job = move |_: &_| Ok(hub.plant_info(&session));
         let plant = Some(self.hub.attendants.resume(job).await?);
         Ok(Response::new(v1::CreatePlantResponse { plant }))
     }
@@ -278,11 +281,11 @@ impl v1::plant_service_server::PlantService for PlantService {
         &self,
         request: Request<v1::GetPlantRequest>,
     ) -> Result<Response<v1::GetPlantResponse>, Status> {
-        let session = self.hub.session(&request.into_inner().id)?;
+        let (hub, session) = (Arc::clone(&self.hub), self.hub.session(&request.into_inner().id)?);
         let job = move |_: &_| {
             let (view, mut copy) = session.view_and_copy();
             let energy = Some(states::energy(copy.energy()));
-            Ok(v1::GetPlantResponse { plant: Some(info(&session, view)), energy })
+            Ok(v1::GetPlantResponse { plant: Some(hub.info(&session, view)), energy })
         };
         Ok(Response::new(self.hub.attendants.run(job).await?))
     }
@@ -294,8 +297,10 @@ impl v1::plant_service_server::PlantService for PlantService {
         let request = request.into_inner();
         let (size, after) = checks::page(request.page_size, &request.page_token)?;
         let (sessions, has_more) = self.hub.page(after, size);
+        let hub = Arc::clone(&self.hub);
         let job = move |_: &_| {
-            let mut plants: Vec<_> = sessions.iter().map(|session| plant_info(session)).collect();
+            let mut plants: Vec<_> =
+                sessions.iter().map(|session| hub.plant_info(session)).collect();
             let has_more = cut_page(&mut plants) || has_more;
             let last = plants.last().filter(|_| has_more);
             let next_page_token = last.map(|plant| plant.id.clone()).unwrap_or_default();
@@ -308,10 +313,19 @@ impl v1::plant_service_server::PlantService for PlantService {
         &self,
         request: Request<v1::DeletePlantRequest>,
     ) -> Result<Response<v1::DeletePlantResponse>, Status> {
-        let id = request.into_inner().id;
-        self.hub.delete(&id).await?;
+        let v1::DeletePlantRequest { id, moved_to, step } = request.into_inner();
+        travel::delete(&self.hub, &id, moved_to, step).await?;
         tracing::info!(plant = id, "plant deleted");
         Ok(Response::new(v1::DeletePlantResponse {}))
+    }
+
+    async fn export_plant(
+        &self,
+        request: Request<v1::ExportPlantRequest>,
+    ) -> Result<Response<v1::ExportPlantResponse>, Status> {
+        let (hub, request) = (Arc::clone(&self.hub), request.into_inner());
+        let job = move |_: &_| travel::export(&hub, &request);
+        Ok(Response::new(self.hub.attendants.run(job).await?))
     }
 
     async fn step(

@@ -57,7 +57,7 @@ pub(crate) async fn run_and_wait(
     tokio::select! {
         biased;
         () = hub.ending.cancelled() => return Err(RpcError::shutting_down()),
-        () = session.closed() => return Err(RpcError::plant_deleted(session.id())),
+        () = session.closed() => return Err(RpcError::closed(&session)),
         _ = status.wait_for(|now| now.run != number || !now.is_running) => {}
     }
     Ok(v1::RunResponse { run: Some(run_info(&session)) })
@@ -261,7 +261,7 @@ impl Messages for EventWatcher {
             tokio::select! {
                 biased;
                 () = self.hub.ending.cancelled() => return Err(RpcError::shutting_down()),
-                () = self.session.closed() => return Err(RpcError::plant_deleted(self.session.id())),
+                () = self.session.closed() => return Err(RpcError::closed(&self.session)),
                 () = tokio::time::sleep(EVENTS_PERIOD) => {}
             }
         }

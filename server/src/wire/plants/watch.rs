@@ -127,7 +127,7 @@ impl Messages for Watcher {
         let (frame, dropped) = tokio::select! {
             biased;
             () = self.hub.ending.cancelled() => return Err(RpcError::shutting_down()),
-            () = session.closed() => return Err(RpcError::plant_deleted(session.id())),
+            () = session.closed() => return Err(RpcError::closed(&session)),
             next = paced(&mut self.subscription, &mut self.pace) => next,
         };
         let mut response = v1::WatchResponse {

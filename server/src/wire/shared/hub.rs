@@ -9,14 +9,17 @@ use std::time::Duration;
 use futures::{StreamExt, future, stream};
 use plantd_models::Plant;
 use plantd_models::scene::UnknownName;
+use plantd_proto::v1;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
 
 use crate::core::catalog::Catalog;
 use crate::core::connection::{Caller, Connection};
+use crate::core::identity::{Drain, Identity, Moved};
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::metrics::registry::Metrics;
+use crate::core::plant::view::View;
 use crate::core::priority::Priority;
 use crate::core::realtime::loops::RealTime;
 use crate::core::realtime::settings::RealTimeSettings;
@@ -27,6 +30,7 @@ use crate::core::tenant::{Tenant, TenantSettings, Tenants};
 use crate::core::workers::pool::Workers;
 use crate::wire::answers::Answers;
 use crate::wire::link::host::{LinkError, LinkHost, LinkInfo};
+use crate::wire::message::plant_info::plant_info;
 use crate::wire::record::directory::Recordings;
 use crate::wire::shared::jobs::Jobs;
 use crate::wire::shared::state_directory::StateDirectory;
@@ -55,6 +59,12 @@ pub struct Hub {
     pub catalog: Catalog,
     /// Permits to hold a trajectory's regulator, filter or optimisation in memory.
     pub trajectory_solves: Arc<Semaphore>,
+    /// Which server this is.
+    pub identity: Identity,
+    /// Its end, once it is decided.
+    pub drain: Drain,
+    /// Plants that have gone to other servers.
+    pub moved: Moved,
     /// Cancelled when the server begins to shut down: streams end.
     pub ending: CancellationToken,
     /// Threads of one search.
@@ -71,6 +81,7 @@ pub struct Hub {
 impl Hub {
     /// A hub without plants. Tenants are kept apart where there are settings of theirs.
     pub fn new(
+        name: String,
         limits: Limits,
         worker_count: usize,
         priority: Priority,
@@ -91,7 +102,7 @@ impl Hub {
         let are_apart = tenants.is_some();
         let tenants = tenants.unwrap_or_default();
         let tenants = Arc::new(Tenants::new(are_apart, tenants, &watch_room, &feedback_room));
-        let metrics = Arc::new(Metrics::new(Arc::clone(&tenants)));
+        let metrics = Arc::new(Metrics::new(Arc::clone(&tenants), &name));
         let realtime = RealTime::new(realtime, &metrics);
         let pool = |name, priority| {
             let (limit, tenants) = (limits.queued_jobs, Arc::clone(&tenants));
@@ -104,6 +115,9 @@ impl Hub {
             catalog: Catalog::new(&limits, metrics.models.clone(), Arc::clone(&tenants)),
             tenants,
             trajectory_solves: Arc::new(Semaphore::new(Limits::size(limits.trajectory_solves))),
+            identity: Identity::new(name),
+            drain: Drain::default(),
+            moved: Moved::default(),
             ending: CancellationToken::new(),
             search_threads: 1,
             recordings: None,
@@ -126,6 +140,10 @@ impl Hub {
                 Ok(Arc::clone(session))
             }
             _ => {
+                let moved = self.moved.address(id);
+                if let Some((_, address)) = moved.filter(|(owner, _)| self.tenants.shows(*owner)) {
+                    return Err(RpcError::plant_elsewhere(id, &address));
+                }
                 let is_known = |session: &Session| !session.is_closed() && self.shows(session);
                 let known = plants.iter().filter(|(_, session)| is_known(session));
                 let known = known.map(|(id, _)| id).take(COMPARED_PLANTS_MAX);
@@ -151,8 +169,41 @@ impl Hub {
         self.tenants.shows(session.owner())
     }
 
+    /// A plant as a message. Waits for a step in progress, which is long on a large model: call it on a
+    /// worker unless you hold the lease.
+    pub fn plant_info(&self, session: &Session) -> v1::PlantInfo {
+        self.info(session, session.view())
+    }
+
+    /// The same, of a view that was taken before.
+    pub(crate) fn info(&self, session: &Session, view: View) -> v1::PlantInfo {
+        let (server, address) = (self.identity.name(), self.identity.address());
+        let (server, address) = (server.to_owned(), address.to_owned());
+        v1::PlantInfo { server, address, ..plant_info(session, view) }
+    }
+
+    /// Plants of the caller.
+    pub fn count(&self) -> usize {
+        let plants = self.plants();
+        plants.values().filter(|session| !session.is_closed() && self.shows(session)).count()
+    }
+
+    /// Plants that somebody drives.
+    pub fn driven(&self) -> usize {
+        self.plants().values().filter(|session| session.driver().is_some()).count()
+    }
+
+    /// Refuses what is new where the server is about to end.
+    pub fn check_takes_new(&self) -> Result<(), RpcError> {
+        match self.drain.has_begun() {
+            true => Err(RpcError::draining(self.identity.name())),
+            false => Ok(()),
+        }
+    }
+
     /// Refuses a new plant that would not be kept, before work is done for it.
     pub fn check_new_plant(&self, id: &str) -> Result<(), RpcError> {
+        self.check_takes_new()?;
         self.admit(&self.plants(), id)
     }
 
@@ -187,6 +238,7 @@ impl Hub {
         let realtime = Arc::clone(&self.realtime);
         let origin = Origin { id: id.clone(), model_name, accuracy, expires, owner };
         let session = Session::new(origin, plant, metrics, realtime);
+        self.moved.forget(&id);
         plants.insert(id, Arc::clone(&session));
         self.metrics.set_plants(plants.len());
         Ok(session)
@@ -196,8 +248,13 @@ impl Hub {
     pub async fn delete(self: &Arc<Self>, id: &str) -> Result<(), RpcError> {
         let session = self.session(id)?;
         if !session.close() {
-            return Err(RpcError::plant_deleted(id));
+            return Err(RpcError::closed(&session));
         }
+        self.clear_away(session).await
+    }
+
+    /// Removes a plant that was closed, with what belongs to it.
+    pub async fn clear_away(self: &Arc<Self>, session: Arc<Session>) -> Result<(), RpcError> {
         let hub = Arc::clone(self);
         // In a task of its own, so that it is finished even if the caller goes away.
         let end = tokio::task::spawn_blocking(move || {
@@ -210,6 +267,9 @@ impl Hub {
             }
             let mut plants = hub.plants();
             plants.remove(session.id());
+            if let Some(address) = session.moved_to() {
+                hub.moved.note(session.owner(), session.id(), address);
+            }
             hub.metrics.set_plants(plants.len());
         });
         end.await.map_err(|error| RpcError::internal(error.to_string()))
@@ -251,12 +311,12 @@ impl Hub {
                 "this server runs without shared-memory links",
             ));
         };
-        let id = session.id().to_owned();
-        let opened = tokio::task::spawn_blocking(move || links.open(session))
+        let host = Arc::clone(&session);
+        let opened = tokio::task::spawn_blocking(move || links.open(host))
             .await
             .map_err(|error| RpcError::internal(error.to_string()))?;
         opened.map_err(|error| match error {
-            LinkError::Closing { .. } => RpcError::plant_deleted(&id),
+            LinkError::Closing { .. } => RpcError::closed(&session),
             LinkError::Domain(_) | LinkError::Thread(_) | LinkError::Failed { .. } => {
                 RpcError::new(Code::Unavailable, "LINK_FAILED", error.to_string())
             }
@@ -265,6 +325,7 @@ impl Hub {
 
     /// Room in memory for one more trajectory's regulator, filter or optimisation.
     pub fn trajectory_permit(&self) -> Result<TrajectoryPermit, RpcError> {
+        self.check_takes_new()?;
         let own = self.tenants.take(|rooms| &rooms.trajectory_solves)?;
         let (name, limit) = ("trajectory_solves", self.limits.trajectory_solves);
         let (what, actual) = ("regulators, filters and optimisations at a time", limit + 1);

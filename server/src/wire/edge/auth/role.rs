@@ -4,7 +4,7 @@
 //! | --- | --- |
 //! | `viewer` | look at plants, models and recordings of its tenant, and have something computed |
 //! | `driver` | change them, too |
-//! | `admin` | do so with those of every tenant, and with models that came with the server |
+//! | `admin` | do so with those of every tenant, and with models that came with the server; and end the server |
 //!
 //! Health is for everybody, because balancers have no name; it says whether the server serves, and nothing else.
 //! Reflection, and methods that nobody has, take a viewer. So do the metrics and the files of models.
@@ -63,7 +63,7 @@ const HEALTH: &str = "/grpc.health.v1.Health/";
 const PACKAGE: &str = "/plantd.v1.";
 
 /// Methods of each service that change nothing.
-const LOOKING: [(&str, &[&str]); 5] = [
+const LOOKING: [(&str, &[&str]); 6] = [
     ("ChannelService", &["GetChannels", "ListFaults"]),
     (
         "ControlService",
@@ -100,6 +100,7 @@ const LOOKING: [(&str, &[&str]); 5] = [
         ],
     ),
     ("RecordingService", &["ListRecordings", "GetRecording"]),
+    ("ServerService", &["GetServer"]),
 ];
 
 /// Methods of each service that change something.
@@ -111,6 +112,8 @@ const DRIVING: [(&str, &[&str]); 4] = [
         &[
             "CreatePlant",
             "DeletePlant",
+            // It may pause the plant.
+            "ExportPlant",
             "Step",
             "StepMany",
             "Drive",
@@ -130,17 +133,18 @@ const DRIVING: [(&str, &[&str]); 4] = [
     ("RecordingService", &["StartRecording", "StopRecording", "DeleteRecording"]),
 ];
 
+/// Methods of each service that concern everybody.
+const RULING: [(&str, &[&str]); 1] = [("ServerService", &["Drain"])];
+
 /// Whether the table has a method; the path is `/plantd.v1.Service/Method`.
 fn role_of(path: &str) -> Option<Role> {
     let (service, method) = path.strip_prefix(PACKAGE)?.split_once('/')?;
     let has = |table: &[(&str, &[&str])]| {
         table.iter().any(|(name, methods)| *name == service && methods.contains(&method))
     };
-    match (has(&LOOKING), has(&DRIVING)) {
-        (true, _) => Some(Role::Viewer),
-        (_, true) => Some(Role::Driver),
-        _ => None,
-    }
+    let tables =
+        [(&LOOKING[..], Role::Viewer), (&DRIVING[..], Role::Driver), (&RULING[..], Role::Admin)];
+    tables.into_iter().find(|(table, _)| has(table)).map(|(_, role)| role)
 }
 
 /// What a call of a method takes. A method of ours that the table has not takes an administrator.
@@ -155,7 +159,7 @@ pub fn needs(path: &str) -> Needs {
 
 fn is_ours(path: &str) -> bool {
     let service = path.strip_prefix(PACKAGE).and_then(|rest| rest.split('/').next());
-    let services = LOOKING.iter().chain(&DRIVING).map(|(name, _)| *name);
+    let services = LOOKING.iter().chain(&DRIVING).chain(&RULING).map(|(name, _)| *name);
     service.is_some_and(|service| services.into_iter().any(|name| name == service))
 }
 
@@ -194,7 +198,7 @@ mod tests {
         let missing: Vec<_> = contract.iter().filter(|path| role_of(path).is_none()).collect();
         assert!(missing.is_empty(), "without a role: {missing:?}");
         let mut table = Vec::new();
-        for (service, methods) in LOOKING.iter().chain(&DRIVING) {
+        for (service, methods) in LOOKING.iter().chain(&DRIVING).chain(&RULING) {
             table.extend(methods.iter().map(|method| format!("{PACKAGE}{service}/{method}")));
         }
         assert_eq!(table.len(), contract.len(), "a method stands in the table twice");
