@@ -1,9 +1,12 @@
 //! The client: one method per thing that a controller's author wants.
 
+use std::sync::Arc;
+
 use plantd_proto::v1::{
     self, channel_service_client::ChannelServiceClient,
     control_service_client::ControlServiceClient, model_service_client::ModelServiceClient,
     plant_service_client::PlantServiceClient, recording_service_client::RecordingServiceClient,
+    server_service_client::ServerServiceClient,
 };
 
 use crate::connection::{ConnectOptions, MAX_RECEIVE_BYTES, connect, is_serving};
@@ -19,6 +22,7 @@ use crate::stream::Answers;
 /// leave the rest to `..Default::default()`.
 #[derive(Clone, Debug)]
 pub struct Client {
+    address: Arc<str>,
     channel: AuthorizedChannel,
     options: ConnectOptions,
 }
@@ -36,7 +40,30 @@ impl Client {
     /// Connects with other limits than the default ones.
     pub async fn connect_with(address: impl AsRef<str>, options: ConnectOptions) -> Result<Self> {
         let channel = connect(address.as_ref(), &options).await?;
-        Ok(Self { channel, options })
+        Ok(Self { address: address.as_ref().into(), channel, options })
+    }
+
+    /// The address of the server.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// Connects to another server as the same user: to where a plant has gone ([`Error::elsewhere`]), or to this one
+    /// again after its connection broke.
+    ///
+    /// # Errors
+    /// As of [`Client::connect`]; and [`Error::Address`] where a token that this server got over TLS or a socket
+    /// would be sent over a network without TLS.
+    pub async fn at(&self, address: impl AsRef<str>) -> Result<Self> {
+        let there = address.as_ref();
+        let is_here = there == &*self.address;
+        let was_hidden = self.address.starts_with("https://") || self.address.starts_with("unix:");
+        let is_hidden = there.starts_with("https://") || there.starts_with("unix:");
+        if !is_here && self.options.credentials.token.is_some() && was_hidden && !is_hidden {
+            let problem = "it is without TLS, and everybody on the way could read the token";
+            return Err(Error::Address { address: there.to_owned(), problem });
+        }
+        Self::connect_with(there, self.options.clone()).await
     }
 
     /// Whether the server at an address serves, by gRPC's health service, which needs no token. A server that is
@@ -76,6 +103,11 @@ impl Client {
             .max_decoding_message_size(MAX_RECEIVE_BYTES)
     }
 
+    /// The generated client of `ServerService`.
+    pub fn server(&self) -> ServerServiceClient<AuthorizedChannel> {
+        ServerServiceClient::new(self.channel.clone()).max_decoding_message_size(MAX_RECEIVE_BYTES)
+    }
+
     /// The channel itself, for services that are not plantd's own (health, reflection).
     pub fn channel(&self) -> AuthorizedChannel {
         self.channel.clone()
@@ -94,6 +126,76 @@ impl Client {
         call: impl Future<Output = Result<tonic::Response<tonic::Streaming<T>>, tonic::Status>>,
     ) -> Result<Answers<T>> {
         Answers::open(self.options.request_timeout, call).await
+    }
+}
+
+/// The server itself.
+impl Client {
+    /// Which server this is.
+    pub async fn server_info(&self) -> Result<v1::GetServerResponse> {
+        let request = self.limited(v1::GetServerRequest {});
+        Ok(self.server().get_server(request).await?.into_inner())
+    }
+
+    /// Lets the server end: it takes nothing new, and serves on while plants are driven, for `drain_s` at most, its
+    /// own time if that is `None`. Returns how many plants are driven.
+    pub async fn drain(&self, drain_s: Option<f64>) -> Result<u32> {
+        let request = self.limited(v1::DrainRequest { drain_s });
+        Ok(self.server().drain(request).await?.into_inner().driven)
+    }
+
+    /// Everything from which another server makes the same plant.
+    pub async fn export_plant(
+        &self,
+        request: v1::ExportPlantRequest,
+    ) -> Result<v1::ExportPlantResponse> {
+        Ok(self.plants().export_plant(self.limited(request)).await?.into_inner())
+    }
+
+    /// Moves a plant to another server, where it goes on as it was: paused here, made there, and then deleted here.
+    /// Who asks for it here is told where it is. A driver in lockstep waits meanwhile, and loses no step if it
+    /// [follows](crate::Reconnecting).
+    ///
+    /// # Errors
+    /// The plant stays here, run as it was, when the other server refuses it. [`Error::Rpc`] with reason `MOVED_ON`
+    /// when somebody has run it meanwhile: then the one that was made there is deleted again. After any other error of
+    /// the last step both may be there, the one here paused.
+    pub async fn move_plant(
+        &self,
+        id: impl Into<String>,
+        to: &Client,
+        any_build: bool,
+    ) -> Result<v1::PlantInfo> {
+        let id = id.into();
+        let exported =
+            self.export_plant(v1::ExportPlantRequest { id: id.clone(), pause: true }).await?;
+        let v1::ExportPlantResponse { record, step, run } = exported;
+        let request = v1::CreatePlantRequest { record, any_build, ..Default::default() };
+        let made = match to.create_plant(request).await {
+            Ok(made) => made,
+            Err(error) => {
+                let run = run.unwrap_or_default();
+                if run.running {
+                    let (settings, steps) = (run.settings, run.steps_left);
+                    let request = v1::RunRequest { id, settings, steps, wait: false };
+                    // The first error is the one to tell.
+                    let _ = self.run(request).await;
+                }
+                return Err(error);
+            }
+        };
+        let moved_to =
+            if made.address.is_empty() { to.address().to_owned() } else { made.address.clone() };
+        let delete = v1::DeletePlantRequest { id: id.clone(), moved_to, step: Some(step) };
+        match self.delete_plant_as(delete).await {
+            Ok(()) => Ok(made),
+            Err(error) if error.reason() == "MOVED_ON" => {
+                let _ = to.delete_plant(made.id).await;
+                Err(error)
+            }
+            // It may be deleted here all the same: better two of it than none.
+            Err(error) => Err(error),
+        }
     }
 }
 
@@ -223,7 +325,11 @@ impl Client {
 
     /// Ends a plant; whoever drives or watches it gets `NOT_FOUND`.
     pub async fn delete_plant(&self, id: impl Into<String>) -> Result<()> {
-        let request = v1::DeletePlantRequest { id: id.into() };
+        self.delete_plant_as(v1::DeletePlantRequest { id: id.into(), ..Default::default() }).await
+    }
+
+    /// Ends a plant that goes on elsewhere, or only at a step.
+    pub async fn delete_plant_as(&self, request: v1::DeletePlantRequest) -> Result<()> {
         self.plants().delete_plant(self.limited(request)).await?;
         Ok(())
     }

@@ -32,6 +32,7 @@ pub struct Driver {
     requests: mpsc::Sender<v1::DriveRequest>,
     responses: tonic::Streaming<v1::DriveResponse>,
     plant: v1::PlantInfo,
+    last: Option<v1::DriveStep>,
     lease_token: String,
     sequence: u64,
     /// When the last state was there, on the server's clock.
@@ -64,6 +65,7 @@ impl Driver {
             requests,
             responses,
             plant,
+            last: opened.last,
             lease_token,
             sequence: 0,
             answers_ns: 0,
@@ -74,6 +76,11 @@ impl Driver {
     /// The plant as it was when the driver opened it.
     pub fn plant(&self) -> &v1::PlantInfo {
         &self.plant
+    }
+
+    /// The last step that the plant had taken then, if it had taken one.
+    pub fn last(&self) -> Option<&v1::DriveStep> {
+        self.last.as_ref()
     }
 
     /// Names the lease, to go on with it after the connection broke; empty if no grace was asked for.

@@ -1,5 +1,6 @@
 //! What can go wrong, with the details that the server sends.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
@@ -46,6 +47,23 @@ pub enum Error {
     /// and the driver goes on.
     #[error("step not taken: {0}")]
     Step(Box<Refusal>),
+    /// The server came back with an earlier state than it had shown: the steps in between are lost. The driver
+    /// goes on from there.
+    #[error("the plant was rolled back: step {from} had been reached, the server is at step {to}")]
+    RolledBack {
+        /// The last step that was seen.
+        from: u64,
+        /// The step at which the plant is.
+        to: u64,
+    },
+    /// Somebody else has stepped the plant while its driver was away. The driver goes on from there.
+    #[error("the plant was at step {from} when its driver lost it, and is at step {to}")]
+    SteppedByOthers {
+        /// The last step that was seen.
+        from: u64,
+        /// The step at which the plant is.
+        to: u64,
+    },
     /// The server ended a stream that should have gone on.
     #[error("the server closed the stream")]
     StreamClosed,
@@ -198,6 +216,12 @@ impl Error {
         self.refusal().map_or("", |refusal| &refusal.reason)
     }
 
+    /// The address of the server to which the plant has gone, if that is why this one refused.
+    pub fn elsewhere(&self) -> Option<&str> {
+        let refusal = self.refusal().filter(|refusal| refusal.reason == "PLANT_ELSEWHERE")?;
+        refusal.metadata.get("address").map(String::as_str)
+    }
+
     /// What is wrong with the request, each with its path; empty if it was not the request.
     pub fn violations(&self) -> &[Violation] {
         self.refusal().map_or(&[], |refusal| &refusal.violations)
@@ -221,6 +245,8 @@ pub struct Refusal {
     pub reason: String,
     /// What is wrong with the request (`google.rpc.BadRequest`).
     pub violations: Vec<Violation>,
+    /// What else belongs to the reason, such as the `address` of `PLANT_ELSEWHERE`.
+    pub metadata: BTreeMap<String, String>,
 }
 
 /// One thing that is wrong with a request.
@@ -247,6 +273,7 @@ impl From<&tonic::Status> for Refusal {
             message: status.message().to_owned(),
             reason: details.error_info().map_or_else(String::new, |info| info.reason.clone()),
             violations,
+            metadata: details.error_info().into_iter().flat_map(|i| i.metadata.clone()).collect(),
         }
     }
 }
@@ -258,6 +285,7 @@ impl From<v1::Failure> for Refusal {
             message: failure.message,
             reason: failure.reason,
             violations: Vec::new(),
+            metadata: BTreeMap::new(),
         }
     }
 }

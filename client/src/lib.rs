@@ -59,6 +59,7 @@ mod follower;
 mod handshake;
 pub mod link;
 mod messages;
+mod reconnect;
 mod recording;
 mod rotation;
 mod schedule;
@@ -75,6 +76,7 @@ pub use messages::{
     GainExt, LawState, MatrixExt, RolloutExt, StateExt, WeightsExt, diagonal, full,
     operating_point, present_state, weights,
 };
+pub use reconnect::Reconnecting;
 pub use recording::{RecordingEntry, RecordingReader};
 pub use rotation::{compose, difference, rotations};
 pub use schedule::{GainSchedule, Law};

@@ -21,8 +21,8 @@ use plantd_client::Credentials;
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, fmu, guard,
     health, import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot,
-    record, reference, render, replay, run, scene, settle, shell, state, step, test, timing, token,
-    top, view, watch,
+    record, reference, render, replay, run, scene, server, settle, shell, state, step, test,
+    timing, token, top, view, watch,
 };
 use crate::output::failure;
 use crate::output::printer::{self, Format, Output};
@@ -59,6 +59,8 @@ Examples:
   plantctl view trial.mcap                          in the browser; `view p1` shows a plant
   plantctl render trial.mcap --out trial.gif        a film for documents; .png is a picture
   plantctl test scenarios --junit junit.xml         scenarios with their expectations
+  plantctl move p1 --to http://plantd-2:50051       a plant to another server; it goes on bit for bit
+  plantctl drain                                    the server takes nothing new, and ends
   plantctl token new anna --role driver --tenant lab --file tokens.toml
   plantctl --on lab list                            a server of ~/.config/plantd/servers.toml
   plantctl --address unix:/run/plantd/plantd.sock list plants";
@@ -169,6 +171,9 @@ enum Command {
     Delete(inventory::Delete),
     Top(top::Top),
     Health(health::Health),
+    Server(server::Server),
+    Drain(server::Drain),
+    Move(server::Move),
     Token(token::Token),
     Completions(shell::Completions),
     Man(shell::Man),
@@ -185,8 +190,15 @@ fn main() -> ExitCode {
 async fn answer(args: Args) -> ExitCode {
     let is_json = args.json || args.output == Format::Json;
     let outcome = async {
-        let (command, context) = args.resolve()?;
-        run(command, &context).await
+        let (command, mut context) = args.resolve()?;
+        let follows = command.is_of_one_plant();
+        match run(command, &context).await {
+            Err(error) if follows && context.follow(&error).await? => {
+                let (command, _) = Args::parse().resolve()?;
+                run(command, &context).await
+            }
+            outcome => outcome,
+        }
     };
     match outcome.await {
         Ok(code) => code,
@@ -200,6 +212,13 @@ async fn answer(args: Args) -> ExitCode {
             }
             ExitCode::from(failure::code(&error))
         }
+    }
+}
+
+impl Command {
+    /// What it does is of one plant, so that it has done nothing where that plant is not.
+    fn is_of_one_plant(&self) -> bool {
+        !matches!(self, Self::Delete(_) | Self::Test(_))
     }
 }
 
@@ -274,6 +293,9 @@ async fn run(command: Command, context: &Context) -> Result<ExitCode> {
         Command::Delete(command) => command.run(context).await?,
         Command::Top(command) => command.run(context).await?,
         Command::Health(command) => return command.run(context).await,
+        Command::Server(command) => command.run(context).await?,
+        Command::Drain(command) => command.run(context).await?,
+        Command::Move(command) => command.run(context).await?,
         Command::Token(command) => command.run(context)?,
         Command::Completions(command) => command.run()?,
         Command::Man(command) => command.run(Args::command(), &context.output)?,

@@ -1,7 +1,7 @@
 //! What every command is given: the server's address, and where results go.
 
 use anyhow::{Context as _, Result};
-use plantd_client::{Answers, Client, ConnectOptions, Credentials, DEFAULT_ADDRESS, v1};
+use plantd_client::{Answers, Client, ConnectOptions, Credentials, DEFAULT_ADDRESS, Error, v1};
 
 use crate::output::printer::Output;
 
@@ -29,9 +29,27 @@ impl Context {
         }
     }
 
+    /// Goes where a plant has gone, if that is why a command was refused: whether there is another address now.
+    pub(crate) async fn follow(&mut self, error: &anyhow::Error) -> Result<bool> {
+        let refused = error.downcast_ref::<Error>();
+        let Some(address) = refused.and_then(Error::elsewhere) else { return Ok(false) };
+        // Not everywhere: a token is for networks that keep it.
+        self.connect().await?.at(address).await?;
+        self.address = Some(address.to_owned());
+        Ok(true)
+    }
+
     /// Connects to a server at an address, as the same user.
     pub(crate) async fn connect_to(&self, address: &str) -> Result<Client> {
-        let credentials = self.credentials.clone();
+        self.connect_as(address, self.credentials.clone()).await
+    }
+
+    /// Connects to a server at an address, as somebody.
+    pub(crate) async fn connect_as(
+        &self,
+        address: &str,
+        credentials: Credentials,
+    ) -> Result<Client> {
         let options = ConnectOptions { credentials, ..ConnectOptions::default() };
         Ok(Client::connect_with(address, options).await?)
     }
