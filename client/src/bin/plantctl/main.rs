@@ -21,7 +21,7 @@ use plantd_client::Credentials;
 use crate::commands::{
     analyze, channels, create, diagnose, dynamics, events, export, fault, feedback, fmu, guard,
     health, import, inventory, kalman, linearize, lqr, mechanics, optimize, parameters, plot,
-    record, reference, render, replay, run, scene, server, settle, shell, state, step, test,
+    record, reference, render, replay, run, scene, servers, settle, shell, state, step, test,
     timing, token, top, view, watch,
 };
 use crate::output::failure;
@@ -171,9 +171,9 @@ enum Command {
     Delete(inventory::Delete),
     Top(top::Top),
     Health(health::Health),
-    Server(server::Server),
-    Drain(server::Drain),
-    Move(server::Move),
+    Server(servers::Server),
+    Drain(servers::Drain),
+    Move(servers::Move),
     Token(token::Token),
     Completions(shell::Completions),
     Man(shell::Man),

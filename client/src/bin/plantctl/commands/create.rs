@@ -45,6 +45,7 @@ impl Create {
             initial,
             open_link: self.link,
             expires_s: self.expires,
+            ..Default::default()
         };
         let plant = client.create_plant(request).await?;
         context.output.success(&format!("there is a plant `{}` now", plant.id));

@@ -28,7 +28,7 @@ pub(crate) mod render;
 pub(crate) mod replay;
 pub(crate) mod run;
 pub(crate) mod scene;
-pub(crate) mod server;
+pub(crate) mod servers;
 pub(crate) mod settle;
 pub(crate) mod shell;
 pub(crate) mod state;

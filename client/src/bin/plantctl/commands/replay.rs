@@ -201,8 +201,7 @@ impl<'a> Twin<'a> {
             model: id.to_owned(),
             settings: plant.settings,
             initial: Some(v1::InitialState { form: Some(snapshot) }),
-            open_link: false,
-            expires_s: 0.0,
+            ..Default::default()
         };
         if let Err(error) = client.create_plant(request).await {
             client.delete_model(id).await?;

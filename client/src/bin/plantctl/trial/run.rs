@@ -158,7 +158,7 @@ impl Run<'_> {
             settings: Some(settings(&scenario.plant)),
             initial: form.map(|form| v1::InitialState { form: Some(form) }),
             open_link,
-            expires_s: 0.0,
+            ..Default::default()
         };
         let plant = client.create_plant(request).await.context("plant")?;
         self.time_step_s = plant.settings.as_ref().map_or(0.0, |settings| settings.time_step_s);
