@@ -69,7 +69,8 @@ async fn rollouts_take_the_very_steps_of_a_plant() {
     };
     let stepped = plants.step(request).await.unwrap().into_inner().states;
 
-    let case = v1::RolloutCase { initial: None, u: Some(torques(STEPS)), hold: 10 };
+    let case =
+        v1::RolloutCase { initial: None, u: Some(torques(STEPS)), hold: 10, ..Default::default() };
     let cases = vec![case; 5];
     let request =
         v1::RolloutRequest { model: "pendulum".to_owned(), cases, every: 7, ..Default::default() };
@@ -92,8 +93,8 @@ async fn one_bad_case_does_not_spoil_the_others() {
         form: Some(v1::initial_state::Form::OperatingPoint("nowhere".to_owned())),
     };
     let cases = vec![
-        v1::RolloutCase { initial: Some(bad), u: None, hold: 3 },
-        v1::RolloutCase { initial: None, u: None, hold: 3 },
+        v1::RolloutCase { initial: Some(bad), u: None, hold: 3, ..Default::default() },
+        v1::RolloutCase { initial: None, u: None, hold: 3, ..Default::default() },
     ];
     let request = v1::RolloutRequest { model: "pendulum".to_owned(), cases, ..Default::default() };
     let answers = ControlServiceClient::new(channel).rollout(request).await.unwrap().into_inner();

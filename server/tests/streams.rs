@@ -221,7 +221,10 @@ async fn streams_of_a_deleted_plant_end_with_not_found() {
     let mut watcher = watch(&mut plants, &id, 1).await.unwrap();
     let mut drive = Drive::open(&mut plants, &id).await;
     drive.answer().await.unwrap();
-    plants.delete_plant(v1::DeletePlantRequest { id: id.clone() }).await.unwrap();
+    plants
+        .delete_plant(v1::DeletePlantRequest { id: id.clone(), ..Default::default() })
+        .await
+        .unwrap();
     let driven = drive.answer().await.unwrap_err();
     assert_eq!((driven.code(), reason(&driven).as_str()), (Code::NotFound, "PLANT_DELETED"));
     let watched = timeout(PATIENCE, async {

@@ -142,13 +142,18 @@ impl ServerProcess {
         self.wait(PATIENCE)
     }
 
+    /// Waits until the server has ended, as somebody else has asked it to.
+    pub fn end(&mut self) -> Result<ExitStatus> {
+        self.wait(PATIENCE)
+    }
+
     fn wait(&mut self, patience: Duration) -> Result<ExitStatus> {
         let deadline = Instant::now() + patience;
         loop {
             if let Some(status) = self.child.try_wait()? {
                 return Ok(status);
             }
-            ensure!(Instant::now() < deadline, "the server ignores SIGTERM:\n{}", self.log());
+            ensure!(Instant::now() < deadline, "the server does not end:\n{}", self.log());
             std::thread::sleep(Duration::from_millis(5));
         }
     }

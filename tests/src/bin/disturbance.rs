@@ -214,7 +214,8 @@ async fn request(client: &Client, horizon: usize) -> Result<v1::OptimizeTrajecto
         let rows: Vec<_> = (0..horizon).map(|k| row(k, pull)).collect();
         v1::Matrix::from_rows(&rows)
     };
-    let case = v1::RolloutCase { initial: None, u: Some(rows(0.05)), hold: 0 };
+    let case =
+        v1::RolloutCase { initial: None, u: Some(rows(0.05)), hold: 0, ..Default::default() };
     let rollout = v1::RolloutRequest {
         model: name.to_owned(),
         cases: vec![case],

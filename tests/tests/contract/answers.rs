@@ -296,6 +296,7 @@ async fn a_failed_case_of_a_rollout_does_not_spoil_the_others() {
         initial: Some(at_velocity(&[0.2], &[velocity])),
         u: None,
         hold: 20,
+        ..Default::default()
     };
     let request = v1::RolloutRequest {
         model: "pendulum".to_owned(),

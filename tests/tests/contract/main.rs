@@ -3,6 +3,7 @@
 
 mod analysis;
 mod answers;
+mod batches;
 mod channels;
 mod derivatives;
 mod drive;

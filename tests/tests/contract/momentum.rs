@@ -128,7 +128,12 @@ async fn a_search_weighs_the_projected_momentum_where_it_is_asked_to() {
     let (_server, client) = server().await;
     let request = v1::RolloutRequest {
         model: MODEL.to_owned(),
-        cases: vec![v1::RolloutCase { initial: None, u: Some(zeros(STEPS, 1)), hold: 0 }],
+        cases: vec![v1::RolloutCase {
+            initial: None,
+            u: Some(zeros(STEPS, 1)),
+            hold: 0,
+            ..Default::default()
+        }],
         every: 1,
         ..Default::default()
     };

@@ -110,6 +110,7 @@ async fn a_search_reports_each_iteration_and_finds_a_motion_of_the_plant() {
         }),
         u: found.u.clone(),
         hold: 0,
+        ..Default::default()
     };
     let request = v1::RolloutRequest {
         model: "pendulum".to_owned(),
@@ -474,7 +475,7 @@ async fn a_search_ends_with_its_call() {
 async fn motion(client: &Client) -> Vec<[f64; 2]> {
     let u: Vec<_> = (0..40).map(|k| [20.0 * (0.2 * f64::from(k)).sin()]).collect();
     let u = v1::Matrix::from_rows(&u);
-    let case = v1::RolloutCase { initial: None, u: Some(u), hold: 0 };
+    let case = v1::RolloutCase { initial: None, u: Some(u), hold: 0, ..Default::default() };
     let request = v1::RolloutRequest {
         model: "cart-pole".to_owned(),
         cases: vec![case],

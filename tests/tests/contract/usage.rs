@@ -94,7 +94,12 @@ async fn a_plant_that_runs_has_no_fault_in_its_past() {
 #[tokio::test]
 async fn a_case_of_a_rollout_whose_initial_state_is_refused_says_so() {
     let (_server, client) = server().await;
-    let case = |initial| v1::RolloutCase { initial: Some(initial), u: None, hold: 5 };
+    let case = |initial| v1::RolloutCase {
+        initial: Some(initial),
+        u: None,
+        hold: 5,
+        ..Default::default()
+    };
     let nowhere = v1::InitialState {
         form: Some(v1::initial_state::Form::OperatingPoint("nowhere".to_owned())),
     };

@@ -3,3 +3,4 @@
 pub mod active;
 pub mod law;
 pub mod regulator;
+pub mod space;

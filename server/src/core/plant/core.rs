@@ -333,6 +333,11 @@ impl Core {
         self.last.has_applied.then_some(&self.last.input)
     }
 
+    /// The watchdog that keeps the plant from moving.
+    pub(crate) fn frozen(&self) -> Option<Trip> {
+        self.protection.frozen
+    }
+
     /// The plant as it is, to be shown.
     pub(crate) fn view(&mut self) -> View {
         View {

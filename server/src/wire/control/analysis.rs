@@ -3,12 +3,13 @@
 use std::sync::Arc;
 
 use nalgebra::DMatrix;
-use plantd_control::{self as control, Mode, Tangent, TransferFunction};
+use plantd_control::{self as control, Mode, TransferFunction};
 use plantd_models::scene::UnknownName;
 use plantd_models::{Continuous, ContinuousPoint, Linearization, Model, Plant};
 use plantd_proto::v1;
 
 use crate::core::feedback::regulator::Constraints;
+use crate::core::feedback::space::Space;
 use crate::core::limits::LimitExceeded;
 use crate::core::workers::pool::Abandoned;
 use crate::wire::control::points::at_point;
@@ -53,26 +54,6 @@ pub(crate) fn analyze(
         state: Some(states::plant_state(&mut plant)),
         u,
     })
-}
-
-/// Poles of the linearized map at a plant's state: of A, as the modes of Analyze on the constraints, and with a
-/// gain of `A − B K` in the directions in which the plant can be moved.
-pub(crate) fn poles(
-    plant: &mut Plant,
-    linearization: &Linearization,
-    gain: Option<&DMatrix<f64>>,
-) -> Result<v1::Poles, RpcError> {
-    let (a, time_step_s) = (linearization.a(), plant.settings().time_step_s);
-    let space = Space::new(plant, Constraints::Manifold);
-    let of = |map: &DMatrix<f64>| -> Result<Vec<v1::Complex>, RpcError> {
-        let modes = control::modes(map, time_step_s)?.into_iter();
-        Ok(modes.map(|Mode { real, imaginary, .. }| v1::Complex { real, imaginary }).collect())
-    };
-    let closed_loop = match gain {
-        Some(gain) => of(&space.moving_map(&(&a - linearization.b() * gain)))?,
-        None => Vec::new(),
-    };
-    Ok(v1::Poles { open_loop: of(&space.free(&a))?, closed_loop })
 }
 
 /// Outputs `y = x_matrix x + u_matrix u`.
@@ -236,57 +217,6 @@ fn responses(
         })
     };
     frequencies_hz.iter().map(response).collect()
-}
-
-/// The directions of the state that count.
-enum Space {
-    Full,
-    Manifold { moving: Tangent, free: Tangent },
-}
-
-impl Space {
-    fn new(plant: &mut Plant, constraints: Constraints) -> Self {
-        if constraints == Constraints::Full {
-            return Self::Full;
-        }
-        let dynamic = plant.model().dimensions().dynamic;
-        let jacobian = plant.constraint_jacobian();
-        Self::Manifold {
-            moving: Tangent::new(&jacobian, dynamic),
-            free: Tangent::held(&jacobian, dynamic),
-        }
-    }
-
-    /// A on the directions in which the plant moves by itself.
-    fn free(&self, a: &DMatrix<f64>) -> DMatrix<f64> {
-        match self {
-            Self::Full => a.clone(),
-            Self::Manifold { free, .. } => free.restrict_map(a),
-        }
-    }
-
-    /// A map on the directions in which it can be moved.
-    fn moving_map(&self, map: &DMatrix<f64>) -> DMatrix<f64> {
-        match self {
-            Self::Full => map.clone(),
-            Self::Manifold { moving, .. } => moving.restrict_map(map),
-        }
-    }
-
-    /// A, B, C on the directions in which it can be moved.
-    fn moving(
-        &self,
-        a: &DMatrix<f64>,
-        b: &DMatrix<f64>,
-        c: &DMatrix<f64>,
-    ) -> (DMatrix<f64>, DMatrix<f64>, DMatrix<f64>) {
-        match self {
-            Self::Full => (a.clone(), b.clone(), c.clone()),
-            Self::Manifold { moving, .. } => {
-                (self.moving_map(a), moving.reduce(b), c * moving.basis())
-            }
-        }
-    }
 }
 
 fn mode(mode: Mode) -> v1::Mode {

@@ -1,6 +1,7 @@
 //! The service of linearizations, regulators, filters and optimisations.
 
 pub(crate) mod analysis;
+pub(crate) mod case;
 pub(crate) mod derivatives;
 pub(crate) mod kalman;
 pub(crate) mod mechanics;

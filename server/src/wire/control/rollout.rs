@@ -1,145 +1,180 @@
 //! `ControlService.Rollout`: many simulations of one model, as many at a time as there are workers.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 
-use futures::{StreamExt, stream};
-use plantd_models::{Model, Plant, Settings};
+use futures::{StreamExt, TryStreamExt as _, stream};
+use plantd_models::{Model, Settings};
 use plantd_proto::v1;
 
-use crate::core::inputs::{Inputs, hold_input};
-use crate::core::limits::LimitExceeded;
+use crate::core::inputs::Inputs;
+use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::workers::pool::Abandoned;
 use crate::core::workers::queue::Admission;
 use crate::wire::answers::Answers;
+use crate::wire::control::case::{Case, Cost, Shared, Simulation};
 use crate::wire::control::points::model_and_settings;
-use crate::wire::message::start::{self, Start};
-use crate::wire::message::states;
+use crate::wire::message::{settings, start, states};
+use crate::wire::models::model::compile;
 use crate::wire::shared::hub::Hub;
 use crate::wire::shared::jobs::Jobs;
 use crate::wire::status::RpcError;
+
+/// Rows of a message with many cases, at most.
+const ROWS_MAX: usize = 1000;
 
 /// A checked request.
 pub(crate) struct Rollout {
     shared: Arc<Shared>,
     cases: Vec<Case>,
+    /// Answer with rows.
+    table: bool,
 }
 
-struct Shared {
-    model: Arc<Model>,
-    settings: Settings,
-    /// Every how many steps a state is returned; `None` means only the last one.
-    every: Option<usize>,
-}
-
-struct Case {
-    index: u32,
-    start: Start,
-    inputs: Inputs,
-    steps: usize,
-}
+/// A case that has ended: what is said of it, and its last state; none of one that never began.
+type Ended = (v1::RolloutResponse, Vec<f64>);
 
 impl Rollout {
-    pub(crate) fn new(hub: &Hub, request: v1::RolloutRequest) -> Result<Self, RpcError> {
+    pub(crate) fn new(hub: &Arc<Hub>, request: v1::RolloutRequest) -> Result<Self, RpcError> {
         let limits = &hub.limits;
         let count = request.cases.len();
         LimitExceeded::check("rollout_cases", limits.rollout_cases, "cases", count)?;
-        let (model, settings) = model_and_settings(hub, &request.model, request.settings)?;
-        let every = (request.every > 0).then_some(request.every as usize);
+        let v1::RolloutRequest { model, scene, settings, every, table, .. } = request;
+        let (model_name, model, settings) = mechanics(hub, model, &scene, settings)?;
+        let every = (every > 0).then_some(every as usize);
         let state_numbers = states::state_numbers(model.dimensions());
+        let width = model.dimensions().input();
+        let mut common = request.common.unwrap_or_default();
+        let common_inputs = Arc::new(Inputs::new("common.u", common.u.take(), width)?);
+        check_feedback("common", &common)?;
         let mut cases = Vec::with_capacity(count);
-        for (index, case) in (0..).zip(request.cases) {
-            let field = format!("cases[{index}].u");
-            let inputs = Inputs::new(&field, case.u, model.dimensions().input())?;
-            let steps = inputs.count().saturating_add(case.hold as usize);
+        for (index, mut own) in (0..).zip(request.cases) {
+            let inputs = match own.u.take() {
+                Some(u) => Arc::new(Inputs::new(&format!("cases[{index}].u"), Some(u), width)?),
+                None => Arc::clone(&common_inputs),
+            };
+            let hold = if own.hold == 0 { common.hold } else { own.hold };
+            let steps = inputs.count().saturating_add(hold as usize);
             LimitExceeded::check("horizon", limits.horizon, "steps", steps)?;
-            let states = every.map_or(1, |every| steps / every);
+            let states = if table { 0 } else { every.map_or(1, |every| steps / every) };
             let numbers = states.saturating_mul(state_numbers);
             let (name, limit) = ("reply_numbers", limits.reply_numbers);
             LimitExceeded::check(name, limit, "numbers in the states of a case", numbers)?;
-            let start = start::start(case.initial, &model, &hub.limits)?;
-            cases.push(Case { index, start, inputs, steps });
+            check_feedback(&format!("cases[{index}]"), &own)?;
+            let initial = own.initial.take().or_else(|| common.initial.clone());
+            let start = start::start(initial, &model, limits)?;
+            cases.push(Case { index, start, inputs, steps, own });
         }
-        Ok(Self { shared: Arc::new(Shared { model, settings, every }), cases })
+        let cost = request.cost.map(|cost| Cost::new(cost, &model)).transpose()?;
+        let shared = Shared {
+            hub: Arc::clone(hub),
+            model,
+            model_name,
+            settings,
+            // Of a table's cases the last state is all that is shown.
+            every: if table { None } else { every },
+            extremes: request.extremes,
+            cost,
+            common,
+            metrics: Arc::default(),
+        };
+        Ok(Self { shared: Arc::new(shared), cases, table })
     }
 
     /// The answers, in the order in which the cases end.
     pub(crate) fn run(self, workers: Jobs) -> Answers<v1::RolloutResponse> {
         let parallel = workers.count();
-        let shared = self.shared;
-        let answers = stream::iter(self.cases).map(move |case| {
+        let Self { shared, cases, table } = self;
+        let whole = Arc::clone(&shared);
+        let ended = stream::iter(cases).map(move |case| {
             let (workers, shared) = (workers.clone(), Arc::clone(&shared));
             async move {
                 let mut simulation = Simulation::new(case, shared);
                 let part = move |abandoned: &Abandoned| simulation.go_on(abandoned);
-                Ok(workers.in_parts(Admission::Granted, part).await?)
+                Ok::<Ended, tonic::Status>(workers.in_parts(Admission::Granted, part).await?)
             }
         });
-        Box::pin(answers.buffer_unordered(parallel))
-    }
-}
-
-/// A case on its way.
-struct Simulation {
-    case: Case,
-    shared: Arc<Shared>,
-    /// Made in the first part.
-    plant: Option<Box<Plant>>,
-    /// The input of the steps after those that have one of their own.
-    held: Vec<f64>,
-    taken: usize,
-    response: v1::RolloutResponse,
-}
-
-impl Simulation {
-    fn new(case: Case, shared: Arc<Shared>) -> Self {
-        let response = v1::RolloutResponse { case_index: case.index, ..Default::default() };
-        Self { case, shared, plant: None, held: Vec::new(), taken: 0, response }
-    }
-
-    /// Goes on for a part; the answer when the case has ended.
-    fn go_on(&mut self, abandoned: &Abandoned) -> Result<Option<v1::RolloutResponse>, RpcError> {
-        match self.simulate(|| Ok(abandoned.part_is_over()?)) {
-            Ok(false) => return Ok(None),
-            Ok(true) => {}
-            Err(fault) if fault.reason() == "CANCELLED" => return Err(fault),
-            Err(fault) => self.response.failure = Some(fault.into()),
+        let ended = ended.buffer_unordered(parallel);
+        if !table {
+            return Box::pin(ended.map_ok(|(response, _)| response));
         }
-        Ok(Some(std::mem::take(&mut self.response)))
+        let columns = columns(&whole);
+        let rows = rows_at_a_time(&whole.hub.limits, columns.len());
+        let chunks = ended.try_chunks(rows).map_err(|broken| broken.1);
+        Box::pin(chunks.map_ok(move |cases| table_of(&whole, &columns, cases)))
     }
+}
 
-    /// Takes steps until all are taken, which is true, or `is_over` after one of them.
-    fn simulate(&mut self, is_over: impl Fn() -> Result<bool, RpcError>) -> Result<bool, RpcError> {
-        let Self { case, shared, held, taken, response, .. } = self;
-        let plant = match &mut self.plant {
-            Some(plant) => plant,
-            None => {
-                let field = format!("cases[{}].initial", case.index);
-                let plant = start::plant(&shared.model, shared.settings, &case.start, &field)?;
-                *held = match case.inputs.last() {
-                    Some(last) => last.to_vec(),
-                    None => hold_input(&plant),
-                };
-                self.plant.insert(Box::new(plant))
-            }
+/// The model of a request, by its name or its scene, and its settings.
+fn mechanics(
+    hub: &Hub,
+    name: String,
+    scene: &str,
+    given: Option<v1::PlantSettings>,
+) -> Result<(String, Arc<Model>, Settings), RpcError> {
+    if scene.is_empty() {
+        let (model, settings) = model_and_settings(hub, &name, given)?;
+        return Ok((name, model, settings));
+    }
+    if !name.is_empty() {
+        return Err(RpcError::field("model", "and `scene` are both given"));
+    }
+    let format = v1::SceneFormat::Unspecified.into();
+    let (model, _) = compile(scene, format, &HashMap::new(), &hub.limits)??;
+    let settings = settings::settings(given, &model, &hub.limits)?;
+    Ok((model.scene().name.clone(), Arc::new(model), settings))
+}
+
+fn check_feedback(field: &str, case: &v1::RolloutCase) -> Result<(), RpcError> {
+    match &case.feedback {
+        Some(feedback) if !feedback.id.is_empty() => {
+            Err(RpcError::field(format!("{field}.feedback.id"), "is of a plant; cases have none"))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Names of a table's columns.
+fn columns(shared: &Shared) -> Vec<String> {
+    let x = states::state_names(&shared.model);
+    let mut names = vec!["steps".to_owned(), "end".to_owned()];
+    names.extend(x.iter().cloned());
+    if shared.extremes {
+        names.extend(x.iter().map(|name| format!("min {name}")));
+        names.extend(x.iter().map(|name| format!("max {name}")));
+    }
+    names.extend(shared.cost.as_ref().map(|_| "cost".to_owned()));
+    names
+}
+
+fn rows_at_a_time(limits: &Limits, columns: usize) -> usize {
+    (Limits::size(limits.reply_numbers) / columns).clamp(1, ROWS_MAX)
+}
+
+fn table_of(shared: &Shared, columns: &[String], cases: Vec<Ended>) -> v1::RolloutResponse {
+    let mut table = v1::RolloutTable { columns: columns.to_vec(), ..Default::default() };
+    let mut data = Vec::with_capacity(cases.len() * columns.len());
+    for (case, x) in cases {
+        let row = data.len();
+        let end = match (&case.failure, &case.ended_by) {
+            (Some(_), _) => 2.0,
+            (None, Some(_)) => 1.0,
+            (None, None) => 0.0,
         };
-        let mut outcome = Ok(());
-        while *taken < case.steps {
-            let u = if *taken < case.inputs.count() { case.inputs.get(*taken) } else { &*held };
-            outcome = plant.step(u).map(|_| ());
-            if outcome.is_err() {
-                break;
-            }
-            *taken += 1;
-            if shared.every.is_some_and(|every| *taken % every == 0) {
-                response.states.push(states::plant_state(plant));
-            }
-            if *taken < case.steps && is_over()? {
-                return Ok(false);
-            }
+        data.extend([case.steps as f64, end]);
+        data.extend(x);
+        data.extend(case.min);
+        data.extend(case.max);
+        if shared.cost.is_some() && data.len() + 1 == row + columns.len() {
+            data.push(case.cost);
         }
-        if shared.every.is_none() {
-            response.states.push(states::plant_state(plant));
-        }
-        Ok(outcome.map(|()| true)?)
+        data.resize(row + columns.len(), f64::NAN);
+        table.case_indices.push(case.case_index);
+        let case_index = case.case_index;
+        let failure = case.failure.map(|why| v1::RolloutFailure { case_index, failure: Some(why) });
+        table.failures.extend(failure);
     }
+    let (rows, cols) = (table.case_indices.len() as u32, columns.len() as u32);
+    table.rows = Some(v1::Matrix { rows, cols, data });
+    v1::RolloutResponse { table: Some(table), ..Default::default() }
 }

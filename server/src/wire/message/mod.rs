@@ -6,6 +6,7 @@ pub mod drawing;
 pub mod matrices;
 pub mod models;
 pub(crate) mod plant_info;
+pub mod poles;
 pub mod report;
 pub(crate) mod run_info;
 pub(crate) mod saved;

@@ -14,8 +14,7 @@ use crate::core::feedback::regulator::{self, Constraints};
 use crate::core::limits::LimitExceeded;
 use crate::core::publish::frame::Frame;
 use crate::core::session::shared::Session;
-use crate::wire::control::analysis;
-use crate::wire::message::{drawing, matrices, states};
+use crate::wire::message::{drawing, matrices, poles, states};
 use crate::wire::status::RpcError;
 
 /// What a watcher has asked for.
@@ -193,6 +192,6 @@ impl Computer {
         let in_force = self.session.feedback_in_force();
         let gain = in_force.as_ref().map(|in_force| in_force.gain_at(step));
         let gain = gain.map(|gain| DMatrix::from_row_slice(d.input(), d.state(), gain));
-        analysis::poles(&mut self.plant, &self.linearization, gain.as_ref())
+        poles::poles(&mut self.plant, &self.linearization, gain.as_ref())
     }
 }

@@ -14,7 +14,7 @@ use v1::point::Source;
 use v1::set_feedback_request::Reference as Form;
 
 use crate::core::connection::Connection;
-use crate::core::feedback::active::{Feedback, GuardBound, InForce, Mode};
+use crate::core::feedback::active::{Feedback, FeedbackInfo, GuardBound, InForce, Mode};
 use crate::core::feedback::law::{Law, Stage};
 use crate::core::feedback::regulator::{Constraints, Memory, Reference, RegulatorError, Spec};
 use crate::core::inputs::Inputs;
@@ -28,7 +28,7 @@ use crate::wire::answers::{Answers, Messages};
 use crate::wire::message::plant_info::{failure_message, feedback_info};
 use crate::wire::message::weights::{self, WeightFields};
 use crate::wire::message::{checks, matrices, start, states};
-use crate::wire::shared::hub::Hub;
+use crate::wire::shared::hub::{Hub, TrajectoryPermit};
 use crate::wire::status::RpcError;
 
 /// Answers a SetParameters call.
@@ -131,66 +131,94 @@ pub(crate) async fn set_feedback(
     request: v1::SetFeedbackRequest,
 ) -> Result<v1::SetFeedbackResponse, RpcError> {
     let session = hub.session(&request.id)?;
-    let mut permit = match request.reference {
-        Some(Form::Trajectory(_)) => Some(hub.trajectory_permit()?),
-        _ => None,
-    };
+    let permit = permit(hub, &request)?;
     let job = {
         let (hub, session) = (Arc::clone(hub), Arc::clone(&session));
-        move |abandoned: &Abandoned| {
-            let mode = mode(request.mode)?;
-            let guard = guard(&request.guard, mode, session.model())?;
-            let first_step = request.first_step;
-            let mechanics = session.mechanics();
-            let is_trajectory = matches!(request.reference, Some(Form::Trajectory(_)));
-            if first_step.is_some() && !is_trajectory {
-                return Err(RpcError::field("first_step", "is for trajectories only"));
-            }
-            if !request.stages.is_empty() && !is_trajectory {
-                return Err(RpcError::field("stages", "are for trajectories only"));
-            }
-            let given = is_trajectory.then(|| Arc::new(request.clone()) as Origin);
-            let constraints = Constraints::new(request.constraints)?;
-            let reference = reference(&hub, request.reference, session.model_name(), &mechanics)?;
-            let model = &mechanics.model;
-            let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
-            let (weights, trajectory_weights) = match &reference {
-                Reference::Gain(_) => (None, None),
-                Reference::Trajectory { inputs, .. } => {
-                    let (steps, stages) = (inputs.count(), request.stages);
-                    let (count, values) = (stages.len(), Values::Drop);
-                    let memory = Memory { steps, stages: count, momentum, values };
-                    let numbers = memory.check(&hub.limits, model)?;
-                    permit.iter_mut().try_for_each(|permit| permit.hold(numbers))?;
-                    let (fields, weights) = (WeightFields::default(), request.weights);
-                    let all = weights::trajectory_weights(fields, weights, stages, steps, model)?;
-                    (None, Some(all))
-                }
-                _ => (Some(weights::weights(request.weights, model)?), None),
-            };
-            let time_step_s = mechanics.settings.time_step_s;
-            let spec = Arc::new(Spec {
-                reference,
-                weights,
-                trajectory_weights,
-                momentum,
-                constraints,
-                time_step_s,
-                given,
-            });
-            let law = solve(&hub, &spec, &mechanics, abandoned)?;
-            if session.is_closed() {
-                return Err(RpcError::closed(&session));
-            }
-            let feedback = Box::new(Feedback::new(spec, law, mode, guard));
-            Ok(session.set_feedback(feedback, mechanics.generation, first_step))
-        }
+        move |abandoned: &Abandoned| put(&hub, &session, request, permit, abandoned)
     };
     let (info, is_outdated) = hub.workers.run(job).await?;
     if is_outdated {
         recompute(Arc::clone(hub), session);
     }
     Ok(v1::SetFeedbackResponse { feedback: Some(feedback_info(info)) })
+}
+
+/// Puts a feedback in force on a plant that does not change meanwhile. Solves for it: call it on a worker.
+pub(crate) fn install(
+    hub: &Hub,
+    session: &Arc<Session>,
+    request: v1::SetFeedbackRequest,
+    abandoned: &Abandoned,
+) -> Result<(), RpcError> {
+    let permit = permit(hub, &request)?;
+    put(hub, session, request, permit, abandoned).map(|_| ())
+}
+
+/// Room for a regulator along a trajectory.
+fn permit(
+    hub: &Hub,
+    request: &v1::SetFeedbackRequest,
+) -> Result<Option<TrajectoryPermit>, RpcError> {
+    match request.reference {
+        Some(Form::Trajectory(_)) => hub.trajectory_permit().map(Some),
+        _ => Ok(None),
+    }
+}
+
+/// Solves for a feedback and puts it in force. True when it is outdated by now.
+fn put(
+    hub: &Hub,
+    session: &Arc<Session>,
+    request: v1::SetFeedbackRequest,
+    mut permit: Option<TrajectoryPermit>,
+    abandoned: &Abandoned,
+) -> Result<(FeedbackInfo, bool), RpcError> {
+    let mode = mode(request.mode)?;
+    let guard = guard(&request.guard, mode, session.model())?;
+    let first_step = request.first_step;
+    let mechanics = session.mechanics();
+    let is_trajectory = matches!(request.reference, Some(Form::Trajectory(_)));
+    if first_step.is_some() && !is_trajectory {
+        return Err(RpcError::field("first_step", "is for trajectories only"));
+    }
+    if !request.stages.is_empty() && !is_trajectory {
+        return Err(RpcError::field("stages", "are for trajectories only"));
+    }
+    let given = is_trajectory.then(|| Arc::new(request.clone()) as Origin);
+    let constraints = Constraints::new(request.constraints)?;
+    let reference = reference(hub, request.reference, session.model_name(), &mechanics)?;
+    let model = &mechanics.model;
+    let momentum = weights::momentum_in("weights", request.weights.as_ref())?;
+    let (weights, trajectory_weights) = match &reference {
+        Reference::Gain(_) => (None, None),
+        Reference::Trajectory { inputs, .. } => {
+            let (steps, stages) = (inputs.count(), request.stages);
+            let (count, values) = (stages.len(), Values::Drop);
+            let memory = Memory { steps, stages: count, momentum, values };
+            let numbers = memory.check(&hub.limits, model)?;
+            permit.iter_mut().try_for_each(|permit| permit.hold(numbers))?;
+            let (fields, weights) = (WeightFields::default(), request.weights);
+            let all = weights::trajectory_weights(fields, weights, stages, steps, model)?;
+            (None, Some(all))
+        }
+        _ => (Some(weights::weights(request.weights, model)?), None),
+    };
+    let time_step_s = mechanics.settings.time_step_s;
+    let spec = Arc::new(Spec {
+        reference,
+        weights,
+        trajectory_weights,
+        momentum,
+        constraints,
+        time_step_s,
+        given,
+    });
+    let law = solve(hub, &spec, &mechanics, abandoned)?;
+    if session.is_closed() {
+        return Err(RpcError::closed(session));
+    }
+    let feedback = Box::new(Feedback::new(spec, law, mode, guard));
+    Ok(session.set_feedback(feedback, mechanics.generation, first_step))
 }
 
 fn mode(mode: i32) -> Result<Mode, RpcError> {

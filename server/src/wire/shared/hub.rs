@@ -244,6 +244,11 @@ impl Hub {
         Ok(session)
     }
 
+    /// A plant that nobody but the caller knows, counted in metrics of its own.
+    pub fn apart(&self, model: &str, plant: Plant, metrics: Arc<Metrics>) -> Arc<Session> {
+        Session::new(Origin::new("case", model), plant, metrics, Arc::clone(&self.realtime))
+    }
+
     /// Ends a plant. Its id is free again when everything that belonged to it is gone.
     pub async fn delete(self: &Arc<Self>, id: &str) -> Result<(), RpcError> {
         let session = self.session(id)?;

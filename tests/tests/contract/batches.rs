@@ -1,0 +1,244 @@
+//! Rollouts with everything that a plant can have: each case moves as a plant does that is driven step by step.
+
+use plantd_client::{Client, Code, MatrixExt as _, diagonal, operating_point, v1, weights};
+use v1::fault_spec::{Kind, Target};
+use v1::output_channel::Source;
+
+use crate::support::*;
+
+const STEPS: u32 = 60;
+
+/// A sensor that is late and noisy, and an actuator that is late and coarse.
+fn channels() -> v1::Channels {
+    let sensor = v1::OutputChannel {
+        name: "angle".to_owned(),
+        source: Some(Source::Coordinate("theta".to_owned())),
+        latency_s: 0.02,
+        noise: 1e-3,
+        ..Default::default()
+    };
+    let actuator = v1::InputChannel {
+        input: "force".to_owned(),
+        delay_s: 0.01,
+        quantum: 0.05,
+        ..Default::default()
+    };
+    v1::Channels { outputs: vec![sensor], inputs: vec![actuator], seed: 1 }
+}
+
+fn noise_of_the_input() -> v1::FaultSpec {
+    let noise = v1::ExtraNoise { deviation: 0.3 };
+    v1::FaultSpec {
+        target: Some(Target::Input("force".to_owned())),
+        kind: Some(Kind::Noise(noise)),
+        ..Default::default()
+    }
+}
+
+async fn feedback(client: &Client) -> v1::SetFeedbackRequest {
+    let request = v1::SolveLqrRequest {
+        model: "cart-pole".to_owned(),
+        point: Some(operating_point("upright")),
+        weights: Some(weights(diagonal([100.0, 100.0, 1.0, 1.0]), diagonal([0.1]))),
+        ..Default::default()
+    };
+    let regulator = client.solve_lqr(request).await.unwrap();
+    v1::SetFeedbackRequest {
+        reference: Some(v1::set_feedback_request::Reference::Gain(regulator.gain.unwrap())),
+        mode: v1::FeedbackMode::Replace.into(),
+        ..Default::default()
+    }
+}
+
+fn mass(k: usize) -> f64 {
+    0.9 + 0.01 * k as f64
+}
+
+fn start() -> v1::InitialState {
+    at_velocity(&[0.0, std::f64::consts::PI - 0.05], &[0.1, 0.0])
+}
+
+#[tokio::test]
+async fn a_case_with_everything_is_a_plant_with_everything_bit_for_bit() {
+    let (_server, client) = server().await;
+    let feedback = feedback(&client).await;
+    let path = "frames[cart].body.mass";
+    let case = |k: usize| v1::RolloutCase {
+        parameters: vec![v1::Parameter { path: path.to_owned(), value: mass(k) }],
+        seed: Some(k as u64),
+        ..Default::default()
+    };
+    let common = v1::RolloutCase {
+        initial: Some(start()),
+        hold: STEPS,
+        channels: Some(channels()),
+        feedback: Some(feedback.clone()),
+        faults: vec![noise_of_the_input()],
+        ..Default::default()
+    };
+    let request = v1::RolloutRequest {
+        model: "cart-pole".to_owned(),
+        cases: (0..20).map(case).collect(),
+        every: 1,
+        common: Some(common),
+        ..Default::default()
+    };
+    let mut cases = client.rollout(request).await.unwrap().collect().await.unwrap();
+    cases.sort_by_key(|case| case.case_index);
+    assert_eq!(cases.len(), 20);
+
+    let text = client.get_model("cart-pole").await.unwrap().scene_toml;
+    for case in cases {
+        assert!(case.failure.is_none(), "{:?}", case.failure);
+        let k = case.case_index as usize;
+        let (id, model) = (format!("p{k}"), format!("cart-pole-{k}"));
+        let scene = v1::CreateModelRequest {
+            scene: text.clone(),
+            name: model.clone(),
+            ..Default::default()
+        };
+        client.create_model_as(scene).await.unwrap();
+        let create = v1::CreatePlantRequest { id: id.clone(), model, ..Default::default() };
+        client.create_plant(create).await.unwrap();
+        let parameters = vec![v1::Parameter { path: path.to_owned(), value: mass(k) }];
+        let change = v1::SetParametersRequest { id: id.clone(), parameters, ..Default::default() };
+        client.set_parameters(change).await.unwrap();
+        let reset = v1::ResetRequest { id: id.clone(), initial: Some(start()) };
+        client.reset_to(reset).await.unwrap();
+        let channels = v1::Channels { seed: k as u64, ..channels() };
+        client.set_channels(&*id, channels).await.unwrap();
+        let feedback = v1::SetFeedbackRequest { id: id.clone(), ..feedback.clone() };
+        client.set_feedback(feedback).await.unwrap();
+        client.inject_fault(&*id, noise_of_the_input()).await.unwrap();
+        let mut driver = client.drive(&*id).await.unwrap();
+        for (state, outputs) in case.states.iter().zip(&case.outputs) {
+            let step = driver.step(&[0.0]).await.unwrap();
+            assert_eq!(bits(step.state.as_ref().unwrap()), bits(state), "case {k}");
+            assert_eq!(step.outputs.as_ref(), Some(outputs), "case {k}");
+        }
+        assert_eq!(case.states.len() as u32, STEPS);
+        driver.close().await.unwrap();
+    }
+}
+
+#[tokio::test]
+async fn cases_end_early_and_are_told_as_rows() {
+    let (_server, client) = server().await;
+    let until = v1::Watchdog {
+        quantity: "theta".to_owned(),
+        min: Some(-0.5),
+        max: Some(0.5),
+        ..Default::default()
+    };
+    let case = |velocity: f64| v1::RolloutCase {
+        initial: Some(at_velocity(&[0.2], &[velocity])),
+        ..Default::default()
+    };
+    let cost = v1::RolloutCost {
+        q: Some(diagonal([2.0, 0.5])),
+        r: Some(diagonal([3.0])),
+        end: Some(diagonal([0.0, 7.0])),
+        x_reference: vec![0.1, 0.0],
+        u_reference: vec![0.25],
+    };
+    let common = v1::RolloutCase {
+        u: Some(v1::Matrix::from_rows(&[[0.5]])),
+        hold: 49,
+        until: vec![until],
+        ..Default::default()
+    };
+    let request = v1::RolloutRequest {
+        model: "pendulum".to_owned(),
+        // The last one cannot begin: it has no such velocity.
+        cases: vec![case(0.0), case(3.0), case(f64::NAN)],
+        every: 1,
+        common: Some(common),
+        extremes: true,
+        cost: Some(cost),
+        ..Default::default()
+    };
+    let mut states = client.rollout(request.clone()).await.unwrap().collect().await.unwrap();
+    states.sort_by_key(|case| case.case_index);
+    let table = v1::RolloutRequest { table: true, ..request };
+    let mut rows = client.rollout(table).await.unwrap().collect().await.unwrap();
+    assert_eq!(rows.len(), 1);
+    let table = rows.remove(0).table.unwrap();
+    assert_eq!(
+        table.columns,
+        [
+            "steps",
+            "end",
+            "theta",
+            "p(theta)",
+            "min theta",
+            "min p(theta)",
+            "max theta",
+            "max p(theta)",
+            "cost"
+        ]
+    );
+    let of = |case: u32| {
+        let row = table.case_indices.iter().position(|index| *index == case).unwrap();
+        let matrix = table.rows.as_ref().unwrap();
+        (0..matrix.cols).map(|col| matrix.at(row, col as usize)).collect::<Vec<_>>()
+    };
+    assert_eq!((of(0)[0], of(0)[1]), (50.0, 0.0));
+    assert!(of(1)[0] < 50.0 && of(1)[1] == 1.0, "{:?}", of(1));
+    assert!(of(2)[0] == 0.0 && of(2)[1] == 2.0 && of(2)[2..].iter().all(|x| x.is_nan()));
+    assert_eq!(table.failures.len(), 1);
+    assert_eq!(table.failures[0].case_index, 2);
+    for (case, first) in states.iter().take(2).zip([0.0, 3.0]) {
+        assert_eq!(case.steps as usize, case.states.len());
+        let ended = case.ended_by.as_ref();
+        assert_eq!(ended.map(|trip| trip.step), (first == 3.0).then_some(case.steps));
+        let start = client.create_plant(v1::CreatePlantRequest {
+            model: "pendulum".to_owned(),
+            initial: Some(at_velocity(&[0.2], &[first])),
+            ..Default::default()
+        });
+        let start = start.await.unwrap().state.unwrap();
+        let all: Vec<&v1::State> = std::iter::once(&start).chain(&case.states).collect();
+        let of_state = |state: &v1::State| (state.q[0], state.p[0]);
+        let least = all.iter().map(|s| s.q[0]).fold(f64::INFINITY, f64::min);
+        let most = all.iter().map(|s| s.p[0]).fold(f64::NEG_INFINITY, f64::max);
+        let row = of(case.case_index);
+        assert_eq!((row[4], row[7]), (least, most));
+        assert_eq!((case.min[0], case.max[1]), (least, most));
+        let (last, before) = all.split_last().unwrap();
+        assert_eq!((row[2], row[3]), of_state(last));
+        let stage = |state: &&v1::State| {
+            let (q, p) = of_state(state);
+            2.0 * (q - 0.1).powi(2) + 0.5 * p.powi(2) + 3.0 * 0.25_f64.powi(2)
+        };
+        let cost = before.iter().map(stage).sum::<f64>() + 7.0 * last.p[0].powi(2);
+        assert!((row[8] / cost - 1.0).abs() < 1e-12, "{} {cost}", row[8]);
+        assert_eq!(row[8], case.cost);
+    }
+}
+
+#[tokio::test]
+async fn a_scene_of_the_request_is_the_model_of_its_cases() {
+    let (_server, client) = server().await;
+    let scene = client.get_model("pendulum").await.unwrap().scene_toml;
+    let case = v1::RolloutCase {
+        initial: Some(at_velocity(&[0.2], &[1.0])),
+        hold: 10,
+        ..Default::default()
+    };
+    let by_scene = v1::RolloutRequest { scene, cases: vec![case], ..Default::default() };
+    let by_name = v1::RolloutRequest {
+        scene: String::new(),
+        model: "pendulum".to_owned(),
+        ..by_scene.clone()
+    };
+    let run = async |request| client.rollout(request).await.unwrap().collect().await.unwrap();
+    let (scene, name) = (run(by_scene.clone()).await, run(by_name).await);
+    assert_eq!(scene, name);
+    let both = v1::RolloutRequest { model: "pendulum".to_owned(), ..by_scene.clone() };
+    assert_bad_field(client.rollout(both).await, "model");
+    let mut of_a_plant = by_scene;
+    of_a_plant.cases[0].feedback =
+        Some(v1::SetFeedbackRequest { id: "p1".to_owned(), ..Default::default() });
+    let refused = client.rollout(of_a_plant).await;
+    assert_refused(refused, Code::InvalidArgument, "INVALID_FIELD", "cases[0].feedback.id");
+}
