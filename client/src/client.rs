@@ -63,7 +63,12 @@ impl Client {
             let problem = "it is without TLS, and everybody on the way could read the token";
             return Err(Error::Address { address: there.to_owned(), problem });
         }
-        Self::connect_with(there, self.options.clone()).await
+        let mut options = self.options.clone();
+        if !is_here {
+            // That was the name of this server.
+            options.authority = None;
+        }
+        Self::connect_with(there, options).await
     }
 
     /// Whether the server at an address serves, by gRPC's health service, which needs no token. A server that is

@@ -6,7 +6,8 @@ use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 use std::time::Duration;
 
-use tonic::codegen::http::uri::PathAndQuery;
+use tonic::codegen::http::Uri;
+use tonic::codegen::http::uri::{InvalidUri, PathAndQuery};
 use tonic::transport::Endpoint;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_check_response::ServingStatus;
@@ -42,6 +43,9 @@ pub struct ConnectOptions {
     pub request_timeout: Duration,
     /// How the client shows who it is, and how it knows the server.
     pub credentials: Credentials,
+    /// Name by which the server is called, if not by the host of its address: for gateways that route by names which
+    /// DNS does not lead to them.
+    pub authority: Option<String>,
 }
 
 impl Default for ConnectOptions {
@@ -50,6 +54,7 @@ impl Default for ConnectOptions {
             connect_timeout: Duration::from_secs(5),
             request_timeout: Duration::from_secs(60),
             credentials: Credentials::default(),
+            authority: None,
         }
     }
 }
@@ -89,6 +94,10 @@ async fn open(address: &str, options: &ConnectOptions) -> Result<AuthorizedChann
         .http2_keep_alive_interval(Duration::from_secs(30))
         .user_agent(concat!("plantd-client/", env!("CARGO_PKG_VERSION")))
         .expect("the user agent is a valid header");
+    let endpoint = match &options.authority {
+        Some(name) => endpoint.origin(origin(address, name)?),
+        None => endpoint,
+    };
     let failed = |problem| Error::Connect { address: address.to_owned(), problem };
     let limit = options.connect_timeout;
     let channel = match tokio::time::timeout(limit, endpoint.connect()).await {
@@ -210,6 +219,14 @@ pub(crate) async fn within<T, E: Into<Error>>(
         Ok(result) => result.map_err(Into::into),
         Err(_) => Err(tonic::Status::deadline_exceeded(format!("no answer in {limit:?}")).into()),
     }
+}
+
+/// What a server of that name is called with.
+fn origin(address: &str, name: &str) -> Result<Uri> {
+    let scheme = if address.starts_with("https://") { "https" } else { "http" };
+    let refused =
+        |_: InvalidUri| Error::Address { address: name.to_owned(), problem: "it is no host name" };
+    format!("{scheme}://{name}").parse().map_err(refused)
 }
 
 /// An endpoint with TLS.

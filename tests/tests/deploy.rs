@@ -238,6 +238,8 @@ fn ports_and_paths_agree() {
     assert!(read("deploy/prometheus.yml").contains(&format!("\"127.0.0.1:{metrics}\"")));
     let unit = read("deploy/plantd.service");
     let folder = unit.lines().find_map(|line| line.strip_prefix("RuntimeDirectory="));
+    // Of the unit that is no instance.
+    let folder = folder.map(|folder| folder.replace("%N", "plantd"));
     let folder = Path::new("/run").join(folder.expect("the unit has a runtime folder"));
     for path in [config.unix, config.link.root] {
         assert!(path.expect("it is set").starts_with(&folder));

@@ -65,6 +65,8 @@ impl ServerProcess {
             .args(["--grpc", "127.0.0.1:0", "--metrics", "127.0.0.1:0"])
             // A test that ends does not answer the server's farewell on its idle connections.
             .args(["--shutdown-grace-s", "0.2"])
+            // Nor does it wait for drivers of its own; flags win over it.
+            .env("PLANTD_DRAIN_S", "0")
             .arg("--unix")
             .arg(directory.path().join("plantd.sock"))
             .arg("--ready-file")

@@ -87,17 +87,10 @@ async fn a_case_with_everything_is_a_plant_with_everything_bit_for_bit() {
     cases.sort_by_key(|case| case.case_index);
     assert_eq!(cases.len(), 20);
 
-    let text = client.get_model("cart-pole").await.unwrap().scene_toml;
     for case in cases {
         assert!(case.failure.is_none(), "{:?}", case.failure);
         let k = case.case_index as usize;
-        let (id, model) = (format!("p{k}"), format!("cart-pole-{k}"));
-        let scene = v1::CreateModelRequest {
-            scene: text.clone(),
-            name: model.clone(),
-            ..Default::default()
-        };
-        client.create_model_as(scene).await.unwrap();
+        let (id, model) = (format!("p{k}"), "cart-pole".to_owned());
         let create = v1::CreatePlantRequest { id: id.clone(), model, ..Default::default() };
         client.create_plant(create).await.unwrap();
         let parameters = vec![v1::Parameter { path: path.to_owned(), value: mass(k) }];

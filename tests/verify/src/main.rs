@@ -34,6 +34,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "python", quick: false, lane: Lane::Aside, run: python::test_client },
     Stage { name: "book", quick: false, lane: Lane::Aside, run: python::make_book },
     Stage { name: "robots", quick: false, lane: Lane::Aside, run: python::compare_robots },
+    Stage { name: "gateway", quick: false, lane: Lane::Main, run: python::test_gateway },
     Stage { name: "viewer", quick: false, lane: Lane::Main, run: viewer::test_page },
     Stage { name: "docs", quick: false, lane: Lane::Main, run: docs },
     Stage { name: "doctests", quick: false, lane: Lane::Main, run: doctests },

