@@ -1,6 +1,8 @@
 //! `plantctl test` against scenarios whose motion is known in closed form: what must come true does,
 //! and what must break breaks at the right time.
 
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -235,4 +237,41 @@ fn a_server_that_is_there_is_left_without_plants() {
     let plants = plantctl(&["--address", server.address(), "list", "plants", "--json"]);
     let plants: Value = serde_json::from_str(&stdout(&plants)).unwrap();
     assert_eq!(plants["plants"], Value::Array(Vec::new()));
+}
+
+#[test]
+fn cases_are_spread_over_servers() {
+    let servers = [ServerProcess::start().unwrap(), ServerProcess::start().unwrap()];
+    let over = servers.each_ref().map(ServerProcess::address).join(",");
+    let (spread, code) = cases("met", &["--over", &over]);
+    assert_eq!((spread.len(), code), (9, 0));
+    // Which server it was makes no difference.
+    let (alone, _) = cases("met", &[]);
+    let told = |cases: &[Value]| -> Vec<String> {
+        let mut told: Vec<_> = cases.iter().map(|case| case["expectations"].to_string()).collect();
+        // How late a step was is the machine's business.
+        told.retain(|told| !told.contains("deadline misses"));
+        told.sort();
+        told
+    };
+    assert_eq!(told(&spread), told(&alone));
+    for server in &servers {
+        assert!(steps_of(server) > 0.0);
+        let plants = plantctl(&["--address", server.address(), "list", "plants", "--json"]);
+        let plants: Value = serde_json::from_str(&stdout(&plants)).unwrap();
+        assert_eq!(plants["plants"], Value::Array(Vec::new()));
+    }
+}
+
+/// Steps that a server has taken, by its metrics.
+fn steps_of(server: &ServerProcess) -> f64 {
+    let metrics = server.addresses().metrics.clone().unwrap();
+    let address = metrics.trim_start_matches("http://").trim_end_matches("/metrics");
+    let mut stream = TcpStream::connect(address).unwrap();
+    let request = format!("GET /metrics HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut text = String::new();
+    stream.read_to_string(&mut text).unwrap();
+    let lines = text.lines().filter(|line| line.starts_with("plantd_steps_total"));
+    lines.map(|line| line.rsplit(' ').next().unwrap().parse::<f64>().unwrap()).sum()
 }

@@ -197,6 +197,9 @@ async fn a_watch_of_health_hears_of_the_end_and_does_not_delay_it() {
 async fn a_draining_server_serves_on_until_a_second_signal() {
     let (mut server, client, mut watch) = watched_for_health(&["--drain-s", "100"]).await;
     let id = plant(&client, "pendulum").await.id;
+    // A balancer, which asks now and then: it has to have time to ask again.
+    let balancer = || HealthCheckRequest { service: "plantd.v1.PlantService".to_owned() };
+    HealthClient::new(client.channel()).check(balancer()).await.unwrap();
     server.terminate().unwrap();
     let last = soon(watch.message()).await.unwrap().unwrap();
     assert_eq!(last.status(), ServingStatus::NotServing);
@@ -204,8 +207,7 @@ async fn a_draining_server_serves_on_until_a_second_signal() {
     let newcomer = server.client().await;
     newcomer.get_plant(&id).await.unwrap();
     let mut health = HealthClient::new(newcomer.channel());
-    let request = HealthCheckRequest { service: "plantd.v1.PlantService".to_owned() };
-    let answer = health.check(request).await.unwrap().into_inner();
+    let answer = health.check(balancer()).await.unwrap().into_inner();
     assert_eq!(answer.status(), ServingStatus::NotServing);
     // An open stream would hold the end up for the grace as well, but for the second signal.
     let mut driver = newcomer.drive(&id).await.unwrap();

@@ -66,6 +66,7 @@ Examples:
   plantctl test scenarios --junit junit.xml --html report.html
   plantctl test hold.toml --case random-7          one case again
   plantctl test hold.toml --seed 2                 other random numbers
+  plantctl test scenarios --over http://a:50051,http://b:50051   spread over two servers
 
 Exit codes:
   0  every expectation came true
@@ -91,6 +92,9 @@ pub(crate) struct Test {
     /// The `plantd` to start; that beside this program or in PATH if not given.
     #[arg(long, value_name = "PROGRAM", alias = "server")]
     plantd: Option<PathBuf>,
+    /// Servers over which the cases are spread, comma-separated addresses, in place of one.
+    #[arg(long, value_name = "ADDRESS", value_delimiter = ',', conflicts_with = "plantd")]
+    over: Vec<String>,
     /// Write results as JUnit XML.
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
@@ -131,23 +135,30 @@ impl Test {
             print_unusable(&context.output, &unusable)?;
             return Ok(ExitCode::from(if unusable.is_empty() { 0 } else { NOT_RUN }));
         }
-        let (own, address) = match &context.address {
-            Some(address) => (None, address.clone()),
-            None => {
+        let given = match &context.address {
+            Some(address) if self.over.is_empty() => vec![address.clone()],
+            _ => self.over.clone(),
+        };
+        let (own, addresses) = match given.is_empty() {
+            false => (None, given),
+            true => {
                 let own = OwnServer::start(self.plantd.as_deref()).await?;
                 let address = own.address().to_owned();
-                (Some(own), address)
+                (Some(own), vec![address])
             }
         };
-        let server = TestServer {
-            client: context.connect_to(&address).await?,
-            link_root: own.as_ref().and_then(OwnServer::link_root).map(Path::to_owned),
-            address,
-            plants: Mutex::new(BTreeSet::new()),
-        };
+        let mut servers = Vec::new();
+        for address in addresses {
+            servers.push(TestServer {
+                client: context.connect_to(&address).await?,
+                link_root: own.as_ref().and_then(OwnServer::link_root).map(Path::to_owned),
+                address,
+                plants: Mutex::new(BTreeSet::new()),
+            });
+        }
         let replay = Replay { address: context.address.as_deref(), plantd: self.plantd.as_deref() };
         let mut terminated = signal(SignalKind::terminate())?;
-        let all = self.run_all(&server, scenarios, &context.output, &replay);
+        let all = self.run_all(&servers, scenarios, &context.output, &replay);
         let tested = tokio::select! {
             tested = all => Some(tested?),
             _ = tokio::signal::ctrl_c() => None,
@@ -155,9 +166,11 @@ impl Test {
         };
         let Some((tested, more)) = tested else {
             // The controllers went with the cases; the plants of somebody else's server must go, too.
-            let plants = std::mem::take(&mut *server.plants());
-            for plant in plants {
-                let _ = server.client.delete_plant(plant).await;
+            for server in &servers {
+                let plants = std::mem::take(&mut *server.plants());
+                for plant in plants {
+                    let _ = server.client.delete_plant(plant).await;
+                }
             }
             if let Some(own) = own {
                 own.stop().await;
@@ -227,10 +240,10 @@ impl Test {
         Ok(())
     }
 
-    /// Runs the cases, some at a time, and prints each when it is done.
+    /// Runs the cases on the servers in turn, some at a time on each, and prints each when it is done.
     async fn run_all(
         &self,
-        server: &TestServer,
+        servers: &[TestServer],
         scenarios: Vec<Suite>,
         output: &Output,
         replay: &Replay<'_>,
@@ -243,7 +256,7 @@ impl Test {
         let mut tested = Vec::new();
         for (file, scenario) in scenarios {
             let named = file.clone();
-            match PreparedScenario::new(server, file, scenario).await {
+            match prepare(servers, file, scenario).await {
                 Ok(prepared) => tested.push(ScenarioResult { prepared, outcomes: Vec::new() }),
                 Err(error) => {
                     let error = format!("{}: {error:#}", named.display());
@@ -262,6 +275,7 @@ impl Test {
             let run = |(order, (index, case)): (usize, (usize, Case))| async move {
                 let prepared = &tested[index].prepared;
                 let plant = plant_id(prepared, &case, counter.fetch_add(1, Ordering::Relaxed));
+                let server = &servers[order % servers.len()];
                 (order, index, run_case(server, prepared, &case, &plant).await)
             };
             let is_paced = |(_, (index, _)): &(usize, (usize, Case))| {
@@ -270,8 +284,9 @@ impl Test {
             let (paced, rest): (Vec<_>, Vec<_>) = cases.into_iter().enumerate().partition(is_paced);
             // Plants that follow the clock must not disturb each other.
             let paced = stream::iter(paced.into_iter().map(run)).buffer_unordered(1);
-            let mut running =
-                stream::iter(rest.into_iter().map(run)).buffer_unordered(jobs).chain(paced);
+            let mut running = stream::iter(rest.into_iter().map(run))
+                .buffer_unordered(jobs * servers.len())
+                .chain(paced);
             let mut finished = Vec::new();
             while let Some((order, index, outcome)) = running.next().await {
                 let prepared = &tested[index].prepared;
@@ -289,6 +304,19 @@ impl Test {
         }
         Ok((tested, unusable))
     }
+}
+
+/// Makes the model of a scenario known to all servers; what it refers to is computed by the first.
+async fn prepare(
+    servers: &[TestServer],
+    file: PathBuf,
+    scenario: Scenario,
+) -> Result<PreparedScenario> {
+    let [first, others @ ..] = servers else { bail!("there is no server to run it on") };
+    for server in others {
+        PreparedScenario::new(server, file.clone(), scenario.clone()).await?;
+    }
+    PreparedScenario::new(first, file, scenario).await
 }
 
 /// Prints the errors in the log of a server.
