@@ -3,8 +3,8 @@
     python3 deploy/envoy.py plantd-1.lab=10.0.0.1:50051 plantd-2.lab=10.0.0.2:50051 > envoy.json
     envoy -c envoy.json
 
-Clients reach a server by its name, `http://plantd-1.lab:8080`, which DNS leads to Envoy; `advertise` of each server is
-that address. The name of `--new` places new plants and batches on the servers that are ready, in turn, and tries the
+Clients reach a server by its name, `http://plantd-1.lab:8080`, which DNS leads to Envoy; that is `advertise` of the
+server, which answers to no other name. The name of `--new` places new plants and batches on the servers that are ready, in turn, and tries the
 next one where a server takes nothing. Whatever is no name gets 404. Loops on the same network connect without it: a
 round trip through it takes about twice as long.
 
@@ -64,7 +64,9 @@ def configuration(servers: dict[str, str], listen: str, new: str, admin: str | N
             }
         ],
     }
-    hosts = [{"name": "new", "domains": [new], "routes": route("new", retry_policy=retry)}]
+    # A server is called by its own name alone, or as one on this machine.
+    placing = route("new", retry_policy=retry, host_rewrite_literal="localhost")
+    hosts = [{"name": "new", "domains": [new], "routes": placing}]
     hosts += [{"name": name, "domains": [name], "routes": route(name)} for name in servers]
     manager = {
         "@type": MANAGER,
@@ -109,7 +111,10 @@ def configuration(servers: dict[str, str], listen: str, new: str, admin: str | N
                 "no_traffic_interval": "0.5s",
                 "unhealthy_threshold": 1,
                 "healthy_threshold": 1,
-                "grpc_health_check": {"service_name": "plantd.v1.PlantService"},
+                "grpc_health_check": {
+                    "service_name": "plantd.v1.PlantService",
+                    "authority": "localhost",
+                },
             }
         ],
     )

@@ -19,7 +19,7 @@ use crate::core::tenant::{ANY_TENANT, TenantSettings, is_tenant_name};
 use crate::tls::{ClientCertificates, TlsSettings};
 use crate::wire::edge::auth::settings::AuthSettings;
 use crate::wire::link::config::LinkConfig;
-use crate::wire::names::{Names, is_address, is_host_name, is_origin};
+use crate::wire::names::{Names, host_of, is_address, is_host_name, is_origin};
 
 /// Port of gRPC over TCP unless another one is given.
 pub const DEFAULT_PORT: u16 = 50051;
@@ -526,7 +526,10 @@ impl Config {
 
     /// By which names the server may be called.
     pub fn names(&self) -> Names {
-        let Self { allowed_hosts: hosts, allowed_origins: origins, grpc, .. } = self.clone();
+        let Self { allowed_hosts: mut hosts, allowed_origins: origins, grpc, .. } = self.clone();
+        // Its own, which nobody else's page can have.
+        hosts.extend(self.name.clone());
+        hosts.extend(self.advertise.as_deref().and_then(host_of).map(str::to_owned));
         Names { hosts, origins, any_host: grpc.is_beyond_loopback() }
     }
 

@@ -119,6 +119,12 @@ pub fn is_address(text: &str) -> bool {
     }
 }
 
+/// The host of an address, if it is a name.
+pub fn host_of(address: &str) -> Option<&str> {
+    let (_, authority) = address.split_once("://")?;
+    name(authority).filter(|name| is_host_name(name))
+}
+
 /// Whether this is an origin as browsers send it: scheme, host, port if it is not the scheme's own.
 pub fn is_origin(text: &str) -> bool {
     text.split_once("://").is_some_and(|(scheme, host)| {
@@ -192,5 +198,15 @@ mod tests {
         assert!(is_origin("chrome-extension://abc"));
         assert!(!is_origin("panel.example") && !is_origin("http://a/") && !is_origin("null"));
         assert!(!is_origin("http://") && !is_origin("://a"));
+        for good in ["http://plants.lab:50051", "https://[::1]:1", "unix:/run/plantd.sock"] {
+            assert!(is_address(good), "{good}");
+        }
+        for bad in
+            ["plants.lab", "http://", "http://a/b", "http://u@a", "ftp://a", "unix:a", "http://a b"]
+        {
+            assert!(!is_address(bad), "{bad}");
+        }
+        assert_eq!(host_of("https://plants.lab:50051"), Some("plants.lab"));
+        assert_eq!((host_of("unix:/run/plantd.sock"), host_of("http://[::1]:1")), (None, None));
     }
 }
