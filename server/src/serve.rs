@@ -468,11 +468,13 @@ async fn save_plants(hub: Arc<Hub>, interval: Duration) {
     }
 }
 
-/// Deletes plants that nobody has used for as long as they are to be kept, over and over.
+/// Deletes plants that nobody has used for as long as they are to be kept, and counts what waits, over and over.
 async fn delete_expired(hub: Arc<Hub>) {
     loop {
         tokio::time::sleep(EXPIRY_PERIOD).await;
         hub.delete_expired().await;
+        let pools = [&hub.workers, &hub.attendants, &hub.steppers];
+        hub.metrics.set_waiting_jobs(pools.map(|jobs| jobs.workers().waiting()).iter().sum());
     }
 }
 

@@ -22,6 +22,8 @@
 //! | `plantd_tenant_plants`, `_running_plants`, `_streams` | gauges | `tenant` |
 //! | `plantd_tenant_overruns_total` | counter | `tenant` |
 //! | `plantd_tenant_rpcs_total` | counter of finished calls | `tenant`, `code` |
+//! | `plantd_waiting_jobs` | gauge: computations that wait for a worker, looked at once a second | |
+//! | `plantd_state_saved_timestamp_seconds` | gauge: when all plants were saved last; 0 for never | |
 //! | `plantd_server_info` | 1 | `name`, `version` |
 //! | `plantd_draining` | 1 where nothing new is taken, else 0 | |
 //! | `plantd_build_info` | 1 | `version`, `arch`, `profile` |
@@ -33,7 +35,7 @@
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::text::encode;
@@ -84,6 +86,8 @@ pub struct Metrics {
     tenants: Arc<Tenants>,
     plants: Gauge,
     draining: Gauge,
+    waiting_jobs: Gauge,
+    state_saved: Gauge,
     /// Uploaded models.
     pub(crate) models: Gauge,
     links: Gauge,
@@ -121,6 +125,8 @@ impl Metrics {
         let metrics = Self {
             plants: Gauge::default(),
             draining: Gauge::default(),
+            waiting_jobs: Gauge::default(),
+            state_saved: Gauge::default(),
             models: Gauge::default(),
             links: Gauge::default(),
             watchers: Gauge::default(),
@@ -145,6 +151,16 @@ impl Metrics {
         let server = [("name", name.to_owned()), ("version", env!("CARGO_PKG_VERSION").to_owned())];
         registry.register("server", "The server's name", Info::new(server));
         registry.register("draining", "1 where nothing new is taken", metrics.draining.clone());
+        registry.register(
+            "waiting_jobs",
+            "Computations that wait for a worker",
+            metrics.waiting_jobs.clone(),
+        );
+        registry.register(
+            "state_saved_timestamp_seconds",
+            "When all plants were saved last, in seconds since 1970; 0 for never",
+            metrics.state_saved.clone(),
+        );
         registry.register("plants", "Plants", metrics.plants.clone());
         registry.register("models", "Uploaded models", metrics.models.clone());
         registry.register("links", "Open shared-memory links", metrics.links.clone());
@@ -205,6 +221,17 @@ impl Metrics {
     /// The server takes nothing new.
     pub fn draining(&self) {
         self.draining.set(1);
+    }
+
+    /// Sets the number of computations that wait for a worker.
+    pub fn set_waiting_jobs(&self, count: usize) {
+        self.waiting_jobs.set(gauge_value(count));
+    }
+
+    /// All plants have been saved, at this time.
+    pub fn state_saved(&self, at: SystemTime) {
+        let since = at.duration_since(UNIX_EPOCH).unwrap_or_default();
+        self.state_saved.set(i64::try_from(since.as_secs()).unwrap_or(i64::MAX));
     }
 
     /// Sets the number of plants.

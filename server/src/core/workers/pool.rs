@@ -141,6 +141,11 @@ impl Workers {
         self.pool.count
     }
 
+    /// Jobs that wait for their first turn.
+    pub fn waiting(&self) -> usize {
+        lock(&self.pool.state).queue.waiting()
+    }
+
     /// Runs a job. Dropping the returned future tells the job to stop.
     pub async fn run<T: Send + 'static, E: From<WorkError> + Send + 'static>(
         &self,

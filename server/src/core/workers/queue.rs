@@ -111,6 +111,12 @@ impl Queue {
         self.short.waiting.is_empty() && self.long.waiting.is_empty()
     }
 
+    /// Jobs that have not begun.
+    pub(super) fn waiting(&self) -> usize {
+        let tickets = self.short.waiting.iter().chain(&self.long.waiting).flat_map(|(_, all)| all);
+        tickets.filter(|ticket| matches!(ticket, Ticket::Begin { .. })).count()
+    }
+
     pub(super) fn push(&mut self, lane: Lane, connection: Connection, ticket: Ticket) {
         let connections = match lane {
             Lane::Short => &mut self.short,

@@ -4,8 +4,9 @@
 //! written aside and renamed: what is there is complete.
 
 use std::path::Path;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::SystemTime;
 use std::{fs, io};
 
 use prost::Message as _;
@@ -62,30 +63,37 @@ impl StateDirectory {
     /// Saves all plants that have changed since they were saved.
     pub fn save(&self, hub: &Hub) {
         let _saving = lock(&self.saving);
-        Connection::server(Tenant::NONE).scope(|| self.save_all(hub));
+        if Connection::server(Tenant::NONE).scope(|| self.save_all(hub)) {
+            hub.metrics.state_saved(SystemTime::now());
+        }
     }
 
-    fn save_all(&self, hub: &Hub) {
-        let mut after = String::new();
+    /// True when all have been written.
+    fn save_all(&self, hub: &Hub) -> bool {
+        let (mut after, mut are_written) = (String::new(), true);
         loop {
             let (sessions, has_more) = hub.page(&after, 100);
-            let Some(last) = sessions.last() else { return };
+            let Some(last) = sessions.last() else { return are_written };
             after = last.id().to_owned();
-            self.save_changed(sessions.iter().filter_map(|each| self.changed(hub, each)).collect());
+            let changed = sessions.iter().filter_map(|each| self.changed(hub, each)).collect();
+            are_written &= self.save_changed(changed);
             if !has_more {
-                return;
+                return are_written;
             }
         }
     }
 
-    /// Writes plants side by side: each waits for the disk, which serves many as fast as one.
-    fn save_changed(&self, changed: Vec<Changed>) {
+    /// Writes plants side by side: each waits for the disk, which serves many as fast as one. True when all have been
+    /// written.
+    fn save_changed(&self, changed: Vec<Changed>) -> bool {
+        let are_written = AtomicBool::new(true);
         self.left.store(changed.len(), Ordering::Relaxed);
         let write = |changed: Changed| {
             let id = changed.session.id().to_owned();
             if let Err(error) = self.write(changed) {
                 let error = format!("{error:#}");
                 tracing::error!(plant = id, error, "plant not saved");
+                are_written.store(false, Ordering::Relaxed);
             }
             self.answers.fetch_add(1, Ordering::Relaxed);
             self.left.fetch_sub(1, Ordering::Relaxed);
@@ -98,6 +106,7 @@ impl StateDirectory {
                 scope.spawn(|| std::iter::from_fn(next).for_each(write));
             }
         });
+        are_written.into_inner()
     }
 
     /// What is to be written of a plant; nothing if it is as it was saved.
