@@ -71,13 +71,18 @@ impl Client {
         Self::connect_with(there, options).await
     }
 
-    /// Whether the server at an address serves, by gRPC's health service, which needs no token. A server that is
-    /// about to end does not.
+    /// Whether the server at an address serves, by gRPC's health service, which needs no token: as a whole, where
+    /// `service` is empty, or one of its services, such as `plantd.v1.PlantService`, which does not when the server is
+    /// about to end.
     ///
     /// # Errors
     /// As of [`Client::connect`].
-    pub async fn is_serving(address: impl AsRef<str>, options: &ConnectOptions) -> Result<bool> {
-        is_serving(address.as_ref(), options).await
+    pub async fn is_serving(
+        address: impl AsRef<str>,
+        service: &str,
+        options: &ConnectOptions,
+    ) -> Result<bool> {
+        is_serving(address.as_ref(), service, options).await
     }
 
     // ---- the generated stubs, for what is not wrapped ----

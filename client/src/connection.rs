@@ -109,9 +109,13 @@ async fn open(address: &str, options: &ConnectOptions) -> Result<AuthorizedChann
 }
 
 /// Asks the health service of gRPC whether a server serves; it answers everybody, whoever they are.
-pub(crate) async fn is_serving(address: &str, options: &ConnectOptions) -> Result<bool> {
+pub(crate) async fn is_serving(
+    address: &str,
+    service: &str,
+    options: &ConnectOptions,
+) -> Result<bool> {
     let mut health = HealthClient::new(open(address, options).await?);
-    let ask = health.check(HealthCheckRequest::default());
+    let ask = health.check(HealthCheckRequest { service: service.to_owned() });
     let answer = within(options.connect_timeout, ask).await?.into_inner();
     Ok(answer.status() == ServingStatus::Serving)
 }

@@ -33,6 +33,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "wheel", quick: false, lane: Lane::Aside, run: python::try_wheel },
     Stage { name: "python", quick: false, lane: Lane::Aside, run: python::test_client },
     Stage { name: "book", quick: false, lane: Lane::Aside, run: python::make_book },
+    Stage { name: "chart", quick: false, lane: Lane::Aside, run: python::check_chart },
     Stage { name: "robots", quick: false, lane: Lane::Aside, run: python::compare_robots },
     Stage { name: "gateway", quick: false, lane: Lane::Main, run: python::test_gateway },
     Stage { name: "viewer", quick: false, lane: Lane::Main, run: viewer::test_page },

@@ -175,6 +175,20 @@ pub(crate) fn test_gateway(context: &mut Context) -> Outcome {
     run(test.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 
+/// Helm's library and the schemas of Kubernetes, as PyPI delivers them.
+const HELM: [&str; 3] = ["helm-python-sdk==0.2.2", "kubernetes-validate==1.37.0", "PyYAML>=6"];
+
+/// Checks the chart.
+pub(crate) fn check_chart(context: &mut Context) -> Outcome {
+    let environment = environment_in(context.scratch().join("helm"))?;
+    let mut install = Command::new(environment.join("bin/pip"));
+    if run(install.args(["install", "--quiet"]).args(HELM)).is_err() {
+        return Err(Failure::Skipped(format!("there is no {} to install", HELM[0])));
+    }
+    let script = context.root.join("tests/verify/chart.py");
+    run(Command::new(environment.join("bin/python")).arg(script))
+}
+
 /// The environment's folder; creates the environment if it is not there.
 fn environment(context: &Context) -> Result<PathBuf, Failure> {
     environment_in(context.scratch().join("venv"))
