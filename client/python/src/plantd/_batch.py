@@ -263,7 +263,7 @@ class BatchCalls(Calls):
             cases=list(cases),
             every=every,
         )
-        return self._messages(self.control.Rollout(request), Rollout._from)
+        return self._messages(self.control.Rollout, request, Rollout._from)
 
 
 def _inputs(u: npt.ArrayLike | Sequence[Vector] | None, count: int) -> Array:

@@ -392,9 +392,11 @@ class FeedbackCalls(Calls):
         """The gains of a plant's feedback: along a trajectory those of every step from the present one
         on, ahead of time; about an operating point the one in force and each that replaces it."""
         request = build(plant_service_pb2.WatchGainsRequest, id=id)
-        return self._messages(self.plants.WatchGains(request), WatchedGain._from)
+        return self._messages(self.plants.WatchGains, request, WatchedGain._from)
 
     def follow_gains(self, id: str) -> Follower:
         """Follows the gains of a plant's feedback, to apply them here: ``u = law(state)``."""
         request = build(plant_service_pb2.WatchGainsRequest, id=id)
-        return Follower(lambda: self.plants.WatchGains(request), self._timeout)
+        return self._following(
+            id, lambda calls: Follower(lambda: calls.plants.WatchGains(request), self._timeout)
+        )

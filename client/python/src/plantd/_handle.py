@@ -123,6 +123,23 @@ class PlantHandle:
         """Its time step, s."""
         return self.info.time_step
 
+    @property
+    def server(self) -> str:
+        """Name of the server that has it now."""
+        return self.info.server
+
+    @property
+    def address(self) -> str:
+        """Where that server is reached; empty for a server in this process."""
+        return self.info.address
+
+    def move(self, to: Client | str, *, any_build: bool = False) -> Plant:
+        """Moves it to another server, as `Client.move`; its calls go there from then on."""
+        moved = self.client.move(self.id, to, any_build=any_build)
+        # An address has its connection in the client that has moved the plant, and is closed with it.
+        self.client = cast("Client", self.client._at(to) if isinstance(to, str) else to)
+        return moved
+
     def diagnose(self) -> Diagnostics:
         """What can be said of its present state."""
         return self.client.diagnose(self.id)
