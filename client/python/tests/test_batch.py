@@ -5,8 +5,12 @@ import math
 import multiprocessing
 import os
 import pickle
+import secrets
 import signal
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import plantd
@@ -151,6 +155,50 @@ def test_a_worker_that_is_killed_changes_nothing(program, expected):
     with pool, pytest.warns(UserWarning, match="the rest is done here"):
         done = batch.rollout("cart-pole", killing(), pool, size=SIZE)
     assert digest(done.x) == expected
+
+
+# Ray reads its variables when it is imported.
+OVER_RAY = """
+import hashlib, os, signal, sys
+import psutil, ray
+from plantd import batch
+from test_batch import COUNT, SIZE, cases, digest
+
+def killing():
+    for k, case in enumerate(cases()):
+        if k == COUNT // 2:
+            busy = [p for p in psutil.Process().children(recursive=True) if p.name().startswith("ray::run")]
+            busy[0].send_signal(signal.SIGKILL)
+            print("killed")
+        yield case
+
+ray.init(num_cpus=2, log_to_driver=False)
+try:
+    batch._WAITING = 2
+    print(digest(batch.rollout("cart-pole", killing(), ray, size=SIZE).x))
+finally:
+    ray.shutdown()
+"""
+
+
+def test_a_worker_of_ray_that_is_killed_changes_nothing(program, expected):
+    for package in ("ray", "psutil"):
+        pytest.importorskip(package)
+    environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    environment |= {"RAY_USAGE_STATS_ENABLED": "0", "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-c", OVER_RAY]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=200)
+    assert told.returncode == 0, told.stderr
+    assert "killed" in told.stdout.split() and told.stdout.split()[-1] == expected
+
+
+def test_over_dask(program, expected):
+    distributed = pytest.importorskip("distributed")
+    options = {"processes": False, "n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.Client(**options) as cluster:
+        assert digest(batch.rollout("cart-pole", cases(), cluster.get_executor(), size=SIZE).x) == expected
+        done = cluster.gather(cluster.map(batch.run, list(batch.pieces("cart-pole", cases(), size=SIZE))))
+        assert digest(batch.together(done).x) == expected
 
 
 def test_an_own_server_that_is_killed_changes_nothing(program, expected):
