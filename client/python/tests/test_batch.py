@@ -164,11 +164,17 @@ import psutil, ray
 from plantd import batch
 from test_batch import COUNT, SIZE, cases, digest
 
+def is_own(process):
+    try:
+        token = process.environ().get("RAY_AUTH_TOKEN")
+        return process.name().startswith("ray::") and token == os.environ["RAY_AUTH_TOKEN"]
+    except psutil.Error:
+        return False
+
 def killing():
     for k, case in enumerate(cases()):
         if k == COUNT // 2:
-            busy = [p for p in psutil.Process().children(recursive=True) if p.name().startswith("ray::run")]
-            busy[0].send_signal(signal.SIGKILL)
+            next(worker for worker in psutil.process_iter() if is_own(worker)).send_signal(signal.SIGKILL)
             print("killed")
         yield case
 

@@ -428,37 +428,26 @@ def _here(cut: Iterator[Piece]) -> Iterator[Done]:
 
 def _by_executor(executor: Executor, cut: Iterator[Piece]) -> Iterator[Done]:
     most = _WAITING * int(getattr(executor, "_max_workers", 0) or 64)
-    waiting: dict[Future[Done], tuple[Piece, int]] = {}
+    waiting: dict[Future[Done], Piece] = {}
     left: list[Piece] = []
-
-    def submit(piece: Piece, attempt: int) -> None:
-        if left:
-            left.append(piece)
-            return
-        try:
-            waiting[executor.submit(run, piece)] = (piece, attempt)
-        except BrokenExecutor:
-            left.append(piece)
-
     try:
         while True:
             while len(waiting) < most and not left:
                 piece = next(cut, None)
                 if piece is None:
                     break
-                submit(piece, 1)
+                try:
+                    waiting[executor.submit(run, piece)] = piece
+                except BrokenExecutor:
+                    left.append(piece)
             if not waiting:
                 break
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                piece, attempt = waiting.pop(future)
+                piece = waiting.pop(future)
                 try:
                     done = future.result()
                 except BrokenExecutor:
                     left.append(piece)
-                except PlantdError as error:
-                    if not is_lost(error) or attempt == _ATTEMPTS:
-                        raise
-                    submit(piece, attempt + 1)
                 else:
                     yield done
     finally:
@@ -466,10 +455,8 @@ def _by_executor(executor: Executor, cut: Iterator[Piece]) -> Iterator[Done]:
             future.cancel()
     if left:
         warnings.warn("the executor has lost a worker and takes no more: the rest is done here", stacklevel=4)
-        for piece in left:
-            yield run(piece)
-        for piece in cut:
-            yield run(piece)
+        for rest in (left, cut):
+            yield from map(run, rest)
 
 
 def _by_ray(ray: Any, cut: Iterator[Piece]) -> Iterator[Done]:
