@@ -158,6 +158,29 @@ def test_a_handle_goes_with_its_plant(two):
     assert one.client.list_plants() == []
 
 
+def test_a_plant_that_moves_on_and_on_is_found(two, tmp_path):
+    one, two = two
+    with processes(tmp_path, "three") as (three,), plantd.connect(one.address) as client:
+        servers = [one, two, three]
+        one.client.create_plant("pendulum", id="p")
+        with client.drive("p", reconnect=True) as driver:
+            for k in range(9):
+                assert driver.step([0.1]).step == k + 1
+                servers[k % 3].client.move("p", servers[(k + 1) % 3].client)
+            assert driver.step([0.1]).step == 10
+            assert driver.reconnections == 9 and driver.address == one.address
+            # Each server has one connection, however often the plant has been there.
+            assert set(client._others) == {two.address, three.address}
+            assert not any(other._others for other in client._others.values())
+        assert client.get_plant("p").server == "one"
+        one.client.move("p", two.client)
+        two.client.move("p", three.client)
+        assert client.get_plant("p").server == "three"
+        one.kill()
+        two.kill()
+        assert client.get_plant("p").server == "three"
+
+
 def test_a_plant_that_is_refused_stays(two):
     one, two = two
     one.client.create_plant("pendulum", id="p")
@@ -355,6 +378,19 @@ def test_an_input_that_is_lost_is_sent_again(client):
         driver._answers.cancel()
         assert driver.step([0.2]).step == 2
         assert driver.reconnections == 1
+
+
+def test_a_step_that_was_interrupted_is_not_taken_for_the_next(client):
+    client.create_plant("pendulum", id="p", q=[0.4])
+    with client.drive("p", reconnect=True) as driver:
+        driver.step([0.2])
+        # As Ctrl-C leaves it: the input is on its way, and nobody has read the answer.
+        driver.offer([0.3])
+        deadline = time.monotonic() + PATIENCE
+        while client.get_plant("p").state.step < 2:
+            assert time.monotonic() < deadline
+        driver._answers.cancel()
+        assert driver.step([0.2]).step == 3 and driver.reconnections == 1
 
 
 def lose(client, driver):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -37,7 +38,8 @@ class Calls:
         self._is_closed = False
         #: Connections to servers to which plants have gone, by address.
         self._others: dict[str, Client] = {}
-        #: Addresses to which plants have gone, by id.
+        self._connecting = threading.Lock()
+        #: Addresses to which plants of this server have gone, by id.
         self._moved: dict[str, str] = {}
         self.models = ModelServiceStub(self._channel)
         self.plants = PlantServiceStub(self._channel)
@@ -70,9 +72,10 @@ class Calls:
         """The same, kept and closed with this client; itself at its own address."""
         if address == self.address:
             return self
-        if address not in self._others:
-            self._others[address] = self.at(address)
-        return self._others[address]
+        with self._connecting:
+            if address not in self._others:
+                self._others[address] = self.at(address)
+            return self._others[address]
 
     def _following(self, id: str, call: Callable[[Calls], _R]) -> _R:
         """Makes a call where the plant is: one that is refused with its address has done nothing."""
@@ -82,12 +85,12 @@ class Calls:
                 return call(here)
             except PlantdError as error:
                 address = error.elsewhere
-                if not address and error.code == "UNAVAILABLE" and here is self:
-                    # This server has ended; where the plant went it has said before.
-                    address = self._moved.get(id, "")
+                if not address and error.code == "UNAVAILABLE":
+                    # The server has ended; where the plant went it has said before.
+                    address = here._moved.get(id, "")
                 if not address:
                     raise
-            self._moved[id] = address
+            here._moved[id] = address
             here = self._at(address)
         return call(here)
 

@@ -168,6 +168,8 @@ class ReconnectingDriver(Driver):
 
     def __init__(self, calls: Calls, open: pb.DriveOpen, patience: float):
         self._calls, self._open, self._patience = calls, open, patience
+        #: Has the connections to all servers at which the plant has been.
+        self._root = calls
         #: How often the plant was opened again.
         self.reconnections = 0
         super().__init__(calls.plants, open)
@@ -265,14 +267,14 @@ class ReconnectingDriver(Driver):
             open.CopyFrom(self._open)
             open.resume = token
             try:
-                there = self._calls._at(address)
+                there = self._root._at(address)
                 with self._watch:
                     self._begin(there.plants, open)
             except PlantdError as error:
                 lost = error
             else:
                 break
-            if self._calls._is_closed:
+            if self._root._is_closed:
                 raise lost
             if lost.reason == "LEASE_LOST" and token:
                 token = ""
@@ -282,7 +284,9 @@ class ReconnectingDriver(Driver):
             time.sleep(pause)
             pause = min(2 * pause, longest)
         if there is not self._calls:
-            self._calls._moved[open.id] = address
+            # For calls after the end of the servers at which it has been.
+            self._root._moved[open.id] = address
+            there._moved.pop(open.id, None)
             self._calls = there
         self._answered = self._sequence
         self.reconnections += 1

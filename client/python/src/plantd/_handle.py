@@ -61,8 +61,9 @@ class PlantHandle:
     """
 
     def __init__(self, client: Client, plant: Plant, *, keep: bool = False):
-        #: The client that made it.
+        #: The client of the server to which it was moved last, at first the one that made it.
         self.client = client
+        self._root = client
         #: Its id.
         self.id = plant.id
         #: Model it was made from.
@@ -135,9 +136,10 @@ class PlantHandle:
 
     def move(self, to: Client | str, *, any_build: bool = False) -> Plant:
         """Moves it to another server, as `Client.move`; its calls go there from then on."""
-        moved = self.client.move(self.id, to, any_build=any_build)
-        # An address has its connection in the client that has moved the plant, and is closed with it.
-        self.client = cast("Client", self.client._at(to) if isinstance(to, str) else to)
+        # A connection to an address is kept and closed by the client that made the plant.
+        there = cast("Client", self._root._at(to)) if isinstance(to, str) else to
+        moved = self.client.move(self.id, there, any_build=any_build)
+        self.client = there
         return moved
 
     def diagnose(self) -> Diagnostics:

@@ -85,6 +85,7 @@ class ServerCalls(Calls):
         except PlantdError:
             self._go_on(id, exported.run)
             raise
+        there._moved.pop(made.id, None)
         address = made.address or there.address
         request = build(pb.DeletePlantRequest, id=id, moved_to=address, step=exported.step)
         try:
