@@ -70,6 +70,7 @@ def test_the_same_bits_everywhere(program, expected, two):
             pool,
             one.address,
             f"{one.address}, {two.address}",
+            [one.address] * 3,
             [client, two.address],
             client,
         ]:
@@ -84,6 +85,10 @@ def test_the_same_bits_everywhere(program, expected, two):
         assert digest(done.x) == expected and done.build == one.client.get_server().build
         # A client that was given is not closed.
         assert client.list_plants() == []
+
+
+def test_a_client_does_a_batch(client, expected):
+    assert digest(batch.rollout("cart-pole", cases(), client, size=SIZE).x) == expected
 
 
 def test_a_server_that_is_killed_changes_nothing(expected, two):

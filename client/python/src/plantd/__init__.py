@@ -14,6 +14,7 @@ Vectors and matrices are numpy arrays in SI units and radians. What the server r
 `PlantdError`, with the gRPC code, the reason and the faults of the request.
 """
 
+from . import batch
 from ._batch import Rollout, Rollouts, Stepped
 from ._channels import Channels, Outputs
 from ._client import Client, connect
@@ -108,6 +109,7 @@ __all__ = [
     "Violation",
     "Watched",
     "WatchedGain",
+    "batch",
     "compose",
     "connect",
     "difference",

@@ -374,13 +374,18 @@ def rollout(
 ) -> Done:
     """Simulates cases, and gives their ends in the order of the cases: the same bits, wherever they are simulated.
 
-    ``over`` says by what. None: a server of this process, on all its processors. An executor of
-    ``concurrent.futures``, or of dask by its ``get_executor``: by `run` in its workers; one that has lost a worker
-    and takes no more leaves the rest to this process. The module ``ray``: tasks, which Ray does again when it loses
-    a machine. One address, several in a text with commas between them, or a list of addresses and clients: by these
-    servers; addresses are connected to by `connect`, with the credentials of its variables. A piece whose worker or
-    server was lost is done again elsewhere. When none of the servers has answered for 30 s, and when a piece was
-    lost eight times, that error is raised.
+    ``over`` says by what:
+
+    - None: a server of this process, on all its processors.
+    - An executor of ``concurrent.futures``, or of dask by its ``get_executor``: by `run` in its workers. One that
+      has lost a worker and takes no more leaves the rest to this process.
+    - The module ``ray``: by `run` in tasks, which Ray does again when it loses a machine.
+    - One address, several in a text with commas between them, or a list of addresses and clients: by these servers,
+      two pieces at a time on each. Addresses are connected to by `connect`, with the credentials of its variables.
+      One behind which there are several servers may stand there as many times.
+
+    A piece whose worker or server was lost is done again elsewhere. When none of the servers has answered for 30 s,
+    and when a piece was lost eight times, that error is raised.
 
     All else is as of `pieces` and `together`.
     """
