@@ -181,6 +181,25 @@ def test_a_plant_that_moves_on_and_on_is_found(two, tmp_path):
         assert client.get_plant("p").server == "three"
 
 
+def test_a_plant_that_runs_by_itself_moves(two):
+    one, two = two
+    one.client.create_plant("pendulum", id="p")
+    one.client.run("p", "free")
+    with one.client.drive("p", reconnect=True) as driver:
+        driver.offer([0.1])
+        before = driver.next()
+        one.client.move("p", two.client)
+        deadline = time.monotonic() + PATIENCE
+        while driver.address != two.address:
+            assert time.monotonic() < deadline
+            state = driver.next()
+            assert state.step >= before.step
+            before = state
+        # It runs on there, under the input that it had.
+        assert driver.next().step > before.step
+        assert driver.step([0.2]).step > before.step
+
+
 def test_a_plant_that_is_refused_stays(two):
     one, two = two
     one.client.create_plant("pendulum", id="p")
