@@ -3,7 +3,9 @@
 import json
 import os
 import signal
+import socket
 import subprocess
+import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -64,6 +66,52 @@ class Process:
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
+
+
+class Gateway:
+    """Hands bytes to a server and back, until its connections are cut."""
+
+    def __init__(self, place):
+        host, port = place.rsplit(":", 1)
+        self._server = (host, int(port))
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        self._sockets = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self):
+        while True:
+            try:
+                near, _ = self._listener.accept()
+            except OSError:
+                return
+            far = socket.create_connection(self._server)
+            self._sockets += [near, far]
+            for here, there in [(near, far), (far, near)]:
+                here.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                threading.Thread(target=self._hand_on, args=(here, there), daemon=True).start()
+
+    @staticmethod
+    def _hand_on(here, there):
+        try:
+            while data := here.recv(65536):
+                there.sendall(data)
+        except OSError:
+            pass
+
+    def cut(self):
+        """Breaks all connections; what is on its way is lost."""
+        broken, self._sockets = self._sockets, []
+        for one in broken:
+            try:
+                one.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                pass
+            one.close()
+
+    def close(self):
+        self._listener.close()
+        self.cut()
 
 
 @contextmanager

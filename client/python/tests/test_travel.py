@@ -10,7 +10,7 @@ import plantd
 import pytest
 from plantd._connect import Credentials
 from plantd.v1 import plant_service_pb2 as pb
-from processes import PATIENCE, processes
+from processes import PATIENCE, Gateway, processes
 
 SCENE = """
 format = 1
@@ -348,6 +348,43 @@ def test_a_server_that_ends_is_driven_on(tmp_path):
             one.wait()
             assert driver.reconnections == 1
         assert two.client.get_plant("p").state.step == 200
+
+
+@pytest.mark.parametrize("grace", [0.0, 60.0])
+def test_connections_that_break_cost_no_step(two, grace):
+    one = two[0]
+    one.client.create_model(SCENE)
+    for id in ("p", "twin"):
+        everything(one.client, id)
+    gateway = Gateway(one.place)
+    is_over = threading.Event()
+
+    def cut():
+        while not is_over.wait(0.15):
+            gateway.cut()
+
+    cutting = threading.Thread(target=cut)
+    try:
+        with plantd.connect(gateway.address) as client, one.client.drive("twin") as twin:
+            with client.drive("p", reconnect=PATIENCE, grace=grace) as driver:
+                cutting.start()
+                step = 0
+                while step < 300 or driver.reconnections < 6:
+                    u = input_of(step)
+                    here, there = seen(driver, driver.step(u)), seen(twin, twin.step(u))
+                    assert here == there and here[0] == step + 1
+                    step += 1
+                is_over.set()
+                cutting.join()
+                if grace:
+                    # Nobody comes in between.
+                    gateway.cut()
+                    with pytest.raises(plantd.PlantdError, match="LEASE_HELD"):
+                        one.client.step("p")
+                assert driver.step(input_of(step)).step == step + 1
+    finally:
+        is_over.set()
+        gateway.close()
 
 
 class Lossy:
