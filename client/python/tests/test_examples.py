@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 import plantd
+import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -66,6 +67,14 @@ def test_marionette_optimization(addresses):
 
 def test_cart_pole_lqg(addresses):
     assert "estimated to" in run("cart_pole_lqg.py", addresses["unix"])
+
+
+def test_monte_carlo_ray():
+    pytest.importorskip("ray")
+    environment = {**os.environ, "PLANTD": os.environ["PLANTD_SERVER"], "RAY_USAGE_STATS_ENABLED": "0"}
+    command = [sys.executable, str(EXAMPLES / "monte_carlo_ray.py")]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=200).stdout
+    assert "2000 cases, of which" in told and "the cart strays by" in told
 
 
 def test_examples_are_short():

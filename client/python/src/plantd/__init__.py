@@ -14,11 +14,12 @@ Vectors and matrices are numpy arrays in SI units and radians. What the server r
 `PlantdError`, with the gRPC code, the reason and the faults of the request.
 """
 
+from . import batch
 from ._batch import Rollout, Rollouts, Stepped
 from ._channels import Channels, Outputs
 from ._client import Client, connect
-from ._drive import Driver, Hold
-from ._errors import PlantdError, StepError, Violation
+from ._drive import Driver, Hold, ReconnectingDriver
+from ._errors import PlantdError, RolledBack, StepError, SteppedByOthers, Violation
 from ._feedback import Feedback, Follower, GainSchedule, WatchedGain
 from ._gains import Gain, Regulator, TrajectoryGain
 from ._handle import PlantHandle
@@ -43,6 +44,7 @@ from ._realtime import Event, StepTiming
 from ._recordings import Recording
 from ._requests import Stepping
 from ._rotation import compose, difference, rotations
+from ._servers import ServerInfo
 from ._states import Energy, State, StepReport, Trajectory
 from ._tables import read_recording
 
@@ -83,19 +85,23 @@ __all__ = [
     "Poses",
     "Progress",
     "ProjectedReference",
+    "ReconnectingDriver",
     "Recording",
     "Regulator",
+    "RolledBack",
     "Rollout",
     "Rollouts",
     "Search",
     "SecondOrder",
     "Server",
+    "ServerInfo",
     "Settled",
     "State",
     "StepError",
     "StepReport",
     "StepTiming",
     "Stepped",
+    "SteppedByOthers",
     "Stepping",
     "Trajectory",
     "TrajectoryGain",
@@ -103,6 +109,7 @@ __all__ = [
     "Violation",
     "Watched",
     "WatchedGain",
+    "batch",
     "compose",
     "connect",
     "difference",

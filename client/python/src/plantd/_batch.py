@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Union, cast
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
 
 #: A plant by its id, its description or its handle.
 PlantLike = Union[str, Plant, "PlantHandle"]
+
+
+#: Limits of a server that a call with fewer cases keeps.
+_LIMITS_OF_A_CALL = ("rollout_cases", "message_bytes", "message_parts")
 
 
 def plant_id(plant: Any, argument: str) -> str:
@@ -263,7 +268,58 @@ class BatchCalls(Calls):
             cases=list(cases),
             every=every,
         )
-        return self._messages(self.control.Rollout(request), Rollout._from)
+        return map(Rollout._from, self._rollout(request))
+
+    def _rollout(
+        self, request: control_service_pb2.RolloutRequest
+    ) -> Iterator[control_service_pb2.RolloutResponse]:
+        """Answers to a request, which is asked for now; in parts, one after the other, where the server has limits
+        that it exceeds."""
+
+        def itself(m: control_service_pb2.RolloutResponse) -> control_service_pb2.RolloutResponse:
+            return m
+
+        answers = self._messages(self.control.Rollout, request, itself)
+
+        def whole_or_halves() -> Iterator[control_service_pb2.RolloutResponse]:
+            try:
+                first = next(answers, None)
+            except PlantdError as error:
+                count = len(request.cases)
+                if count < 2 or error.metadata.get("limit") not in _LIMITS_OF_A_CALL:
+                    raise
+            else:
+                if first is not None:
+                    yield first
+                    yield from answers
+                return
+            for start, end in [(0, count // 2), (count // 2, count)]:
+                half = control_service_pb2.RolloutRequest()
+                half.CopyFrom(request)
+                del half.cases[end:]
+                del half.cases[:start]
+                for answer in self._rollout(half):
+                    shift_cases(answer, start)
+                    yield answer
+
+        return whole_or_halves()
+
+
+def shift_cases(answer: control_service_pb2.RolloutResponse, by: int) -> None:
+    """Counts the cases of an answer from another one on."""
+
+    def shift(failure: Any) -> None:
+        failure.message = re.sub(r"\bcases\[(\d+)\]", lambda m: f"cases[{int(m[1]) + by}]", failure.message)
+
+    if not answer.HasField("table"):
+        answer.case_index += by
+        if answer.HasField("failure"):
+            shift(answer.failure)
+        return
+    answer.table.case_indices[:] = [case + by for case in answer.table.case_indices]
+    for failed in answer.table.failures:
+        failed.case_index += by
+        shift(failed.failure)
 
 
 def _inputs(u: npt.ArrayLike | Sequence[Vector] | None, count: int) -> Array:

@@ -18,6 +18,7 @@ from ._mechanics import MechanicsCalls
 from ._optimize import OptimizeCalls
 from ._realtime import RealtimeCalls
 from ._recordings import RecordingCalls
+from ._servers import ServerCalls
 from ._tables import TableCalls
 
 if TYPE_CHECKING:
@@ -63,11 +64,15 @@ class Client(
     KalmanCalls,
     OptimizeCalls,
     BatchCalls,
+    ServerCalls,
 ):
     """A connection to a server. Use it in a ``with`` statement, or call ``close``.
 
-    ``models``, ``plants``, ``control``, ``channels`` and ``recordings`` are the generated stubs, for
-    what is not wrapped.
+    ``models``, ``plants``, ``control``, ``channels``, ``recordings`` and ``servers`` are the generated stubs,
+    for what is not wrapped.
+
+    A plant that has gone to another server is asked for there: calls that are refused with its address are
+    made once more at that address, with this client's credentials.
     """
 
     #: The server that `plantd.launch` has started for this client.
@@ -75,7 +80,7 @@ class Client(
 
     def close(self) -> None:
         """Closes the connection; streams end, and so does the server of `plantd.launch`."""
-        self._channel.close()
+        super().close()
         if self.server is not None:
             self.server.stop()
 

@@ -23,6 +23,9 @@ _MAX_RECEIVE_BYTES = 256 << 20
 #: Longest wait for a connection.
 _CONNECT_SECONDS = 5.0
 
+#: First and longest pause between two attempts to connect, ms: a server that comes back is found at once.
+_RECONNECT_MS = (100, 500)
+
 _UNIX = "unix:"
 
 _HOW_TO_START = (
@@ -128,7 +131,11 @@ def open_channel(address: str, credentials: Credentials | None = None) -> grpc.C
     if not isinstance(address, str):
         raise TypeError(f"`address` is {shown(address)}; a text such as http://127.0.0.1:50051 is needed")
     target = _target(address)
-    options: list[tuple[str, Any]] = [("grpc.max_receive_message_length", _MAX_RECEIVE_BYTES)]
+    options: list[tuple[str, Any]] = [
+        ("grpc.max_receive_message_length", _MAX_RECEIVE_BYTES),
+        ("grpc.initial_reconnect_backoff_ms", _RECONNECT_MS[0]),
+        ("grpc.max_reconnect_backoff_ms", _RECONNECT_MS[1]),
+    ]
     if target.startswith(_UNIX):
         # Without it gRPC sends the path as the authority, which HTTP/2 servers refuse.
         options.append(("grpc.default_authority", "localhost"))
@@ -169,6 +176,16 @@ def _target(address: str) -> str:
     except ValueError:
         raise _refused(address, "it cannot be read") from None
     return place if has_port else f"{place}:{443 if scheme == 'https' else 80}"
+
+
+def check_token_stays_hidden(here: str, there: str, credentials: Credentials | None) -> None:
+    """That a token which nobody on the way could read is not sent to a server without TLS."""
+    hidden = ("https://", _UNIX)
+    if credentials is None or credentials.token is None or here == there:
+        return
+    if here.startswith(hidden) and not there.startswith(hidden):
+        message = f"the token is not sent to {there}: it is without TLS, and everybody on the way could read it"
+        raise PlantdError("INVALID_ARGUMENT", message)
 
 
 def _refused(address: str, problem: str) -> PlantdError:

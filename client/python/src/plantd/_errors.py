@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -38,7 +38,14 @@ class Violation:
 class PlantdError(Exception):
     """A call was refused or failed, or a stream ended with an error."""
 
-    def __init__(self, code: str, message: str, reason: str = "", violations: tuple[Violation, ...] = ()):
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        reason: str = "",
+        violations: tuple[Violation, ...] = (),
+        metadata: Mapping[str, str] | None = None,
+    ):
         lines = [f"{code} ({reason}): {message}" if reason else f"{code}: {message}"]
         lines += [
             f"  {violation.field}: {violation.description}"
@@ -54,10 +61,66 @@ class PlantdError(Exception):
         self.reason = reason
         #: The faults of the request.
         self.violations = violations
+        #: What belongs to the reason, for example ``address`` of ``PLANT_ELSEWHERE``.
+        self.metadata: dict[str, str] = dict(metadata or {})
+
+    @property
+    def elsewhere(self) -> str:
+        """Address of the server to which the plant has gone; empty for all other errors."""
+        return self.metadata.get("address", "") if self.reason == "PLANT_ELSEWHERE" else ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Processes hand errors to one another.
+        return type(self), (self.code, self.message, self.reason, self.violations, self.metadata)
 
 
 class StepError(PlantdError):
     """A step was refused or failed; the plant is where it was and the driver goes on."""
+
+
+class RolledBack(PlantdError):
+    """The server came back with an earlier state than a driver had seen: the steps in between are lost.
+
+    The input was not taken; the driver goes on from there.
+    """
+
+    def __init__(self, from_step: int, to_step: int):
+        message = f"step {from_step} had been reached, the server is at step {to_step}"
+        super().__init__("DATA_LOSS", message, "ROLLED_BACK")
+        #: The last step that was seen.
+        self.from_step = from_step
+        #: The step at which the plant is.
+        self.to_step = to_step
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.from_step, self.to_step)
+
+
+class SteppedByOthers(PlantdError):
+    """Somebody else has stepped a plant while its driver was away.
+
+    The input was not taken; the driver goes on from there.
+    """
+
+    def __init__(self, from_step: int, to_step: int):
+        message = f"the plant was at step {from_step} when its driver lost it, and is at step {to_step}"
+        super().__init__("ABORTED", message, "STEPPED_BY_OTHERS")
+        #: The last step that was seen.
+        self.from_step = from_step
+        #: The step at which the plant is.
+        self.to_step = to_step
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.from_step, self.to_step)
+
+
+def is_lost(error: PlantdError) -> bool:
+    """Whether an error is of the connection, or of a server that ends, and not of the plant or the request."""
+    if isinstance(error, StepError):
+        return False
+    if error.code in ("UNAVAILABLE", "DEADLINE_EXCEEDED") or error.reason == "LEASE_LOST" or error.elsewhere:
+        return True
+    return error.code in ("INTERNAL", "UNKNOWN", "CANCELLED") and not error.reason
 
 
 def from_failure(failure: common_pb2.Failure, kind: type[PlantdError] = StepError) -> PlantdError:
@@ -70,7 +133,7 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
     if not isinstance(error, grpc.Call):
         return PlantdError("UNKNOWN", str(error))
     metadata = dict(error.trailing_metadata() or ())
-    reason, violations = _details(metadata.get(_DETAILS_KEY, b""))
+    reason, violations, said = _details(metadata.get(_DETAILS_KEY, b""))
     code, message = error.code().name, error.details() or ""
     if code == "CANCELLED" and message == "Timeout expired":
         # The server keeps the client's time as well, and was the first to see that it is over.
@@ -78,7 +141,7 @@ def from_rpc_error(error: grpc.RpcError) -> PlantdError:
     if not reason:
         # It did not come from the server.
         message = _TRANSPORT.get(code, message)
-    return PlantdError(code, message, reason, violations)
+    return PlantdError(code, message, reason, violations, said)
 
 
 def error_of(number: int, message: str, details: bytes, kind: type[PlantdError] = PlantdError) -> PlantdError:
@@ -86,15 +149,16 @@ def error_of(number: int, message: str, details: bytes, kind: type[PlantdError] 
     return kind(_code_name(number), message, *_details(details))
 
 
-def _details(value: bytes) -> tuple[str, tuple[Violation, ...]]:
-    reason, violations = "", []
+def _details(value: bytes) -> tuple[str, tuple[Violation, ...], dict[str, str]]:
+    """Reason, faults of the request, and what belongs to the reason."""
+    reason, violations, metadata = "", [], {}
     for detail in status_pb2.Status.FromString(value).details:
         info, request = error_details_pb2.ErrorInfo(), error_details_pb2.BadRequest()
         if detail.Unpack(info):
-            reason = info.reason
+            reason, metadata = info.reason, dict(info.metadata)
         elif detail.Unpack(request):
             violations += [Violation(v.field, v.description) for v in request.field_violations]
-    return reason, tuple(violations)
+    return reason, tuple(violations), metadata
 
 
 def _code_name(number: int) -> str:
@@ -112,7 +176,7 @@ def translated() -> Iterator[None]:
     except grpc.RpcError as error:
         raise from_rpc_error(error) from None
     except ValueError as error:
-        if "closed channel" not in str(error):
+        if "closed channel" not in str(error) and "Channel closed" not in str(error):
             raise
         raise PlantdError("CANCELLED", "the client is closed") from None
 

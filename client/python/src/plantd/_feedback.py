@@ -316,6 +316,58 @@ class Follower:
         self.close()
 
 
+def feedback_request(
+    id: str,
+    *,
+    at: str | None = None,
+    state: State | None = None,
+    u: Vector = (),
+    plant: str = "",
+    trajectory: Trajectory | None = None,
+    gain: Gain | None = None,
+    q: npt.ArrayLike | None = None,
+    r: npt.ArrayLike | None = None,
+    q_final: npt.ArrayLike | None = None,
+    s: npt.ArrayLike | None = None,
+    projected_momentum: bool = False,
+    stages: Iterable[Mapping[str, npt.ArrayLike]] = (),
+    full: bool = False,
+    mode: Literal["watch", "replace", "add", "guard"] = "watch",
+    first_step: int | None = None,
+    guard: Bounds | None = None,
+) -> plant_service_pb2.SetFeedbackRequest:
+    """What `FeedbackCalls.set_feedback` asks for."""
+    forms = [at is not None, state is not None, bool(plant), trajectory is not None]
+    if sum([*forms, gain is not None]) != 1:
+        raise ValueError("give one of `at`, `state`, `plant`, `trajectory` and `gain`")
+    one_of("mode", mode, FEEDBACK_MODES)
+    for argument, value, kind in [
+        ("trajectory", trajectory, Trajectory),
+        ("gain", gain, Gain),
+    ]:
+        if value is not None and not isinstance(value, kind):
+            raise TypeError(f"`{argument}` is {shown(value)}; a `plantd.{kind.__name__}` is needed")
+    request = build(
+        plant_service_pb2.SetFeedbackRequest,
+        id=id,
+        stages=stage_weights(stages),
+        constraints=constraints(full),
+        mode=FEEDBACK_MODES[mode],
+        first_step=first_step,
+        guard=bounds(guard),
+    )
+    if gain is not None:
+        request.gain.CopyFrom(gain._message())
+    elif trajectory is not None:
+        request.trajectory.CopyFrom(trajectory._message())
+    else:
+        request.point.CopyFrom(point(at, state, u, plant))
+    given = trajectory_weights(q, r, q_final, s, projected_momentum)
+    if given is not None:
+        request.weights.CopyFrom(given)
+    return request
+
+
 class FeedbackCalls(Calls):
     """Calls that give a plant a regulator."""
 
@@ -354,34 +406,25 @@ class FeedbackCalls(Calls):
         u = law from the first step on at which an entry of x - x_reference leaves its bounds in
         ``guard``.
         """
-        forms = [at is not None, state is not None, bool(plant), trajectory is not None]
-        if sum([*forms, gain is not None]) != 1:
-            raise ValueError("give one of `at`, `state`, `plant`, `trajectory` and `gain`")
-        one_of("mode", mode, FEEDBACK_MODES)
-        for argument, value, kind in [
-            ("trajectory", trajectory, Trajectory),
-            ("gain", gain, Gain),
-        ]:
-            if value is not None and not isinstance(value, kind):
-                raise TypeError(f"`{argument}` is {shown(value)}; a `plantd.{kind.__name__}` is needed")
-        request = build(
-            plant_service_pb2.SetFeedbackRequest,
-            id=id,
-            stages=stage_weights(stages),
-            constraints=constraints(full),
-            mode=FEEDBACK_MODES[mode],
+        request = feedback_request(
+            id,
+            at=at,
+            state=state,
+            u=u,
+            plant=plant,
+            trajectory=trajectory,
+            gain=gain,
+            q=q,
+            r=r,
+            q_final=q_final,
+            s=s,
+            projected_momentum=projected_momentum,
+            stages=stages,
+            full=full,
+            mode=mode,
             first_step=first_step,
-            guard=bounds(guard),
+            guard=guard,
         )
-        if gain is not None:
-            request.gain.CopyFrom(gain._message())
-        elif trajectory is not None:
-            request.trajectory.CopyFrom(trajectory._message())
-        else:
-            request.point.CopyFrom(point(at, state, u, plant))
-        given = trajectory_weights(q, r, q_final, s, projected_momentum)
-        if given is not None:
-            request.weights.CopyFrom(given)
         return Feedback._from(self._call(self.plants.SetFeedback, request).feedback)
 
     def clear_feedback(self, id: str) -> None:
@@ -392,9 +435,11 @@ class FeedbackCalls(Calls):
         """The gains of a plant's feedback: along a trajectory those of every step from the present one
         on, ahead of time; about an operating point the one in force and each that replaces it."""
         request = build(plant_service_pb2.WatchGainsRequest, id=id)
-        return self._messages(self.plants.WatchGains(request), WatchedGain._from)
+        return self._messages(self.plants.WatchGains, request, WatchedGain._from)
 
     def follow_gains(self, id: str) -> Follower:
         """Follows the gains of a plant's feedback, to apply them here: ``u = law(state)``."""
         request = build(plant_service_pb2.WatchGainsRequest, id=id)
-        return Follower(lambda: self.plants.WatchGains(request), self._timeout)
+        return self._following(
+            id, lambda calls: Follower(lambda: calls.plants.WatchGains(request), self._timeout)
+        )

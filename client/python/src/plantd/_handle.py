@@ -61,8 +61,9 @@ class PlantHandle:
     """
 
     def __init__(self, client: Client, plant: Plant, *, keep: bool = False):
-        #: The client that made it.
+        #: The client of the server to which it was moved last, at first the one that made it.
         self.client = client
+        self._root = client
         #: Its id.
         self.id = plant.id
         #: Model it was made from.
@@ -122,6 +123,24 @@ class PlantHandle:
     def time_step(self) -> float:
         """Its time step, s."""
         return self.info.time_step
+
+    @property
+    def server(self) -> str:
+        """Name of the server that has it now."""
+        return self.info.server
+
+    @property
+    def address(self) -> str:
+        """Where that server is reached; empty for a server in this process."""
+        return self.info.address
+
+    def move(self, to: Client | str, *, any_build: bool = False) -> Plant:
+        """Moves it to another server, as `Client.move`; its calls go there from then on."""
+        # A connection to an address is kept and closed by the client that made the plant.
+        there = cast("Client", self._root._at(to)) if isinstance(to, str) else to
+        moved = self.client.move(self.id, there, any_build=any_build)
+        self.client = there
+        return moved
 
     def diagnose(self) -> Diagnostics:
         """What can be said of its present state."""

@@ -332,7 +332,8 @@ class LinearizeCalls(Calls):
             model=model, settings=settings(**stepping), trajectory=trajectory(initial, u)
         )
         return self._messages(
-            self.control.LinearizeTrajectory(request),
+            self.control.LinearizeTrajectory,
+            request,
             lambda m: Linearization._from(
                 m.linearization, state=State._from(m.state), report=StepReport._from(m.report)
             ),

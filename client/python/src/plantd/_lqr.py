@@ -95,4 +95,4 @@ class LqrCalls(Calls):
             values=values,
             constraints=constraints(full),
         )
-        return self._messages(self.control.SolveTrajectoryLqr(request), TrajectoryGain._from_answer)
+        return self._messages(self.control.SolveTrajectoryLqr, request, TrajectoryGain._from_answer)

@@ -97,6 +97,10 @@ class Plant:
     paper: bool = False
     #: Seconds without use after which the server deletes it; 0 means never.
     expires: float = 0.0
+    #: Name of the server that has it.
+    server: str = ""
+    #: Where that server is reached; empty for a server in this process.
+    address: str = ""
 
     @classmethod
     def _from(cls, m: plant_service_pb2.PlantInfo, energy: Energy | None = None) -> Plant:
@@ -120,6 +124,8 @@ class Plant:
             m.settings.max_iterations,
             m.settings.force_split == plant_service_pb2.FORCE_SPLIT_PAPER,
             m.expires_s,
+            m.server,
+            m.address,
         )
 
 
@@ -382,7 +388,7 @@ class PlantCalls(Calls):
             at_most_hz=at_most_hz,
         )
         # Asked for now rather than at the first message, so that nothing in between is missed.
-        return self._messages(self.plants.Watch(request), Watched._from)
+        return self._messages(self.plants.Watch, request, Watched._from)
 
     def reset(
         self,

@@ -177,4 +177,4 @@ class RealtimeCalls(Calls):
         Without ``since``: from now on. Leaving the loop ends the watch.
         """
         request = build(realtime_pb2.WatchEventsRequest, id=id, since=since)
-        return self._messages(self.plants.WatchEvents(request), Event._from)
+        return self._messages(self.plants.WatchEvents, request, Event._from)
