@@ -134,6 +134,7 @@ def contract() -> str:
 def python() -> str:
     """The Python package by its docstrings."""
     import plantd
+    import plantd.batch
     import plantd.gym
     import plantd.link
 
@@ -158,7 +159,7 @@ def python() -> str:
                 yield f"### {kind.__name__}.{name}\n\n{doc(member)}"
 
     parts = ["# Python\n\nThe package `plantd`, by its docstrings."]
-    for module in (plantd, plantd.link, plantd.gym):
+    for module in (plantd, plantd.batch, plantd.link, plantd.gym):
         names = getattr(module, "__all__", None) or [
             name for name, m in vars(module).items() if getattr(m, "__module__", "") == module.__name__
         ]
