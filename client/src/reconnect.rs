@@ -14,6 +14,9 @@ use crate::error::{Error, Result};
 const PAUSE_MIN: Duration = Duration::from_millis(10);
 const PAUSE_MAX: Duration = Duration::from_millis(500);
 
+/// Servers on the way of a plant that are asked one after the other.
+const HOPS_MAX: u32 = 8;
+
 /// A [`Driver`] that opens its plant again when it has lost it, and sorts out what became of the step that was under
 /// way: an input that did not arrive is sent again, an answer that was lost is read, and steps that the server has
 /// lost are an error of their own.
@@ -52,16 +55,17 @@ impl Reconnecting {
     /// # Errors
     /// Those of [`Client::drive_as`].
     pub async fn open(client: Client, open: v1::DriveOpen, patience: Duration) -> Result<Self> {
-        let (client, driver) = match client.drive_as(open.clone()).await {
-            Err(error) => match error.elsewhere() {
-                Some(address) => {
-                    let there = client.at(address).await?;
-                    let driver = there.drive_as(open.clone()).await?;
-                    (there, driver)
-                }
-                None => return Err(error),
-            },
-            Ok(driver) => (client, driver),
+        let mut client = client;
+        let mut hops = 0;
+        let driver = loop {
+            match client.drive_as(open.clone()).await {
+                Ok(driver) => break driver,
+                Err(error) => match error.elsewhere() {
+                    Some(address) if hops < HOPS_MAX => client = client.at(address).await?,
+                    _ => return Err(error),
+                },
+            }
+            hops += 1;
         };
         let known = step_of(&driver);
         Ok(Self { client, open, patience, driver, known, reconnections: 0 })
