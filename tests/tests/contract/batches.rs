@@ -155,7 +155,9 @@ async fn cases_end_early_and_are_told_as_rows() {
     let table = v1::RolloutRequest { table: true, ..request };
     let mut rows = client.rollout(table).await.unwrap().collect().await.unwrap();
     assert_eq!(rows.len(), 1);
+    let build = client.server_info().await.unwrap().build;
     let table = rows.remove(0).table.unwrap();
+    assert_eq!(table.build, build);
     assert_eq!(
         table.columns,
         [

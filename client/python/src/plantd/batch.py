@@ -310,7 +310,7 @@ def _forget(workers: int, client: Client) -> None:
 def _do(client: Client, piece: Piece) -> Done:
     """Does a piece by a server."""
     request = control_service_pb2.RolloutRequest.FromString(piece.request)
-    of_build = client.get_server().build
+    of_build = ""
     rows = np.zeros((piece.count, 0))
     columns: tuple[str, ...] = ()
     errors: dict[int, PlantdError] = {}
@@ -320,6 +320,7 @@ def _do(client: Client, piece: Piece) -> Done:
         if not columns:
             columns = tuple(table.columns)
             rows = np.full((piece.count, len(columns)), np.nan)
+            of_build = table.build
         rows[list(table.case_indices)] = matrix(table.rows)
         count += len(table.case_indices)
         shift_cases(answer, piece.first)

@@ -7,6 +7,7 @@ use futures::{StreamExt, TryStreamExt as _, stream};
 use plantd_models::{Model, Settings};
 use plantd_proto::v1;
 
+use crate::core::identity::build;
 use crate::core::inputs::Inputs;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::workers::pool::Abandoned;
@@ -152,7 +153,8 @@ fn rows_at_a_time(limits: &Limits, columns: usize) -> usize {
 }
 
 fn table_of(shared: &Shared, columns: &[String], cases: Vec<Ended>) -> v1::RolloutResponse {
-    let mut table = v1::RolloutTable { columns: columns.to_vec(), ..Default::default() };
+    let names = columns.to_vec();
+    let mut table = v1::RolloutTable { columns: names, build: build(), ..Default::default() };
     let mut data = Vec::with_capacity(cases.len() * columns.len());
     for (case, x) in cases {
         let row = data.len();
