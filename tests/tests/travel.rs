@@ -4,8 +4,10 @@ use std::net::TcpListener;
 use std::path::Path;
 use std::time::Duration;
 
-use plantd_client::{Client, Code, Error, Reconnecting, diagonal, operating_point};
-use plantd_client::{v1, weights};
+use plantd_client::{
+    Client, Code, ConnectOptions, Credentials, Error, Reconnecting, diagonal, operating_point, v1,
+    weights,
+};
 use plantd_tests::server::ServerProcess;
 use v1::fault_spec::{Kind, Start, Target};
 use v1::output_channel::Source;
@@ -200,6 +202,8 @@ async fn a_server_that_drains_loses_no_step_and_takes_nothing_new() {
         }
     };
     go_on(10).await;
+    let refused = client.drain(Some(-1.0)).await.unwrap_err();
+    assert_eq!(refused.violations()[0].field, "drain_s");
     assert!(!client.server_info().await.unwrap().draining);
     assert_eq!(client.drain(None).await.unwrap(), 1);
     go_on(10).await;
@@ -300,4 +304,19 @@ async fn a_restarted_server_has_the_plant_at_the_very_step() {
         assert_eq!(step.state.unwrap().step, k + 1);
     }
     assert_eq!(driver.reconnections(), 1);
+}
+
+#[tokio::test]
+async fn a_token_is_not_carried_into_the_open() {
+    let server = named("here", &[]);
+    let credentials = Credentials { token: Some("secret".to_owned()), ..Default::default() };
+    let options = ConnectOptions { credentials, ..Default::default() };
+    let socket = Client::connect_with(server.unix_address(), options.clone()).await.unwrap();
+    // Nobody has to listen there: it is not tried.
+    let refused = socket.at("http://192.0.2.1:50051").await.unwrap_err();
+    assert!(matches!(refused, Error::Address { .. }), "{refused}");
+    assert!(socket.at(server.unix_address()).await.is_ok());
+    // What went in clear may go on in clear.
+    let open = Client::connect_with(server.address(), options).await.unwrap();
+    assert!(open.at(server.address()).await.is_ok());
 }
