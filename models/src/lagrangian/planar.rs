@@ -441,8 +441,7 @@ impl<A: Arrangement> Joints<A> {
                 (A::COUNT * block, group::<A>(joints, block), &mut links[block]);
             // Of one joint in registers: what is written in parts waits before it is read as a whole.
             let mut single = [sums[first]];
-            let own =
-                if A::COUNT == 1 { &mut single[..] } else { &mut sums[first..][..A::COUNT] };
+            let own = if A::COUNT == 1 { &mut single[..] } else { &mut sums[first..][..A::COUNT] };
             for (lane, joint) in group.iter().enumerate().rev() {
                 let mut sum = own[lane];
                 if joint.is_followed {
