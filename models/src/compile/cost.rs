@@ -48,7 +48,7 @@ impl Model {
             }
             Solver::Planar => (100.0 + 340.0 * joints, 110.0 + 88.0 * joints),
             Solver::Loops => (5.0 * fronts, 41.0 * rows),
-            Solver::Spatial => (100.0 + 820.0 * joints, 110.0 + 93.0 * joints),
+            Solver::Spatial => (100.0 + 1350.0 * joints, 110.0 + 93.0 * joints),
         };
         let schur = 800.0 + 165.0 * nd * nc + 2.0 * nc.powi(3);
         let jacobian = 71.0 * support.iter().sum::<f64>();
@@ -63,7 +63,7 @@ impl Model {
         let evaluation = 560.0 + evaluation + balls + 300.0 * others;
         // Where the end of a step is foreseen, the last correction is not looked at, but for a linearization.
         let is_foreseen = self.is_foreseen(&Settings::new(self));
-        let (evaluations, corrections) = if is_foreseen { (2.0, 2.0) } else { (3.2, 3.1) };
+        let (evaluations, corrections) = if is_foreseen { (1.8, 1.8) } else { (3.2, 3.1) };
         let mut stages = vec![
             stage("evaluation", evaluations, evaluation),
             stage("factorization", 1.1, 100.0 + factorization),
@@ -74,6 +74,7 @@ impl Model {
             ),
         ];
         if is_foreseen {
+            stages.push(stage("what it leaves over", 1.0, 220.0 * joints));
             linearization += evaluation;
         }
         if nc > 0.0 {

@@ -766,7 +766,9 @@ mod tests {
         assert!(exact.planar.is_some() && exact.straightened == (0, 0.0));
         // One axis that is tilted keeps all others as they are written.
         let mut scene = tilted(1e-9);
-        let Some(scene::Joint::Revolute { axis, .. }) = &mut scene.frames[6].joint else { panic!() };
+        let Some(scene::Joint::Revolute { axis, .. }) = &mut scene.frames[6].joint else {
+            panic!()
+        };
         *axis = [1e-6, 1.0, 0.0];
         assert_eq!(Model::compile(&scene).unwrap().straightened, (0, 0.0));
     }
