@@ -15,7 +15,7 @@
 //! rows and columns of the ball joints that it belongs to.
 
 use plantd_math::rotation;
-use plantd_math::simd::wide;
+use plantd_math::simd::widest;
 use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::balls::BallJoints;
@@ -143,7 +143,7 @@ impl Sink<'_> {
     fn put_pairs(&mut self, model: &Model) {
         let (nd, stride, increment) = (self.nd, self.stride, &mut *self.increment);
         let Tangents { flanks, stiffness, end_slopes, .. } = &mut *self.tangents;
-        wide!({
+        widest!({
             stiffness.fill(0.0);
             end_slopes.fill(0.0);
             for pair in &model.pairs {
