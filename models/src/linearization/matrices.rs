@@ -141,25 +141,25 @@ impl<'a> Target<'a> {
         to.zip(source.iter().step_by(stride)).for_each(|(to, entry)| *to += factor * entry);
     }
 
-    /// The same of three columns side by side, each with its factor.
+    /// Adds three columns, of `count` numbers `stride` apart, multiplied by the transpose of a matrix.
     fn add_columns(
         &mut self,
-        [x, y, z]: [f64; 3],
+        by: &Mat3,
         source: &[f64],
         stride: usize,
         count: usize,
         [row, column]: [usize; 2],
     ) {
-        let (first, step) = match self.layout {
-            Layout::Rows => (row * self.columns + column, self.columns),
-            Layout::Columns => (column * self.rows + row, 1),
+        let (first, down, right) = match self.layout {
+            Layout::Rows => (row * self.columns + column, self.columns, 1),
+            Layout::Columns => (column * self.rows + row, 1, self.rows),
         };
-        let to = self.numbers[first..].iter_mut().step_by(step).take(count);
-        to.zip(source.chunks(stride)).for_each(|(to, line)| {
-            if let [f, g, h, ..] = line {
-                *to = *to + x * f + y * g + z * h;
+        for (i, line) in source.chunks(stride).take(count).enumerate() {
+            if let [x, y, z, ..] = *line {
+                let product = by.apply_transposed(Vec3([x, y, z]));
+                (0..3).for_each(|k| self.numbers[first + i * down + k * right] += product[k]);
             }
-        });
+        }
     }
 
     /// Multiplies three rows, beginning at `row`, by a matrix.
@@ -192,6 +192,17 @@ impl<'a> Target<'a> {
             (0..3).for_each(|a| *self.at(row + a, column + b) = entries[a]);
         }
     }
+}
+
+/// What three inputs give to the residual of a ball joint, a column for each, where the list begins with these.
+fn of_ball(impulses: &[InputImpulse]) -> Option<Mat3> {
+    let nine = impulses.first_chunk::<9>()?;
+    let [first, ..] = nine;
+    let is_in_place = |(k, impulse): (usize, &InputImpulse)| {
+        impulse.input == first.input + k / 3 && impulse.coordinate == first.coordinate + k % 3
+    };
+    let column = |k: usize| Vec3([0, 1, 2].map(|a| nine[k + a].residual));
+    nine.iter().enumerate().all(is_in_place).then(|| Mat3([column(0), column(3), column(6)]))
 }
 
 impl Linearization {
@@ -246,24 +257,22 @@ impl Linearization {
         let mut b = Target::new(out, layout, [2 * n, ni + nk]);
         b.clear();
         if self.kind == Kind::Step {
-            for impulses in self.inputs.chunk_by(|a, b| a.input == b.input) {
-                let (column, input) = (n + impulses[0].coordinate, impulses[0].input);
+            let mut rest = &self.inputs[..];
+            while let Some(impulse) = rest.first() {
+                let (column, input) = (n + impulse.coordinate, impulse.input);
+                let of_ball = of_ball(rest);
                 for (rows, first) in [(&self.increment, 0), (&self.momentum, n)] {
-                    if let [x, y, z] = impulses
-                        && (y.coordinate, z.coordinate) == (x.coordinate + 1, x.coordinate + 2)
-                    {
-                        let factors = [x.residual, y.residual, z.residual];
-                        b.add_columns(factors, &rows[column..], stride, nd, [first, input]);
-                        continue;
-                    }
-                    for impulse in impulses {
-                        let source = &rows[n + impulse.coordinate..];
-                        b.add_column(impulse.residual, source, stride, nd, [first, input]);
+                    let (source, place) = (&rows[column..], [first, input]);
+                    match &of_ball {
+                        Some(by) => b.add_columns(by, source, stride, nd, place),
+                        None => b.add_column(impulse.residual, source, stride, nd, place),
                     }
                 }
-                for &InputImpulse { input, coordinate, residual, momentum } in impulses {
+                let (done, next) = rest.split_at(if of_ball.is_some() { 9 } else { 1 });
+                for &InputImpulse { input, coordinate, residual, momentum } in done {
                     *b.at(n + coordinate, input) += momentum - residual;
                 }
+                rest = next;
             }
         } else if ni > 0 {
             b.copy(&self.driven, ni, [nd, ni], [0, 0]);
