@@ -6,6 +6,7 @@
 mod accuracy;
 mod common;
 mod continuous;
+mod costs;
 mod derivatives;
 mod diagnose;
 mod drawing;

@@ -83,12 +83,18 @@ pub fn sin_cos_of_four(angles: [f64; 4]) -> [[f64; 4]; 2] {
         all_small &= angle.abs() <= LARGEST;
         [sines[i], cosines[i]] = reduced(*angle);
     }
-    if !all_small {
-        for (i, angle) in angles.iter().enumerate() {
-            (sines[i], cosines[i]) = sin_cos_of(*angle);
-        }
+    if all_small { [sines, cosines] } else { sin_cos_one_by_one(angles) }
+}
+
+/// Apart, lest the usual results go through memory.
+#[cold]
+#[inline(never)]
+fn sin_cos_one_by_one(angles: [f64; 4]) -> [[f64; 4]; 2] {
+    let mut out = [[0.0; 4]; 2];
+    for (i, angle) in angles.into_iter().enumerate() {
+        (out[0][i], out[1][i]) = sin_cos_of(angle);
     }
-    [sines, cosines]
+    out
 }
 
 /// The sine and the cosine of one angle.

@@ -46,6 +46,12 @@ impl Model {
             self.scene.frames.iter().filter(|f| !f.motions().is_empty()).count(),
             kinds.collect::<Vec<_>>().join(", ")
         ));
+        let (axes, most) = self.straightened;
+        if axes > 0 {
+            line(format!(
+                "axes          {axes} of them turned by up to {most:.1e} rad, to be parallel or across"
+            ));
+        }
         let islands = self.elimination.islands();
         let islands = format!("{islands} {}", if islands == 1 { "island" } else { "islands" });
         line(match self.solver {

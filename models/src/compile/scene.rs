@@ -19,7 +19,7 @@ use crate::model::mechanism::{
     Dimensions, Length, Model, OperatingPoint, PathJoint, PathLength, PointDistance, PointPair,
     Polynomial, Product, Solver, Vector,
 };
-use crate::model::planar_tree::planar;
+use crate::model::planar_tree::{crooked, planar};
 use crate::model::site::Site;
 use crate::model::tree::{Attachment, Body, Joint, JointKind, Rotational, Tree, WORLD};
 
@@ -82,7 +82,11 @@ impl Model {
 
 /// Compiles a scene that has been validated.
 fn compile(scene: &Scene) -> Model {
-    let layout = Layout::new(scene);
+    assemble(scene, Layout::new(scene))
+}
+
+/// The model of a scene of which the layout is known.
+fn assemble(scene: &Scene, layout: Layout) -> Model {
     let [dynamics, closure] = layout.needs(scene);
     let (dynamics, in_dynamics) = Tree::pruned(&layout.joints, &dynamics);
     let (closure, in_closure) = Tree::pruned(&layout.joints, &closure);
@@ -118,6 +122,7 @@ fn compile(scene: &Scene) -> Model {
         digest: digest(scene),
         solver: Solver::of(&dynamics, &elimination, planar.as_deref(), needs_poses, dimensions),
         planar,
+        straightened: layout.straightened,
         loops: None,
         gravity,
         damping,
@@ -208,10 +213,29 @@ pub(crate) struct Layout {
     pub(crate) inputs: BTreeMap<String, usize>,
     /// First coordinate of each orientation.
     pub(crate) orientations: Vec<usize>,
+    /// How many axes were turned into the planes of their trees, and the largest angle.
+    straightened: (usize, f64),
 }
 
 impl Layout {
+    /// Axes that are off the plane of their tree by no more than [`PARALLEL`](crate::model::planar_tree::PARALLEL)
+    /// are turned into it, where that makes the whole scene one in planes.
     pub(super) fn new(scene: &Scene) -> Self {
+        let written = Self::with_axes(scene, &[]);
+        let [dynamics, _] = written.needs(scene);
+        let (tree, places) = Tree::pruned(&written.joints, &dynamics);
+        let crooked = crooked(&tree);
+        if crooked.is_empty() {
+            return written;
+        }
+        let axis = |place: &usize| crooked.iter().find(|c| c.joint == *place).map(|c| c.axis);
+        let axes: Vec<Option<Vec3>> = places.iter().map(axis).collect();
+        let most = crooked.iter().map(|c| c.off).fold(0.0, f64::max);
+        Self { straightened: (crooked.len(), most), ..Self::with_axes(scene, &axes) }
+    }
+
+    /// With other axes of some joints, in the frames of the joints as they are written.
+    fn with_axes(scene: &Scene, axes: &[Option<Vec3>]) -> Self {
         let mut children: BTreeMap<&str, Vec<&scene::Frame>> = BTreeMap::new();
         for frame in &scene.frames {
             children.entry(&frame.parent).or_default().push(frame);
@@ -223,7 +247,7 @@ impl Layout {
         let mut stack: Vec<&scene::Frame> =
             children.get("world").map(|c| c.iter().rev().copied().collect()).unwrap_or_default();
         while let Some(frame) = stack.pop() {
-            layout.place(frame, &mut names);
+            layout.place(frame, &mut names, axes);
             stack.extend(children.get(frame.name.as_str()).into_iter().flatten().rev());
         }
         layout.number(scene, &names);
@@ -232,7 +256,7 @@ impl Layout {
     }
 
     /// Places one frame, whose parent is placed, and its body.
-    fn place(&mut self, frame: &scene::Frame, names: &mut Vec<String>) {
+    fn place(&mut self, frame: &scene::Frame, names: &mut Vec<String>, axes: &[Option<Vec3>]) {
         let parent = self.frames[&frame.parent];
         let mut placement = Placement {
             joint: parent.joint,
@@ -240,7 +264,10 @@ impl Layout {
             translation: parent.translation + parent.rotation.apply(Vec3(frame.translation)),
         };
         for (name, motion) in frame.motions() {
-            let (kind, turned) = joint(&motion);
+            let (kind, mut turned) = joint(&motion);
+            if let Some(Some(axis)) = axes.get(self.joints.len()) {
+                turned = Mat3::with_z_along(turned.apply(*axis));
+            }
             if motion == Motion::Ball(0) {
                 self.orientations.push(usize::MAX);
             }
@@ -669,4 +696,97 @@ fn digest(scene: &Scene) -> u64 {
     essence.frames.iter_mut().for_each(|frame| frame.visuals.clear());
     let text = serde_json::to_string(&essence).unwrap_or_default();
     fnv1a(text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::integrator::settings::Settings;
+    use crate::model::mechanism::Solver;
+    use crate::plant::facade::Plant;
+    use plantd_scene::builtin;
+
+    /// A chain of which every second axis is tilted.
+    fn tilted(tilt: f64) -> Scene {
+        let mut scene = builtin::scene("chain-8").unwrap();
+        for (i, frame) in scene.frames.iter_mut().enumerate().filter(|(i, _)| i % 2 == 1) {
+            let Some(scene::Joint::Revolute { axis, .. }) = &mut frame.joint else { panic!() };
+            *axis = if i % 4 == 1 { [tilt, 1.0, 0.5 * tilt] } else { [0.0, -1.0, tilt] };
+        }
+        scene
+    }
+
+    fn motion(model: Model) -> Vec<f64> {
+        let model = Arc::new(model);
+        let mut plant = Plant::new(Arc::clone(&model), Settings::new(&model)).unwrap();
+        let u = vec![0.1; model.dimensions.input()];
+        for _ in 0..50 {
+            plant.step(&u).unwrap();
+        }
+        [plant.q(), plant.p()].concat()
+    }
+
+    /// As it is written, and by the equations in space.
+    fn in_space(scene: &Scene) -> Model {
+        let mut model = assemble(scene, Layout::with_axes(scene, &[]));
+        if model.planar.take().is_some() {
+            model.solver = Solver::Spatial;
+        }
+        model
+    }
+
+    #[test]
+    fn nearly_parallel_axes_are_parallel() {
+        for tilt in [1e-13, 1e-9, 5e-9] {
+            let scene = tilted(tilt);
+            let model = Model::compile(&scene).unwrap();
+            let (axes, most) = model.straightened;
+            assert!(model.planar.is_some() && axes == 4 && most <= 1.2 * tilt, "{axes} {most}");
+            let plan = model.plan();
+            assert!(plan.contains("axes          4 of them turned by up to"), "{plan}");
+            let [flat, space] = [motion(model), motion(in_space(&scene))];
+            let largest = space.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
+            for (a, b) in flat.iter().zip(&space) {
+                assert!((a - b).abs() <= (tilt + 1e-12) * largest, "{tilt}: {a} {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn axes_are_turned_no_farther_than_stated() {
+        // The last is a right angle of imported robots with four digits.
+        for tilt in [1.2e-8, 1e-6, 3.7e-6] {
+            let model = Model::compile(&tilted(tilt)).unwrap();
+            assert!(model.planar.is_none() && model.straightened == (0, 0.0), "{tilt}");
+            assert!(!model.plan().contains("turned by"));
+        }
+        let exact = Model::compile(&tilted(0.0)).unwrap();
+        assert!(exact.planar.is_some() && exact.straightened == (0, 0.0));
+        // One axis that is tilted keeps all others as they are written.
+        let mut scene = tilted(1e-9);
+        let Some(scene::Joint::Revolute { axis, .. }) = &mut scene.frames[6].joint else {
+            panic!()
+        };
+        *axis = [1e-6, 1.0, 0.0];
+        assert_eq!(Model::compile(&scene).unwrap().straightened, (0, 0.0));
+    }
+
+    /// What is fixed to a joint stays where it is; only the axis is another.
+    #[test]
+    fn slides_are_turned_into_the_plane() {
+        let mut scene = builtin::scene("cart-pole").unwrap();
+        let slide = scene.frames.iter_mut().find_map(|frame| match &mut frame.joint {
+            Some(scene::Joint::Prismatic { axis, .. }) => Some(axis),
+            _ => None,
+        });
+        *slide.unwrap() = [1.0, 0.0, 3e-9];
+        let model = Model::compile(&scene).unwrap();
+        assert!(model.planar.is_some() && model.straightened.0 == 1, "{:?}", model.straightened);
+        let [flat, space] = [motion(model), motion(in_space(&scene))];
+        for (a, b) in flat.iter().zip(&space) {
+            assert!((a - b).abs() <= 3e-9 * b.abs().max(1.0), "{a} {b}");
+        }
+    }
 }

@@ -15,7 +15,7 @@
 
 use plantd_math::rotation;
 use plantd_math::rotation::{Quaternion, Turn};
-use plantd_math::simd::wide;
+use plantd_math::simd::widest;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::integrator::settings::Settings;
@@ -192,7 +192,7 @@ impl Workspace {
         self.weigh_balls(model, settings);
         let Self { mid, kkt, balls, .. } = self;
         let (matrix, weights) = (&mut kkt.factored.tree, &kkt.balls);
-        wide!({
+        widest!({
             let step = Step::new(&balls.vertical, h, MatrixKind::Newton);
             let generators = &mut balls.generators[..];
             for (i, joint) in model.dynamics.joints.iter().enumerate() {
@@ -316,7 +316,7 @@ impl Tangents {
         h: f64,
     ) {
         let flanks = &mut self.flanks[..];
-        wide!({
+        widest!({
             let step = Step::new(vertical, h, MatrixKind::Newton);
             for (i, joint) in model.dynamics.joints.iter().enumerate() {
                 match joint.kind {

@@ -41,8 +41,8 @@ pub(crate) struct Strayed {
 impl Model {
     /// Whether bodies in space, with damping, armatures and inputs on coordinates, are all there is.
     pub(crate) fn is_of_bodies(&self) -> bool {
-        self.constraints.is_empty()
-            && self.planar.is_none()
+        self.planar.is_none()
+            && self.constraints.is_empty()
             && self.forces.is_none()
             && self.potentials.springs.is_empty()
     }

@@ -89,23 +89,33 @@ impl Chord {
 
 impl Workspace {
     /// Solves one step; the solution stays in the workspace.
+    #[inline]
     pub(crate) fn solve(&mut self, at: StepContext<'_>) -> Result<StepReport, StepError> {
+        if at.model.is_of_bodies() { self.solve_as::<true>(at) } else { self.solve_as::<false>(at) }
+    }
+
+    /// `BODIES`: whether the model is one of bodies ([`Model::is_of_bodies`]). All others have no push and no end
+    /// that is foreseen, and nothing of these in their steps.
+    fn solve_as<const BODIES: bool>(
+        &mut self,
+        at: StepContext<'_>,
+    ) -> Result<StepReport, StepError> {
         let StepContext { model, settings, state, .. } = at;
         self.prepare(at);
         let is_guessed = state.past.predict(settings.time_step_s, &mut self.step.increment);
-        if !state.past.point.is_empty() {
+        if BODIES && !state.past.point.is_empty() {
             self.push(at);
         }
         if is_guessed {
             // The equations are linear in the multipliers: any guess is as good.
             self.step.multipliers.copy_from_slice(&state.multipliers);
-            let report = self.iterate(model, settings, state, false);
+            let report = self.iterate::<BODIES>(model, settings, state, false);
             if report.is_ok() {
                 return report;
             }
         }
         self.ballistic(model, settings, state);
-        self.iterate(model, settings, state, true)
+        self.iterate::<BODIES>(model, settings, state, true)
             .map_err(|error| model.explain(error, state, &self.step.q_end))
     }
 
@@ -232,7 +242,7 @@ impl Workspace {
     }
 
     /// Corrects the guess until the residual is at round-off.
-    fn iterate(
+    fn iterate<const BODIES: bool>(
         &mut self,
         model: &Model,
         settings: &Settings,
@@ -241,8 +251,8 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
         let mut chord = Chord::new(settings, self.kkt.corrections(), always_factor);
-        let mut strayed = model.is_foreseen(settings).then(Strayed::default);
-        let pushes = !state.past.point.is_empty();
+        let mut strayed = (BODIES && model.is_foreseen(settings)).then(Strayed::default);
+        let pushes = BODIES && !state.past.point.is_empty();
         loop {
             if report.iterations == settings.max_iterations {
                 let residual = chord.previous;
@@ -259,7 +269,9 @@ impl Workspace {
             // Factor: K = D2D1Ld + D2F⁻ and S = A1 K⁻¹ A0ᵀ.
             let converged = chord.judge(size, report.constraint_residual);
             if chord.is_fresh {
-                self.response.save_first(&mut self.kkt);
+                if pushes {
+                    self.response.save_first(&mut self.kkt);
+                }
                 self.factor(model, settings, state)?;
                 if pushes && report.factorizations == 0 {
                     self.note_point(StepContext { model, settings, state, u: &[] });
@@ -292,7 +304,7 @@ impl Workspace {
             chord.is_idle = self.is_round_off_of_coordinates();
         }
         // Accept: p1 = D2Ld + F⁺.
-        self.accept(model, settings, report)
+        self.accept::<BODIES>(model, settings, report)
     }
 
     /// Constraint values `r2` at the current increment; returns their size in units of round-off.
@@ -336,7 +348,7 @@ impl Workspace {
     }
 
     /// Checks the solution, and finds its impulse.
-    fn accept(
+    fn accept<const BODIES: bool>(
         &mut self,
         model: &Model,
         settings: &Settings,
@@ -344,7 +356,7 @@ impl Workspace {
     ) -> Result<StepReport, StepError> {
         model.check_turns(&self.step.increment)?;
         self.find_impulse(model, settings);
-        if !self.step.is_evaluated {
+        if BODIES && !self.step.is_evaluated {
             self.nudge_impulse(model, settings);
         }
         if model.dimensions.constraints > 0 {

@@ -102,8 +102,6 @@ pub(crate) struct Tangents {
     pub(crate) constraint_hessian: Vec<f64>,
     /// `½h L_qq + L_qv`.
     pub(crate) end_slopes: Vec<f64>,
-    /// `h L_qq`.
-    pub(crate) stiffness: Vec<f64>,
     /// Of joints, with ball joints.
     pub(crate) flanks: Vec<Flanks>,
     pub(crate) terms: Vec<Term>,
@@ -138,7 +136,6 @@ impl Workspace {
                 diagonals: [zeros(nd), zeros(nd)],
                 constraint_hessian: zeros(if nc > 0 { n * n } else { 0 }),
                 end_slopes: zeros(nd * nd),
-                stiffness: zeros(nd * nd),
                 flanks: vec![
                     Flanks::default();
                     if has_balls { model.dynamics.joints.len() } else { 0 }

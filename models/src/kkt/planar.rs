@@ -194,15 +194,19 @@ impl PlanarRecursion {
         kind: MatrixKind,
     ) -> SmallestPivot {
         wide!({
-            let method = Method::new(step, kind);
+            let (method, n) = (Method::new(step, kind), joints.len());
             self.step = step;
+            let (diagonal, inertia) = (&diagonal[..n], &inertia[..n]);
+            let (generators, passages) = (&mut self.generators[..n], &mut self.passages[..n]);
+            let branches = &mut self.branches[..n];
             let mut smallest = SmallestPivot::NONE;
             // `A` of the joint that follows, about its parent.
             let mut below = [[0.0; 3]; 3];
-            for (row, joint) in joints.iter().enumerate().rev() {
+            for row in (0..n).rev() {
+                let joint = &joints[row];
                 let mut sum = if joint.is_followed { below } else { [[0.0; 3]; 3] };
                 if joint.has_branches {
-                    sum = plus33(sum, std::mem::take(&mut self.branches[row]));
+                    sum = plus33(sum, std::mem::take(&mut branches[row]));
                 }
                 let [a, b, c] = sum;
                 let link = tree.link(row);
@@ -233,14 +237,12 @@ impl PlanarRecursion {
                 match joint.parent {
                     0 => {}
                     parent if parent == row => below = sum,
-                    parent => {
-                        self.branches[parent - 1] = plus33(self.branches[parent - 1], sum);
-                    }
+                    parent => branches[parent - 1] = plus33(branches[parent - 1], sum),
                 }
                 // Right-hand sides pass by 1 − U minusᵀ / D up, and by 1 − plus Wᵀ / D down.
                 let (u_over_d, wrench) = (scaled(inverse_d, u), [1.0, -ey, ex]);
                 let unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
-                self.passages[row] = Passage {
+                passages[row] = Passage {
                     up: [
                         add_scaled(wrench, -u_over_d[0], minus),
                         add_scaled(unit[1], -u_over_d[1], minus),
@@ -255,7 +257,7 @@ impl PlanarRecursion {
                     w_over_d,
                 };
                 generator.inverse_d = inverse_d;
-                self.generators[row] = generator;
+                generators[row] = generator;
             }
             smallest
         })
@@ -265,9 +267,13 @@ impl PlanarRecursion {
     #[inline(never)]
     pub(crate) fn solve(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
         wide!({
-            let Self { generators, passages, flows_of_branches: branches, flow: flows, .. } = self;
+            let n = joints.len();
+            let (generators, passages) = (&self.generators[..n], &self.passages[..n]);
+            let (branches, flows) = (&mut self.flows_of_branches[..n], &mut self.flow[..n]);
+            let x = &mut x[..n];
             let mut below = [0.0; 3];
-            for (i, joint) in joints.iter().enumerate().rev() {
+            for i in (0..n).rev() {
+                let joint = &joints[i];
                 let (Generator { minus, inverse_d, .. }, passage) = (&generators[i], &passages[i]);
                 let mut flow = if joint.is_followed { below } else { [0.0; 3] };
                 if joint.has_branches {
@@ -283,7 +289,8 @@ impl PlanarRecursion {
                 }
             }
             let mut above = [0.0; 3];
-            for (i, joint) in joints.iter().enumerate() {
+            for i in 0..n {
+                let joint = &joints[i];
                 let flow = match joint.parent {
                     0 => [0.0; 3],
                     parent if parent == i => above,

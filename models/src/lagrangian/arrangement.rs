@@ -66,14 +66,13 @@ impl Arrangement for Fours {
     #[inline(always)]
     fn gather(joints: &PlanarJoints, block: usize, list: &[f64]) -> Lanes {
         let first = Self::COUNT * block;
+        let four = list.get(first..).and_then(|list| list.first_chunk());
+        if let (Some(four), true) = (four, joints.are_in_order) {
+            return Lanes(*four);
+        }
         let mut lanes = Lanes::ZERO;
-        match list.get(first..first + Self::COUNT) {
-            Some(four) if joints.are_in_order => lanes.0.copy_from_slice(four),
-            _ => {
-                for (lane, joint) in lanes.0.iter_mut().zip(&joints[first..]) {
-                    *lane = list[joint.coordinate];
-                }
-            }
+        for (lane, joint) in lanes.0.iter_mut().zip(&joints[first..]) {
+            *lane = list[joint.coordinate];
         }
         lanes
     }

@@ -215,6 +215,13 @@ pub(crate) struct Link<S> {
     pub(crate) weight: S,
 }
 
+/// The joints of a block.
+#[inline(always)]
+fn group<A: Arrangement>(joints: &[PlanarJoint], block: usize) -> &[PlanarJoint] {
+    let rest = &joints[A::COUNT * block..];
+    &rest[..A::COUNT.min(rest.len())]
+}
+
 impl<A: Arrangement> Joints<A> {
     pub(crate) fn new(joints: &PlanarJoints) -> Self {
         let n = joints.len();
@@ -257,8 +264,7 @@ impl<A: Arrangement> Joints<A> {
             let mut below = A::Number::ZERO;
             for (block, link) in self.links.iter_mut().enumerate().rev() {
                 let first = A::COUNT * block;
-                let count = A::COUNT.min(joints.len() - first);
-                for (lane, joint) in joints[first..][..count].iter().enumerate().rev() {
+                for (lane, joint) in group::<A>(joints, block).iter().enumerate().rev() {
                     let mut sum = A::one(&link.inertia, lane);
                     if joint.is_followed {
                         sum += below;
@@ -366,11 +372,11 @@ impl<A: Arrangement> Joints<A> {
     /// Angles and angular velocities of bodies.
     #[inline(always)]
     fn turn(&mut self, joints: &PlanarJoints, blocks: Range<usize>, last: &mut Motion<A::Number>) {
-        let links = &mut self.links[..];
+        let links = &mut self.links[..blocks.end];
         let Motion { mut direction, mut spin, .. } = *last;
         for block in blocks {
             let first = A::COUNT * block;
-            for (lane, joint) in joints[first..].iter().take(A::COUNT).enumerate() {
+            for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
                 match joint.parent {
                     0 => Motion { direction, spin, .. } = Motion::NONE,
                     parent if parent == first + lane => {}
@@ -396,11 +402,11 @@ impl<A: Arrangement> Joints<A> {
     /// Velocities of joints.
     #[inline(always)]
     fn go_on(&mut self, joints: &PlanarJoints, blocks: Range<usize>, last: &mut Motion<A::Number>) {
-        let links = &mut self.links[..];
+        let links = &mut self.links[..blocks.end];
         let mut velocity = last.velocity;
         for block in blocks {
             let first = A::COUNT * block;
-            for (lane, joint) in joints[first..].iter().take(A::COUNT).enumerate() {
+            for (lane, joint) in group::<A>(joints, block).iter().enumerate() {
                 match joint.parent {
                     0 => velocity = [A::Number::ZERO; 2],
                     parent if parent == first + lane => {}
@@ -427,56 +433,62 @@ impl<A: Arrangement> Joints<A> {
         l_v: &mut [A::Number],
         mut below: Below<A::Number>,
     ) -> Below<A::Number> {
-        let of = |blocks: &Range<usize>| {
-            A::COUNT * blocks.start..joints.len().min(A::COUNT * blocks.end)
-        };
-        for i in of(&blocks).rev() {
-            let joint = &joints[i];
-            let mut sum = self.sums[i];
-            if joint.is_followed {
-                sum = add4(sum, below.sums);
-            }
-            if joint.has_branches {
-                sum = add4(sum, std::mem::replace(&mut self.branches[i].sums, Below::NONE.sums));
-            }
-            self.sums[i] = sum;
-            let [x, y] = one2::<A>(&self.links[i / A::COUNT].lever, i % A::COUNT);
-            let sum = [sum[0], sum[1], sum[2] + x, sum[3] + y];
-            match joint.parent {
-                0 => {}
-                parent if parent == i => below.sums = sum,
-                parent => {
-                    let others = &mut self.branches[parent - 1].sums;
-                    *others = add4(*others, sum);
+        let Self { links, sums, branches, .. } = self;
+        let (links, sums) = (&mut links[..blocks.end], &mut sums[..A::COUNT * blocks.end]);
+        let branches = &mut branches[..];
+        for block in blocks.clone().rev() {
+            let (first, group, link) =
+                (A::COUNT * block, group::<A>(joints, block), &mut links[block]);
+            // Of one joint in registers: what is written in parts waits before it is read as a whole.
+            let mut single = [sums[first]];
+            let own = if A::COUNT == 1 { &mut single[..] } else { &mut sums[first..][..A::COUNT] };
+            for (lane, joint) in group.iter().enumerate().rev() {
+                let mut sum = own[lane];
+                if joint.is_followed {
+                    sum = add4(sum, below.sums);
+                }
+                if joint.has_branches {
+                    let others = &mut branches[first + lane].sums;
+                    sum = add4(sum, std::mem::replace(others, Below::NONE.sums));
+                }
+                own[lane] = sum;
+                let [x, y] = one2::<A>(&link.lever, lane);
+                let sum = [sum[0], sum[1], sum[2] + x, sum[3] + y];
+                match joint.parent {
+                    0 => {}
+                    parent if parent == first + lane => below.sums = sum,
+                    parent => {
+                        let others = &mut branches[parent - 1].sums;
+                        *others = add4(*others, sum);
+                    }
                 }
             }
-        }
-        for block in blocks.clone() {
-            let link = &mut self.links[block];
-            let [fx, fy, x, y] = A::collect(&self.sums[A::COUNT * block..]);
+            let [fx, fy, x, y] = A::collect(own);
             (link.momentum, link.moment) = ([fx, fy], [x, y]);
             link.torque = cross(link.edge, [fx, fy]);
         }
-        for i in of(&blocks).rev() {
-            let (joint, lane) = (&joints[i], i % A::COUNT);
-            let link = &mut self.links[i / A::COUNT];
-            let mut sum = A::one(&link.turning, lane);
-            if joint.is_followed {
-                sum += below.turning;
-            }
-            if joint.has_branches {
-                sum += std::mem::take(&mut self.branches[i].turning);
-            }
-            A::put(sum, &mut link.turning, lane);
-            sum += A::one(&link.torque, lane);
-            match joint.parent {
-                0 => {}
-                parent if parent == i => below.turning = sum,
-                parent => self.branches[parent - 1].turning += sum,
+        for block in blocks.clone().rev() {
+            let (first, group, link) =
+                (A::COUNT * block, group::<A>(joints, block), &mut links[block]);
+            for (lane, joint) in group.iter().enumerate().rev() {
+                let mut sum = A::one(&link.turning, lane);
+                if joint.is_followed {
+                    sum += below.turning;
+                }
+                if joint.has_branches {
+                    sum += std::mem::take(&mut branches[first + lane].turning);
+                }
+                A::put(sum, &mut link.turning, lane);
+                sum += A::one(&link.torque, lane);
+                match joint.parent {
+                    0 => {}
+                    parent if parent == first + lane => below.turning = sum,
+                    parent => branches[parent - 1].turning += sum,
+                }
             }
         }
         for block in blocks {
-            let (link, body) = (&self.links[block], A::body(joints, block));
+            let (link, body) = (&links[block], A::body(joints, block));
             let Links { slide, rate, turning, momentum: f, moment, .. } = *link;
             let mut by_velocity = turning * body.turn;
             let mut by_position = dot(rate, f) + cross(moment, body.gravity) * body.turn;

@@ -3,9 +3,11 @@
 //! Rows of a [`Linearization`] hold the derivatives of increments; `q[k+1] = q[k] + x` adds a one on the
 //! diagonal. Ball joints turn at their ends by `dexp₋ξ ξ' + exp(−ξ) η`.
 
+use plantd_math::rows::{Block, LANES};
+use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3};
 
-use crate::linearization::linearize::{Kind, Linearization};
+use crate::linearization::linearize::{InputImpulse, Kind, Linearization};
 
 /// How the numbers of a matrix follow each other in memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -17,7 +19,7 @@ pub enum Layout {
 }
 
 /// Rows and columns that are copied together.
-const TILE: usize = 8;
+const TILE: usize = LANES;
 
 /// A matrix in memory that somebody else owns.
 struct Target<'a> {
@@ -28,15 +30,17 @@ struct Target<'a> {
 }
 
 impl<'a> Target<'a> {
-    /// Zero everywhere.
     fn new(numbers: &'a mut [f64], layout: Layout, [rows, columns]: [usize; 2]) -> Self {
         assert!(
             numbers.len() == rows * columns,
             "the matrix has {rows} rows of {columns} numbers, not {}",
             numbers.len()
         );
-        numbers.fill(0.0);
         Self { numbers, layout, rows, columns }
+    }
+
+    fn clear(&mut self) {
+        self.numbers.fill(0.0);
     }
 
     fn at(&mut self, row: usize, column: usize) -> &mut f64 {
@@ -80,6 +84,46 @@ impl<'a> Target<'a> {
         }
     }
 
+    /// Copies three rows, `stride` apart and `width` long, multiplied by a matrix.
+    fn copy_turned(
+        &mut self,
+        by: &Mat3,
+        source: &[f64],
+        stride: usize,
+        width: usize,
+        [row, column]: [usize; 2],
+    ) {
+        wide!({
+            let Mat3([x, y, z]) = *by;
+            let [from_x, from_y, from_z] = [0, 1, 2].map(|a| &source[a * stride..]);
+            for left in (0..width).step_by(TILE) {
+                // Rows are padded to whole tiles.
+                let [f, g, h] = [from_x, from_y, from_z].map(|row| {
+                    let mut block = [0.0; TILE];
+                    block.copy_from_slice(&row[left..left + TILE]);
+                    Block(block)
+                });
+                let turned = |a: usize| f.times(x[a]).plus(g.times(y[a])).plus(h.times(z[a]));
+                let [f, g, h] = [turned(0).0, turned(1).0, turned(2).0];
+                let count = TILE.min(width - left);
+                match self.layout {
+                    Layout::Rows => {
+                        for (a, turned) in [f, g, h].iter().enumerate() {
+                            let to = (row + a) * self.columns + column + left;
+                            self.numbers[to..][..count].copy_from_slice(&turned[..count]);
+                        }
+                    }
+                    Layout::Columns => {
+                        for j in 0..count {
+                            let to = (column + left + j) * self.rows + row;
+                            self.numbers[to..][..3].copy_from_slice(&[f[j], g[j], h[j]]);
+                        }
+                    }
+                }
+            }
+        })
+    }
+
     /// Adds `factor` times `count` numbers, `stride` apart, to a column.
     fn add_column(
         &mut self,
@@ -97,8 +141,38 @@ impl<'a> Target<'a> {
         to.zip(source.iter().step_by(stride)).for_each(|(to, entry)| *to += factor * entry);
     }
 
+    /// Adds three columns, of `count` numbers `stride` apart, multiplied by the transpose of a matrix.
+    fn add_columns(
+        &mut self,
+        by: &Mat3,
+        source: &[f64],
+        stride: usize,
+        count: usize,
+        [row, column]: [usize; 2],
+    ) {
+        let (first, down, right) = match self.layout {
+            Layout::Rows => (row * self.columns + column, self.columns, 1),
+            Layout::Columns => (column * self.rows + row, 1, self.rows),
+        };
+        for (i, line) in source.chunks(stride).take(count).enumerate() {
+            if let [x, y, z, ..] = *line {
+                let product = by.apply_transposed(Vec3([x, y, z]));
+                (0..3).for_each(|k| self.numbers[first + i * down + k * right] += product[k]);
+            }
+        }
+    }
+
     /// Multiplies three rows, beginning at `row`, by a matrix.
+    #[inline(always)]
     fn turn_rows(&mut self, by: &Mat3, row: usize) {
+        if self.layout == Layout::Columns {
+            for column in self.numbers.chunks_exact_mut(self.rows) {
+                if let Some(three) = column[row..].first_chunk_mut() {
+                    *three = by.apply(Vec3(*three)).0;
+                }
+            }
+            return;
+        }
         for column in 0..self.columns {
             let turned = by.apply(Vec3([0, 1, 2].map(|a| *self.at(row + a, column))));
             (0..3).for_each(|a| *self.at(row + a, column) = turned[a]);
@@ -120,6 +194,17 @@ impl<'a> Target<'a> {
     }
 }
 
+/// What three inputs give to the residual of a ball joint, a column for each, where the list begins with these.
+fn of_ball(impulses: &[InputImpulse]) -> Option<Mat3> {
+    let nine = impulses.first_chunk::<9>()?;
+    let [first, ..] = nine;
+    let is_in_place = |(k, impulse): (usize, &InputImpulse)| {
+        impulse.input == first.input + k / 3 && impulse.coordinate == first.coordinate + k % 3
+    };
+    let column = |k: usize| Vec3([0, 1, 2].map(|a| nine[k + a].residual));
+    nine.iter().enumerate().all(is_in_place).then(|| Mat3([column(0), column(3), column(6)]))
+}
+
 impl Linearization {
     /// Writes [`Linearization::a`] over `out`, without allocation: `4 (nd + nk)²` numbers.
     ///
@@ -130,11 +215,24 @@ impl Linearization {
         let (nd, nk, stride) = (self.nd, self.nk, self.stride);
         let (n, state_columns) = (nd + nk, self.next_columns());
         let mut a = Target::new(out, layout, [2 * n; 2]);
-        a.copy(&self.increment, stride, [nd, state_columns], [0, 0]);
+        if nk > 0 {
+            a.clear();
+        }
+        let turned = || self.turnings.iter().filter(|t| t.coordinate < nd);
+        let mut next = 0;
+        for t in turned() {
+            let (first, i) = (next, t.coordinate);
+            let source = &self.increment[first * stride..];
+            a.copy(source, stride, [i - first, state_columns], [first, 0]);
+            let source = &self.increment[i * stride..];
+            a.copy_turned(&t.to_end, source, stride, state_columns, [i, 0]);
+            next = i + 3;
+        }
+        let rest = &self.increment[next * stride..];
+        a.copy(rest, stride, [nd - next, state_columns], [next, 0]);
         a.copy(&self.momentum, stride, [nd, state_columns], [n, 0]);
-        for t in self.turnings.iter().filter(|t| t.coordinate < nd) {
+        for t in turned() {
             let i = t.coordinate;
-            a.turn_rows(&t.to_end, i);
             a.add_block(&t.carried, [i, i]);
             (i..i + 3).for_each(|i| *a.at(i, i) -= 1.0);
         }
@@ -157,13 +255,24 @@ impl Linearization {
         let (nd, nk, ni, stride) = (self.nd, self.nk, self.ni, self.stride);
         let n = nd + nk;
         let mut b = Target::new(out, layout, [2 * n, ni + nk]);
+        b.clear();
         if self.kind == Kind::Step {
-            for impulse in &self.inputs {
+            let mut rest = &self.inputs[..];
+            while let Some(impulse) = rest.first() {
                 let (column, input) = (n + impulse.coordinate, impulse.input);
+                let of_ball = of_ball(rest);
                 for (rows, first) in [(&self.increment, 0), (&self.momentum, n)] {
-                    b.add_column(impulse.residual, &rows[column..], stride, nd, [first, input]);
+                    let (source, place) = (&rows[column..], [first, input]);
+                    match &of_ball {
+                        Some(by) => b.add_columns(by, source, stride, nd, place),
+                        None => b.add_column(impulse.residual, source, stride, nd, place),
+                    }
                 }
-                *b.at(n + impulse.coordinate, input) += impulse.momentum - impulse.residual;
+                let (done, next) = rest.split_at(if of_ball.is_some() { 9 } else { 1 });
+                for &InputImpulse { input, coordinate, residual, momentum } in done {
+                    *b.at(n + coordinate, input) += momentum - residual;
+                }
+                rest = next;
             }
         } else if ni > 0 {
             b.copy(&self.driven, ni, [nd, ni], [0, 0]);

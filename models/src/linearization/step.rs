@@ -169,7 +169,6 @@ impl Workspace {
                 place.momentum = h * input.gain;
                 place.residual = out.at_start * place.momentum;
             }
-            self.tangents.stiffness.fill(0.0);
             self.tangents.end_slopes.fill(0.0);
             for pair in &model.pairs {
                 let (i, j) = (pair.row as usize, pair.column as usize);
@@ -183,8 +182,8 @@ impl Workspace {
                 out.increment[j * stride + i] = half - second.q_above_v_below;
                 self.tangents.end_slopes[i * nd + j] = half + second.q_above_v_below;
                 self.tangents.end_slopes[j * nd + i] = half + second.v_above_q_below;
-                self.tangents.stiffness[i * nd + j] = h * second.qq;
-                self.tangents.stiffness[j * nd + i] = h * second.qq;
+                out.momentum[i * stride + j] = h * second.qq;
+                out.momentum[j * stride + i] = h * second.qq;
             }
             for pair in &model.mixed_pairs {
                 let second = self.mid.mechanics.pair(model, pair.ancestor, pair.descendant);
@@ -227,8 +226,6 @@ impl Workspace {
                 }
             }
             for (i, target) in out.momentum.chunks_exact_mut(stride).enumerate() {
-                let stiffness = &self.tangents.stiffness[i * nd..][..nd];
-                target.iter_mut().zip(stiffness).for_each(|(t, entry)| *t += entry);
                 let slopes = &self.tangents.end_slopes[i * nd..][..nd];
                 self.tangents.terms.clear();
                 for &j in model.elimination.coupled(i) {
@@ -256,7 +253,7 @@ impl Workspace {
         let model = at.model;
         let h = at.settings.time_step_s;
         let (nd, nk, stride) = (out.nd, out.nk, out.stride);
-        let (stiffness, slopes) = (&mut self.tangents.stiffness, &mut self.tangents.end_slopes);
+        let slopes = &mut self.tangents.end_slopes;
         let poses = &self.mid.mechanics.poses;
         model.for_each_spring_derivative(poses, &self.mid.q, |row, column, value| {
             if row >= nd {
@@ -265,7 +262,7 @@ impl Workspace {
             if column < nd {
                 out.increment[row * stride + column] -= 0.5 * h * value;
                 slopes[row * nd + column] -= 0.5 * h * value;
-                stiffness[row * nd + column] -= h * value;
+                out.momentum[row * stride + column] -= h * value;
             } else {
                 for column in [column, nd + column + nk] {
                     out.increment[row * stride + column] -= 0.25 * h * value;
@@ -280,13 +277,13 @@ impl Workspace {
         let Some(forces) = &at.model.forces else { return };
         let h = at.settings.time_step_s;
         let (nd, nk, stride, a) = (out.nd, out.nk, out.stride, out.at_start);
-        let Tangents { end_slopes: slopes, stiffness, .. } = &mut self.tangents;
+        let Tangents { end_slopes: slopes, .. } = &mut self.tangents;
         let instant = self.mid.instant(at.model);
         forces.for_each_derivative(&instant, |row, column, by_q, by_v| {
             if row < nd && column < nd {
                 out.increment[row * stride + column] += a * h * by_q;
                 slopes[row * nd + column] += 0.5 * h * by_q + by_v;
-                stiffness[row * nd + column] += h * by_q;
+                out.momentum[row * stride + column] += h * by_q;
             } else if row < nd {
                 let half = 0.5 * h * by_q;
                 for (column, slope) in [(column, half - by_v), (nd + column + nk, half + by_v)] {

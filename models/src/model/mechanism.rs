@@ -27,6 +27,8 @@ pub struct Model {
     pub(crate) dynamics: Tree,
     /// [`Self::dynamics`] as a planar tree, where it is one and nothing needs its poses in space.
     pub(crate) planar: Option<PlanarJoints>,
+    /// Axes that were turned to make it one, and the largest angle.
+    pub(crate) straightened: (usize, f64),
     /// Its loops, where they are eliminated with it.
     pub(crate) loops: Option<Loops>,
     /// How a step solves for corrections.

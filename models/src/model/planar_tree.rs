@@ -8,8 +8,10 @@ use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::model::tree::{JointKind, Rotational, Tree, WORLD};
 
-/// Sine of the angle below which two axes count as parallel: what rounding leaves of a rotation.
-const PARALLEL: f64 = 1e-15;
+/// Sine of the angle below which two axes are meant to be parallel.
+pub(crate) const PARALLEL: f64 = 1e-8;
+/// The same of axes that are: what rounding leaves of a rotation.
+const ROUND_OFF: f64 = 1e-15;
 
 /// What is fixed to a joint, in the axes of its tree's plane at the configuration zero: of one joint, or of
 /// several side by side.
@@ -174,11 +176,59 @@ pub(crate) fn planar(tree: &Tree, gravity: Option<Vec3>) -> Option<PlanarJoints>
 
 /// The plane across the first hinge of the tree with this root.
 fn plane_of(tree: &Tree, root: usize) -> Option<Mat3> {
+    first_hinge(tree, root).map(Mat3::with_z_along)
+}
+
+/// The axis of the first hinge of the tree with this root, at the configuration zero.
+fn first_hinge(tree: &Tree, root: usize) -> Option<Vec3> {
     let hinge = (root..tree.joints.len())
         .find(|&i| tree.joints[i].root == root && tree.joints[i].kind == JointKind::Revolute)?;
     let mut rotation = Mat3::IDENTITY;
     for joint in tree.path(hinge) {
         rotation = rotation.times(&tree.joints[joint].rotation);
     }
-    Some(Mat3::with_z_along(rotation.0[2]))
+    Some(rotation.0[2])
+}
+
+/// An axis that is not quite in the plane of its tree, or across it.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Crooked {
+    pub(crate) joint: usize,
+    /// What it is meant to be, in the joint's frame.
+    pub(crate) axis: Vec3,
+    /// Sine of the angle between both.
+    pub(crate) off: f64,
+}
+
+/// The axes that keep a tree from being planar where all are off by less than [`PARALLEL`]; none where some joint
+/// moves otherwise. A normal that is nearly an axis of the world is meant to be that.
+pub(crate) fn crooked(tree: &Tree) -> Vec<Crooked> {
+    let mut zero: Vec<(Mat3, Vec3)> = Vec::with_capacity(tree.joints.len());
+    let mut crooked = Vec::new();
+    for (joint, at) in tree.joints.iter().enumerate() {
+        let (rotation, normal) = if at.parent == WORLD {
+            let Some(axis) = first_hinge(tree, joint) else { return Vec::new() };
+            let is_meant = |unit: &Vec3| axis.cross(*unit).norm() <= PARALLEL;
+            (at.rotation, Mat3::IDENTITY.0.into_iter().find(is_meant).unwrap_or(axis))
+        } else {
+            let (above, normal) = zero[at.parent];
+            (above.times(&at.rotation), normal)
+        };
+        zero.push((rotation, normal));
+        let axis = rotation.0[2];
+        let along = axis.dot(normal);
+        let (off, meant) = match at.kind {
+            JointKind::Revolute => (axis.cross(normal).norm(), normal * along.signum()),
+            JointKind::Prismatic => (along.abs(), axis - normal * along),
+            _ => return Vec::new(),
+        };
+        if !(off <= PARALLEL) {
+            return Vec::new();
+        }
+        if off > ROUND_OFF {
+            let axis = rotation.apply_transposed(meant * (1.0 / meant.norm()));
+            crooked.push(Crooked { joint, axis, off });
+        }
+    }
+    crooked
 }
