@@ -46,7 +46,7 @@ impl Messages for Holder {
         tokio::select! {
             biased;
             () = self.hub.ending.cancelled() => Err(RpcError::shutting_down()),
-            () = session.closed() => Err(RpcError::closed(&session)),
+            () = session.closed() => Err(RpcError::closed(session)),
             _ = status.wait_for(|_| self.lease.is_revoked()) => {
                 Err(RpcError::from_drive(DriveError::Revoked, session))
             }
