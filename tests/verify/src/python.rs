@@ -170,7 +170,8 @@ pub(crate) fn test_gateway(context: &mut Context) -> Outcome {
     let found = Command::new(environment.join("bin/python")).args(["-c", find]).output();
     let found = found.map_err(|error| Failure::Failed(error.to_string()))?;
     let program = String::from_utf8_lossy(&found.stdout).trim().to_owned();
-    let mut test = context.cargo(&["test", "--locked", "-p", "plantd-tests", "--test", "gateway"]);
+    // With the features of the whole workspace, for which it is built already.
+    let mut test = context.cargo(&["test", "--locked", "--workspace", "--test", "gateway"]);
     test.args(["--", "--ignored"]).env("PLANTD_ENVOY", program);
     run(test.env("PLANTD_BINARY_DIR", context.binaries()))
 }
