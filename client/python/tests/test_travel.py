@@ -436,6 +436,8 @@ def test_an_input_that_is_lost_is_sent_again(client):
         assert driver.reconnections == 1
 
 
+# In this process a step is taken by whoever asks for its answer: there it is not interrupted in between.
+@pytest.mark.parametrize("client", ["grpc", "unix"], indirect=True)
 def test_a_step_that_was_interrupted_is_not_taken_for_the_next(client):
     client.create_plant("pendulum", id="p", q=[0.4])
     with client.drive("p", reconnect=True) as driver:
