@@ -7,17 +7,19 @@ import { ModelService } from "./gen/plantd/v1/model_service_pb.js";
 import { PlantService } from "./gen/plantd/v1/plant_service_pb.js";
 import { RecordingService } from "./gen/plantd/v1/recording_service_pb.js";
 import { complain } from "./state.js";
-import { askForToken } from "./token.js";
+import { askForToken, known as knownToken } from "./token.js";
 
 /** A call that the server refuses because it does not know who asks is made again when it does. */
 const known: Interceptor = (next) => async (request) => {
   for (;;) {
+    const used = knownToken();
     try {
       return await next(request);
     } catch (error) {
       const { code, rawMessage } = ConnectError.from(error);
       if (code !== Code.Unauthenticated || request.stream) throw error;
-      await askForToken(rawMessage);
+      // Somebody has answered while this call was under way.
+      if (knownToken() === used) await askForToken(rawMessage);
     }
   }
 };

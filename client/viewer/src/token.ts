@@ -26,7 +26,8 @@ function keep(token: string): void {
 /** Where the browser stores nothing. */
 let present = "";
 
-function known(): string {
+/** The token that is in use; empty where there is none. */
+export function known(): string {
   try {
     return sessionStorage.getItem(KEY) ?? present;
   } catch {
