@@ -73,7 +73,7 @@ impl Drain {
         let name = client.server_info().await?.name;
         let driven = client.drain(self.drain_s).await?;
         let waits = match driven {
-            0 => "ends now: nobody drives a plant".to_owned(),
+            0 => "takes nothing new, and ends: nobody drives a plant".to_owned(),
             1 => "takes nothing new; one plant is driven".to_owned(),
             _ => format!("takes nothing new; {driven} plants are driven"),
         };
