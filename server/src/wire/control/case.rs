@@ -1,7 +1,7 @@
 //! One case of a rollout: a plant that is made, takes its steps, and is gone. With nothing but inputs it is the bare
 //! map; else a session like any other, so that it moves bit for bit as a plant does that is driven step by step.
 
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 use nalgebra::{DMatrix, DVector};
 use plantd_models::parameters::{self, Parameters};
@@ -35,8 +35,8 @@ pub(crate) struct Shared {
     pub(crate) cost: Option<Cost>,
     /// What cases have that do not say otherwise, but for inputs.
     pub(crate) common: v1::RolloutCase,
-    /// Of plants that are nobody's.
-    pub(crate) metrics: Arc<Metrics>,
+    /// Of plants that are nobody's, where there are any.
+    pub(crate) metrics: LazyLock<Arc<Metrics>>,
 }
 
 /// A checked case.
@@ -102,6 +102,18 @@ enum Machine {
     Whole(Lease),
 }
 
+impl Machine {
+    /// Looks at the plant.
+    fn look<R>(&self, look: impl FnOnce(&Plant) -> R) -> Result<R, RpcError> {
+        match self {
+            Self::Map(plant) => Ok(look(plant)),
+            Self::Whole(lease) => lease
+                .look(|core| look(core.plant()))
+                .map_err(|error| RpcError::from_drive(error, lease.session())),
+        }
+    }
+}
+
 /// A case on its way.
 pub(crate) struct Simulation {
     case: Case,
@@ -156,12 +168,8 @@ impl Simulation {
                 return Ok(false);
             }
         }
-        match &mut self.machine {
-            None => {}
-            Some(Machine::Map(plant)) => write_x(plant, &mut self.x),
-            Some(Machine::Whole(lease)) => {
-                self.x = lease.session().with_core(|core| states::x(core.plant()));
-            }
+        if let Some(machine) = &self.machine {
+            self.x = machine.look(states::x)?;
         }
         if self.shared.every.is_none() {
             self.note_state();
@@ -174,15 +182,11 @@ impl Simulation {
 
     fn begin(&mut self, abandoned: &Abandoned) -> Result<(), RpcError> {
         let machine = make(&self.case, &self.shared, abandoned)?;
-        let plant = match &machine {
-            Machine::Map(plant) => plant.as_ref().clone(),
-            Machine::Whole(lease) => lease.session().copy_plant(),
-        };
         self.held = match self.case.inputs.last() {
             Some(last) => last.to_vec(),
-            None => hold_input(&plant),
+            None => machine.look(hold_input)?,
         };
-        write_x(&plant, &mut self.x);
+        self.x = machine.look(states::x)?;
         if self.shared.extremes {
             self.response.min = self.x.clone();
             self.response.max = self.x.clone();
@@ -205,13 +209,13 @@ impl Simulation {
             Machine::Map(plant) => {
                 plant.step(u)?;
                 if is_looked_at {
-                    write_x(plant, x);
+                    *x = states::x(plant);
                 }
             }
             Machine::Whole(lease) => {
                 let look = |core: &mut Core| {
                     if is_looked_at {
-                        write_x(core.plant(), x);
+                        *x = states::x(core.plant());
                     }
                     core.frozen()
                 };
@@ -247,13 +251,6 @@ impl Simulation {
     }
 }
 
-fn write_x(plant: &Plant, x: &mut Vec<f64>) {
-    x.clear();
-    x.extend_from_slice(plant.q());
-    x.extend_from_slice(plant.p());
-    x.extend_from_slice(plant.v());
-}
-
 /// Makes what a case steps.
 fn make(case: &Case, shared: &Shared, abandoned: &Abandoned) -> Result<Machine, RpcError> {
     let (own, common, limits) = (&case.own, &shared.common, &shared.hub.limits);
@@ -277,7 +274,7 @@ fn make(case: &Case, shared: &Shared, abandoned: &Abandoned) -> Result<Machine, 
     if is_bare {
         return Ok(Machine::Map(Box::new(plant)));
     }
-    let metrics = Arc::clone(&shared.metrics);
+    let metrics = Arc::clone(&*shared.metrics);
     let session = shared.hub.apart(&shared.model_name, plant, metrics);
     let mut channels = channels.cloned().unwrap_or_default();
     if let Some(seed) = own.seed.or(common.seed) {

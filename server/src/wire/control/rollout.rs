@@ -1,7 +1,7 @@
 //! `ControlService.Rollout`: many simulations of one model, as many at a time as there are workers.
 
 use std::collections::HashMap;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 use futures::{StreamExt, TryStreamExt as _, stream};
 use plantd_models::{Model, Settings};
@@ -77,7 +77,7 @@ impl Rollout {
             extremes: request.extremes,
             cost,
             common,
-            metrics: Arc::default(),
+            metrics: LazyLock::new(Arc::default),
         };
         Ok(Self { shared: Arc::new(shared), cases, table })
     }
