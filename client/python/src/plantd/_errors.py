@@ -78,40 +78,42 @@ class StepError(PlantdError):
     """A step was refused or failed; the plant is where it was and the driver goes on."""
 
 
-class RolledBack(PlantdError):
+class _AtAnotherStep(PlantdError):
+    """A plant is at another step than its driver has left it at. The input was not taken; the driver goes on there."""
+
+    _code: str
+    _reason: str
+    _said: str
+
+    def __init__(self, from_step: int, to_step: int):
+        super().__init__(self._code, self._said.format(from_step, to_step), self._reason)
+        #: The last step that was seen.
+        self.from_step = from_step
+        #: The step at which the plant is.
+        self.to_step = to_step
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.from_step, self.to_step)
+
+
+class RolledBack(_AtAnotherStep):
     """The server came back with an earlier state than a driver had seen: the steps in between are lost.
 
     The input was not taken; the driver goes on from there.
     """
 
-    def __init__(self, from_step: int, to_step: int):
-        message = f"step {from_step} had been reached, the server is at step {to_step}"
-        super().__init__("DATA_LOSS", message, "ROLLED_BACK")
-        #: The last step that was seen.
-        self.from_step = from_step
-        #: The step at which the plant is.
-        self.to_step = to_step
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.from_step, self.to_step)
+    _code, _reason = "DATA_LOSS", "ROLLED_BACK"
+    _said = "step {} had been reached, the server is at step {}"
 
 
-class SteppedByOthers(PlantdError):
+class SteppedByOthers(_AtAnotherStep):
     """Somebody else has stepped a plant while its driver was away.
 
     The input was not taken; the driver goes on from there.
     """
 
-    def __init__(self, from_step: int, to_step: int):
-        message = f"the plant was at step {from_step} when its driver lost it, and is at step {to_step}"
-        super().__init__("ABORTED", message, "STEPPED_BY_OTHERS")
-        #: The last step that was seen.
-        self.from_step = from_step
-        #: The step at which the plant is.
-        self.to_step = to_step
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.from_step, self.to_step)
+    _code, _reason = "ABORTED", "STEPPED_BY_OTHERS"
+    _said = "the plant was at step {} when its driver lost it, and is at step {}"
 
 
 def is_lost(error: PlantdError) -> bool:
