@@ -309,6 +309,8 @@ fn threads_do_not_change_a_bit() {
             let mut search = Optimizer::new(start, guess, cost, &bounds, None, options).unwrap();
             search.set_threads(threads);
             let rows = run(&mut search);
+            // Without others nobody has helped.
+            assert_eq!(threads > 1, !search.helped().is_zero(), "{name}, {threads}");
             (rows, search.states(), search.inputs())
         });
         let newton = searches[0].0.iter().any(|row| row.method == Method::Newton);

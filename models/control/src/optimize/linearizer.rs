@@ -1,6 +1,7 @@
 //! The linearized map along a motion, made block by block, shared among threads where that pays.
 
 use std::ops::{ControlFlow, Range};
+use std::time::{Duration, Instant};
 
 use plantd_math::sparse_map::Map;
 use plantd_models::{Contraction, KnownStep, Linearization, Plant, StepError};
@@ -54,6 +55,8 @@ pub(super) struct Linearizer {
     is_current: Vec<bool>,
     /// One per thread; at least one.
     pub(super) workers: Vec<Worker>,
+    /// Time for which other threads have worked.
+    helped: Duration,
 }
 
 /// The map to write, and the linearization to keep.
@@ -74,6 +77,7 @@ impl Linearizer {
             linearizations: vec![Linearization::new(model); if keeps { steps } else { 0 }],
             is_current: vec![false; blocks],
             workers: vec![Worker::new(plant)],
+            helped: Duration::ZERO,
         }
     }
 
@@ -81,6 +85,11 @@ impl Linearizer {
     pub(super) fn set_threads(&mut self, threads: usize, plant: &Plant) {
         let useful = if self.states < STATES_FOR_THREADS { 1 } else { threads.max(1) };
         self.workers.resize_with(useful, || Worker::new(plant));
+    }
+
+    /// Time for which other threads than the caller's have worked, taken together.
+    pub(super) fn helped(&self) -> Duration {
+        self.helped
     }
 
     /// The motion is another one.
@@ -96,7 +105,7 @@ impl Linearizer {
         go_on: Question<'_>,
         mut visit: impl FnMut(usize, &Map, Option<&Linearization>) -> Verdict,
     ) -> Result<Option<usize>, OptimizeError> {
-        let Self { states, maps, linearizations, is_current, workers, .. } = self;
+        let Self { states, maps, linearizations, is_current, workers, helped } = self;
         let keeps = !linearizations.is_empty();
         let mut stopped = None;
         for (made, used) in blocks(maps.len(), *states) {
@@ -125,7 +134,7 @@ impl Linearizer {
                 }
                 Ok(())
             };
-            share_work(workers, jobs.collect(), job, consume)?;
+            *helped += share_work(workers, jobs.collect(), job, consume)?;
             is_current[block] = true;
             if stopped.is_some() {
                 break;
@@ -145,7 +154,7 @@ impl Linearizer {
         + Sync,
         mut visit: impl FnMut(usize, &Map, &mut T) -> Verdict,
     ) -> Result<Option<usize>, OptimizeError> {
-        let Self { states, maps, linearizations, workers, .. } = self;
+        let Self { states, maps, linearizations, workers, helped, .. } = self;
         let [mut made_now, mut made_before] = rooms.each_mut();
         let mut stopped = None;
         for (made, used) in blocks(maps.len(), *states) {
@@ -164,7 +173,7 @@ impl Linearizer {
                 }
                 Ok(())
             };
-            share_work(workers, jobs, job, consume)?;
+            *helped += share_work(workers, jobs, job, consume)?;
             if stopped.is_some() {
                 break;
             }
@@ -189,21 +198,25 @@ fn blocks(steps: usize, states: usize) -> impl Iterator<Item = (Range<usize>, Ra
 }
 
 /// Does the jobs of steps: helpers do while this thread does `consume`, or this one before if there are none.
+/// The time that helpers took.
 fn share_work<J: Send>(
     workers: &mut [Worker],
     jobs: Vec<(usize, J)>,
     job: impl Fn(&mut Worker, usize, J) -> Result<(), StepError> + Sync,
     consume: impl FnOnce() -> Result<(), OptimizeError>,
-) -> Result<(), OptimizeError> {
+) -> Result<Duration, OptimizeError> {
+    let none = Duration::ZERO;
     let do_all = |worker: &mut Worker, jobs: Vec<(usize, J)>| {
         jobs.into_iter().try_for_each(|(step, what)| {
             job(worker, step, what).map_err(|error| OptimizeError::Linearization { step, error })
         })
     };
-    let Some((own, helpers)) = workers.split_first_mut() else { return consume() };
+    let Some((own, helpers)) = workers.split_first_mut() else {
+        return consume().map(|()| none);
+    };
     if helpers.is_empty() {
         do_all(own, jobs)?;
-        return consume();
+        return consume().map(|()| none);
     }
     let share = jobs.len().div_ceil(helpers.len()).max(1);
     let mut jobs = jobs.into_iter();
@@ -212,19 +225,22 @@ fn share_work<J: Send>(
         for worker in helpers {
             let part: Vec<_> = jobs.by_ref().take(share).collect();
             if !part.is_empty() {
-                threads.push(scope.spawn(|| do_all(worker, part)));
+                threads.push(scope.spawn(|| {
+                    let began = Instant::now();
+                    do_all(worker, part).map(|()| began.elapsed())
+                }));
             }
         }
         let consumed = consume();
         // All are joined, and the first failure counts, whichever thread was faster.
-        let mut made = Ok(());
+        let mut made = Ok(none);
         for thread in threads {
             match thread.join() {
-                Ok(result) => made = made.and(result),
+                Ok(result) => made = made.and_then(|sum| result.map(|time| sum + time)),
                 Err(panic) => std::panic::resume_unwind(panic),
             }
         }
-        made?;
-        consumed
+        let helped = made?;
+        consumed.map(|()| helped)
     })
 }

@@ -4,6 +4,8 @@ mod ending;
 #[cfg(test)]
 mod tests;
 
+use std::time::Duration;
+
 use nalgebra::DMatrix;
 use plantd_models::{Initial, Plant, State};
 
@@ -207,6 +209,11 @@ impl Optimizer {
     /// is large enough to gain from it; 1 at first. Results are the same to the bit for any number.
     pub fn set_threads(&mut self, threads: usize) {
         self.linearizer.set_threads(threads, &self.trials.plant);
+    }
+
+    /// Time for which threads that [`set_threads`](Self::set_threads) added have worked until now, taken together.
+    pub fn helped(&self) -> Duration {
+        self.linearizer.helped()
     }
 
     /// Whether the search goes on.

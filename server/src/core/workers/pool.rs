@@ -69,6 +69,7 @@ pub struct Abandoned {
     pool: Arc<Pool>,
     id: u64,
     turn_began: Cell<Instant>,
+    helped_ms: Cell<f64>,
 }
 
 impl fmt::Debug for Abandoned {
@@ -98,6 +99,11 @@ impl Abandoned {
         }
         self.turn_began.set(Instant::now());
         Ok(self.pool.keep_turn(self.id))
+    }
+
+    /// Counts time that threads of the job's own have worked for it.
+    pub fn helped(&self, time: Duration) {
+        self.helped_ms.update(|ms| ms + time.as_secs_f64() * 1e3);
     }
 
     fn check_caller(&self) -> Result<(), WorkError> {
@@ -202,11 +208,12 @@ impl Workers {
             Box::new(move |id| {
                 let turn_began = Cell::new(Instant::now());
                 // Nobody may wait any more.
-                let abandoned = Abandoned { token, pool, id, turn_began };
+                let abandoned = Abandoned { token, pool, id, turn_began, helped_ms: Cell::new(0.0) };
+                let meter = || thread_ms() + abandoned.helped_ms.get();
                 let outcome = account
                     .rates
                     .worker_ms_per_s
-                    .spent_by(thread_ms, || span.in_scope(|| caller.scope(|| job(&abandoned))));
+                    .spent_by(meter, || span.in_scope(|| caller.scope(|| job(&abandoned))));
                 drop(span);
                 let _ = sender.send(outcome);
             })

@@ -94,7 +94,10 @@ impl Search {
     fn iterate(&mut self, abandoned: &Abandoned) -> Result<(VecDeque<Answer>, bool), RpcError> {
         let mut messages = VecDeque::new();
         if self.optimizer.status() == Status::Running {
-            match self.optimizer.iterate(&mut || abandoned.check().is_ok()) {
+            let before = self.optimizer.helped();
+            let iterated = self.optimizer.iterate(&mut || abandoned.check().is_ok());
+            abandoned.helped(self.optimizer.helped() - before);
+            match iterated {
                 Ok(progress) => messages.push_back(Answer::Progress(self.progress(&progress)?)),
                 // A trajectory that the search cannot leave: what there is is the answer.
                 Err(error) => {

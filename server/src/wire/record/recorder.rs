@@ -22,7 +22,8 @@ const END_WAIT_MAX: Duration = Duration::from_millis(if cfg!(test) { 300 } else 
 pub(super) struct Recorder {
     session: Weak<Session>,
     shared: Arc<Shared>,
-    tap: Arc<Tap>,
+    /// Of a recording in progress: one that has ended keeps no ring.
+    tap: Weak<Tap>,
     /// Number of the ring's record with which it begins.
     first: u64,
     /// Breaks off when the thread ends.
@@ -71,7 +72,7 @@ impl Recorder {
         match outcome {
             Ok(thread) => {
                 tap.set_recorder(thread.thread().clone());
-                let session = Arc::downgrade(session);
+                let (session, tap) = (Arc::downgrade(session), Arc::downgrade(&tap));
                 Ok(Self { session, shared, tap, first: mark.at, ended: Mutex::new(ended) })
             }
             Err(error) => {
@@ -95,7 +96,9 @@ impl Recorder {
     /// Lets it end.
     pub(super) fn begin_to_end(&self) {
         self.shared.is_ending.store(true, Ordering::Release);
-        self.tap.wake();
+        if let Some(tap) = self.tap.upgrade() {
+            tap.wake();
+        }
     }
 
     /// Ends it, and waits until the file is complete, or for a disk that does not answer.
@@ -125,12 +128,13 @@ impl Recorder {
         // If the disk answers after all, the thread says how it ended.
         info.status = RecordingStatus::Failed.into();
         why.clone_into(&mut info.failure);
-        info.lost = self.tap.ring.written() - self.first - info.steps;
+        let tap = self.tap.upgrade();
+        info.lost = tap.as_ref().map_or(0, |tap| tap.ring.written() - self.first - info.steps);
         let (recording, lost) = (info.name.clone(), info.lost);
         drop(info);
         tracing::error!(recording, lost, why, "recording given up");
-        if let Some(session) = self.session.upgrade() {
-            session.close_tap(&self.tap, 3);
+        if let (Some(session), Some(tap)) = (self.session.upgrade(), tap) {
+            session.close_tap(&tap, 3);
         }
     }
 }
@@ -149,7 +153,7 @@ mod tests {
         let (reader, writer) = std::io::pipe().unwrap();
         let file = File::from(std::os::fd::OwnedFd::from(writer));
         let Ok(hung) = Recorder::start(&session, file, options()) else { panic!("no recording") };
-        let steps = 4 * hung.tap.ring.capacity() as u64;
+        let steps = 4 * hung.tap.upgrade().unwrap().ring.capacity() as u64;
         let mut lease = session.acquire(DriverKind::Step).unwrap();
         for _ in 0..steps {
             lease.step(&[0.1]).unwrap();
@@ -197,5 +201,7 @@ mod tests {
         let info = recorder.info();
         assert_eq!((info.status(), info.steps), (RecordingStatus::Done, 1));
         assert!(session.with_core(|core| core.records.ring.is_none()));
+        // What is known of it stays, its ring does not.
+        assert!(recorder.tap.upgrade().is_none());
     }
 }
