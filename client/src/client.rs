@@ -154,6 +154,13 @@ impl Client {
         Ok(self.server().drain(request).await?.into_inner().driven)
     }
 
+    /// Lets the server take the plants over that another one of the same object store has, and does not come back for.
+    /// Should that one live after all, nothing of what it does is saved any more.
+    pub async fn adopt_plants(&self, from: &str) -> Result<v1::AdoptPlantsResponse> {
+        let request = self.limited(v1::AdoptPlantsRequest { from: from.to_owned() });
+        Ok(self.server().adopt_plants(request).await?.into_inner())
+    }
+
     /// Everything from which another server makes the same plant.
     pub async fn export_plant(
         &self,

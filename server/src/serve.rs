@@ -1,7 +1,7 @@
 //! Starts a server, keeps it, and ends it.
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -48,20 +48,30 @@ use crate::wire::edge::metrics_http;
 use crate::wire::edge::observe::{Observe, ObserveLayer};
 use crate::wire::edge::page::{FindFile, PageLayer};
 use crate::wire::link::host::LinkHost;
+use crate::wire::models::kept;
 use crate::wire::models::model::ModelService;
+use crate::wire::plants::adopt;
 use crate::wire::plants::channels::ChannelService;
 use crate::wire::plants::plant::PlantService;
 use crate::wire::plants::recordings::RecordingService;
 use crate::wire::plants::server::ServerService;
+use crate::wire::record::archive::Archive;
 use crate::wire::record::directory::Recordings;
 use crate::wire::shared::hub::Hub;
-use crate::wire::shared::state_directory::StateDirectory;
+use crate::wire::shared::state::State;
+use crate::wire::shared::state::directory::Directory;
+#[cfg(feature = "object-store")]
+use crate::wire::shared::state::objects::Objects;
+use crate::wire::shared::state::store::Store;
 
 /// Longest wait at the end for a disk that does not answer while plants are saved.
 const SAVE_WAIT_MAX: Duration = Duration::from_secs(10);
 
 /// How often a server that drains looks whether plants are driven.
 const DRAIN_PERIOD: Duration = Duration::from_millis(20);
+
+/// How often recordings that have ended are looked for, where there is an archive.
+const ARCHIVE_PERIOD: Duration = Duration::from_secs(1);
 
 /// How often plants are looked at that are kept for a time.
 const EXPIRY_PERIOD: Duration = Duration::from_secs(1);
@@ -97,6 +107,8 @@ pub struct RunningServer {
     closing: CancellationToken,
     /// Saves plants that change.
     saver: tokio::task::JoinHandle<()>,
+    /// Brings recordings that have ended into the archive.
+    archiver: tokio::task::JoinHandle<()>,
     /// Gives free memory back to the system.
     memory: tokio::task::JoinHandle<()>,
     /// Deletes plants that nobody uses any more.
@@ -172,18 +184,25 @@ impl RunningServer {
             config.auth.as_ref().map(|_| config.tenants.clone()),
         );
         hub.search_threads = config.search_thread_count();
+        let mut archive = None;
         if let Some(path) = &config.state_directory {
-            let state = StateDirectory::open(path, config.file_mode, Arc::clone(&hub.tenants));
-            hub.state = Some(state.with_context(|| format!("plants in {}", path.display()))?);
+            let opened = open_store(path, &config, &hub);
+            let (store, shared) =
+                opened.with_context(|| format!("plants in {}", path.display()))?;
+            (hub.state, archive) = (Some(State::new(store)), shared);
         }
         if let Some(path) = &config.recordings {
             let (limits, tenants) = (config.limits.clone(), Arc::clone(&hub.tenants));
-            let recordings = Recordings::open(path, config.file_mode, limits, tenants);
+            let recordings = Recordings::open(path, config.file_mode, limits, tenants, archive);
             let recordings =
                 recordings.with_context(|| format!("recordings in {}", path.display()));
             hub.recordings = Some(recordings?);
         }
         let hub = Arc::new(hub);
+        if hub.state.as_ref().and_then(State::shared).is_some() {
+            let _ = hub.find.set(adopt::finder(&hub));
+            let _ = hub.catalog.find.set(kept::finder(&hub));
+        }
         if let Some(directory) = &config.scenes {
             // They are there for everybody.
             Connection::server(Tenant::NONE).scope(|| scenes::load(&hub.catalog, directory))?;
@@ -220,6 +239,7 @@ impl RunningServer {
             listeners: JoinSet::new(),
             closing: CancellationToken::new(),
             saver: tokio::spawn(save_plants(Arc::clone(&hub), config.state_interval())),
+            archiver: tokio::spawn(archive_recordings(Arc::clone(&hub))),
             memory: tokio::spawn(memory::give_back()),
             reaper: tokio::spawn(delete_expired(Arc::clone(&hub))),
             metrics: None,
@@ -249,6 +269,9 @@ impl RunningServer {
         };
         let listens = || by_name().or_else(|| addresses.unix.clone());
         if let Some(address) = config.advertise.clone().or_else(listens) {
+            if let Some(shared) = hub.state.as_ref().and_then(State::shared) {
+                shared.announce(&address);
+            }
             hub.identity.announce(address);
         }
     }
@@ -447,10 +470,15 @@ impl RunningServer {
             tracing::error!(%error, "shared-memory links were not closed");
         }
         self.saver.abort();
+        self.archiver.abort();
         self.memory.abort();
         self.reaper.abort();
         self.lookouts.abort_all();
         save_at_the_end(&self.hub).await;
+        let archived = tokio::time::timeout(SAVE_WAIT_MAX, archive_once(&self.hub)).await;
+        if archived.is_err() {
+            tracing::warn!("recordings stay where they are: the object store takes too long");
+        }
         if let Some(metrics) = &self.metrics {
             metrics.abort();
         }
@@ -468,6 +496,25 @@ async fn save_plants(hub: Arc<Hub>, interval: Duration) {
     }
 }
 
+/// Brings recordings that have ended into the archive, over and over.
+async fn archive_recordings(hub: Arc<Hub>) {
+    loop {
+        tokio::time::sleep(ARCHIVE_PERIOD).await;
+        archive_once(&hub).await;
+    }
+}
+
+async fn archive_once(hub: &Arc<Hub>) {
+    if !hub.recordings.as_ref().is_some_and(Recordings::has_archive) {
+        return;
+    }
+    let hub = Arc::clone(hub);
+    let archive = move || hub.recordings.as_ref().map(Recordings::archive_ended);
+    if let Err(error) = tokio::task::spawn_blocking(archive).await {
+        tracing::error!(%error, "recordings were not archived");
+    }
+}
+
 /// Deletes plants that nobody has used for as long as they are to be kept, and counts what waits, over and over.
 async fn delete_expired(hub: Arc<Hub>) {
     loop {
@@ -481,18 +528,19 @@ async fn delete_expired(hub: Arc<Hub>) {
 /// Saves the plants for the next server: as long as it takes, unless the disk does not answer at all.
 async fn save_at_the_end(hub: &Arc<Hub>) {
     let Some(state) = &hub.state else { return };
+    state.give_up();
     let mut saving = pin!(save_once(hub));
     let mut before = state.progress();
     while tokio::time::timeout(SAVE_WAIT_MAX, &mut saving).await.is_err() {
         let now = state.progress();
         if now == before {
             let plants = now.0;
-            tracing::error!(plants, "the disk does not answer: these are not saved, or more");
+            tracing::error!(plants, "the store does not answer: these are not saved, or more");
             return;
         }
         before = now;
     }
-    state.release();
+    state.store.release();
 }
 
 async fn save_once(hub: &Arc<Hub>) {
@@ -520,6 +568,24 @@ fn within(address: SocketAddr) -> SocketAddr {
     };
     SocketAddr::new(ip, address.port())
 }
+
+/// Where the plants of a server survive it: a directory; or an object store if it is given by a URL, to which recordings
+/// that have ended go, too.
+fn open_store(path: &Path, config: &Config, hub: &Hub) -> Result<Opened> {
+    let tenants = Arc::clone(&hub.tenants);
+    let Some(url) = path.to_str().filter(|text| text.contains("://")) else {
+        return Ok((Arc::new(Directory::open(path, config.file_mode, tenants)?), None));
+    };
+    #[cfg(feature = "object-store")]
+    {
+        let objects = Arc::new(Objects::open(url, hub.identity.name(), tenants)?);
+        Ok((Arc::clone(&objects) as _, Some(objects)))
+    }
+    #[cfg(not(feature = "object-store"))]
+    anyhow::bail!("`{url}` needs a plantd that was built with the feature `object-store`");
+}
+
+type Opened = (Arc<dyn Store>, Option<Arc<dyn Archive>>);
 
 /// Finds the files of models for the page.
 fn find_file(hub: Arc<Hub>) -> FindFile {

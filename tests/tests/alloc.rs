@@ -319,7 +319,7 @@ fn a_recorded_step_allocates_nothing() {
     let directory = tempfile::tempdir().expect("a directory");
     let (path, mode) = (directory.path(), modes::Mode::PRIVATE);
     let recordings =
-        Recordings::open(path, mode, Limits::default(), Arc::default()).expect("opened");
+        Recordings::open(path, mode, Limits::default(), Arc::default(), None).expect("opened");
     recordings.start(&session, "steps".to_owned(), 0.0).expect("it can be recorded");
     let mut lease = session.acquire(DriverKind::Step).expect("nobody has it");
     // More than the ring holds, so that some steps wait for the recorder.

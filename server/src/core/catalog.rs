@@ -68,6 +68,8 @@ pub struct Entry {
     pub model: Arc<Model>,
     /// Files that show it; none of a built-in one.
     pub files: Arc<Files>,
+    /// Whose it is; nobody's is there for all.
+    pub owner: Tenant,
 }
 
 /// An uploaded model.
@@ -81,11 +83,14 @@ struct Uploaded {
 
 impl Uploaded {
     fn entry(&self, name: &str) -> Entry {
-        let Self { model, files, .. } = self;
+        let Self { model, files, owner, .. } = self;
         let (model, files) = (Arc::clone(model), Arc::clone(files));
-        Entry { name: name.to_owned(), builtin: false, model, files }
+        Entry { name: name.to_owned(), builtin: false, model, files, owner: *owner }
     }
 }
+
+/// Looks for an uploaded model by its name, and says whose it is. Waits for a store.
+pub type FindModel = Box<dyn Fn(&str) -> Option<(Model, Tenant)> + Send + Sync>;
 
 /// All models.
 pub struct Catalog {
@@ -96,6 +101,8 @@ pub struct Catalog {
     uploaded: Mutex<BTreeMap<String, Uploaded>>,
     models_max: u64,
     file_room: FileRoom,
+    /// Looks elsewhere for models that are not here.
+    pub find: OnceLock<FindModel>,
     /// Shows how many are uploaded.
     gauge: Gauge,
     tenants: Arc<Tenants>,
@@ -110,6 +117,7 @@ impl Catalog {
             uploaded: Mutex::default(),
             models_max: limits.models,
             file_room: FileRoom::new(limits),
+            find: OnceLock::new(),
             gauge,
             tenants,
         }
@@ -139,8 +147,17 @@ impl Catalog {
         if let Some(uploaded) = lock(&self.uploaded).get(name).filter(|found| self.shows(found)) {
             return Ok(uploaded.entry(name));
         }
-        let model = self.builtin(name)?.ok_or_else(|| self.not_found(name))?;
-        Ok(Entry { name: name.to_owned(), builtin: true, model, files: Arc::default() })
+        if let Some(model) = self.builtin(name)? {
+            let (name, files) = (name.to_owned(), Arc::default());
+            return Ok(Entry { name, builtin: true, model, files, owner: Tenant::NONE });
+        }
+        match self.find.get().and_then(|find| find(name)) {
+            Some((model, owner)) => {
+                // Somebody else may have found it meanwhile.
+                Connection::server(owner).scope(|| self.replace(name, Arc::new(model)))
+            }
+            None => Err(self.not_found(name)),
+        }
     }
 
     fn not_found(&self, name: &str) -> CatalogError {

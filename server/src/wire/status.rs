@@ -179,6 +179,11 @@ impl RpcError {
         Self::resource(Code::AlreadyExists, "PLANT_EXISTS", "plant", id, "there already is a plant")
     }
 
+    /// The store that servers share does not answer, or not as it should.
+    pub fn store_failed(error: &dyn std::fmt::Display) -> Self {
+        Self::new(Code::Unavailable, "STORE_FAILED", format!("the object store: {error}"))
+    }
+
     /// There is no such recording.
     pub fn recording_not_found(name: &str) -> Self {
         let (reason, sentence) = ("RECORDING_NOT_FOUND", "there is no recording");

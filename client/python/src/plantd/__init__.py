@@ -44,11 +44,12 @@ from ._realtime import Event, StepTiming
 from ._recordings import Recording
 from ._requests import Stepping
 from ._rotation import compose, difference, rotations
-from ._servers import ServerInfo
+from ._servers import Adopted, ServerInfo
 from ._states import Energy, State, StepReport, Trajectory
 from ._tables import read_recording
 
 __all__ = [
+    "Adopted",
     "Accuracy",
     "Analysis",
     "CenterOfMass",

@@ -39,6 +39,16 @@ class ServerInfo:
         return cls(m.name, m.address, m.version, m.build, m.draining, m.plants)
 
 
+@dataclass(frozen=True)
+class Adopted:
+    """Plants of another server that were taken over."""
+
+    #: Ids of the plants that are on this server now.
+    plants: tuple[str, ...]
+    #: Plants that could not be taken, each with why; they stay as they are.
+    lost: dict[str, str]
+
+
 class ServerCalls(Calls):
     """Calls of the service of servers, and the move of a plant."""
 
@@ -57,6 +67,18 @@ class ServerCalls(Calls):
         answer: server_service_pb2.DrainResponse
         answer = self._call(self.servers.Drain, build(server_service_pb2.DrainRequest, drain_s=drain_s))
         return answer.driven
+
+    def adopt(self, server: str) -> Adopted:
+        """Takes the plants over that another server of the same object store has, and does not come back for.
+
+        ``server`` is its name. Plants of a server that ended in good order need no such call: they come to whoever is
+        asked for them. Should it live after all, nothing of what it does is saved any more. ``NO_OBJECT_STORE`` when
+        this server keeps its plants in no store that others share.
+        """
+        answer: server_service_pb2.AdoptPlantsResponse
+        request = build(server_service_pb2.AdoptPlantsRequest, **{"from": server})
+        answer = self._call(self.servers.AdoptPlants, request)
+        return Adopted(tuple(answer.plants), {lost.id: lost.problem for lost in answer.lost})
 
     def move(self, plant: PlantLike, to: Client | str, *, any_build: bool = False) -> Plant:
         """Moves a plant to another server, where it goes on as it was, and describes it there.

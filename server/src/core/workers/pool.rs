@@ -208,7 +208,8 @@ impl Workers {
             Box::new(move |id| {
                 let turn_began = Cell::new(Instant::now());
                 // Nobody may wait any more.
-                let abandoned = Abandoned { token, pool, id, turn_began, helped_ms: Cell::new(0.0) };
+                let abandoned =
+                    Abandoned { token, pool, id, turn_began, helped_ms: Cell::new(0.0) };
                 let meter = || thread_ms() + abandoned.helped_ms.get();
                 let outcome = account
                     .rates

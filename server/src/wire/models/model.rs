@@ -12,7 +12,7 @@ use crate::core::catalog::Entry;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::wire::answers::cut_page;
 use crate::wire::message::{checks, models, settings};
-use crate::wire::models::{drawing, settle};
+use crate::wire::models::{drawing, kept, settle};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -103,6 +103,10 @@ impl v1::model_service_server::ModelService for ModelService {
                 true => hub.catalog.replace(&name, model)?,
                 false => hub.catalog.insert(&name, model)?,
             };
+            if let Err(fault) = kept::keep(&hub, &entry) {
+                hub.catalog.remove(&name)?;
+                return Err(fault);
+            }
             let model = Some(message(&entry, true));
             Ok(v1::CreateModelResponse { model, import_report: report.map(import_report) })
         };
@@ -137,7 +141,14 @@ impl v1::model_service_server::ModelService for ModelService {
         request: Request<v1::DeleteModelRequest>,
     ) -> Result<Response<v1::DeleteModelResponse>, Status> {
         let name = request.into_inner().name;
-        self.hub.catalog.remove(&name).map_err(RpcError::from)?;
+        let hub = Arc::clone(&self.hub);
+        let job = move |_: &_| {
+            // It may be one that this server has not needed yet.
+            let entry = hub.catalog.get(&name)?;
+            hub.catalog.remove(&name)?;
+            kept::forget(&hub, &entry)
+        };
+        self.hub.workers.run(job).await?;
         Ok(Response::new(v1::DeleteModelResponse {}))
     }
 

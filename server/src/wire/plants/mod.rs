@@ -1,5 +1,6 @@
 //! The services of plants: steps, streams, channels, recordings; and plants that survive their server.
 
+pub mod adopt;
 pub(crate) mod change;
 pub mod channels;
 pub(crate) mod commands;

@@ -23,6 +23,7 @@ use crate::wire::message::report::report_message;
 use crate::wire::message::start::{self, Start};
 use crate::wire::message::{checks, settings, states};
 use crate::wire::plants::drive::DriveStream;
+use crate::wire::plants::state::claim;
 use crate::wire::plants::{feedback, hold, run, step_many, travel, watch};
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
@@ -81,6 +82,7 @@ impl PlantService {
             self.hub.delete(session.id()).await?;
             return Err(fault);
         }
+        claim(&self.hub, &session, false).await?;
         tracing::info!(plant = session.id(), model = session.model_name(), "plant created");
         Ok(session)
     }

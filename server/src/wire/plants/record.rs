@@ -8,9 +8,7 @@ use std::sync::Arc;
 
 use plantd_models::{Initial, Model, Snapshot, Spare};
 use plantd_proto::v1;
-use prost::Message as _;
 
-use crate::core::channels::noise::hash;
 use crate::core::identity::build;
 use crate::core::plant::view::PlantSnapshot;
 use crate::core::session::shared::Session;
@@ -20,7 +18,6 @@ use crate::wire::models::model::compile;
 use crate::wire::plants::feedback::set_feedback;
 use crate::wire::plants::run::{protect, run};
 use crate::wire::shared::hub::Hub;
-use crate::wire::shared::state_directory::StateDirectory;
 use crate::wire::status::RpcError;
 
 /// What becomes of a part of a plant that cannot be made again: the plant does without it, or is not made.
@@ -46,19 +43,36 @@ pub(crate) fn add_models(
     record.build = build();
 }
 
-/// A record as bytes, with their hash, by which damage is found.
-pub(crate) fn encode(record: &v1::PlantRecord) -> Vec<u8> {
-    StateDirectory::sealed(record.encode_to_vec())
+/// Refuses a plant that would not go on bit for bit.
+pub(crate) fn check_build(record: &v1::PlantRecord) -> Result<(), RpcError> {
+    let (of_record, of_server) = (&record.build, build());
+    if *of_record == of_server {
+        return Ok(());
+    }
+    let message = format!(
+        "the plant is of build `{of_record}`, this server of `{of_server}`: its motion would have other \
+         round-off; `any_build` takes it all the same"
+    );
+    let refused = RpcError::precondition("OTHER_BUILD", "record", message);
+    Err(refused.with("record", of_record).with("server", of_server))
 }
 
-/// A record of bytes with their hash.
-pub(crate) fn decode(bytes: &[u8]) -> Result<v1::PlantRecord, RpcError> {
-    let (body, found) =
-        bytes.split_last_chunk().ok_or_else(|| unusable("is cut short".to_owned()))?;
-    if hash(body).to_le_bytes() != *found {
-        return Err(unusable("is damaged: its hash does not match".to_owned()));
-    }
-    v1::PlantRecord::decode(body).map_err(|error| unusable(error.to_string()))
+/// The plant is made whole, or not at all.
+pub(crate) fn whole() -> Lose {
+    Arc::new(|_, fault| Err(fault))
+}
+
+/// What is missing is told in the log: without some of what belongs to it, a plant is still worth having.
+pub(crate) fn lossy(id: &str) -> Lose {
+    let id = id.to_owned();
+    Arc::new(move |what, fault| {
+        tracing::warn!(plant = id, error = sentence(fault), "{what}");
+        Ok(())
+    })
+}
+
+pub(crate) fn sentence(fault: RpcError) -> String {
+    tonic::Status::from(fault).message().to_owned()
 }
 
 /// A record that makes no plant.

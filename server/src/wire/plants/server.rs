@@ -7,6 +7,7 @@ use plantd_proto::v1;
 use tonic::{Request, Response, Status};
 
 use crate::core::identity::{DRAIN_MAX_S, build};
+use crate::wire::plants::adopt::adopt_plants;
 use crate::wire::shared::hub::Hub;
 use crate::wire::status::RpcError;
 
@@ -51,5 +52,12 @@ impl v1::server_service_server::ServerService for ServerService {
         self.hub.drain.request(limit.map(Duration::from_secs_f64));
         let driven = u32::try_from(self.hub.driven()).unwrap_or(u32::MAX);
         Ok(Response::new(v1::DrainResponse { driven }))
+    }
+
+    async fn adopt_plants(
+        &self,
+        request: Request<v1::AdoptPlantsRequest>,
+    ) -> Result<Response<v1::AdoptPlantsResponse>, Status> {
+        Ok(Response::new(adopt_plants(&self.hub, request.get_ref()).await?))
     }
 }

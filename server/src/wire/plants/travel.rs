@@ -5,12 +5,13 @@ use std::sync::Arc;
 
 use plantd_proto::v1;
 
-use crate::core::identity::build;
 use crate::core::session::shared::Session;
 use crate::wire::message::run_info::run_info;
 use crate::wire::names::is_address;
 use crate::wire::plants::record;
+use crate::wire::plants::state::claim;
 use crate::wire::shared::hub::Hub;
+use crate::wire::shared::state::{sealed, unsealed};
 use crate::wire::status::RpcError;
 
 /// Answers an ExportPlant call. Blocks for as long as a step takes: call it on a worker.
@@ -35,7 +36,7 @@ pub(crate) fn export(
         plant.run = Some(run.clone());
     }
     record::add_models(&mut record, hub, &session, &model);
-    Ok(v1::ExportPlantResponse { record: record::encode(&record), step, run: Some(run) })
+    Ok(v1::ExportPlantResponse { record: sealed(&record), step, run: Some(run) })
 }
 
 /// How a plant is run, and the step at which that was true.
@@ -66,21 +67,17 @@ pub(crate) async fn import(
             return Err(RpcError::field(field, "is what the record says"));
         }
     }
-    let record = record::decode(record)?;
+    let record = unsealed(record).map_err(record::unusable)?;
     let own = record.plant.as_ref().map_or("", |plant| plant.id.as_str());
     let id = if id.is_empty() { own.to_owned() } else { id.clone() };
     hub.check_new_plant(&id)?;
-    let (of_record, of_server) = (&record.build, build());
-    if *of_record != of_server && !any_build {
-        let message = format!(
-            "the plant is of build `{of_record}`, this server of `{of_server}`: its motion would have other \
-             round-off; `any_build` takes it all the same"
-        );
-        let refused = RpcError::precondition("OTHER_BUILD", "record", message);
-        return Err(refused.with("record", of_record).with("server", of_server));
+    if !any_build {
+        record::check_build(&record)?;
     }
-    let whole: record::Lose = Arc::new(|_, fault| Err(fault));
+    let whole = record::whole();
     let session = record::make(hub, id, record, whole).await?;
+    // Whoever has it in the store these servers share does not any more.
+    claim(hub, &session, true).await?;
     tracing::info!(plant = session.id(), step = session.step_index(), "plant received");
     Ok(session)
 }

@@ -1,9 +1,9 @@
 //! The recordings in a directory. Those of a tenant lie in a folder of its own, see `folders.rs`;
-//! names are taken for all tenants together.
+//! names are taken for all tenants together. Where there is an archive, those that have ended go there.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io;
+use std::io::{self, Seek as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
@@ -15,10 +15,12 @@ use tonic::Code;
 use crate::core::connection::Caller;
 use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::modes::Mode;
+use crate::core::mutex::lock;
 use crate::core::room::Reservation;
 use crate::core::session::shared::Session;
 use crate::core::tenant::{Account, Tenant, Tenants};
 use crate::wire::message::checks::check_name;
+use crate::wire::record::archive::{Archive, Archived};
 use crate::wire::record::folders::{folder_of, folders};
 use crate::wire::record::progress::{Options, Share, sentence};
 use crate::wire::record::recorder::{Recorder, StartError};
@@ -47,12 +49,21 @@ struct Entry {
     path: PathBuf,
 }
 
+/// Where a recording is.
+enum Found {
+    Here(Entry),
+    Archived(Tenant, Archived),
+}
+
 /// The recordings in a directory.
 pub struct Recordings {
     directory: PathBuf,
     mode: Mode,
     limits: Limits,
     tenants: Arc<Tenants>,
+    archive: Option<Arc<dyn Archive>>,
+    /// Held while one goes to the archive.
+    archiving: Mutex<()>,
     /// Those that this server has begun; none while it begins. Nobody waits for the disk with this in hand.
     own: Mutex<BTreeMap<String, Option<Own>>>,
     /// Permits to wait for the disk: one that does not answer holds no more threads than these.
@@ -66,11 +77,13 @@ impl Recordings {
         mode: Mode,
         limits: Limits,
         tenants: Arc<Tenants>,
+        archive: Option<Arc<dyn Archive>>,
     ) -> io::Result<Self> {
         mode.create_directory(directory)?;
         let permits = Arc::new(Semaphore::new(WAITING_MAX));
         let (directory, own) = (directory.to_owned(), Mutex::default());
-        Ok(Self { directory, mode, limits, tenants, own, permits })
+        let archiving = Mutex::default();
+        Ok(Self { directory, mode, limits, tenants, archive, archiving, own, permits })
     }
 
     /// Does something for which the disk is waited for, on a thread that may wait.
@@ -153,7 +166,11 @@ impl Recordings {
             file.tenant == owner.tenant && begun.get(&file.name).is_none_or(Option::is_none)
         });
         let bytes = |file: &Entry| fs::metadata(&file.path).map_or(0, |metadata| metadata.len());
-        let left: u64 = left.map(bytes).sum();
+        let mut left: u64 = left.map(bytes).sum();
+        if let Some(archive) = &self.archive {
+            let archived = archive.list(owner.tenant).map_err(|error| failed(&error))?;
+            left += archived.iter().map(|archived| archived.bytes).sum::<u64>();
+        }
         let (name, what) = ("tenant.recording_bytes", "bytes of this tenant's recordings");
         let actual = left.saturating_add(room.used());
         if actual >= limit {
@@ -173,7 +190,13 @@ impl Recordings {
         let files = self.files().map_err(|error| failed(&error))?;
         let (limit, count) = (self.limits.recordings, files.len() + 1);
         LimitExceeded::check("recordings", limit, "recordings", count)?;
-        if files.iter().any(|file| file.name == name) {
+        let is_archived = match &self.archive {
+            Some(archive) => {
+                archive.length(session.owner(), name).map_err(|error| failed(&error))?
+            }
+            None => None,
+        };
+        if is_archived.is_some() || files.iter().any(|file| file.name == name) {
             return Err(RpcError::recording_exists(name));
         }
         let folder = folder_of(&self.directory, &self.tenants, session.owner());
@@ -198,7 +221,10 @@ impl Recordings {
 
     /// Ends a recording and waits for it: call it on a worker.
     pub fn stop(&self, name: &str) -> Result<v1::Recording, RpcError> {
-        let file = self.find(name)?;
+        let file = match self.find(name)? {
+            Found::Here(file) => file,
+            Found::Archived(_, archived) => return Ok(done(&archived)),
+        };
         match self.recorder(name) {
             Some(recorder) => {
                 recorder.stop();
@@ -219,32 +245,79 @@ impl Recordings {
     /// Up to `size` recordings after the one named `after`, and whether there are more.
     pub fn page(&self, after: &str, size: usize) -> Result<(Vec<v1::Recording>, bool), RpcError> {
         let mut files = self.files().map_err(|error| failed(&error))?;
-        files.retain(|file| file.name.as_str() > after && self.tenants.shows(file.tenant));
-        files.sort_by(|one, other| one.name.cmp(&other.name));
-        let has_more = files.len() > size;
-        files.truncate(size);
-        let info = |file: &Entry| match self.recorder(&file.name) {
-            Some(recorder) => Ok(recorder.info()),
-            None => left(file),
+        files.retain(|file| self.tenants.shows(file.tenant));
+        let here = files.into_iter().map(|file| (file.name.clone(), Found::Here(file)));
+        let archived = self.archived()?;
+        let archived = archived
+            .into_iter()
+            .map(|(tenant, archived)| (archived.name.clone(), Found::Archived(tenant, archived)));
+        // One that is on its way into the archive is still here.
+        let all: BTreeMap<_, _> = archived.chain(here).collect();
+        let mut rest = all.into_iter().filter(|(name, _)| name.as_str() > after);
+        let page: Vec<_> = rest.by_ref().take(size).collect();
+        let info = |(name, found): (String, Found)| match found {
+            Found::Archived(_, archived) => Ok(done(&archived)),
+            Found::Here(file) => match self.recorder(&name) {
+                Some(recorder) => Ok(recorder.info()),
+                None => left(&file),
+            },
         };
+        let has_more = rest.next().is_some();
         // One that was deleted since is left out.
-        Ok((files.iter().filter_map(|file| info(file).ok()).collect(), has_more))
+        Ok((page.into_iter().filter_map(|found| info(found).ok()).collect(), has_more))
     }
 
-    /// The file of a recording, and its present length.
+    /// What the archive has for the caller.
+    fn archived(&self) -> Result<Vec<(Tenant, Archived)>, RpcError> {
+        let Some(archive) = &self.archive else { return Ok(Vec::new()) };
+        let mut all = Vec::new();
+        for tenant in archive.tenants().map_err(|error| failed(&error))? {
+            if self.tenants.shows(tenant) {
+                let archived = archive.list(tenant).map_err(|error| failed(&error))?;
+                all.extend(archived.into_iter().map(|archived| (tenant, archived)));
+            }
+        }
+        Ok(all)
+    }
+
+    /// The file of a recording, and its present length. Of an archived one it is a copy, without a name.
     pub fn file(&self, name: &str) -> Result<(File, u64), RpcError> {
-        let found = self.find(name)?;
-        let open = || {
-            let file = File::open(&found.path)?;
-            let length = file.metadata()?.len();
-            Ok((file, length))
+        let open = || match self.find(name)? {
+            Found::Here(file) => {
+                let file =
+                    File::open(&file.path).map_err(|error| not_found_or_failed(name, &error))?;
+                Ok(file)
+            }
+            Found::Archived(tenant, _) => {
+                self.copy(tenant, name).map_err(|error| not_found_or_failed(name, &error))
+            }
         };
-        open().map_err(|error: io::Error| not_found_or_failed(name, &error))
+        let file = open()?;
+        let metadata = file.metadata().map_err(|error| failed(&error))?;
+        Ok((file, metadata.len()))
+    }
+
+    fn copy(&self, tenant: Tenant, name: &str) -> io::Result<File> {
+        let Some(archive) = &self.archive else { return Err(io::ErrorKind::NotFound.into()) };
+        let file = tempfile::tempfile_in(&self.directory)?;
+        archive.get(tenant, name, &file)?;
+        (&file).rewind()?;
+        Ok(file)
     }
 
     /// Deletes a recording that is not in progress.
     pub fn delete(&self, name: &str) -> Result<(), RpcError> {
-        let file = self.find(name)?;
+        let _archiving = lock(&self.archiving);
+        let file = match (self.find(name)?, &self.archive) {
+            (Found::Here(file), _) => file,
+            (Found::Archived(tenant, _), Some(archive)) => {
+                return match archive.delete(tenant, name).map_err(|error| failed(&error))? {
+                    true => Ok(()),
+                    false => Err(RpcError::recording_not_found(name)),
+                };
+            }
+            (Found::Archived(..), None) => return Err(RpcError::recording_not_found(name)),
+        };
         if self.own().get(name).is_some_and(is_active) {
             return Err(RpcError::recording_active(format!("recording:{name}")));
         }
@@ -254,24 +327,70 @@ impl Recordings {
         Ok(())
     }
 
+    /// What has ended goes to an archive.
+    pub fn has_archive(&self) -> bool {
+        self.archive.is_some()
+    }
+
+    /// Brings what has ended into the archive. What cannot be brought stays, and is tried again.
+    pub fn archive_ended(&self) {
+        let Some(archive) = &self.archive else { return };
+        let files = match self.files() {
+            Ok(files) => files,
+            Err(error) => return tracing::error!(%error, "recordings not archived"),
+        };
+        for Entry { name, tenant, path } in files {
+            let _archiving = lock(&self.archiving);
+            if self.own().get(&name).is_some_and(is_active) {
+                continue;
+            }
+            let bring = || {
+                let file = File::open(&path)?;
+                if archive.length(tenant, &name)?.is_some() {
+                    let problem = "one of that name is there already";
+                    return Err(io::Error::new(io::ErrorKind::AlreadyExists, problem));
+                }
+                archive.put(tenant, &name, &file)?;
+                fs::remove_file(&path)
+            };
+            match bring() {
+                Ok(()) => {
+                    self.own().retain(|other, recorder| *other != name || is_active(recorder));
+                    tracing::info!(recording = name, "recording archived");
+                }
+                // Deleted meanwhile.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => tracing::error!(recording = name, %error, "recording not archived"),
+            }
+        }
+    }
+
     /// One that this server has begun.
     fn recorder(&self, name: &str) -> Option<Arc<Recorder>> {
         self.own().get(name)?.as_ref().map(|own| Arc::clone(&own.recorder))
     }
 
-    /// The file of a recording that is there for the caller.
-    fn find(&self, name: &str) -> Result<Entry, RpcError> {
+    /// A recording that is there for the caller.
+    fn find(&self, name: &str) -> Result<Found, RpcError> {
         check_name("name", name)?;
         Caller::note(name);
         let folders = folders(&self.directory, &self.tenants).map_err(|error| failed(&error))?;
-        let of = |(tenant, folder): (Tenant, PathBuf)| {
+        for (tenant, folder) in folders {
             let path = folder.join(name).with_extension(EXTENSION);
-            Entry { name: name.to_owned(), tenant, path }
-        };
-        let mut shown =
-            folders.into_iter().filter(|(tenant, _)| self.tenants.shows(*tenant)).map(of);
-        let found = shown.find(|file| file.path.exists());
-        found.ok_or_else(|| RpcError::recording_not_found(name))
+            if self.tenants.shows(tenant) && path.exists() {
+                return Ok(Found::Here(Entry { name: name.to_owned(), tenant, path }));
+            }
+        }
+        let Some(archive) = &self.archive else { return Err(RpcError::recording_not_found(name)) };
+        for tenant in archive.tenants().map_err(|error| failed(&error))? {
+            if self.tenants.shows(tenant)
+                && let Some(bytes) = archive.length(tenant, name).map_err(|error| failed(&error))?
+            {
+                let name = name.to_owned();
+                return Ok(Found::Archived(tenant, Archived { name, bytes }));
+            }
+        }
+        Err(RpcError::recording_not_found(name))
     }
 
     /// All recordings. Files with other names belong to somebody else.
@@ -304,6 +423,12 @@ fn left(file: &Entry) -> Result<v1::Recording, RpcError> {
     let bytes = metadata.map_err(|error| not_found_or_failed(name, &error))?.len();
     let status = RecordingStatus::Done.into();
     Ok(v1::Recording { name: name.clone(), status, bytes, ..Default::default() })
+}
+
+/// What can be said of one in the archive.
+fn done(archived: &Archived) -> v1::Recording {
+    let Archived { name, bytes } = archived.clone();
+    v1::Recording { name, status: RecordingStatus::Done.into(), bytes, ..Default::default() }
 }
 
 /// It begins or is in progress.

@@ -13,6 +13,7 @@
 //! For players the recorder adds pictures of some steps: where frames and lines are, and signals by their
 //! names. They give way where it is behind.
 
+pub mod archive;
 pub mod directory;
 pub(crate) mod file;
 pub(crate) mod folders;

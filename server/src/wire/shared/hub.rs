@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Duration;
 
 use futures::{StreamExt, future, stream};
@@ -33,11 +33,14 @@ use crate::wire::link::host::{LinkError, LinkHost, LinkInfo};
 use crate::wire::message::plant_info::plant_info;
 use crate::wire::record::directory::Recordings;
 use crate::wire::shared::jobs::Jobs;
-use crate::wire::shared::state_directory::StateDirectory;
+use crate::wire::shared::state::State;
 use crate::wire::status::RpcError;
 
 /// Ids with which an unknown one is compared, at most.
 const COMPARED_PLANTS_MAX: usize = 1000;
+
+/// Looks for a plant by its id: it is here now, or the error says where it is. Waits for a store.
+pub type Find = Box<dyn Fn(&str) -> Option<Result<Arc<Session>, RpcError>> + Send + Sync>;
 
 /// Everything that belongs to one server.
 pub struct Hub {
@@ -71,8 +74,10 @@ pub struct Hub {
     pub search_threads: usize,
     /// Recordings of plants.
     pub recordings: Option<Recordings>,
-    /// Directory in which plants survive the server.
-    pub state: Option<StateDirectory>,
+    /// Where plants survive the server.
+    pub state: Option<State>,
+    /// Looks elsewhere for plants that are not here, where servers share a store.
+    pub find: OnceLock<Find>,
     realtime: Arc<RealTime>,
     links: Option<Arc<LinkHost>>,
     plants: Mutex<BTreeMap<String, Arc<Session>>>,
@@ -122,6 +127,7 @@ impl Hub {
             search_threads: 1,
             recordings: None,
             state: None,
+            find: OnceLock::new(),
             realtime,
             links: links.map(Arc::new),
             plants: Mutex::default(),
@@ -133,23 +139,29 @@ impl Hub {
     /// The plant of that id, if it is there for the caller.
     pub fn session(&self, id: &str) -> Result<Arc<Session>, RpcError> {
         Caller::note(id);
-        let plants = self.plants();
-        match plants.get(id) {
-            Some(session) if !session.is_closed() && self.shows(session) => {
-                session.life().touch();
-                Ok(Arc::clone(session))
-            }
-            _ => {
-                let moved = self.moved.address(id);
-                if let Some((_, address)) = moved.filter(|(owner, _)| self.tenants.shows(*owner)) {
-                    return Err(RpcError::plant_elsewhere(id, &address));
-                }
-                let is_known = |session: &Session| !session.is_closed() && self.shows(session);
-                let known = plants.iter().filter(|(_, session)| is_known(session));
-                let known = known.map(|(id, _)| id).take(COMPARED_PLANTS_MAX);
-                Err(RpcError::plant_not_found(&UnknownName::among(id, known)))
-            }
+        if let Some(session) = self.present(id) {
+            session.life().touch();
+            return Ok(session);
         }
+        let moved = self.moved.address(id);
+        if let Some((_, address)) = moved.filter(|(owner, _)| self.tenants.shows(*owner)) {
+            return Err(RpcError::plant_elsewhere(id, &address));
+        }
+        if let Some(found) = self.find.get().and_then(|find| find(id)) {
+            return found;
+        }
+        let plants = self.plants();
+        let is_known = |session: &Session| !session.is_closed() && self.shows(session);
+        let known = plants.iter().filter(|(_, session)| is_known(session));
+        let known = known.map(|(id, _)| id).take(COMPARED_PLANTS_MAX);
+        Err(RpcError::plant_not_found(&UnknownName::among(id, known)))
+    }
+
+    /// The same, if it is on this server.
+    pub fn present(&self, id: &str) -> Option<Arc<Session>> {
+        let plants = self.plants();
+        let found = plants.get(id);
+        found.filter(|session| !session.is_closed() && self.shows(session)).map(Arc::clone)
     }
 
     /// Refuses a change by somebody who may only look, in a call that changes nothing otherwise.

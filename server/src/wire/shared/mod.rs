@@ -2,4 +2,4 @@
 
 pub mod hub;
 pub mod jobs;
-pub mod state_directory;
+pub mod state;

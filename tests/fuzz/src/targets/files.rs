@@ -10,7 +10,8 @@ use plantd_client::{RecordingReader, v1};
 use plantd_proto::FILE_DESCRIPTOR_SET;
 use plantd_server::core::modes::Mode;
 use plantd_server::core::tenant::Tenants;
-use plantd_server::wire::shared::state_directory::StateDirectory;
+use plantd_server::wire::shared::state::directory::Directory;
+use plantd_server::wire::shared::state::{State, with_hash};
 use prost::Message as _;
 use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor};
 
@@ -50,7 +51,7 @@ fn rich_plant(inside: &Inside) -> Result<()> {
 struct SavedPlants {
     inside: Inside,
     path: PathBuf,
-    directory: StateDirectory,
+    state: State,
     record: MessageDescriptor,
     seeds: Vec<Vec<u8>>,
 }
@@ -58,9 +59,10 @@ struct SavedPlants {
 pub(super) fn saved() -> Result<Box<dyn Target>> {
     let inside = Inside::new()?;
     let path = inside.folder.path().join("saved");
-    let directory = StateDirectory::open(&path, Mode::PRIVATE, Arc::new(Tenants::default()))?;
+    let directory = Directory::open(&path, Mode::PRIVATE, Arc::new(Tenants::default()))?;
+    let state = State::new(Arc::new(directory));
     rich_plant(&inside)?;
-    directory.save(inside.server.hub());
+    state.save(inside.server.hub());
     let whole = fs::read(path.join("p.plant"))?;
     let mut seeds = vec![whole[..whole.len() - 8].to_vec()];
     for entry in corpus("saved").read_dir().into_iter().flatten().flatten() {
@@ -69,7 +71,7 @@ pub(super) fn saved() -> Result<Box<dyn Target>> {
     let pool = DescriptorPool::decode(FILE_DESCRIPTOR_SET)?;
     let record = pool.get_message_by_name("plantd.v1.PlantRecord").context("the record")?;
     inside.clear();
-    let target = SavedPlants { inside, path, directory, record, seeds };
+    let target = SavedPlants { inside, path, state, record, seeds };
     ensure!(target.loads(&target.seeds[0]) == 1, "the seed is a saved plant");
     Ok(Box::new(target))
 }
@@ -77,10 +79,10 @@ pub(super) fn saved() -> Result<Box<dyn Target>> {
 impl SavedPlants {
     /// Plants that there are after a start with these bytes.
     fn loads(&self, bytes: &[u8]) -> usize {
-        let file = StateDirectory::sealed(bytes.to_vec());
+        let file = with_hash(bytes.to_vec());
         fs::write(self.path.join("p.plant"), file).expect("it is written");
         let hub = self.inside.server.hub();
-        let loaded = self.inside.runtime.block_on(self.directory.load(hub));
+        let loaded = self.inside.runtime.block_on(self.state.load(hub));
         loaded.expect("what cannot be read is left out");
         let count = hub.page("", 100).0.len();
         self.inside.clear();

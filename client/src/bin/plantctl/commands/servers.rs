@@ -1,7 +1,8 @@
-//! `server`, `drain` and `move`: servers among others.
+//! `server`, `drain`, `move` and `adopt`: servers among others.
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use clap::Args;
+use plantd_client::v1;
 use serde_json::json;
 
 use crate::output::page::table;
@@ -42,6 +43,23 @@ pub(crate) struct Move {
     /// Also to a server of another build, where its motion has other round-off.
     #[arg(long)]
     any_build: bool,
+}
+
+const ADOPT: &str = "\
+Example:
+  plantctl --address https://plantd-1.lab:50051 adopt --from plantd-3
+
+For servers that keep their plants in an object store (`state_directory = \"s3://...\"`). Plants of a server that ended
+in good order need no such call: they come to whoever is asked for them. Should the lost server live after all, it
+closes these plants as soon as it wants to save them.";
+
+/// Takes the plants of a server over that is lost, onto the server that is asked.
+#[derive(Debug, Args)]
+#[command(after_help = ADOPT)]
+pub(crate) struct Adopt {
+    /// Name of the lost server.
+    #[arg(long, value_name = "NAME")]
+    from: String,
 }
 
 impl Server {
@@ -103,4 +121,30 @@ impl Move {
         );
         context.output.done(as_json, &sentence)
     }
+}
+
+impl Adopt {
+    pub(crate) async fn run(self, context: &Context) -> Result<()> {
+        let client = context.connect().await?;
+        let adopted = client.adopt_plants(&self.from).await?;
+        let lost = |lost: &v1::LostPlant| json!({ "id": lost.id, "problem": lost.problem });
+        let as_json = json!({
+            "plants": adopted.plants,
+            "lost": adopted.lost.iter().map(lost).collect::<Vec<_>>(),
+        });
+        let sentence = match &adopted.plants[..] {
+            [] => format!("server `{}` has left no plants to take", self.from),
+            plants => format!("{} here now: {}", counted(plants.len()), plants.join(", ")),
+        };
+        context.output.done(as_json, &sentence)?;
+        let problem = |lost: &v1::LostPlant| format!("\n  {}: {}", lost.id, lost.problem);
+        let problems: String = adopted.lost.iter().map(problem).collect();
+        let count = counted(adopted.lost.len());
+        ensure!(problems.is_empty(), "{count} not taken, and left as they were:{problems}");
+        Ok(())
+    }
+}
+
+fn counted(plants: usize) -> String {
+    if plants == 1 { "one plant is".to_owned() } else { format!("{plants} plants are") }
 }

@@ -134,7 +134,7 @@ const DRIVING: [(&str, &[&str]); 4] = [
 ];
 
 /// Methods of each service that concern everybody.
-const RULING: [(&str, &[&str]); 1] = [("ServerService", &["Drain"])];
+const RULING: [(&str, &[&str]); 1] = [("ServerService", &["AdoptPlants", "Drain"])];
 
 /// Whether the table has a method; the path is `/plantd.v1.Service/Method`.
 fn role_of(path: &str) -> Option<Role> {
