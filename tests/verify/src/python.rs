@@ -176,6 +176,22 @@ pub(crate) fn test_gateway(context: &mut Context) -> Outcome {
     run(test.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 
+/// A server that speaks S3, as PyPI delivers it.
+const MOTO: &str = "moto[server]==5.2.1";
+
+/// Tests servers that share an object store.
+pub(crate) fn test_store(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    let environment = environment_in(context.scratch().join("moto"))?;
+    let mut install = Command::new(environment.join("bin/pip"));
+    if run(install.args(["install", "--quiet", MOTO])).is_err() {
+        return Err(Failure::Skipped(format!("there is no {MOTO} to install")));
+    }
+    let mut test = context.cargo(&["test", "--locked", "--workspace", "--test", "store"]);
+    test.args(["--", "--ignored"]).env("PLANTD_MOTO", environment.join("bin/moto_server"));
+    run(test.env("PLANTD_BINARY_DIR", context.binaries()))
+}
+
 /// Helm's library and the schemas of Kubernetes, as PyPI delivers them.
 const HELM: [&str; 3] = ["helm-python-sdk==0.2.2", "kubernetes-validate==1.37.0", "PyYAML>=6"];
 
