@@ -82,8 +82,13 @@ impl Finder {
         };
         let holder = record.holder.clone().unwrap_or_default();
         if !holder.server.is_empty() {
-            let is_here = holder.server == hub.identity.name() || holder.address.is_empty();
-            return (!is_here).then(|| Err(RpcError::plant_elsewhere(&place.id, &holder.address)));
+            if holder.server == hub.identity.name() {
+                // Another call is taking it.
+                let _taking = self.taking.lock().await;
+                return hub.present(&place.id).map(Ok);
+            }
+            let is_reached = !holder.address.is_empty();
+            return is_reached.then(|| Err(RpcError::plant_elsewhere(&place.id, &holder.address)));
         }
         let _taking = self.taking.lock().await;
         if let Some(session) = hub.present(&place.id) {
