@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "client/python/tests"), str(ROOT / "deploy")]
+sys.path.insert(0, str(ROOT / "client/python/tests"))
 
 
 @pytest.fixture
