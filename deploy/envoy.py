@@ -34,6 +34,7 @@ MANAGER = (
 ASSIGNMENT = "type.googleapis.com/envoy.config.endpoint.v3.ClusterLoadAssignment"
 ROUTER = "type.googleapis.com/envoy.extensions.filters.http.router.v3.Router"
 PREVIOUS = "type.googleapis.com/envoy.extensions.retry.host.previous_hosts.v3.PreviousHostsPredicate"
+BREAKERS = ("max_connections", "max_pending_requests", "max_requests", "max_retries")
 
 
 def address(text: str) -> dict:
@@ -53,7 +54,11 @@ def assignment(name: str, servers: list[str]) -> dict:
 
 
 def cluster(name: str, servers: list[str], folder: Path | None, **more) -> dict:
-    keepalive = {"connection_keepalive": {"interval": "5s", "timeout": "5s"}}
+    http2 = {
+        # As many as a server takes on one (`streams_per_connection`); for more there are more connections.
+        "max_concurrent_streams": 256,
+        "connection_keepalive": {"interval": "5s", "timeout": "5s"},
+    }
     if folder:
         source = {"path": str(file_of(folder, name)), "watched_directory": {"path": str(folder)}}
         config = {"resource_api_version": "V3", "path_config_source": source}
@@ -64,10 +69,12 @@ def cluster(name: str, servers: list[str], folder: Path | None, **more) -> dict:
         "name": name,
         **found,
         "connect_timeout": "1s",
+        # A driver is one request for as long as it drives; how many there may be is the server's business.
+        "circuit_breakers": {"thresholds": [dict.fromkeys(BREAKERS, 1_000_000)]},
         "typed_extension_protocol_options": {
             "envoy.extensions.upstreams.http.v3.HttpProtocolOptions": {
                 "@type": HTTP,
-                "explicit_http_config": {"http2_protocol_options": keepalive},
+                "explicit_http_config": {"http2_protocol_options": http2},
             }
         },
         **more,

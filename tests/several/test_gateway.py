@@ -3,6 +3,7 @@
 import math
 import time
 
+import grpc
 import numpy as np
 import pytest
 from envoys import NEW, again, envoy
@@ -65,6 +66,27 @@ def test_a_server_at_a_new_address_keeps_its_name(three, tmp_path):
             deadline = time.monotonic() + 60
             while again(lambda: new.create_plant("pendulum")).server != moving.name:
                 assert time.monotonic() < deadline
+
+
+def test_many_streams_go_to_one_server(server, tmp_path):
+    """Each driver and each watcher is a stream for as long as it likes: more of them than Envoy lets through by
+    itself (1024 a cluster), and than the server takes on a connection (256)."""
+    count, on_one = 2000, 200
+    with processes(tmp_path, name(0)) as (one,), envoy(tmp_path, [one]) as gateway:
+        options = [("grpc.default_authority", one.name), ("grpc.use_local_subchannel_pool", 1)]
+        channels = [grpc.insecure_channel(gateway.place, options) for _ in range(count // on_one)]
+        try:
+            watches = [
+                channels[k // on_one].unary_stream("/grpc.health.v1.Health/Watch")(b"") for k in range(count)
+            ]
+            # All are open together.
+            answers = [next(watch) for watch in watches]
+            assert len(answers) == count and set(answers) == {answers[0]}
+            for watch in watches:
+                watch.cancel()
+        finally:
+            for channel in channels:
+                channel.close()
 
 
 def test_a_round_trip_through_envoy(server, tmp_path):
