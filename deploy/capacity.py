@@ -67,9 +67,13 @@ class Fleet:
     gateways: int = 2
     gateway_cores: float = 2.0
     interval_s: float = 2.0
-    #: Records a second: of the volume of each server, or of one store for all of them.
+    #: Records a second: of the volume of each server, or of one store for all of them, which outlives machines.
     store_rate: float = 3000.0
     is_store_shared: bool = False
+    #: What one read or write waits for such a store, s; of a volume it is in what was measured.
+    store_answer_s: float = 0.0
+    #: Until somebody says that another server adopts the plants of a lost one, which takes a shared store, s; 0: nobody.
+    adopt_s: float = 0.0
     #: Until a process is started again, and until a machine is given up, s.
     restart_s: float = 1.0
     machine_s: float = 300.0
@@ -79,6 +83,8 @@ class Fleet:
     create_rate: float = 5000.0
 
 
+#: Records that a server reads or writes side by side.
+SIDE_BY_SIDE = 16
 #: Between two checks of a server by a gateway, and for which it waits for an answer, s.
 CHECK_S, CHECK_TIMEOUT_S = 0.5, 1.0
 #: For which Kubernetes waits until a server has started, and until it has ended after it has drained, s.
@@ -99,6 +105,12 @@ class Need:
         return self.need / self.have if self.have else math.inf
 
 
+def rate_of(fleet: Fleet, each_s: float) -> float:
+    """Records that a server reads or writes in a second if the store has no other work."""
+    answering = SIDE_BY_SIDE / fleet.store_answer_s if fleet.store_answer_s else math.inf
+    return min(1 / max(each_s, 1e-9), answering)
+
+
 def needs(fleet: Fleet, costs: Costs) -> list[Need]:
     """What a fleet in steady state needs, of the fullest server and of all gateways."""
     plants = math.ceil(fleet.plants / fleet.servers)
@@ -110,8 +122,8 @@ def needs(fleet: Fleet, costs: Costs) -> list[Need]:
     processors = steps * costs.step_cpu_s + looks + checks * costs.health_cpu_s
     sharing = fleet.servers if fleet.is_store_shared else 1
     written = sharing * changed / fleet.interval_s
-    at_once = min(1 / costs.write_s if costs.write_s else math.inf, fleet.store_rate / sharing)
-    restored = min(1 / costs.restore_s if costs.restore_s else math.inf, fleet.store_rate / sharing)
+    at_once = min(rate_of(fleet, costs.write_s), fleet.store_rate / sharing)
+    restored = min(rate_of(fleet, costs.restore_s), fleet.store_rate / sharing)
     found = [
         Need("limit `plants`", plants, fleet.limit, "plants"),
         Need("memory", memory / 2**20, fleet.memory_bytes / 2**20, "MiB"),
@@ -156,10 +168,10 @@ class Store:
         self.rate, self.is_shared = rate, is_shared
         self.is_there = True
         #: Records that are left, and the most that the server does in a second.
-        self.jobs: dict[int, list[float]] = {}
+        self.jobs: dict[object, list[float]] = {}
         self.written = 0.0
 
-    def rates(self) -> dict[int, float]:
+    def rates(self) -> dict[object, float]:
         if not self.is_there:
             return dict.fromkeys(self.jobs, 0.0)
         if not self.is_shared:
@@ -170,10 +182,10 @@ class Store:
             left, number = left - found[key], number - 1
         return found
 
-    def next_end(self) -> tuple[float, int | None]:
+    def next_end(self) -> tuple[float, object]:
         """In how long a job ends first, and which."""
         ends = [(self.jobs[key][0] / rate if rate else math.inf, key) for key, rate in self.rates().items()]
-        return min(ends, default=(math.inf, None))
+        return min(ends, key=lambda end: end[0], default=(math.inf, None))
 
     def advance(self, time: float) -> None:
         for key, rate in self.rates().items():
@@ -193,14 +205,24 @@ class Server:
         self.saved = self.under_way = self.unsaved = 0.0
         #: Up to when its steps are counted.
         self.counted = 0.0
-        #: Plants that have changed although nobody drives them: what was read is written once more.
-        self.is_anew = False
+        #: Plants that were read: they are written once more, although nobody drives them.
+        self.anew = 0
         self.writing = 0.0
         #: Share of its drivers that stand.
         self.standing = 0.0
 
 
 ON, WAITING, LOST, REFUSED = "on a server", "waiting for its server", "lost", "refused"
+
+
+@dataclass(frozen=True)
+class Adoption:
+    """Plants of a lost server that another one reads, in one life of each."""
+
+    lost: int
+    life: int
+    by: int
+    life_of_adopter: int
 
 
 class Simulation:
@@ -288,8 +310,8 @@ class Simulation:
         if server.life != life:
             return
         self.count(server)
-        changed = len(server.plants) if server.is_anew else server.driven
-        server.is_anew = False
+        changed = min(len(server.plants), server.driven + server.anew)
+        server.anew = 0
         server.under_way, server.unsaved = server.unsaved, 0.0
         server.writing = changed
         looking = len(server.plants) * self.costs.look_cpu_s
@@ -300,7 +322,7 @@ class Simulation:
         if server.life != life:
             return
         if server.writing:
-            self.store.jobs[k] = [server.writing, 1 / max(self.costs.write_s, 1e-9)]
+            self.store.jobs[k] = [server.writing, rate_of(self.fleet, self.costs.write_s)]
         else:
             self.pass_ends(k)
 
@@ -310,7 +332,11 @@ class Simulation:
         server.saved, server.under_way = server.saved + server.under_way, 0.0
         self.at(self.now + self.fleet.interval_s, self.pass_begins, k, server.life)
 
-    def job_ends(self, k: int) -> None:
+    def job_ends(self, key) -> None:
+        if isinstance(key, Adoption):
+            self.adopted(key)
+            return
+        k = key
         if self.servers[k].is_up:
             self.pass_ends(k)
         else:
@@ -327,6 +353,8 @@ class Simulation:
             self.most_waiting = max(self.most_waiting, self.waiting)
         server.is_up, server.life = False, server.life + 1
         self.store.jobs.pop(k, None)
+        for adoption in [key for key in self.store.jobs if isinstance(key, Adoption) and key.by == k]:
+            del self.store.jobs[adoption]
         self.lost_steps += server.unsaved + server.under_way
         server.unsaved = server.under_way = 0.0
         for plant in server.plants:
@@ -335,12 +363,16 @@ class Simulation:
         self.at(self.now + away + self.costs.start_s, self.loads, k, server.life)
 
     def lose_machine(self, k: int) -> None:
-        """The same, and it takes its time until somebody says so; the volume goes along."""
+        """The same, and it takes its time until somebody says so; the volume goes along, or another server adopts."""
         self.kill(k, self.fleet.machine_s)
+        if self.fleet.is_store_shared and self.fleet.adopt_s:
+            self.at(self.now + self.fleet.adopt_s, self.adopts, k, self.servers[k].life)
 
     def lose_disk(self, k: int) -> None:
-        """A machine with its disk: the plants are gone."""
+        """A machine with its disk: the plants are gone, unless they are in a store elsewhere."""
         self.lose_machine(k)
+        if self.fleet.is_store_shared:
+            return
         server = self.servers[k]
         self.lost_steps += server.saved
         server.saved = 0.0
@@ -349,6 +381,38 @@ class Simulation:
             self.home[plant] = None
         self.waiting -= len(server.plants)
         server.plants, server.driven = [], 0
+
+    def adopts(self, k: int, life: int) -> None:
+        """The server with the most room takes the plants of one that is away."""
+        if self.servers[k].life != life or self.servers[k].is_up:
+            return
+        ready = [j for j, server in enumerate(self.servers) if server.is_up]
+        if ready:
+            j = min(ready, key=lambda j: len(self.servers[j].plants))
+            plants = min(len(self.servers[k].plants), self.fleet.limit - len(self.servers[j].plants))
+            if plants > 0:
+                rate = rate_of(self.fleet, self.costs.restore_s)
+                self.store.jobs[Adoption(k, life, j, self.servers[j].life)] = [plants, rate]
+
+    def adopted(self, adoption: "Adoption") -> None:
+        lost, adopter = self.servers[adoption.lost], self.servers[adoption.by]
+        if (lost.life, adopter.life) != (adoption.life, adoption.life_of_adopter) or lost.is_up:
+            # One of the two has started anew: the plants are the first one's, and read by it.
+            return
+        self.count(adopter)
+        room = max(0, self.fleet.limit - len(adopter.plants))
+        taken, lost.plants = lost.plants[:room], lost.plants[room:]
+        driven = sum(self.is_driven[plant] for plant in taken)
+        # What is saved of their steps goes along, as much for each that is driven.
+        saved = lost.saved * driven / lost.driven if lost.driven else 0.0
+        lost.saved, adopter.saved = lost.saved - saved, adopter.saved + saved
+        lost.driven, adopter.driven = lost.driven - driven, adopter.driven + driven
+        adopter.plants += taken
+        adopter.anew += len(taken)
+        for plant in taken:
+            self.home[plant], self.became[plant] = adoption.by, ON
+        self.waiting -= len(taken)
+        self.whole_at = self.now
 
     def lose_gateway(self) -> None:
         """Its drivers stand until they have found the next one."""
@@ -378,18 +442,19 @@ class Simulation:
         if server.life != life:
             return
         if server.plants:
-            self.store.jobs[k] = [len(server.plants), 1 / max(self.costs.restore_s, 1e-9)]
+            self.store.jobs[k] = [len(server.plants), rate_of(self.fleet, self.costs.restore_s)]
         else:
             self.is_back(k)
 
     def is_back(self, k: int) -> None:
         server = self.servers[k]
-        server.is_up, server.is_anew = True, True
+        server.is_up, server.anew = True, len(server.plants)
         server.counted = self.now
         for plant in server.plants:
             self.became[plant] = ON
-        self.waiting -= len(server.plants)
-        self.whole_at = self.now
+        if server.plants:
+            self.waiting -= len(server.plants)
+            self.whole_at = self.now
         self.at(self.now + self.fleet.interval_s, self.pass_begins, k, server.life)
 
     # Laws.
@@ -519,7 +584,7 @@ def costs_of(found: list[Loss]) -> str:
         [
             loss.what,
             rounded(loss.plants_away),
-            f"{rounded(loss.away_s)} s",
+            "ever" if loss.plants_lost else f"{rounded(loss.away_s)} s",
             rounded(loss.steps_lost),
             rounded(loss.steps_lost_each),
             rounded(loss.plants_lost),

@@ -37,7 +37,7 @@ SMALL = capacity.Fleet(
 def shaken(seed):
     """A small fleet to which anything happens at any time, while plants are placed too; all its laws are checked."""
     chance = random.Random(seed)
-    fleet = replace(SMALL, is_store_shared=chance.random() < 0.5)
+    fleet = replace(SMALL, is_store_shared=chance.random() < 0.5, adopt_s=chance.choice([0.0, 3.0]))
     simulation = capacity.Simulation(fleet, COSTS, seed)
     time = 0.0
     for _ in range(40):
@@ -120,6 +120,30 @@ def test_it_is_what_arithmetic_says():
     assert math.isclose(storm.away_s, shared.restart_s + COSTS.start_s + 4000 / 500.0, rel_tol=1e-9)
 
 
+def test_another_server_adopts():
+    fleet = replace(capacity.Fleet(), servers=4, plants=2000, driven=0.0, is_store_shared=True, limit=2000)
+    fleet = replace(fleet, store_answer_s=0.02, adopt_s=10.0)
+    simulation = capacity.Simulation(fleet, COSTS)
+    simulation.run(20.0)
+    lost = list(simulation.servers[2].plants)
+    simulation.lose_machine(2)
+    simulation.run(400.0)
+    assert simulation.check() == {capacity.ON: 2000}
+    # By one of the others, before the machine was there again, and for good.
+    (by,) = {simulation.home[plant] for plant in lost}
+    assert by != 2 and simulation.servers[2].is_up and not simulation.servers[2].plants
+    reading = 500 / min(capacity.SIDE_BY_SIDE / 0.02, 1 / COSTS.restore_s)
+    assert math.isclose(simulation.whole_at, 20.0 + 10.0 + reading, rel_tol=1e-9)
+    # Not where there is no room: they wait for their own.
+    full = capacity.Simulation(replace(fleet, limit=600), COSTS)
+    full.run(20.0)
+    full.lose_machine(2)
+    full.run(100.0)
+    assert full.check() == {capacity.ON: 1600, capacity.WAITING: 400}
+    full.run(400.0)
+    assert full.check() == {capacity.ON: 2000}
+
+
 def test_a_resource_is_full_where_it_says():
     fleet = capacity.Fleet()
     for need in capacity.needs(fleet, COSTS):
@@ -135,10 +159,16 @@ def test_a_resource_is_full_where_it_says():
 def test_the_documents_have_its_tables():
     document = (ROOT / "docs/several.md").read_text()
     fleet = capacity.Fleet()
+    # As its text says by which command.
+    command = document.split("capacity.py --store-shared ")[1].split("`")[0].split()
+    names = [word.removeprefix("--").replace("-", "_") for word in command[::2]]
+    given = {name: type(getattr(fleet, name))(value) for name, value in zip(names, command[1::2], strict=True)}
+    stored = replace(fleet, is_store_shared=True, **given)
     for table in [
         capacity.of_sizes(fleet, COSTS),
         capacity.ends(fleet, COSTS),
         capacity.costs_of(capacity.losses(fleet, COSTS)),
+        capacity.costs_of(capacity.losses(stored, COSTS)),
     ]:
         assert table in document, f"docs/several.md lacks\n{table}"
 
