@@ -14,6 +14,7 @@ const DOCUMENTS: &[&str] = &[
     "docs/limits.md",
     "docs/recording.md",
     "docs/robots.md",
+    "docs/several.md",
     "docs/theory.md",
     "docs/tutorial.md",
     "docs/view.md",

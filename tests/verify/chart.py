@@ -20,6 +20,10 @@ SAFE = {
     "networkPolicy": {"from": [{"podSelector": {"matchLabels": {"app": "lab"}}}]},
     "config": "state_interval_s = 1.0\n[limits]\nplants = 10\n",
 }
+KINDS = ["ConfigMap", "NetworkPolicy", "PodDisruptionBudget", "Service", "Service", "StatefulSet"]
+#: Each target by itself, and all of them.
+SCALED = [{"plants": 500, "waitingJobs": 0}, {"plants": 0, "waitingJobs": 0, "processors": 60}, {"processors": 60}]
+METRICS = Path(__file__).resolve().parents[2] / "deploy/prometheus.yml"
 
 
 def rendered(values: dict) -> list[dict]:
@@ -45,15 +49,34 @@ def problems(part: dict, version: str) -> list[str]:
     return []
 
 
+def check_autoscaling(values: dict) -> None:
+    """The servers are scaled by what they export, upwards alone."""
+    parts = rendered({**CLOSED, "autoscaling": values})
+    (scaler,) = (part for part in parts if part["kind"] not in KINDS)
+    found = [text for part in parts for version in VERSIONS for text in problems(part, version)]
+    assert not found, "\n".join(found)
+    (servers,) = (part for part in parts if part["kind"] == "StatefulSet")
+    # Its number is the scaler's business alone.
+    assert "replicas" not in servers["spec"]
+    spec = scaler["spec"]
+    assert spec["scaleTargetRef"]["name"] == servers["metadata"]["name"] and spec["minReplicas"] == 2
+    assert spec["behavior"]["scaleDown"] == {"selectPolicy": "Disabled"}
+    of_pods = [metric["pods"]["metric"]["name"] for metric in spec["metrics"] if metric["type"] == "Pods"]
+    of_servers = [metric["resource"]["name"] for metric in spec["metrics"] if metric["type"] == "Resource"]
+    wanted = {"plantd_plants": values.get("plants", 1), "plantd_waiting_jobs": values.get("waitingJobs", 1)}
+    assert of_pods == [name for name, target in wanted.items() if target], of_pods
+    assert of_servers == ["cpu"] * ("processors" in values), of_servers
+    exported = METRICS.read_text()
+    assert all(f"# | `{name}` | gauge |" in exported for name in of_pods)
+
+
 def main() -> None:
     report = helm_python.lint(str(CHART), strict=True, values=CLOSED)
     assert not report["errors"], report
     for values in (CLOSED, SAFE):
         parts = rendered(values)
         kinds = sorted(part["kind"] for part in parts)
-        assert kinds == [
-            "ConfigMap", "NetworkPolicy", "PodDisruptionBudget", "Service", "Service", "StatefulSet",
-        ], kinds
+        assert kinds == KINDS, kinds
         found = [text for part in parts for version in VERSIONS for text in problems(part, version)]
         assert not found, "\n".join(found)
         (configuration,) = (part for part in parts if part["kind"] == "ConfigMap")
@@ -73,6 +96,10 @@ def main() -> None:
         # These checks find something where there is something.
         servers["spec"]["podManagmentPolicy"] = "Parallel"
         assert problems(servers, VERSIONS[0]), "a misspelt key passes"
+    for scaled in SCALED:
+        check_autoscaling({"enabled": True, "minReplicas": 2, **scaled})
+    for wrong in ({"minReplicas": 11}, {"plants": 0, "waitingJobs": 0}, {"plants": -1}, {"plant": 1}):
+        assert is_refused({**CLOSED, "autoscaling": {"enabled": True, **wrong}}), wrong
     assert is_refused({}), "servers that everybody can reach, and nobody has said so"
     assert is_refused({"insecure": True, "replica": 3}), "an unknown value passes"
     assert is_refused({"insecure": True, "replicas": "three"}), "a wrong type passes"

