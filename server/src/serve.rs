@@ -578,7 +578,11 @@ fn open_store(path: &Path, config: &Config, hub: &Hub) -> Result<Opened> {
     };
     #[cfg(feature = "object-store")]
     {
+        use crate::wire::shared::state::store::Shared as _;
         let objects = Arc::new(Objects::open(url, hub.identity.name(), tenants)?);
+        if let Some(address) = &config.advertise {
+            objects.announce(address);
+        }
         Ok((Arc::clone(&objects) as _, Some(objects)))
     }
     #[cfg(not(feature = "object-store"))]

@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import grpc
 import plantd
 import plantd._connect
 import pytest
@@ -61,21 +60,9 @@ class Envoy:
         places = [f"{server.name}={server.place}" for server in servers]
         return subprocess.run([*command, *places], check=True, capture_output=True, text=True).stdout
 
-    @contextlib.contextmanager
     def client(self, name):
-        """A client of the server, or the placement, of a name; what DNS would do is done here."""
-        plain = grpc.insecure_channel
-
-        def named(target, options):
-            return plain(target, [*options, ("grpc.default_authority", name)])
-
-        plantd._connect.grpc.insecure_channel = named
-        try:
-            client = plantd.connect(f"http://{self.place}")
-        finally:
-            plantd._connect.grpc.insecure_channel = plain
-        with client:
-            yield client
+        """A client of the server, or the placement, of a name."""
+        return plantd.connect(f"http://{self.place}", authority=name)
 
     def end(self):
         self.process.terminate()

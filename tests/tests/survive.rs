@@ -128,6 +128,33 @@ async fn a_server_that_was_ended_has_its_plants_again() {
     }
 }
 
+/// In a store for many, what is as it was is not written again by each server that starts.
+#[tokio::test]
+async fn what_nobody_has_changed_is_not_written_again() {
+    let state = tempfile::tempdir().unwrap();
+    let mut server = serve(state.path());
+    let client = server.client().await;
+    for id in ["still", "stepped"] {
+        create_changed(&client, id).await;
+        step(&client, id, 0, 10).await;
+    }
+    assert!(server.stop().unwrap().success());
+    let written = |id: &str| {
+        let path = state.path().join(id).with_extension("plant");
+        std::fs::metadata(path).unwrap().modified().unwrap()
+    };
+    let before = ["still", "stepped"].map(written);
+    let mut server = serve(state.path());
+    step(&server.client().await, "stepped", 10, 1).await;
+    let deadline = Instant::now() + Duration::from_secs(20);
+    while written("stepped") == before[1] {
+        assert!(Instant::now() < deadline, "a plant that was stepped is written");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert!(server.stop().unwrap().success());
+    assert_eq!(written("still"), before[0]);
+}
+
 #[tokio::test]
 async fn the_trajectory_over_a_restart_is_the_uninterrupted_one() {
     let mut whole = Vec::new();

@@ -292,6 +292,11 @@ impl RpcError {
     pub fn reason(&self) -> &'static str {
         self.reason
     }
+
+    /// What `with` has added under a name.
+    pub fn detail(&self, name: &str) -> Option<&str> {
+        self.extra.metadata.get(name).map(String::as_str)
+    }
 }
 
 /// The text, cut to [`MAX_TEXT_BYTES`].

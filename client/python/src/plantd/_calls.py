@@ -29,10 +29,11 @@ _HOPS = 8
 class Calls:
     """A connection with its stubs, and how a call is made over it."""
 
-    def __init__(self, address: str, *, timeout: float = 60.0, credentials: Credentials | None = None):
+    def __init__(self, address: str, *, timeout: float = 60.0, credentials: Credentials | None = None, authority: str | None = None):
         #: Where it is connected to; empty for a server in this process.
         self.address = address
         self._credentials = credentials
+        self._authority = authority
         self._channel = self._open(address)
         self._timeout = timeout
         self._is_closed = False
@@ -49,7 +50,7 @@ class Calls:
         self.servers = ServerServiceStub(self._channel)
 
     def _open(self, address: str) -> Any:
-        return open_channel(address, self._credentials)
+        return open_channel(address, self._credentials, self._authority)
 
     def close(self) -> None:
         """Closes the connection; streams end."""

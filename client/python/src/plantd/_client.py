@@ -36,6 +36,7 @@ def connect(
     ca: str | PathLike[str] | None = None,
     cert: str | PathLike[str] | None = None,
     key: str | PathLike[str] | None = None,
+    authority: str | None = None,
 ) -> Client:
     """Connects to ``http://host:port``, ``https://host:port``, ``host:port`` or ``unix:/path``.
 
@@ -46,8 +47,12 @@ def connect(
     the certificates of the CA that issued the server's, without which those count that gRPC knows. These three
     are files in PEM. What is not given comes from the variables PLANTD_TOKEN, PLANTD_CA, PLANTD_CERT and
     PLANTD_KEY.
+
+    ``authority`` is the name by which the server is called where its address says another one: that of a server
+    behind a gateway.
     """
-    return Client(address, timeout=timeout, credentials=Credentials.of(token, ca, cert, key))
+    credentials = Credentials.of(token, ca, cert, key)
+    return Client(address, timeout=timeout, credentials=credentials, authority=authority)
 
 
 class Client(

@@ -125,9 +125,11 @@ class _WithToken(
         return self._call(continuation, client_call_details, request_iterator)
 
 
-def open_channel(address: str, credentials: Credentials | None = None) -> grpc.Channel:
+def open_channel(
+    address: str, credentials: Credentials | None = None, authority: str | None = None
+) -> grpc.Channel:
     """A connection to ``http://host:port``, ``https://host:port``, ``host:port`` or ``unix:/path`` on which a
-    server answers."""
+    server answers, that of the name ``authority`` if it is given."""
     if not isinstance(address, str):
         raise TypeError(f"`address` is {shown(address)}; a text such as http://127.0.0.1:50051 is needed")
     target = _target(address)
@@ -136,9 +138,11 @@ def open_channel(address: str, credentials: Credentials | None = None) -> grpc.C
         ("grpc.initial_reconnect_backoff_ms", _RECONNECT_MS[0]),
         ("grpc.max_reconnect_backoff_ms", _RECONNECT_MS[1]),
     ]
-    if target.startswith(_UNIX):
+    if authority is None and target.startswith(_UNIX):
         # Without it gRPC sends the path as the authority, which HTTP/2 servers refuse.
-        options.append(("grpc.default_authority", "localhost"))
+        authority = "localhost"
+    if authority is not None:
+        options.append(("grpc.default_authority", authority))
     credentials = credentials or Credentials()
     is_secured = address.startswith("https://")
     if is_secured:

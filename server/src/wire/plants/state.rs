@@ -6,6 +6,8 @@ use std::sync::{Arc, Mutex};
 use std::time::SystemTime;
 
 use futures::{StreamExt as _, future, stream};
+use plantd_models::Model;
+use plantd_proto::v1;
 use prost::Message as _;
 use tokio::runtime::Handle;
 
@@ -19,7 +21,7 @@ use crate::core::workers::pool::Abandoned;
 use crate::wire::message::run_info::run_info;
 use crate::wire::plants::record::{self, sentence};
 use crate::wire::shared::hub::Hub;
-use crate::wire::shared::state::store::{Place, Store, StoreError};
+use crate::wire::shared::state::store::{Place, Shared, Store, StoreError};
 use crate::wire::shared::state::{Changed, State, unsealed};
 use crate::wire::status::RpcError;
 
@@ -39,7 +41,8 @@ impl State {
                 Err(NotRestored::Gone) => {}
                 Err(NotRestored::Broken(fault)) => {
                     let error = sentence(fault);
-                    tracing::error!(plant = place.id, error, "plant not restored");
+                    let path = self.store.location(&place);
+                    tracing::error!(path, error, "plant not restored");
                     self.note_broken(&place.id);
                 }
             }
@@ -104,8 +107,8 @@ impl State {
         are_written.into_inner()
     }
 
-    /// What is to be written of a plant; nothing if it is as it was saved.
-    fn changed(&self, hub: &Hub, session: &Arc<Session>) -> Option<Changed> {
+    /// A plant as a record without its models, and the model in force.
+    fn record(&self, session: &Session) -> (v1::PlantRecord, Arc<Model>) {
         let (mut record, model) = session.saved();
         if let Some(plant) = &mut record.plant {
             let mut run = run_info(session);
@@ -114,6 +117,12 @@ impl State {
             }
             plant.run = Some(run);
         }
+        (record, model)
+    }
+
+    /// What is to be written of a plant; nothing if it is as it was saved.
+    fn changed(&self, hub: &Hub, session: &Arc<Session>) -> Option<Changed> {
+        let (mut record, model) = self.record(session);
         let hash = hash(&record.encode_to_vec());
         let is_kept =
             session.kept().as_ref().is_some_and(|Kept { model: before, hash: of_before }| {
@@ -210,11 +219,16 @@ pub(crate) async fn restore(
     };
     // What is made is this tenant's.
     let session = Connection::server(place.tenant).work(made).await.map_err(NotRestored::Broken)?;
-    note_kept(&session);
+    let state = hub.state.as_ref();
+    // Where others look for it, it is written again once this server knows where it is reached.
+    let is_as_written = state.and_then(State::shared).is_none_or(Shared::is_announced);
+    let (hash, model) = match state.filter(|_| is_as_written) {
+        Some(state) => {
+            let (record, model) = state.record(&session);
+            (hash(&record.encode_to_vec()), model)
+        }
+        None => (0, Arc::clone(session.model())),
+    };
+    *session.kept() = Some(Kept { model, hash });
     Ok(session)
-}
-
-/// It is in the store, and is written again in any case.
-fn note_kept(session: &Session) {
-    *session.kept() = Some(Kept { model: Arc::clone(session.model()), hash: 0 });
 }

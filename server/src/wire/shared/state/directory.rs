@@ -86,6 +86,10 @@ impl Store for Directory {
         Ok(fs::remove_file(self.file(place))?)
     }
 
+    fn location(&self, place: &Place) -> String {
+        self.file(place).display().to_string()
+    }
+
     fn release(&self) {
         if let Err(error) = self.lock.unlock() {
             tracing::error!(%error, "{} stays locked", self.path.join(LOCK).display());

@@ -387,6 +387,10 @@ impl Store for Objects {
         self.wait(self.remove_own(place))
     }
 
+    fn location(&self, place: &Place) -> String {
+        self.object(place).to_string()
+    }
+
     fn release(&self) {}
 
     fn shared(&self) -> Option<&dyn Shared> {
@@ -397,6 +401,10 @@ impl Store for Objects {
 impl Shared for Objects {
     fn announce(&self, address: &str) {
         let _ = self.address.set(address.to_owned());
+    }
+
+    fn is_announced(&self) -> bool {
+        self.address.get().is_some()
     }
 
     fn give_up(&self) {

@@ -59,6 +59,9 @@ pub trait Store: Send + Sync {
     /// Removes a plant.
     fn remove(&self, place: &Place) -> Result<(), StoreError>;
 
+    /// Where a plant lies, for who looks after the store.
+    fn location(&self, place: &Place) -> String;
+
     /// Leaves the store to other servers, after the last plant was written.
     fn release(&self);
 
@@ -72,6 +75,9 @@ pub trait Store: Send + Sync {
 pub trait Shared: Store {
     /// Says where this server is reached.
     fn announce(&self, address: &str);
+
+    /// It is known where this server is reached.
+    fn is_announced(&self) -> bool;
 
     /// What is written from now on is given up: whoever is asked for a plant takes it.
     fn give_up(&self);
