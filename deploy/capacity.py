@@ -448,7 +448,8 @@ class Simulation:
 
     def is_back(self, k: int) -> None:
         server = self.servers[k]
-        server.is_up, server.anew = True, len(server.plants)
+        # In a store for all each plant is written by whoever takes it.
+        server.is_up, server.anew = True, len(server.plants) if self.fleet.is_store_shared else 0
         server.counted = self.now
         for plant in server.plants:
             self.became[plant] = ON

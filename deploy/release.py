@@ -33,6 +33,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("plantd-server", "plantd-client", "plantd-fmi", "plantd-python", "plantd-link-c")
+#: What the programs of a release have besides what is always there.
+FEATURES = "plantd-server/object-store"
 #: Packages with programs, and the programs.
 PROGRAMS = {"server": "plantd", "client": "plantctl"}
 #: What the archive of programs has beside them.
@@ -234,7 +236,7 @@ def main() -> None:
         if told("git", "status", "--porcelain").strip():
             sys.exit("there are changes that are not committed: a release is made of a commit")
         words = [word for package in PACKAGES for word in ("-p", package)]
-        run("cargo", "build", "--release", "--locked", *words)
+        run("cargo", "build", "--release", "--locked", *words, "--features", FEATURES)
     binaries = arguments.binaries or built / "release"
     make(binaries.resolve(), arguments.output.resolve(), number, triple, time)
 

@@ -97,8 +97,8 @@ pub struct Settings {
     /// Directory of scenes to load as models.
     #[arg(long, env = "PLANTD_SCENES", value_name = "DIRECTORY")]
     pub scenes: Option<PathBuf>,
-    /// Directory in which plants survive the server.
-    #[arg(long, env = "PLANTD_STATE_DIRECTORY", value_name = "DIRECTORY")]
+    /// Directory in which plants survive the server, or an object store that servers share: `s3://bucket/folder`.
+    #[arg(long, env = "PLANTD_STATE_DIRECTORY", value_name = "DIRECTORY|URL")]
     pub state_directory: Option<PathBuf>,
     /// Seconds between two savings of the plants that change; 0 means only at the end.
     #[arg(long, env = "PLANTD_STATE_INTERVAL_S", value_name = "SECONDS")]

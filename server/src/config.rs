@@ -60,7 +60,8 @@ pub struct Config {
     /// Directory of scenes (`*.toml`, `*.json`) to load as models at the start, with their meshes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scenes: Option<PathBuf>,
-    /// Directory in which plants survive the server; not given means none.
+    /// Directory in which plants survive the server, or an object store that servers share, `s3://bucket/folder`; not
+    /// given means none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub state_directory: Option<PathBuf>,
     /// Time between two savings of the plants that change, s; 0 means only at the end.

@@ -20,6 +20,7 @@ SAFE = {
     "networkPolicy": {"from": [{"podSelector": {"matchLabels": {"app": "lab"}}}]},
     "config": "state_interval_s = 1.0\n[limits]\nplants = 10\n",
 }
+STORED = {**CLOSED, "state": {"store": "s3://lab/plantd", "storeSecret": "lab-bucket"}}
 KINDS = ["ConfigMap", "NetworkPolicy", "PodDisruptionBudget", "Service", "Service", "StatefulSet"]
 #: Each target by itself, and all of them.
 SCALED = [{"plants": 500, "waitingJobs": 0}, {"plants": 0, "waitingJobs": 0, "processors": 60}, {"processors": 60}]
@@ -73,7 +74,7 @@ def check_autoscaling(values: dict) -> None:
 def main() -> None:
     report = helm_python.lint(str(CHART), strict=True, values=CLOSED)
     assert not report["errors"], report
-    for values in (CLOSED, SAFE):
+    for values in (CLOSED, SAFE, STORED):
         parts = rendered(values)
         kinds = sorted(part["kind"] for part in parts)
         assert kinds == KINDS, kinds
@@ -87,6 +88,10 @@ def main() -> None:
         said = {entry["name"]: entry.get("value") for entry in pod["containers"][0]["env"]}
         scheme = "https" if "tls" in values else "http"
         assert said["PLANTD_ADVERTISE"] == f"{scheme}://$(PLANTD_NAME).plantd.$(NAMESPACE).svc:50051"
+        store = values.get("state", {}).get("store")
+        assert said["PLANTD_STATE_DIRECTORY"] == (store or "/var/lib/plantd/plants")
+        secrets = [entry["secretRef"]["name"] for entry in pod["containers"][0].get("envFrom", [])]
+        assert secrets == (["lab-bucket"] if store else []), secrets
         # It is not cut off while it drains or saves.
         assert pod["terminationGracePeriodSeconds"] > float(said["PLANTD_DRAIN_S"]) + 10
         mounts = {mount["name"] for mount in pod["containers"][0]["volumeMounts"]}
@@ -102,6 +107,7 @@ def main() -> None:
         assert is_refused({**CLOSED, "autoscaling": {"enabled": True, **wrong}}), wrong
     assert is_refused({}), "servers that everybody can reach, and nobody has said so"
     assert is_refused({"insecure": True, "replica": 3}), "an unknown value passes"
+    assert is_refused({**CLOSED, "state": {"store": "ftp://lab"}}), "a store that is none passes"
     assert is_refused({"insecure": True, "replicas": "three"}), "a wrong type passes"
     print(f"the chart is good for Kubernetes {', '.join(VERSIONS)}")
 
