@@ -119,6 +119,7 @@ fn floors() -> Vec<(String, Vec<String>)> {
             "models/scene/src",
             "models/src",
             "models/control/src",
+            "models/expect/src",
             "models/import/src",
             "server/src",
             "client/src",

@@ -293,6 +293,11 @@ impl RpcError {
         self.reason
     }
 
+    /// What is wrong, in words.
+    pub fn message(&self) -> &str {
+        &self.message
+    }
+
     /// What `with` has added under a name.
     pub fn detail(&self, name: &str) -> Option<&str> {
         self.extra.metadata.get(name).map(String::as_str)

@@ -25,12 +25,6 @@ mod input {
     pub(crate) mod numbers;
 }
 
-#[path = "../../../client/src/bin/plantctl/output"]
-mod output {
-    #[expect(dead_code, reason = "see above")]
-    pub(crate) mod text;
-}
-
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode};
 use std::thread;

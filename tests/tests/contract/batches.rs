@@ -1,5 +1,6 @@
 //! Rollouts with everything that a plant can have: each case moves as a plant does that is driven step by step.
 
+use futures::TryStreamExt as _;
 use plantd_client::{Client, Code, MatrixExt as _, diagonal, operating_point, v1, weights};
 use v1::fault_spec::{Kind, Target};
 use v1::output_channel::Source;
@@ -236,4 +237,66 @@ async fn a_scene_of_the_request_is_the_model_of_its_cases() {
         Some(v1::SetFeedbackRequest { id: "p1".to_owned(), ..Default::default() });
     let refused = client.rollout(of_a_plant).await;
     assert_refused(refused, Code::InvalidArgument, "INVALID_FIELD", "cases[0].feedback.id");
+}
+
+/// One case stays upright and the other falls; verdicts say so, with the time and the value of the sensor.
+#[tokio::test]
+async fn expectations_are_judged_case_by_case() {
+    let (_server, client) = server().await;
+    let expect = "[[expect]]\nnever_exceeds = { signal = \"|angle - pi|\", limit = 0.5 }\n\
+                  [[expect]]\nsettles = { signal = \"velocity(theta)\", to = 0, within = 0.2, by_s = 1 }\n\
+                  [[expect]]\neventually = { signal = \"energy\", low = -1e9 }\n\
+                  [[expect]]\nno_failures = true\n";
+    let held = v1::RolloutCase { feedback: Some(feedback(&client).await), ..Default::default() };
+    let request = |table| v1::RolloutRequest {
+        model: "cart-pole".to_owned(),
+        cases: vec![held.clone(), v1::RolloutCase::default()],
+        common: Some(v1::RolloutCase {
+            initial: Some(start()),
+            hold: 300,
+            channels: Some(channels()),
+            ..Default::default()
+        }),
+        every: 1,
+        expect: expect.to_owned(),
+        table,
+        ..Default::default()
+    };
+    let cases = client.rollout(request(false)).await.unwrap();
+    let mut cases: Vec<_> = cases.try_collect().await.unwrap();
+    cases.sort_by_key(|case| case.case_index);
+    let came_true = |case: &v1::RolloutResponse| {
+        case.verdicts.iter().map(|verdict| verdict.came_true).collect::<Vec<_>>()
+    };
+    assert_eq!(came_true(&cases[0]), [true; 4], "{:?}", cases[0].verdicts);
+    assert_eq!(came_true(&cases[1]), [false, false, true, true], "{:?}", cases[1].verdicts);
+    // It broke when the sensor first said so.
+    let fallen = &cases[1].verdicts[0];
+    let angle = |outputs: &v1::Outputs| (outputs.y[0] - std::f64::consts::PI).abs();
+    let first = cases[1].outputs.iter().position(|outputs| angle(outputs) > 0.5).unwrap();
+    assert_eq!(fallen.time_s, Some(cases[1].states[first].time_s));
+    assert_eq!(fallen.value, Some(angle(&cases[1].outputs[first])));
+
+    let answers = client.rollout(request(true)).await.unwrap();
+    let answers: Vec<_> = answers.try_collect().await.unwrap();
+    let table = answers[0].table.as_ref().unwrap();
+    let named = table.columns.iter().position(|name| name == "expect: no failures").unwrap();
+    assert_eq!(named + 1, table.columns.len());
+    for (row, index) in table.case_indices.iter().enumerate() {
+        let rows = table.rows.as_ref().unwrap();
+        let numbers =
+            (named - 3..=named).map(|column| rows.data[row * table.columns.len() + column] == 1.0);
+        assert_eq!(numbers.collect::<Vec<_>>(), came_true(&cases[*index as usize]));
+    }
+
+    // What there is not is named.
+    let refused = v1::RolloutRequest {
+        expect: "[[expect]]\nnever_exceeds = { signal = \"phi\", limit = 1 }".to_owned(),
+        common: Some(v1::RolloutCase { hold: 3, ..Default::default() }),
+        ..request(false)
+    };
+    let refused = client.rollout(refused).await.map(drop).unwrap_err();
+    let violation = &refused.violations()[0];
+    assert_eq!(violation.field, "expect");
+    assert!(violation.description.contains("`phi`"), "{refused}");
 }

@@ -92,6 +92,10 @@ class Piece:
     workers: int
 
 
+#: How the names of columns begin that say whether an expectation came true.
+_EXPECT = "expect: "
+
+
 @dataclass(frozen=True, eq=False)
 class Done:
     """The ends of cases, a row for each, in the order of the cases. It can be pickled."""
@@ -100,7 +104,7 @@ class Done:
     cases: npt.NDArray[np.int64]
     #: [case][column]: NaN in a case that was not begun.
     rows: Array
-    #: Names of the columns: ``steps``; ``end``; the last x; its least and its largest entries; ``cost``.
+    #: Names of the columns: ``steps``; ``end``; the last x; its least and its largest entries; ``cost``; expectations.
     columns: tuple[str, ...]
     #: Errors by the index of the case.
     errors: dict[int, PlantdError]
@@ -139,13 +143,27 @@ class Done:
         """Cost of each case, with ``cost``."""
         if not self._has_cost:
             raise ValueError("the batch was not asked for `cost`")
-        return self.rows[:, -1]
+        return self.rows[:, len(self.columns) - len(self.expectations) - 1]
+
+    @property
+    def expectations(self) -> tuple[str, ...]:
+        """The expectations in words, with ``expect``."""
+        marked = (name.partition(_EXPECT) for name in self.columns)
+        return tuple(sentence for before, mark, sentence in marked if mark and not before)
+
+    @property
+    def came_true(self) -> npt.NDArray[np.bool_]:
+        """Whether each expectation came true, with ``expect``; not in a case that never began: [case][expectation]."""
+        count = len(self.expectations)
+        if not count:
+            raise ValueError("the batch was not asked for `expect`")
+        return self.rows[:, len(self.columns) - count :] == 1
 
     def _part(self, number: int) -> Array:
         """The last x, its least, or its largest entries."""
         if number and not self._has_extremes:
             raise ValueError("the batch was not asked for `extremes`")
-        size = (len(self.columns) - 2 - self._has_cost) // (3 if self._has_extremes else 1)
+        size = (len(self.columns) - 2 - self._has_cost - len(self.expectations)) // (3 if self._has_extremes else 1)
         start = 2 + number * size
         return self.rows[:, start : start + size]
 
@@ -209,6 +227,7 @@ def pieces(
     common: Case | None = None,
     extremes: bool = False,
     cost: Mapping[str, npt.ArrayLike] | None = None,
+    expect: str = "",
     workers: int = 1,
     **stepping: Unpack[Stepping],
 ) -> Iterator[Piece]:
@@ -219,7 +238,8 @@ def pieces(
     before theirs. ``extremes`` asks for the least and the largest entries of x over the steps. ``cost`` has weights
     ``q``, ``r`` and ``end``, diagonals or matrices, and ``x_reference`` and ``u_reference``: a case costs the sum
     over its steps of e' q e + d' r d, with the differences e and d of x and u from these references, and e' end e
-    of its last state. ``workers`` is the number of threads of the server by which `run` does a piece, 0 for one for
+    of its last state. ``expect`` has expectations as scenarios of ``plantctl test`` have them, tables ``[[expect]]`` in
+    TOML: see `Done.came_true`. ``workers`` is the number of threads of the server by which `run` does a piece, 0 for one for
     each processor; engines run several pieces side by side.
     """
     if not isinstance(size, int) or size < 1:
@@ -234,6 +254,7 @@ def pieces(
         common=common,
         extremes=extremes,
         cost=None if cost is None else _cost(cost),
+        expect=expect,
         table=True,
     )
     return _cut(head, cases, size, workers)

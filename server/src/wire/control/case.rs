@@ -15,6 +15,7 @@ use crate::core::plant::core::Core;
 use crate::core::plant::watchdog::Trip;
 use crate::core::session::lease::Lease;
 use crate::core::workers::pool::Abandoned;
+use crate::wire::control::expected::{Expected, Watched};
 use crate::wire::message::start::{self, Start};
 use crate::wire::message::{checks, states, weights};
 use crate::wire::plants::change::ParametersError;
@@ -33,6 +34,7 @@ pub(crate) struct Shared {
     pub(crate) every: Option<usize>,
     pub(crate) extremes: bool,
     pub(crate) cost: Option<Cost>,
+    pub(crate) expected: Option<Expected>,
     /// What cases have that do not say otherwise, but for inputs.
     pub(crate) common: v1::RolloutCase,
     /// Of plants that are nobody's, where there are any.
@@ -124,6 +126,8 @@ pub(crate) struct Simulation {
     held: Vec<f64>,
     taken: usize,
     x: Vec<f64>,
+    /// What was seen of it, where something is expected.
+    watched: Option<Watched>,
     response: v1::RolloutResponse,
 }
 
@@ -131,7 +135,8 @@ impl Simulation {
     pub(crate) fn new(case: Case, shared: Arc<Shared>) -> Self {
         let response = v1::RolloutResponse { case_index: case.index, ..Default::default() };
         let x = Vec::new();
-        Self { case, shared, machine: None, held: Vec::new(), taken: 0, x, response }
+        let (machine, held, watched) = (None, Vec::new(), None);
+        Self { case, shared, machine, held, taken: 0, x, watched, response }
     }
 
     /// Goes on for a part; the answer, and the last state, when the case has ended.
@@ -177,6 +182,10 @@ impl Simulation {
         if let Some(cost) = &self.shared.cost {
             self.response.cost += cost.of_state(cost.end.as_ref(), &self.shared.model, &self.x);
         }
+        if let (Some(expected), Some(watched)) = (&self.shared.expected, &self.watched) {
+            let failure = outcome.as_ref().err().map(|fault| fault.message().to_owned());
+            self.response.verdicts = expected.judge(watched, failure)?;
+        }
         outcome.map(|()| true)
     }
 
@@ -191,13 +200,61 @@ impl Simulation {
             self.response.min = self.x.clone();
             self.response.max = self.x.clone();
         }
+        let outputs = match &machine {
+            Machine::Map(_) => Vec::new(),
+            Machine::Whole(lease) => lease.session().channels().0.names.clone(),
+        };
+        let expected = self.shared.expected.as_ref();
+        self.watched =
+            expected.map(|expected| expected.watch(&self.shared.model, &outputs)).transpose()?;
         self.machine = Some(machine);
+        let d = self.shared.model.dimensions();
+        let prescribed = &self.x[d.dynamic..d.coordinates()];
+        let at_rest = [&vec![0.0; d.input() - prescribed.len()][..], prescribed].concat();
+        self.watch(&at_rest)
+    }
+
+    /// Looks at the plant after a step with an input, where something is expected.
+    fn watch(&mut self, u: &[f64]) -> Result<(), RpcError> {
+        let (Some(expected), Some(watched)) = (&self.shared.expected, &mut self.watched) else {
+            return Ok(());
+        };
+        let energy = |plant: &mut Plant| {
+            let energy = plant.energy();
+            [energy.kinetic_j, energy.potential_j]
+        };
+        match &mut self.machine {
+            None => {}
+            Some(Machine::Map(plant)) => {
+                let state = states::plant_state(plant);
+                let energy = expected.uses_energy.then(|| energy(plant));
+                watched.push(expected, &state, u, &[], energy);
+            }
+            Some(Machine::Whole(lease)) => {
+                let (u, uses_energy) = (u.to_vec(), expected.uses_energy);
+                let look = move |core: &mut Core| {
+                    let applied = core.applied_input().map_or(u, <[f64]>::to_vec);
+                    let copy = uses_energy.then(|| core.plant().clone());
+                    (states::shown(&core.published()), states::core_outputs(core), applied, copy)
+                };
+                let (state, outputs, applied, copy) = lease.session().with_core(look);
+                let y = outputs.map(|outputs| outputs.y).unwrap_or_default();
+                watched.push(
+                    expected,
+                    &state,
+                    &applied,
+                    &y,
+                    copy.map(|mut copy| energy(&mut copy)),
+                );
+            }
+        }
         Ok(())
     }
 
     /// Takes a step, and notes what is asked for of it.
     fn step(&mut self) -> Result<(), RpcError> {
-        let Self { case, shared, machine: Some(machine), held, taken, x, response } = self else {
+        let Self { case, shared, machine: Some(machine), held, taken, x, response, .. } = self
+        else {
             return Err(RpcError::internal("a case that has not begun"));
         };
         let u = if *taken < case.inputs.count() { case.inputs.get(*taken) } else { held };
@@ -232,7 +289,11 @@ impl Simulation {
                 (*min, *max) = (min.min(*x), max.max(*x));
             }
         }
-        Ok(())
+        if shared.expected.is_none() {
+            return Ok(());
+        }
+        let u = u.to_vec();
+        self.watch(&u)
     }
 
     /// Adds the present state to the answer.

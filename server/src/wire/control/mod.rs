@@ -3,6 +3,7 @@
 pub(crate) mod analysis;
 pub(crate) mod case;
 pub(crate) mod derivatives;
+pub(crate) mod expected;
 pub(crate) mod kalman;
 pub(crate) mod mechanics;
 pub(crate) mod optimize;

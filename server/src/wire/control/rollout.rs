@@ -14,6 +14,7 @@ use crate::core::workers::pool::Abandoned;
 use crate::core::workers::queue::Admission;
 use crate::wire::answers::Answers;
 use crate::wire::control::case::{Case, Cost, Shared, Simulation};
+use crate::wire::control::expected::Expected;
 use crate::wire::control::points::model_and_settings;
 use crate::wire::message::{settings, start, states};
 use crate::wire::models::model::compile;
@@ -67,6 +68,8 @@ impl Rollout {
             cases.push(Case { index, start, inputs, steps, own });
         }
         let cost = request.cost.map(|cost| Cost::new(cost, &model)).transpose()?;
+        let expected =
+            expected(&request.expect, &model, settings.time_step_s, &common, &cases, limits)?;
         let shared = Shared {
             hub: Arc::clone(hub),
             model,
@@ -76,6 +79,7 @@ impl Rollout {
             every: if table { None } else { every },
             extremes: request.extremes,
             cost,
+            expected,
             common,
             metrics: LazyLock::new(Arc::default),
         };
@@ -135,6 +139,28 @@ fn check_feedback(field: &str, case: &v1::RolloutCase) -> Result<(), RpcError> {
     }
 }
 
+/// What is expected of the cases, if anything is.
+fn expected(
+    text: &str,
+    model: &Model,
+    time_step_s: f64,
+    common: &v1::RolloutCase,
+    cases: &[Case],
+    limits: &Limits,
+) -> Result<Option<Expected>, RpcError> {
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let steps = cases.iter().map(|case| case.steps).max().unwrap_or_default();
+    let has_channels =
+        common.channels.is_some() || cases.iter().any(|case| case.own.channels.is_some());
+    let expected = Expected::new(text, model, time_step_s, steps, has_channels)?;
+    let (name, limit) = ("trajectory_numbers", limits.trajectory_numbers);
+    let what = "numbers of signals that are kept of a case to judge it";
+    LimitExceeded::check(name, limit, what, expected.numbers(model, steps))?;
+    Ok(Some(expected))
+}
+
 /// Names of a table's columns.
 fn columns(shared: &Shared) -> Vec<String> {
     let x = states::state_names(&shared.model);
@@ -145,6 +171,8 @@ fn columns(shared: &Shared) -> Vec<String> {
         names.extend(x.iter().map(|name| format!("max {name}")));
     }
     names.extend(shared.cost.as_ref().map(|_| "cost".to_owned()));
+    let expected = shared.expected.iter().flat_map(Expected::sentences);
+    names.extend(expected.map(|sentence| format!("expect: {sentence}")));
     names
 }
 
@@ -167,9 +195,12 @@ fn table_of(shared: &Shared, columns: &[String], cases: Vec<Ended>) -> v1::Rollo
         data.extend(x);
         data.extend(case.min);
         data.extend(case.max);
-        if shared.cost.is_some() && data.len() + 1 == row + columns.len() {
+        let expected = shared.expected.as_ref().map_or(0, |expected| expected.sentences().count());
+        if shared.cost.is_some() && data.len() + 1 + expected == row + columns.len() {
             data.push(case.cost);
         }
+        data.resize(row + columns.len() - expected, f64::NAN);
+        data.extend(case.verdicts.iter().map(|verdict| f64::from(verdict.came_true)));
         data.resize(row + columns.len(), f64::NAN);
         table.case_indices.push(case.case_index);
         let case_index = case.case_index;

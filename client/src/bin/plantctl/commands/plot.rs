@@ -15,8 +15,9 @@ use crate::figure::browser;
 use crate::figure::chart::{self, Curve};
 use crate::figure::terminal;
 use crate::output::page::{Page, table};
-use crate::scenario::samples::{Columns, Sample, Samples};
+use crate::scenario::columns::{Columns, Sample};
 use crate::server::context::Context;
+use plantd_expect::Samples;
 
 /// Columns where the terminal does not say how many it has.
 const COLUMNS: usize = 80;

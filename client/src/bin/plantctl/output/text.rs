@@ -1,5 +1,7 @@
 //! Numbers for people.
 
+pub(crate) use plantd_expect::short;
+
 /// The name of an entry, or its index if it has none.
 pub(crate) fn label(names: &[String], index: usize) -> String {
     names.get(index).cloned().unwrap_or_else(|| index.to_string())
@@ -18,19 +20,6 @@ pub(crate) fn number(x: f64) -> String {
     } else {
         format!("{x:.6e}")
     }
-}
-
-/// A number for people: four significant digits where more would only be noise.
-pub(crate) fn short(x: f64) -> String {
-    if !x.is_finite() {
-        return x.to_string();
-    }
-    let magnitude = x.abs();
-    if magnitude != 0.0 && !(1e-3..1e6).contains(&magnitude) {
-        return format!("{x:.3e}");
-    }
-    let text = format!("{x:.4}");
-    text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
 /// Numbers, comma-separated.

@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use crate::output::markup::escaped;
 use crate::report::plot::svg;
 use crate::report::results::{Replay, Report, ScenarioResult};
-use crate::scenario::verdict::{Curve, Verdict};
 use crate::trial::outcome::{Outcome, Status};
+use plantd_expect::{Curve, Verdict};
 
 /// Cases that passed, and that did not, of each scenario that are plotted.
 const PASSED_PLOTTED: usize = 10;

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use crate::figure::axis::{Axis, thinned};
 use crate::output::markup::escaped;
 use crate::output::text::short;
-use crate::scenario::verdict::Curve;
+use plantd_expect::Curve;
 
 const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 220.0;

@@ -8,9 +8,9 @@ use serde_json::json;
 use crate::output::page::{Cell, Page, Table, table};
 use crate::output::printer::{GOOD, Output, WRONG};
 use crate::report::results::{Report, UnusableFile};
-use crate::scenario::verdict::Verdict;
 use crate::trial::outcome::{Outcome, Status};
 use crate::trial::prepared::PreparedScenario;
+use plantd_expect::Verdict;
 
 /// A case by the name of its scenario and its own.
 pub(crate) fn title(scenario: &str, case: &str) -> String {

@@ -10,8 +10,8 @@ use serde::Deserialize;
 
 use crate::input::numbers::Vector;
 use crate::scenario::distribution::{Distribution, case_seed};
-use crate::scenario::expectation::Expectation;
-use crate::scenario::expression::Expression;
+use plantd_expect::Expectation;
+use plantd_expect::Expression;
 
 /// Most cases of one scenario.
 const CASES_MAX: usize = 100_000;

@@ -1,8 +1,5 @@
-//! Scenarios of `plantctl test`: what a file may say, and whether what it expects came true.
+//! Scenarios of `plantctl test`: what a file may say, and the signals of a plant by their names.
 
+pub(crate) mod columns;
 pub(crate) mod distribution;
-pub(crate) mod expectation;
-pub(crate) mod expression;
 pub(crate) mod file;
-pub(crate) mod samples;
-pub(crate) mod verdict;

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::scenario::verdict::{Curve, Verdict};
+use plantd_expect::{Curve, Verdict};
 
 /// What came of a case.
 pub(crate) struct Outcome {

@@ -10,10 +10,10 @@ use crate::contract::{json, names};
 use crate::input::files::{parse_table, read_result};
 use crate::input::settings::Settings;
 use crate::input::weights::diagonals;
-use crate::scenario::expression::Expression;
+use crate::scenario::columns::Columns;
 use crate::scenario::file::{Case, Controller, Event, Inputs, Lqr, Plant, Reference, Scenario};
-use crate::scenario::samples::Columns;
 use crate::trial::server::TestServer;
+use plantd_expect::Expression;
 
 /// Part of a time step by which a time may miss a step and still mean it.
 const STEP_ROUNDING: f64 = 1e-6;

@@ -7,13 +7,14 @@ use anyhow::{Context as _, Result, ensure};
 use plantd_client::{Answers, Error, v1};
 use tokio::time::{Instant, sleep_until, timeout_at};
 
+use crate::scenario::columns::Sample;
 use crate::scenario::file::{Case, Controller, Event, Pace};
-use crate::scenario::samples::{Sample, Samples};
-use crate::scenario::verdict::{Curve, Facts, judge};
 use crate::trial::outcome::Outcome;
 use crate::trial::prepared::{PreparedScenario, feedback, first_step, initial_state, settings};
 use crate::trial::process::{Assignment, Process};
 use crate::trial::server::TestServer;
+use plantd_expect::Samples;
+use plantd_expect::{Curve, Facts, judge};
 
 /// Samples that may wait to be read.
 const WATCH_QUEUE: u32 = 2048;

@@ -2,17 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use plantd_client::v1;
-
-use crate::contract::names;
-
 /// Columns of equal length: `q(theta)`, `p(theta)`, `v(lift)`, `velocity(theta)`, `u(tau)`,
 /// `force(pin.x)`, `kinetic`, `potential`, `y(tip.x)`; with a reference also `ref.q(theta)` and
 /// `error.q(theta)`, and so on.
 ///
 /// A column of inputs holds at each sample the input of the step that led there.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Samples {
+pub struct Samples {
     time_s: Vec<f64>,
     columns: BTreeMap<String, Vec<f64>>,
 }
@@ -22,17 +18,17 @@ const BARE: [&str; 4] = ["q", "u", "force", "y"];
 
 impl Samples {
     /// Number of samples.
-    pub(crate) fn len(&self) -> usize {
+    pub fn len(&self) -> usize {
         self.time_s.len()
     }
 
     /// Time of each sample, s.
-    pub(crate) fn time_s(&self) -> &[f64] {
+    pub fn time_s(&self) -> &[f64] {
         &self.time_s
     }
 
     /// A column by the name that an expression has for it.
-    pub(crate) fn signal(&self, name: &str) -> Result<Vec<f64>, String> {
+    pub fn signal(&self, name: &str) -> Result<Vec<f64>, String> {
         if name == "energy" && !self.columns.contains_key("q(energy)") {
             let (kinetic, potential) = (self.signal("kinetic")?, self.signal("potential")?);
             return Ok(kinetic.iter().zip(potential).map(|(t, v)| t + v).collect());
@@ -59,7 +55,7 @@ impl Samples {
     }
 
     /// Adds an entry to a column.
-    pub(crate) fn push(&mut self, name: &str, value: f64) {
+    pub fn push(&mut self, name: &str, value: f64) {
         match self.columns.get_mut(name) {
             Some(column) => column.push(value),
             None => self.put(name, vec![value]),
@@ -67,12 +63,12 @@ impl Samples {
     }
 
     /// Adds the time of a sample, s.
-    pub(crate) fn push_time(&mut self, time_s: f64) {
+    pub fn push_time(&mut self, time_s: f64) {
         self.time_s.push(time_s);
     }
 
     /// Sets a column.
-    pub(crate) fn put(&mut self, name: &str, values: Vec<f64>) {
+    pub fn put(&mut self, name: &str, values: Vec<f64>) {
         self.columns.insert(name.to_owned(), values);
     }
 
@@ -82,71 +78,101 @@ impl Samples {
     }
 }
 
-/// The columns of a model, in the order of the contract's vectors.
+/// Names of the entries of a plant's vectors, in their order.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Columns {
-    q: Vec<String>,
-    p: Vec<String>,
-    v: Vec<String>,
+pub struct Names {
+    /// Of all coordinates.
+    pub coordinates: Vec<String>,
+    /// Of those with a momentum.
+    pub dynamic: Vec<String>,
+    /// Of those that are prescribed.
+    pub prescribed: Vec<String>,
+    /// Of the inputs, without prescribed coordinates.
+    pub inputs: Vec<String>,
+    /// Of the constraints.
+    pub constraints: Vec<String>,
+    /// Of what sensors deliver.
+    pub outputs: Vec<String>,
+}
+
+/// The columns of a plant.
+#[derive(Clone, Debug, Default)]
+pub struct Columns {
+    x: Vec<String>,
     velocity: Vec<String>,
     u: Vec<String>,
     force: Vec<String>,
     y: Vec<String>,
-    rotations: Vec<u32>,
     has_reference: bool,
     has_energy: bool,
 }
 
-/// One sample, as the contract has it.
+/// One sample.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Sample<'a> {
-    pub(crate) state: &'a v1::State,
-    pub(crate) time_step_s: f64,
+pub struct Sample<'a> {
+    /// The plant's time, s.
+    pub time_s: f64,
+    /// Time step, s.
+    pub time_step_s: f64,
+    /// State `(q, p, v)`.
+    pub x: &'a [f64],
+    /// Velocities of all coordinates.
+    pub velocity: &'a [f64],
+    /// Impulses of the constraints; none before the first step.
+    pub multipliers: &'a [f64],
     /// Input of the step that led here.
-    pub(crate) u: &'a [f64],
+    pub u: &'a [f64],
     /// What sensors deliver.
-    pub(crate) y: &'a [f64],
-    pub(crate) energy: Option<&'a v1::Energy>,
-    /// State and input of the reference.
-    pub(crate) reference: Option<(&'a [f64], &'a [f64])>,
+    pub y: &'a [f64],
+    /// Kinetic and potential energy, J.
+    pub energy: Option<[f64; 2]>,
+    /// Where the plant should be.
+    pub reference: Option<Reference<'a>>,
+}
+
+/// Where a plant should be.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Reference<'a> {
+    /// State.
+    pub x: &'a [f64],
+    /// Input.
+    pub u: &'a [f64],
+    /// The plant's state seen from there, on the group for rotations.
+    pub error: &'a [f64],
 }
 
 impl Columns {
-    /// The columns of a model, with outputs of these names.
-    pub(crate) fn new(
-        model: &v1::Model,
-        outputs: &[String],
-        has_reference: bool,
-        has_energy: bool,
-    ) -> Self {
-        fn named<'a>(quantity: &str, names: impl IntoIterator<Item = &'a String>) -> Vec<String> {
-            names.into_iter().map(|name| format!("{quantity}({name})")).collect()
+    /// The columns of a plant with these names.
+    pub fn new(names: &Names, has_reference: bool, has_energy: bool) -> Self {
+        fn named(quantity: &str, names: &[String]) -> Vec<String> {
+            names.iter().map(|name| format!("{quantity}({name})")).collect()
         }
-        let coordinates = || model.coordinates.iter().map(|c| &c.name);
-        let prescribed = || names::prescribed(model);
+        let Names { coordinates, dynamic, prescribed, inputs, constraints, outputs } = names;
+        let x = [named("q", coordinates), named("p", dynamic), named("v", prescribed)].concat();
         Self {
-            q: named("q", coordinates()),
-            p: named("p", names::dynamic(model)),
-            v: named("v", prescribed()),
-            velocity: named("velocity", coordinates()),
-            u: named("u", model.inputs.iter().chain(prescribed())),
-            force: named("force", &model.constraints),
+            x,
+            velocity: named("velocity", coordinates),
+            u: [named("u", inputs), named("u", prescribed)].concat(),
+            force: named("force", constraints),
             y: named("y", outputs),
-            rotations: plantd_client::rotations(model),
             has_reference,
             has_energy,
         }
     }
 
-    fn x(&self) -> impl Iterator<Item = &String> {
-        self.q.iter().chain(&self.p).chain(&self.v)
+    /// How many there are.
+    pub fn count(&self) -> usize {
+        let x = self.x.len() * if self.has_reference { 3 } else { 1 };
+        let u = self.u.len() * if self.has_reference { 2 } else { 1 };
+        let energy = if self.has_energy { 2 } else { 0 };
+        1 + x + u + energy + self.velocity.len() + self.force.len() + self.y.len()
     }
 
     /// Samples that have all columns and no rows.
-    pub(crate) fn empty(&self) -> Samples {
+    pub fn empty(&self) -> Samples {
         let mut samples = Samples::default();
         let others = [&self.velocity, &self.u, &self.force, &self.y];
-        for name in self.x().chain(others.into_iter().flatten()) {
+        for name in self.x.iter().chain(others.into_iter().flatten()) {
             samples.put(name, Vec::new());
         }
         if self.has_energy {
@@ -154,7 +180,7 @@ impl Columns {
             samples.put("potential", Vec::new());
         }
         if self.has_reference {
-            for name in self.x() {
+            for name in &self.x {
                 samples.put(&format!("ref.{name}"), Vec::new());
                 samples.put(&format!("error.{name}"), Vec::new());
             }
@@ -165,48 +191,38 @@ impl Columns {
         samples
     }
 
-    /// Adds a sample. What the server did not send is NaN, which no expectation takes for good.
-    pub(crate) fn push(&self, samples: &mut Samples, sample: Sample<'_>) {
-        let Sample { state, time_step_s, u, y, energy, reference } = sample;
+    /// Adds a sample. What is not known is NaN, which no expectation takes for good.
+    pub fn push(&self, samples: &mut Samples, sample: Sample<'_>) {
+        let Sample { time_s, time_step_s, x, velocity, multipliers, u, y, energy, reference } =
+            sample;
         let entry = |values: &[f64], i: usize| values.get(i).copied().unwrap_or(f64::NAN);
-        samples.push_time(state.time_s);
-        let x = [state.q.as_slice(), &state.p, &state.v].concat();
-        for (i, name) in self.x().enumerate() {
-            samples.push(name, entry(&x, i));
-        }
-        for (i, name) in self.velocity.iter().enumerate() {
-            samples.push(name, entry(&state.velocity, i));
-        }
-        for (i, name) in self.u.iter().enumerate() {
-            samples.push(name, entry(u, i));
-        }
-        for (i, name) in self.y.iter().enumerate() {
-            samples.push(name, entry(y, i));
+        samples.push_time(time_s);
+        let given = [(&self.x, x), (&self.velocity, velocity), (&self.u, u), (&self.y, y)];
+        for (names, values) in given {
+            for (i, name) in names.iter().enumerate() {
+                samples.push(name, entry(values, i));
+            }
         }
         for (i, name) in self.force.iter().enumerate() {
             // Before the first step there are none.
-            let impulse =
-                if state.multipliers.is_empty() { 0.0 } else { entry(&state.multipliers, i) };
+            let impulse = if multipliers.is_empty() { 0.0 } else { entry(multipliers, i) };
             samples.push(name, impulse / time_step_s);
         }
         if self.has_energy {
-            samples.push("kinetic", energy.map_or(f64::NAN, |e| e.kinetic_j));
-            samples.push("potential", energy.map_or(f64::NAN, |e| e.potential_j));
+            let [kinetic, potential] = energy.unwrap_or([f64::NAN; 2]);
+            samples.push("kinetic", kinetic);
+            samples.push("potential", potential);
         }
         if !self.has_reference {
             return;
         }
-        let (x_reference, u_reference) = reference.unwrap_or_default();
-        let error = match x_reference.len() == x.len() {
-            true => plantd_client::difference(x_reference, &x, &self.rotations),
-            false => Vec::new(),
-        };
-        for (i, name) in self.x().enumerate() {
-            samples.push(&format!("ref.{name}"), entry(x_reference, i));
-            samples.push(&format!("error.{name}"), entry(&error, i));
+        let reference = reference.unwrap_or_default();
+        for (i, name) in self.x.iter().enumerate() {
+            samples.push(&format!("ref.{name}"), entry(reference.x, i));
+            samples.push(&format!("error.{name}"), entry(reference.error, i));
         }
         for (i, name) in self.u.iter().enumerate() {
-            samples.push(&format!("ref.{name}"), entry(u_reference, i));
+            samples.push(&format!("ref.{name}"), entry(reference.u, i));
         }
     }
 }
@@ -215,42 +231,36 @@ impl Columns {
 mod tests {
     use super::*;
 
-    fn model() -> v1::Model {
-        let coordinate = |name: &str, prescribed| v1::Coordinate {
-            name: name.to_owned(),
-            prescribed,
-            ..Default::default()
-        };
-        v1::Model {
-            coordinates: vec![coordinate("theta", false), coordinate("lift", true)],
-            inputs: vec!["tau".to_owned()],
-            constraints: vec!["pin.x".to_owned()],
-            ..Default::default()
+    fn names(output: &str) -> Names {
+        let names = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect();
+        Names {
+            coordinates: names(&["theta", "lift"]),
+            dynamic: names(&["theta"]),
+            prescribed: names(&["lift"]),
+            inputs: names(&["tau"]),
+            constraints: names(&["pin.x"]),
+            outputs: names(&[output]),
         }
     }
 
     #[test]
     fn every_entry_of_a_sample_has_its_name() {
-        let columns = Columns::new(&model(), &["tip.x".to_owned()], true, true);
+        let columns = Columns::new(&names("tip.x"), true, true);
         let mut samples = columns.empty();
-        let state = v1::State {
-            time_s: 0.5,
-            q: vec![1.0, 2.0],
-            p: vec![3.0],
-            v: vec![4.0],
-            multipliers: vec![5.0],
-            velocity: vec![3.5, 4.0],
-            ..Default::default()
-        };
-        let energy = v1::Energy { kinetic_j: 6.0, potential_j: 7.0 };
-        let reference = ([0.5, 0.0, 0.0, 0.0], [9.0, 9.5]);
         let sample = Sample {
-            state: &state,
+            time_s: 0.5,
             time_step_s: 0.1,
+            x: &[1.0, 2.0, 3.0, 4.0],
+            velocity: &[3.5, 4.0],
+            multipliers: &[5.0],
             u: &[8.0, 8.5],
             y: &[1.5],
-            energy: Some(&energy),
-            reference: Some((&reference.0, &reference.1)),
+            energy: Some([6.0, 7.0]),
+            reference: Some(Reference {
+                x: &[0.5, 0.0, 0.0, 0.0],
+                u: &[9.0, 9.5],
+                error: &[0.5, 2.0, 3.0, 4.0],
+            }),
         };
         columns.push(&mut samples, sample);
         for (name, value) in [
@@ -276,17 +286,21 @@ mod tests {
             assert_eq!(samples.signal(name), Ok(vec![value]), "{name}");
         }
         assert_eq!(samples.time_s(), [0.5]);
+        // Each of them, and the time.
+        assert_eq!(samples.columns.len() + 1, columns.count());
         assert!(samples.signal("error.tau").unwrap_err().contains("`error.tau`"));
     }
 
     #[test]
     fn what_was_not_sent_is_not_a_number() {
-        let columns = Columns::new(&model(), &[], false, true);
+        let columns = Columns::new(&names("tip.x"), false, true);
         let mut samples = columns.empty();
-        let state = v1::State { q: vec![1.0], ..Default::default() };
         let sample = Sample {
-            state: &state,
+            time_s: 0.0,
             time_step_s: 0.1,
+            x: &[1.0],
+            velocity: &[],
+            multipliers: &[],
             u: &[],
             y: &[],
             energy: None,

@@ -6,7 +6,7 @@ use std::fmt;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use crate::scenario::samples::Samples;
+use crate::samples::Samples;
 
 /// Longest text of an expression, bytes; bounds how deep one can be.
 const TEXT_MAX_BYTES: usize = 500;
@@ -14,7 +14,7 @@ const TEXT_MAX_BYTES: usize = 500;
 /// A signal computed from what is seen of a plant, sample by sample.
 #[derive(Clone, Debug, Deserialize, PartialEq)]
 #[serde(try_from = "NumberOrText")]
-pub(crate) struct Expression {
+pub struct Expression {
     text: String,
     node: Node,
 }
@@ -95,7 +95,7 @@ const QUANTITIES: [&str; 7] = ["q", "p", "v", "velocity", "u", "force", "y"];
 
 impl Expression {
     /// Reads an expression.
-    pub(crate) fn parse(text: &str) -> Result<Self, String> {
+    pub fn parse(text: &str) -> Result<Self, String> {
         if text.len() > TEXT_MAX_BYTES {
             return Err(format!("the expression is longer than {TEXT_MAX_BYTES} bytes"));
         }
@@ -112,12 +112,12 @@ impl Expression {
     ///
     /// # Errors
     /// A signal that there is not, by name.
-    pub(crate) fn values(&self, samples: &Samples) -> Result<Vec<f64>, String> {
+    pub fn values(&self, samples: &Samples) -> Result<Vec<f64>, String> {
         self.node.values(samples)
     }
 
     /// Whether it needs the energies.
-    pub(crate) fn uses_energy(&self) -> bool {
+    pub fn uses_energy(&self) -> bool {
         self.node.any(&|name| ["energy", "kinetic", "potential"].contains(&name))
     }
 }

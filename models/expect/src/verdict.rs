@@ -1,59 +1,64 @@
 //! Whether what a scenario expects came true. Nothing but arithmetic on samples.
 
-use crate::output::text::short;
-use crate::scenario::expectation::{Bounds, Count, Expectation, OvershootBelow};
-use crate::scenario::expression::Expression;
-use crate::scenario::samples::Samples;
+use crate::expectation::{Bounds, Count, Expectation, OvershootBelow};
+use crate::expression::Expression;
+use crate::number::short;
+use crate::samples::Samples;
 
 /// Times closer than this are the same, s.
 const TIME_ROUNDING_S: f64 = 1e-9;
 
 /// What happened beside the signals.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Facts {
+pub struct Facts {
     /// Steps that were refused or failed: time and reason.
-    pub(crate) failures: Vec<(f64, String)>,
+    pub failures: Vec<(f64, String)>,
     /// Deadlines missed; only of a paced plant.
-    pub(crate) deadline_misses: Option<u64>,
+    pub deadline_misses: Option<u64>,
 }
 
 /// Whether an expectation came true, and why not.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Verdict {
+pub struct Verdict {
     /// The expectation, in words.
-    pub(crate) expectation: String,
+    pub expectation: String,
     /// None: it came true.
-    pub(crate) broken: Option<Break>,
+    pub broken: Option<Break>,
     /// In words: how near it came, or what broke it.
-    pub(crate) message: String,
+    pub message: String,
     /// What to plot; none for expectations without a signal.
-    pub(crate) curve: Option<Curve>,
+    pub curve: Option<Curve>,
 }
 
 /// Where an expectation broke.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Break {
+pub struct Break {
     /// Time, s; none if it is no single time.
-    pub(crate) time_s: Option<f64>,
+    pub time_s: Option<f64>,
     /// Value of the signal then.
-    pub(crate) value: Option<f64>,
+    pub value: Option<f64>,
 }
 
 /// A signal with its bounds and the time in which they hold.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Curve {
-    pub(crate) name: String,
-    pub(crate) values: Vec<f64>,
+pub struct Curve {
+    /// The signal, in words.
+    pub name: String,
+    /// Its values, sample by sample.
+    pub values: Vec<f64>,
     /// Entries that are infinite are no bounds.
-    pub(crate) low: Vec<f64>,
-    pub(crate) high: Vec<f64>,
-    pub(crate) from_s: f64,
-    pub(crate) until_s: f64,
+    pub low: Vec<f64>,
+    /// The same.
+    pub high: Vec<f64>,
+    /// The first time at which they hold, s.
+    pub from_s: f64,
+    /// The last time at which they hold, s.
+    pub until_s: f64,
 }
 
 impl Curve {
     /// A signal without bounds.
-    pub(crate) fn unbounded(signal: &Expression, samples: &Samples) -> Result<Self, String> {
+    pub fn unbounded(signal: &Expression, samples: &Samples) -> Result<Self, String> {
         let values = signal.values(samples)?;
         Ok(Self {
             name: signal.to_string(),
@@ -94,7 +99,7 @@ impl Curve {
 ///
 /// # Errors
 /// A signal that there is not, by name.
-pub(crate) fn judge(
+pub fn judge(
     expectation: &Expectation,
     samples: &Samples,
     facts: &Facts,
@@ -287,7 +292,7 @@ mod tests {
     use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
     use super::*;
-    use crate::scenario::expectation::tests::expectation;
+    use crate::expectation::tests::expectation;
 
     /// `x = 1 - exp(-t) cos(4 t)`, `line = t`, `tone = sin(2 pi t)`, over 5 s at 1 kHz.
     fn samples() -> Samples {

@@ -5,13 +5,13 @@ use std::fmt;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use crate::scenario::expression::Expression;
-use crate::scenario::samples::Samples;
+use crate::expression::Expression;
+use crate::samples::Samples;
 
 /// One expectation. What is not a number never meets one.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub(crate) enum Expectation {
+pub enum Expectation {
     /// From `by_s` on the signal stays within `within` of `to`.
     Settles(Settles),
     /// Between `from_s` and `until_s` the signal goes past `to`, seen from its value at `from_s`, by less
@@ -34,18 +34,20 @@ pub(crate) enum Expectation {
     NoFailures(bool),
 }
 
+/// A signal stays near a value from a time on.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Settles {
+pub struct Settles {
     pub(crate) signal: Expression,
     pub(crate) to: Expression,
     pub(crate) within: Expression,
     pub(crate) by_s: f64,
 }
 
+/// A signal goes past a value by little.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct OvershootBelow {
+pub struct OvershootBelow {
     pub(crate) signal: Expression,
     pub(crate) to: Expression,
     pub(crate) limit: Option<f64>,
@@ -55,9 +57,10 @@ pub(crate) struct OvershootBelow {
     pub(crate) until_s: Option<f64>,
 }
 
+/// A signal is never outside its bounds.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct StaysInside {
+pub struct StaysInside {
     pub(crate) signal: Expression,
     low: Option<Expression>,
     high: Option<Expression>,
@@ -68,9 +71,10 @@ pub(crate) struct StaysInside {
     pub(crate) until_s: Option<f64>,
 }
 
+/// A signal is never above a limit.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct NeverExceeds {
+pub struct NeverExceeds {
     pub(crate) signal: Expression,
     pub(crate) limit: Expression,
     #[serde(default)]
@@ -78,9 +82,10 @@ pub(crate) struct NeverExceeds {
     pub(crate) until_s: Option<f64>,
 }
 
+/// A signal is inside its bounds at some time.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Eventually {
+pub struct Eventually {
     pub(crate) signal: Expression,
     low: Option<Expression>,
     high: Option<Expression>,
@@ -91,17 +96,19 @@ pub(crate) struct Eventually {
     pub(crate) by_s: Option<f64>,
 }
 
+/// A signal ends near a value.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Final {
+pub struct Final {
     pub(crate) signal: Expression,
     pub(crate) to: Expression,
     pub(crate) within: Expression,
 }
 
+/// A signal is small in the mean.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct RmsBelow {
+pub struct RmsBelow {
     pub(crate) signal: Expression,
     pub(crate) limit: f64,
     #[serde(default)]
@@ -109,9 +116,10 @@ pub(crate) struct RmsBelow {
     pub(crate) until_s: Option<f64>,
 }
 
+/// There are fewer than so many.
 #[derive(Clone, Debug, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Count {
+pub struct Count {
     pub(crate) limit: u64,
 }
 
@@ -221,7 +229,7 @@ impl fmt::Display for Expectation {
 
 impl Expectation {
     /// Name of its key.
-    pub(crate) fn key(&self) -> &'static str {
+    pub fn key(&self) -> &'static str {
         match self {
             Self::Settles(_) => "settles",
             Self::OvershootBelow(_) => "overshoot_below",
@@ -236,7 +244,7 @@ impl Expectation {
     }
 
     /// Refuses what no run could be judged by.
-    pub(crate) fn check(&self, duration_s: f64) -> Result<(), String> {
+    pub fn check(&self, duration_s: f64) -> Result<(), String> {
         let inside = |key: &str, time_s: f64| match time_s >= 0.0 && time_s <= duration_s {
             true => Ok(()),
             false => Err(format!("{key} is {time_s}; it must lie between 0 and the duration")),
@@ -274,7 +282,7 @@ impl Expectation {
     }
 
     /// All its expressions.
-    pub(crate) fn expressions(&self) -> Vec<&Expression> {
+    pub fn expressions(&self) -> Vec<&Expression> {
         let optional = match self {
             Self::Settles(e) => vec![Some(&e.signal), Some(&e.to), Some(&e.within)],
             Self::OvershootBelow(e) => vec![Some(&e.signal), Some(&e.to)],
