@@ -18,7 +18,10 @@
 //! Prescribed coordinates move at a constant rate, `c_i` of the way at node `i`. Inputs that signals drive
 //! are taken at the nodes.
 
+pub(crate) mod balls;
 pub(crate) mod hessian;
+pub(crate) mod masses;
+pub(crate) mod slopes;
 pub(crate) mod sweep;
 pub(crate) mod system;
 
@@ -43,18 +46,24 @@ pub(crate) struct Collocation {
     /// One stage after the other, where there are many unknowns.
     sweep: Option<Box<Sweep>>,
     /// All at once; also for derivatives. Made when it is first needed.
-    pub(crate) system: Option<Box<System>>,
+    pub(crate) system: Box<System>,
 }
 
 impl Collocation {
     pub(crate) fn new(model: &Model, stages: usize) -> Self {
         let d = model.dimensions;
+        let tableau = Tableau::new(stages);
+        let by_masses = stages * d.dynamic > AT_ONCE || !model.orientations.is_empty();
+        let mut system = System::new(model, &tableau, by_masses);
+        if !by_masses {
+            system.make_dense(model, &tableau);
+        }
         Self {
-            tableau: Tableau::new(stages),
             inputs: vec![0.0; stages * d.inputs],
             motion: vec![0.0; 2 * stages * d.dynamic],
-            sweep: (stages * d.dynamic > AT_ONCE).then(|| Box::new(Sweep::new(model, stages))),
-            system: None,
+            sweep: None,
+            system: Box::new(system),
+            tableau,
         }
     }
 
@@ -75,9 +84,15 @@ impl Collocation {
         let mut report = match swept {
             Some(report) => report,
             None => {
-                let system = system.get_or_insert_with(|| Box::new(System::new(at.model, tableau)));
                 system.begin(at, motion, inputs, &mut workspace.mid.input_force);
-                let report = system.correct(workspace, at, inputs)?;
+                let report = match system.correct_by_masses(workspace, at, inputs) {
+                    Some(report) => report,
+                    None => {
+                        system.make_dense(at.model, tableau);
+                        system.begin(at, motion, inputs, &mut workspace.mid.input_force);
+                        system.correct(workspace, at, inputs)?
+                    }
+                };
                 let sums = [&mut *workspace.step.increment, &mut *workspace.step.impulse];
                 system.finish(at.model, motion, sums)?;
                 report

@@ -453,7 +453,7 @@ pub(crate) struct StageTangents {
     pub(crate) nodes: Vec<f64>,
     pub(crate) weights: Vec<f64>,
     pub(crate) coupling: Vec<f64>,
-    /// `Q_i`, `V_i` and inputs, stage by stage.
+    /// `Q_i`, `V_i` and inputs, stage by stage; of ball joints `η_i` and its rate.
     pub(crate) q: Vec<f64>,
     pub(crate) velocity: Vec<f64>,
     pub(crate) inputs: Vec<f64>,
@@ -467,4 +467,7 @@ pub(crate) struct StageTangents {
     /// The inverse of `∂R/∂Y`.
     pub(crate) matrix: DenseInverse,
     pub(crate) terms: Vec<Term>,
+    /// Momentum, and orientations of ball joints, at the start; with ball joints.
+    pub(crate) momentum: Vec<f64>,
+    pub(crate) orientations: Vec<Mat3>,
 }
