@@ -21,6 +21,7 @@
 pub(crate) mod balls;
 pub(crate) mod hessian;
 pub(crate) mod masses;
+pub(crate) mod secants;
 pub(crate) mod slopes;
 pub(crate) mod sweep;
 pub(crate) mod system;

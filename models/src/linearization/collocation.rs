@@ -41,9 +41,7 @@ impl Collocation {
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {
                 time_step_s: h,
-                nodes: self.tableau.nodes.clone(),
-                weights: self.tableau.weights.clone(),
-                coupling: self.tableau.coupling.clone(),
+                tableau: self.tableau.clone(),
                 q: vec![0.0; count * n],
                 velocity: vec![0.0; count * n],
                 inputs: vec![0.0; count * d.inputs],
@@ -130,7 +128,8 @@ impl StageTangents {
         let (n, inputs, next, count) =
             (theta.n(), theta.inputs(), theta.next(), tableau.nodes.len());
         let (hessian, width) = system.hessian();
-        let Self { coupling, tangent, impulses, slopes, terms, .. } = self;
+        let Self { tangent, impulses, slopes, terms, .. } = self;
+        let coupling = &tableau.coupling;
         tangent.fill(0.0);
         impulses.fill(0.0);
         slopes.fill(0.0);

@@ -32,6 +32,7 @@ use plantd_math::rows::{AlignedRows, Term, padded, spread};
 use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::integrator::report::StepError;
+use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
@@ -450,9 +451,7 @@ pub(crate) struct Part {
 #[derive(Clone, Debug)]
 pub(crate) struct StageTangents {
     pub(crate) time_step_s: f64,
-    pub(crate) nodes: Vec<f64>,
-    pub(crate) weights: Vec<f64>,
-    pub(crate) coupling: Vec<f64>,
+    pub(crate) tableau: Tableau,
     /// `Q_i`, `V_i` and inputs, stage by stage; of ball joints `η_i` and its rate.
     pub(crate) q: Vec<f64>,
     pub(crate) velocity: Vec<f64>,

@@ -65,7 +65,8 @@ pub(crate) struct Balls {
 /// The numbers of the three coordinates of a joint, of four stages.
 #[inline(always)]
 fn load(numbers: &[f64], coordinate: usize, width: usize, first: usize) -> Vec3<Lanes> {
-    Vec3([0, 1, 2].map(|a| Lanes::load(&numbers[(coordinate + a) * width + first..])))
+    let of = |a: usize| Lanes::load(&numbers[(coordinate + a) * width + first..]);
+    Vec3([of(0), of(1), of(2)])
 }
 
 #[inline(always)]
@@ -74,10 +75,10 @@ fn store(
     coordinate: usize,
     width: usize,
     first: usize,
-    Vec3(values): Vec3<Lanes>,
+    values: Vec3<Lanes>,
 ) {
-    for (a, value) in values.into_iter().enumerate() {
-        value.store(&mut numbers[(coordinate + a) * width + first..]);
+    for a in 0..3 {
+        values[a].store(&mut numbers[(coordinate + a) * width + first..]);
     }
 }
 
@@ -145,14 +146,15 @@ impl Balls {
     #[inline(always)]
     fn offset(&self, numbers: &[f64], coordinate: usize, g: usize) -> Vec3<Lanes> {
         let (width, groups) = (self.width, self.groups());
-        Vec3([0, 1, 2].map(|a| {
+        let of = |a: usize| {
             let mut sum = Lanes::ZERO;
             let numbers = &numbers[(coordinate + a) * width..][..self.count];
             for (column, x) in self.skew.chunks_exact(groups).zip(numbers) {
                 sum += column[g] * *x;
             }
             sum
-        }))
+        };
+        Vec3([of(0), of(1), of(2)])
     }
 
     /// Orientations of four stages.
@@ -166,7 +168,7 @@ impl Balls {
     pub(super) fn turn(&mut self, increment: &[f64]) {
         for (o, &c) in self.coordinates.iter().enumerate() {
             let sum = |a: usize| increment[(c + a) * self.width..][..self.count].iter().sum();
-            self.turns[o] = Turn::new(Vec3([0, 1, 2].map(sum)));
+            self.turns[o] = Turn::new(Vec3([sum(0), sum(1), sum(2)]));
             self.centers[o] = self.start[o].times(&self.turns[o].half());
         }
     }
@@ -220,7 +222,7 @@ impl Balls {
     /// `ΣT` of a joint.
     fn total(&self, o: usize) -> Vec3 {
         let sum = |a: usize| self.torque[(3 * o + a) * self.width..][..self.count].iter().sum();
-        Vec3([0, 1, 2].map(sum))
+        Vec3([sum(0), sum(1), sum(2)])
     }
 
     /// Writes the residuals of ball joints.

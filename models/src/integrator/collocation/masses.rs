@@ -7,6 +7,7 @@
 use plantd_math::scalar::{Lanes, Scalar, Side};
 use plantd_math::simd::wide;
 
+use crate::integrator::collocation::secants::Secants;
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::model::mechanism::Model;
@@ -21,16 +22,18 @@ pub(crate) struct Masses {
     inverse: Vec<Lanes>,
     /// Right-hand sides of four stages.
     pub(crate) right: Vec<Lanes>,
+    pub(crate) secants: Secants,
 }
 
 impl Masses {
-    pub(crate) fn new(model: &Model, width: usize) -> Self {
+    pub(crate) fn new(model: &Model, width: usize, count: usize) -> Self {
         let (groups, nd) = (width / Lanes::COUNT, model.dimensions.dynamic);
         Self {
             groups,
             entries: vec![Lanes::ZERO; groups * model.elimination.entries()],
             inverse: vec![Lanes::ZERO; groups * nd],
             right: vec![Lanes::ZERO; nd],
+            secants: Secants::new(nd * count),
         }
     }
 

@@ -116,7 +116,7 @@ impl System {
             l_v: lanes(groups * d.dynamic),
             balls: has_balls.then(|| Box::new(Balls::new(model, tableau))),
             force: lanes(if has_balls { groups * d.dynamic } else { 0 }),
-            masses: by_masses.then(|| Box::new(Masses::new(model, width))),
+            masses: by_masses.then(|| Box::new(Masses::new(model, width, count))),
             slopes: None,
             hessian: Hessian::default(),
             matrix: DenseInverse::new(0, 0),
@@ -524,6 +524,9 @@ impl System {
             report.iterations = iteration;
             let magnitude = self.evaluate(workspace, at, inputs);
             let size = self.find_residuals(state) / (f64::EPSILON * magnitude);
+            if std::env::var_os("TRACE").is_some() {
+                eprintln!("{iteration}: {size:.1e}");
+            }
             if !size.is_finite() {
                 break;
             }
@@ -531,7 +534,7 @@ impl System {
                 self.factor_masses(&mut masses, workspace, at, inputs);
                 report.factorizations = 1;
             }
-            self.correct_with(model, &mut masses);
+            self.correct_with(model, &mut masses, iteration == 1);
             report.residual = size;
             if size <= enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
                 if size > STALE {
@@ -573,7 +576,7 @@ impl System {
     }
 
     /// Corrects the increments with the mass matrices.
-    fn correct_with(&mut self, model: &Model, masses: &mut Masses) {
+    fn correct_with(&mut self, model: &Model, masses: &mut Masses, is_first: bool) {
         for g in 0..self.groups() {
             let first = g * Lanes::COUNT;
             let length = (self.count - first).min(Lanes::COUNT);
@@ -591,11 +594,18 @@ impl System {
                 balls.into_axes(&mut masses.right, g, true);
             }
             let lengths = Lanes::load(&self.lengths[first..]);
-            for (own, velocity) in self.increment.chunks_exact_mut(self.width).zip(&masses.right) {
+            for (own, velocity) in self.residual.chunks_exact_mut(self.count).zip(&masses.right) {
                 let change = *velocity * lengths;
-                let own = &mut own[first..first + length];
-                own.iter_mut().zip(change.0).for_each(|(y, change)| *y += change);
+                own[first..first + length].copy_from_slice(&change.0[..length]);
             }
+        }
+        if is_first {
+            masses.secants.forget();
+        }
+        masses.secants.improve(&mut self.residual);
+        let corrections = self.residual.chunks_exact(self.count);
+        for (own, corrections) in self.increment.chunks_exact_mut(self.width).zip(corrections) {
+            own.iter_mut().zip(corrections).for_each(|(y, change)| *y += change);
         }
     }
 
