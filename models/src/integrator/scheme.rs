@@ -11,7 +11,7 @@
 //! of which the sum is skew to the last bit: `μ_ij + μ_ji = 1`, which is what makes the method symplectic.
 //!
 //! **Symmetric compositions** take the midpoint rule with the steps `γ_1 h … γ_m h`, forward and
-//! backward, which keeps constraints and rotations: the five steps of Suzuki (Phys. Lett. A 146, 1990),
+//! backward, which keeps constraints: the five steps of Suzuki (Phys. Lett. A 146, 1990),
 //! and the nine and seventeen of Kahan and Li (Math. Comp. 66, 1997).
 
 use plantd_math::trigonometry::sin_cos_of;

@@ -23,7 +23,7 @@ use crate::linearization::linearize::{Linearization, StageTangents};
 use crate::linearization::parameters::Parameters;
 
 impl Collocation {
-    /// Linearizes at the solution.
+    /// Linearizes at the solution of the last step.
     pub(crate) fn linearize(
         &mut self,
         workspace: &mut Workspace,
@@ -54,7 +54,6 @@ impl Collocation {
                 orientations: vec![Mat3::IDENTITY; model.orientations.len()],
             })
         });
-        system.begin(at, &self.motion, &self.inputs, &mut workspace.mid.input_force);
         system.evaluate(workspace, at, &self.inputs);
         system.differentiate(workspace, at, &self.inputs);
         for i in 0..count {

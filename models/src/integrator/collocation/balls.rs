@@ -70,13 +70,7 @@ fn load(numbers: &[f64], coordinate: usize, width: usize, first: usize) -> Vec3<
 }
 
 #[inline(always)]
-fn store(
-    numbers: &mut [f64],
-    coordinate: usize,
-    width: usize,
-    first: usize,
-    values: Vec3<Lanes>,
-) {
+fn store(numbers: &mut [f64], coordinate: usize, width: usize, first: usize, values: Vec3<Lanes>) {
     for a in 0..3 {
         values[a].store(&mut numbers[(coordinate + a) * width + first..]);
     }

@@ -77,10 +77,8 @@ impl Secants {
         if known > 0 {
             let own = (self.seen - 1) % DEPTH;
             for k in 0..known {
-                let product = dot(
-                    &self.changed[own * size..][..size],
-                    &self.changed[k * size..][..size],
-                );
+                let product =
+                    dot(&self.changed[own * size..][..size], &self.changed[k * size..][..size]);
                 (self.products[own][k], self.products[k][own]) = (product, product);
             }
             let weights = self.weights(known, correction);
@@ -138,9 +136,8 @@ mod tests {
     fn linear_equations_are_solved_in_as_many_rounds() {
         let matrix = [[0.3, -1.4, 0.2], [1.1, 0.2, -0.6], [0.1, 0.5, 0.9]];
         let (mut x, mut secants) = ([0.0; 3], Secants::new(3));
-        let correction = |x: &[f64; 3]| -> [f64; 3] {
-            std::array::from_fn(|i| 1.0 - x[i] + dot(&matrix[i], x))
-        };
+        let correction =
+            |x: &[f64; 3]| -> [f64; 3] { std::array::from_fn(|i| 1.0 - x[i] + dot(&matrix[i], x)) };
         for _ in 0..4 {
             let mut step = correction(&x);
             secants.improve(&mut step);

@@ -1,4 +1,4 @@
-//! All stages corrected at once, and evaluated four side by side.
+//! All stages, evaluated four side by side, and corrected together.
 //!
 //! What belongs to the stages of a coordinate lies side by side, padded to whole [`Lanes`]: number `i` of
 //! coordinate `a` is entry `a·width + i`.
@@ -524,9 +524,6 @@ impl System {
             report.iterations = iteration;
             let magnitude = self.evaluate(workspace, at, inputs);
             let size = self.find_residuals(state) / (f64::EPSILON * magnitude);
-            if std::env::var_os("TRACE").is_some() {
-                eprintln!("{iteration}: {size:.1e}");
-            }
             if !size.is_finite() {
                 break;
             }

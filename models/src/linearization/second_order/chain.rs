@@ -191,7 +191,8 @@ impl Contraction {
             let length = stages.tableau.weights[j] * stages.time_step_s;
             self.place_tangent(stages, j, &mut tangent);
             let weight = |a: usize| {
-                let coupled = |i: usize| stages.tableau.coupling[i * count + j] * adjoint[a * count + i];
+                let coupled =
+                    |i: usize| stages.tableau.coupling[i * count + j] * adjoint[a * count + i];
                 length * (z_p[a] + (0..count).map(coupled).sum::<f64>())
             };
             let weights: Vec<f64> = (0..nd).map(weight).collect();
@@ -289,9 +290,8 @@ impl Contraction {
                 let turn = three(&slopes.increment, c);
                 let (to_end, carried) = (rotation::dexp(turn), rotation::exp(-turn));
                 for b in 0..3 {
-                    let of = |m: &Mat3<Dual>| -> f64 {
-                        (0..3).map(|k| z[c + k] * m.0[b][k].eps).sum()
-                    };
+                    let of =
+                        |m: &Mat3<Dual>| -> f64 { (0..3).map(|k| z[c + k] * m.0[b][k].eps).sum() };
                     row[c + b] += of(&carried);
                     let by = of(&to_end);
                     let own = &mut by_unknown[(c + b) * count..][..count];
@@ -322,7 +322,8 @@ impl Contraction {
             let (q, v) = (&mut by_q[a * stride..][..stride], &mut by_v[a * stride..][..stride]);
             if a < nd {
                 q[a] = 1.0;
-                let coupled = (0..count).map(|k| (stages.tableau.coupling[j * count + k], a * count + k));
+                let coupled =
+                    (0..count).map(|k| (stages.tableau.coupling[j * count + k], a * count + k));
                 add_rows(q, &stages.tangent, stride, &coupled.collect::<Vec<_>>());
                 let rate = 1.0 / (stages.tableau.weights[j] * h);
                 add_rows(v, &stages.tangent, stride, &[(rate, a * count + j)]);
