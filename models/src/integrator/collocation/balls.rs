@@ -240,9 +240,7 @@ impl Balls {
                         - load(momentum, c, self.width, first);
                     for (a, own) in own.0.into_iter().enumerate() {
                         let residual = &mut residual[(c + a) * self.count..][..self.count];
-                        let rest = &mut residual[first..];
-                        let length = rest.len().min(Lanes::COUNT);
-                        rest[..length].copy_from_slice(&own.0[..length]);
+                        own.store_some(&mut residual[first..]);
                     }
                 }
             }

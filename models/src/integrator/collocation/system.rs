@@ -332,7 +332,7 @@ impl System {
                     let sum = Self::coupled(&self.columns, groups, g, &own[..self.count]);
                     let momentum = Lanes::load(&self.momentum[a * self.width + first..]);
                     let value = (-momentum + state.p[a] + sum) + state.p_low[a];
-                    residual.copy_from_slice(&value.0[..residual.len()]);
+                    value.store_some(residual);
                     for (size, value) in sizes.0.iter_mut().zip(&*residual) {
                         *size = larger(*size, *value);
                     }
@@ -354,10 +354,7 @@ impl System {
                 for b in 0..nd {
                     let corrections = &self.residual[b * count..][..count];
                     let moved = Self::coupled(&self.columns, groups, g, corrections);
-                    let mut own = Lanes::ZERO;
-                    let rest = &corrections[first..];
-                    let length = rest.len().min(Lanes::COUNT);
-                    own.0[..length].copy_from_slice(&rest[..length]);
+                    let own = Lanes::load_some(&corrections[first..]);
                     for a in 0..nd {
                         let at = (a * n + b) * width + first;
                         let by_position = Lanes::load(&self.hessian.qq[at..]) * moved * lengths;
@@ -527,14 +524,18 @@ impl System {
             if !size.is_finite() {
                 break;
             }
+            let is_fast = settings.precision == Precision::Fast;
+            // What the correction will leave.
+            let left =
+                if is_fast && iteration > 1 { size * (size / previous).min(1.0) } else { size };
             if iteration == 1 {
                 self.factor_masses(&mut masses, workspace, at, inputs);
                 report.factorizations = 1;
             }
             self.correct_with(model, &mut masses, iteration == 1);
             report.residual = size;
-            if size <= enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
-                if size > STALE {
+            if left <= enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
+                if size > STALE && !is_fast {
                     self.evaluate(workspace, at, inputs);
                     self.find_residuals(state);
                 }
@@ -576,12 +577,10 @@ impl System {
     fn correct_with(&mut self, model: &Model, masses: &mut Masses, is_first: bool) {
         for g in 0..self.groups() {
             let first = g * Lanes::COUNT;
-            let length = (self.count - first).min(Lanes::COUNT);
             for (right, residual) in
                 masses.right.iter_mut().zip(self.residual.chunks_exact(self.count))
             {
-                *right = Lanes::ZERO;
-                right.0[..length].copy_from_slice(&residual[first..first + length]);
+                *right = Lanes::load_some(&residual[first..]);
             }
             if let Some(balls) = &self.balls {
                 balls.into_axes(&mut masses.right, g, false);
@@ -593,7 +592,7 @@ impl System {
             let lengths = Lanes::load(&self.lengths[first..]);
             for (own, velocity) in self.residual.chunks_exact_mut(self.count).zip(&masses.right) {
                 let change = *velocity * lengths;
-                own[first..first + length].copy_from_slice(&change.0[..length]);
+                change.store_some(&mut own[first..]);
             }
         }
         if is_first {
