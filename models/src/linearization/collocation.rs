@@ -14,13 +14,13 @@ use plantd_math::spatial::{Mat3, three};
 use crate::integrator::collocation::Collocation;
 use crate::integrator::collocation::slopes::Slopes;
 use crate::integrator::collocation::system::System;
+use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::{Linearization, StageTangents};
-use crate::linearization::parameters::Parameters;
 
 impl Collocation {
     /// Linearizes at the solution of the last step.

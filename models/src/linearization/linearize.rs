@@ -31,6 +31,7 @@ use plantd_math::pivoted_lu::PivotedLu;
 use plantd_math::rows::{AlignedRows, Term, padded, spread};
 use plantd_math::spatial::{Mat3, Vec3};
 
+use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Settings;
@@ -39,7 +40,6 @@ use crate::kkt::schur::room_for_schur;
 use crate::kkt::system::Factors;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::matrices::Layout;
-use crate::linearization::parameters::Parameters;
 use crate::model::mechanism::Model;
 
 /// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.

@@ -248,7 +248,7 @@ impl Balls {
     }
 
     /// From a right-hand side by `η` to one by turns of the body, or from its turn to the change of `η`.
-    pub(super) fn into_axes(&self, x: &mut [Lanes], g: usize, back: bool) {
+    pub(super) fn change_axes(&self, x: &mut [Lanes], g: usize, back: bool) {
         wide!({
             let no = self.coordinates.len();
             for (&c, chart) in self.coordinates.iter().zip(&self.charts[g * no..][..no]) {

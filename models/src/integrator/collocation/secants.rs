@@ -9,7 +9,7 @@
 //! which is Newton's method as far as the past rounds know the Jacobian.
 
 /// Rounds that count.
-const DEPTH: usize = 8;
+const DEPTH: usize = 16;
 /// Of a column of `ΔF`, what must be left beside the others, squared.
 const LEFT: f64 = 1e-12;
 
@@ -99,8 +99,8 @@ impl Secants {
         let mut right = [0.0; DEPTH];
         let mut counts = [false; DEPTH];
         for i in 0..known {
-            for j in 0..known {
-                matrix[i][j] = self.products[place(i)][place(j)];
+            for (j, entry) in matrix[i].iter_mut().enumerate().take(known) {
+                *entry = self.products[place(i)][place(j)];
             }
             let changed = &self.changed[place(i) * self.size..][..self.size];
             right[i] = dot(changed, correction);
@@ -110,8 +110,8 @@ impl Secants {
             let whole = matrix[i][i];
             for k in (0..i).filter(|k| counts[*k]) {
                 let factor = matrix[i][k] / matrix[k][k];
-                for j in i..known {
-                    matrix[j][i] -= factor * matrix[j][k];
+                for row in &mut matrix[i..known] {
+                    row[i] -= factor * row[k];
                 }
                 right[i] -= factor * right[k];
             }

@@ -18,8 +18,8 @@ use plantd_math::rotation::{Chart, Turn};
 use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
+use crate::integrator::parameters::Parameters;
 use crate::integrator::scheme::Tableau;
-use crate::linearization::parameters::Parameters;
 use crate::model::mechanism::Model;
 
 /// The stages, and what they make of the step.

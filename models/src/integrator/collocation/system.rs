@@ -28,8 +28,12 @@ use crate::model::mechanism::Model;
 const ROUNDS: u32 = 16;
 /// A residual that falls by less than this from one round to the next falls too slowly.
 const SLOW: f64 = 0.5;
-/// The same with the mass matrices, whose rounds cost little.
-const SLUGGISH: f64 = 0.8;
+/// The same with the mass matrices, whose rounds cost little, and how many in a row.
+const SLUGGISH: f64 = 0.9;
+const SLUGGISH_ROUNDS: u32 = 6;
+/// Of a residual in units of the largest momentum, what is left to light bodies: rounds with the mass matrices do not
+/// leave much less than they must, as rounds with the Jacobian do.
+const OF_LIGHT_BODIES: f64 = 1e-2;
 /// What a factorization costs, in rounds of corrections.
 const PATIENCE: i32 = 3;
 
@@ -513,7 +517,10 @@ impl System {
     ) -> Option<StepReport> {
         let StepContext { model, settings, state, .. } = at;
         let mut masses = self.masses.take()?;
-        let enough = settings.precision.residual();
+        let enough = match settings.precision {
+            Precision::Exact => settings.precision.residual(),
+            Precision::Fast => settings.precision.residual() * OF_LIGHT_BODIES,
+        };
         let mut report = StepReport::default();
         let (mut previous, mut sluggish) = (f64::INFINITY, 0);
         let mut solved = None;
@@ -524,10 +531,11 @@ impl System {
             if !size.is_finite() {
                 break;
             }
-            let is_fast = settings.precision == Precision::Fast;
-            // What the correction will leave.
-            let left =
-                if is_fast && iteration > 1 { size * (size / previous).min(1.0) } else { size };
+            let left = match settings.precision {
+                // What the correction will leave.
+                Precision::Fast if iteration > 1 => size * (size / previous).min(1.0),
+                _ => size,
+            };
             if iteration == 1 {
                 self.factor_masses(&mut masses, workspace, at, inputs);
                 report.factorizations = 1;
@@ -535,7 +543,7 @@ impl System {
             self.correct_with(model, &mut masses, iteration == 1);
             report.residual = size;
             if left <= enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
-                if size > STALE && !is_fast {
+                if size > STALE {
                     self.evaluate(workspace, at, inputs);
                     self.find_residuals(state);
                 }
@@ -543,7 +551,7 @@ impl System {
                 break;
             }
             sluggish = if size > SLUGGISH * previous { sluggish + 1 } else { 0 };
-            if sluggish == 3 {
+            if sluggish == SLUGGISH_ROUNDS {
                 break;
             }
             previous = size;
@@ -583,11 +591,11 @@ impl System {
                 *right = Lanes::load_some(&residual[first..]);
             }
             if let Some(balls) = &self.balls {
-                balls.into_axes(&mut masses.right, g, false);
+                balls.change_axes(&mut masses.right, g, false);
             }
             masses.solve(model, g);
             if let Some(balls) = &self.balls {
-                balls.into_axes(&mut masses.right, g, true);
+                balls.change_axes(&mut masses.right, g, true);
             }
             let lengths = Lanes::load(&self.lengths[first..]);
             for (own, velocity) in self.residual.chunks_exact_mut(self.count).zip(&masses.right) {
