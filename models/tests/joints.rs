@@ -4,7 +4,7 @@ use crate::common::{SPLITS, builtin, plant, slope, wave, waving_input};
 use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
 use plantd_models::{
     Continuous, ContinuousPoint, Contraction, ForceSplit, Initial, Linearization, Plant, Scene,
-    SecondOrder, State,
+    SecondOrder, Settings, State,
 };
 
 fn element(name: &str) -> Scene {
@@ -190,7 +190,12 @@ fn a_ball_joint_moves_like_three_hinges() {
 /// The second order against differences of the first: with ball joints the mean of the derivative along
 /// one direction of the derivative along the other, both ways.
 fn check_second_order(scene: &Scene, split: ForceSplit) {
-    let mut plant = plant(scene, |s| s.force_split = split);
+    check_second_order_with(scene, |s| s.force_split = split);
+}
+
+fn check_second_order_with(scene: &Scene, change: impl FnOnce(&mut Settings)) {
+    let mut plant = plant(scene, change);
+    let Settings { order, force_split: split, .. } = *plant.settings();
     wave(&mut plant, 20);
     let model = plant.model().clone();
     let (d, x, u) = (model.dimensions(), plant.state(), waving_input(&plant, 23));
@@ -225,7 +230,7 @@ fn check_second_order(scene: &Scene, split: ForceSplit) {
         .unwrap();
     let contracted = whole(&contraction.xx, &contraction.xu, &contraction.uu);
     let error = (&sum - &contracted).amax() / sum.amax().max(1e-2);
-    assert!(error < 1e-11, "{} {split:?}: contraction differs by {error:e}", scene.name);
+    assert!(error < 1e-11, "{} {split:?} {order}: contraction differs by {error:e}", scene.name);
 
     // Rows of all outputs, columns of all parameters, row by row.
     let size = states + d.input();
@@ -276,7 +281,7 @@ fn check_second_order(scene: &Scene, split: ForceSplit) {
             let (a, b) = (entry % size, entry / size);
             assert!(
                 (x - y).abs() < 1e-7 * scale,
-                "{} {split:?}: ∂²[{output}] by {a}, {b} is {x}, differences {y}",
+                "{} {split:?} {order}: ∂²[{output}] by {a}, {b} is {x}, differences {y}",
                 scene.name
             );
         }
@@ -288,6 +293,11 @@ fn second_derivatives_on_the_manifold() {
     for name in ["screw", "universal", "free"] {
         for split in SPLITS {
             check_second_order(&element(name), split);
+        }
+    }
+    for name in ["ball", "free"] {
+        for order in [4, 8] {
+            check_second_order_with(&element(name), |s| s.order = order);
         }
     }
 }

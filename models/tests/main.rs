@@ -4,6 +4,7 @@
 //! the time.
 
 mod accuracy;
+mod collocation;
 mod common;
 mod continuous;
 mod costs;

@@ -387,6 +387,120 @@ impl Turn {
     }
 }
 
+/// Rotation vectors `y` as coordinates of the rotations `exp(y)`, with what their derivatives are made of: the
+/// numbers `e_N = Σ (−s)ⁱ / (2i + N)!` of `s = |y|²` for `N ≤ 7`, of which `e_N' = ½ (N e_N+2 − e_N+1)`.
+///
+/// Nothing branches, so it takes several rotations side by side; to round-off up to half a turn.
+#[derive(Clone, Copy, Debug)]
+pub struct Chart<S = f64> {
+    y: Vec3<S>,
+    square: S,
+    /// `e_1 … e_7`, from the second entry on.
+    e: [S; 8],
+}
+
+impl<S: Scalar> Chart<S> {
+    /// At `y`.
+    #[inline(always)]
+    pub fn new(y: Vec3<S>) -> Self {
+        /// As many terms as half a turn takes: the next is less than 1e-17 of the first.
+        const fn tail<const N: usize>() -> [f64; 13] {
+            let (mut c, mut i) = ([0.0; 13], 0);
+            while i < 13 {
+                let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
+                c[i] = sign * inverse_factorial(2 * i + N);
+                i += 1;
+            }
+            c
+        }
+        let square = y.dot(y);
+        let sum = |c: &[f64; 13]| c.iter().rev().fold(S::ZERO, |sum, c| sum * square + *c);
+        let (e6, e7) = (sum(const { &tail::<6>() }), sum(const { &tail::<7>() }));
+        // e_N = 1/N! − s e_N+2
+        let down = |e: S, n: usize| -(e * square) + inverse_factorial(n);
+        let (e4, e5) = (down(e6, 4), down(e7, 5));
+        let (e2, e3) = (down(e4, 2), down(e5, 3));
+        Self { y, square, e: [S::ZERO, down(e3, 1), e2, e3, e4, e5, e6, e7] }
+    }
+
+    /// `exp(y)`.
+    #[inline(always)]
+    pub fn exp(&self) -> Mat3<S> {
+        polynomial(self.y, self.e[1], self.e[2])
+    }
+
+    /// `D = dexp₋y`, as [`dexp`].
+    #[inline(always)]
+    pub fn dexp(&self) -> Mat3<S> {
+        polynomial(self.y, -self.e[2], self.e[3])
+    }
+
+    /// The inverse of `D`.
+    #[inline(always)]
+    pub fn inverse_dexp(&self) -> Mat3<S> {
+        let [_, _, e2, e3, e4, ..] = self.e;
+        polynomial(self.y, S::constant(0.5), (e3 - (e4 + e4)) * (e2 + e2).recip())
+    }
+
+    /// `e_N'` by `s`.
+    #[inline(always)]
+    fn slope_of(&self, n: usize) -> S {
+        (self.e[n + 2] * n as f64 - self.e[n + 1]) * 0.5
+    }
+
+    /// How `D x` changes with `y`.
+    #[inline(always)]
+    pub fn slope(&self, x: Vec3<S>) -> Mat3<S> {
+        self.slope_as(x, -self.e[2], -self.slope_of(2))
+    }
+
+    /// How `Dᵀ x` changes with `y`.
+    #[inline(always)]
+    pub fn transposed_slope(&self, x: Vec3<S>) -> Mat3<S> {
+        self.slope_as(x, self.e[2], self.slope_of(2))
+    }
+
+    /// How `x + a y×x + e3 y×(y×x)` changes with `y`, where `a` changes by `slope` with `s`.
+    #[inline(always)]
+    fn slope_as(&self, x: Vec3<S>, a: S, slope: S) -> Mat3<S> {
+        let (y, e3) = (self.y, self.e[3]);
+        let turned = y.cross(x);
+        let along = e3 * y.dot(x);
+        let (weight, by_square) = (x * e3, turned * slope + y.cross(turned) * self.slope_of(3));
+        let by_square = by_square + by_square - weight - weight;
+        let mut change = crossed(x * a);
+        for (b, column) in change.0.iter_mut().enumerate() {
+            *column += y * weight[b] + by_square * y[b];
+            column.0[b] += along;
+        }
+        change
+    }
+
+    /// The second derivatives of `m·D v` by `y`.
+    #[inline]
+    pub fn curvature(&self, m: Vec3<S>, v: Vec3<S>) -> Mat3<S> {
+        let (y, s) = (self.y, self.square);
+        let e3 = self.e[3];
+        let (b1, c1) = (self.slope_of(2), self.slope_of(3));
+        let b2 = self.slope_of(4) - self.slope_of(3) * 0.5;
+        let c2 = self.slope_of(5) * 1.5 - self.slope_of(4) * 0.5;
+        // m·D v = m·v (1 − e3 s) − e2 y·a + e3 (y·m) (y·v)
+        let a = v.cross(m);
+        let (mv, ya, ym, yv) = (m.dot(v), y.dot(a), y.dot(m), y.dot(v));
+        let product = ym * yv;
+        let twice = |x: S| x + x;
+        let unit = twice(c1 * product - b1 * ya - (e3 + s * c1) * mv);
+        let square = twice(twice(c2 * product - b2 * ya - (twice(c1) + s * c2) * mv));
+        let mixed = (m * yv + v * ym) * twice(c1) - a * twice(b1);
+        let mut sum = Mat3::IDENTITY.scaled(unit);
+        for (b, column) in sum.0.iter_mut().enumerate() {
+            *column += y * (square * y[b]) + mixed * y[b] + y * mixed[b];
+            *column += (m * v[b] + v * m[b]) * e3;
+        }
+        sum
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -518,6 +632,33 @@ mod tests {
         let numbers = |turn: Turn| [[turn.c, turn.k], turn.slopes()].concat();
         for (a, b) in numbers(turn(below)).iter().zip(numbers(turn(above))) {
             assert!((a - b).abs() < 1e-12 * a, "{a} {b}");
+        }
+    }
+
+    /// The maps of a chart are those of rotation vectors, and their slopes what dual numbers say.
+    #[test]
+    fn charts_and_their_slopes() {
+        let close = |a: &Mat3, b: &Mat3| distance(a, b) < 3e-14;
+        let (x, m) = (Vec3([0.3, 0.7, -0.2]), Vec3([-0.4, 0.1, 0.9]));
+        for y in vectors() {
+            let chart = Chart::new(y);
+            assert!(close(&chart.exp(), &exp(y)) && close(&chart.dexp(), &dexp(y)), "{y:?}");
+            assert!(close(&chart.inverse_dexp(), &momentum_at_start(y)), "{y:?}");
+            for b in 0..3 {
+                let along: Vec3<Dual> =
+                    Vec3([0, 1, 2].map(|i| Dual::new(y[i], if i == b { 1.0 } else { 0.0 })));
+                let there = Chart::new(along);
+                let eps = |v: Vec3<Dual>| Vec3(v.0.map(|c| c.eps));
+                let (dx, dtx) = (
+                    there.dexp().apply(Vec3::lift(x)),
+                    there.dexp().transpose().apply(Vec3::lift(x)),
+                );
+                assert!((eps(dx) - chart.slope(x).0[b]).norm() < 1e-14, "{y:?}");
+                assert!((eps(dtx) - chart.transposed_slope(x).0[b]).norm() < 1e-14, "{y:?}");
+                let gradient = there.slope(Vec3::lift(x)).transpose().apply(Vec3::lift(m));
+                let found = chart.curvature(m, x).0[b];
+                assert!((eps(gradient) - found).norm() < 1e-14, "{y:?}: {found:?}");
+            }
         }
     }
 }

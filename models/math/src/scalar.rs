@@ -210,6 +210,28 @@ impl Lanes {
         self.each(f64::abs)
     }
 
+    /// The first numbers of a list, up to four; those that it does not have are zero.
+    #[inline(always)]
+    pub fn load_some(list: &[f64]) -> Self {
+        match list.first_chunk() {
+            Some(four) => Self(*four),
+            None => {
+                let mut lanes = [0.0; 4];
+                lanes.iter_mut().zip(list).for_each(|(lane, x)| *lane = *x);
+                Self(lanes)
+            }
+        }
+    }
+
+    /// Replaces the first numbers of a list, up to four.
+    #[inline(always)]
+    pub fn store_some(self, list: &mut [f64]) {
+        match list.first_chunk_mut() {
+            Some(four) => *four = self.0,
+            None => list.iter_mut().zip(self.0).for_each(|(x, lane)| *x = lane),
+        }
+    }
+
     #[inline(always)]
     fn each(mut self, f: impl Fn(f64) -> f64) -> Self {
         for x in &mut self.0 {

@@ -326,6 +326,7 @@ impl<S: Scalar> Inertia<S> {
 }
 
 /// The three numbers that begin at `i`: those of a ball joint.
+#[inline(always)]
 pub fn three<S: Scalar>(values: &[S], i: usize) -> Vec3<S> {
     Vec3([values[i], values[i + 1], values[i + 2]])
 }

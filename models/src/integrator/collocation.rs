@@ -7,30 +7,32 @@
 //! 0 = p + Σ_j μ_ij P_j − L_v(Q_i, V_i)      p[k+1] = p + Σ P_j
 //! ```
 //!
-//! Since `μ_ii = ½`, each stage is a step of the midpoint rule of length `h b_i`, from what the other
-//! stages give it to begin with: its Newton matrix is that of such a step.
+//! `μ_ij + μ_ji = 1` makes the method symplectic whatever the rounding of the weights. Where ball joints turn it
+//! says the same of curves on the rotations: see [`balls`].
 //!
-//! Few unknowns are corrected all at once, with the dense Jacobian of the guess. Many are corrected stage
-//! after stage, each with its own factors of O(n), until all residuals are at round-off; where that is slow,
-//! because the coupling is stiff, they are taken at once too. `μ_ij + μ_ji = 1` makes the method
-//! symplectic whatever the rounding of the weights.
+//! Few unknowns are corrected by Newton's method with the dense Jacobian of the guess. Many, and those of ball
+//! joints, are corrected with the mass matrices of the stages, O(n·depth), by corrections that learn from those
+//! before ([`masses`], [`secants`]), until all residuals are at round-off; where that is slow, because something is
+//! stiff, the dense Jacobian is taken after all.
 //!
 //! Prescribed coordinates move at a constant rate, `c_i` of the way at node `i`. Inputs that signals drive
 //! are taken at the nodes.
 
+pub(crate) mod balls;
 pub(crate) mod hessian;
-pub(crate) mod sweep;
+pub(crate) mod masses;
+pub(crate) mod secants;
+pub(crate) mod slopes;
 pub(crate) mod system;
 
-use crate::integrator::collocation::sweep::Sweep;
 use crate::integrator::collocation::system::System;
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::model::mechanism::Model;
 
-/// Unknowns up to which all stages are corrected at once.
-const AT_ONCE: usize = 48;
+/// Unknowns up to which the dense Jacobian is taken.
+const DENSE: usize = 48;
 
 /// A step, and all memory that it needs.
 #[derive(Clone, Debug)]
@@ -38,23 +40,27 @@ pub(crate) struct Collocation {
     pub(crate) tableau: Tableau,
     /// Inputs at the stages, one after the other.
     pub(crate) inputs: Vec<f64>,
-    /// Velocities at the stages of the solution, one after the other, then forces `L_q + f`.
+    /// Velocities at the stages of the solution, one after the other, then forces `L_q + f`; of ball joints angular
+    /// velocities.
     pub(crate) motion: Vec<f64>,
-    /// One stage after the other, where there are many unknowns.
-    sweep: Option<Box<Sweep>>,
-    /// All at once; also for derivatives. Made when it is first needed.
-    pub(crate) system: Option<Box<System>>,
+    /// The stages.
+    pub(crate) system: Box<System>,
 }
 
 impl Collocation {
     pub(crate) fn new(model: &Model, stages: usize) -> Self {
         let d = model.dimensions;
+        let tableau = Tableau::new(stages);
+        let by_masses = stages * d.dynamic > DENSE || !model.orientations.is_empty();
+        let mut system = System::new(model, &tableau, by_masses);
+        if !by_masses {
+            system.make_dense(model, &tableau);
+        }
         Self {
-            tableau: Tableau::new(stages),
             inputs: vec![0.0; stages * d.inputs],
             motion: vec![0.0; 2 * stages * d.dynamic],
-            sweep: (stages * d.dynamic > AT_ONCE).then(|| Box::new(Sweep::new(model, stages))),
-            system: None,
+            system: Box::new(system),
+            tableau,
         }
     }
 
@@ -67,22 +73,18 @@ impl Collocation {
         start_s: f64,
     ) -> Result<StepReport, StepError> {
         self.guess(workspace, at, start_s)?;
-        let Self { tableau, inputs, motion, sweep, system } = self;
-        let swept = match sweep {
-            Some(sweep) => sweep.correct(workspace, at, tableau, inputs, motion)?,
-            None => None,
-        };
-        let mut report = match swept {
+        let Self { tableau, inputs, motion, system } = self;
+        system.begin(at, motion, inputs, &mut workspace.mid.input_force);
+        let mut report = match system.correct_by_masses(workspace, at, inputs) {
             Some(report) => report,
             None => {
-                let system = system.get_or_insert_with(|| Box::new(System::new(at.model, tableau)));
+                system.make_dense(at.model, tableau);
                 system.begin(at, motion, inputs, &mut workspace.mid.input_force);
-                let report = system.correct(workspace, at, inputs)?;
-                let sums = [&mut *workspace.step.increment, &mut *workspace.step.impulse];
-                system.finish(at.model, motion, sums)?;
-                report
+                system.correct(workspace, at, inputs)?
             }
         };
+        let sums = [&mut *workspace.step.increment, &mut *workspace.step.impulse];
+        system.finish(at.model, motion, sums)?;
         workspace.prepare(at);
         workspace.kkt.estimates.write(&mut report);
         Ok(report)

@@ -13,6 +13,7 @@ pub(crate) mod foresight;
 pub(crate) mod matrix;
 pub(crate) mod midpoint;
 pub(crate) mod newton;
+pub(crate) mod parameters;
 pub(crate) mod point;
 pub(crate) mod predictor;
 pub(crate) mod push;

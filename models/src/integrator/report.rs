@@ -9,7 +9,7 @@ use crate::model::mechanism::Model;
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepReport {
     /// Residual evaluations, each followed by one correction; those of all steps of the period. Of
-    /// collocation, sweeps over the stages.
+    /// collocation, rounds over the stages.
     pub iterations: u32,
     /// Factorizations of the Newton matrix.
     pub factorizations: u32,

@@ -11,7 +11,7 @@
 //! of which the sum is skew to the last bit: `μ_ij + μ_ji = 1`, which is what makes the method symplectic.
 //!
 //! **Symmetric compositions** take the midpoint rule with the steps `γ_1 h … γ_m h`, forward and
-//! backward, which keeps constraints and rotations: the five steps of Suzuki (Phys. Lett. A 146, 1990),
+//! backward, which keeps constraints: the five steps of Suzuki (Phys. Lett. A 146, 1990),
 //! and the nine and seventeen of Kahan and Li (Math. Comp. 66, 1997).
 
 use plantd_math::trigonometry::sin_cos_of;
@@ -69,14 +69,14 @@ const KAHAN_LI_8: [f64; 17] = {
 impl Scheme {
     /// The method that has the order for a model.
     pub(crate) fn of_order(order: u32, model: &Model) -> Result<Self, &'static str> {
-        let is_bound = model.dimensions().constraints > 0 || !model.orientations.is_empty();
+        let is_bound = model.dimensions().constraints > 0;
         match (order, is_bound) {
             (2, _) => Ok(Self::Midpoint),
             (4 | 6 | 8 | 12, false) => Ok(Self::Gauss(order as usize / 2)),
             (4, true) => Ok(Self::Composition(&SUZUKI_4)),
             (6, true) => Ok(Self::Composition(&KAHAN_LI_6)),
             (8, true) => Ok(Self::Composition(&KAHAN_LI_8)),
-            (12, true) => Err("is not there with constraints or ball joints, which go to 8"),
+            (12, true) => Err("is not there with constraints, which go to 8"),
             _ => Err("is none of 2, 4, 6, 8 and 12"),
         }
     }
@@ -105,6 +105,8 @@ pub(crate) struct Tableau {
     pub(crate) weights: Vec<f64>,
     /// `μ_ij`, row-major.
     pub(crate) coupling: Vec<f64>,
+    /// `σ_ij = μ_ij − ½`, skew, row-major.
+    pub(crate) skew: Vec<f64>,
     /// The velocities of the next step from those of the last: the collocation polynomial one step on,
     /// column after column.
     pub(crate) onward: Vec<f64>,
@@ -157,7 +159,9 @@ impl Tableau {
                 onward.push(factors.product());
             }
         }
-        Self { nodes, weights, coupling, onward }
+        // No digit is lost: what rounds is `μ`.
+        let skew = coupling.iter().map(|mu| mu - 0.5).collect();
+        Self { nodes, weights, coupling, skew, onward }
     }
 }
 
@@ -169,7 +173,7 @@ mod tests {
     #[test]
     fn the_tableaus_are_those_of_gauss() {
         for stages in [1, 2, 3, 4, 6] {
-            let Tableau { nodes, weights, coupling, .. } = Tableau::new(stages);
+            let Tableau { nodes, weights, coupling, skew, .. } = Tableau::new(stages);
             for k in 1..=2 * stages as i32 {
                 let sum: f64 = weights.iter().zip(&nodes).map(|(b, c)| b * c.powi(k - 1)).sum();
                 assert!((sum - 1.0 / f64::from(k)).abs() < 2e-15, "B({k}), {stages} stages");
@@ -183,6 +187,8 @@ mod tests {
                 for j in 0..stages {
                     let sum = coupling[i * stages + j] + coupling[j * stages + i];
                     assert_eq!(sum, 1.0, "symplectic to the last bit");
+                    let sum = skew[i * stages + j] + skew[j * stages + i];
+                    assert_eq!(sum, 0.0, "symmetric to the last bit");
                 }
             }
         }

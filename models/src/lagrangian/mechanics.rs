@@ -10,6 +10,7 @@ use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
 use crate::lagrangian::planar::PlanarTree;
 use crate::model::mechanism::Model;
+use crate::model::tree::JointKind;
 
 /// What its derivatives are found from.
 #[derive(Clone, Debug)]
@@ -86,7 +87,7 @@ impl<S: Planar> Mechanics<S> {
 
     /// Second derivatives in the rows of the dynamic coordinates, at the last [`Mechanics::differentiate`]:
     /// row, column, and what stands there. Entries that it does not name are zero; those on the diagonal
-    /// come twice, and the second one counts.
+    /// and between the axes of a ball joint come twice or more, and the last one counts.
     #[inline(always)]
     pub(crate) fn for_each_second_derivative(
         &self,
@@ -106,6 +107,21 @@ impl<S: Planar> Mechanics<S> {
             let is_below = entries[0].0 >= model.dimensions.dynamic;
             let (row, column, entry) = entries[usize::from(is_below)];
             take(row, column, entry);
+        }
+        // The axes of a ball joint turn with it.
+        let joints = &model.dynamics.joints[..];
+        let joints = if model.orientations.is_empty() { &[] } else { joints };
+        for (first, joint) in joints.iter().enumerate() {
+            if joint.kind != JointKind::Ball(0) || joint.coordinate >= model.dimensions.dynamic {
+                continue;
+            }
+            let within = self.curvature.within_ball(&self.momenta, model.gravity, first);
+            let i = joint.coordinate;
+            for (a, b) in (0..9).map(|entry| (entry / 3, entry % 3)) {
+                let (qq, vv) = (within.tau_z.0[b][a], within.m_v.0[b][a]);
+                let (qv, vq) = (within.tau_v.0[b][a], within.tau_v.0[a][b]);
+                take(i + a, i + b, Entry { qq, qv, vq, vv });
+            }
         }
     }
 }

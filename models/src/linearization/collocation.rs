@@ -9,17 +9,21 @@
 //! Costs O((s n)³) for `s` stages of `n` dynamic coordinates.
 
 use plantd_math::rows::{add_product, add_rows};
+use plantd_math::spatial::{Mat3, three};
 
 use crate::integrator::collocation::Collocation;
+use crate::integrator::collocation::slopes::Slopes;
 use crate::integrator::collocation::system::System;
+use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
 use crate::integrator::scheme::Tableau;
+use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{StepContext, Workspace};
+use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::{Linearization, StageTangents};
-use crate::linearization::parameters::Parameters;
 
 impl Collocation {
-    /// Linearizes at the solution.
+    /// Linearizes at the solution of the last step.
     pub(crate) fn linearize(
         &mut self,
         workspace: &mut Workspace,
@@ -32,13 +36,12 @@ impl Collocation {
         let h = at.settings.time_step_s;
         let theta = Parameters::new(model);
         let stride = theta.stride;
-        let system = self.system.get_or_insert_with(|| Box::new(System::new(model, &self.tableau)));
+        let system = &mut *self.system;
+        system.make_dense(model, &self.tableau);
         let mut tangents = out.take_stages().unwrap_or_else(|| {
             Box::new(StageTangents {
                 time_step_s: h,
-                nodes: self.tableau.nodes.clone(),
-                weights: self.tableau.weights.clone(),
-                coupling: self.tableau.coupling.clone(),
+                tableau: self.tableau.clone(),
                 q: vec![0.0; count * n],
                 velocity: vec![0.0; count * n],
                 inputs: vec![0.0; count * d.inputs],
@@ -47,28 +50,39 @@ impl Collocation {
                 slopes: vec![0.0; nd * count * nd],
                 matrix: system.matrix.clone(),
                 terms: Vec::new(),
+                momentum: vec![0.0; nd],
+                orientations: vec![Mat3::IDENTITY; model.orientations.len()],
             })
         });
-        system.begin(at, &self.motion, &self.inputs, &mut workspace.mid.input_force);
         system.evaluate(workspace, at, &self.inputs);
         system.differentiate(workspace, at, &self.inputs);
         for i in 0..count {
             system.place(workspace, at.state, i);
             tangents.q[i * n..][..n].copy_from_slice(&workspace.mid.q);
             tangents.velocity[i * n..][..n].copy_from_slice(&workspace.mid.velocity);
+            system.take_rates(i, &mut tangents.velocity[i * n..][..n]);
         }
         tangents.inputs.copy_from_slice(&self.inputs);
         workspace.prepare(at);
-        system.fill_matrix(n);
+        system.fill_matrix(at);
         if !system.matrix.invert() {
             return Err(StepError::NotFinite { iterations: 0 });
         }
-        tangents.fill(system, &self.tableau, &theta, h);
+        if system.slopes.is_some() {
+            tangents.take(system, at.state);
+        } else {
+            tangents.fill(system, &self.tableau, &theta, h);
+        }
         let StageTangents { tangent, impulses, slopes, terms, .. } = &mut *tangents;
         system.matrix.solve_rows(tangent, stride);
         tangent.iter_mut().for_each(|entry| *entry = -*entry);
 
         out.begin_collocation(h);
+        let turned = system.slopes.as_deref();
+        for &c in &model.orientations {
+            let turn = three(&workspace.step.increment, c);
+            out.turnings.push(Turning::new(model, c, turn, h));
+        }
         let [mut increment, mut moved] = [0; 2].map(|_| vec![0.0; stride]);
         for a in 0..nd {
             increment.fill(0.0);
@@ -76,8 +90,12 @@ impl Collocation {
             terms.extend((0..count).map(|i| (1.0, a * count + i)));
             add_rows(&mut increment, tangent, stride, terms);
             moved.fill(0.0);
-            moved[n + a] = 1.0;
-            add_rows(&mut moved, impulses, stride, terms);
+            if let Some(Slopes { next_by: [_, by_theta], .. }) = turned {
+                moved.copy_from_slice(&by_theta[a * stride..][..stride]);
+            } else {
+                moved[n + a] = 1.0;
+                add_rows(&mut moved, impulses, stride, terms);
+            }
             let slopes = slopes[a * count * nd..][..count * nd].iter().copied();
             add_product(&mut moved, tangent, stride, slopes, terms);
             out.set_rows(a, [&increment, &moved]);
@@ -91,13 +109,26 @@ impl Collocation {
 }
 
 impl StageTangents {
+    /// Takes the derivatives of a step with ball joints, where they have been found.
+    fn take(&mut self, system: &System, state: &PreciseState) {
+        let Some(slopes) = system.slopes.as_deref() else { return };
+        let Slopes { residual: [_, by_theta], next_by: [by_unknowns, _], .. } = slopes;
+        self.tangent.copy_from_slice(by_theta);
+        self.slopes.copy_from_slice(by_unknowns);
+        self.momentum.copy_from_slice(&slopes.start);
+        for (to, orientation) in self.orientations.iter_mut().zip(&state.orientations) {
+            *to = orientation.matrix();
+        }
+    }
+
     /// Writes `∂P_j/∂θ`, `Σ ∂P_j/∂Y`, and into `tangent` the derivatives `R_θ` of the residuals.
     fn fill(&mut self, system: &System, tableau: &Tableau, theta: &Parameters, h: f64) {
         let &Parameters { nd, ni, stride, .. } = theta;
         let (n, inputs, next, count) =
             (theta.n(), theta.inputs(), theta.next(), tableau.nodes.len());
         let (hessian, width) = system.hessian();
-        let Self { coupling, tangent, impulses, slopes, terms, .. } = self;
+        let Self { tangent, impulses, slopes, terms, .. } = self;
+        let coupling = &tableau.coupling;
         tangent.fill(0.0);
         impulses.fill(0.0);
         slopes.fill(0.0);

@@ -31,14 +31,15 @@ use plantd_math::pivoted_lu::PivotedLu;
 use plantd_math::rows::{AlignedRows, Term, padded, spread};
 use plantd_math::spatial::{Mat3, Vec3};
 
+use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
+use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Settings;
 use crate::integrator::workspace::{StepContext, Workspace};
 use crate::kkt::schur::room_for_schur;
 use crate::kkt::system::Factors;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::matrices::Layout;
-use crate::linearization::parameters::Parameters;
 use crate::model::mechanism::Model;
 
 /// What a unit input gives to the residual and to `p[k+1]` of a dynamic coordinate.
@@ -450,10 +451,8 @@ pub(crate) struct Part {
 #[derive(Clone, Debug)]
 pub(crate) struct StageTangents {
     pub(crate) time_step_s: f64,
-    pub(crate) nodes: Vec<f64>,
-    pub(crate) weights: Vec<f64>,
-    pub(crate) coupling: Vec<f64>,
-    /// `Q_i`, `V_i` and inputs, stage by stage.
+    pub(crate) tableau: Tableau,
+    /// `Q_i`, `V_i` and inputs, stage by stage; of ball joints `η_i` and its rate.
     pub(crate) q: Vec<f64>,
     pub(crate) velocity: Vec<f64>,
     pub(crate) inputs: Vec<f64>,
@@ -467,4 +466,7 @@ pub(crate) struct StageTangents {
     /// The inverse of `∂R/∂Y`.
     pub(crate) matrix: DenseInverse,
     pub(crate) terms: Vec<Term>,
+    /// Momentum, and orientations of ball joints, at the start; with ball joints.
+    pub(crate) momentum: Vec<f64>,
+    pub(crate) orientations: Vec<Mat3>,
 }

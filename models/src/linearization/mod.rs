@@ -1,6 +1,6 @@
 //! The discrete map differentiated: `A = ∂x[k+1]/∂x[k]`, `B = ∂x[k+1]/∂u[k]`, multipliers, second derivatives.
 //!
-//! Everything is differentiated by one list of parameters, `θ = (q, p, u, k)` ([`parameters`]). Read
+//! Everything is differentiated by one list of parameters, `θ = (q, p, u, k)` ([`parameters`](crate::integrator::parameters)). Read
 //! [`linearize`] first: it has the equations of a step; [`mod@step`] fills their right-hand sides, with ball
 //! joints [`turned`], [`chain`] goes on over the steps of a period, [`collocation`] over stages, [`map`] hands
 //! it to linear-quadratic problems, [`matrices`] to whoever wants `A` and `B`, and [`second_order`]
@@ -11,7 +11,6 @@ pub(crate) mod collocation;
 pub(crate) mod linearize;
 pub(crate) mod map;
 pub(crate) mod matrices;
-pub(crate) mod parameters;
 pub(crate) mod second_order;
 pub(crate) mod step;
 pub(crate) mod turned;

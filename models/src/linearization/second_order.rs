@@ -24,9 +24,9 @@ use plantd_math::scalar::Dual;
 use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::integrator::blocks::StepBlocks;
+use crate::integrator::parameters::Parameters;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::SolvedStep;
-use crate::linearization::parameters::Parameters;
 use crate::model::mechanism::Model;
 
 /// What both forms compute with.

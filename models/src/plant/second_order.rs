@@ -2,9 +2,9 @@
 
 use plantd_math::rows::{add_product, add_rows, padded};
 
+use crate::integrator::parameters::Parameters;
 use crate::integrator::report::{StepError, StepReport};
 use crate::linearization::linearize::Linearization;
-use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::contraction::{Contraction, check_weights};
 use crate::linearization::second_order::tensors::{SecondOrder, symmetrise};
 use crate::linearization::second_order::{Scratch, assert_layout, spin_change};

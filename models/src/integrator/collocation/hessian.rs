@@ -9,7 +9,7 @@ use crate::model::mechanism::Model;
 
 /// Derivatives of `L` and of the forces: rows of dynamic coordinates, n columns unless said, row-major,
 /// and for each entry those of all stages.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub(crate) struct Hessian {
     /// Numbers for each entry.
     width: usize,

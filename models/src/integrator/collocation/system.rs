@@ -1,4 +1,4 @@
-//! All stages corrected at once, and evaluated four side by side.
+//! All stages, evaluated four side by side, and corrected together.
 //!
 //! What belongs to the stages of a coordinate lies side by side, padded to whole [`Lanes`]: number `i` of
 //! coordinate `a` is entry `a·width + i`.
@@ -7,10 +7,14 @@ use plantd_math::dense_inverse::DenseInverse;
 use plantd_math::norms::{larger, largest};
 use plantd_math::scalar::{Lanes, Scalar, Side};
 use plantd_math::simd::wide;
+use plantd_math::spatial::three;
 use plantd_math::trigonometry::without_turns;
 
+use crate::integrator::collocation::balls::Balls;
 use crate::integrator::collocation::hessian::Hessian;
-use crate::integrator::newton::{CHORD_FLOOR, FLOOR};
+use crate::integrator::collocation::masses::Masses;
+use crate::integrator::collocation::slopes::Slopes;
+use crate::integrator::newton::{CHORD_FLOOR, FLOOR, STALE};
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::scheme::Tableau;
 use crate::integrator::settings::Precision;
@@ -24,6 +28,12 @@ use crate::model::mechanism::Model;
 const ROUNDS: u32 = 16;
 /// A residual that falls by less than this from one round to the next falls too slowly.
 const SLOW: f64 = 0.5;
+/// The same with the mass matrices, whose rounds cost little, and how many in a row.
+const SLUGGISH: f64 = 0.9;
+const SLUGGISH_ROUNDS: u32 = 6;
+/// Of a residual in units of the largest momentum, what is left to light bodies: rounds with the mass matrices do not
+/// leave much less than they must, as rounds with the Jacobian do.
+const OF_LIGHT_BODIES: f64 = 1e-2;
 /// What a factorization costs, in rounds of corrections.
 const PATIENCE: i32 = 3;
 
@@ -54,15 +64,24 @@ pub(crate) struct System {
     velocity: Vec<Lanes>,
     l_q: Vec<Lanes>,
     l_v: Vec<Lanes>,
+    pub(crate) balls: Option<Box<Balls>>,
+    /// `L_q + f` of each four stages, with ball joints.
+    force: Vec<Lanes>,
+    masses: Option<Box<Masses>>,
+    /// With ball joints, all derivatives.
+    pub(crate) slopes: Option<Box<Slopes>>,
     hessian: Hessian,
-    /// Derivatives of the residuals by all `Y`; entry `a·count + i` belongs to stage `i` of coordinate `a`.
+    /// Derivatives of the residuals by all `Y`; entry `a·count + i` belongs to stage `i` of coordinate `a`. Made
+    /// when it is first needed, like the other dense matrices.
     pub(crate) matrix: DenseInverse,
     residual: Vec<f64>,
 }
 
 impl System {
-    pub(crate) fn new(model: &Model, tableau: &Tableau) -> Self {
+    /// `by_masses`: for a solution with the mass matrices of the stages.
+    pub(crate) fn new(model: &Model, tableau: &Tableau, by_masses: bool) -> Self {
         let d = model.dimensions;
+        let has_balls = !model.orientations.is_empty();
         let count = tableau.nodes.len();
         let width = count.next_multiple_of(Lanes::COUNT);
         let groups = width / Lanes::COUNT;
@@ -97,11 +116,24 @@ impl System {
             held: zeros(),
             q: lanes(groups * d.coordinates()),
             velocity: lanes(groups * d.coordinates()),
-            l_q: lanes(d.dynamic),
-            l_v: lanes(d.dynamic),
-            hessian: Hessian::new(model, width),
-            matrix: DenseInverse::new(count * d.dynamic, width - count),
+            l_q: lanes(groups * d.dynamic),
+            l_v: lanes(groups * d.dynamic),
+            balls: has_balls.then(|| Box::new(Balls::new(model, tableau))),
+            force: lanes(if has_balls { groups * d.dynamic } else { 0 }),
+            masses: by_masses.then(|| Box::new(Masses::new(model, width, count))),
+            slopes: None,
+            hessian: Hessian::default(),
+            matrix: DenseInverse::new(0, 0),
             residual: vec![0.0; count * d.dynamic],
+        }
+    }
+
+    /// Makes room for dense matrices.
+    pub(crate) fn make_dense(&mut self, model: &Model, tableau: &Tableau) {
+        if self.matrix.matrix.is_empty() {
+            self.hessian = Hessian::new(model, self.width);
+            self.matrix = DenseInverse::new(self.residual.len(), self.width - self.count);
+            self.slopes = self.balls.as_ref().map(|_| Box::new(Slopes::new(model, tableau)));
         }
     }
 
@@ -136,6 +168,19 @@ impl System {
             workspace.mid.q[a] = q.0[lane] + turns;
             workspace.mid.velocity[a] = v.0[lane];
         }
+        if let Some(balls) = &self.balls {
+            balls.place(workspace, stage);
+        }
+    }
+
+    /// Replaces the velocities of ball joints at a stage by the rates of `η`.
+    pub(crate) fn take_rates(&self, stage: usize, velocity: &mut [f64]) {
+        let Some(balls) = &self.balls else { return };
+        let (n, g) = (velocity.len(), stage / Lanes::COUNT);
+        for (o, &c) in balls.coordinates.iter().enumerate() {
+            let [_, rate] = balls.at(o, stage, &self.q[g * n..][..n]);
+            velocity[c..c + 3].copy_from_slice(&rate.0);
+        }
     }
 
     /// Takes velocities and forces, stage by stage, and what does not change within the step.
@@ -164,6 +209,9 @@ impl System {
                 }
             }
         }
+        if let Some(balls) = &mut self.balls {
+            balls.begin(state, &mut self.increment);
+        }
         for k in 0..d.prescribed {
             let start = state.q[nd + k];
             let way = u[d.inputs + k] - start;
@@ -183,20 +231,35 @@ impl System {
         inputs: &[f64],
     ) -> f64 {
         let StepContext { model, state, .. } = at;
-        let n = model.dimensions.coordinates();
+        let (n, nd) = (model.dimensions.coordinates(), model.dimensions.dynamic);
         let mut magnitude = f64::MIN_POSITIVE;
+        if let Some(balls) = &mut self.balls {
+            balls.turn(&self.increment);
+        }
         for g in 0..self.groups() {
             self.move_to(state, &workspace.mid.turns_per_radian, n, g);
+            let first = g * Lanes::COUNT;
+            if let Some(balls) = &mut self.balls {
+                let place = [&mut self.q[g * n..][..n], &mut self.velocity[g * n..][..n]];
+                balls.move_to(&self.increment, Lanes::load(&self.rates[first..]), g, place);
+            }
             if self.mechanics.is_empty() {
                 for lane in 0..Lanes::COUNT.min(self.count - g * Lanes::COUNT) {
                     self.evaluate_alone(workspace, at, inputs, g * Lanes::COUNT + lane);
                 }
             } else {
                 let (q, velocity) = (&self.q[g * n..][..n], &self.velocity[g * n..][..n]);
-                let derivatives = [&mut *self.l_q, &mut *self.l_v];
-                self.mechanics[g].gradient(model, q, &[], velocity, derivatives);
+                let own = g * nd..(g + 1) * nd;
+                let derivatives = [&mut self.l_q[own.clone()], &mut self.l_v[own]];
+                let orientations = self.balls.as_ref().map_or(&[][..], |b| b.orientations(g));
+                self.mechanics[g].gradient(model, q, orientations, velocity, derivatives);
             }
             magnitude = magnitude.max(self.take_impulses(state, &model.damping, n, g));
+            if let Some(balls) = &mut self.balls {
+                let lengths = Lanes::load(&self.lengths[first..]);
+                let from = (&self.force[g * nd..][..nd], &self.l_v[g * nd..][..nd]);
+                balls.take(lengths, g, from, [&mut self.impulse, &mut self.momentum]);
+            }
         }
         magnitude
     }
@@ -230,11 +293,16 @@ impl System {
             let first = g * Lanes::COUNT;
             let lengths = Lanes::load(&self.lengths[first..]);
             let mut largest = [0.0; Lanes::COUNT];
-            for (a, (l_q, l_v)) in self.l_q.iter().zip(&self.l_v).enumerate() {
+            let nd = state.p.len();
+            let derivatives = self.l_q[g * nd..][..nd].iter().zip(&self.l_v[g * nd..]);
+            for (a, (l_q, l_v)) in derivatives.enumerate() {
                 let at = a * self.width + first;
                 let mut force = Lanes::load(&self.held[at..]);
                 if let Some(c) = damping.get(a) {
                     force -= self.velocity[g * n + a] * *c;
+                }
+                if let Some(sum) = self.force.get_mut(g * nd + a) {
+                    *sum = *l_q + force;
                 }
                 let (by_position, by_force) = (*l_q * lengths, force * lengths);
                 (by_position + by_force).store(&mut self.impulse[at..]);
@@ -251,6 +319,14 @@ impl System {
 
     /// Writes the residuals of all stages; returns the largest.
     pub(crate) fn find_residuals(&mut self, state: &PreciseState) -> f64 {
+        let size = self.find_linear_residuals(state);
+        let Some(balls) = &mut self.balls else { return size };
+        balls.find_residuals(state, [&self.impulse, &self.momentum], &mut self.residual);
+        largest(&self.residual)
+    }
+
+    /// The residuals, as if there were no ball joints.
+    fn find_linear_residuals(&mut self, state: &PreciseState) -> f64 {
         wide!({
             let (groups, mut sizes) = (self.groups(), Lanes::ZERO);
             for (a, residual) in self.residual.chunks_exact_mut(self.count).enumerate() {
@@ -260,7 +336,7 @@ impl System {
                     let sum = Self::coupled(&self.columns, groups, g, &own[..self.count]);
                     let momentum = Lanes::load(&self.momentum[a * self.width + first..]);
                     let value = (-momentum + state.p[a] + sum) + state.p_low[a];
-                    residual.copy_from_slice(&value.0[..residual.len()]);
+                    value.store_some(residual);
                     for (size, value) in sizes.0.iter_mut().zip(&*residual) {
                         *size = larger(*size, *value);
                     }
@@ -282,10 +358,7 @@ impl System {
                 for b in 0..nd {
                     let corrections = &self.residual[b * count..][..count];
                     let moved = Self::coupled(&self.columns, groups, g, corrections);
-                    let mut own = Lanes::ZERO;
-                    let rest = &corrections[first..];
-                    let length = rest.len().min(Lanes::COUNT);
-                    own.0[..length].copy_from_slice(&rest[..length]);
+                    let own = Lanes::load_some(&corrections[first..]);
                     for a in 0..nd {
                         let at = (a * n + b) * width + first;
                         let by_position = Lanes::load(&self.hessian.qq[at..]) * moved * lengths;
@@ -303,13 +376,54 @@ impl System {
     /// ```text
     /// ∂R_i/∂Y_k = Σ_j μ_ij h_j (L_qq + f_q)_j μ_jk + μ_ik ((L_qv + f_v)_k − (L_vq)_i) − δ_ik (L_vv)_i / h_i
     /// ```
-    pub(crate) fn fill_matrix(&mut self, n: usize) {
+    pub(crate) fn fill_matrix(&mut self, at: StepContext<'_>) {
+        let n = at.state.q.len();
+        if self.balls.is_some() {
+            self.fill_turned(at);
+            return;
+        }
         wide!({
             match self.groups() {
                 1 => self.fill_groups::<1>(n),
                 _ => self.fill_groups::<2>(n),
             }
         })
+    }
+
+    /// The same with ball joints, and all other derivatives of the step.
+    fn fill_turned(&mut self, StepContext { settings, state, .. }: StepContext<'_>) {
+        let (Some(balls), Some(slopes)) = (&self.balls, &mut self.slopes) else { return };
+        let (nd, n, width, count) = (state.p.len(), state.q.len(), self.width, self.count);
+        slopes.time_step_s = settings.time_step_s;
+        let Hessian { qq, qv, vq, vv, qu, .. } = &self.hessian;
+        let tables = slopes.second.iter_mut().zip([qq, qv, vq, vv]);
+        for (to, from) in tables.chain([(&mut slopes.by_input, qu)]) {
+            for (entry, numbers) in from.chunks_exact(width).enumerate() {
+                let stages = to.chunks_exact_mut((from.len() / width).max(1));
+                stages.zip(numbers).for_each(|(stage, number)| stage[entry] = *number);
+            }
+        }
+        for stage in 0..count {
+            let (g, lane) = (stage / Lanes::COUNT, stage % Lanes::COUNT);
+            for a in 0..nd {
+                slopes.torque[stage * nd + a] = self.force[g * nd + a].0[lane];
+                slopes.momentum[stage * nd + a] = self.l_v[g * nd + a].0[lane];
+            }
+            for (o, c) in balls.coordinates.iter().enumerate() {
+                let [offset, rate] = balls.at(o, stage, &self.q[g * n..][..n]);
+                slopes.offset[stage * nd + c..][..3].copy_from_slice(&offset.0);
+                slopes.rate[stage * nd + c..][..3].copy_from_slice(&rate.0);
+            }
+        }
+        for a in 0..nd {
+            slopes.increment[a] = self.increment[a * width..][..count].iter().sum();
+            slopes.start[a] = state.p[a] + state.p_low[a];
+        }
+        slopes.find();
+        let rows = self.matrix.matrix.chunks_exact_mut(self.matrix.stride);
+        for (to, from) in rows.zip(slopes.residual[0].chunks_exact((nd * count).max(1))) {
+            to[..nd * count].copy_from_slice(from);
+        }
     }
 
     /// Derivatives of `L` at one stage, with springs and forces.
@@ -327,13 +441,13 @@ impl System {
         }
         self.place(workspace, state, stage);
         workspace.mid.evaluate(model);
-        let lane = stage % Lanes::COUNT;
+        let (first, lane) = (stage / Lanes::COUNT * d.dynamic, stage % Lanes::COUNT);
         for a in 0..d.dynamic {
             // Forces count as a part of `L_q`; those of inputs and dampers are added to all stages.
             let damping = model.damping.get(a).map_or(0.0, |c| c * workspace.mid.velocity[a]);
             let others = workspace.mid.force[a] - (self.held[a * self.width + stage] - damping);
-            self.l_q[a].0[lane] = workspace.mid.l_q[a] + others;
-            self.l_v[a].0[lane] = workspace.mid.l_v[a];
+            self.l_q[first + a].0[lane] = workspace.mid.l_q[a] + others;
+            self.l_v[first + a].0[lane] = workspace.mid.l_v[a];
         }
     }
 
@@ -368,7 +482,7 @@ impl System {
             fresh = iteration == 1 || (!converged && size * rate.powi(PATIENCE) > enough);
             if fresh {
                 self.differentiate(workspace, at, inputs);
-                self.fill_matrix(n);
+                self.fill_matrix(at);
                 report.factorizations += 1;
                 if !self.matrix.invert() {
                     return Err(StepError::NotConverged { iterations: iteration, residual: size });
@@ -381,12 +495,122 @@ impl System {
             }
             report.residual = size;
             if converged {
-                self.correct_impulses(n);
+                if self.balls.is_none() {
+                    self.correct_impulses(n);
+                } else if size > STALE {
+                    self.evaluate(workspace, at, inputs);
+                    self.find_residuals(state);
+                }
                 return Ok(report);
             }
             previous = size;
         }
         Err(StepError::NotConverged { iterations: report.iterations, residual: previous })
+    }
+
+    /// Corrects all stages with the mass matrices of the guess; `None` if that takes too long.
+    pub(super) fn correct_by_masses(
+        &mut self,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        inputs: &[f64],
+    ) -> Option<StepReport> {
+        let StepContext { model, settings, state, .. } = at;
+        let mut masses = self.masses.take()?;
+        let enough = match settings.precision {
+            Precision::Exact => settings.precision.residual(),
+            Precision::Fast => settings.precision.residual() * OF_LIGHT_BODIES,
+        };
+        let mut report = StepReport::default();
+        let (mut previous, mut sluggish) = (f64::INFINITY, 0);
+        let mut solved = None;
+        for iteration in 1..=settings.max_iterations {
+            report.iterations = iteration;
+            let magnitude = self.evaluate(workspace, at, inputs);
+            let size = self.find_residuals(state) / (f64::EPSILON * magnitude);
+            if !size.is_finite() {
+                break;
+            }
+            let left = match settings.precision {
+                // What the correction will leave.
+                Precision::Fast if iteration > 1 => size * (size / previous).min(1.0),
+                _ => size,
+            };
+            if iteration == 1 {
+                self.factor_masses(&mut masses, workspace, at, inputs);
+                report.factorizations = 1;
+            }
+            self.correct_with(model, &mut masses, iteration == 1);
+            report.residual = size;
+            if left <= enough || (size > SLOW * previous && size <= CHORD_FLOOR) {
+                if size > STALE {
+                    self.evaluate(workspace, at, inputs);
+                    self.find_residuals(state);
+                }
+                solved = Some(report);
+                break;
+            }
+            sluggish = if size > SLUGGISH * previous { sluggish + 1 } else { 0 };
+            if sluggish == SLUGGISH_ROUNDS {
+                break;
+            }
+            previous = size;
+        }
+        self.masses = Some(masses);
+        solved
+    }
+
+    /// Factors the mass matrices at the last evaluation.
+    fn factor_masses(
+        &mut self,
+        masses: &mut Masses,
+        workspace: &mut Workspace,
+        at: StepContext<'_>,
+        inputs: &[f64],
+    ) {
+        masses.clear();
+        if self.mechanics.is_empty() {
+            for stage in 0..self.count {
+                self.evaluate_alone(workspace, at, inputs, stage);
+                masses.take(at.model, &mut workspace.mid.mechanics, stage);
+            }
+        }
+        for (g, mechanics) in self.mechanics.iter_mut().enumerate() {
+            masses.take(at.model, mechanics, g * Lanes::COUNT);
+        }
+        masses.factor(at.model);
+    }
+
+    /// Corrects the increments with the mass matrices.
+    fn correct_with(&mut self, model: &Model, masses: &mut Masses, is_first: bool) {
+        for g in 0..self.groups() {
+            let first = g * Lanes::COUNT;
+            for (right, residual) in
+                masses.right.iter_mut().zip(self.residual.chunks_exact(self.count))
+            {
+                *right = Lanes::load_some(&residual[first..]);
+            }
+            if let Some(balls) = &self.balls {
+                balls.change_axes(&mut masses.right, g, false);
+            }
+            masses.solve(model, g);
+            if let Some(balls) = &self.balls {
+                balls.change_axes(&mut masses.right, g, true);
+            }
+            let lengths = Lanes::load(&self.lengths[first..]);
+            for (own, velocity) in self.residual.chunks_exact_mut(self.count).zip(&masses.right) {
+                let change = *velocity * lengths;
+                change.store_some(&mut own[first..]);
+            }
+        }
+        if is_first {
+            masses.secants.forget();
+        }
+        masses.secants.improve(&mut self.residual);
+        let corrections = self.residual.chunks_exact(self.count);
+        for (own, corrections) in self.increment.chunks_exact_mut(self.width).zip(corrections) {
+            own.iter_mut().zip(corrections).for_each(|(y, change)| *y += change);
+        }
     }
 
     /// Takes second derivatives at the last evaluation.
@@ -470,6 +694,20 @@ impl System {
             for i in 0..count {
                 motion[i * nd + a] = self.rates[i] * turns[i];
                 motion[(count + i) * nd + a] = self.rates[i] * impulses[i];
+            }
+        }
+        let Some(balls) = &self.balls else { return Ok(()) };
+        balls.finish(impulse);
+        for &c in &balls.coordinates {
+            let turn = three(increment, c).norm();
+            if !(turn <= std::f64::consts::PI) {
+                let coordinate = model.coordinates[c].name.clone();
+                return Err(StepError::TooFast { coordinate, increment: turn });
+            }
+            // Angular velocities are the same in any chart.
+            for (i, a) in (0..count).flat_map(|i| (c..c + 3).map(move |a| (i, a))) {
+                let (g, lane) = (i / Lanes::COUNT, i % Lanes::COUNT);
+                motion[i * nd + a] = self.velocity[g * model.dimensions.coordinates() + a].0[lane];
             }
         }
         Ok(())

@@ -1,9 +1,14 @@
 //! Weighted second derivatives of collocation, and of periods of several steps.
 
+use plantd_math::rotation::{self, Chart, Turn};
 use plantd_math::rows::{Term, add_product, add_rows};
-use plantd_math::scalar::Dual;
+use plantd_math::scalar::{Dual, Scalar};
+use plantd_math::spatial::{Mat3, Vec3, three};
 
+use crate::integrator::blocks::StepBlocks;
+use crate::integrator::collocation::slopes::Slopes;
 use crate::integrator::report::StepError;
+use crate::integrator::scheme::Tableau;
 use crate::linearization::linearize::{Linearization, Part, StageTangents};
 use crate::linearization::second_order::contraction::Contraction;
 use crate::model::mechanism::Model;
@@ -19,6 +24,93 @@ fn add_transposed_product(
     for (a, row) in sum.chunks_exact_mut(stride).enumerate() {
         let column = left.iter().skip(a).step_by(stride).copied();
         add_product(row, right, stride, column, terms);
+    }
+}
+
+impl StageTangents {
+    /// How a ball joint turns in the step.
+    fn turn(&self, c: usize) -> Vec3 {
+        let n = self.q.len() / self.tableau.weights.len();
+        let stages = self.velocity.chunks_exact(n).zip(&self.tableau.weights);
+        let turned = |sum: Vec3, (v, b): (&[f64], &f64)| sum + three(v, c) * (b * self.time_step_s);
+        stages.fold(Vec3::ZERO, turned)
+    }
+
+    /// Places a step with ball joints, with the tangent of parameter `a`.
+    fn seed(
+        &self,
+        a: usize,
+        model: &Model,
+        slopes: &mut Slopes<Dual>,
+        blocks: &mut StepBlocks<Dual>,
+    ) {
+        let theta = slopes.theta;
+        let (nd, n, ni, stride) = (theta.nd, theta.n(), theta.ni, theta.stride);
+        let Tableau { nodes, weights, coupling, .. } = &self.tableau;
+        let (count, h) = (nodes.len(), self.time_step_s);
+        let unit = |is: bool| if is { 1.0 } else { 0.0 };
+        let increment = |b: usize, k: usize| {
+            let by = self.tangent[(b * count + k) * stride + a];
+            Dual::new(h * weights[k] * self.velocity[k * n + b], by)
+        };
+        for b in 0..nd {
+            slopes.increment[b] = (0..count).fold(Dual::ZERO, |sum, k| sum + increment(b, k));
+            slopes.start[b] = Dual::new(self.momentum[b], unit(a == n + b));
+        }
+        for (i, input) in blocks.inputs.iter_mut().enumerate() {
+            input.eps = unit(a == theta.inputs() + i);
+        }
+        for i in 0..count {
+            let rate = 1.0 / (h * weights[i]);
+            for b in 0..n {
+                let q = self.q[i * n + b];
+                (blocks.q_mid[b], blocks.velocity[b]) = if b < nd {
+                    let by = (0..count).map(|k| coupling[i * count + k] * increment(b, k).eps);
+                    let by = unit(a == b) + by.sum::<f64>();
+                    (Dual::new(q, by), increment(b, i) * rate)
+                } else {
+                    let [start, next] = [unit(a == b), unit(a == theta.next() + b - nd)];
+                    let by = (1.0 - nodes[i]) * start + nodes[i] * next;
+                    let v = self.velocity[i * n + b];
+                    (Dual::new(q, by), Dual::new(v, (next - start) / h))
+                };
+            }
+            for (o, &c) in model.orientations.iter().enumerate() {
+                let start = &self.orientations[o];
+                let axis = Vec3([0, 1, 2].map(|k| Dual::new(0.0, unit(a == c + k))));
+                let turned = Mat3::lift(*start).times(&rotation::exp(axis));
+                let center = turned.times(&Turn::new(three(&slopes.increment, c)).half());
+                let offset = Vec3([0, 1, 2].map(|b| {
+                    let skew = &self.tableau.skew[i * count..][..count];
+                    let along = skew.iter().enumerate().map(|(k, s)| increment(c + b, k) * *s);
+                    along.fold(Dual::ZERO, |sum, x| sum + x)
+                }));
+                let (chart, v) = (Chart::new(offset), three(&blocks.velocity, c));
+                slopes.offset[i * nd + c..][..3].copy_from_slice(&offset.0);
+                slopes.rate[i * nd + c..][..3].copy_from_slice(&v.0);
+                blocks.orientations[1][o] = center.times(&chart.exp());
+                blocks.velocity[c..c + 3].copy_from_slice(&chart.dexp().apply(v).0);
+            }
+            for (input, value) in blocks.inputs.iter_mut().zip(&self.inputs[i * ni..]) {
+                input.re = *value;
+            }
+            blocks.evaluate_mid(model);
+            let mid = &blocks.mid;
+            let [qq, qv, vq, vv] =
+                slopes.second.each_mut().map(|table| &mut table[i * nd * n..][..nd * n]);
+            for (row, column) in (0..nd).flat_map(|r| (0..n).map(move |c| (r, c))) {
+                let (at, mirrored) = (row * n + column, column * n + row);
+                qq[at] = mid.l_qq[at] + mid.f_q[at];
+                qv[at] = mid.l_qv[at] + mid.f_v[at];
+                vq[at] = mid.l_qv[mirrored];
+                vv[at] = mid.l_vv[at];
+            }
+            slopes.by_input[i * nd * ni..][..nd * ni].copy_from_slice(&mid.f_u);
+            for b in 0..nd {
+                slopes.torque[i * nd + b] = mid.l_q[b] + mid.force[b];
+                slopes.momentum[i * nd + b] = mid.l_v[b];
+            }
+        }
     }
 }
 
@@ -75,22 +167,32 @@ impl Contraction {
     pub(super) fn contract_stages(&mut self, model: &Model, stages: &StageTangents, z: &[f64]) {
         let layout = self.scratch.layout;
         let (nd, n, ni, stride) = (layout.nd, layout.n(), layout.ni, layout.stride);
-        let (size, count) = (layout.count(), stages.weights.len());
+        let (size, count) = (layout.count(), stages.tableau.weights.len());
         let z_p = &z[n..][..nd];
+        let mut weights = z[..nd].to_vec();
+        for &c in &model.orientations {
+            let turned = rotation::dexp(stages.turn(c)).apply_transposed(three(z, c));
+            weights[c..c + 3].copy_from_slice(&turned.0);
+        }
         let mut adjoint = vec![0.0; count * nd];
         for (k, mu) in adjoint.iter_mut().enumerate() {
             let slopes = z_p.iter().enumerate().map(|(a, z)| z * stages.slopes[a * count * nd + k]);
-            *mu = -(z[k / count] + slopes.sum::<f64>());
+            *mu = -(weights[k / count] + slopes.sum::<f64>());
         }
         stages.matrix.solve_transposed(&mut adjoint);
+        if !model.orientations.is_empty() {
+            self.contract_turned_stages(model, stages, &adjoint, z);
+            return;
+        }
 
         self.quadratic.clear();
         let [mut tangent, mut product] = [0; 2].map(|_| vec![0.0; 2 * n * stride]);
         for j in 0..count {
-            let length = stages.weights[j] * stages.time_step_s;
+            let length = stages.tableau.weights[j] * stages.time_step_s;
             self.place_tangent(stages, j, &mut tangent);
             let weight = |a: usize| {
-                let coupled = |i: usize| stages.coupling[i * count + j] * adjoint[a * count + i];
+                let coupled =
+                    |i: usize| stages.tableau.coupling[i * count + j] * adjoint[a * count + i];
                 length * (z_p[a] + (0..count).map(coupled).sum::<f64>())
             };
             let weights: Vec<f64> = (0..nd).map(weight).collect();
@@ -152,21 +254,78 @@ impl Contraction {
         }
     }
 
+    /// The sum with ball joints: all derivatives of the step in dual numbers, for each parameter.
+    fn contract_turned_stages(
+        &mut self,
+        model: &Model,
+        stages: &StageTangents,
+        adjoint: &[f64],
+        z: &[f64],
+    ) {
+        let layout = self.scratch.layout;
+        let (nd, n, stride, size) = (layout.nd, layout.n(), layout.stride, layout.count());
+        let count = stages.tableau.weights.len();
+        let mut slopes = Slopes::<Dual>::new(model, &stages.tableau);
+        slopes.time_step_s = stages.time_step_s;
+        self.quadratic.clear();
+        let Self { scratch, quadratic, .. } = self;
+        let mut by_unknown = vec![0.0; count * nd];
+        for (a, row) in quadratic.sum.chunks_exact_mut(stride).enumerate().take(size) {
+            stages.seed(a, model, &mut slopes, &mut scratch.blocks);
+            slopes.find();
+            by_unknown.fill(0.0);
+            row.fill(0.0);
+            let mut add = |weight: f64, [unknowns, parameters]: [&[Dual]; 2]| {
+                by_unknown.iter_mut().zip(unknowns).for_each(|(to, by)| *to += weight * by.eps);
+                row.iter_mut().zip(parameters).for_each(|(to, by)| *to += weight * by.eps);
+            };
+            for (weights, [unknowns, parameters]) in
+                [(adjoint, &slopes.residual), (&z[n..][..nd], &slopes.next_by)]
+            {
+                let unknowns = unknowns.chunks_exact(count * nd);
+                let rows = unknowns.zip(parameters.chunks_exact(stride));
+                weights.iter().zip(rows).for_each(|(weight, (y, theta))| add(*weight, [y, theta]));
+            }
+            for &c in &model.orientations {
+                let turn = three(&slopes.increment, c);
+                let (to_end, carried) = (rotation::dexp(turn), rotation::exp(-turn));
+                for b in 0..3 {
+                    let of =
+                        |m: &Mat3<Dual>| -> f64 { (0..3).map(|k| z[c + k] * m.0[b][k].eps).sum() };
+                    row[c + b] += of(&carried);
+                    let by = of(&to_end);
+                    let own = &mut by_unknown[(c + b) * count..][..count];
+                    own.iter_mut().for_each(|entry| *entry += by);
+                }
+            }
+            let weights = by_unknown.iter().copied();
+            add_product(row, &stages.tangent, stride, weights, &mut scratch.terms);
+        }
+        // Both orders of derivatives count the same.
+        let sum = &mut quadratic.sum;
+        for a in 1..size {
+            for b in 0..a {
+                sum[b * stride + a] = 0.5 * (sum[a * stride + b] + sum[b * stride + a]);
+            }
+        }
+    }
+
     /// Writes the derivatives of `Q_j` and `V_j`, 2 n rows.
     fn place_tangent(&self, stages: &StageTangents, j: usize, tangent: &mut [f64]) {
         let layout = self.scratch.layout;
         let (nd, n, stride) = (layout.nd, layout.n(), layout.stride);
-        let count = stages.weights.len();
-        let (node, h) = (stages.nodes[j], stages.time_step_s);
+        let count = stages.tableau.weights.len();
+        let (node, h) = (stages.tableau.nodes[j], stages.time_step_s);
         tangent.fill(0.0);
         let (by_q, by_v) = tangent.split_at_mut(n * stride);
         for a in 0..n {
             let (q, v) = (&mut by_q[a * stride..][..stride], &mut by_v[a * stride..][..stride]);
             if a < nd {
                 q[a] = 1.0;
-                let coupled = (0..count).map(|k| (stages.coupling[j * count + k], a * count + k));
+                let coupled =
+                    (0..count).map(|k| (stages.tableau.coupling[j * count + k], a * count + k));
                 add_rows(q, &stages.tangent, stride, &coupled.collect::<Vec<_>>());
-                let rate = 1.0 / (stages.weights[j] * h);
+                let rate = 1.0 / (stages.tableau.weights[j] * h);
                 add_rows(v, &stages.tangent, stride, &[(rate, a * count + j)]);
             } else {
                 let next = layout.next() + a - nd;

@@ -25,11 +25,11 @@ use plantd_math::tree_lu::TreeLu;
 
 use crate::constraints::closure::Closure;
 use crate::integrator::blocks::StepBlocks;
+use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
 use crate::kkt::schur::{fill_schur, room_for_schur};
 use crate::lagrangian::kinematics::Place;
 use crate::linearization::linearize::{Linearization, SolvedStep};
-use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::{Scratch, assert_layout, spin_change};
 use crate::model::mechanism::Model;
 

@@ -4,10 +4,10 @@ use nalgebra::DMatrix;
 use plantd_math::scalar::Dual;
 use plantd_math::spatial::Mat3;
 
+use crate::integrator::parameters::Parameters;
 use crate::integrator::report::StepError;
 use crate::lagrangian::turning::Turning;
 use crate::linearization::linearize::Linearization;
-use crate::linearization::parameters::Parameters;
 use crate::linearization::second_order::Scratch;
 use crate::linearization::second_order::contraction::Contraction;
 use crate::model::mechanism::Model;

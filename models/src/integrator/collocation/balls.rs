@@ -1,0 +1,286 @@
+//! Ball joints in collocation: curves of orientations as the exponentials of polynomials.
+//!
+//! Over a step a ball joint turns by `ξ = Σ Y_j`. About the orientation half-way, `C = R exp(ξ/2)`, its stages are
+//! at
+//!
+//! ```text
+//! R_i = C exp(η_i)     η_i = Σ_j σ_ij Y_j     ω_i = D(η_i) V_i     V_i = Y_i / (h b_i)     σ_ij = μ_ij − ½
+//! ```
+//!
+//! with `D(η) = dexp₋η`. So `Ld = Σ h b_i L(R_i, ω_i)` is a function of the ends of the step, and its equations are,
+//! with momentum `m` and torque `τ + f` of the stages in the joint's own axes, and `W = ∂(D V)/∂η`,
+//!
+//! ```text
+//! P_i = h b_i (Dᵀ(τ + f) + Wᵀ m)_i      T = Σ h b_i (exp(η) (τ + f))_i
+//! p   = N⁻ Λ − ½ T⁻ T                   0 = Λ + Σ_i σ_ji P_i − (Dᵀ m)_j
+//! p[k+1] = N⁺ Λ + ½ T⁺ T = p + T + Λ × ξ
+//! ```
+//!
+//! with the maps of [`plantd_math::rotation`]. For one stage, `Λ = m`, that is the midpoint rule of
+//! [`balls`](crate::integrator::balls). Other coordinates have `D = exp(η) = N = T⁻ = 1` and `W = 0`: then it is
+//! ordinary collocation.
+//!
+//! The middle belongs to both ends alike, and `σ` is skew: what is symmetric in time stays so. The equations come
+//! from a function of the ends: the step is symplectic. That function does not change when all orientations are
+//! turned in space: the momentum of such turns is kept, whatever the length of the step. It differs from that of
+//! the motion itself by `O(h^(2s+1))`, since in the chart `η` about any fixed orientation it is that of ordinary
+//! collocation: the order is `2s`.
+
+use plantd_math::rotation::{Chart, Turn};
+use plantd_math::scalar::{Lanes, Scalar, Side};
+use plantd_math::simd::wide;
+use plantd_math::spatial::{Mat3, Vec3, three};
+
+use crate::integrator::scheme::Tableau;
+use crate::integrator::state::PreciseState;
+use crate::integrator::workspace::Workspace;
+use crate::model::mechanism::Model;
+
+/// Rounds in which rates of `η` are found from angular velocities.
+const ROUNDS: usize = 3;
+
+/// The ball joints of all stages.
+#[derive(Clone, Debug)]
+pub(crate) struct Balls {
+    /// First coordinates.
+    pub(crate) coordinates: Vec<usize>,
+    count: usize,
+    width: usize,
+    /// `σ_ij`, column after column, padded.
+    skew: Vec<Lanes>,
+    /// Orientations at the start and half-way, and how they turn.
+    start: Vec<Mat3>,
+    centers: Vec<Mat3>,
+    turns: Vec<Turn>,
+    /// Of each four stages, joint after joint: orientations, charts, `V`.
+    orientations: Vec<Mat3<Lanes>>,
+    charts: Vec<Chart<Lanes>>,
+    rates: Vec<Vec3<Lanes>>,
+    /// `h b_i exp(η) (τ + f)`, as numbers of coordinates are.
+    torque: Vec<f64>,
+    /// `Λ`.
+    carried: Vec<Vec3>,
+}
+
+/// The numbers of the three coordinates of a joint, of four stages.
+#[inline(always)]
+fn load(numbers: &[f64], coordinate: usize, width: usize, first: usize) -> Vec3<Lanes> {
+    let of = |a: usize| Lanes::load(&numbers[(coordinate + a) * width + first..]);
+    Vec3([of(0), of(1), of(2)])
+}
+
+#[inline(always)]
+fn store(numbers: &mut [f64], coordinate: usize, width: usize, first: usize, values: Vec3<Lanes>) {
+    for a in 0..3 {
+        values[a].store(&mut numbers[(coordinate + a) * width + first..]);
+    }
+}
+
+#[inline(always)]
+fn lane(v: Vec3<Lanes>, lane: usize) -> Vec3 {
+    Vec3(v.0.map(|c| c.0[lane]))
+}
+
+impl Balls {
+    pub(super) fn new(model: &Model, tableau: &Tableau) -> Self {
+        let count = tableau.nodes.len();
+        let width = count.next_multiple_of(Lanes::COUNT);
+        let coordinates = model.orientations.clone();
+        let no = coordinates.len();
+        let stages = no * width / Lanes::COUNT;
+        let entry = |i: usize, j: usize| {
+            if i < count { tableau.skew[i * count + j] } else { 0.0 }
+        };
+        let columns = (0..count).flat_map(|j| (0..width).step_by(4).map(move |i| (i, j)));
+        Self {
+            count,
+            width,
+            skew: columns
+                .map(|(i, j)| Lanes([0, 1, 2, 3].map(|lane| entry(i + lane, j))))
+                .collect(),
+            start: vec![Mat3::IDENTITY; no],
+            centers: vec![Mat3::IDENTITY; no],
+            turns: vec![Turn::new(Vec3::ZERO); no],
+            orientations: vec![Mat3::IDENTITY; stages],
+            charts: vec![Chart::new(Vec3::ZERO); stages],
+            rates: vec![Vec3::ZERO; stages],
+            torque: vec![0.0; 3 * no * width],
+            carried: vec![Vec3::ZERO; no],
+            coordinates,
+        }
+    }
+
+    /// Starts at a state: `increment` has `h b_i ω_i`, and gets the `Y_i` that belong to them.
+    pub(super) fn begin(&mut self, state: &PreciseState, increment: &mut [f64]) {
+        for (start, orientation) in self.start.iter_mut().zip(&state.orientations) {
+            *start = orientation.matrix();
+        }
+        let (width, groups) = (self.width, self.groups());
+        for &c in &self.coordinates {
+            let mut turned = [Vec3::ZERO; 2];
+            for (g, turned) in turned.iter_mut().enumerate().take(groups) {
+                *turned = load(increment, c, width, g * Lanes::COUNT);
+            }
+            for _ in 0..ROUNDS {
+                let offset = [0, 1]
+                    .map(|g| if g < groups { self.offset(increment, c, g) } else { Vec3::ZERO });
+                for g in 0..groups {
+                    let own = Chart::new(offset[g]).inverse_dexp().apply(turned[g]);
+                    store(increment, c, width, g * Lanes::COUNT, own);
+                }
+            }
+        }
+    }
+
+    fn groups(&self) -> usize {
+        self.width / Lanes::COUNT
+    }
+
+    /// `Σ_j σ_ij x_j` of four stages.
+    #[inline(always)]
+    fn offset(&self, numbers: &[f64], coordinate: usize, g: usize) -> Vec3<Lanes> {
+        let (width, groups) = (self.width, self.groups());
+        let of = |a: usize| {
+            let mut sum = Lanes::ZERO;
+            let numbers = &numbers[(coordinate + a) * width..][..self.count];
+            for (column, x) in self.skew.chunks_exact(groups).zip(numbers) {
+                sum += column[g] * *x;
+            }
+            sum
+        };
+        Vec3([of(0), of(1), of(2)])
+    }
+
+    /// Orientations of four stages.
+    #[inline(always)]
+    pub(super) fn orientations(&self, g: usize) -> &[Mat3<Lanes>] {
+        let no = self.coordinates.len();
+        &self.orientations[g * no..][..no]
+    }
+
+    /// Finds where the joints are half-way.
+    pub(super) fn turn(&mut self, increment: &[f64]) {
+        for (o, &c) in self.coordinates.iter().enumerate() {
+            let sum = |a: usize| increment[(c + a) * self.width..][..self.count].iter().sum();
+            self.turns[o] = Turn::new(Vec3([sum(0), sum(1), sum(2)]));
+            self.centers[o] = self.start[o].times(&self.turns[o].half());
+        }
+    }
+
+    /// Moves to four stages; writes `η` and `ω` in place of coordinates and velocities.
+    pub(super) fn move_to(
+        &mut self,
+        increment: &[f64],
+        rates: Lanes,
+        g: usize,
+        [q, velocity]: [&mut [Lanes]; 2],
+    ) {
+        wide!({
+            let no = self.coordinates.len();
+            for o in 0..no {
+                let (c, at) = (self.coordinates[o], g * no + o);
+                let offset = self.offset(increment, c, g);
+                let rate = load(increment, c, self.width, g * Lanes::COUNT) * rates;
+                let chart = Chart::new(offset);
+                self.orientations[at] = Mat3::lift(self.centers[o]).times(&chart.exp());
+                q[c..c + 3].copy_from_slice(&offset.0);
+                velocity[c..c + 3].copy_from_slice(&chart.dexp().apply(rate).0);
+                (self.charts[at], self.rates[at]) = (chart, rate);
+            }
+        })
+    }
+
+    /// Takes forces and momenta of four stages in the chart; returns what they are the sums of, at most.
+    pub(super) fn take(
+        &mut self,
+        lengths: Lanes,
+        g: usize,
+        (force, l_v): (&[Lanes], &[Lanes]),
+        [impulse, momentum]: [&mut [f64]; 2],
+    ) {
+        wide!({
+            let (no, width, first) = (self.coordinates.len(), self.width, g * Lanes::COUNT);
+            for o in 0..no {
+                let (c, at) = (self.coordinates[o], g * no + o);
+                let chart = &self.charts[at];
+                let (torque, m) = (three(force, c) * lengths, three(l_v, c));
+                let (d, w) = (chart.dexp(), chart.slope(self.rates[at]));
+                let pushed = d.apply_transposed(torque) + w.apply_transposed(m) * lengths;
+                store(impulse, c, width, first, pushed);
+                store(momentum, c, width, first, d.apply_transposed(m));
+                store(&mut self.torque, 3 * o, width, first, chart.exp().apply(torque));
+            }
+        })
+    }
+
+    /// `ΣT` of a joint.
+    fn total(&self, o: usize) -> Vec3 {
+        let sum = |a: usize| self.torque[(3 * o + a) * self.width..][..self.count].iter().sum();
+        Vec3([sum(0), sum(1), sum(2)])
+    }
+
+    /// Writes the residuals of ball joints.
+    pub(super) fn find_residuals(
+        &mut self,
+        state: &PreciseState,
+        [impulse, momentum]: [&[f64]; 2],
+        residual: &mut [f64],
+    ) {
+        wide!({
+            for o in 0..self.coordinates.len() {
+                let c = self.coordinates[o];
+                let (p, low) = (three(&state.p, c), three(&state.p_low, c));
+                let turn = &self.turns[o];
+                let at_start = turn.torque_to_start(self.total(o)) * 0.5 + low + p;
+                let carried = Chart::new(turn.xi).dexp().apply(at_start);
+                self.carried[o] = carried;
+                for g in 0..self.groups() {
+                    let first = g * Lanes::COUNT;
+                    let own = self.offset(impulse, c, g) + Vec3::lift(carried)
+                        - load(momentum, c, self.width, first);
+                    for (a, own) in own.0.into_iter().enumerate() {
+                        let residual = &mut residual[(c + a) * self.count..][..self.count];
+                        own.store_some(&mut residual[first..]);
+                    }
+                }
+            }
+        })
+    }
+
+    /// From a right-hand side by `η` to one by turns of the body, or from its turn to the change of `η`.
+    pub(super) fn change_axes(&self, x: &mut [Lanes], g: usize, back: bool) {
+        wide!({
+            let no = self.coordinates.len();
+            for (&c, chart) in self.coordinates.iter().zip(&self.charts[g * no..][..no]) {
+                let inverse = chart.inverse_dexp();
+                let v = three(x, c);
+                let v = if back { inverse.apply(v) } else { inverse.apply_transposed(v) };
+                x[c..c + 3].copy_from_slice(&v.0);
+            }
+        })
+    }
+
+    /// Writes the impulses `p[k+1] − p` of ball joints.
+    pub(super) fn finish(&self, impulse: &mut [f64]) {
+        for (o, &c) in self.coordinates.iter().enumerate() {
+            let change = self.total(o) + self.carried[o].cross(self.turns[o].xi);
+            impulse[c..c + 3].copy_from_slice(&change.0);
+        }
+    }
+
+    /// Places a workspace at a stage.
+    pub(super) fn place(&self, workspace: &mut Workspace, stage: usize) {
+        let no = self.coordinates.len();
+        let at = stage / Lanes::COUNT * no;
+        for (to, from) in workspace.mid.orientations.iter_mut().zip(&self.orientations[at..]) {
+            *to = Mat3(from.0.map(|axis| lane(axis, stage % Lanes::COUNT)));
+        }
+    }
+
+    /// `η` and `V` of a joint at a stage.
+    pub(super) fn at(&self, o: usize, stage: usize, q: &[Lanes]) -> [Vec3; 2] {
+        let at = stage / Lanes::COUNT * self.coordinates.len() + o;
+        let one = stage % Lanes::COUNT;
+        [lane(three(q, self.coordinates[o]), one), lane(self.rates[at], one)]
+    }
+}
