@@ -5,6 +5,7 @@
 //! coordinates of ball joints by orientations. [`collocation`] is the method of higher orders, of which
 //! [`scheme`] has the coefficients.
 
+pub(crate) mod abreast;
 pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod collocation;

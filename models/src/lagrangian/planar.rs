@@ -111,14 +111,16 @@ impl PlanarTree {
             Self::Few(_) => None,
         }
     }
+}
 
+impl<S: Planar> PlanarTree<S> {
     /// Writes the Jacobian of the residual by the increment, without springs and forces, entry by entry.
     pub(crate) fn fill_newton_matrix(
         &self,
         joints: &[PlanarJoint],
         pairs: &[Pair],
         step: f64,
-        matrix: &mut TreeLu,
+        matrix: &mut TreeLu<S>,
     ) {
         match self {
             Self::Few(tree) => tree.fill_newton_matrix(joints, pairs, step, matrix),
@@ -566,20 +568,20 @@ impl<A: Arrangement> Joints<A> {
     }
 }
 
-impl<A: Arrangement<Number = f64>> Joints<A> {
+impl<A: Arrangement> Joints<A> {
     #[inline(never)]
     fn fill_newton_matrix(
         &self,
         joints: &[PlanarJoint],
         pairs: &[Pair],
         step: f64,
-        matrix: &mut TreeLu,
+        matrix: &mut TreeLu<A::Number>,
     ) {
         let (quarter, inverse) = (0.25 * step, 1.0 / step);
         for pair in pairs {
             let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
-            let (common, slot) = (quarter * second.qq - inverse * second.vv, pair.slot as usize);
-            let skew = 0.5 * (second.q_above_v_below - second.v_above_q_below);
+            let (common, slot) = (second.qq * quarter - second.vv * inverse, pair.slot as usize);
+            let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
             matrix.upper[slot] = common + skew;
             matrix.lower[slot] = common - skew;
         }

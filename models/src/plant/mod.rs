@@ -12,6 +12,7 @@
 pub(crate) mod choice;
 pub(crate) mod diagnose;
 pub(crate) mod facade;
+pub(crate) mod fleet;
 pub(crate) mod initial;
 pub(crate) mod known;
 pub(crate) mod period;

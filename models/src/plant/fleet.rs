@@ -1,0 +1,338 @@
+//! Many plants of one model, stepped together.
+
+use std::sync::Arc;
+
+use plantd_math::scalar::Truths;
+
+use crate::integrator::abreast::Abreast;
+use crate::integrator::report::{StepError, StepReport};
+use crate::integrator::settings::Settings;
+use crate::model::mechanism::Model;
+use crate::plant::facade::Plant;
+use crate::plant::solve::CALM;
+
+/// Plants of one model and one choice of settings that are stepped together, each with its own state and inputs.
+///
+/// Every plant moves as [`Plant::step`] would move it, to the same bits, whatever the others do; one that fails
+/// stays where it was. Where the model allows it, several are computed at once, each in a lane of wide registers:
+/// trees of joints in space or in planes without constraints, ball joints, springs, forces between points, signals
+/// and prescribed coordinates, by the midpoint rule in one step. All others are stepped one after the other. A
+/// plant whose step is not the usual one (the first, or one that has to be halved) is stepped by itself.
+///
+/// After construction steps allocate nothing, as those of plants.
+///
+/// ```
+/// use std::sync::Arc;
+/// use plantd_models::{Fleet, Initial, Model, Plant, Settings, builtin};
+///
+/// let model = Arc::new(Model::compile(&builtin::scene("pendulum").unwrap())?);
+/// let plant = Plant::new(Arc::clone(&model), Settings::new(&model))?;
+/// let mut plants = vec![plant; 5];
+/// for (plant, angle) in plants.iter_mut().zip([0.1, 0.2, 0.3, 0.4, 0.5]) {
+///     plant.initialize(&Initial::Velocity { q: vec![angle], v: vec![0.0] })?;
+/// }
+/// let mut alone = plants[3].clone();
+/// let mut fleet = Fleet::new(plants);
+/// for _ in 0..100 {
+///     let results = fleet.step(&[0.0; 5]);
+///     assert!(results.iter().all(Result::is_ok));
+///     alone.step(&[0.0])?;
+/// }
+/// assert_eq!(fleet.plant(3).state(), alone.state(), "to the last bit");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Clone, Debug)]
+pub struct Fleet {
+    plants: Vec<Plant>,
+    /// Plants that are left out of steps.
+    resting: Vec<bool>,
+    results: Vec<Result<StepReport, StepError>>,
+    rows: Rows,
+}
+
+/// Plants side by side.
+#[derive(Clone, Debug)]
+enum Rows {
+    None,
+    Fours(Vec<Row<4>>),
+    Eights(Vec<Row<8>>),
+}
+
+/// A few plants side by side.
+#[derive(Clone, Debug)]
+struct Row<const N: usize> {
+    abreast: Abreast<N>,
+    /// Steps that lanes have taken since they were taken out of their plants; `None` where the state is in the plant.
+    taken: [Option<u64>; N],
+    /// Whether plants have moved since their states were written to them.
+    is_ahead: [bool; N],
+}
+
+/// Plants of a row, below which one after the other is faster.
+const FEW: usize = 2;
+
+impl Fleet {
+    /// Takes plants in.
+    ///
+    /// # Panics
+    ///
+    /// If they do not share one model and the same settings.
+    pub fn new(plants: Vec<Plant>) -> Self {
+        let rows = match plants.first() {
+            Some(Plant { model, settings, .. }) => {
+                let is_alike = |p: &Plant| Arc::ptr_eq(&p.model, model) && p.settings == *settings;
+                assert!(plants.iter().all(is_alike), "plants of one model, with the same settings");
+                Rows::new(model, settings, plants.len())
+            }
+            None => Rows::None,
+        };
+        let results = vec![Ok(StepReport::default()); plants.len()];
+        Self { resting: vec![false; plants.len()], results, plants, rows }
+    }
+
+    /// How many plants there are.
+    pub fn len(&self) -> usize {
+        self.plants.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.plants.is_empty()
+    }
+
+    /// Whether several are computed at once.
+    pub fn is_side_by_side(&self) -> bool {
+        !matches!(self.rows, Rows::None)
+    }
+
+    /// Leaves a plant out of steps from now on, or lets it take part again.
+    pub fn rest(&mut self, index: usize, is_resting: bool) {
+        self.resting[index] = is_resting;
+    }
+
+    /// Takes a step with each plant that does not rest; `inputs` has the inputs `u` of all plants, one plant's
+    /// after the other's. The results are in the order of the plants, of one that rests its last.
+    ///
+    /// # Panics
+    ///
+    /// If `inputs` has not `ni + nk` entries for each plant.
+    pub fn step(&mut self, inputs: &[f64]) -> &[Result<StepReport, StepError>] {
+        let Self { plants, resting, results, rows } = self;
+        let width = plants.first().map_or(0, |plant| plant.model.dimensions.input());
+        assert_eq!(inputs.len(), plants.len() * width, "entries of the inputs");
+        let input = |i: usize| &inputs[i * width..][..width];
+        match rows {
+            Rows::None => {
+                let all = plants.iter_mut().zip(results.iter_mut()).zip(&*resting);
+                for (i, ((plant, result), _)) in all.enumerate().filter(|(_, (_, rests))| !**rests)
+                {
+                    *result = plant.step(input(i));
+                }
+            }
+            Rows::Fours(rows) => step_rows(rows, plants, resting, results, input),
+            Rows::Eights(rows) => step_rows(rows, plants, resting, results, input),
+        }
+        results
+    }
+
+    /// A plant as it is now.
+    pub fn plant(&mut self, index: usize) -> &Plant {
+        self.rows.write(index, &mut self.plants[index]);
+        &self.plants[index]
+    }
+
+    /// A plant, to be changed: what the next step begins from. It has to stay one of the same model and settings.
+    pub fn plant_mut(&mut self, index: usize) -> &mut Plant {
+        self.rows.write(index, &mut self.plants[index]);
+        self.rows.leave(index);
+        &mut self.plants[index]
+    }
+
+    /// Writes configuration and momentum of a plant, nd + nk and nd.
+    ///
+    /// # Panics
+    ///
+    /// If the lists are shorter.
+    pub fn write_state(&self, index: usize, q: &mut [f64], p: &mut [f64]) {
+        let d = self.plants[index].model.dimensions;
+        let (q, p) = (&mut q[..d.coordinates()], &mut p[..d.dynamic]);
+        if !self.rows.write_state(index, q, p) {
+            q.copy_from_slice(self.plants[index].q());
+            p.copy_from_slice(self.plants[index].p());
+        }
+    }
+
+    /// The plants as they are now.
+    pub fn into_plants(mut self) -> Vec<Plant> {
+        for (index, plant) in self.plants.iter_mut().enumerate() {
+            self.rows.write(index, plant);
+        }
+        self.plants
+    }
+}
+
+/// Steps of all rows.
+fn step_rows<'a, const N: usize>(
+    rows: &mut [Row<N>],
+    plants: &mut [Plant],
+    resting: &[bool],
+    results: &mut [Result<StepReport, StepError>],
+    input: impl Fn(usize) -> &'a [f64],
+) {
+    let parts = plants.chunks_mut(N).zip(results.chunks_mut(N)).zip(resting.chunks(N));
+    for (i, (row, ((plants, results), resting))) in rows.iter_mut().zip(parts).enumerate() {
+        row.step(plants, resting, results, |lane| input(i * N + lane));
+    }
+}
+
+/// The row and the lane of a plant.
+fn place<const N: usize>(rows: &mut [Row<N>], index: usize) -> (&mut Row<N>, usize) {
+    (&mut rows[index / N], index % N)
+}
+
+impl Rows {
+    fn new(model: &Model, settings: &Settings, count: usize) -> Self {
+        if count < FEW || !model.goes_abreast(settings) {
+            Self::None
+        } else if count > 4 && std::env::var("EIGHT").is_ok() {
+            Self::Eights(vec![Row::new(model, settings); count.div_ceil(8)])
+        } else {
+            Self::Fours(vec![Row::new(model, settings); count.div_ceil(4)])
+        }
+    }
+
+    /// Writes the state to the plant, if it is in a lane.
+    fn write(&mut self, index: usize, plant: &mut Plant) {
+        match self {
+            Self::None => {}
+            Self::Fours(rows) => {
+                let (row, lane) = place(rows, index);
+                row.write(lane, plant);
+            }
+            Self::Eights(rows) => {
+                let (row, lane) = place(rows, index);
+                row.write(lane, plant);
+            }
+        }
+    }
+
+    /// The next step begins from what is in the plant.
+    fn leave(&mut self, index: usize) {
+        match self {
+            Self::None => {}
+            Self::Fours(rows) => {
+                let (row, lane) = place(rows, index);
+                row.leave(lane);
+            }
+            Self::Eights(rows) => {
+                let (row, lane) = place(rows, index);
+                row.leave(lane);
+            }
+        }
+    }
+
+    /// Writes a state that is in a lane; whether it is.
+    fn write_state(&self, index: usize, q: &mut [f64], p: &mut [f64]) -> bool {
+        match self {
+            Self::None => false,
+            Self::Fours(rows) => rows[index / 4].write_state(index % 4, q, p),
+            Self::Eights(rows) => rows[index / 8].write_state(index % 8, q, p),
+        }
+    }
+}
+
+impl<const N: usize> Row<N> {
+    fn new(model: &Model, settings: &Settings) -> Self {
+        Self { abreast: Abreast::new(model, settings), taken: [None; N], is_ahead: [false; N] }
+    }
+
+    /// Takes the states of plants in that can step side by side.
+    fn enter(&mut self, lane: usize, plant: &Plant) {
+        let Plant { settings, state, workspace, .. } = plant;
+        if self.abreast.load(lane, settings, state, &workspace.response) {
+            self.taken[lane] = Some(0);
+        }
+    }
+
+    fn leave(&mut self, lane: usize) {
+        if self.taken[lane].take().is_some() {
+            self.abreast.clear(lane);
+        }
+    }
+
+    fn write(&mut self, lane: usize, plant: &mut Plant) {
+        if let Some(taken) = &mut self.taken[lane]
+            && std::mem::take(&mut self.is_ahead[lane])
+        {
+            self.abreast.store(lane, &mut plant.state);
+            let state = &mut plant.state;
+            state.step = state.step.saturating_add(*taken);
+            state.calm = state.calm.saturating_add((*taken).min(CALM.into()) as u8).min(CALM);
+            *taken = 0;
+        }
+    }
+
+    fn write_state(&self, lane: usize, q: &mut [f64], p: &mut [f64]) -> bool {
+        let is_here = self.taken[lane].is_some();
+        if is_here {
+            self.abreast.write_state(lane, q, p);
+        }
+        is_here
+    }
+
+    /// Takes a step with all plants that do not rest.
+    fn step<'a>(
+        &mut self,
+        plants: &mut [Plant],
+        resting: &[bool],
+        results: &mut [Result<StepReport, StepError>],
+        input: impl Fn(usize) -> &'a [f64],
+    ) {
+        let is_worth = resting.iter().filter(|rests| !**rests).count() >= FEW;
+        let (mut lanes, mut count) = (Truths([0; N]), 0);
+        for (lane, plant) in plants.iter().enumerate() {
+            if resting[lane] || !input(lane).iter().all(|u| u.is_finite()) {
+                continue;
+            }
+            if is_worth && self.taken[lane].is_none() {
+                self.enter(lane, plant);
+            }
+            if self.taken[lane].is_some() {
+                self.abreast.set_inputs(lane, input(lane));
+                (lanes.0[lane], count) = (u64::MAX, count + 1);
+            }
+        }
+        let mut done = Truths([0; N]);
+        if is_worth && count >= FEW {
+            let mut reports = [StepReport::default(); N];
+            let Plant { model, settings, .. } = &plants[0];
+            done = self.abreast.solve(model, settings, lanes, &mut reports);
+            for ((lane, result), report) in results.iter_mut().enumerate().zip(reports) {
+                if done.of(lane) {
+                    *result = Ok(report);
+                }
+            }
+        }
+        // Those that are not done go on by themselves, from where they are.
+        for (lane, plant) in plants.iter_mut().enumerate().filter(|(lane, _)| !done.of(*lane)) {
+            self.write(lane, plant);
+        }
+        if done.0 != [0; N] {
+            self.abreast.move_on(&plants[0].model);
+        }
+        for (lane, plant) in plants.iter_mut().enumerate() {
+            if done.of(lane) {
+                self.taken[lane] = self.taken[lane].map(|taken| taken + 1);
+                self.is_ahead[lane] = true;
+                continue;
+            }
+            self.leave(lane);
+            if !resting[lane] {
+                results[lane] = plant.step(input(lane));
+                if is_worth {
+                    self.enter(lane, plant);
+                }
+            }
+        }
+    }
+}
