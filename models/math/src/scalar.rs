@@ -6,6 +6,7 @@
 use std::fmt::Debug;
 use std::ops::{Add, AddAssign, BitAnd, BitOr, Div, Mul, Neg, Not, Sub, SubAssign};
 
+use crate::simd::{wide, widest};
 use crate::trigonometry;
 
 /// Operators of a type: by what they make of one or two operands, and of what they put in its place.
@@ -70,6 +71,11 @@ pub trait Scalar:
     fn constant(value: f64) -> Self;
     /// The real part.
     fn value(self) -> f64;
+    /// Runs a block in registers that suit these numbers ([`wide`]).
+    #[inline(always)]
+    fn in_registers<R>(block: impl FnOnce() -> R) -> R {
+        wide!({ block() })
+    }
     /// `(sin x, cos x)`.
     fn sin_cos(self) -> (Self, Self);
     /// Writes `sin x` and `cos x` of each.
@@ -245,6 +251,10 @@ impl<const N: usize> Scalar for LanesOf<N> {
     #[inline(always)]
     fn constant(value: f64) -> Self {
         Self([value; N])
+    }
+    #[inline(always)]
+    fn in_registers<R>(block: impl FnOnce() -> R) -> R {
+        if N > Lanes::COUNT { widest!({ block() }) } else { wide!({ block() }) }
     }
     /// Of the first: nothing that branches on it may run on several numbers.
     #[inline(always)]

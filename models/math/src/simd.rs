@@ -4,11 +4,15 @@ use std::sync::atomic::{AtomicU8, Ordering};
 
 /// Runs a block as it is compiled for processors with AVX2, where there is one, and as it is compiled for
 /// all others elsewhere. The operations are the same, and so are the bits. What the block calls is compiled
-/// with it where it is always inlined.
+/// with it where it is always inlined. With a type of numbers before the block, registers are as wide as suits
+/// them.
 #[macro_export]
 macro_rules! wide {
     ($body:block) => {
         $crate::simd::wide!(@run [AVX2 "avx2" avx2] $body)
+    };
+    ($number:ty, $body:block) => {
+        <$number as $crate::scalar::Scalar>::in_registers(#[inline(always)] move || $body)
     };
     (@run [$($registers:ident $feature:tt $wider:ident)+] $body:block) => {{
         #[inline(always)]

@@ -91,7 +91,7 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        wide!({
+        wide!(S, {
             for ((reference, end), scale) in
                 self.reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
             {
@@ -131,6 +131,12 @@ impl<S: Compared> TreeLu<S> {
     /// Solves `K x = b` in place.
     #[inline(never)]
     pub fn solve(&self, elimination: &SymbolicElimination, x: &mut [S]) {
+        self.substitute(elimination, x);
+    }
+
+    /// [`Self::solve`] in the registers of the caller.
+    #[inline(always)]
+    pub fn substitute(&self, elimination: &SymbolicElimination, x: &mut [S]) {
         for k in (0..elimination.rows()).rev() {
             let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
             let value = x[k];

@@ -144,7 +144,7 @@ impl<S: Planar> System<S> {
     #[inline(always)]
     fn solve(&mut self, model: &Model, x: &mut [S]) {
         match (self, &model.planar) {
-            (Self::Tree(matrix), _) => matrix.solve(&model.elimination, x),
+            (Self::Tree(matrix), _) => matrix.substitute(&model.elimination, x),
             (Self::Planar(matrix), Some(joints)) => matrix.solve(joints, x),
             (Self::Planar(_), None) => {}
         }
@@ -153,7 +153,7 @@ impl<S: Planar> System<S> {
     /// Takes the factors of others where that is said.
     #[inline(never)]
     fn take_where(&mut self, truth: S::Truth, others: &Self) {
-        wide!({
+        wide!(S, {
             match (self, others) {
                 (Self::Tree(own), Self::Tree(others)) => own.take_where(truth, others),
                 (Self::Planar(own), Self::Planar(others)) => own.take_where(truth, others),
@@ -336,7 +336,7 @@ impl<const N: usize> Abreast<N> {
         lanes: Truths<N>,
         reports: &mut [StepReport; N],
     ) -> Truths<N> {
-        wide!({
+        wide!(LanesOf<N>, {
             let Midpoint { inputs, input_force, force, .. } = &mut self.mid;
             crate::lagrangian::forces::input_forces(&model.coordinate_inputs, inputs, input_force);
             force.copy_from_slice(input_force);
@@ -584,7 +584,7 @@ impl<const N: usize> Abreast<N> {
     /// Moves all lanes on to what they have come to.
     #[inline(never)]
     pub(crate) fn move_on(&mut self, model: &Model) {
-        wide!({
+        wide!(LanesOf<N>, {
             let Self { state, solved: [increment, impulse], push, systems, .. } = self;
             let States { q, q_low, p, p_low, past, known, order } = state;
             add(q, q_low, increment);

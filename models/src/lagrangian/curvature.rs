@@ -84,7 +84,7 @@ impl<S: Scalar> Curvature<S> {
     /// Computes the generators from poses and momenta of the same configuration and velocity.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
-        wide!({
+        wide!(S, {
             let tensors = &mut self.tensor[..];
             let (forces, rates) = (&mut self.force[..], &mut self.rate[..]);
             for (i, joint) in tree.joints.iter().enumerate() {
@@ -200,7 +200,7 @@ impl<S: Compared> Curvature<S> {
         step: f64,
         matrix: &mut TreeLu<S>,
     ) {
-        wide!({
+        wide!(S, {
             let [half, middle, inverse, same, back] =
                 [0.5 * step, 0.5, 1.0 / step, 1.0, -1.0].map(S::constant);
             let (mut plus, mut minus) = (Force::default(), Force::default());

@@ -65,7 +65,7 @@ impl<S: Scalar> Poses<S> {
     /// to the leaves, about 50 flops and one sine and cosine for each joint.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
-        wide!({
+        wide!(S, {
             if tree.has_other_joints {
                 self.walk::<true>(tree, q, orientations);
             } else {

@@ -52,7 +52,7 @@ impl<S: Scalar> Momenta<S> {
         l_q: &mut [S],
         l_v: &mut [S],
     ) {
-        wide!({
+        wide!(S, {
             if tree.has_other_joints {
                 self.forward::<true>(tree, poses, velocity);
             } else {

@@ -64,7 +64,7 @@ impl<S: Planar> Nudge<S> {
     /// space. About 75 flops an axis.
     #[inline(never)]
     pub(crate) fn find(&mut self, model: &Model, mechanics: &Mechanics<S>) {
-        wide!({
+        wide!(S, {
             self.ascend(&model.dynamics.joints, mechanics);
             if model.orientations.is_empty() {
                 self.descend::<false>(model, mechanics);

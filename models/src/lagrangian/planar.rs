@@ -246,7 +246,7 @@ impl<A: Arrangement> Joints<A> {
         l_q: &mut [A::Number],
         l_v: &mut [A::Number],
     ) {
-        wide!({
+        wide!(A::Number, {
             if joints.have_sliders {
                 self.walk::<true>(joints, q, velocity, l_q, l_v);
             } else {
@@ -258,7 +258,7 @@ impl<A: Arrangement> Joints<A> {
     /// Computes `F` and `P` of each joint at the last gradient.
     #[inline(never)]
     pub(crate) fn differentiate(&mut self, joints: &PlanarJoints) {
-        wide!({
+        wide!(A::Number, {
             for link in &mut self.links {
                 link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
             }
@@ -507,24 +507,26 @@ impl<A: Arrangement> Joints<A> {
     /// Places the joints, for [`PlanarTree::pair`].
     #[inline(never)]
     fn place(&mut self, joints: &[PlanarJoint]) {
-        for (i, joint) in joints.iter().enumerate() {
-            // The root of a tree is its origin, unless that moves on.
-            self.positions[i] = match joint.parent {
-                0 => [A::Number::ZERO; 2],
-                parent => add(self.positions[parent - 1], self.edge(i)),
-            };
-            if joint.anchor {
-                // All joints placed so far in its tree are its ancestors.
-                self.positions[i] = [A::Number::ZERO; 2];
-                let mut below = i;
-                while joints[below].parent > 0 {
-                    let (parent, edge) = (joints[below].parent - 1, self.edge(below));
-                    let position = self.positions[below];
-                    self.positions[parent] = [position[0] - edge[0], position[1] - edge[1]];
-                    below = parent;
+        wide!(A::Number, {
+            for (i, joint) in joints.iter().enumerate() {
+                // The root of a tree is its origin, unless that moves on.
+                self.positions[i] = match joint.parent {
+                    0 => [A::Number::ZERO; 2],
+                    parent => add(self.positions[parent - 1], self.edge(i)),
+                };
+                if joint.anchor {
+                    // All joints placed so far in its tree are its ancestors.
+                    self.positions[i] = [A::Number::ZERO; 2];
+                    let mut below = i;
+                    while joints[below].parent > 0 {
+                        let (parent, edge) = (joints[below].parent - 1, self.edge(below));
+                        let position = self.positions[below];
+                        self.positions[parent] = [position[0] - edge[0], position[1] - edge[1]];
+                        below = parent;
+                    }
                 }
             }
-        }
+        })
     }
 
     #[inline(always)]
@@ -577,13 +579,16 @@ impl<A: Arrangement> Joints<A> {
         step: f64,
         matrix: &mut TreeLu<A::Number>,
     ) {
-        let (quarter, inverse) = (0.25 * step, 1.0 / step);
-        for pair in pairs {
-            let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
-            let (common, slot) = (second.qq * quarter - second.vv * inverse, pair.slot as usize);
-            let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
-            matrix.upper[slot] = common + skew;
-            matrix.lower[slot] = common - skew;
-        }
+        wide!(A::Number, {
+            let (quarter, inverse) = (0.25 * step, 1.0 / step);
+            for pair in pairs {
+                let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
+                let (common, slot) =
+                    (second.qq * quarter - second.vv * inverse, pair.slot as usize);
+                let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
+                matrix.upper[slot] = common + skew;
+                matrix.lower[slot] = common - skew;
+            }
+        })
     }
 }

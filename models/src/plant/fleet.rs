@@ -194,7 +194,7 @@ impl Rows {
     fn new(model: &Model, settings: &Settings, count: usize) -> Self {
         if count < FEW || !model.goes_abreast(settings) {
             Self::None
-        } else if count > 4 && std::env::var("EIGHT").is_ok() {
+        } else if count > 4 && std::env::var("FOUR").is_err() {
             Self::Eights(vec![Row::new(model, settings); count.div_ceil(8)])
         } else {
             Self::Fours(vec![Row::new(model, settings); count.div_ceil(4)])
