@@ -12,8 +12,8 @@ use std::sync::Arc;
 use plantd_models::scene::{Body, Frame, Input, Joint, Scene};
 use plantd_models::{Fleet, Initial, Model, Plant, Settings, builtin};
 
-const PLANTS: usize = 8;
-const STEPS: usize = 1600;
+const PLANTS: usize = 64;
+const STEPS: usize = 200;
 const PASSES: usize = 15;
 
 const SCENES: [&str; 10] = [

@@ -33,10 +33,9 @@ use crate::lagrangian::nudge::Nudge;
 use crate::lagrangian::planar::PlanarTree;
 use crate::model::mechanism::{Model, Solver};
 
-/// Plants side by side: their states, and the memory of a step.
+/// The memory of a step of plants side by side.
 #[derive(Clone, Debug)]
 pub(crate) struct Abreast<const N: usize> {
-    state: States<N>,
     mid: Midpoint<LanesOf<N>>,
     /// `r1`; a correction takes its place.
     residual: Vec<LanesOf<N>>,
@@ -53,7 +52,7 @@ pub(crate) struct Abreast<const N: usize> {
 
 /// States side by side.
 #[derive(Clone, Debug)]
-struct States<const N: usize> {
+pub(crate) struct States<const N: usize> {
     q: Vec<LanesOf<N>>,
     q_low: Vec<LanesOf<N>>,
     p: Vec<LanesOf<N>>,
@@ -62,6 +61,15 @@ struct States<const N: usize> {
     past: Vec<[LanesOf<N>; LENGTH]>,
     known: LanesOf<N>,
     order: LanesOf<N>,
+    /// Of the last step, where inputs push.
+    last: Option<Last<N>>,
+}
+
+/// Where the last step was factored first, and its factors.
+#[derive(Clone, Debug)]
+struct Last<const N: usize> {
+    points: Points<N>,
+    factors: System<LanesOf<N>>,
 }
 
 /// Factors of a step: the first ones, those in their place, and room to make others.
@@ -89,10 +97,7 @@ enum System<S: Planar> {
 #[derive(Clone, Debug)]
 struct Push<const N: usize> {
     pushed: Vec<LanesOf<N>>,
-    last: Points<N>,
-    next: Points<N>,
-    /// Factors of the last step.
-    kept: System<LanesOf<N>>,
+    points: Points<N>,
 }
 
 /// Parts of points where steps were factored first.
@@ -198,46 +203,20 @@ impl Model {
     }
 }
 
-impl<const N: usize> Abreast<N> {
-    pub(crate) fn new(model: &Model, settings: &Settings) -> Self {
+impl<const N: usize> States<N> {
+    pub(crate) fn new(model: &Model) -> Self {
         let nd = model.dimensions.dynamic;
         let zeros = || vec![LanesOf::ZERO; nd];
-        let system = || System::new(model);
-        let pushes = !Point::of(model).is_empty();
-        let mut mid = Midpoint::new(model);
-        mid.inputs = vec![LanesOf::ZERO; model.dimensions.inputs];
+        let last = || Last { points: Points::new(nd), factors: System::new(model) };
         Self {
-            state: States {
-                q: zeros(),
-                q_low: zeros(),
-                p: zeros(),
-                p_low: zeros(),
-                past: vec![[LanesOf::ZERO; LENGTH]; nd],
-                known: LanesOf::ONE,
-                order: LanesOf::ONE,
-            },
-            mid,
-            residual: zeros(),
-            round_off: LanesOf::ONE,
-            increment: zeros(),
-            impulse: zeros(),
-            solved: [zeros(), zeros()],
-            systems: Systems {
-                first: system(),
-                later: system(),
-                room: system(),
-                is_later: false,
-                curvature: model.is_foreseen(settings).then(|| Curvature::new(&model.dynamics)),
-                pivots: LanesOf::ONE,
-            },
-            diagonal: zeros(),
-            nudge: Nudge::new(model),
-            push: pushes.then(|| Push {
-                pushed: zeros(),
-                last: Points::new(nd),
-                next: Points::new(nd),
-                kept: system(),
-            }),
+            q: zeros(),
+            q_low: zeros(),
+            p: zeros(),
+            p_low: zeros(),
+            past: vec![[LanesOf::ZERO; LENGTH]; nd],
+            known: LanesOf::ONE,
+            order: LanesOf::ONE,
+            last: (!Point::of(model).is_empty()).then(last),
         }
     }
 
@@ -254,71 +233,93 @@ impl<const N: usize> Abreast<N> {
         if state.halvings != 0 {
             return false;
         }
-        if let Some(Push { last, kept, .. }) = &mut self.push {
+        if let Some(Last { points, factors }) = &mut self.last {
             let (point, n) = (&state.past.point, state.q.len());
-            let factored = &response.kept;
+            let kept = &response.kept;
             if !point.is_of_length(settings.time_step_s)
                 || !response.kept_at.is_factored_as(point, n)
-                || factored.valid != Factors::Tree
+                || kept.valid != Factors::Tree
             {
                 return false;
             }
-            if let System::Tree(kept) = kept {
-                kept.take_lane(lane, &factored.tree);
+            if let System::Tree(factors) = factors {
+                factors.take_lane(lane, &kept.tree);
             }
             let Parts { force, increment, angles, weighed, .. } = point.parts(n, n);
-            load(lane, &mut last.force, force);
-            load(lane, &mut last.increment, increment);
-            load(lane, &mut last.angles, angles);
-            load(lane, &mut last.weighed, weighed);
+            load(lane, &mut points.force, force);
+            load(lane, &mut points.increment, increment);
+            load(lane, &mut points.angles, angles);
+            load(lane, &mut points.weighed, weighed);
         }
-        let own = &mut self.state;
-        load(lane, &mut own.q, &state.q);
-        load(lane, &mut own.q_low, &state.q_low);
-        load(lane, &mut own.p, &state.p);
-        load(lane, &mut own.p_low, &state.p_low);
-        own.past.iter_mut().zip(past).for_each(|(own, past)| load(lane, own, past));
-        (own.known.0[lane], own.order.0[lane]) = (f64::from(known), f64::from(order));
+        load(lane, &mut self.q, &state.q);
+        load(lane, &mut self.q_low, &state.q_low);
+        load(lane, &mut self.p, &state.p);
+        load(lane, &mut self.p_low, &state.p_low);
+        self.past.iter_mut().zip(past).for_each(|(own, past)| load(lane, own, past));
+        (self.known.0[lane], self.order.0[lane]) = (f64::from(known), f64::from(order));
         true
     }
 
     /// Takes the state out of a lane, but for what counts steps.
     pub(crate) fn store(&self, lane: usize, state: &mut PreciseState) {
-        let own = &self.state;
-        store(lane, &own.q, &mut state.q);
-        store(lane, &own.q_low, &mut state.q_low);
-        store(lane, &own.p, &mut state.p);
-        store(lane, &own.p_low, &mut state.p_low);
-        let counts = [own.known.0[lane] as u8, own.order.0[lane] as u8];
+        self.write(lane, &mut state.q, &mut state.p);
+        store(lane, &self.q_low, &mut state.q_low);
+        store(lane, &self.p_low, &mut state.p_low);
+        let counts = [self.known.0[lane] as u8, self.order.0[lane] as u8];
         let past = state.past.replace_increments(counts);
-        past.iter_mut().zip(&own.past).for_each(|(past, own)| store(lane, own, past));
-        if let Some(Push { last, .. }) = &self.push {
+        past.iter_mut().zip(&self.past).for_each(|(past, own)| store(lane, own, past));
+        if let Some(Last { points, .. }) = &self.last {
             let n = state.q.len();
             let (_, rest) = state.past.point.numbers.split_at_mut(1);
-            for (list, to) in [&last.force, &last.increment, &last.angles, &last.weighed]
-                .into_iter()
-                .zip(rest.chunks_exact_mut(n))
-            {
+            let lists = [&points.force, &points.increment, &points.angles, &points.weighed];
+            for (list, to) in lists.into_iter().zip(rest.chunks_exact_mut(n)) {
                 store(lane, list, to);
             }
         }
     }
 
     /// Writes configuration and momentum of a lane.
-    pub(crate) fn write_state(&self, lane: usize, q: &mut [f64], p: &mut [f64]) {
-        store(lane, &self.state.q, q);
-        store(lane, &self.state.p, p);
+    pub(crate) fn write(&self, lane: usize, q: &mut [f64], p: &mut [f64]) {
+        store(lane, &self.q, q);
+        store(lane, &self.p, p);
     }
 
     /// Nothing of use is in a lane any more: it rests at the origin.
     pub(crate) fn clear(&mut self, lane: usize) {
-        let own = &mut self.state;
-        let lists = [&mut own.q, &mut own.q_low, &mut own.p, &mut own.p_low];
-        let past = own.past.iter_mut().flatten();
-        for number in lists.into_iter().flatten().chain(past).chain(&mut self.mid.inputs) {
-            number.0[lane] = 0.0;
+        let lists = [&mut self.q, &mut self.q_low, &mut self.p, &mut self.p_low];
+        let past = self.past.iter_mut().flatten();
+        lists.into_iter().flatten().chain(past).for_each(|number| number.0[lane] = 0.0);
+        (self.known.0[lane], self.order.0[lane]) = (1.0, 1.0);
+    }
+}
+
+impl<const N: usize> Abreast<N> {
+    pub(crate) fn new(model: &Model, settings: &Settings) -> Self {
+        let nd = model.dimensions.dynamic;
+        let zeros = || vec![LanesOf::ZERO; nd];
+        let system = || System::new(model);
+        let pushes = !Point::of(model).is_empty();
+        let mut mid = Midpoint::new(model);
+        mid.inputs = vec![LanesOf::ZERO; model.dimensions.inputs];
+        Self {
+            mid,
+            residual: zeros(),
+            round_off: LanesOf::ONE,
+            increment: zeros(),
+            impulse: zeros(),
+            solved: [zeros(), zeros()],
+            systems: Systems {
+                first: system(),
+                later: system(),
+                room: system(),
+                is_later: false,
+                curvature: model.is_foreseen(settings).then(|| Curvature::new(&model.dynamics)),
+                pivots: LanesOf::ONE,
+            },
+            diagonal: zeros(),
+            nudge: Nudge::new(model),
+            push: pushes.then(|| Push { pushed: zeros(), points: Points::new(nd) }),
         }
-        (own.known.0[lane], own.order.0[lane]) = (1.0, 1.0);
     }
 
     /// Sets the inputs of a lane.
@@ -333,6 +334,7 @@ impl<const N: usize> Abreast<N> {
         &mut self,
         model: &Model,
         settings: &Settings,
+        state: &mut States<N>,
         lanes: Truths<N>,
         reports: &mut [StepReport; N],
     ) -> Truths<N> {
@@ -340,19 +342,19 @@ impl<const N: usize> Abreast<N> {
             let Midpoint { inputs, input_force, force, .. } = &mut self.mid;
             crate::lagrangian::forces::input_forces(&model.coordinate_inputs, inputs, input_force);
             force.copy_from_slice(input_force);
-            self.predict();
+            self.predict(state);
             let mut lanes = lanes;
             if self.push.is_some() {
-                lanes = lanes & self.push(model, settings);
+                lanes = lanes & self.push(model, settings, state);
             }
-            self.iterate(model, settings, lanes, reports)
+            self.iterate(model, settings, state, lanes, reports)
         })
     }
 
     /// As [`Past::predict`](super::predictor::Past::predict).
     #[inline(always)]
-    fn predict(&mut self) {
-        let States { past, order, .. } = &self.state;
+    fn predict(&mut self, state: &States<N>) {
+        let States { past, order, .. } = state;
         let most = order.0.into_iter().fold(1.0, f64::max) as usize;
         let is_taken: [Truths<N>; LENGTH] =
             std::array::from_fn(|m| LanesOf::constant(m as f64).less(*order));
@@ -367,9 +369,10 @@ impl<const N: usize> Abreast<N> {
 
     /// As [`Workspace::push`](super::workspace::Workspace::push); which lanes may go on.
     #[inline(always)]
-    fn push(&mut self, model: &Model, settings: &Settings) -> Truths<N> {
+    fn push(&mut self, model: &Model, settings: &Settings, state: &mut States<N>) -> Truths<N> {
         let all = LanesOf::<N>::all(true);
-        let Some(Push { pushed, last, kept, .. }) = &mut self.push else { return all };
+        let Some(Push { pushed, .. }) = &mut self.push else { return all };
+        let Some(Last { points: last, factors }) = &mut state.last else { return all };
         let (h, a) = (settings.time_step_s, settings.force_split.at_start());
         let mut is_pushed = LanesOf::all(false);
         for (i, pushed) in pushed.iter_mut().enumerate() {
@@ -380,9 +383,9 @@ impl<const N: usize> Abreast<N> {
             pushed.fill(LanesOf::ZERO);
             return all;
         }
-        kept.solve(model, pushed);
+        factors.solve(model, pushed);
         let mut is_finite = all;
-        let extrapolates = is_pushed & LanesOf::constant(2.0).at_most(self.state.order);
+        let extrapolates = is_pushed & LanesOf::constant(2.0).at_most(state.order);
         for (increment, pushed) in self.increment.iter_mut().zip(pushed) {
             is_finite = is_finite & pushed.abs().less(LanesOf::constant(f64::INFINITY));
             *pushed = LanesOf::choose(is_pushed, -*pushed, LanesOf::ZERO);
@@ -393,8 +396,8 @@ impl<const N: usize> Abreast<N> {
 
     /// Evaluates the residual at the increments; its size.
     #[inline(always)]
-    fn evaluate(&mut self, model: &Model, settings: &Settings) -> LanesOf<N> {
-        let Self { state, mid, residual, increment, .. } = self;
+    fn evaluate(&mut self, model: &Model, settings: &Settings, state: &States<N>) -> LanesOf<N> {
+        let Self { mid, residual, increment, .. } = self;
         let h = settings.time_step_s;
         let inverse = 1.0 / h;
         for i in 0..increment.len() {
@@ -447,8 +450,12 @@ impl<const N: usize> Abreast<N> {
 
     /// Takes note of the point where the step has just been factored for the first time.
     #[inline(always)]
-    fn note_point(&mut self, settings: &Settings) {
-        let Some(Push { last, next, .. }) = &mut self.push else { return };
+    fn note_point(&mut self, settings: &Settings, state: &States<N>) {
+        let (Some(Push { points: next, .. }), Some(Last { points: last, .. })) =
+            (&mut self.push, &state.last)
+        else {
+            return;
+        };
         let a = settings.force_split.at_start();
         let forces = self.mid.input_force.iter().zip(&last.force);
         for (w, (force, before)) in next.weighed.iter_mut().zip(forces) {
@@ -488,6 +495,7 @@ impl<const N: usize> Abreast<N> {
         &mut self,
         model: &Model,
         settings: &Settings,
+        state: &States<N>,
         lanes: Truths<N>,
         reports: &mut [StepReport; N],
     ) -> Truths<N> {
@@ -500,14 +508,14 @@ impl<const N: usize> Abreast<N> {
         let (mut factorizations, mut iterations) = (LanesOf::<N>::ZERO, 0);
         while LanesOf::<N>::any(live) && iterations < settings.max_iterations {
             iterations += 1;
-            let size = self.evaluate(model, settings);
+            let size = self.evaluate(model, settings, state);
             live = live & size.less(constant(f64::INFINITY));
             let converged = chord.judge(size, LanesOf::ZERO);
             let is_fresh = chord.is_fresh & live;
             if LanesOf::<N>::any(is_fresh) {
                 self.factor(model, settings, is_fresh, iterations == 1);
                 if iterations == 1 {
-                    self.note_point(settings);
+                    self.note_point(settings, state);
                 }
                 factorizations = LanesOf::choose(is_fresh, factorizations + 1.0, factorizations);
                 let is_regular = constant(settings.singular_below).at_most(self.systems.pivots);
@@ -573,7 +581,7 @@ impl<const N: usize> Abreast<N> {
             let ends = live & converged;
             if LanesOf::<N>::any(ends) {
                 report(ends, size, self.systems.pivots);
-                self.evaluate(model, settings);
+                self.evaluate(model, settings, state);
                 done = done | self.accept(model, settings, ends, false);
                 live = live & !ends;
             }
@@ -583,10 +591,10 @@ impl<const N: usize> Abreast<N> {
 
     /// Moves all lanes on to what they have come to.
     #[inline(never)]
-    pub(crate) fn move_on(&mut self, model: &Model) {
+    pub(crate) fn move_on(&mut self, model: &Model, state: &mut States<N>) {
         wide!(LanesOf<N>, {
-            let Self { state, solved: [increment, impulse], push, systems, .. } = self;
-            let States { q, q_low, p, p_low, past, known, order } = state;
+            let Self { solved: [increment, impulse], push, systems, .. } = self;
+            let States { q, q_low, p, p_low, past, known, order, last } = state;
             add(q, q_low, increment);
             add(p, p_low, impulse);
             let rows = past.iter_mut().zip(&*increment).zip(&model.conditioning.inertia);
@@ -605,9 +613,9 @@ impl<const N: usize> Abreast<N> {
             let next = *known + 1.0;
             let longest = LanesOf::constant(LENGTH as f64);
             *known = LanesOf::choose(next.less(longest), next, longest);
-            if let Some(Push { last, next, kept, .. }) = push {
-                std::mem::swap(last, next);
-                std::mem::swap(kept, &mut systems.first);
+            if let (Some(push), Some(last)) = (push, last) {
+                std::mem::swap(&mut last.points, &mut push.points);
+                std::mem::swap(&mut last.factors, &mut systems.first);
             }
         })
     }

@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use plantd_math::scalar::Truths;
 
-use crate::integrator::abreast::Abreast;
+use crate::integrator::abreast::{Abreast, States};
 use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::settings::Settings;
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::solve::CALM;
 
@@ -54,22 +54,26 @@ pub struct Fleet {
 #[derive(Clone, Debug)]
 enum Rows {
     None,
-    Fours(Vec<Row<4>>),
-    Eights(Vec<Row<8>>),
+    Fours(Box<Wide<4>>),
+    Eights(Box<Wide<8>>),
+}
+
+/// Rows of plants, and the memory of a step of one of them.
+#[derive(Clone, Debug)]
+struct Wide<const N: usize> {
+    abreast: Abreast<N>,
+    rows: Vec<Row<N>>,
 }
 
 /// A few plants side by side.
 #[derive(Clone, Debug)]
 struct Row<const N: usize> {
-    abreast: Abreast<N>,
+    states: States<N>,
     /// Steps that lanes have taken since they were taken out of their plants; `None` where the state is in the plant.
     taken: [Option<u64>; N],
     /// Whether plants have moved since their states were written to them.
     is_ahead: [bool; N],
 }
-
-/// Plants of a row, below which one after the other is faster.
-const FEW: usize = 2;
 
 impl Fleet {
     /// Takes plants in.
@@ -129,8 +133,8 @@ impl Fleet {
                     *result = plant.step(input(i));
                 }
             }
-            Rows::Fours(rows) => step_rows(rows, plants, resting, results, input),
-            Rows::Eights(rows) => step_rows(rows, plants, resting, results, input),
+            Rows::Fours(wide) => wide.step(plants, resting, results, input),
+            Rows::Eights(wide) => wide.step(plants, resting, results, input),
         }
         results
     }
@@ -171,33 +175,15 @@ impl Fleet {
     }
 }
 
-/// Steps of all rows.
-fn step_rows<'a, const N: usize>(
-    rows: &mut [Row<N>],
-    plants: &mut [Plant],
-    resting: &[bool],
-    results: &mut [Result<StepReport, StepError>],
-    input: impl Fn(usize) -> &'a [f64],
-) {
-    let parts = plants.chunks_mut(N).zip(results.chunks_mut(N)).zip(resting.chunks(N));
-    for (i, (row, ((plants, results), resting))) in rows.iter_mut().zip(parts).enumerate() {
-        row.step(plants, resting, results, |lane| input(i * N + lane));
-    }
-}
-
-/// The row and the lane of a plant.
-fn place<const N: usize>(rows: &mut [Row<N>], index: usize) -> (&mut Row<N>, usize) {
-    (&mut rows[index / N], index % N)
-}
-
 impl Rows {
     fn new(model: &Model, settings: &Settings, count: usize) -> Self {
-        if count < FEW || !model.goes_abreast(settings) {
+        if count < Row::<4>::FEW || !model.goes_abreast(settings) {
             Self::None
-        } else if count > 4 && std::env::var("FOUR").is_err() {
-            Self::Eights(vec![Row::new(model, settings); count.div_ceil(8)])
+        } else if count <= 4 || model.solver == Solver::Planar {
+            // Of many joints in planes eight at once do not fit into the nearest cache.
+            Self::Fours(Box::new(Wide::new(model, settings, count)))
         } else {
-            Self::Fours(vec![Row::new(model, settings); count.div_ceil(4)])
+            Self::Eights(Box::new(Wide::new(model, settings, count)))
         }
     }
 
@@ -205,14 +191,8 @@ impl Rows {
     fn write(&mut self, index: usize, plant: &mut Plant) {
         match self {
             Self::None => {}
-            Self::Fours(rows) => {
-                let (row, lane) = place(rows, index);
-                row.write(lane, plant);
-            }
-            Self::Eights(rows) => {
-                let (row, lane) = place(rows, index);
-                row.write(lane, plant);
-            }
+            Self::Fours(wide) => wide.rows[index / 4].write(index % 4, plant),
+            Self::Eights(wide) => wide.rows[index / 8].write(index % 8, plant),
         }
     }
 
@@ -220,14 +200,8 @@ impl Rows {
     fn leave(&mut self, index: usize) {
         match self {
             Self::None => {}
-            Self::Fours(rows) => {
-                let (row, lane) = place(rows, index);
-                row.leave(lane);
-            }
-            Self::Eights(rows) => {
-                let (row, lane) = place(rows, index);
-                row.leave(lane);
-            }
+            Self::Fours(wide) => wide.rows[index / 4].leave(index % 4),
+            Self::Eights(wide) => wide.rows[index / 8].leave(index % 8),
         }
     }
 
@@ -235,49 +209,16 @@ impl Rows {
     fn write_state(&self, index: usize, q: &mut [f64], p: &mut [f64]) -> bool {
         match self {
             Self::None => false,
-            Self::Fours(rows) => rows[index / 4].write_state(index % 4, q, p),
-            Self::Eights(rows) => rows[index / 8].write_state(index % 8, q, p),
+            Self::Fours(wide) => wide.rows[index / 4].write_state(index % 4, q, p),
+            Self::Eights(wide) => wide.rows[index / 8].write_state(index % 8, q, p),
         }
     }
 }
 
-impl<const N: usize> Row<N> {
-    fn new(model: &Model, settings: &Settings) -> Self {
-        Self { abreast: Abreast::new(model, settings), taken: [None; N], is_ahead: [false; N] }
-    }
-
-    /// Takes the states of plants in that can step side by side.
-    fn enter(&mut self, lane: usize, plant: &Plant) {
-        let Plant { settings, state, workspace, .. } = plant;
-        if self.abreast.load(lane, settings, state, &workspace.response) {
-            self.taken[lane] = Some(0);
-        }
-    }
-
-    fn leave(&mut self, lane: usize) {
-        if self.taken[lane].take().is_some() {
-            self.abreast.clear(lane);
-        }
-    }
-
-    fn write(&mut self, lane: usize, plant: &mut Plant) {
-        if let Some(taken) = &mut self.taken[lane]
-            && std::mem::take(&mut self.is_ahead[lane])
-        {
-            self.abreast.store(lane, &mut plant.state);
-            let state = &mut plant.state;
-            state.step = state.step.saturating_add(*taken);
-            state.calm = state.calm.saturating_add((*taken).min(CALM.into()) as u8).min(CALM);
-            *taken = 0;
-        }
-    }
-
-    fn write_state(&self, lane: usize, q: &mut [f64], p: &mut [f64]) -> bool {
-        let is_here = self.taken[lane].is_some();
-        if is_here {
-            self.abreast.write_state(lane, q, p);
-        }
-        is_here
+impl<const N: usize> Wide<N> {
+    fn new(model: &Model, settings: &Settings, count: usize) -> Self {
+        let row = Row { states: States::new(model), taken: [None; N], is_ahead: [false; N] };
+        Self { abreast: Abreast::new(model, settings), rows: vec![row; count.div_ceil(N)] }
     }
 
     /// Takes a step with all plants that do not rest.
@@ -288,25 +229,80 @@ impl<const N: usize> Row<N> {
         results: &mut [Result<StepReport, StepError>],
         input: impl Fn(usize) -> &'a [f64],
     ) {
-        let is_worth = resting.iter().filter(|rests| !**rests).count() >= FEW;
+        let Self { abreast, rows } = self;
+        let parts = plants.chunks_mut(N).zip(results.chunks_mut(N)).zip(resting.chunks(N));
+        for (i, (row, ((plants, results), resting))) in rows.iter_mut().zip(parts).enumerate() {
+            row.step(abreast, plants, resting, results, |lane| input(i * N + lane));
+        }
+    }
+}
+
+impl<const N: usize> Row<N> {
+    /// Plants that move, below which one after the other is faster.
+    const FEW: usize = N / 2;
+
+    /// Takes the state of a plant in, if it can be stepped side by side.
+    fn enter(&mut self, lane: usize, plant: &Plant) {
+        let Plant { settings, state, workspace, .. } = plant;
+        if self.states.load(lane, settings, state, &workspace.response) {
+            self.taken[lane] = Some(0);
+        }
+    }
+
+    fn leave(&mut self, lane: usize) {
+        if self.taken[lane].take().is_some() {
+            self.states.clear(lane);
+        }
+    }
+
+    fn write(&mut self, lane: usize, plant: &mut Plant) {
+        if let Some(taken) = &mut self.taken[lane]
+            && std::mem::take(&mut self.is_ahead[lane])
+        {
+            self.states.store(lane, &mut plant.state);
+            let state = &mut plant.state;
+            state.step = state.step.saturating_add(*taken);
+            state.calm = state.calm.saturating_add((*taken).min(CALM.into()) as u8).min(CALM);
+            *taken = 0;
+        }
+    }
+
+    fn write_state(&self, lane: usize, q: &mut [f64], p: &mut [f64]) -> bool {
+        let is_here = self.taken[lane].is_some();
+        if is_here {
+            self.states.write(lane, q, p);
+        }
+        is_here
+    }
+
+    /// Takes a step with all plants that do not rest.
+    fn step<'a>(
+        &mut self,
+        abreast: &mut Abreast<N>,
+        plants: &mut [Plant],
+        resting: &[bool],
+        results: &mut [Result<StepReport, StepError>],
+        input: impl Fn(usize) -> &'a [f64],
+    ) {
+        let is_worth = resting.iter().filter(|rests| !**rests).count() >= Self::FEW;
         let (mut lanes, mut count) = (Truths([0; N]), 0);
         for (lane, plant) in plants.iter().enumerate() {
-            if resting[lane] || !input(lane).iter().all(|u| u.is_finite()) {
+            if resting[lane] || !is_worth || !input(lane).iter().all(|u| u.is_finite()) {
                 continue;
             }
-            if is_worth && self.taken[lane].is_none() {
+            if self.taken[lane].is_none() {
                 self.enter(lane, plant);
             }
             if self.taken[lane].is_some() {
-                self.abreast.set_inputs(lane, input(lane));
+                abreast.set_inputs(lane, input(lane));
                 (lanes.0[lane], count) = (u64::MAX, count + 1);
             }
         }
         let mut done = Truths([0; N]);
-        if is_worth && count >= FEW {
+        if is_worth && count >= Self::FEW {
             let mut reports = [StepReport::default(); N];
             let Plant { model, settings, .. } = &plants[0];
-            done = self.abreast.solve(model, settings, lanes, &mut reports);
+            done = abreast.solve(model, settings, &mut self.states, lanes, &mut reports);
             for ((lane, result), report) in results.iter_mut().enumerate().zip(reports) {
                 if done.of(lane) {
                     *result = Ok(report);
@@ -318,7 +314,7 @@ impl<const N: usize> Row<N> {
             self.write(lane, plant);
         }
         if done.0 != [0; N] {
-            self.abreast.move_on(&plants[0].model);
+            abreast.move_on(&plants[0].model, &mut self.states);
         }
         for (lane, plant) in plants.iter_mut().enumerate() {
             if done.of(lane) {
