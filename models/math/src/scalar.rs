@@ -6,7 +6,7 @@
 use std::fmt::Debug;
 use std::ops::{Add, AddAssign, BitAnd, BitOr, Div, Mul, Neg, Not, Sub, SubAssign};
 
-use crate::simd::{wide, widest};
+use crate::simd::{many_wide, wide, widest};
 use crate::trigonometry;
 
 /// Operators of a type: by what they make of one or two operands, and of what they put in its place.
@@ -46,6 +46,15 @@ macro_rules! operators {
 }
 pub(crate) use operators;
 
+/// [`wide!`] in registers as wide as suits a type of numbers ([`Scalar::in_registers`]).
+#[macro_export]
+macro_rules! in_registers {
+    ($number:ty, $body:block) => {
+        <$number as $crate::scalar::Scalar>::in_registers(#[inline(always)] move || $body)
+    };
+}
+pub use in_registers;
+
 /// A real number, or one that carries derivatives.
 pub trait Scalar:
     Copy
@@ -71,7 +80,7 @@ pub trait Scalar:
     fn constant(value: f64) -> Self;
     /// The real part.
     fn value(self) -> f64;
-    /// Runs a block in registers that suit these numbers ([`wide`]).
+    /// Runs a block in registers that suit these numbers; see [`wide!`].
     #[inline(always)]
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
         wide!({ block() })
@@ -254,7 +263,7 @@ impl<const N: usize> Scalar for LanesOf<N> {
     }
     #[inline(always)]
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
-        if N > Lanes::COUNT { widest!({ block() }) } else { wide!({ block() }) }
+        if N > Lanes::COUNT { widest!({ block() }) } else { many_wide!({ block() }) }
     }
     /// Of the first: nothing that branches on it may run on several numbers.
     #[inline(always)]

@@ -4,15 +4,11 @@ use std::sync::atomic::{AtomicU8, Ordering};
 
 /// Runs a block as it is compiled for processors with AVX2, where there is one, and as it is compiled for
 /// all others elsewhere. The operations are the same, and so are the bits. What the block calls is compiled
-/// with it where it is always inlined. With a type of numbers before the block, registers are as wide as suits
-/// them.
+/// with it where it is always inlined.
 #[macro_export]
 macro_rules! wide {
     ($body:block) => {
         $crate::simd::wide!(@run [AVX2 "avx2" avx2] $body)
-    };
-    ($number:ty, $body:block) => {
-        <$number as $crate::scalar::Scalar>::in_registers(#[inline(always)] move || $body)
     };
     (@run [$($registers:ident $feature:tt $wider:ident)+] $body:block) => {{
         #[inline(always)]
@@ -43,13 +39,21 @@ macro_rules! widest {
     };
 }
 
-pub use {wide, widest};
+/// [`wide!`] with the registers of four numbers that AVX-512 has twice as many of.
+#[macro_export]
+macro_rules! many_wide {
+    ($body:block) => {
+        $crate::simd::wide!(@run [AVX512 "avx512f,avx512vl" avx512vl AVX2 "avx2" avx2] $body)
+    };
+}
+
+pub use {many_wide, wide, widest};
 
 /// Registers that every processor has.
 pub const PORTABLE: u8 = 1;
 /// Registers of four numbers: AVX2.
 pub const AVX2: u8 = 2;
-/// Registers of eight numbers: AVX-512.
+/// Registers of eight numbers, and more of those of four: AVX-512 as processors have had it since 2017.
 pub const AVX512: u8 = 3;
 
 /// The widest registers that blocks may use; 0 until the processor has been asked.
@@ -65,7 +69,9 @@ pub fn has(registers: u8) -> bool {
 #[cold]
 fn ask_the_processor() -> u8 {
     #[cfg(target_arch = "x86_64")]
-    let widest = if std::arch::is_x86_feature_detected!("avx512f") {
+    let widest = if std::arch::is_x86_feature_detected!("avx512f")
+        && std::arch::is_x86_feature_detected!("avx512vl")
+    {
         AVX512
     } else if std::arch::is_x86_feature_detected!("avx2") {
         AVX2

@@ -3,8 +3,8 @@
 
 use crate::elimination::SymbolicElimination;
 use crate::rows::{LANES, Term, add_rows_portable, padded};
-use crate::scalar::{Compared, LanesOf};
-use crate::simd::{wide, widest};
+use crate::scalar::{Compared, LanesOf, in_registers};
+use crate::simd::widest;
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
 #[derive(Clone, Debug, Default)]
@@ -91,7 +91,7 @@ impl<S: Compared> TreeLu<S> {
         scale: &[f64],
         factor: f64,
     ) -> SmallestPivot<S> {
-        wide!(S, {
+        in_registers!(S, {
             for ((reference, end), scale) in
                 self.reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
             {

@@ -9,8 +9,7 @@
 use std::f64::consts::PI;
 
 use plantd_math::norms::largest_of_each;
-use plantd_math::scalar::{Compared, LanesOf, Scalar, Truths};
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Compared, LanesOf, Scalar, Truths, in_registers};
 use plantd_math::tree_lu::TreeLu;
 
 use crate::integrator::foresight::{Strayed, is_negligible};
@@ -19,7 +18,7 @@ use crate::integrator::newton::{CONVERGED, Chord, STALE, is_round_off};
 use crate::integrator::point::{Parts, Point};
 use crate::integrator::predictor::{LENGTH, best_order, difference};
 use crate::integrator::push::weigh;
-use crate::integrator::report::StepReport;
+use crate::integrator::report::{StepError, StepReport};
 use crate::integrator::residual::sum_of;
 use crate::integrator::response::Response;
 use crate::integrator::settings::Settings;
@@ -158,7 +157,7 @@ impl<S: Planar> System<S> {
     /// Takes the factors of others where that is said.
     #[inline(never)]
     fn take_where(&mut self, truth: S::Truth, others: &Self) {
-        wide!(S, {
+        in_registers!(S, {
             match (self, others) {
                 (Self::Tree(own), Self::Tree(others)) => own.take_where(truth, others),
                 (Self::Planar(own), Self::Planar(others)) => own.take_where(truth, others),
@@ -328,7 +327,8 @@ impl<const N: usize> Abreast<N> {
         load(lane, &mut self.mid.inputs, u);
     }
 
-    /// Solves a step of the lanes that are said; those that are solved are returned, and their reports written.
+    /// Solves a step of the lanes that are said; those that are solved are returned, and their results
+    /// written.
     #[inline(never)]
     pub(crate) fn solve(
         &mut self,
@@ -336,9 +336,9 @@ impl<const N: usize> Abreast<N> {
         settings: &Settings,
         state: &mut States<N>,
         lanes: Truths<N>,
-        reports: &mut [StepReport; N],
+        results: &mut [Result<StepReport, StepError>],
     ) -> Truths<N> {
-        wide!(LanesOf<N>, {
+        in_registers!(LanesOf<N>, {
             let Midpoint { inputs, input_force, force, .. } = &mut self.mid;
             crate::lagrangian::forces::input_forces(&model.coordinate_inputs, inputs, input_force);
             force.copy_from_slice(input_force);
@@ -347,7 +347,7 @@ impl<const N: usize> Abreast<N> {
             if self.push.is_some() {
                 lanes = lanes & self.push(model, settings, state);
             }
-            self.iterate(model, settings, state, lanes, reports)
+            self.iterate(model, settings, state, lanes, results)
         })
     }
 
@@ -497,7 +497,7 @@ impl<const N: usize> Abreast<N> {
         settings: &Settings,
         state: &States<N>,
         lanes: Truths<N>,
-        reports: &mut [StepReport; N],
+        results: &mut [Result<StepReport, StepError>],
     ) -> Truths<N> {
         let constant = LanesOf::<N>::constant;
         let patience = if matches!(self.systems.first, System::Planar(_)) { 2 } else { 3 };
@@ -523,8 +523,8 @@ impl<const N: usize> Abreast<N> {
                 strayed.begin_again(is_fresh);
             }
             let mut report = |lanes: Truths<N>, residual: LanesOf<N>, pivots: LanesOf<N>| {
-                for (lane, report) in reports.iter_mut().enumerate().filter(|(l, _)| lanes.of(*l)) {
-                    *report = StepReport {
+                for (lane, result) in results.iter_mut().enumerate().filter(|(l, _)| lanes.of(*l)) {
+                    *result = Ok(StepReport {
                         iterations,
                         factorizations: factorizations.0[lane] as u32,
                         residual: residual.0[lane],
@@ -534,7 +534,7 @@ impl<const N: usize> Abreast<N> {
                         redundant_constraints: 0,
                         steps: 1,
                         halvings: 0,
-                    };
+                    });
                 }
             };
             if iterations == 1 {
@@ -592,7 +592,7 @@ impl<const N: usize> Abreast<N> {
     /// Moves all lanes on to what they have come to.
     #[inline(never)]
     pub(crate) fn move_on(&mut self, model: &Model, state: &mut States<N>) {
-        wide!(LanesOf<N>, {
+        in_registers!(LanesOf<N>, {
             let Self { solved: [increment, impulse], push, systems, .. } = self;
             let States { q, q_low, p, p_low, past, known, order, last } = state;
             add(q, q_low, increment);

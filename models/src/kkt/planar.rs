@@ -22,8 +22,8 @@
 //! joint, long chains lose no digits.
 
 use plantd_math::rows::{Block, LANES};
-use plantd_math::scalar::{Compared, Scalar};
-use plantd_math::simd::{wide, widest};
+use plantd_math::scalar::{Compared, Scalar, in_registers};
+use plantd_math::simd::widest;
 use plantd_math::tree_lu::SmallestPivot;
 
 use crate::lagrangian::arrangement::{Fours, Planar};
@@ -195,7 +195,7 @@ impl<S: Planar> Elimination<S> {
         step: f64,
         kind: MatrixKind,
     ) -> SmallestPivot<S> {
-        wide!(S, {
+        in_registers!(S, {
             let (method, n) = (Method::new(step, kind), joints.len());
             let (diagonal, inertia) = (&diagonal[..n], &inertia[..n]);
             let (generators, passages) = (&mut self.generators[..n], &mut self.passages[..n]);
@@ -269,7 +269,7 @@ impl<S: Planar> Elimination<S> {
     /// Solves `K x = b` in place, about 55 flops a joint.
     #[inline(never)]
     pub(crate) fn solve(&mut self, joints: &[PlanarJoint], x: &mut [S]) {
-        wide!(S, {
+        in_registers!(S, {
             let n = joints.len();
             let (generators, passages) = (&self.generators[..n], &self.passages[..n]);
             let (branches, flows) = (&mut self.flows_of_branches[..n], &mut self.flow[..n]);

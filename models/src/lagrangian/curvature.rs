@@ -6,8 +6,7 @@
 //!                ∂²L/∂q_i∂q_j = J̇_i·P_j + w_i·(f_j × g)      w_i: angular part of J_i, f_j: force part of F_j
 //! ```
 
-use plantd_math::scalar::{Compared, Scalar};
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Compared, Scalar, in_registers};
 use plantd_math::spatial::{Force, Inertia, Mat3, Motion, Sym3, Vec3};
 use plantd_math::tree_lu::TreeLu;
 
@@ -84,7 +83,7 @@ impl<S: Scalar> Curvature<S> {
     /// Computes the generators from poses and momenta of the same configuration and velocity.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
-        wide!(S, {
+        in_registers!(S, {
             let tensors = &mut self.tensor[..];
             let (forces, rates) = (&mut self.force[..], &mut self.rate[..]);
             for (i, joint) in tree.joints.iter().enumerate() {
@@ -200,7 +199,7 @@ impl<S: Compared> Curvature<S> {
         step: f64,
         matrix: &mut TreeLu<S>,
     ) {
-        wide!(S, {
+        in_registers!(S, {
             let [half, middle, inverse, same, back] =
                 [0.5 * step, 0.5, 1.0 / step, 1.0, -1.0].map(S::constant);
             let (mut plus, mut minus) = (Force::default(), Force::default());

@@ -17,8 +17,7 @@
 //! δL_v,i = F_i·(E_parent + Σ J̇ a + Σ J b) + J_i·Σ G_child
 //! ```
 
-use plantd_math::scalar::Scalar;
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::spatial::{Force, Motion, Vec3};
 
 use crate::lagrangian::arrangement::Planar;
@@ -64,7 +63,7 @@ impl<S: Planar> Nudge<S> {
     /// space. About 75 flops an axis.
     #[inline(never)]
     pub(crate) fn find(&mut self, model: &Model, mechanics: &Mechanics<S>) {
-        wide!(S, {
+        in_registers!(S, {
             self.ascend(&model.dynamics.joints, mechanics);
             if model.orientations.is_empty() {
                 self.descend::<false>(model, mechanics);

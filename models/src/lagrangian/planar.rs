@@ -28,8 +28,7 @@
 
 use std::ops::Range;
 
-use plantd_math::scalar::Scalar;
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::tree_lu::TreeLu;
 
 use crate::lagrangian::arrangement::{Arrangement, Fours, Ones, Planar, one2, one3, put2};
@@ -246,7 +245,7 @@ impl<A: Arrangement> Joints<A> {
         l_q: &mut [A::Number],
         l_v: &mut [A::Number],
     ) {
-        wide!(A::Number, {
+        in_registers!(A::Number, {
             if joints.have_sliders {
                 self.walk::<true>(joints, q, velocity, l_q, l_v);
             } else {
@@ -258,7 +257,7 @@ impl<A: Arrangement> Joints<A> {
     /// Computes `F` and `P` of each joint at the last gradient.
     #[inline(never)]
     pub(crate) fn differentiate(&mut self, joints: &PlanarJoints) {
-        wide!(A::Number, {
+        in_registers!(A::Number, {
             for link in &mut self.links {
                 link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
             }
@@ -507,7 +506,7 @@ impl<A: Arrangement> Joints<A> {
     /// Places the joints, for [`PlanarTree::pair`].
     #[inline(never)]
     fn place(&mut self, joints: &[PlanarJoint]) {
-        wide!(A::Number, {
+        in_registers!(A::Number, {
             for (i, joint) in joints.iter().enumerate() {
                 // The root of a tree is its origin, unless that moves on.
                 self.positions[i] = match joint.parent {
@@ -579,7 +578,7 @@ impl<A: Arrangement> Joints<A> {
         step: f64,
         matrix: &mut TreeLu<A::Number>,
     ) {
-        wide!(A::Number, {
+        in_registers!(A::Number, {
             let (quarter, inverse) = (0.25 * step, 1.0 / step);
             for pair in pairs {
                 let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);

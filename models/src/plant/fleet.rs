@@ -300,14 +300,8 @@ impl<const N: usize> Row<N> {
         }
         let mut done = Truths([0; N]);
         if is_worth && count >= Self::FEW {
-            let mut reports = [StepReport::default(); N];
             let Plant { model, settings, .. } = &plants[0];
-            done = abreast.solve(model, settings, &mut self.states, lanes, &mut reports);
-            for ((lane, result), report) in results.iter_mut().enumerate().zip(reports) {
-                if done.of(lane) {
-                    *result = Ok(report);
-                }
-            }
+            done = abreast.solve(model, settings, &mut self.states, lanes, results);
         }
         // Those that are not done go on by themselves, from where they are.
         for (lane, plant) in plants.iter_mut().enumerate().filter(|(lane, _)| !done.of(*lane)) {
