@@ -39,21 +39,13 @@ macro_rules! widest {
     };
 }
 
-/// [`wide!`] with the registers of four numbers that AVX-512 has twice as many of.
-#[macro_export]
-macro_rules! many_wide {
-    ($body:block) => {
-        $crate::simd::wide!(@run [AVX512 "avx512f,avx512vl" avx512vl AVX2 "avx2" avx2] $body)
-    };
-}
-
-pub use {many_wide, wide, widest};
+pub use {wide, widest};
 
 /// Registers that every processor has.
 pub const PORTABLE: u8 = 1;
 /// Registers of four numbers: AVX2.
 pub const AVX2: u8 = 2;
-/// Registers of eight numbers, and more of those of four: AVX-512 as processors have had it since 2017.
+/// Registers of eight numbers: AVX-512.
 pub const AVX512: u8 = 3;
 
 /// The widest registers that blocks may use; 0 until the processor has been asked.
@@ -69,9 +61,7 @@ pub fn has(registers: u8) -> bool {
 #[cold]
 fn ask_the_processor() -> u8 {
     #[cfg(target_arch = "x86_64")]
-    let widest = if std::arch::is_x86_feature_detected!("avx512f")
-        && std::arch::is_x86_feature_detected!("avx512vl")
-    {
+    let widest = if std::arch::is_x86_feature_detected!("avx512f") {
         AVX512
     } else if std::arch::is_x86_feature_detected!("avx2") {
         AVX2

@@ -113,14 +113,14 @@ impl Arrangement for Fours {
 
 /// One joint after the other.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Ones<S, const ALONE: bool = true>(PhantomData<S>);
+pub(crate) struct Ones<S>(PhantomData<S>);
 
-impl<S: Scalar, const ALONE: bool> Arrangement for Ones<S, ALONE> {
+impl<S: Scalar> Arrangement for Ones<S> {
     type Number = S;
     type Several = S;
     type Constant = f64;
     const COUNT: usize = 1;
-    const ALONE: bool = ALONE;
+    const ALONE: bool = true;
 
     #[inline(always)]
     fn body(joints: &PlanarJoints, block: usize) -> &Body {
@@ -171,7 +171,7 @@ impl Planar for f64 {
 }
 
 impl<const N: usize> Planar for LanesOf<N> {
-    type Many = Ones<Self, false>;
+    type Many = Ones<Self>;
 }
 
 #[inline(always)]

@@ -19,7 +19,8 @@ use crate::plant::solve::CALM;
 /// and prescribed coordinates, by the midpoint rule in one step. All others are stepped one after the other. A
 /// plant whose step is not the usual one (the first, or one that has to be halved) is stepped by itself.
 ///
-/// After construction steps allocate nothing, as those of plants.
+/// After construction steps allocate nothing, as those of plants. A step costs a plant what it costs it by itself;
+/// side by side, for each of many, half to a quarter of that.
 ///
 /// ```
 /// use std::sync::Arc;
@@ -61,8 +62,17 @@ enum Rows {
 /// Rows of plants, and the memory of a step of one of them.
 #[derive(Clone, Debug)]
 struct Wide<const N: usize> {
+    model: Arc<Model>,
+    settings: Settings,
     abreast: Abreast<N>,
     rows: Vec<Row<N>>,
+}
+
+/// What all plants have in common.
+#[derive(Clone, Copy)]
+struct Mechanics<'a> {
+    model: &'a Arc<Model>,
+    settings: &'a Settings,
 }
 
 /// A few plants side by side.
@@ -176,7 +186,7 @@ impl Fleet {
 }
 
 impl Rows {
-    fn new(model: &Model, settings: &Settings, count: usize) -> Self {
+    fn new(model: &Arc<Model>, settings: &Settings, count: usize) -> Self {
         if count < Row::<4>::FEW || !model.goes_abreast(settings) {
             Self::None
         } else if count <= 4 || model.solver == Solver::Planar {
@@ -216,9 +226,10 @@ impl Rows {
 }
 
 impl<const N: usize> Wide<N> {
-    fn new(model: &Model, settings: &Settings, count: usize) -> Self {
+    fn new(model: &Arc<Model>, settings: &Settings, count: usize) -> Self {
         let row = Row { states: States::new(model), taken: [None; N], is_ahead: [false; N] };
-        Self { abreast: Abreast::new(model, settings), rows: vec![row; count.div_ceil(N)] }
+        let (abreast, rows) = (Abreast::new(model, settings), vec![row; count.div_ceil(N)]);
+        Self { model: Arc::clone(model), settings: *settings, abreast, rows }
     }
 
     /// Takes a step with all plants that do not rest.
@@ -229,10 +240,11 @@ impl<const N: usize> Wide<N> {
         results: &mut [Result<StepReport, StepError>],
         input: impl Fn(usize) -> &'a [f64],
     ) {
-        let Self { abreast, rows } = self;
+        let Self { model, settings, abreast, rows } = self;
+        let mechanics = Mechanics { model, settings };
         let parts = plants.chunks_mut(N).zip(results.chunks_mut(N)).zip(resting.chunks(N));
         for (i, (row, ((plants, results), resting))) in rows.iter_mut().zip(parts).enumerate() {
-            row.step(abreast, plants, resting, results, |lane| input(i * N + lane));
+            row.step(abreast, mechanics, plants, resting, results, |lane| input(i * N + lane));
         }
     }
 }
@@ -242,9 +254,12 @@ impl<const N: usize> Row<N> {
     const FEW: usize = N / 2;
 
     /// Takes the state of a plant in, if it can be stepped side by side.
-    fn enter(&mut self, lane: usize, plant: &Plant) {
-        let Plant { settings, state, workspace, .. } = plant;
-        if self.states.load(lane, settings, state, &workspace.response) {
+    fn enter(&mut self, lane: usize, own: Mechanics<'_>, plant: &Plant) {
+        let Plant { model, settings, state, workspace, .. } = plant;
+        if Arc::ptr_eq(model, own.model)
+            && settings == own.settings
+            && self.states.load(lane, settings, state, &workspace.response)
+        {
             self.taken[lane] = Some(0);
         }
     }
@@ -279,6 +294,7 @@ impl<const N: usize> Row<N> {
     fn step<'a>(
         &mut self,
         abreast: &mut Abreast<N>,
+        mechanics: Mechanics<'_>,
         plants: &mut [Plant],
         resting: &[bool],
         results: &mut [Result<StepReport, StepError>],
@@ -291,7 +307,7 @@ impl<const N: usize> Row<N> {
                 continue;
             }
             if self.taken[lane].is_none() {
-                self.enter(lane, plant);
+                self.enter(lane, mechanics, plant);
             }
             if self.taken[lane].is_some() {
                 abreast.set_inputs(lane, input(lane));
@@ -300,7 +316,7 @@ impl<const N: usize> Row<N> {
         }
         let mut done = Truths([0; N]);
         if is_worth && count >= Self::FEW {
-            let Plant { model, settings, .. } = &plants[0];
+            let Mechanics { model, settings } = mechanics;
             done = abreast.solve(model, settings, &mut self.states, lanes, results);
         }
         // Those that are not done go on by themselves, from where they are.
@@ -308,7 +324,7 @@ impl<const N: usize> Row<N> {
             self.write(lane, plant);
         }
         if done.0 != [0; N] {
-            abreast.move_on(&plants[0].model, &mut self.states);
+            abreast.move_on(mechanics.model, &mut self.states);
         }
         for (lane, plant) in plants.iter_mut().enumerate() {
             if done.of(lane) {
@@ -320,7 +336,7 @@ impl<const N: usize> Row<N> {
             if !resting[lane] {
                 results[lane] = plant.step(input(lane));
                 if is_worth {
-                    self.enter(lane, plant);
+                    self.enter(lane, mechanics, plant);
                 }
             }
         }
