@@ -167,7 +167,7 @@ mod tests {
             assert!(distance(*s, sine) <= 1.0, "sin {angle:e}: {s:e}, {sine:e}");
             assert!(distance(*c, cosine) <= 1.0, "cos {angle:e}: {c:e}, {cosine:e}");
         }
-        for (angles, out) in angles.as_chunks().0.iter().zip(out.as_chunks::<4>().0) {
+        for (angles, out) in angles.as_chunks::<4>().0.iter().zip(out.as_chunks::<4>().0) {
             let [sines, cosines] = sin_cos_of_several(*angles);
             assert_eq!([0, 1, 2, 3].map(|i| [sines[i], cosines[i]]), *out, "four at a time");
         }
