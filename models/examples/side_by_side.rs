@@ -135,9 +135,9 @@ fn robot(name: &str) -> Option<Scene> {
                 ..Frame::default()
             });
             let name = format!("torque-{coordinate}");
+            parent = coordinate.clone();
             let coordinate = Some(coordinate);
-            scene.inputs.push(Input { name, coordinate: coordinate.clone(), ..Input::default() });
-            parent = coordinate.unwrap_or_default();
+            scene.inputs.push(Input { name, coordinate, ..Input::default() });
         }
         parent
     };

@@ -400,10 +400,10 @@ impl<const N: usize> Abreast<N> {
         let Self { mid, residual, increment, .. } = self;
         let h = settings.time_step_s;
         let inverse = 1.0 / h;
-        for i in 0..increment.len() {
+        for (i, x) in increment.iter().enumerate() {
             let turns = mid.turns_per_radian[i];
             [mid.q[i], mid.velocity[i], mid.angles[i]] =
-                middle(increment[i], state.q[i], state.q_low[i], turns, inverse);
+                middle(*x, state.q[i], state.q_low[i], turns, inverse);
         }
         mid.evaluate(model);
         let weight = settings.force_split.at_start() * h;
