@@ -407,7 +407,7 @@ impl<const N: usize> Abreast<N> {
         }
         mid.evaluate(model);
         let weight = settings.force_split.at_start() * h;
-        // The largest magnitude of all terms is that of the largest sum of magnitudes.
+        // As `largest_of_each`, without a list of magnitudes.
         let (mut round_off, mut sum) = (LanesOf::ZERO, LanesOf::ZERO);
         for (i, residual) in residual.iter_mut().enumerate() {
             let of_mid = [mid.l_q[i], mid.l_v[i], mid.force[i], mid.angles[i]];
