@@ -80,6 +80,8 @@ pub trait Scalar:
     fn constant(value: f64) -> Self;
     /// The real part.
     fn value(self) -> f64;
+    /// Whether it is several numbers side by side: then all code pays in wide registers.
+    const IS_SEVERAL: bool = false;
     /// Runs a block in registers that suit these numbers; see [`wide!`].
     #[inline(always)]
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
@@ -257,6 +259,7 @@ impl<const N: usize> LanesOf<N> {
 impl<const N: usize> Scalar for LanesOf<N> {
     const ZERO: Self = Self([0.0; N]);
     const ONE: Self = Self([1.0; N]);
+    const IS_SEVERAL: bool = true;
     #[inline(always)]
     fn constant(value: f64) -> Self {
         Self([value; N])

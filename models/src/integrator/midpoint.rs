@@ -100,7 +100,6 @@ impl<S: Planar> Midpoint<S> {
     }
 
     /// Gradient of the Lagrangian, and forces.
-    #[inline(always)]
     pub(crate) fn evaluate(&mut self, model: &Model) {
         let Self { l_q, l_v, force, .. } = self;
         self.mechanics.gradient(

@@ -506,26 +506,33 @@ impl<A: Arrangement> Joints<A> {
     /// Places the joints, for [`PlanarTree::pair`].
     #[inline(never)]
     fn place(&mut self, joints: &[PlanarJoint]) {
-        in_registers!(A::Number, {
-            for (i, joint) in joints.iter().enumerate() {
-                // The root of a tree is its origin, unless that moves on.
-                self.positions[i] = match joint.parent {
-                    0 => [A::Number::ZERO; 2],
-                    parent => add(self.positions[parent - 1], self.edge(i)),
-                };
-                if joint.anchor {
-                    // All joints placed so far in its tree are its ancestors.
-                    self.positions[i] = [A::Number::ZERO; 2];
-                    let mut below = i;
-                    while joints[below].parent > 0 {
-                        let (parent, edge) = (joints[below].parent - 1, self.edge(below));
-                        let position = self.positions[below];
-                        self.positions[parent] = [position[0] - edge[0], position[1] - edge[1]];
-                        below = parent;
-                    }
+        if A::Number::IS_SEVERAL {
+            in_registers!(A::Number, { self.place_now(joints) })
+        } else {
+            self.place_now(joints);
+        }
+    }
+
+    #[inline(always)]
+    fn place_now(&mut self, joints: &[PlanarJoint]) {
+        for (i, joint) in joints.iter().enumerate() {
+            // The root of a tree is its origin, unless that moves on.
+            self.positions[i] = match joint.parent {
+                0 => [A::Number::ZERO; 2],
+                parent => add(self.positions[parent - 1], self.edge(i)),
+            };
+            if joint.anchor {
+                // All joints placed so far in its tree are its ancestors.
+                self.positions[i] = [A::Number::ZERO; 2];
+                let mut below = i;
+                while joints[below].parent > 0 {
+                    let (parent, edge) = (joints[below].parent - 1, self.edge(below));
+                    let position = self.positions[below];
+                    self.positions[parent] = [position[0] - edge[0], position[1] - edge[1]];
+                    below = parent;
                 }
             }
-        })
+        }
     }
 
     #[inline(always)]
@@ -578,16 +585,28 @@ impl<A: Arrangement> Joints<A> {
         step: f64,
         matrix: &mut TreeLu<A::Number>,
     ) {
-        in_registers!(A::Number, {
-            let (quarter, inverse) = (0.25 * step, 1.0 / step);
-            for pair in pairs {
-                let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
-                let (common, slot) =
-                    (second.qq * quarter - second.vv * inverse, pair.slot as usize);
-                let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
-                matrix.upper[slot] = common + skew;
-                matrix.lower[slot] = common - skew;
-            }
-        })
+        if A::Number::IS_SEVERAL {
+            in_registers!(A::Number, { self.fill_now(joints, pairs, step, matrix) })
+        } else {
+            self.fill_now(joints, pairs, step, matrix);
+        }
+    }
+
+    #[inline(always)]
+    fn fill_now(
+        &self,
+        joints: &[PlanarJoint],
+        pairs: &[Pair],
+        step: f64,
+        matrix: &mut TreeLu<A::Number>,
+    ) {
+        let (quarter, inverse) = (0.25 * step, 1.0 / step);
+        for pair in pairs {
+            let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
+            let (common, slot) = (second.qq * quarter - second.vv * inverse, pair.slot as usize);
+            let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
+            matrix.upper[slot] = common + skew;
+            matrix.lower[slot] = common - skew;
+        }
     }
 }
