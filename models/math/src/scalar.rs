@@ -50,7 +50,10 @@ pub(crate) use operators;
 #[macro_export]
 macro_rules! in_registers {
     ($number:ty, $body:block) => {
-        <$number as $crate::scalar::Scalar>::in_registers(#[inline(always)] move || $body)
+        <$number as $crate::scalar::Scalar>::in_registers(
+            #[inline(always)]
+            move || $body,
+        )
     };
 }
 pub use in_registers;

@@ -69,13 +69,7 @@ impl<S: Compared> TreeLu<S> {
 
     /// Adds to the entry of two coupled rows, which may be one.
     #[inline]
-    pub fn add(
-        &mut self,
-        elimination: &SymbolicElimination,
-        row: usize,
-        column: usize,
-        value: S,
-    ) {
+    pub fn add(&mut self, elimination: &SymbolicElimination, row: usize, column: usize, value: S) {
         let slot = elimination.slot(row.max(column), row.min(column));
         let slot = slot.expect("what a model adds to its matrix is coupled");
         let triangle = if row <= column { &mut self.upper } else { &mut self.lower };
