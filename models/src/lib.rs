@@ -52,6 +52,7 @@ pub use crate::model::site::Site;
 pub use crate::plant::choice::{Choice, ChoiceError, ErrorEstimate};
 pub use crate::plant::diagnose::Diagnostics;
 pub use crate::plant::facade::Plant;
+pub use crate::plant::fleet::Fleet;
 pub use crate::plant::initial::{Initial, InitialError};
 pub use crate::plant::known::KnownStep;
 pub use crate::plant::settle::{Equilibrium, SettleError, SettleRequest};

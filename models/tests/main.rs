@@ -12,6 +12,7 @@ mod derivatives;
 mod diagnose;
 mod drawing;
 mod elements;
+mod fleet;
 mod forces;
 mod guess;
 mod joints;

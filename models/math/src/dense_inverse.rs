@@ -4,7 +4,7 @@
 //! while products with the inverse wait for nothing, and there are several for each matrix.
 
 use crate::rows::{LANES, Term, add_rows};
-use crate::scalar::{Lanes, Scalar};
+use crate::scalar::{Lanes, LanesOf, Scalar};
 use crate::simd::{wide, widest};
 
 /// A square matrix, row-major, then the inverse of it with its rows exchanged.
@@ -95,7 +95,7 @@ impl DenseInverse {
             for (x, row) in x.iter_mut().zip(self.matrix.chunks_exact(self.stride)) {
                 let mut sums = Lanes::ZERO;
                 for (entries, b) in row.as_chunks().0.iter().zip(self.work.as_chunks().0) {
-                    sums += Lanes(*entries) * Lanes(*b);
+                    sums += LanesOf(*entries) * LanesOf(*b);
                 }
                 let [a, b, c, d] = sums.0;
                 *x = (a + c) + (b + d);

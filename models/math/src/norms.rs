@@ -1,5 +1,7 @@
 //! Largest magnitudes, by which residuals are measured.
 
+use crate::scalar::Compared;
+
 /// The larger of two numbers; a NaN wins, so that it is never taken for converged.
 ///
 /// Both are taken without their signs, and bits of such numbers are in their order.
@@ -21,6 +23,18 @@ pub fn largest(numbers: &[f64]) -> f64 {
         sum += number.abs();
     }
     if sum < f64::INFINITY { most } else { f64::NAN }
+}
+
+/// [`largest`] of each of several lists side by side.
+#[inline(always)]
+pub fn largest_of_each<S: Compared>(numbers: &[S]) -> S {
+    let (mut most, mut sum) = (S::ZERO, S::ZERO);
+    for number in numbers {
+        let size = number.abs();
+        most = S::choose(most.less(size), size, most);
+        sum += size;
+    }
+    S::choose(sum.less(S::constant(f64::INFINITY)), most, S::constant(f64::NAN))
 }
 
 /// The greater of two numbers; the second, if the first is none. `f64::max` takes three instructions more.

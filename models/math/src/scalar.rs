@@ -4,8 +4,9 @@
 //! [`Dual`] numbers, which differentiates it exactly, to round-off.
 
 use std::fmt::Debug;
-use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
+use std::ops::{Add, AddAssign, BitAnd, BitOr, Div, Mul, Neg, Not, Sub, SubAssign};
 
+use crate::simd::{wide, widest};
 use crate::trigonometry;
 
 /// Operators of a type: by what they make of one or two operands, and of what they put in its place.
@@ -45,6 +46,18 @@ macro_rules! operators {
 }
 pub(crate) use operators;
 
+/// [`wide!`] in registers as wide as suits a type of numbers ([`Scalar::in_registers`]).
+#[macro_export]
+macro_rules! in_registers {
+    ($number:ty, $body:block) => {
+        <$number as $crate::scalar::Scalar>::in_registers(
+            #[inline(always)]
+            move || $body,
+        )
+    };
+}
+pub use in_registers;
+
 /// A real number, or one that carries derivatives.
 pub trait Scalar:
     Copy
@@ -70,6 +83,13 @@ pub trait Scalar:
     fn constant(value: f64) -> Self;
     /// The real part.
     fn value(self) -> f64;
+    /// Whether it is several numbers side by side: then all code pays in wide registers.
+    const IS_SEVERAL: bool = false;
+    /// Runs a block in registers that suit these numbers; see [`wide!`].
+    #[inline(always)]
+    fn in_registers<R>(block: impl FnOnce() -> R) -> R {
+        wide!({ block() })
+    }
     /// `(sin x, cos x)`.
     fn sin_cos(self) -> (Self, Self);
     /// Writes `sin x` and `cos x` of each.
@@ -195,20 +215,23 @@ operators! { [S: Scalar] Dual<S>;
     SubAssign sub_assign(mut a, b) { *a - b }
 }
 
-/// Four numbers side by side, for the same computation on each: a register's worth.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// Numbers side by side, for the same computation on each.
+#[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(align(32))]
-pub struct Lanes(pub [f64; 4]);
+pub struct LanesOf<const N: usize>(pub [f64; N]);
 
-impl Lanes {
-    /// How many numbers stand side by side.
-    pub const COUNT: usize = 4;
+/// Four numbers side by side: a register's worth.
+pub type Lanes = LanesOf<4>;
 
-    /// Their magnitudes.
-    #[inline(always)]
-    pub fn abs(self) -> Self {
-        self.each(f64::abs)
+impl<const N: usize> Default for LanesOf<N> {
+    fn default() -> Self {
+        Self::ZERO
     }
+}
+
+impl<const N: usize> LanesOf<N> {
+    /// How many numbers stand side by side.
+    pub const COUNT: usize = N;
 
     /// The first numbers of a list, up to four; those that it does not have are zero.
     #[inline(always)]
@@ -247,14 +270,28 @@ impl Lanes {
         }
         self
     }
+
+    #[inline(always)]
+    fn compare(self, other: Self, f: impl Fn(f64, f64) -> bool) -> Truths<N> {
+        let mut truths = [0; N];
+        for ((truth, x), y) in truths.iter_mut().zip(self.0).zip(other.0) {
+            *truth = if f(x, y) { u64::MAX } else { 0 };
+        }
+        Truths(truths)
+    }
 }
 
-impl Scalar for Lanes {
-    const ZERO: Self = Self([0.0; 4]);
-    const ONE: Self = Self([1.0; 4]);
+impl<const N: usize> Scalar for LanesOf<N> {
+    const ZERO: Self = Self([0.0; N]);
+    const ONE: Self = Self([1.0; N]);
+    const IS_SEVERAL: bool = true;
     #[inline(always)]
     fn constant(value: f64) -> Self {
-        Self([value; 4])
+        Self([value; N])
+    }
+    #[inline(always)]
+    fn in_registers<R>(block: impl FnOnce() -> R) -> R {
+        if N > Lanes::COUNT { widest!({ block() }) } else { wide!({ block() }) }
     }
     /// Of the first: nothing that branches on it may run on several numbers.
     #[inline(always)]
@@ -263,7 +300,7 @@ impl Scalar for Lanes {
     }
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
-        let [s, c] = trigonometry::sin_cos_of_four(self.0);
+        let [s, c] = trigonometry::sin_cos_of_several(self.0);
         (Self(s), Self(c))
     }
     #[inline(always)]
@@ -281,6 +318,142 @@ impl Scalar for Lanes {
     #[inline(always)]
     fn atan2(self, x: Self) -> Self {
         self.with(x, libm::atan2)
+    }
+}
+
+/// Reals, one or several side by side, that are compared and chosen from one by one.
+pub trait Compared: Scalar + Div<Output = Self> + Div<f64, Output = Self> {
+    /// What comparisons say.
+    type Truth: Copy
+        + Debug
+        + BitAnd<Output = Self::Truth>
+        + BitOr<Output = Self::Truth>
+        + Not<Output = Self::Truth>;
+    /// The same of all.
+    fn all(truth: bool) -> Self::Truth;
+    /// Whether it is so of one at least.
+    fn any(truth: Self::Truth) -> bool;
+    /// `self < other`.
+    fn less(self, other: Self) -> Self::Truth;
+    /// `self <= other`.
+    fn at_most(self, other: Self) -> Self::Truth;
+    /// One number where it is true, the other where it is not.
+    fn choose(truth: Self::Truth, yes: Self, no: Self) -> Self;
+    /// The magnitude.
+    fn abs(self) -> Self;
+    /// The larger one; a NaN is none.
+    fn max(self, other: Self) -> Self;
+}
+
+impl Compared for f64 {
+    type Truth = bool;
+    #[inline(always)]
+    fn all(truth: bool) -> bool {
+        truth
+    }
+    #[inline(always)]
+    fn any(truth: bool) -> bool {
+        truth
+    }
+    #[inline(always)]
+    fn less(self, other: Self) -> bool {
+        self < other
+    }
+    #[inline(always)]
+    fn at_most(self, other: Self) -> bool {
+        self <= other
+    }
+    #[inline(always)]
+    fn choose(truth: bool, yes: Self, no: Self) -> Self {
+        if truth { yes } else { no }
+    }
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.abs()
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.max(other)
+    }
+}
+
+/// What is true of numbers side by side: all bits of one are set, or none.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(align(32))]
+pub struct Truths<const N: usize>(pub [u64; N]);
+
+impl<const N: usize> Truths<N> {
+    /// What is true of one.
+    #[inline(always)]
+    pub fn of(&self, lane: usize) -> bool {
+        self.0[lane] != 0
+    }
+    #[inline(always)]
+    fn with(mut self, other: Self, f: impl Fn(u64, u64) -> u64) -> Self {
+        for (x, y) in self.0.iter_mut().zip(other.0) {
+            *x = f(*x, y);
+        }
+        self
+    }
+}
+
+impl<const N: usize> BitAnd for Truths<N> {
+    type Output = Self;
+    #[inline(always)]
+    fn bitand(self, other: Self) -> Self {
+        self.with(other, |x, y| x & y)
+    }
+}
+
+impl<const N: usize> BitOr for Truths<N> {
+    type Output = Self;
+    #[inline(always)]
+    fn bitor(self, other: Self) -> Self {
+        self.with(other, |x, y| x | y)
+    }
+}
+
+impl<const N: usize> Not for Truths<N> {
+    type Output = Self;
+    #[inline(always)]
+    fn not(self) -> Self {
+        self.with(self, |x, _| !x)
+    }
+}
+
+impl<const N: usize> Compared for LanesOf<N> {
+    type Truth = Truths<N>;
+    #[inline(always)]
+    fn all(truth: bool) -> Truths<N> {
+        Truths([if truth { u64::MAX } else { 0 }; N])
+    }
+    #[inline(always)]
+    fn any(truth: Truths<N>) -> bool {
+        truth.0.into_iter().fold(0, |any, one| any | one) != 0
+    }
+    #[inline(always)]
+    fn less(self, other: Self) -> Truths<N> {
+        self.compare(other, |x, y| x < y)
+    }
+    #[inline(always)]
+    fn at_most(self, other: Self) -> Truths<N> {
+        self.compare(other, |x, y| x <= y)
+    }
+    #[inline(always)]
+    fn choose(truth: Truths<N>, yes: Self, no: Self) -> Self {
+        let mut chosen = no;
+        for ((no, yes), truth) in chosen.0.iter_mut().zip(yes.0).zip(truth.0) {
+            *no = f64::from_bits((yes.to_bits() & truth) | (no.to_bits() & !truth));
+        }
+        chosen
+    }
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.each(f64::abs)
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.with(other, f64::max)
     }
 }
 
@@ -307,7 +480,7 @@ macro_rules! side_by_side {
         $(let $out = <[f64]>::as_chunks_mut::<{ $crate::scalar::Lanes::COUNT }>($to);)+
         let (lanes, rest) = [$(($x.0.len(), $x.1.len())),+][0];
         for i in 0..lanes {
-            $(let $x = $crate::scalar::Lanes($x.0[i]);)+
+            $(let $x = $crate::scalar::LanesOf($x.0[i]);)+
             let $local = $value;
             $($out.0[i] = ($result).0;)+
         }
@@ -335,16 +508,16 @@ impl Side for f64 {
     }
 }
 
-impl Side for Lanes {
+impl<const N: usize> Side for LanesOf<N> {
     #[inline(always)]
     fn load(list: &[f64]) -> Self {
-        let mut lanes = [0.0; 4];
-        lanes.copy_from_slice(&list[..4]);
+        let mut lanes = [0.0; N];
+        lanes.copy_from_slice(&list[..N]);
         Self(lanes)
     }
     #[inline(always)]
     fn store(self, list: &mut [f64]) {
-        list[..4].copy_from_slice(&self.0);
+        list[..N].copy_from_slice(&self.0);
     }
     #[inline(always)]
     fn unwound(angle: Self, more: Self, per_radian: Self) -> Self {
@@ -356,7 +529,7 @@ impl Side for Lanes {
     }
 }
 
-operators! { [] Lanes;
+operators! { [const N: usize] LanesOf<N>;
     Neg neg(a) { a.each(|x| -x) }
     Add add(a, b: Self) { a.with(b, |x, y| x + y) }
     Sub sub(a, b: Self) { a.with(b, |x, y| x - y) }
@@ -364,6 +537,8 @@ operators! { [] Lanes;
     Add add(a, b: f64) { a.each(|x| x + b) }
     Sub sub(a, b: f64) { a.each(|x| x - b) }
     Mul mul(a, b: f64) { a.each(|x| x * b) }
+    Div div(a, b: Self) { a.with(b, |x, y| x / y) }
+    Div div(a, b: f64) { a.each(|x| x / b) }
     AddAssign add_assign(mut a, b) { *a + b }
     SubAssign sub_assign(mut a, b) { *a - b }
 }

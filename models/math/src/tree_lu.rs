@@ -3,76 +3,73 @@
 
 use crate::elimination::SymbolicElimination;
 use crate::rows::{LANES, Term, add_rows_portable, padded};
-use crate::simd::{wide, widest};
+use crate::scalar::{Compared, LanesOf, in_registers};
+use crate::simd::widest;
 
 /// A matrix that couples each row only with its ancestors, and its factorization in place.
 #[derive(Clone, Debug, Default)]
-pub struct TreeLu {
+pub struct TreeLu<S = f64> {
     /// `upper[slot] = K[ancestor, row]`.
-    pub upper: Vec<f64>,
+    pub upper: Vec<S>,
     /// `lower[slot] = K[row, ancestor]`.
-    pub lower: Vec<f64>,
-    inverse_pivot: Vec<f64>,
+    pub lower: Vec<S>,
+    inverse_pivot: Vec<S>,
     /// What each pivot is compared with.
-    reference: Vec<f64>,
+    reference: Vec<S>,
     terms: Vec<Term>,
 }
 
 /// The smallest pivot of a factorization.
 #[derive(Clone, Copy, Debug)]
-pub struct SmallestPivot {
-    /// Where it stands.
+pub struct SmallestPivot<S = f64> {
+    /// Where it stands; of matrices side by side, where that of one of them does.
     pub row: usize,
     /// Relative to its reference, at most 1.
-    pub relative: f64,
+    pub relative: S,
 }
 
-impl SmallestPivot {
+impl<S: Compared> SmallestPivot<S> {
     /// Before any.
-    pub const NONE: Self = Self { row: 0, relative: 1.0 };
+    pub const NONE: Self = Self { row: 0, relative: S::ONE };
 
     /// Compares a pivot with its reference. A NaN counts as zero.
     #[inline(always)]
-    pub fn see(&mut self, row: usize, pivot: f64, reference: f64) {
-        let relative = (pivot.abs() / reference).max(0.0);
-        if relative < self.relative {
-            *self = Self { row, relative };
+    pub fn see(&mut self, row: usize, pivot: S, reference: S) {
+        let relative = (pivot.abs() / reference).max(S::ZERO);
+        let is_smaller = relative.less(self.relative);
+        if S::any(is_smaller) {
+            self.row = row;
+            self.relative = S::choose(is_smaller, relative, self.relative);
         }
     }
 }
 
-impl TreeLu {
+impl<S: Compared> TreeLu<S> {
     /// Of a matrix with that elimination tree; all entries are zero.
     pub fn new(elimination: &SymbolicElimination) -> Self {
         Self {
-            upper: vec![0.0; elimination.entries()],
-            lower: vec![0.0; elimination.entries()],
-            inverse_pivot: vec![0.0; elimination.rows()],
-            reference: vec![0.0; elimination.rows()],
+            upper: vec![S::ZERO; elimination.entries()],
+            lower: vec![S::ZERO; elimination.entries()],
+            inverse_pivot: vec![S::ZERO; elimination.rows()],
+            reference: vec![S::ZERO; elimination.rows()],
             terms: Vec::with_capacity(elimination.rows()),
         }
     }
 
     /// Sets all entries to zero; needed before filling where not every slot is written.
     pub fn clear(&mut self) {
-        self.upper.fill(0.0);
-        self.lower.fill(0.0);
+        self.upper.fill(S::ZERO);
+        self.lower.fill(S::ZERO);
     }
 
     /// Adds to a diagonal entry, which only the upper triangle holds for the factorization.
-    pub fn add_to_diagonal(&mut self, slot: usize, value: f64) {
+    pub fn add_to_diagonal(&mut self, slot: usize, value: S) {
         self.upper[slot] += value;
     }
 
     /// Adds to the entry of two coupled rows, which may be one.
     #[inline]
-    pub fn add(
-        &mut self,
-        elimination: &SymbolicElimination,
-        row: usize,
-        column: usize,
-        value: f64,
-    ) {
+    pub fn add(&mut self, elimination: &SymbolicElimination, row: usize, column: usize, value: S) {
         let slot = elimination.slot(row.max(column), row.min(column));
         let slot = slot.expect("what a model adds to its matrix is coupled");
         let triangle = if row <= column { &mut self.upper } else { &mut self.lower };
@@ -87,12 +84,12 @@ impl TreeLu {
         elimination: &SymbolicElimination,
         scale: &[f64],
         factor: f64,
-    ) -> SmallestPivot {
-        wide!({
+    ) -> SmallestPivot<S> {
+        in_registers!(S, {
             for ((reference, end), scale) in
                 self.reference.iter_mut().zip(&elimination.offsets[1..]).zip(scale)
             {
-                *reference = self.upper[end - 1].abs().max(scale * factor);
+                *reference = self.upper[end - 1].abs().max(S::constant(scale * factor));
             }
             let mut smallest = SmallestPivot::NONE;
             for k in (0..elimination.rows()).rev() {
@@ -103,21 +100,21 @@ impl TreeLu {
                 let (lower_above, lower_row) = self.lower.split_at_mut(start);
                 let pivot = upper_row[depth];
                 smallest.see(k, pivot, self.reference[k]);
-                let inverse = 1.0 / pivot;
+                let inverse = pivot.recip();
                 self.inverse_pivot[k] = inverse;
                 for entry in &mut upper_row[..depth] {
-                    *entry *= inverse;
+                    *entry = *entry * inverse;
                 }
                 for (d, &ancestor) in ancestors.iter().enumerate().rev() {
                     let target = elimination.offsets[ancestor];
                     let (l, u) = (lower_row[d], upper_row[d]);
                     let upper_target = &mut upper_above[target..=target + d];
                     for (t, s) in upper_target.iter_mut().zip(&upper_row[..=d]) {
-                        *t -= l * s;
+                        *t -= l * *s;
                     }
                     let lower_target = &mut lower_above[target..target + d];
                     for (t, s) in lower_target.iter_mut().zip(&lower_row[..d]) {
-                        *t -= u * s;
+                        *t -= u * *s;
                     }
                 }
             }
@@ -125,6 +122,69 @@ impl TreeLu {
         })
     }
 
+    /// Solves `K x = b` in place.
+    #[inline(never)]
+    pub fn solve(&self, elimination: &SymbolicElimination, x: &mut [S]) {
+        self.substitute(elimination, x);
+    }
+
+    /// [`Self::solve`] in the registers of the caller.
+    #[inline(always)]
+    pub fn substitute(&self, elimination: &SymbolicElimination, x: &mut [S]) {
+        for k in (0..elimination.rows()).rev() {
+            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
+            let value = x[k];
+            for (&ancestor, u) in
+                elimination.ancestors[range.clone()].iter().zip(&self.upper[range])
+            {
+                x[ancestor] -= *u * value;
+            }
+        }
+        for k in 0..elimination.rows() {
+            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
+            let mut value = x[k];
+            for (&ancestor, l) in
+                elimination.ancestors[range.clone()].iter().zip(&self.lower[range])
+            {
+                value -= *l * x[ancestor];
+            }
+            x[k] = value * self.inverse_pivot[k];
+        }
+    }
+}
+
+impl<S: Compared> TreeLu<S> {
+    /// Takes the factors of others where that is said.
+    #[inline(always)]
+    pub fn take_where(&mut self, truth: S::Truth, others: &Self) {
+        let lists = [
+            (&mut self.upper, &others.upper),
+            (&mut self.lower, &others.lower),
+            (&mut self.inverse_pivot, &others.inverse_pivot),
+        ];
+        for (own, others) in lists {
+            for (own, other) in own.iter_mut().zip(others) {
+                *own = S::choose(truth, *other, *own);
+            }
+        }
+    }
+}
+
+impl<const N: usize> TreeLu<LanesOf<N>> {
+    /// Takes the factors of one matrix into a lane.
+    pub fn take_lane(&mut self, lane: usize, other: &TreeLu) {
+        let lists = [
+            (&mut self.upper, &other.upper),
+            (&mut self.lower, &other.lower),
+            (&mut self.inverse_pivot, &other.inverse_pivot),
+        ];
+        for (own, other) in lists {
+            own.iter_mut().zip(other).for_each(|(own, other)| own.0[lane] = *other);
+        }
+    }
+}
+
+impl TreeLu {
     /// Solves `K X = B` in place for the first columns of a row-major matrix; `columns` and `stride`
     /// are whole blocks.
     pub fn solve_rows(
@@ -176,30 +236,6 @@ impl TreeLu {
                 row.iter_mut().for_each(|entry| *entry *= inverse);
             }
         })
-    }
-
-    /// Solves `K x = b` in place.
-    #[inline(never)]
-    pub fn solve(&self, elimination: &SymbolicElimination, x: &mut [f64]) {
-        for k in (0..elimination.rows()).rev() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
-            let value = x[k];
-            for (&ancestor, u) in
-                elimination.ancestors[range.clone()].iter().zip(&self.upper[range])
-            {
-                x[ancestor] -= u * value;
-            }
-        }
-        for k in 0..elimination.rows() {
-            let range = elimination.offsets[k]..elimination.offsets[k + 1] - 1;
-            let mut value = x[k];
-            for (&ancestor, l) in
-                elimination.ancestors[range.clone()].iter().zip(&self.lower[range])
-            {
-                value -= l * x[ancestor];
-            }
-            x[k] = value * self.inverse_pivot[k];
-        }
     }
 }
 

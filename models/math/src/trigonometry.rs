@@ -75,10 +75,10 @@ pub fn sin_cos(angles: &[f64], out: &mut [[f64; 2]]) {
     }
 }
 
-/// The sines and the cosines of four angles.
+/// The sines and the cosines of a few angles.
 #[inline(always)]
-pub fn sin_cos_of_four(angles: [f64; 4]) -> [[f64; 4]; 2] {
-    let ([mut sines, mut cosines], mut all_small) = ([[0.0; 4]; 2], true);
+pub fn sin_cos_of_several<const N: usize>(angles: [f64; N]) -> [[f64; N]; 2] {
+    let ([mut sines, mut cosines], mut all_small) = ([[0.0; N]; 2], true);
     for (i, angle) in angles.iter().enumerate() {
         all_small &= angle.abs() <= LARGEST;
         [sines[i], cosines[i]] = reduced(*angle);
@@ -89,8 +89,8 @@ pub fn sin_cos_of_four(angles: [f64; 4]) -> [[f64; 4]; 2] {
 /// Apart, lest the usual results go through memory.
 #[cold]
 #[inline(never)]
-fn sin_cos_one_by_one(angles: [f64; 4]) -> [[f64; 4]; 2] {
-    let mut out = [[0.0; 4]; 2];
+fn sin_cos_one_by_one<const N: usize>(angles: [f64; N]) -> [[f64; N]; 2] {
+    let mut out = [[0.0; N]; 2];
     for (i, angle) in angles.into_iter().enumerate() {
         (out[0][i], out[1][i]) = sin_cos_of(angle);
     }
@@ -167,8 +167,8 @@ mod tests {
             assert!(distance(*s, sine) <= 1.0, "sin {angle:e}: {s:e}, {sine:e}");
             assert!(distance(*c, cosine) <= 1.0, "cos {angle:e}: {c:e}, {cosine:e}");
         }
-        for (angles, out) in angles.as_chunks().0.iter().zip(out.as_chunks::<4>().0) {
-            let [sines, cosines] = sin_cos_of_four(*angles);
+        for (angles, out) in angles.as_chunks::<4>().0.iter().zip(out.as_chunks::<4>().0) {
+            let [sines, cosines] = sin_cos_of_several(*angles);
             assert_eq!([0, 1, 2, 3].map(|i| [sines[i], cosines[i]]), *out, "four at a time");
         }
         #[cfg(target_arch = "x86_64")]

@@ -16,10 +16,14 @@
 //! `p[k+1] = p[k] + h (τ + f)` has been found before the correction; what the correction makes of it is linear,
 //! with an error as small as what is left of the residual.
 
+use plantd_math::scalar::Compared;
 use plantd_math::spatial::three;
 
 use crate::integrator::settings::{ForceSplit, Settings};
 use crate::integrator::workspace::Workspace;
+use crate::lagrangian::arrangement::Planar;
+use crate::lagrangian::mechanics::Mechanics;
+use crate::lagrangian::nudge::Nudge;
 use crate::model::mechanism::Model;
 
 /// What may be left of the residual unseen, in units of its round-off, as it is estimated.
@@ -31,11 +35,43 @@ const EXPECTED: f64 = 0.2;
 
 /// How far corrections have gone from the increment of the Jacobian.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Strayed {
+pub(crate) struct Strayed<S = f64> {
     /// `α`.
-    turned: f64,
+    turned: S,
     /// `σ`.
-    weighed: f64,
+    weighed: S,
+}
+
+impl<S: Compared> Strayed<S> {
+    /// What a correction of an increment leaves of the residual, in units that are given.
+    #[inline(always)]
+    pub(crate) fn left(
+        &mut self,
+        corrections: &[S],
+        increments: &[S],
+        inertia: &[f64],
+        unit: S,
+    ) -> S {
+        let ([mut turned, mut moved, mut square], mut largest) = ([S::ZERO; 3], 0.0_f64);
+        for ((x, increment), inertia) in corrections.iter().zip(increments).zip(inertia) {
+            turned += x.abs();
+            moved += increment.abs();
+            square += *x * *x * *inertia;
+            largest = largest.max(*inertia);
+        }
+        let weighed = square.sqrt();
+        let product = self.turned * weighed + turned * (self.weighed + weighed);
+        self.turned += turned;
+        self.weighed += weighed;
+        product * largest.sqrt() * (moved + 1.0) / unit
+    }
+
+    /// A new Jacobian, where there is one.
+    #[inline(always)]
+    pub(crate) fn begin_again(&mut self, is_fresh: S::Truth) {
+        self.turned = S::choose(is_fresh, S::ZERO, self.turned);
+        self.weighed = S::choose(is_fresh, S::ZERO, self.weighed);
+    }
 }
 
 impl Model {
@@ -56,29 +92,46 @@ impl Model {
 }
 
 /// Whether a residual that is estimated and expected to be left may stay unseen.
-pub(crate) fn is_negligible(left: f64, expected: f64) -> bool {
-    left <= UNSEEN || (left <= BORNE_OUT && expected <= EXPECTED)
+#[inline(always)]
+pub(crate) fn is_negligible<S: Compared>(left: S, expected: S) -> S::Truth {
+    let [unseen, borne_out, little] = [UNSEEN, BORNE_OUT, EXPECTED].map(S::constant);
+    left.at_most(unseen) | (left.at_most(borne_out) & expected.at_most(little))
+}
+
+impl<S: Planar> Nudge<S> {
+    /// Moves an impulse on by a correction, but for what ball joints make of it.
+    #[inline(always)]
+    pub(crate) fn move_on(
+        &mut self,
+        model: &Model,
+        mechanics: &Mechanics<S>,
+        corrections: &[S],
+        h: f64,
+        turn: impl FnOnce(&mut [S]),
+        impulse: &mut [S],
+    ) {
+        let changes = self.position.iter_mut().zip(&mut self.velocity);
+        for ((position, velocity), x) in changes.zip(corrections) {
+            (*position, *velocity) = (*x * -0.5, -*x / h);
+        }
+        turn(&mut self.position);
+        self.find(model, mechanics);
+        for (impulse, l_q) in impulse.iter_mut().zip(&self.l_q) {
+            *impulse += *l_q * h;
+        }
+        for ((impulse, c), x) in impulse.iter_mut().zip(&model.damping).zip(corrections) {
+            *impulse += *x * *c;
+        }
+    }
 }
 
 impl Workspace {
     /// What the last correction leaves of the residual, in units of its round-off.
     #[inline(never)]
     pub(crate) fn foresee(&self, model: &Model, settings: &Settings, strayed: &mut Strayed) -> f64 {
-        let corrections = &self.residual.dynamics[..];
-        let (mut turned, mut moved, mut square, mut largest) = (0.0, 0.0, 0.0, 0.0_f64);
-        let rows = corrections.iter().zip(&self.step.increment).zip(&model.conditioning.inertia);
-        for ((x, increment), inertia) in rows {
-            turned += x.abs();
-            moved += increment.abs();
-            square += x * x * inertia;
-            largest = largest.max(*inertia);
-        }
-        let weighed = square.sqrt();
-        let product = strayed.turned * weighed + turned * (strayed.weighed + weighed);
-        strayed.turned += turned;
-        strayed.weighed += weighed;
         let unit = f64::EPSILON * self.residual.round_off * settings.time_step_s.abs();
-        product * largest.sqrt() * (1.0 + moved) / unit
+        let (corrections, inertia) = (&self.residual.dynamics, &model.conditioning.inertia);
+        strayed.left(corrections, &self.step.increment, inertia, unit)
     }
 
     /// Moves the impulse on by the last correction, at the last factorization.
@@ -87,25 +140,17 @@ impl Workspace {
         let h = settings.time_step_s;
         let Self { step, mid, balls, residual, kkt, nudge, .. } = self;
         let corrections = &residual.dynamics[..];
-        let changes = nudge.position.iter_mut().zip(&mut nudge.velocity);
-        for ((position, velocity), x) in changes.zip(corrections) {
-            (*position, *velocity) = (-0.5 * x, -x / h);
-        }
         let orientations = || {
             let all = model.orientations.iter().enumerate();
             all.filter(|(_, i)| **i < model.dimensions.dynamic).map(|(o, i)| (o, *i))
         };
-        for (o, i) in orientations() {
-            let turned = kkt.balls[o].column.apply(three(&nudge.position, i));
-            nudge.position[i..i + 3].copy_from_slice(&turned.0);
-        }
-        nudge.find(model, &mid.mechanics);
-        for (impulse, l_q) in step.impulse.iter_mut().zip(&nudge.l_q) {
-            *impulse += h * l_q;
-        }
-        for ((impulse, c), x) in step.impulse.iter_mut().zip(&model.damping).zip(corrections) {
-            *impulse += c * x;
-        }
+        let turn = |position: &mut [f64]| {
+            for (o, i) in orientations() {
+                let turned = kkt.balls[o].column.apply(three(position, i));
+                position[i..i + 3].copy_from_slice(&turned.0);
+            }
+        };
+        nudge.move_on(model, &mid.mechanics, corrections, h, turn, &mut step.impulse);
         if model.orientations.is_empty() {
             return;
         }

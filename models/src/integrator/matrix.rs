@@ -7,7 +7,6 @@ use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::Workspace;
 use crate::kkt::schur::{SchurComplement, fill_schur};
 use crate::kkt::system::{Factors, Linearized};
-use crate::lagrangian::armature;
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::turning::Weights;
@@ -71,7 +70,7 @@ impl Workspace {
         if !self.kkt.has_recursion() {
             return Ok(false);
         }
-        self.fill_diagonal(model, settings);
+        self.mid.fill_diagonal(model, settings, &mut self.kkt.diagonal);
         if !model.orientations.is_empty() {
             self.weigh_balls(model, settings);
         }
@@ -100,7 +99,6 @@ impl Workspace {
 
     /// Fills `K` at the last evaluation.
     pub(crate) fn fill_newton_matrix(&mut self, model: &Model, settings: &Settings) {
-        let h = settings.time_step_s;
         if model.potentials.couple_branches || model.forces.is_some() {
             self.kkt.factored.tree.clear();
         }
@@ -108,34 +106,7 @@ impl Workspace {
             self.fill_turned_newton_matrix(model, settings);
             return;
         }
-        self.mid.mechanics.differentiate(model);
-        if let (Some(planar), Some(joints)) = (&mut self.mid.mechanics.planar, &model.planar) {
-            planar.fill_newton_matrix(joints, &model.pairs, h, &mut self.kkt.factored.tree);
-        } else {
-            self.mid.mechanics.curvature.fill_newton_matrix(
-                &model.pairs,
-                &self.mid.mechanics.momenta,
-                model.gravity,
-                h,
-                &mut self.kkt.factored.tree,
-            );
-        }
-        if model.potentials.any {
-            let (dynamic, matrix) = (model.dimensions.dynamic, &mut self.kkt.factored.tree);
-            let poses = &self.mid.mechanics.poses;
-            model.for_each_spring_derivative(poses, &self.mid.q, |i, j, value| {
-                if i < dynamic && j < dynamic {
-                    matrix.add(&model.elimination, i, j, -0.25 * h * value);
-                }
-            });
-            for entry in &model.armature {
-                armature::add_to(&mut self.kkt.factored.tree, model, entry, -1.0 / h);
-            }
-        }
-        for (i, c) in model.damping.iter().enumerate() {
-            let slot = model.elimination.offsets[i + 1] - 1;
-            self.kkt.factored.tree.add_to_diagonal(slot, -settings.force_split.at_start() * c);
-        }
+        self.mid.fill_newton_matrix(model, settings, &mut self.kkt.factored.tree);
         if let Some(forces) = &model.forces {
             self.add_forces_to_newton_matrix(model, forces, settings);
         }
@@ -151,23 +122,6 @@ impl Workspace {
         self.kkt
             .factor_tree(model, settings.time_step_s, settings.singular_below)
             .map_err(|pivot| model.singular_matrix(pivot))
-    }
-
-    /// What springs, dampers and armatures of coordinates add to the diagonal of `K`.
-    fn fill_diagonal(&mut self, model: &Model, settings: &Settings) {
-        let h = settings.time_step_s;
-        let diagonal = &mut self.kkt.diagonal;
-        diagonal.fill(0.0);
-        if model.potentials.any {
-            let poses = &self.mid.mechanics.poses;
-            let add = |i: usize, _, value| diagonal[i] -= 0.25 * h * value;
-            model.for_each_spring_derivative(poses, &self.mid.q, add);
-            model.armature.iter().for_each(|a| diagonal[a.row] -= a.inertia / h);
-        }
-        let a = settings.force_split.at_start();
-        for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
-            *entry -= a * c;
-        }
     }
 
     /// Adds the part `a (½h f_q + f_v)` of forces to the Newton matrix.

@@ -5,45 +5,74 @@ use std::f64::consts::TAU;
 use plantd_math::scalar::{Side, side_by_side};
 use plantd_math::simd::wide;
 use plantd_math::spatial::Mat3;
+use plantd_math::tree_lu::TreeLu;
 
+use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
+use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::lagrangian::{armature, forces};
-use crate::model::mechanism::Model;
+use crate::model::mechanism::{Armature, Model};
 use crate::model::tree::JointKind;
 
-/// Configuration and velocity at the midpoint, with the derivatives of the Lagrangian and the forces there.
-#[derive(Clone, Debug)]
-pub(crate) struct Midpoint {
-    /// Configuration.
-    pub(crate) q: Vec<f64>,
-    /// Configuration with angles of hinges less their whole turns, in which they keep all digits.
-    pub(crate) angles: Vec<f64>,
-    /// `1/2π` for the coordinates of hinges, else zero.
-    pub(crate) turns_per_radian: Vec<f64>,
-    /// Orientations of ball joints.
-    pub(crate) orientations: Vec<Mat3>,
-    pub(crate) velocity: Vec<f64>,
-    pub(crate) mechanics: Mechanics,
-    pub(crate) l_q: Vec<f64>,
-    pub(crate) l_v: Vec<f64>,
-    /// The inputs, where forces need them; else empty.
-    pub(crate) inputs: Vec<f64>,
-    pub(crate) input_force: Vec<f64>,
-    /// Inputs, damping and forces.
-    pub(crate) force: Vec<f64>,
+/// The midpoint of an increment `x`: `q0 + ½x`, `x/h` with `1/h` given, and the first without whole turns.
+#[inline(always)]
+pub(crate) fn middle<S: Side>(x: S, q: S, q_low: S, per_radian: S, inverse: f64) -> [S; 3] {
+    let more = x * 0.5 + q_low;
+    [q + more, x * inverse, Side::unwound(q, more, per_radian)]
 }
 
 impl Midpoint {
+    /// Goes to the midpoint of an increment, with `1/h` given.
+    pub(crate) fn go_to(&mut self, state: &PreciseState, increment: &[f64], inverse: f64) {
+        wide!({
+            let nd = increment.len();
+            side_by_side!(for (
+                x in &increment[..nd],
+                q in &state.q[..nd],
+                q_low in &state.q_low[..nd],
+                per_radian in &self.turns_per_radian[..nd],
+            ) let [middle, velocity, angle] = middle(x, q, q_low, per_radian, inverse); {
+                middle_out(&mut self.q[..nd]) = middle;
+                velocity_out(&mut self.velocity[..nd]) = velocity;
+                angle_out(&mut self.angles[..nd]) = angle;
+            });
+        })
+    }
+}
+
+/// Configuration and velocity at the midpoint, with the derivatives of the Lagrangian and the forces there.
+#[derive(Clone, Debug)]
+pub(crate) struct Midpoint<S: Planar = f64> {
+    /// Configuration.
+    pub(crate) q: Vec<S>,
+    /// Configuration with angles of hinges less their whole turns, in which they keep all digits.
+    pub(crate) angles: Vec<S>,
+    /// `1/2π` for the coordinates of hinges, else zero.
+    pub(crate) turns_per_radian: Vec<S>,
+    /// Orientations of ball joints.
+    pub(crate) orientations: Vec<Mat3<S>>,
+    pub(crate) velocity: Vec<S>,
+    pub(crate) mechanics: Mechanics<S>,
+    pub(crate) l_q: Vec<S>,
+    pub(crate) l_v: Vec<S>,
+    /// The inputs, where forces need them; else empty.
+    pub(crate) inputs: Vec<S>,
+    pub(crate) input_force: Vec<S>,
+    /// Inputs, damping and forces.
+    pub(crate) force: Vec<S>,
+}
+
+impl<S: Planar> Midpoint<S> {
     pub(crate) fn new(model: &Model) -> Self {
         let d = model.dimensions;
         let (nd, n, no) = (d.dynamic, d.coordinates(), model.orientations.len());
-        let zeros = |len: usize| vec![0.0; len];
+        let zeros = |len: usize| vec![S::ZERO; len];
         let mut turns_per_radian = zeros(nd);
         for joint in model.dynamics.joints.iter().filter(|j| j.kind == JointKind::Revolute) {
             if let Some(turns) = turns_per_radian.get_mut(joint.coordinate) {
-                *turns = 1.0 / TAU;
+                *turns = S::constant(1.0 / TAU);
             }
         }
         Self {
@@ -62,29 +91,12 @@ impl Midpoint {
     }
 
     /// Inputs, and their forces on coordinates.
-    pub(crate) fn set_inputs(&mut self, model: &Model, inputs: &[f64]) {
+    pub(crate) fn set_inputs(&mut self, model: &Model, inputs: &[S]) {
         forces::input_forces(&model.coordinate_inputs, inputs, &mut self.input_force);
         self.force.copy_from_slice(&self.input_force);
         if !self.inputs.is_empty() {
             self.inputs.copy_from_slice(inputs);
         }
-    }
-
-    /// Goes to the midpoint of an increment: `q0 + ½x`, and `x/h` with `1/h` given.
-    pub(crate) fn go_to(&mut self, state: &PreciseState, increment: &[f64], inverse: f64) {
-        wide!({
-            let nd = increment.len();
-            side_by_side!(for (
-                x in &increment[..nd],
-                q in &state.q[..nd],
-                q_low in &state.q_low[..nd],
-                per_radian in &self.turns_per_radian[..nd],
-            ) let more = x * 0.5 + q_low; {
-                middle(&mut self.q[..nd]) = q + more;
-                velocity(&mut self.velocity[..nd]) = x * inverse;
-                angle(&mut self.angles[..nd]) = Side::unwound(q, more, per_radian);
-            });
-        })
     }
 
     /// Gradient of the Lagrangian, and forces.
@@ -113,8 +125,50 @@ impl Midpoint {
         }
     }
 
+    /// Fills `K` of a model without ball joints at the last evaluation, but for forces.
+    pub(crate) fn fill_newton_matrix(
+        &mut self,
+        model: &Model,
+        settings: &Settings,
+        matrix: &mut TreeLu<S>,
+    ) {
+        let h = settings.time_step_s;
+        self.mechanics.fill_newton_matrix(model, h, matrix);
+        if model.potentials.any {
+            let dynamic = model.dimensions.dynamic;
+            model.for_each_spring_derivative(&self.mechanics.poses, &self.q, |i, j, value| {
+                if i < dynamic && j < dynamic {
+                    matrix.add(&model.elimination, i, j, value * (-0.25 * h));
+                }
+            });
+            for entry in &model.armature {
+                armature::add_to(matrix, model, entry, -1.0 / h);
+            }
+        }
+        for (i, c) in model.damping.iter().enumerate() {
+            let slot = model.elimination.offsets[i + 1] - 1;
+            matrix.add_to_diagonal(slot, S::constant(-settings.force_split.at_start() * c));
+        }
+    }
+
+    /// What springs, dampers and armatures of coordinates add to the diagonal of `K`.
+    pub(crate) fn fill_diagonal(&self, model: &Model, settings: &Settings, diagonal: &mut [S]) {
+        let h = settings.time_step_s;
+        diagonal.fill(S::ZERO);
+        if model.potentials.any {
+            let add = |i: usize, _, value: S| diagonal[i] -= value * (0.25 * h);
+            model.for_each_spring_derivative(&self.mechanics.poses, &self.q, add);
+            let add = |a: &Armature| diagonal[a.row] -= S::constant(a.inertia / h);
+            model.armature.iter().for_each(add);
+        }
+        let a = settings.force_split.at_start();
+        for (entry, c) in diagonal.iter_mut().zip(&model.damping) {
+            *entry -= S::constant(a * c);
+        }
+    }
+
     /// What forces depend on, at the last evaluation.
-    pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a> {
+    pub(crate) fn instant<'a>(&'a self, model: &'a Model) -> Instant<'a, S> {
         self.mechanics.instant(model, &self.q, &self.velocity, &self.inputs)
     }
 }

@@ -3,8 +3,9 @@
 //! Read [`residual`] first: it has the equations. [`newton`] solves them, from the guess of [`predictor`] and [`push`], at
 //! the [`midpoint`], with matrices that [`matrix`] fills and [`crate::kkt`] factors; [`balls`] replaces
 //! coordinates of ball joints by orientations. [`collocation`] is the method of higher orders, of which
-//! [`scheme`] has the coefficients.
+//! [`scheme`] has the coefficients. [`abreast`] takes steps of several plants side by side.
 
+pub(crate) mod abreast;
 pub(crate) mod balls;
 pub(crate) mod blocks;
 pub(crate) mod collocation;

@@ -6,6 +6,7 @@
 //! to ([`foresight`](super::foresight)).
 
 use plantd_math::norms::{larger, largest};
+use plantd_math::scalar::Compared;
 
 use crate::integrator::foresight::{Strayed, is_negligible};
 use crate::integrator::report::{StepError, StepReport};
@@ -15,7 +16,7 @@ use crate::integrator::workspace::{Residual, StepContext, Workspace};
 use crate::model::mechanism::Model;
 
 /// A residual this small, in units of round-off, is as good as zero.
-const CONVERGED: f64 = 4.0;
+pub(crate) const CONVERGED: f64 = 4.0;
 /// A residual this small will do where precision is not asked for.
 const NEARLY: f64 = 1e5;
 /// A residual that no longer falls, with a fresh Jacobian, is at its floor if it is below this.
@@ -36,55 +37,70 @@ impl Precision {
 }
 
 /// How far an iteration with kept factors has come.
-struct Chord {
+pub(crate) struct Chord<S: Compared = f64> {
     /// A residual after which one more correction is the last.
     enough: f64,
     /// What a factorization costs, in corrections.
     patience: u32,
     always_factor: bool,
-    previous: f64,
+    previous: S,
     /// The residual before that.
-    before: f64,
+    before: S,
     /// The Jacobian is that of this residual.
-    is_fresh: bool,
+    pub(crate) is_fresh: S::Truth,
     /// The last correction was no more than round-off of the coordinates.
-    is_idle: bool,
+    pub(crate) is_idle: S::Truth,
 }
 
-impl Chord {
-    fn new(settings: &Settings, patience: u32, always_factor: bool) -> Self {
+impl<S: Compared> Chord<S> {
+    pub(crate) fn new(settings: &Settings, patience: u32, always_factor: bool) -> Self {
         let enough = settings.precision.residual();
-        let (previous, before) = (f64::INFINITY, f64::INFINITY);
-        Self { enough, patience, always_factor, previous, before, is_fresh: false, is_idle: false }
+        let [previous, before] = [S::constant(f64::INFINITY); 2];
+        let [is_fresh, is_idle] = [S::all(false); 2];
+        Self { enough, patience, always_factor, previous, before, is_fresh, is_idle }
     }
 
     /// Whether the correction of a residual is the last; `is_fresh` says whether it takes a new Jacobian.
-    fn judge(&mut self, size: f64, constraint_residual: f64) -> bool {
-        let floor = if self.is_fresh { FLOOR } else { CHORD_FLOOR };
-        let stagnates = size > 0.5 * self.previous;
+    #[inline(always)]
+    pub(crate) fn judge(&mut self, size: S, constraint_residual: S) -> S::Truth {
+        let [fresh, kept] = [FLOOR, CHORD_FLOOR].map(S::constant);
+        let floor = S::choose(self.is_fresh, fresh, kept);
+        let stagnates = (self.previous * 0.5).less(size);
         // Where forces balance, a unit of round-off of a coordinate outweighs the residual's own.
-        let is_idle = self.is_idle && constraint_residual <= FLOOR;
-        let at_floor = stagnates && (size <= floor || is_idle);
-        let converged = size <= self.enough || at_floor;
+        let is_idle = self.is_idle & constraint_residual.at_most(fresh);
+        let at_floor = stagnates & (size.at_most(floor) | is_idle);
+        let enough = S::constant(self.enough);
+        let converged = size.at_most(enough) | at_floor;
         // A new Jacobian squares the rate: it pays where the old one needs many corrections more.
         let rate = size / self.previous;
         let later = (0..self.patience).fold(size, |size, _| size * rate);
         // The first correction is one with this step's Jacobian, also where it is the last: factors of
         // another step would be memory beside the state.
-        self.is_fresh = self.previous.is_infinite()
-            || (!converged && (self.always_factor || later > self.enough));
+        self.is_fresh = is_infinite(self.previous)
+            | (!converged & (S::all(self.always_factor) | enough.less(later)));
         (self.before, self.previous) = (self.previous, size);
         converged
     }
 
     /// What the correction of the last residual leaves over, from how the residual has fallen: kept factors
     /// get no better, and those of a new Jacobian are off by twice as much as their first correction shows.
-    fn expected(&self) -> f64 {
-        if self.before.is_infinite() {
-            return f64::INFINITY;
-        }
-        8.0 * self.previous * (self.previous / self.before)
+    #[inline(always)]
+    pub(crate) fn expected(&self) -> S {
+        let expected = self.previous * 8.0 * (self.previous / self.before);
+        S::choose(is_infinite(self.before), S::constant(f64::INFINITY), expected)
     }
+}
+
+#[inline(always)]
+fn is_infinite<S: Compared>(size: S) -> S::Truth {
+    S::constant(f64::MAX).less(size)
+}
+
+/// Whether a correction is no more than the round-off of a coordinate at an angle, with an increment.
+#[inline(always)]
+pub(crate) fn is_round_off<S: Compared>(correction: S, angle: S, increment: S) -> S::Truth {
+    // The midpoint may be next to zero where start and end are not.
+    correction.abs().at_most((angle.abs() + increment.abs()) * (2.0 * f64::EPSILON))
 }
 
 impl Workspace {
@@ -250,7 +266,7 @@ impl Workspace {
         always_factor: bool,
     ) -> Result<StepReport, StepError> {
         let mut report = StepReport::default();
-        let mut chord = Chord::new(settings, self.kkt.corrections(), always_factor);
+        let mut chord = Chord::<f64>::new(settings, self.kkt.corrections(), always_factor);
         let mut strayed = (BODIES && model.is_foreseen(settings)).then(Strayed::default);
         let pushes = BODIES && !state.past.point.is_empty();
         loop {
@@ -341,10 +357,8 @@ impl Workspace {
 
     /// Whether the last correction is no more than the round-off of the coordinates.
     fn is_round_off_of_coordinates(&self) -> bool {
-        // The midpoint may be next to zero where start and end are not.
-        let size = |i: usize| self.mid.angles[i].abs() + self.step.increment[i].abs();
         let mut corrections = self.residual.dynamics.iter().enumerate();
-        corrections.all(|(i, x)| x.abs() <= 2.0 * f64::EPSILON * size(i))
+        corrections.all(|(i, x)| is_round_off(*x, self.mid.angles[i], self.step.increment[i]))
     }
 
     /// Checks the solution, and finds its impulse.

@@ -12,6 +12,8 @@
 //! Steps of uneven length interpolate velocities nearby ([`Kind::Trail`]); collocation goes on with its
 //! polynomial ([`Kind::Stages`]).
 
+use plantd_math::scalar::{Compared, Scalar};
+
 use crate::integrator::point::Point;
 use crate::integrator::scheme::{STAGES_MAX, Scheme, Tableau};
 use crate::model::mechanism::Model;
@@ -46,7 +48,7 @@ enum Kind {
 }
 
 /// Steps kept.
-const LENGTH: usize = 8;
+pub(crate) const LENGTH: usize = 8;
 /// Velocities at most, of which a guess is made.
 const NODES: usize = 5;
 /// Velocities closer in time than this, relative to the step, count as one.
@@ -55,10 +57,10 @@ const APART: f64 = 0.1;
 /// Takes new increments into the differences of past ones, those from `∇²` on less what was pushed, and sums up
 /// their squares, weighed.
 #[inline(always)]
-fn difference<'a>(
-    rows: impl Iterator<Item = (&'a mut [f64; LENGTH], f64, f64, f64)>,
-) -> [f64; LENGTH] {
-    let mut errors = [0.0; LENGTH];
+pub(crate) fn difference<'a, S: Scalar>(
+    rows: impl Iterator<Item = (&'a mut [S; LENGTH], S, S, f64)>,
+) -> [S; LENGTH] {
+    let mut errors = [S::ZERO; LENGTH];
     for (differences, increment, pushed, weight) in rows {
         let mut difference = increment;
         for (m, (kept, error)) in differences.iter_mut().zip(&mut errors).enumerate() {
@@ -70,6 +72,19 @@ fn difference<'a>(
         }
     }
     errors
+}
+
+/// Differences that the next prediction takes, of those that mean something: the more, the better they have been.
+#[inline(always)]
+pub(crate) fn best_order<S: Compared>(errors: &[S; LENGTH], known: S, most: usize) -> S {
+    let (mut least, mut order) = (errors[1], S::ONE);
+    for (m, error) in errors.iter().enumerate().take(most + 1).skip(2) {
+        let place = S::constant(m as f64);
+        let is_better = error.less(least) & place.at_most(known);
+        least = S::choose(is_better, *error, least);
+        order = S::choose(is_better, place, order);
+    }
+    order
 }
 
 impl Past {
@@ -91,6 +106,19 @@ impl Past {
         let mut past = Self { kind, numbers, known: 0, order: 0, is_even: true, point };
         past.numbers.resize(past.length(coordinates), 0.0);
         past
+    }
+
+    /// The differences of the increments, how many steps were seen, and how many differences the next guess takes;
+    /// `None` if there is nothing to guess from, or it is of another kind.
+    pub(crate) fn increments(&self) -> Option<(&[[f64; LENGTH]], [u8; 2])> {
+        let is_known = self.kind == Kind::Increments && self.known > 0 && self.order > 0;
+        is_known.then(|| (self.numbers.as_chunks().0, [self.known, self.order]))
+    }
+
+    /// Replaces the counts; the differences may be replaced after that.
+    pub(crate) fn replace_increments(&mut self, [known, order]: [u8; 2]) -> &mut [[f64; LENGTH]] {
+        (self.known, self.order) = (known, order);
+        self.numbers.as_chunks_mut().0
     }
 
     /// Whether a guess goes on with the last change of the increments.
@@ -185,9 +213,7 @@ impl Past {
                 };
                 // Of the differences, as many mean something as there were increments before.
                 let known = usize::from(self.known).clamp(1, LENGTH - 1);
-                let better =
-                    |best: usize, m: usize| if errors[m] < errors[best] { m } else { best };
-                self.order = (2..=known).fold(1, better) as u8;
+                self.order = best_order(&errors, known as f64, known) as u8;
             }
             Kind::Trail => {
                 rows.iter_mut().for_each(|row| row.copy_within(..LENGTH - 1, 1));

@@ -8,6 +8,7 @@
 //! factored first; whoever does not have those factors, after a snapshot was restored, makes them again.
 
 use plantd_math::rotation::Turn;
+use plantd_math::scalar::Scalar;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
 use crate::integrator::point::Parts;
@@ -16,8 +17,8 @@ use crate::integrator::workspace::{StepContext, Workspace};
 
 /// `a f[k] + (1 − a) f[k−1]`.
 #[inline(always)]
-fn weigh(at_start: f64, force: f64, before: f64) -> f64 {
-    at_start * force + (1.0 - at_start) * before
+pub(crate) fn weigh<S: Scalar>(at_start: f64, force: S, before: S) -> S {
+    force * at_start + before * (1.0 - at_start)
 }
 
 impl Workspace {

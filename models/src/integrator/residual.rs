@@ -19,7 +19,7 @@
 //! Ball joints weigh the terms by their maps: see [`balls`](crate::integrator::balls).
 
 use plantd_math::norms::largest;
-use plantd_math::scalar::side_by_side;
+use plantd_math::scalar::{Compared, side_by_side};
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Vec3, three};
 
@@ -27,7 +27,21 @@ use crate::integrator::midpoint::Midpoint;
 use crate::integrator::settings::Settings;
 use crate::integrator::state::PreciseState;
 use crate::integrator::workspace::{Residual, Workspace};
+use crate::lagrangian::arrangement::Planar;
 use crate::model::mechanism::Model;
+
+/// `r1 = p0 + D1Ld + F⁻` of a coordinate, without constraints, and the magnitude of its terms.
+#[inline(always)]
+pub(crate) fn sum_of<S: Compared>(
+    [p, p_low]: [S; 2],
+    [l_q, l_v, force, angle]: [S; 4],
+    half: f64,
+    weight: f64,
+) -> [S; 2] {
+    let (half_q, force) = (l_q * half, force * weight);
+    let residual = ((p - l_v) + (half_q + force)) + p_low;
+    [residual, p.abs() + l_v.abs() + half_q.abs() * (angle.abs() + 1.0) + force.abs()]
+}
 
 impl Residual {
     /// Sums up `r1 = p0 + D1Ld + F⁻`, without constraints, and the magnitudes; `half` is `½h`, `weight`
@@ -42,21 +56,20 @@ impl Residual {
                 l_v in &mid.l_v[..nd],
                 force in &mid.force[..nd],
                 angle in &mid.angles[..nd],
-            ) let (half_q, force) = (l_q * half, force * weight); {
-                residual(&mut self.dynamics[..nd]) = ((p - l_v) + (half_q + force)) + p_low;
-                magnitude(&mut self.magnitudes[..nd]) =
-                    p.abs() + l_v.abs() + half_q.abs() * (angle.abs() + 1.0) + force.abs();
+            ) let sums = sum_of([p, p_low], [l_q, l_v, force, angle], half, weight); {
+                residual(&mut self.dynamics[..nd]) = sums[0];
+                magnitude(&mut self.magnitudes[..nd]) = sums[1];
             });
         })
     }
 }
 
-impl Midpoint {
+impl<S: Planar> Midpoint<S> {
     /// Writes `D1Ld + D2Ld + F⁻ + F⁺ = h (L_q + f)`.
-    pub(crate) fn write_impulse(&self, h: f64, impulse: &mut [f64]) {
+    pub(crate) fn write_impulse(&self, h: f64, impulse: &mut [S]) {
         let pairs = self.l_q.iter().zip(&self.force);
         for (impulse, (l_q, force)) in impulse.iter_mut().zip(pairs) {
-            *impulse = h * (l_q + force);
+            *impulse = (*l_q + *force) * h;
         }
     }
 }

@@ -1,7 +1,9 @@
 //! The state of a plant: as users see it, and with the digits that rounding took.
 
 use plantd_math::rotation::Quaternion;
+use plantd_math::scalar::Scalar;
 use plantd_math::spatial::three;
+use plantd_math::sums::two_sum;
 
 use crate::integrator::predictor::Past;
 use crate::integrator::scheme::Scheme;
@@ -115,5 +117,12 @@ impl PreciseState {
     /// Time after so many more steps of length `h`, s.
     pub(crate) fn time_after_s(&self, steps: f64, h: f64) -> f64 {
         self.time_origin_s + (self.step as f64 + steps) * h
+    }
+}
+
+/// Adds changes to sums, with what rounding took from them.
+pub(crate) fn add<S: Scalar>(sums: &mut [S], low: &mut [S], changes: &[S]) {
+    for ((sum, low), change) in sums.iter_mut().zip(low).zip(changes) {
+        (*sum, *low) = two_sum(*sum, *change + *low);
     }
 }

@@ -22,10 +22,11 @@
 //! joint, long chains lose no digits.
 
 use plantd_math::rows::{Block, LANES};
-use plantd_math::simd::{wide, widest};
+use plantd_math::scalar::{Compared, Scalar, in_registers};
+use plantd_math::simd::widest;
 use plantd_math::tree_lu::SmallestPivot;
 
-use crate::lagrangian::arrangement::Fours;
+use crate::lagrangian::arrangement::{Fours, Planar};
 use crate::lagrangian::generators::MatrixKind;
 use crate::lagrangian::planar::{Joints, Link};
 use crate::lagrangian::plane::{Vec2, Vec3, cross, dot, linear};
@@ -33,10 +34,10 @@ use crate::model::planar_tree::PlanarJoint;
 
 /// What a joint gives to the matrix, and what is left of it when it has been eliminated.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Generator {
-    pub(super) minus: Vec3,
-    pub(super) plus: Vec3,
-    inverse_d: f64,
+pub(super) struct Generator<S = f64> {
+    pub(super) minus: Vec3<S>,
+    pub(super) plus: Vec3<S>,
+    inverse_d: S,
 }
 
 /// What a joint gives to the derivative of the momentum.
@@ -54,12 +55,12 @@ struct Slope {
 /// `up · flow + U/D · b`, and what is above the children as `down · flow + plus · x`. These wait for one
 /// product each, not for the solution.
 #[derive(Clone, Copy, Debug, Default)]
-struct Passage {
-    up: [Vec3; 3],
-    u_over_d: Vec3,
-    down: [Vec3; 3],
+struct Passage<S = f64> {
+    up: [Vec3<S>; 3],
+    u_over_d: Vec3<S>,
+    down: [Vec3<S>; 3],
     /// `W/D`: what the flow from the parent takes from the solution.
-    w_over_d: Vec3,
+    w_over_d: Vec3<S>,
 }
 
 /// What springs and dampers of coordinates add: `−½h V_ii` to the derivative of the residual by the
@@ -87,38 +88,45 @@ impl Method {
 
     /// What a joint gives to the matrix, `upper` and `lower` first, without a pivot.
     #[inline(always)]
-    pub(super) fn generator(
+    pub(super) fn generator<S: Compared>(
         &self,
-        link: &Link<f64>,
+        link: &Link<S>,
         joint: &PlanarJoint,
-    ) -> ([Vec3; 2], Generator) {
+    ) -> ([Vec3<S>; 2], Generator<S>) {
         let Self { motion, half, inverse } = *self;
-        let ([dx, dy], [rx, ry]) = (link.slide, [half * link.rate[0], half * link.rate[1]]);
-        let turn = joint.body.turn;
+        let ([dx, dy], [rx, ry]) = (link.slide, [link.rate[0] * half, link.rate[1] * half]);
+        let turn = S::constant(joint.body.turn);
+        let [motion, inverse] = [0.5 * motion, inverse].map(S::constant);
         let plus = [turn, rx + dx, ry + dy];
         let minus = [-turn, rx - dx, ry - dy];
-        let weight = half * link.weight;
-        let mut upper = add_scaled(scaled(0.5 * motion, link.slope), inverse, link.force);
-        let mut lower = add_scaled(upper, -2.0 * inverse, link.force);
-        upper[0] -= 0.5 * weight;
-        lower[0] += 0.5 * weight;
-        let generator = Generator { minus, plus, inverse_d: 0.0 };
+        let weight = link.weight * half * 0.5;
+        let mut upper = add_scaled(scaled(motion, link.slope), inverse, link.force);
+        let mut lower = add_scaled(upper, inverse * -2.0, link.force);
+        upper[0] -= weight;
+        lower[0] += weight;
+        let generator = Generator { minus, plus, inverse_d: S::ZERO };
         ([upper, lower], generator)
     }
 }
 
-/// The Newton matrix of a planar tree, factored.
+/// The Newton matrix of a planar tree, factored: of one, or of several side by side.
+#[derive(Clone, Debug)]
+pub(crate) struct Elimination<S = f64> {
+    generators: Vec<Generator<S>>,
+    passages: Vec<Passage<S>>,
+    /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
+    branches: Vec<[Vec3<S>; 3]>,
+    /// What branches pass of a right-hand side, and what joints with several children pass down to them.
+    flows_of_branches: Vec<Vec3<S>>,
+    flow: Vec<Vec3<S>>,
+}
+
+/// The Newton matrix of a planar tree, factored, with room for a linearization.
 #[derive(Clone, Debug)]
 pub(crate) struct PlanarRecursion {
-    generators: Vec<Generator>,
+    pub(crate) elimination: Elimination,
     slopes: Vec<Slope>,
-    passages: Vec<Passage>,
     pub(super) step: f64,
-    /// `A` of joints that do not follow their parent, summed for that; zero but within a pass.
-    branches: Vec<[Vec3; 3]>,
-    /// What branches pass of a right-hand side, and what joints with several children pass down to them.
-    flows_of_branches: Vec<Vec3>,
-    flow: Vec<Vec3>,
     /// Both for a block of right-hand sides; the first is that of the world. What goes up is zero but within a
     /// pass.
     flows: Vec<[Block; 3]>,
@@ -129,54 +137,48 @@ pub(crate) struct PlanarRecursion {
 }
 
 #[inline(always)]
-pub(super) fn dot3(a: Vec3, b: Vec3) -> f64 {
+pub(super) fn dot3<S: Scalar>(a: Vec3<S>, b: Vec3<S>) -> S {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
 #[inline(always)]
-fn plus3(a: Vec3, b: Vec3) -> Vec3 {
+fn plus3<S: Scalar>(a: Vec3<S>, b: Vec3<S>) -> Vec3<S> {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
 }
 
 /// `matrix · flow + b · drive`: a product and two sums behind the flow.
 #[inline(always)]
-fn passed(matrix: &[Vec3; 3], flow: Vec3, b: f64, drive: Vec3) -> Vec3 {
+fn passed<S: Scalar>(matrix: &[Vec3<S>; 3], flow: Vec3<S>, b: S, drive: Vec3<S>) -> Vec3<S> {
     let [r, s, t] = matrix;
-    let of = |row: &Vec3, drive: f64| {
+    let of = |row: &Vec3<S>, drive: S| {
         (row[0] * flow[0] + row[1] * flow[1]) + (row[2] * flow[2] + drive * b)
     };
     [of(r, drive[0]), of(s, drive[1]), of(t, drive[2])]
 }
 
 #[inline(always)]
-fn plus33([a, b, c]: [Vec3; 3], [d, e, f]: [Vec3; 3]) -> [Vec3; 3] {
+fn plus33<S: Scalar>([a, b, c]: [Vec3<S>; 3], [d, e, f]: [Vec3<S>; 3]) -> [Vec3<S>; 3] {
     [plus3(a, d), plus3(b, e), plus3(c, f)]
 }
 
 #[inline(always)]
-fn scaled(s: f64, a: Vec3) -> Vec3 {
+fn scaled<S: Scalar>(s: S, a: Vec3<S>) -> Vec3<S> {
     [s * a[0], s * a[1], s * a[2]]
 }
 
 #[inline(always)]
-fn add_scaled(a: Vec3, s: f64, b: Vec3) -> Vec3 {
+fn add_scaled<S: Scalar>(a: Vec3<S>, s: S, b: Vec3<S>) -> Vec3<S> {
     [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]]
 }
 
-impl PlanarRecursion {
+impl<S: Planar> Elimination<S> {
     pub(crate) fn new(joints: usize) -> Self {
         Self {
             generators: vec![Generator::default(); joints],
-            slopes: vec![Slope::default(); joints],
-            step: 0.0,
             passages: vec![Passage::default(); joints],
-            branches: vec![[[0.0; 3]; 3]; joints],
-            flows_of_branches: vec![[0.0; 3]; joints],
-            flow: vec![[0.0; 3]; joints],
-            flows: vec![[Block::ZERO; 3]; joints + 1],
-            motions: vec![[Block::ZERO; 3]; joints + 1],
-            increment: vec![Block::ZERO; joints],
-            momentum: vec![Block::ZERO; joints],
+            branches: vec![[[S::ZERO; 3]; 3]; joints],
+            flows_of_branches: vec![[S::ZERO; 3]; joints],
+            flow: vec![[S::ZERO; 3]; joints],
         }
     }
 
@@ -186,25 +188,24 @@ impl PlanarRecursion {
     #[inline(never)]
     pub(crate) fn factor(
         &mut self,
-        tree: &Joints<Fours>,
+        tree: &Joints<S::Many>,
         joints: &[PlanarJoint],
-        diagonal: &[f64],
+        diagonal: &[S],
         inertia: &[f64],
         step: f64,
         kind: MatrixKind,
-    ) -> SmallestPivot {
-        wide!({
+    ) -> SmallestPivot<S> {
+        in_registers!(S, {
             let (method, n) = (Method::new(step, kind), joints.len());
-            self.step = step;
             let (diagonal, inertia) = (&diagonal[..n], &inertia[..n]);
             let (generators, passages) = (&mut self.generators[..n], &mut self.passages[..n]);
             let branches = &mut self.branches[..n];
             let mut smallest = SmallestPivot::NONE;
             // `A` of the joint that follows, about its parent.
-            let mut below = [[0.0; 3]; 3];
+            let mut below = [[S::ZERO; 3]; 3];
             for row in (0..n).rev() {
                 let joint = &joints[row];
-                let mut sum = if joint.is_followed { below } else { [[0.0; 3]; 3] };
+                let mut sum = if joint.is_followed { below } else { [[S::ZERO; 3]; 3] };
                 if joint.has_branches {
                     sum = plus33(sum, std::mem::take(&mut branches[row]));
                 }
@@ -217,14 +218,15 @@ impl PlanarRecursion {
                 let a_plus = [dot3(a, plus), dot3(b, plus), dot3(c, plus)];
                 let k_jj = dot3(minus, upper) + diagonal[row];
                 let d = k_jj + dot3(minus, a_plus);
-                smallest.see(row, d, k_jj.abs().max(inertia[row] * method.inverse));
-                let inverse_d = 1.0 / d;
+                let inertia = S::constant(inertia[row] * method.inverse);
+                smallest.see(row, d, k_jj.abs().max(inertia));
+                let inverse_d = d.recip();
                 let a_minus = add_scaled(add_scaled(scaled(minus[0], a), minus[1], b), minus[2], c);
                 let (u, w) = (plus3(upper, a_plus), plus3(lower, a_minus));
                 // A, U and W / D about the parent: all that can be done before D is known.
                 let edge = link.edge;
                 let [ex, ey] = edge;
-                let moved = |v: Vec3| [v[0] + cross(edge, linear(v)), v[1], v[2]];
+                let moved = |v: Vec3<S>| [v[0] + cross(edge, linear(v)), v[1], v[2]];
                 let (a, b, c) =
                     (moved(add_scaled(add_scaled(a, ex, c), -ey, b)), moved(b), moved(c));
                 let (u, w_over_d) = (moved(u), scaled(inverse_d, moved(w)));
@@ -240,8 +242,9 @@ impl PlanarRecursion {
                     parent => branches[parent - 1] = plus33(branches[parent - 1], sum),
                 }
                 // Right-hand sides pass by 1 − U minusᵀ / D up, and by 1 − plus Wᵀ / D down.
-                let (u_over_d, wrench) = (scaled(inverse_d, u), [1.0, -ey, ex]);
-                let unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+                let (u_over_d, wrench) = (scaled(inverse_d, u), [S::ONE, -ey, ex]);
+                let (o, l) = (S::ZERO, S::ONE);
+                let unit = [[l, o, o], [o, l, o], [o, o, l]];
                 passages[row] = Passage {
                     up: [
                         add_scaled(wrench, -u_over_d[0], minus),
@@ -251,8 +254,8 @@ impl PlanarRecursion {
                     u_over_d,
                     down: [
                         add_scaled(unit[0], -plus[0], w_over_d),
-                        add_scaled([-ey, 1.0, 0.0], -plus[1], w_over_d),
-                        add_scaled([ex, 0.0, 1.0], -plus[2], w_over_d),
+                        add_scaled([-ey, l, o], -plus[1], w_over_d),
+                        add_scaled([ex, o, l], -plus[2], w_over_d),
                     ],
                     w_over_d,
                 };
@@ -265,22 +268,22 @@ impl PlanarRecursion {
 
     /// Solves `K x = b` in place, about 55 flops a joint.
     #[inline(never)]
-    pub(crate) fn solve(&mut self, joints: &[PlanarJoint], x: &mut [f64]) {
-        wide!({
+    pub(crate) fn solve(&mut self, joints: &[PlanarJoint], x: &mut [S]) {
+        in_registers!(S, {
             let n = joints.len();
             let (generators, passages) = (&self.generators[..n], &self.passages[..n]);
             let (branches, flows) = (&mut self.flows_of_branches[..n], &mut self.flow[..n]);
             let x = &mut x[..n];
-            let mut below = [0.0; 3];
+            let mut below = [S::ZERO; 3];
             for i in (0..n).rev() {
                 let joint = &joints[i];
                 let (Generator { minus, inverse_d, .. }, passage) = (&generators[i], &passages[i]);
-                let mut flow = if joint.is_followed { below } else { [0.0; 3] };
+                let mut flow = if joint.is_followed { below } else { [S::ZERO; 3] };
                 if joint.has_branches {
                     flow = plus3(flow, std::mem::take(&mut branches[i]));
                 }
                 let b = x[i];
-                x[i] = (b - dot3(*minus, flow)) * inverse_d;
+                x[i] = (b - dot3(*minus, flow)) * *inverse_d;
                 let up = passed(&passage.up, flow, b, passage.u_over_d);
                 match joint.parent {
                     0 => {}
@@ -288,11 +291,11 @@ impl PlanarRecursion {
                     parent => branches[parent - 1] = plus3(branches[parent - 1], up),
                 }
             }
-            let mut above = [0.0; 3];
+            let mut above = [S::ZERO; 3];
             for i in 0..n {
                 let joint = &joints[i];
                 let flow = match joint.parent {
-                    0 => [0.0; 3],
+                    0 => [S::ZERO; 3],
                     parent if parent == i => above,
                     parent => flows[parent - 1],
                 };
@@ -304,6 +307,56 @@ impl PlanarRecursion {
                 }
             }
         })
+    }
+}
+
+impl<S: Planar> Elimination<S> {
+    /// Takes the factors of others where that is said.
+    #[inline(always)]
+    pub(crate) fn take_where(&mut self, truth: S::Truth, others: &Self) {
+        let choose = |own: &mut S, other: &S| *own = S::choose(truth, *other, *own);
+        let choose3 = |own: &mut Vec3<S>, other: &Vec3<S>| {
+            own.iter_mut().zip(other).for_each(|(own, other)| choose(own, other));
+        };
+        for (own, other) in self.generators.iter_mut().zip(&others.generators) {
+            choose3(&mut own.minus, &other.minus);
+            choose3(&mut own.plus, &other.plus);
+            choose(&mut own.inverse_d, &other.inverse_d);
+        }
+        for (own, other) in self.passages.iter_mut().zip(&others.passages) {
+            own.up.iter_mut().zip(&other.up).for_each(|(own, other)| choose3(own, other));
+            own.down.iter_mut().zip(&other.down).for_each(|(own, other)| choose3(own, other));
+            choose3(&mut own.u_over_d, &other.u_over_d);
+            choose3(&mut own.w_over_d, &other.w_over_d);
+        }
+    }
+}
+
+impl PlanarRecursion {
+    pub(crate) fn new(joints: usize) -> Self {
+        Self {
+            elimination: Elimination::new(joints),
+            slopes: vec![Slope::default(); joints],
+            step: 0.0,
+            flows: vec![[Block::ZERO; 3]; joints + 1],
+            motions: vec![[Block::ZERO; 3]; joints + 1],
+            increment: vec![Block::ZERO; joints],
+            momentum: vec![Block::ZERO; joints],
+        }
+    }
+
+    /// [`Elimination::factor`], for a linearization, too.
+    pub(crate) fn factor(
+        &mut self,
+        tree: &Joints<Fours>,
+        joints: &[PlanarJoint],
+        diagonal: &[f64],
+        inertia: &[f64],
+        step: f64,
+        kind: MatrixKind,
+    ) -> SmallestPivot {
+        self.step = step;
+        self.elimination.factor(tree, joints, diagonal, inertia, step, kind)
     }
 
     /// Writes the derivatives of the increment, `X = −K⁻¹ [G 1]` with `G = ½h L_qq − L_vq`, and of the
@@ -429,7 +482,7 @@ impl PlanarRecursion {
     /// From the leaves to the root, with the right-hand side taken away.
     #[inline(always)]
     fn eliminate(&mut self, joints: &[PlanarJoint]) {
-        let passages = self.generators.iter().zip(&self.passages);
+        let passages = self.elimination.generators.iter().zip(&self.elimination.passages);
         for (i, ((joint, row), (generator, passage))) in
             joints.iter().zip(&mut self.increment).zip(passages).enumerate().rev()
         {
@@ -448,7 +501,7 @@ impl PlanarRecursion {
     #[inline(always)]
     fn substitute(&mut self, joints: &[PlanarJoint], diagonal: &Diagonal<'_>) {
         let rows = self.increment.iter_mut().zip(&mut self.momentum);
-        let passages = self.slopes.iter().zip(&self.passages);
+        let passages = self.slopes.iter().zip(&self.elimination.passages);
         for (i, (((joint, (row, momentum)), own), (slope, passage))) in
             joints.iter().zip(rows).zip(diagonal.momentum).zip(passages).enumerate()
         {

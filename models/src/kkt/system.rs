@@ -226,7 +226,7 @@ impl KktSystem {
     ) {
         match (&mut self.factored.recursion, self.factored.valid, &model.planar) {
             (Recursion::Planar(recursion), Factors::Recursion, Some(joints)) => {
-                recursion.solve(joints, x);
+                recursion.elimination.solve(joints, x);
             }
             (Recursion::Loops(fronts), Factors::Recursion, _) => {
                 if let Some(loops) = &model.loops {

@@ -7,7 +7,7 @@
 //! `v` is a coordinate's velocity; of a ball joint that is a component of the angular velocity in its own
 //! axes.
 
-use plantd_math::scalar::Scalar;
+use plantd_math::scalar::{Compared, Scalar};
 use plantd_math::tree_lu::TreeLu;
 
 use crate::model::mechanism::{Armature, Model};
@@ -27,11 +27,17 @@ pub(crate) fn twice_kinetic_energy(armature: &[Armature], velocity: &[f64]) -> f
 
 /// Adds so many times an entry to a matrix.
 #[inline]
-pub(crate) fn add_to(matrix: &mut TreeLu, model: &Model, entry: &Armature, times: f64) {
+pub(crate) fn add_to<S: Compared>(
+    matrix: &mut TreeLu<S>,
+    model: &Model,
+    entry: &Armature,
+    times: f64,
+) {
     let &Armature { row, column, inertia } = entry;
+    let added = S::constant(times * inertia);
     if row == column {
-        matrix.add_to_diagonal(model.elimination.offsets[row + 1] - 1, times * inertia);
+        matrix.add_to_diagonal(model.elimination.offsets[row + 1] - 1, added);
     } else {
-        matrix.add(&model.elimination, row, column, times * inertia);
+        matrix.add(&model.elimination, row, column, added);
     }
 }

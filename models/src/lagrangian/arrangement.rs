@@ -4,7 +4,7 @@ use std::fmt::Debug;
 use std::marker::PhantomData;
 use std::ops::Mul;
 
-use plantd_math::scalar::{Lanes, Scalar};
+use plantd_math::scalar::{Compared, Lanes, LanesOf, Scalar, Side};
 
 use crate::lagrangian::plane::{Vec2, Vec3};
 use crate::model::planar_tree::{Body, PlanarJoints};
@@ -68,7 +68,7 @@ impl Arrangement for Fours {
         let first = Self::COUNT * block;
         let four = list.get(first..).and_then(|list| list.first_chunk());
         if let (Some(four), true) = (four, joints.are_in_order) {
-            return Lanes(*four);
+            return LanesOf(*four);
         }
         let mut lanes = Lanes::ZERO;
         for (lane, joint) in lanes.0.iter_mut().zip(&joints[first..]) {
@@ -161,7 +161,7 @@ impl<S: Scalar> Arrangement for Ones<S> {
 }
 
 /// Numbers of which planar trees are computed.
-pub(crate) trait Planar: Scalar {
+pub(crate) trait Planar: Compared + Side {
     /// Of many joints.
     type Many: Arrangement<Number = Self>;
 }
@@ -170,7 +170,7 @@ impl Planar for f64 {
     type Many = Fours;
 }
 
-impl Planar for Lanes {
+impl<const N: usize> Planar for LanesOf<N> {
     type Many = Ones<Self>;
 }
 

@@ -6,8 +6,7 @@
 //!                ∂²L/∂q_i∂q_j = J̇_i·P_j + w_i·(f_j × g)      w_i: angular part of J_i, f_j: force part of F_j
 //! ```
 
-use plantd_math::scalar::Scalar;
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Compared, Scalar, in_registers};
 use plantd_math::spatial::{Force, Inertia, Mat3, Motion, Sym3, Vec3};
 use plantd_math::tree_lu::TreeLu;
 
@@ -84,7 +83,7 @@ impl<S: Scalar> Curvature<S> {
     /// Computes the generators from poses and momenta of the same configuration and velocity.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, poses: &Poses<S>, momenta: &Momenta<S>) {
-        wide!({
+        in_registers!(S, {
             let tensors = &mut self.tensor[..];
             let (forces, rates) = (&mut self.force[..], &mut self.rate[..]);
             for (i, joint) in tree.joints.iter().enumerate() {
@@ -172,7 +171,21 @@ impl<S: Scalar> Curvature<S> {
     }
 }
 
-impl Curvature {
+impl<S: Compared> Curvature<S> {
+    /// Takes the generators of others where that is said.
+    #[inline(always)]
+    pub(crate) fn take_where(&mut self, truth: S::Truth, others: &Self) {
+        let choose = |own: &mut Force<S>, other: &Force<S>| {
+            for (own, other) in [(&mut own.n, &other.n), (&mut own.f, &other.f)] {
+                for (own, other) in own.0.iter_mut().zip(&other.0) {
+                    *own = S::choose(truth, *other, *own);
+                }
+            }
+        };
+        self.force.iter_mut().zip(&others.force).for_each(|(own, other)| choose(own, other));
+        self.rate.iter_mut().zip(&others.rate).for_each(|(own, other)| choose(own, other));
+    }
+
     /// Writes the Jacobian of the residual by the increment, without springs and forces:
     /// `K = ¼h L_qq + ½ L_qv − ½ L_vq − L_vv/h`.
     ///
@@ -181,13 +194,14 @@ impl Curvature {
     pub(crate) fn fill_newton_matrix(
         &self,
         pairs: &[Pair],
-        momenta: &Momenta,
+        momenta: &Momenta<S>,
         gravity: Option<Vec3>,
         step: f64,
-        matrix: &mut TreeLu,
+        matrix: &mut TreeLu<S>,
     ) {
-        wide!({
-            let (half, inverse) = (0.5 * step, 1.0 / step);
+        in_registers!(S, {
+            let [half, middle, inverse, same, back] =
+                [0.5 * step, 0.5, 1.0 / step, 1.0, -1.0].map(S::constant);
             let (mut plus, mut minus) = (Force::default(), Force::default());
             let mut weight = Vec3::ZERO;
             for pair in pairs.iter().rev() {
@@ -195,21 +209,24 @@ impl Curvature {
                 if i == j {
                     // Pairs come grouped by descendant, and backwards the descendant itself comes first.
                     let (f, p) = (self.force[j], self.rate[j]);
-                    plus = Force::default().add_scaled(0.5, p).add_scaled(inverse, f);
-                    minus = Force::default().add_scaled(0.5, p).add_scaled(-inverse, f);
-                    weight = gravity.map_or(Vec3::ZERO, |g| f.f.cross(g) * (0.25 * step));
+                    plus = Force::default().add_scaled(middle, p).add_scaled(inverse, f);
+                    minus = Force::default().add_scaled(middle, p).add_scaled(-inverse, f);
+                    weight = gravity
+                        .map_or(Vec3::ZERO, |g| f.f.cross(Vec3::lift(g)).scaled(0.25 * step));
                 }
                 let (axis, axis_rate) = (momenta.axis[i], momenta.axis_rate[i]);
                 let gravity_term = axis.w.dot(weight);
                 let scaled = Motion { w: axis_rate.w * half, v: axis_rate.v * half };
                 matrix.upper[pair.slot as usize] =
-                    scaled.add_scaled(-1.0, axis).dot(plus) + gravity_term;
+                    scaled.add_scaled(back, axis).dot(plus) + gravity_term;
                 matrix.lower[pair.slot as usize] =
-                    scaled.add_scaled(1.0, axis).dot(minus) + gravity_term;
+                    scaled.add_scaled(same, axis).dot(minus) + gravity_term;
             }
         })
     }
+}
 
+impl Curvature {
     /// Writes the mass matrix `L_vv` of the dynamic coordinates.
     pub(crate) fn fill_mass_matrix(&self, pairs: &[Pair], momenta: &Momenta, matrix: &mut TreeLu) {
         for pair in pairs {

@@ -20,18 +20,23 @@ use crate::model::tree::Tree;
 
 /// Writes the input forces of a step; they do not change within it.
 #[inline(never)]
-pub(crate) fn input_forces(inputs: &[CoordinateInput], u: &[f64], force: &mut [f64]) {
-    force.fill(0.0);
+pub(crate) fn input_forces<S: Scalar>(inputs: &[CoordinateInput], u: &[S], force: &mut [S]) {
+    force.fill(S::ZERO);
     for input in inputs {
-        force[input.coordinate] += input.gain * u[input.input];
+        force[input.coordinate] += u[input.input] * input.gain;
     }
 }
 
 /// Writes `total = input − C v`.
 #[inline(never)]
-pub(crate) fn add_damping(damping: &[f64], velocity: &[f64], input: &[f64], total: &mut [f64]) {
+pub(crate) fn add_damping<S: Scalar>(
+    damping: &[f64],
+    velocity: &[S],
+    input: &[S],
+    total: &mut [S],
+) {
     for (((total, input), c), v) in total.iter_mut().zip(input).zip(damping).zip(velocity) {
-        *total = input - c * v;
+        *total = *input - *v * *c;
     }
 }
 

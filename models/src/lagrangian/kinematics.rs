@@ -1,7 +1,6 @@
 //! Poses of the joints at a configuration.
 
-use plantd_math::scalar::Scalar;
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::spatial::{Mat3, Vec3};
 
 use crate::model::tree::{Attachment, JointKind, Tree, WORLD};
@@ -65,7 +64,7 @@ impl<S: Scalar> Poses<S> {
     /// to the leaves, about 50 flops and one sine and cosine for each joint.
     #[inline(never)]
     pub(crate) fn evaluate(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
-        wide!({
+        in_registers!(S, {
             if tree.has_other_joints {
                 self.walk::<true>(tree, q, orientations);
             } else {

@@ -2,6 +2,7 @@
 //! scene allows it, else in space.
 
 use plantd_math::spatial::Mat3;
+use plantd_math::tree_lu::TreeLu;
 
 use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::curvature::{Curvature, Entry, SecondDerivatives};
@@ -56,6 +57,18 @@ impl<S: Planar> Mechanics<S> {
         match (&mut self.planar, &model.planar) {
             (Some(planar), Some(joints)) => planar.differentiate(joints),
             _ => self.curvature.evaluate(&model.dynamics, &self.poses, &self.momenta),
+        }
+    }
+
+    /// Writes the Jacobian of the residual by the increment at the last gradient, without springs and forces,
+    /// entry by entry.
+    pub(crate) fn fill_newton_matrix(&mut self, model: &Model, step: f64, matrix: &mut TreeLu<S>) {
+        self.differentiate(model);
+        if let (Some(planar), Some(joints)) = (&self.planar, &model.planar) {
+            planar.fill_newton_matrix(joints, &model.pairs, step, matrix);
+        } else {
+            let (momenta, gravity) = (&self.momenta, model.gravity);
+            self.curvature.fill_newton_matrix(&model.pairs, momenta, gravity, step, matrix);
         }
     }
 

@@ -7,8 +7,7 @@
 //!                ∂L/∂q_i = J̇_i · H_i + J_i · W_i      W_i: weight of the subtree
 //! ```
 
-use plantd_math::scalar::Scalar;
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::spatial::{Force, Motion, Sym3, Vec3};
 
 use crate::lagrangian::kinematics::Poses;
@@ -52,7 +51,7 @@ impl<S: Scalar> Momenta<S> {
         l_q: &mut [S],
         l_v: &mut [S],
     ) {
-        wide!({
+        in_registers!(S, {
             if tree.has_other_joints {
                 self.forward::<true>(tree, poses, velocity);
             } else {

@@ -17,37 +17,38 @@
 //! δL_v,i = F_i·(E_parent + Σ J̇ a + Σ J b) + J_i·Σ G_child
 //! ```
 
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::spatial::{Force, Motion, Vec3};
 
+use crate::lagrangian::arrangement::Planar;
 use crate::lagrangian::mechanics::Mechanics;
 use crate::model::mechanism::Model;
 use crate::model::tree::{Joint, JointKind, WORLD};
 
 /// What a joint passes on to those that it carries: `E` and `Z`.
-type Above = (Motion, Vec3);
+type Above<S> = (Motion<S>, Vec3<S>);
 /// What it passes on to its parent: `G` and `N`.
-type Below = (Force, Vec3);
+type Below<S> = (Force<S>, Vec3<S>);
 
 /// A small change of the motion, and what it makes of the gradient.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Nudge {
+pub(crate) struct Nudge<S = f64> {
     /// `a`: changes of the dynamic coordinates, of ball joints turns in their own axes.
-    pub(crate) position: Vec<f64>,
+    pub(crate) position: Vec<S>,
     /// `b`.
-    pub(crate) velocity: Vec<f64>,
+    pub(crate) velocity: Vec<S>,
     /// `δL_q`.
-    pub(crate) l_q: Vec<f64>,
+    pub(crate) l_q: Vec<S>,
     /// `δL_v`, of ball joints alone.
-    pub(crate) l_v: Vec<f64>,
-    above: Vec<Above>,
-    below: Vec<Below>,
+    pub(crate) l_v: Vec<S>,
+    above: Vec<Above<S>>,
+    below: Vec<Below<S>>,
 }
 
-impl Nudge {
+impl<S: Planar> Nudge<S> {
     pub(crate) fn new(model: &Model) -> Self {
         let (nd, joints) = (model.dimensions.dynamic, model.dynamics.joints.len());
-        let zeros = || vec![0.0; nd];
+        let zeros = || vec![S::ZERO; nd];
         Self {
             position: zeros(),
             velocity: zeros(),
@@ -61,8 +62,8 @@ impl Nudge {
     /// Finds the changes of `L_q` and `L_v`, of the bodies alone, at the last second derivatives of a tree in
     /// space. About 75 flops an axis.
     #[inline(never)]
-    pub(crate) fn find(&mut self, model: &Model, mechanics: &Mechanics) {
-        wide!({
+    pub(crate) fn find(&mut self, model: &Model, mechanics: &Mechanics<S>) {
+        in_registers!(S, {
             self.ascend(&model.dynamics.joints, mechanics);
             if model.orientations.is_empty() {
                 self.descend::<false>(model, mechanics);
@@ -74,7 +75,7 @@ impl Nudge {
 
     /// From the roots to the leaves.
     #[inline(always)]
-    fn ascend(&mut self, joints: &[Joint], mechanics: &Mechanics) {
+    fn ascend(&mut self, joints: &[Joint], mechanics: &Mechanics<S>) {
         let momenta = &mechanics.momenta;
         let (axes, rates) = (&momenta.axis[..], &momenta.axis_rate[..]);
         let (above, below) = (&mut self.above[..], &mut self.below[..]);
@@ -92,9 +93,9 @@ impl Nudge {
 
     /// From the leaves to the roots; `BALLS`: some joint is a ball joint.
     #[inline(always)]
-    fn descend<const BALLS: bool>(&mut self, model: &Model, mechanics: &Mechanics) {
+    fn descend<const BALLS: bool>(&mut self, model: &Model, mechanics: &Mechanics<S>) {
         let Mechanics { momenta, curvature, .. } = mechanics;
-        let gravity = model.gravity.unwrap_or_default();
+        let gravity = Vec3::lift(model.gravity.unwrap_or_default());
         let (above, below) = (&self.above[..], &mut self.below[..]);
         for (i, joint) in model.dynamics.joints.iter().enumerate().rev() {
             let axes = match joint.kind {
@@ -143,7 +144,7 @@ impl Nudge {
 }
 
 #[inline(always)]
-fn over(above: &[Above], parent: usize) -> Above {
+fn over<S: Scalar>(above: &[Above<S>], parent: usize) -> Above<S> {
     if parent == WORLD { Above::default() } else { above[parent] }
 }
 

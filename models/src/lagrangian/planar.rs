@@ -28,8 +28,7 @@
 
 use std::ops::Range;
 
-use plantd_math::scalar::Scalar;
-use plantd_math::simd::wide;
+use plantd_math::scalar::{Scalar, in_registers};
 use plantd_math::tree_lu::TreeLu;
 
 use crate::lagrangian::arrangement::{Arrangement, Fours, Ones, Planar, one2, one3, put2};
@@ -111,14 +110,16 @@ impl PlanarTree {
             Self::Few(_) => None,
         }
     }
+}
 
+impl<S: Planar> PlanarTree<S> {
     /// Writes the Jacobian of the residual by the increment, without springs and forces, entry by entry.
     pub(crate) fn fill_newton_matrix(
         &self,
         joints: &[PlanarJoint],
         pairs: &[Pair],
         step: f64,
-        matrix: &mut TreeLu,
+        matrix: &mut TreeLu<S>,
     ) {
         match self {
             Self::Few(tree) => tree.fill_newton_matrix(joints, pairs, step, matrix),
@@ -244,7 +245,7 @@ impl<A: Arrangement> Joints<A> {
         l_q: &mut [A::Number],
         l_v: &mut [A::Number],
     ) {
-        wide!({
+        in_registers!(A::Number, {
             if joints.have_sliders {
                 self.walk::<true>(joints, q, velocity, l_q, l_v);
             } else {
@@ -256,7 +257,7 @@ impl<A: Arrangement> Joints<A> {
     /// Computes `F` and `P` of each joint at the last gradient.
     #[inline(never)]
     pub(crate) fn differentiate(&mut self, joints: &PlanarJoints) {
-        wide!({
+        in_registers!(A::Number, {
             for link in &mut self.links {
                 link.moved = dot(link.edge, add(link.lever, times(link.moment, 2.0)));
             }
@@ -505,6 +506,15 @@ impl<A: Arrangement> Joints<A> {
     /// Places the joints, for [`PlanarTree::pair`].
     #[inline(never)]
     fn place(&mut self, joints: &[PlanarJoint]) {
+        if A::Number::IS_SEVERAL {
+            in_registers!(A::Number, { self.place_now(joints) })
+        } else {
+            self.place_now(joints);
+        }
+    }
+
+    #[inline(always)]
+    fn place_now(&mut self, joints: &[PlanarJoint]) {
         for (i, joint) in joints.iter().enumerate() {
             // The root of a tree is its origin, unless that moves on.
             self.positions[i] = match joint.parent {
@@ -566,20 +576,35 @@ impl<A: Arrangement> Joints<A> {
     }
 }
 
-impl<A: Arrangement<Number = f64>> Joints<A> {
+impl<A: Arrangement> Joints<A> {
     #[inline(never)]
     fn fill_newton_matrix(
         &self,
         joints: &[PlanarJoint],
         pairs: &[Pair],
         step: f64,
-        matrix: &mut TreeLu,
+        matrix: &mut TreeLu<A::Number>,
+    ) {
+        if A::Number::IS_SEVERAL {
+            in_registers!(A::Number, { self.fill_now(joints, pairs, step, matrix) })
+        } else {
+            self.fill_now(joints, pairs, step, matrix);
+        }
+    }
+
+    #[inline(always)]
+    fn fill_now(
+        &self,
+        joints: &[PlanarJoint],
+        pairs: &[Pair],
+        step: f64,
+        matrix: &mut TreeLu<A::Number>,
     ) {
         let (quarter, inverse) = (0.25 * step, 1.0 / step);
         for pair in pairs {
             let second = self.pair(joints, pair.ancestor as usize, pair.descendant as usize);
-            let (common, slot) = (quarter * second.qq - inverse * second.vv, pair.slot as usize);
-            let skew = 0.5 * (second.q_above_v_below - second.v_above_q_below);
+            let (common, slot) = (second.qq * quarter - second.vv * inverse, pair.slot as usize);
+            let skew = (second.q_above_v_below - second.v_above_q_below) * 0.5;
             matrix.upper[slot] = common + skew;
             matrix.lower[slot] = common - skew;
         }

@@ -2,6 +2,7 @@
 //!
 //! Read [`facade`] first: what a user of a plant calls. [`solve`] takes a control period, [`period`] says what
 //! it is a sequence of; the steps themselves are the integrator's, their derivatives the linearization's.
+//! [`fleet`] steps many plants together.
 //!
 //! - where a plant starts: [`initial`], [`settle`] (at rest), [`targets`] (of frames), [`snapshot`], [`spare`]
 //!   (made ahead);
@@ -12,6 +13,7 @@
 pub(crate) mod choice;
 pub(crate) mod diagnose;
 pub(crate) mod facade;
+pub(crate) mod fleet;
 pub(crate) mod initial;
 pub(crate) mod known;
 pub(crate) mod period;

@@ -9,13 +9,11 @@
 //! The next period begins with as many; after four that went well, half as many are tried. How often a
 //! period was halved is in its report: it is another map then.
 
-use plantd_math::sums::two_sum;
-
 use crate::integrator::collocation::Collocation;
 use crate::integrator::report::StepError;
 use crate::integrator::response::Response;
 use crate::integrator::scheme::Scheme;
-use crate::integrator::state::PreciseState;
+use crate::integrator::state::{PreciseState, add};
 use crate::integrator::workspace::Workspace;
 use crate::linearization::chain::Chain;
 use crate::model::mechanism::Model;
@@ -171,12 +169,5 @@ impl PreciseState {
                 self.past.point.follow(point);
             }
         }
-    }
-}
-
-/// Adds changes to sums, with what rounding took from them.
-pub(crate) fn add(sums: &mut [f64], low: &mut [f64], changes: &[f64]) {
-    for ((sum, low), change) in sums.iter_mut().zip(low).zip(changes) {
-        (*sum, *low) = two_sum(*sum, change + *low);
     }
 }

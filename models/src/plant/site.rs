@@ -16,11 +16,11 @@ use plantd_math::spatial::{Mat3, Vec3};
 use plantd_math::trigonometry::sin_cos_of;
 
 use crate::integrator::report::StepError;
+use crate::integrator::state::add;
 use crate::model::mechanism::Model;
 use crate::model::site::Site;
 use crate::model::tree::{Joint, JointKind};
 use crate::plant::facade::Plant;
-use crate::plant::period::add;
 
 /// Where a site is, in world axes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -5,7 +5,7 @@
 
 use plantd_math::dense_inverse::DenseInverse;
 use plantd_math::norms::{larger, largest};
-use plantd_math::scalar::{Lanes, Scalar, Side};
+use plantd_math::scalar::{Compared, Lanes, LanesOf, Scalar, Side};
 use plantd_math::simd::wide;
 use plantd_math::spatial::three;
 use plantd_math::trigonometry::without_turns;
@@ -94,7 +94,7 @@ impl System {
         let coupling = |i: usize, j: usize| {
             if i < count && j < count { tableau.coupling[i * count + j] } else { 0.0 }
         };
-        let four = |entry: &dyn Fn(usize) -> f64| Lanes([0, 1, 2, 3].map(entry));
+        let four = |entry: &dyn Fn(usize) -> f64| LanesOf([0, 1, 2, 3].map(entry));
         let entries = (0..width).flat_map(|i| (0..width).step_by(4).map(move |j| (i, j)));
         let rows = entries.clone().map(|(i, j)| four(&|lane| coupling(i, j + lane))).collect();
         let columns = entries.map(|(j, i)| four(&|lane| coupling(i + lane, j))).collect();
