@@ -146,7 +146,7 @@ impl<'a> Bounds<'a> {
     pub(crate) fn values(&self, samples: &Samples) -> Result<(Vec<f64>, Vec<f64>), String> {
         let of = |bound: Option<&Expression>, none: f64| match bound {
             Some(expression) => expression.values(samples),
-            None => Ok(vec![none; samples.len()]),
+            None => Ok(vec![none; samples.count()]),
         };
         let Some(to) = self.to else {
             return Ok((of(self.low, f64::NEG_INFINITY)?, of(self.high, f64::INFINITY)?));

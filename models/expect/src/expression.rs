@@ -154,7 +154,7 @@ impl Node {
 
     fn values(&self, samples: &Samples) -> Result<Vec<f64>, String> {
         let (function, arguments) = match self {
-            Self::Number(x) => return Ok(vec![*x; samples.len()]),
+            Self::Number(x) => return Ok(vec![*x; samples.count()]),
             Self::Time => return Ok(samples.time_s().to_vec()),
             Self::Signal(name) => return samples.signal(name),
             Self::Apply(function, arguments) => (*function, arguments),
@@ -165,10 +165,10 @@ impl Node {
             return Ok(rate(samples.time_s(), &columns[0]));
         }
         if function == Function::Start {
-            return Ok(vec![columns[0].first().copied().unwrap_or(f64::NAN); samples.len()]);
+            return Ok(vec![columns[0].first().copied().unwrap_or(f64::NAN); samples.count()]);
         }
         let row = |k: usize| function.of(columns.iter().map(|column| column[k]));
-        Ok((0..samples.len()).map(row).collect())
+        Ok((0..samples.count()).map(row).collect())
     }
 }
 

@@ -18,7 +18,7 @@ const BARE: [&str; 4] = ["q", "u", "force", "y"];
 
 impl Samples {
     /// Number of samples.
-    pub fn len(&self) -> usize {
+    pub fn count(&self) -> usize {
         self.time_s.len()
     }
 

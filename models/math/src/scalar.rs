@@ -233,24 +233,24 @@ impl<const N: usize> LanesOf<N> {
     /// How many numbers stand side by side.
     pub const COUNT: usize = N;
 
-    /// The first numbers of a list, up to four; those that it does not have are zero.
+    /// The first numbers of a list; those that it does not have are zero.
     #[inline(always)]
     pub fn load_some(list: &[f64]) -> Self {
         match list.first_chunk() {
-            Some(four) => Self(*four),
+            Some(all) => Self(*all),
             None => {
-                let mut lanes = [0.0; 4];
+                let mut lanes = [0.0; N];
                 lanes.iter_mut().zip(list).for_each(|(lane, x)| *lane = *x);
                 Self(lanes)
             }
         }
     }
 
-    /// Replaces the first numbers of a list, up to four.
+    /// Replaces the first numbers of a list, as many as there are.
     #[inline(always)]
     pub fn store_some(self, list: &mut [f64]) {
         match list.first_chunk_mut() {
-            Some(four) => *four = self.0,
+            Some(all) => *all = self.0,
             None => list.iter_mut().zip(self.0).for_each(|(x, lane)| *x = lane),
         }
     }

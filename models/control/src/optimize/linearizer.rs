@@ -1,7 +1,8 @@
 //! The linearized map along a motion, made block by block, shared among threads where that pays.
 
+use std::fmt;
 use std::ops::{ControlFlow, Range};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
 
 use plantd_math::sparse_map::Map;
 use plantd_models::{Contraction, KnownStep, Linearization, Plant, StepError};
@@ -55,8 +56,8 @@ pub(super) struct Linearizer {
     is_current: Vec<bool>,
     /// One per thread; at least one.
     pub(super) workers: Vec<Worker>,
-    /// Time for which other threads have worked.
-    helped: Duration,
+    /// What is done around the work of other threads.
+    around: Around,
 }
 
 /// The map to write, and the linearization to keep.
@@ -77,7 +78,7 @@ impl Linearizer {
             linearizations: vec![Linearization::new(model); if keeps { steps } else { 0 }],
             is_current: vec![false; blocks],
             workers: vec![Worker::new(plant)],
-            helped: Duration::ZERO,
+            around: Around(Arc::new(|work| work())),
         }
     }
 
@@ -87,9 +88,9 @@ impl Linearizer {
         self.workers.resize_with(useful, || Worker::new(plant));
     }
 
-    /// Time for which other threads than the caller's have worked, taken together.
-    pub(super) fn helped(&self) -> Duration {
-        self.helped
+    /// Does the work of other threads than the caller's inside something, which has to do it once.
+    pub(super) fn set_around(&mut self, around: impl Fn(&mut dyn FnMut()) + Send + Sync + 'static) {
+        self.around = Around(Arc::new(around));
     }
 
     /// The motion is another one.
@@ -105,7 +106,7 @@ impl Linearizer {
         go_on: Question<'_>,
         mut visit: impl FnMut(usize, &Map, Option<&Linearization>) -> Verdict,
     ) -> Result<Option<usize>, OptimizeError> {
-        let Self { states, maps, linearizations, is_current, workers, helped } = self;
+        let Self { states, maps, linearizations, is_current, workers, around } = self;
         let keeps = !linearizations.is_empty();
         let mut stopped = None;
         for (made, used) in blocks(maps.len(), *states) {
@@ -134,7 +135,7 @@ impl Linearizer {
                 }
                 Ok(())
             };
-            *helped += share_work(workers, jobs.collect(), job, consume)?;
+            share_work(workers, around, jobs.collect(), job, consume)?;
             is_current[block] = true;
             if stopped.is_some() {
                 break;
@@ -154,7 +155,7 @@ impl Linearizer {
         + Sync,
         mut visit: impl FnMut(usize, &Map, &mut T) -> Verdict,
     ) -> Result<Option<usize>, OptimizeError> {
-        let Self { states, maps, linearizations, workers, helped, .. } = self;
+        let Self { states, maps, linearizations, workers, around, .. } = self;
         let [mut made_now, mut made_before] = rooms.each_mut();
         let mut stopped = None;
         for (made, used) in blocks(maps.len(), *states) {
@@ -173,7 +174,7 @@ impl Linearizer {
                 }
                 Ok(())
             };
-            *helped += share_work(workers, jobs, job, consume)?;
+            share_work(workers, around, jobs, job, consume)?;
             if stopped.is_some() {
                 break;
             }
@@ -197,26 +198,36 @@ fn blocks(steps: usize, states: usize) -> impl Iterator<Item = (Range<usize>, Ra
     (0..=count).rev().map(move |i| (if i == 0 { 0..0 } else { block(i - 1) }, block(i)))
 }
 
+/// Takes the work of a thread, which it has to do.
+type Wrapper = dyn Fn(&mut dyn FnMut()) + Send + Sync;
+
+/// What is done around the work of a thread.
+#[derive(Clone)]
+struct Around(Arc<Wrapper>);
+
+impl fmt::Debug for Around {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Around")
+    }
+}
+
 /// Does the jobs of steps: helpers do while this thread does `consume`, or this one before if there are none.
-/// The time that helpers took.
 fn share_work<J: Send>(
     workers: &mut [Worker],
+    around: &Around,
     jobs: Vec<(usize, J)>,
     job: impl Fn(&mut Worker, usize, J) -> Result<(), StepError> + Sync,
     consume: impl FnOnce() -> Result<(), OptimizeError>,
-) -> Result<Duration, OptimizeError> {
-    let none = Duration::ZERO;
+) -> Result<(), OptimizeError> {
     let do_all = |worker: &mut Worker, jobs: Vec<(usize, J)>| {
         jobs.into_iter().try_for_each(|(step, what)| {
             job(worker, step, what).map_err(|error| OptimizeError::Linearization { step, error })
         })
     };
-    let Some((own, helpers)) = workers.split_first_mut() else {
-        return consume().map(|()| none);
-    };
+    let Some((own, helpers)) = workers.split_first_mut() else { return consume() };
     if helpers.is_empty() {
         do_all(own, jobs)?;
-        return consume().map(|()| none);
+        return consume();
     }
     let share = jobs.len().div_ceil(helpers.len()).max(1);
     let mut jobs = jobs.into_iter();
@@ -225,22 +236,27 @@ fn share_work<J: Send>(
         for worker in helpers {
             let part: Vec<_> = jobs.by_ref().take(share).collect();
             if !part.is_empty() {
-                threads.push(scope.spawn(|| {
-                    let began = Instant::now();
-                    do_all(worker, part).map(|()| began.elapsed())
+                threads.push(scope.spawn(move || {
+                    let (mut part, mut result) = (Some(part), Ok(()));
+                    (around.0)(&mut || {
+                        if let Some(part) = part.take() {
+                            result = do_all(worker, part);
+                        }
+                    });
+                    result
                 }));
             }
         }
         let consumed = consume();
         // All are joined, and the first failure counts, whichever thread was faster.
-        let mut made = Ok(none);
+        let mut made = Ok(());
         for thread in threads {
             match thread.join() {
-                Ok(result) => made = made.and_then(|sum| result.map(|time| sum + time)),
+                Ok(result) => made = made.and(result),
                 Err(panic) => std::panic::resume_unwind(panic),
             }
         }
-        let helped = made?;
-        consumed.map(|()| helped)
+        made?;
+        consumed
     })
 }

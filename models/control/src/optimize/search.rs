@@ -4,8 +4,6 @@ mod ending;
 #[cfg(test)]
 mod tests;
 
-use std::time::Duration;
-
 use nalgebra::DMatrix;
 use plantd_models::{Initial, Plant, State};
 
@@ -211,9 +209,10 @@ impl Optimizer {
         self.linearizer.set_threads(threads, &self.trials.plant);
     }
 
-    /// Time for which threads that [`set_threads`](Self::set_threads) added have worked until now, taken together.
-    pub fn helped(&self) -> Duration {
-        self.linearizer.helped()
+    /// Does the work of the threads that [`set_threads`](Self::set_threads) adds inside of `around`, which is called in
+    /// each of them and has to do it, once: so that somebody can measure it.
+    pub fn set_around(&mut self, around: impl Fn(&mut dyn FnMut()) + Send + Sync + 'static) {
+        self.linearizer.set_around(around);
     }
 
     /// Whether the search goes on.

@@ -27,7 +27,7 @@
 //! collocation: the order is `2s`.
 
 use plantd_math::rotation::{Chart, Turn};
-use plantd_math::scalar::{Lanes, Scalar, Side};
+use plantd_math::scalar::{Lanes, LanesOf, Scalar, Side};
 use plantd_math::simd::wide;
 use plantd_math::spatial::{Mat3, Vec3, three};
 
@@ -96,7 +96,7 @@ impl Balls {
             count,
             width,
             skew: columns
-                .map(|(i, j)| Lanes([0, 1, 2, 3].map(|lane| entry(i + lane, j))))
+                .map(|(i, j)| LanesOf([0, 1, 2, 3].map(|lane| entry(i + lane, j))))
                 .collect(),
             start: vec![Mat3::IDENTITY; no],
             centers: vec![Mat3::IDENTITY; no],

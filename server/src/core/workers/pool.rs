@@ -49,6 +49,24 @@ fn thread_ms() -> f64 {
     time.tv_sec as f64 * 1e3 + time.tv_nsec as f64 * 1e-6
 }
 
+/// Processor time of threads that work for a job besides its own.
+#[derive(Debug, Default)]
+pub struct Helpers(Mutex<f64>);
+
+impl Helpers {
+    /// Does some work of this thread, and counts it.
+    pub fn count(&self, work: &mut dyn FnMut()) {
+        let before = thread_ms();
+        work();
+        *lock(&self.0) += thread_ms() - before;
+    }
+
+    /// The milliseconds that were counted since the last time.
+    pub fn take(&self) -> f64 {
+        std::mem::take(&mut *lock(&self.0))
+    }
+}
+
 /// Why a computation has no result.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum WorkError {
@@ -101,9 +119,9 @@ impl Abandoned {
         Ok(self.pool.keep_turn(self.id))
     }
 
-    /// Counts time that threads of the job's own have worked for it.
-    pub fn helped(&self, time: Duration) {
-        self.helped_ms.update(|ms| ms + time.as_secs_f64() * 1e3);
+    /// Counts milliseconds for which threads of the job's own have worked for it.
+    pub fn helped(&self, time_ms: f64) {
+        self.helped_ms.update(|ms| ms + time_ms);
     }
 
     fn check_caller(&self) -> Result<(), WorkError> {

@@ -18,7 +18,7 @@ use v1::optimize_trajectory_response::Response as Answer;
 
 use crate::core::inputs::Inputs;
 use crate::core::limits::LimitExceeded;
-use crate::core::workers::pool::Abandoned;
+use crate::core::workers::pool::{Abandoned, Helpers};
 use crate::wire::answers::Answers;
 use crate::wire::control::points::model_and_settings;
 use crate::wire::message::weights::{self, WeightFields};
@@ -29,6 +29,8 @@ use crate::wire::status::RpcError;
 /// A search.
 pub(crate) struct Search {
     optimizer: Optimizer,
+    /// What the threads of the search have used besides this one's.
+    helpers: Arc<Helpers>,
     /// Finds the velocities of states.
     spare: Spare,
     checkpoint_every: u32,
@@ -62,9 +64,12 @@ impl Search {
             }
         };
         optimizer.set_threads(hub.search_threads);
+        let helpers = Arc::new(Helpers::default());
+        let counted = Arc::clone(&helpers);
+        optimizer.set_around(move |work| counted.count(work));
         let spare = Spare::new(model, settings)
             .map_err(|error| RpcError::from_initial(error, "settings"))?;
-        Ok(Self { optimizer, spare, checkpoint_every, _permit: permit })
+        Ok(Self { optimizer, helpers, spare, checkpoint_every, _permit: permit })
     }
 
     /// The messages of the search.
@@ -94,9 +99,8 @@ impl Search {
     fn iterate(&mut self, abandoned: &Abandoned) -> Result<(VecDeque<Answer>, bool), RpcError> {
         let mut messages = VecDeque::new();
         if self.optimizer.status() == Status::Running {
-            let before = self.optimizer.helped();
             let iterated = self.optimizer.iterate(&mut || abandoned.check().is_ok());
-            abandoned.helped(self.optimizer.helped() - before);
+            abandoned.helped(self.helpers.take());
             match iterated {
                 Ok(progress) => messages.push_back(Answer::Progress(self.progress(&progress)?)),
                 // A trajectory that the search cannot leave: what there is is the answer.

@@ -87,7 +87,7 @@ pub(crate) async fn run_case(
         steps: last_step,
     };
     // Of what was never seen there is nothing to judge.
-    let is_unseen = outcome.error.is_some() && samples.len() == 0;
+    let is_unseen = outcome.error.is_some() && samples.count() == 0;
     for expectation in prepared.scenario.expect.iter().filter(|_| !is_unseen) {
         match judge(expectation, &samples, &facts) {
             Ok(verdict) => outcome.verdicts.push(verdict),
@@ -383,7 +383,7 @@ impl Run<'_> {
             if self.ended.is_some() {
                 return Ok(());
             }
-            if self.samples.len() > 0 && self.last_step >= goal {
+            if self.samples.count() > 0 && self.last_step >= goal {
                 break;
             }
             if is_begun && stopped.is_none() && self.last_step >= self.until {
@@ -442,7 +442,7 @@ impl Run<'_> {
     /// Takes a message of the watch.
     fn see(&mut self, message: &v1::WatchResponse) -> Result<()> {
         let state = message.state.as_ref().context("a message without a state")?;
-        let is_first = self.samples.len() == 0;
+        let is_first = self.samples.count() == 0;
         if !is_first && state.step < self.last_step {
             self.ended = Some(format!("somebody put the plant back after step {}", self.last_step));
             return Ok(());
