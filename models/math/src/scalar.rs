@@ -50,10 +50,15 @@ pub(crate) use operators;
 #[macro_export]
 macro_rules! in_registers {
     ($number:ty, $body:block) => {
-        <$number as $crate::scalar::Scalar>::in_registers(
-            #[inline(always)]
-            move || $body,
-        )
+        // A block in a block would be handed on once more.
+        if <$number as $crate::scalar::Scalar>::IS_SEVERAL {
+            <$number as $crate::scalar::Scalar>::in_registers(
+                #[inline(always)]
+                move || $body,
+            )
+        } else {
+            $crate::simd::wide!($body)
+        }
     };
 }
 pub use in_registers;

@@ -78,10 +78,14 @@ pub(crate) fn difference<'a, S: Scalar>(
 #[inline(always)]
 pub(crate) fn best_order<S: Compared>(errors: &[S; LENGTH], known: S, most: usize) -> S {
     let (mut least, mut order) = (errors[1], S::ONE);
-    for (m, error) in errors.iter().enumerate().take(most + 1).skip(2) {
-        let place = S::constant(m as f64);
-        let is_better = error.less(least) & place.at_most(known);
-        least = S::choose(is_better, *error, least);
+    for m in 2..=most.min(LENGTH - 1) {
+        let (error, place) = (errors[m], S::constant(m as f64));
+        let mut is_better = error.less(least);
+        // By itself a plant has as many as are gone through.
+        if S::IS_SEVERAL {
+            is_better = is_better & place.at_most(known);
+        }
+        least = S::choose(is_better, error, least);
         order = S::choose(is_better, place, order);
     }
     order

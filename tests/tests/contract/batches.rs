@@ -300,3 +300,59 @@ async fn expectations_are_judged_case_by_case() {
     assert_eq!(violation.field, "expect");
     assert!(violation.description.contains("`phi`"), "{refused}");
 }
+
+/// Cases with nothing but inputs go side by side where their states are not asked for one by one, and are the same.
+#[tokio::test]
+async fn cases_side_by_side_are_the_cases_by_themselves() {
+    let (_server, client) = server().await;
+    for model in ["pendulum", "chain-8", "tree-8"] {
+        let described = client.get_model(model).await.unwrap();
+        let (size, width) = (described.coordinates.len(), described.inputs.len());
+        let case = |k: usize| {
+            let force =
+                |step: usize| if k == 7 && step == 9 { 1e12 } else { (k + step) as f64 * 0.01 };
+            let rows: Vec<_> = (0..10 + k).map(|step| vec![force(step); width]).collect();
+            let q = vec![0.1 * (k + 1) as f64; if k == 5 { size + 1 } else { size }];
+            v1::RolloutCase {
+                initial: Some(at_velocity(&q, &vec![0.0; q.len()])),
+                u: Some(v1::Matrix::from_rows(&rows)),
+                hold: 20,
+                ..Default::default()
+            }
+        };
+        let request = |every| v1::RolloutRequest {
+            model: model.to_owned(),
+            cases: (0..19).map(case).collect(),
+            every,
+            extremes: true,
+            cost: Some(v1::RolloutCost {
+                q: Some(diagonal(vec![1.0; 2 * size])),
+                r: Some(diagonal(vec![0.1; width])),
+                ..Default::default()
+            }),
+            ..Default::default()
+        };
+        let answers = async |request| {
+            let answers = client.rollout(request).await.unwrap();
+            let mut answers: Vec<_> = answers.try_collect().await.unwrap();
+            answers.sort_by_key(|answer: &v1::RolloutResponse| answer.case_index);
+            answers
+        };
+        let together = answers(request(0)).await;
+        let alone = answers(request(1)).await;
+        assert_eq!(together.len(), 19);
+        for (one, other) in together.iter().zip(&alone) {
+            let case = one.case_index;
+            assert_eq!(one.failure, other.failure, "{model}, case {case}");
+            assert_eq!(one.states.last(), other.states.last(), "{model}, case {case}");
+            assert_eq!((&one.min, &one.max), (&other.min, &other.max), "{model}, case {case}");
+            assert_eq!((one.cost, one.steps), (other.cost, other.steps), "{model}, case {case}");
+        }
+        let failed: Vec<_> = together.iter().filter(|case| case.failure.is_some()).collect();
+        assert_eq!(
+            failed.iter().map(|case| case.case_index).collect::<Vec<_>>(),
+            [5, 7],
+            "{model}"
+        );
+    }
+}

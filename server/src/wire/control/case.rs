@@ -1,6 +1,8 @@
 //! One case of a rollout: a plant that is made, takes its steps, and is gone. With nothing but inputs it is the bare
 //! map; else a session like any other, so that it moves bit for bit as a plant does that is driven step by step.
 
+pub(crate) mod flock;
+
 use std::sync::{Arc, LazyLock};
 
 use nalgebra::{DMatrix, DVector};
@@ -50,6 +52,9 @@ pub(crate) struct Case {
     /// What else it has of its own.
     pub(crate) own: v1::RolloutCase,
 }
+
+/// A case that has ended: what is said of it, and its last state; none of one that never began.
+pub(crate) type Ended = (v1::RolloutResponse, Vec<f64>);
 
 /// A quadratic cost along a case.
 pub(crate) struct Cost {
@@ -140,18 +145,19 @@ impl Simulation {
     }
 
     /// Goes on for a part; the answer, and the last state, when the case has ended.
-    pub(crate) fn go_on(
-        &mut self,
-        abandoned: &Abandoned,
-    ) -> Result<Option<(v1::RolloutResponse, Vec<f64>)>, RpcError> {
+    pub(crate) fn go_on(&mut self, abandoned: &Abandoned) -> Result<Option<Ended>, RpcError> {
         match self.simulate(abandoned) {
             Ok(false) => return Ok(None),
             Ok(true) => {}
             Err(fault) if fault.reason() == "CANCELLED" => return Err(fault),
             Err(fault) => self.response.failure = Some(fault.into()),
         }
+        Ok(Some(self.ended()))
+    }
+
+    fn ended(&mut self) -> Ended {
         self.response.steps = self.taken as u64;
-        Ok(Some((std::mem::take(&mut self.response), std::mem::take(&mut self.x))))
+        (std::mem::take(&mut self.response), std::mem::take(&mut self.x))
     }
 
     /// Takes steps until all are taken, which is true, or the part is over.
@@ -173,6 +179,16 @@ impl Simulation {
                 return Ok(false);
             }
         }
+        self.sum_up()?;
+        if let (Some(expected), Some(watched)) = (&self.shared.expected, &self.watched) {
+            let failure = outcome.as_ref().err().map(|fault| fault.message().to_owned());
+            self.response.verdicts = expected.judge(watched, failure)?;
+        }
+        outcome.map(|()| true)
+    }
+
+    /// Says what is asked for of the last state.
+    fn sum_up(&mut self) -> Result<(), RpcError> {
         if let Some(machine) = &self.machine {
             self.x = machine.look(states::x)?;
         }
@@ -182,11 +198,7 @@ impl Simulation {
         if let Some(cost) = &self.shared.cost {
             self.response.cost += cost.of_state(cost.end.as_ref(), &self.shared.model, &self.x);
         }
-        if let (Some(expected), Some(watched)) = (&self.shared.expected, &self.watched) {
-            let failure = outcome.as_ref().err().map(|fault| fault.message().to_owned());
-            self.response.verdicts = expected.judge(watched, failure)?;
-        }
-        outcome.map(|()| true)
+        Ok(())
     }
 
     fn begin(&mut self, abandoned: &Abandoned) -> Result<(), RpcError> {
@@ -251,17 +263,42 @@ impl Simulation {
         Ok(())
     }
 
+    /// The input of the next step.
+    fn input(&self) -> &[f64] {
+        let Self { case, held, taken, .. } = self;
+        if *taken < case.inputs.count() { case.inputs.get(*taken) } else { held }
+    }
+
+    /// Counts what the next step costs.
+    fn count_cost(&mut self) {
+        if let Some(cost) = &self.shared.cost {
+            let of_state = cost.of_state(cost.q.as_ref(), &self.shared.model, &self.x);
+            self.response.cost += of_state + cost.of_input(self.input());
+        }
+    }
+
+    /// The state after each step is of interest.
+    fn is_looked_at(&self) -> bool {
+        self.shared.extremes || self.shared.cost.is_some()
+    }
+
+    fn note_extremes(&mut self) {
+        if self.shared.extremes {
+            let Self { x, response, .. } = self;
+            for ((x, min), max) in x.iter().zip(&mut response.min).zip(&mut response.max) {
+                (*min, *max) = (min.min(*x), max.max(*x));
+            }
+        }
+    }
+
     /// Takes a step, and notes what is asked for of it.
     fn step(&mut self) -> Result<(), RpcError> {
-        let Self { case, shared, machine: Some(machine), held, taken, x, response, .. } = self
-        else {
+        self.count_cost();
+        let is_looked_at = self.is_looked_at();
+        let Self { case, machine: Some(machine), held, taken, x, response, .. } = self else {
             return Err(RpcError::internal("a case that has not begun"));
         };
         let u = if *taken < case.inputs.count() { case.inputs.get(*taken) } else { held };
-        if let Some(cost) = &shared.cost {
-            response.cost += cost.of_state(cost.q.as_ref(), &shared.model, x) + cost.of_input(u);
-        }
-        let is_looked_at = shared.extremes || shared.cost.is_some();
         match machine {
             Machine::Map(plant) => {
                 plant.step(u)?;
@@ -284,15 +321,11 @@ impl Simulation {
                 });
             }
         }
-        if shared.extremes {
-            for ((x, min), max) in x.iter().zip(&mut response.min).zip(&mut response.max) {
-                (*min, *max) = (min.min(*x), max.max(*x));
-            }
-        }
-        if shared.expected.is_none() {
+        self.note_extremes();
+        if self.shared.expected.is_none() {
             return Ok(());
         }
-        let u = u.to_vec();
+        let u = self.input().to_vec();
         self.watch(&u)
     }
 
@@ -309,6 +342,17 @@ impl Simulation {
                 self.response.outputs.extend(shown.1);
             }
         }
+    }
+}
+
+impl Case {
+    /// It has nothing but inputs, and the model of all.
+    pub(crate) fn is_bare(&self, common: &v1::RolloutCase) -> bool {
+        [&self.own, common].iter().all(|case| {
+            let v1::RolloutCase { parameters, feedback, channels, faults, until, .. } = case;
+            let is_plain = feedback.is_none() && channels.is_none();
+            is_plain && parameters.is_empty() && faults.is_empty() && until.is_empty()
+        })
     }
 }
 

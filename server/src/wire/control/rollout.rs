@@ -13,7 +13,8 @@ use crate::core::limits::{LimitExceeded, Limits};
 use crate::core::workers::pool::Abandoned;
 use crate::core::workers::queue::Admission;
 use crate::wire::answers::Answers;
-use crate::wire::control::case::{Case, Cost, Shared, Simulation};
+use crate::wire::control::case::flock::{ABREAST, Flock, may_go_together};
+use crate::wire::control::case::{Case, Cost, Ended, Shared, Simulation};
 use crate::wire::control::expected::Expected;
 use crate::wire::control::points::model_and_settings;
 use crate::wire::message::{settings, start, states};
@@ -32,9 +33,6 @@ pub(crate) struct Rollout {
     /// Answer with rows.
     table: bool,
 }
-
-/// A case that has ended: what is said of it, and its last state; none of one that never began.
-type Ended = (v1::RolloutResponse, Vec<f64>);
 
 impl Rollout {
     pub(crate) fn new(hub: &Arc<Hub>, request: v1::RolloutRequest) -> Result<Self, RpcError> {
@@ -91,15 +89,26 @@ impl Rollout {
         let parallel = workers.count();
         let Self { shared, cases, table } = self;
         let whole = Arc::clone(&shared);
-        let ended = stream::iter(cases).map(move |case| {
+        let jobs = together(&shared, cases, parallel);
+        let ended = stream::iter(jobs).map(move |cases| {
             let (workers, shared) = (workers.clone(), Arc::clone(&shared));
             async move {
-                let mut simulation = Simulation::new(case, shared);
-                let part = move |abandoned: &Abandoned| simulation.go_on(abandoned);
-                Ok::<Ended, tonic::Status>(workers.in_parts(Admission::Granted, part).await?)
+                let ended = match <[Case; 1]>::try_from(cases) {
+                    Ok([case]) => {
+                        let mut simulation = Simulation::new(case, shared);
+                        let part = move |abandoned: &Abandoned| simulation.go_on(abandoned);
+                        vec![workers.in_parts(Admission::Granted, part).await?]
+                    }
+                    Err(cases) => {
+                        let mut flock = Flock::new(cases, &shared);
+                        let part = move |abandoned: &Abandoned| flock.go_on(abandoned);
+                        workers.in_parts(Admission::Granted, part).await?
+                    }
+                };
+                Ok::<_, tonic::Status>(stream::iter(ended.into_iter().map(Ok)))
             }
         });
-        let ended = ended.buffer_unordered(parallel);
+        let ended = ended.buffer_unordered(parallel).try_flatten();
         if !table {
             return Box::pin(ended.map_ok(|(response, _)| response));
         }
@@ -108,6 +117,22 @@ impl Rollout {
         let chunks = ended.try_chunks(rows).map_err(|broken| broken.1);
         Box::pin(chunks.map_ok(move |cases| table_of(&whole, &columns, cases)))
     }
+}
+
+/// Cases job by job: those with nothing but inputs together, as long as there is work for all workers.
+fn together(shared: &Shared, cases: Vec<Case>, parallel: usize) -> Vec<Vec<Case>> {
+    let size = cases.len().div_ceil(parallel.max(1)).clamp(1, ABREAST);
+    let mut jobs: Vec<Vec<Case>> = Vec::new();
+    let mut is_open = false;
+    for case in cases {
+        let is_bare = may_go_together(shared) && case.is_bare(&shared.common);
+        match jobs.last_mut().filter(|job| is_bare && is_open && job.len() < size) {
+            Some(job) => job.push(case),
+            None => jobs.push(vec![case]),
+        }
+        is_open = is_bare;
+    }
+    jobs
 }
 
 /// The model of a request, by its name or its scene, and its settings.
