@@ -78,8 +78,8 @@ pub(crate) fn difference<'a, S: Scalar>(
 #[inline(always)]
 pub(crate) fn best_order<S: Compared>(errors: &[S; LENGTH], known: S, most: usize) -> S {
     let (mut least, mut order) = (errors[1], S::ONE);
-    for m in 2..=most.min(LENGTH - 1) {
-        let (error, place) = (errors[m], S::constant(m as f64));
+    for (m, &error) in (2..).zip(&errors[2..=most.clamp(1, LENGTH - 1)]) {
+        let place = S::constant(f64::from(m));
         let mut is_better = error.less(least);
         // By itself a plant has as many as are gone through.
         if S::IS_SEVERAL {
