@@ -157,7 +157,7 @@ class Done:
         count = len(self.expectations)
         if not count:
             raise ValueError("the batch was not asked for `expect`")
-        return self.rows[:, len(self.columns) - count :] == 1
+        return np.asarray(self.rows[:, len(self.columns) - count :] == 1, dtype=np.bool_)
 
     def _part(self, number: int) -> Array:
         """The last x, its least, or its largest entries."""
