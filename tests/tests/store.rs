@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use futures::TryStreamExt as _;
+use futures::{StreamExt as _, TryStreamExt as _};
 use plantd_client::{
     Client, Code, ConnectOptions, Error, Reconnecting, RecordingEntry, RecordingReader, v1,
 };
@@ -450,4 +450,31 @@ async fn servers_come_and_go_with_their_plants_in_a_real_store() {
     let pieces = a.client().await.get_recording("trial").await.unwrap();
     let pieces: Vec<_> = pieces.map_ok(|piece| piece.data.len()).try_collect().await.unwrap();
     assert!(pieces.iter().sum::<usize>() > 1000);
+}
+
+/// The store is slow for so many at once; the server waits for it, and nobody is lost.
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "needs an S3 server: cargo verify --only store"]
+async fn a_thousand_plants_outlive_their_server_in_a_slow_store() {
+    const PLANTS: usize = 1000;
+    let folder = tempfile::tempdir().unwrap();
+    let moto = Moto::start().await;
+    let mut a = moto.server("a", folder.path());
+    let to_a = a.client().await;
+    let ids: Vec<String> = (0..PLANTS).map(|k| format!("p{k}")).collect();
+    let created = futures::stream::iter(&ids).map(async |id| create(&to_a, id, "pendulum").await);
+    let created: Vec<_> = created.buffer_unordered(16).try_collect().await.unwrap();
+    assert_eq!(created.len(), PLANTS);
+    for id in &ids {
+        step(&to_a, id, 0).await.unwrap();
+    }
+    let began = Instant::now();
+    assert!(a.stop().unwrap().success());
+    println!("{PLANTS} plants were given up in {:.1} s", began.elapsed().as_secs_f64());
+    let b = moto.server("b", folder.path());
+    let to_b = b.client().await;
+    for id in &ids {
+        let state = to_b.get_plant(id).await.unwrap().plant.unwrap().state.unwrap();
+        assert_eq!(state.step, 1, "{id}");
+    }
 }
