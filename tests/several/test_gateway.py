@@ -5,6 +5,8 @@ import time
 
 import grpc
 import numpy as np
+import plantd
+import plantd.batch
 import pytest
 from envoys import NEW, again, envoy
 from frames import Driver
@@ -66,6 +68,21 @@ def test_a_server_at_a_new_address_keeps_its_name(three, tmp_path):
             deadline = time.monotonic() + 60
             while again(lambda: new.create_plant("pendulum")).server != moving.name:
                 assert time.monotonic() < deadline
+
+
+def test_a_batch_goes_over_all_servers(three, tmp_path):
+    """10 000 cases by the name for new plants: the bits of one server, and all servers have worked."""
+    random = np.random.default_rng(3)
+    cases = [plantd.batch.case(steps=200, q=[0.0, angle]) for angle in random.normal(np.pi, 0.3, 10_000)]
+    with envoy(tmp_path, three) as gateway, gateway.client(three[0].name) as one, gateway.client(NEW) as new:
+        again(lambda: one.get_server())
+        alone = plantd.batch.rollout("cart-pole", cases, [one])
+        before = [server.cpu_s() for server in three]
+        spread = plantd.batch.rollout("cart-pole", cases, [new] * 3)
+        after = [server.cpu_s() for server in three]
+    assert spread.errors == {} and spread.rows.tobytes() == alone.rows.tobytes()
+    used = [end - begin for begin, end in zip(before, after)]
+    assert min(used) > 0.1 * sum(used), used
 
 
 def test_many_streams_go_to_one_server(server, tmp_path):

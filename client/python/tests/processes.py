@@ -43,6 +43,12 @@ class Process:
         self.address = json.loads(ready.read_text())["grpc"]
         self.place = self.address.removeprefix("http://")
 
+    def cpu_s(self):
+        """Processor time that it has used, s."""
+        text = Path(f"/proc/{self.process.pid}/stat").read_text()
+        user, system = text.rpartition(")")[2].split()[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
     def signal(self, number):
         self.process.send_signal(number)
 

@@ -281,7 +281,10 @@ def test_cases_have_what_a_plant_has(program):
         common=common,
         extremes=True,
         cost=dict(q=[1, 1, 0, 0], r=[0.1], end=[5, 5, 0, 0], x_reference=[0.1, 0, 0, 0]),
+        expect='[[expect]]\nno_failures = true\n[[expect]]\nnever_exceeds = { signal = "|arm|", limit = 1e-9 }\n',
     )
+    assert done.expectations == ("no failures", "|arm| never exceeds 1e-9")
+    assert done.came_true.tolist() == [[True, False]] * 5
     assert done.errors == {} and done.columns[:3] == ("steps", "end", "arm")
     assert done.x[1].tobytes() == state.x.tobytes()
     assert len({row.tobytes() for row in done.x}) == 5

@@ -77,6 +77,17 @@ def test_monte_carlo_ray():
     assert "2000 cases, of which" in told and "the cart strays by" in told
 
 
+@pytest.mark.parametrize(
+    ("example", "needs", "told"),
+    [("worst_case.py", "numpy", "the worst case: a pole of"), ("gains_cma.py", "cma", "the best gain")],
+)
+def test_searches(example, needs, told):
+    pytest.importorskip(needs)
+    environment = {**os.environ, "PLANTD": os.environ["PLANTD_SERVER"]}
+    command = [sys.executable, str(EXAMPLES / example)]
+    assert told in subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=200).stdout
+
+
 def test_examples_are_short():
     for file in EXAMPLES.glob("*.py"):
         assert len(file.read_text().splitlines()) < 50, file.name

@@ -391,6 +391,7 @@ def rollout(
     common: Case | None = None,
     extremes: bool = False,
     cost: Mapping[str, npt.ArrayLike] | None = None,
+    expect: str = "",
     any_build: bool = False,
     **stepping: Unpack[Stepping],
 ) -> Done:
@@ -419,7 +420,7 @@ def rollout(
         scene=scene,
         common=common,
         extremes=extremes,
-        cost=cost,
+        cost=cost, expect=expect,
         workers=workers,
         **stepping,
     )
