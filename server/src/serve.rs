@@ -498,6 +498,9 @@ async fn save_plants(hub: Arc<Hub>, interval: Duration) {
 
 /// Brings recordings that have ended into the archive, over and over.
 async fn archive_recordings(hub: Arc<Hub>) {
+    if !hub.recordings.as_ref().is_some_and(Recordings::has_archive) {
+        return;
+    }
     loop {
         tokio::time::sleep(ARCHIVE_PERIOD).await;
         archive_once(&hub).await;
@@ -505,9 +508,6 @@ async fn archive_recordings(hub: Arc<Hub>) {
 }
 
 async fn archive_once(hub: &Arc<Hub>) {
-    if !hub.recordings.as_ref().is_some_and(Recordings::has_archive) {
-        return;
-    }
     let hub = Arc::clone(hub);
     let archive = move || hub.recordings.as_ref().map(Recordings::archive_ended);
     if let Err(error) = tokio::task::spawn_blocking(archive).await {

@@ -265,8 +265,7 @@ impl Simulation {
 
     /// The input of the next step.
     fn input(&self) -> &[f64] {
-        let Self { case, held, taken, .. } = self;
-        if *taken < case.inputs.count() { case.inputs.get(*taken) } else { held }
+        self.case.input(self.taken, &self.held)
     }
 
     /// Counts what the next step costs.
@@ -298,7 +297,7 @@ impl Simulation {
         let Self { case, machine: Some(machine), held, taken, x, response, .. } = self else {
             return Err(RpcError::internal("a case that has not begun"));
         };
-        let u = if *taken < case.inputs.count() { case.inputs.get(*taken) } else { held };
+        let u = case.input(*taken, held);
         match machine {
             Machine::Map(plant) => {
                 plant.step(u)?;
@@ -346,13 +345,23 @@ impl Simulation {
 }
 
 impl Case {
-    /// It has nothing but inputs, and the model of all.
-    pub(crate) fn is_bare(&self, common: &v1::RolloutCase) -> bool {
+    /// The input of a step: its own, or the one that is held after those.
+    fn input<'a>(&'a self, step: usize, held: &'a [f64]) -> &'a [f64] {
+        if step < self.inputs.count() { self.inputs.get(step) } else { held }
+    }
+
+    /// It has nothing but inputs and numbers.
+    fn is_bare(&self, common: &v1::RolloutCase) -> bool {
         [&self.own, common].iter().all(|case| {
-            let v1::RolloutCase { parameters, feedback, channels, faults, until, .. } = case;
-            let is_plain = feedback.is_none() && channels.is_none();
-            is_plain && parameters.is_empty() && faults.is_empty() && until.is_empty()
+            let v1::RolloutCase { feedback, channels, faults, until, .. } = case;
+            feedback.is_none() && channels.is_none() && faults.is_empty() && until.is_empty()
         })
+    }
+
+    /// It has nothing but inputs, and the model of all.
+    pub(crate) fn is_like_others(&self, common: &v1::RolloutCase) -> bool {
+        let has_numbers = !self.own.parameters.is_empty() || !common.parameters.is_empty();
+        self.is_bare(common) && !has_numbers
     }
 }
 
@@ -370,15 +379,13 @@ fn make(case: &Case, shared: &Shared, abandoned: &Abandoned) -> Result<Machine, 
     };
     let field = format!("cases[{}].initial", case.index);
     let plant = start::plant(&model, shared.settings, &case.start, &field)?;
+    if case.is_bare(common) {
+        return Ok(Machine::Map(Box::new(plant)));
+    }
     let channels = own.channels.as_ref().or(common.channels.as_ref());
     let feedback = own.feedback.as_ref().or(common.feedback.as_ref());
     let faults = || common.faults.iter().chain(&own.faults);
     let until = if own.until.is_empty() { &common.until } else { &own.until };
-    let is_bare =
-        channels.is_none() && feedback.is_none() && faults().next().is_none() && until.is_empty();
-    if is_bare {
-        return Ok(Machine::Map(Box::new(plant)));
-    }
     let metrics = Arc::clone(&*shared.metrics);
     let session = shared.hub.apart(&shared.model_name, plant, metrics);
     let mut channels = channels.cloned().unwrap_or_default();

@@ -59,6 +59,11 @@ impl Expected {
         columns(model, &[], self.uses_energy).count().saturating_mul(steps.saturating_add(1))
     }
 
+    /// How many there are.
+    pub(crate) fn count(&self) -> usize {
+        self.list.len()
+    }
+
     /// In words.
     pub(crate) fn sentences(&self) -> impl Iterator<Item = String> {
         self.list.iter().map(ToString::to_string)

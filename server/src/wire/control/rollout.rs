@@ -125,7 +125,7 @@ fn together(shared: &Shared, cases: Vec<Case>, parallel: usize) -> Vec<Vec<Case>
     let mut jobs: Vec<Vec<Case>> = Vec::new();
     let mut is_open = false;
     for case in cases {
-        let is_bare = may_go_together(shared) && case.is_bare(&shared.common);
+        let is_bare = may_go_together(shared) && case.is_like_others(&shared.common);
         match jobs.last_mut().filter(|job| is_bare && is_open && job.len() < size) {
             Some(job) => job.push(case),
             None => jobs.push(vec![case]),
@@ -220,7 +220,7 @@ fn table_of(shared: &Shared, columns: &[String], cases: Vec<Ended>) -> v1::Rollo
         data.extend(x);
         data.extend(case.min);
         data.extend(case.max);
-        let expected = shared.expected.as_ref().map_or(0, |expected| expected.sentences().count());
+        let expected = shared.expected.as_ref().map_or(0, Expected::count);
         if shared.cost.is_some() && data.len() + 1 + expected == row + columns.len() {
             data.push(case.cost);
         }

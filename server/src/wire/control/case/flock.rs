@@ -79,8 +79,9 @@ impl Flock {
         let Self { cases, fleet: Some(fleet), inputs, moving, taken } = self else {
             return Err(RpcError::internal("cases that have not begun"));
         };
+        let now = *taken;
         let goes_on = |case: &Simulation| {
-            case.taken == *taken && case.taken < case.case.steps && case.response.failure.is_none()
+            case.taken == now && case.taken < case.case.steps && case.response.failure.is_none()
         };
         let mut any = false;
         for (place, index) in moving.iter().enumerate() {
@@ -97,25 +98,25 @@ impl Flock {
         if !any {
             return Ok(false);
         }
-        let results = fleet.step(inputs);
-        let failures: Vec<_> =
-            results.iter().map(|result| result.as_ref().err().cloned()).collect();
-        for ((place, index), failure) in moving.iter().enumerate().zip(failures) {
+        for (index, result) in moving.iter().zip(fleet.step(inputs)) {
             let case = &mut cases[*index];
-            if !goes_on(case) {
-                continue;
+            if goes_on(case) {
+                match result {
+                    Ok(_) => case.taken += 1,
+                    Err(error) => {
+                        case.response.failure = Some(RpcError::from(error.clone()).into())
+                    }
+                }
             }
-            if let Some(error) = failure {
-                case.response.failure = Some(RpcError::from(error).into());
-                continue;
-            }
-            case.taken += 1;
-            if case.is_looked_at() {
+        }
+        *taken += 1;
+        for (place, index) in moving.iter().enumerate() {
+            let case = &mut cases[*index];
+            if case.taken == *taken && case.is_looked_at() {
                 case.x = states::x(fleet.plant(place));
                 case.note_extremes();
             }
         }
-        *taken += 1;
         Ok(true)
     }
 }

@@ -6,7 +6,7 @@ pub mod objects;
 pub mod store;
 
 use std::collections::BTreeSet;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 
 use plantd_proto::v1;
@@ -32,7 +32,6 @@ pub struct State {
     pub(crate) left: AtomicUsize,
     /// Ids of the plants that were not paused when the server began to pause them all.
     pub(crate) running: OnceLock<BTreeSet<String>>,
-    gives_up: AtomicBool,
 }
 
 /// A plant that has changed since it was saved.
@@ -52,7 +51,6 @@ impl State {
             answers: AtomicUsize::new(0),
             left: AtomicUsize::new(0),
             running: OnceLock::new(),
-            gives_up: AtomicBool::new(false),
         }
     }
 
@@ -65,13 +63,12 @@ impl State {
     pub fn give_up(&self) {
         if let Some(shared) = self.shared() {
             shared.give_up();
-            self.gives_up.store(true, Ordering::Relaxed);
         }
     }
 
     /// Plants are given up, also those that have not changed.
     pub(crate) fn gives_up(&self) -> bool {
-        self.gives_up.load(Ordering::Relaxed)
+        self.shared().is_some_and(Shared::gives_up)
     }
 
     /// Notes which plants are not paused: they go on with the next server.

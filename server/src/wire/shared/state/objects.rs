@@ -120,7 +120,7 @@ impl Objects {
 
     /// Who this is.
     fn holder(&self) -> v1::Holder {
-        let gives_up = self.gives_up.load(Ordering::Relaxed);
+        let gives_up = self.gives_up();
         v1::Holder {
             server: if gives_up { String::new() } else { self.server.clone() },
             address: self.address.get().filter(|_| !gives_up).cloned().unwrap_or_default(),
@@ -409,6 +409,10 @@ impl Shared for Objects {
 
     fn give_up(&self) {
         self.gives_up.store(true, Ordering::Relaxed);
+    }
+
+    fn gives_up(&self) -> bool {
+        self.gives_up.load(Ordering::Relaxed)
     }
 
     fn look(&self, place: &Place) -> Result<v1::PlantRecord, StoreError> {

@@ -82,6 +82,9 @@ pub trait Shared: Store {
     /// What is written from now on is given up: whoever is asked for a plant takes it.
     fn give_up(&self);
 
+    /// Plants are given up.
+    fn gives_up(&self) -> bool;
+
     /// A plant as it was written last, with who has it.
     fn look(&self, place: &Place) -> Result<v1::PlantRecord, StoreError>;
 
