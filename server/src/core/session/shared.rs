@@ -301,17 +301,22 @@ impl Session {
                 Place::Rest(core) => return act(core),
                 Place::Running { key, handle, .. } => (*key, handle.clone()),
             };
-            let (give, taken) = mpsc::sync_channel(1);
+            // The channel is of one type for all results: it is much code, which would be compiled for each.
+            let (done, is_done) = mpsc::sync_channel(1);
+            let outcome = Arc::new(Mutex::new(None));
+            let place = Arc::clone(&outcome);
             let in_loop = move |core: Option<&mut Core>| {
-                let outcome = match core {
+                *lock(&place) = Some(match core {
                     Some(core) => Ok(act(core)),
                     None => Err(act),
-                };
+                });
                 // The receiver waits for it.
-                let _ = give.send(outcome);
+                let _ = done.send(());
             };
             handle.act(key, Box::new(in_loop));
-            match taken.recv().expect("a loop does what it is told") {
+            let _ = is_done.recv();
+            let outcome = lock(&outcome).take();
+            match outcome.expect("a loop does what it is told") {
                 Ok(outcome) => return outcome,
                 // The loop has put it back since.
                 Err(back) => act = back,

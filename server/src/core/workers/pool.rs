@@ -213,9 +213,22 @@ impl Workers {
         lane: Lane,
         job: impl FnOnce(&Abandoned) -> Result<T, E> + Send + 'static,
     ) -> Result<T, E> {
+        let outcome = Arc::new(Mutex::new(None));
+        let place = Arc::clone(&outcome);
+        let job = Box::new(move |abandoned: &Abandoned| {
+            let outcome = job(abandoned);
+            *lock(&place) = Some(outcome);
+        });
+        self.do_job(admission, lane, job).await?;
+        let outcome = lock(&outcome).take();
+        outcome.unwrap_or_else(|| Err(WorkError::BrokeOff.into()))
+    }
+
+    /// [`start`](Self::start) for jobs of all results: what is in here is compiled once.
+    async fn do_job(&self, admission: Admission, lane: Lane, job: Job) -> Result<(), WorkError> {
         let account = self.pool.tenants.current();
         if admission == Admission::Bounded {
-            account.rates.worker_ms_per_s.check().map_err(WorkError::from)?;
+            account.rates.worker_ms_per_s.check()?;
         }
         let token = CancellationToken::new();
         let (sender, mut receiver) = oneshot::channel();
@@ -229,29 +242,32 @@ impl Workers {
                 let abandoned =
                     Abandoned { token, pool, id, turn_began, helped_ms: Cell::new(0.0) };
                 let meter = || thread_ms() + abandoned.helped_ms.get();
-                let outcome = account
+                account
                     .rates
                     .worker_ms_per_s
                     .spent_by(meter, || span.in_scope(|| caller.scope(|| job(&abandoned))));
                 drop(span);
-                let _ = sender.send(outcome);
+                let _ = sender.send(());
             })
         };
-        let id = self.pool.submit(admission, lane, work).map_err(WorkError::from)?;
+        let id = self.pool.submit(admission, lane, work)?;
         let mut waiting = Waiting { pool: &self.pool, id, token, waits: true };
-        let outcome = loop {
+        let is_done = loop {
             match tokio::time::timeout(TURN_OVERDUE, &mut receiver).await {
-                Ok(outcome) => break outcome,
+                Ok(is_done) => break is_done,
                 Err(_) => self.pool.look_after(),
             }
         };
         waiting.waits = false;
-        outcome.unwrap_or_else(|_| {
+        is_done.map_err(|_| {
             tracing::error!("a computation broke off");
-            Err(WorkError::BrokeOff.into())
+            WorkError::BrokeOff
         })
     }
 }
+
+/// What a worker does for a caller, who finds the outcome where the job puts it.
+type Job = Box<dyn FnOnce(&Abandoned) + Send>;
 
 /// Whoever waits for a job.
 struct Waiting<'a> {
