@@ -6,7 +6,7 @@
 use std::fmt::Debug;
 use std::ops::{Add, AddAssign, BitAnd, BitOr, Div, Mul, Neg, Not, Sub, SubAssign};
 
-use crate::simd::{wide, widest};
+use crate::simd::{in_eights, wide};
 use crate::trigonometry;
 
 /// Operators of a type: by what they make of one or two operands, and of what they put in its place.
@@ -296,7 +296,7 @@ impl<const N: usize> Scalar for LanesOf<N> {
     }
     #[inline(always)]
     fn in_registers<R>(block: impl FnOnce() -> R) -> R {
-        if N > Lanes::COUNT { widest!({ block() }) } else { wide!({ block() }) }
+        if const { N > Lanes::COUNT } { in_eights(block) } else { wide!({ block() }) }
     }
     /// Of the first: nothing that branches on it may run on several numbers.
     #[inline(always)]

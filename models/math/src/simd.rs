@@ -41,6 +41,28 @@ macro_rules! widest {
 
 pub use {wide, widest};
 
+/// Runs a block as it is compiled for processors with AVX-512, and in no other way, where code for others would be
+/// compiled for nothing.
+///
+/// # Panics
+///
+/// On an x86 processor without it: ask [`has`] before.
+#[inline(always)]
+pub(crate) fn in_eights<R>(block: impl FnOnce() -> R) -> R {
+    #[cfg(target_arch = "x86_64")]
+    {
+        #[target_feature(enable = "avx512f")]
+        fn avx512<R>(block: impl FnOnce() -> R) -> R {
+            block()
+        }
+        assert!(std::arch::is_x86_feature_detected!("avx512f"), "registers of eight numbers");
+        // SAFETY: the processor has the feature.
+        unsafe { avx512(block) }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    block()
+}
+
 /// Registers that every processor has.
 pub const PORTABLE: u8 = 1;
 /// Registers of four numbers: AVX2.

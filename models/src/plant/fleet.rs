@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use plantd_math::scalar::Truths;
+use plantd_math::simd::{AVX512, has};
 
 use crate::integrator::abreast::{Abreast, States};
 use crate::integrator::report::{StepError, StepReport};
@@ -189,7 +190,7 @@ impl Rows {
     fn new(model: &Arc<Model>, settings: &Settings, count: usize) -> Self {
         if count < Row::<4>::FEW || !model.goes_abreast(settings) {
             Self::None
-        } else if count <= 4 || model.solver == Solver::Planar {
+        } else if count <= 4 || model.solver == Solver::Planar || !has(AVX512) {
             // Of many joints in planes eight at once do not fit into the nearest cache.
             Self::Fours(Box::new(Wide::new(model, settings, count)))
         } else {
