@@ -18,6 +18,7 @@ pub struct Subscription {
     slot: Arc<Slot>,
     frame: Frame,
     dropped: u64,
+    passes_over: bool,
 }
 
 impl Subscription {
@@ -34,7 +35,7 @@ impl Subscription {
         let slot = Arc::new(Slot::new(every, from, frames));
         feed.watchers.add(Arc::clone(&slot), watchers_max)?;
         metrics.watcher_started();
-        Ok(Self { feed, metrics, slot, frame, dropped: 0 })
+        Ok(Self { feed, metrics, slot, frame, dropped: 0, passes_over: false })
     }
 
     pub(crate) fn offer(&self, published: &Published<'_>) {
@@ -47,14 +48,9 @@ impl Subscription {
         (&self.frame, self.dropped)
     }
 
-    /// Frames lost so far, those among them of which the watcher was not told.
-    pub fn lost(&self) -> u64 {
-        lock(&self.slot.cell).dropped
-    }
-
-    /// Does not count as lost what was passed over since so many were.
-    pub fn forget_lost_since(&self, lost: u64) {
-        lock(&self.slot.cell).dropped = lost;
+    /// From now on the latest frame is what is wanted: those before it are passed over, and not lost.
+    pub fn pass_over(&mut self) {
+        self.passes_over = true;
     }
 
     /// The next frame, with the number of frames lost so far.
@@ -76,6 +72,9 @@ impl Subscription {
         let mut cell = lock(&self.slot.cell);
         if !cell.pop(&mut self.frame) {
             return false;
+        }
+        if self.passes_over {
+            cell.dropped = self.dropped;
         }
         let lost = cell.dropped - self.dropped;
         self.dropped = cell.dropped;

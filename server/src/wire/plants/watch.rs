@@ -50,9 +50,13 @@ pub(crate) fn stream(
     // The one frame that every watcher has is covered by the limit of watchers.
     let numbers = (queue - 1).saturating_mul(record_words(session.model().dimensions()));
     let room = hub.tenants.current().rooms.watch_numbers.reserve(numbers)?;
+    let mut subscription = session.subscribe(every, queue, hub.limits.watchers_per_plant)?;
+    if pace.period.is_some() {
+        subscription.pass_over();
+    }
     let watcher = Watcher {
         session: Arc::clone(&session),
-        subscription: session.subscribe(every, queue, hub.limits.watchers_per_plant)?,
+        subscription,
         _room: room,
         hub: Arc::clone(hub),
         wanted,
@@ -110,9 +114,7 @@ impl Pace {
 /// The latest frame, when the pace lets it through. What comes meanwhile is passed over, and not lost.
 async fn paced<'a>(subscription: &'a mut Subscription, pace: &mut Pace) -> (&'a Frame, u64) {
     if let Some(next) = pace.next {
-        let lost = subscription.lost();
         tokio::time::sleep_until(next).await;
-        subscription.forget_lost_since(lost);
     }
     let taken = subscription.next().await;
     pace.restart();
