@@ -199,7 +199,7 @@ impl RunningServer {
             hub.recordings = Some(recordings?);
         }
         let hub = Arc::new(hub);
-        if hub.state.as_ref().and_then(State::shared).is_some() {
+        if hub.shared_store().is_some() {
             let _ = hub.find.set(adopt::finder(&hub));
             let _ = hub.catalog.find.set(kept::finder(&hub));
         }
@@ -269,7 +269,7 @@ impl RunningServer {
         };
         let listens = || by_name().or_else(|| addresses.unix.clone());
         if let Some(address) = config.advertise.clone().or_else(listens) {
-            if let Some(shared) = hub.state.as_ref().and_then(State::shared) {
+            if let Some(shared) = hub.shared_store() {
                 shared.announce(&address);
             }
             hub.identity.announce(address);

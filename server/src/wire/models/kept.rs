@@ -12,24 +12,19 @@ use crate::core::tenant::Tenant;
 use crate::wire::message::checks::check_name;
 use crate::wire::models::model::compile;
 use crate::wire::shared::hub::Hub;
-use crate::wire::shared::state::State;
-use crate::wire::shared::state::store::{Shared, StoreError};
+use crate::wire::shared::state::store::StoreError;
 use crate::wire::status::RpcError;
-
-fn shared(hub: &Hub) -> Option<&dyn Shared> {
-    hub.state.as_ref().and_then(State::shared)
-}
 
 /// Keeps an uploaded model for all servers.
 pub(crate) fn keep(hub: &Hub, entry: &Entry) -> Result<(), RpcError> {
-    let Some(shared) = shared(hub) else { return Ok(()) };
+    let Some(shared) = hub.shared_store() else { return Ok(()) };
     let kept = shared.put_scene(entry.owner, &entry.name, entry.model.scene().to_toml());
     kept.map_err(|error| RpcError::store_failed(&error))
 }
 
 /// Forgets a model for all servers; those that have used it have it until they end.
 pub(crate) fn forget(hub: &Hub, entry: &Entry) -> Result<(), RpcError> {
-    let Some(shared) = shared(hub) else { return Ok(()) };
+    let Some(shared) = hub.shared_store() else { return Ok(()) };
     let removed = shared.remove_scene(entry.owner, &entry.name);
     removed.map_err(|error| RpcError::store_failed(&error))
 }
@@ -42,7 +37,7 @@ pub(crate) fn finder(hub: &Arc<Hub>) -> FindModel {
 
 /// A model that another server has kept, and whose it is.
 fn find(hub: &Hub, name: &str) -> Option<(Model, Tenant)> {
-    let shared = shared(hub)?;
+    let shared = hub.shared_store()?;
     check_name("name", name).ok()?;
     let own = Connection::current().tenant();
     let places = if own == Tenant::NONE { vec![own] } else { vec![own, Tenant::NONE] };

@@ -17,7 +17,6 @@ use crate::wire::message::checks::check_name;
 use crate::wire::plants::record::{self, sentence};
 use crate::wire::plants::state::{NotRestored, restore};
 use crate::wire::shared::hub::{Find, Hub};
-use crate::wire::shared::state::State;
 use crate::wire::shared::state::store::{Place, Shared, StoreError};
 use crate::wire::status::RpcError;
 
@@ -54,7 +53,7 @@ impl Finder {
     /// The plant, if the store has it; the error says where it is.
     fn find(&self, id: &str) -> Option<Result<Arc<Session>, RpcError>> {
         let hub = self.hub.upgrade()?;
-        hub.state.as_ref().and_then(State::shared)?;
+        hub.shared_store()?;
         check_name("id", id).ok()?;
         let place = Place { tenant: Connection::current().tenant(), id: id.to_owned() };
         if lock(&self.absent).get(&place).is_some_and(|since| since.elapsed() < ABSENT) {
@@ -114,7 +113,7 @@ async fn in_store<T: Send + 'static>(
     ask: impl FnOnce(&dyn Shared, &Place) -> Result<T, StoreError> + Send + 'static,
 ) -> Result<T, StoreError> {
     let (hub, place) = (Arc::clone(hub), place.clone());
-    let asked = move || match hub.state.as_ref().and_then(State::shared) {
+    let asked = move || match hub.shared_store() {
         Some(shared) => ask(shared, &place),
         None => Err(StoreError::Missing),
     };
@@ -148,7 +147,7 @@ pub(crate) async fn adopt_plants(
 ) -> Result<v1::AdoptPlantsResponse, RpcError> {
     let from = &request.from;
     hub.check_takes_new()?;
-    if hub.state.as_ref().and_then(State::shared).is_none() {
+    if hub.shared_store().is_none() {
         let message = "this server shares no object store with others (`state_directory`)";
         return Err(RpcError::precondition("NO_OBJECT_STORE", "server", message));
     }

@@ -157,7 +157,7 @@ pub(crate) async fn claim(
     session: &Arc<Session>,
     takes: bool,
 ) -> Result<(), RpcError> {
-    if hub.state.as_ref().and_then(State::shared).is_none() {
+    if hub.shared_store().is_none() {
         return Ok(());
     }
     let job = {

@@ -34,6 +34,7 @@ use crate::wire::message::plant_info::plant_info;
 use crate::wire::record::directory::Recordings;
 use crate::wire::shared::jobs::Jobs;
 use crate::wire::shared::state::State;
+use crate::wire::shared::state::store::Shared;
 use crate::wire::status::RpcError;
 
 /// Ids with which an unknown one is compared, at most.
@@ -134,6 +135,11 @@ impl Hub {
             limits,
             metrics,
         }
+    }
+
+    /// The store that other servers have too, if there is one.
+    pub fn shared_store(&self) -> Option<&dyn Shared> {
+        self.state.as_ref().and_then(State::shared)
     }
 
     /// The plant of that id, if it is there for the caller.
