@@ -14,7 +14,7 @@ pub(crate) struct Poses<S = f64> {
     pub(crate) origin: Vec<Vec3<S>>,
     /// Position of a joint relative to its parent.
     edge: Vec<Vec3<S>>,
-    /// Angles by which joints turn about their axes, and their sines and cosines.
+    /// Angles by which hinges and screws turn about their axes, in their order, and their sines and cosines.
     angles: Vec<S>,
     turns: Vec<[S; 2]>,
 }
@@ -31,13 +31,14 @@ pub(crate) struct Place<'a, S = f64> {
 impl<S: Scalar> Poses<S> {
     pub(crate) fn new(tree: &Tree) -> Self {
         let n = tree.joints.len();
+        let turns = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis()).count();
         Self {
             rotation: vec![Mat3::IDENTITY; n],
             position: vec![Vec3::ZERO; n],
             origin: vec![Vec3::ZERO; n],
             edge: vec![Vec3::ZERO; n],
-            angles: vec![S::ZERO; n],
-            turns: vec![[S::ZERO, S::ONE]; n],
+            angles: vec![S::ZERO; turns],
+            turns: vec![[S::ZERO, S::ONE]; turns],
         }
     }
 
@@ -76,12 +77,12 @@ impl<S: Scalar> Poses<S> {
     /// `OTHER`: some joint is neither revolute nor prismatic.
     #[inline(always)]
     fn walk<const OTHER: bool>(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
-        for (angle, joint) in self.angles.iter_mut().zip(&tree.joints) {
-            if matches!(joint.kind, JointKind::Revolute | JointKind::Screw(_)) {
-                *angle = q[joint.coordinate];
-            }
+        let turning = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis());
+        for (angle, joint) in self.angles.iter_mut().zip(turning) {
+            *angle = q[joint.coordinate];
         }
         S::sin_cos_of_all(&self.angles, &mut self.turns);
+        let mut turning = 0;
         for (i, joint) in tree.joints.iter().enumerate() {
             if let (true, JointKind::Ball(1 | 2)) = (OTHER, joint.kind) {
                 // The entry before has turned already.
@@ -94,9 +95,11 @@ impl<S: Scalar> Poses<S> {
                 continue;
             }
             // In the parent's frame, which nothing waits for.
-            let own = match joint.kind {
-                JointKind::Prismatic | JointKind::Ball(_) => Mat3::lift(joint.rotation),
-                _ => turned_about_z(&joint.rotation, self.turns[i]),
+            let own = if joint.kind.turns_about_axis() {
+                turning += 1;
+                turned_about_z(&joint.rotation, self.turns[turning - 1])
+            } else {
+                Mat3::lift(joint.rotation)
             };
             let (turned, mut edge) = if joint.parent == WORLD {
                 self.origin[i] = Vec3::lift(joint.translation);

@@ -21,6 +21,14 @@ pub(crate) enum JointKind {
     Ball(usize),
 }
 
+impl JointKind {
+    /// Whether its coordinate is an angle about its z axis.
+    #[inline(always)]
+    pub(crate) fn turns_about_axis(self) -> bool {
+        matches!(self, Self::Revolute | Self::Screw(_))
+    }
+}
+
 /// A moving joint with everything that is fixed to it.
 #[derive(Clone, Debug)]
 pub(crate) struct Joint {
