@@ -21,7 +21,7 @@ use crate::plant::solve::CALM;
 /// plant whose step is not the usual one (the first, or one that has to be halved) is stepped by itself.
 ///
 /// After construction steps allocate nothing, as those of plants. A step costs a plant what it costs it by itself;
-/// side by side, for each of many, half to a quarter of that.
+/// side by side, for each of many, half to a fifth of that.
 ///
 /// ```
 /// use std::sync::Arc;
