@@ -75,7 +75,7 @@ export const windowTests = ({ api, server, until, shows, watched }) => ({
         await shows(page, id);
         return page;
       };
-      // Two that have places for sure, and all others at once, which come before each other as they like.
+      // Two that have places for sure, and all others at once, in whatever order they come.
       const pages = [await open()];
       first = await processOf(browser, pages[0]);
       pages.push(await open());

@@ -77,12 +77,12 @@ impl<S: Scalar> Poses<S> {
     /// `OTHER`: some joint is neither revolute nor prismatic.
     #[inline(always)]
     fn walk<const OTHER: bool>(&mut self, tree: &Tree, q: &[S], orientations: &[Mat3<S>]) {
-        let turning = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis());
-        for (angle, joint) in self.angles.iter_mut().zip(turning) {
-            *angle = q[joint.coordinate];
+        let hinges = tree.joints.iter().filter(|joint| joint.kind.turns_about_axis());
+        for (angle, hinge) in self.angles.iter_mut().zip(hinges) {
+            *angle = q[hinge.coordinate];
         }
         S::sin_cos_of_all(&self.angles, &mut self.turns);
-        let mut turning = 0;
+        let mut hinges_before = 0;
         for (i, joint) in tree.joints.iter().enumerate() {
             if let (true, JointKind::Ball(1 | 2)) = (OTHER, joint.kind) {
                 // The entry before has turned already.
@@ -96,8 +96,9 @@ impl<S: Scalar> Poses<S> {
             }
             // In the parent's frame, which nothing waits for.
             let own = if joint.kind.turns_about_axis() {
-                turning += 1;
-                turned_about_z(&joint.rotation, self.turns[turning - 1])
+                let turn = self.turns[hinges_before];
+                hinges_before += 1;
+                turned_about_z(&joint.rotation, turn)
             } else {
                 Mat3::lift(joint.rotation)
             };

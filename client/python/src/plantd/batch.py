@@ -420,7 +420,8 @@ def rollout(
         scene=scene,
         common=common,
         extremes=extremes,
-        cost=cost, expect=expect,
+        cost=cost,
+        expect=expect,
         workers=workers,
         **stepping,
     )
