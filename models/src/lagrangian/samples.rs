@@ -14,7 +14,7 @@ use crate::model::tree::Tree;
 
 /// Models of the scenes of all elements.
 pub(crate) fn models() -> Vec<Model> {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("scenes/elements");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../scenes/elements");
     let models = std::fs::read_dir(folder).unwrap().map(|entry| {
         let text = std::fs::read_to_string(entry.unwrap().path()).unwrap();
         Model::compile(&Scene::from_toml(&text).unwrap()).unwrap()

@@ -29,7 +29,6 @@ const STAGES: &[Stage] = &[
     Stage { name: "deny", quick: false, lane: Lane::Aside, run: python::check_dependencies },
     Stage { name: "clippy", quick: true, lane: Lane::Main, run: clippy },
     Stage { name: "build", quick: true, lane: Lane::Main, run: build },
-    Stage { name: "counter", quick: true, lane: Lane::Aside, run: counter },
     Stage { name: "tests", quick: true, lane: Lane::Alone, run: tests },
     Stage { name: "wheel", quick: false, lane: Lane::Aside, run: python::try_wheel },
     Stage { name: "python", quick: false, lane: Lane::Aside, run: python::test_client },
@@ -147,12 +146,6 @@ fn build(context: &mut Context) -> Outcome {
     let built = run(&mut context.cargo(&all));
     (context.broken, context.is_built) = (built.is_err(), built.is_ok());
     built
-}
-
-/// Builds the program whose instructions the tests count: as users run it.
-fn counter(context: &mut Context) -> Outcome {
-    let counter = ["build", "--release", "--locked", "-p", "plantd-control"];
-    run(context.cargo(&counter).args(["--example", "step_count"]))
 }
 
 fn tests(context: &mut Context) -> Outcome {

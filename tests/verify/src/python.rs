@@ -156,8 +156,8 @@ pub(crate) fn test_gateway(context: &mut Context) -> Outcome {
     let found = found.map_err(|error| Failure::Failed(error.to_string()))?;
     let program = String::from_utf8_lossy(&found.stdout).trim().to_owned();
     // With the features of the whole workspace, for which it is built already.
-    let mut test = context.cargo(&["test", "--locked", "--workspace", "--test", "gateway"]);
-    test.args(["--", "--ignored"]).env("PLANTD_ENVOY", program);
+    let mut test = context.cargo(&["test", "--locked", "--workspace", "--test", "servers"]);
+    test.args(["--", "--ignored", "gateway::"]).env("PLANTD_ENVOY", program);
     run(test.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 
@@ -171,8 +171,9 @@ pub(crate) fn test_store(context: &mut Context) -> Outcome {
     if install(context, &environment, &[MOTO]).is_err() {
         return Err(Failure::Skipped(format!("there is no {MOTO} to install")));
     }
-    let mut test = context.cargo(&["test", "--locked", "--workspace", "--test", "store"]);
-    test.args(["--", "--ignored"]).env("PLANTD_MOTO", environment.join("bin/moto_server"));
+    let mut test = context.cargo(&["test", "--locked", "--workspace", "--test", "servers"]);
+    test.args(["--", "--ignored", "store::"])
+        .env("PLANTD_MOTO", environment.join("bin/moto_server"));
     run(test.env("PLANTD_BINARY_DIR", context.binaries()))
 }
 

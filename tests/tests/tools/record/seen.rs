@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 
 use plantd_tests::server::binary;
 
-use crate::{Setup, plantctl, setup};
+use super::{Setup, plantctl, setup};
 
 /// A recording of a pendulum.
 async fn recorded(setup: &Setup, name: &str) -> std::path::PathBuf {

@@ -49,7 +49,7 @@ fn tables_are_comma_separated_values_with_all_digits() {
 #[test]
 fn the_readme_s_commands_run() {
     let server = ServerProcess::start().unwrap();
-    let readme = include_str!("../../../README.md");
+    let readme = include_str!("../../../../README.md");
     let section = readme.split("## On the command line").nth(1).unwrap();
     let lines = section.split("```sh\n").nth(1).unwrap().split("```").next().unwrap().lines();
     let commands: Vec<&str> = lines.filter(|line| line.starts_with("plantctl ")).collect();

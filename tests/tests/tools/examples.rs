@@ -2,33 +2,9 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::OnceLock;
 
+use plantd_tests::example;
 use plantd_tests::server::{ServerProcess, binary};
-
-/// Builds the examples with the binaries, so that Cargo sees the same dependencies as for these and
-/// builds none of them a second time.
-fn example(name: &str) -> PathBuf {
-    static DIRECTORY: OnceLock<PathBuf> = OnceLock::new();
-    let directory = DIRECTORY.get_or_init(|| {
-        let program = std::env::current_exe().unwrap();
-        let directory = program.ancestors().nth(2).unwrap();
-        let profile = match directory.file_name().and_then(|name| name.to_str()) {
-            Some("debug") => "dev",
-            other => other.unwrap(),
-        };
-        let status = plantd_launch::cargo()
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .args(["build", "--quiet", "--workspace", "--bins", "--examples"])
-            .args(["--profile", profile, "--target-dir"])
-            .arg(directory.parent().unwrap())
-            .status()
-            .unwrap();
-        assert!(status.success(), "cannot build the examples");
-        directory.join("examples")
-    });
-    directory.join(name)
-}
 
 #[track_caller]
 fn run(name: &str) -> String {

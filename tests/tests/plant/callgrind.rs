@@ -6,7 +6,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 
@@ -193,7 +192,7 @@ const TOLERANCE: f64 = 0.05;
 const HEADER: &str = "\
 # Instructions per call, counted by callgrind from the initial configuration on; \
 riccati: per step of the recursion.
-# To renew: UPDATE_INSTRUCTIONS=1 cargo test -p plantd-tests --test callgrind
+# To renew: UPDATE_INSTRUCTIONS=1 cargo test -p plantd-tests --test plant callgrind
 
 ";
 
@@ -282,25 +281,8 @@ fn valgrind() -> Option<Valgrind> {
         eprintln!("skipped: valgrind is not installed");
         return None;
     }
-    Some(Valgrind { program: step_count() })
-}
-
-/// The program, built as it is for use: optimised like the release.
-fn step_count() -> PathBuf {
-    static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
-    let build = || {
-        let test = std::env::current_exe().expect("a test has a path");
-        let target = test.ancestors().nth(3).expect("the test is target/PROFILE/deps/NAME");
-        let status = plantd_launch::cargo()
-            .args(["build", "--quiet", "--release", "--locked", "-p", "plantd-control"])
-            .args(["--example", "step_count", "--target-dir"])
-            .arg(target)
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .status();
-        assert!(status.is_ok_and(|status| status.success()), "step_count does not build");
-        target.join("release/examples/step_count")
-    };
-    PROGRAM.get_or_init(build).clone()
+    // Tests compile the mechanics as a release does.
+    Some(Valgrind { program: plantd_tests::example("step_count") })
 }
 
 impl Valgrind {

@@ -4,7 +4,7 @@ use std::fs;
 
 use plantd_tests::server::ServerProcess;
 
-use crate::{json_lines, plantctl, text};
+use super::{json_lines, plantctl, text};
 
 #[test]
 fn a_shell_completes_names_of_the_server() {

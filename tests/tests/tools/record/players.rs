@@ -7,7 +7,7 @@ use plantd_client::v1;
 use plantd_proto::foxglove::{FrameTransforms, SceneUpdate};
 use prost::Message;
 
-use crate::setup;
+use super::setup;
 
 /// A message with its log time and its publish time, ns.
 type Timed<T> = (u64, u64, T);

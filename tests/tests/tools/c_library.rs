@@ -182,7 +182,7 @@ fn cmake_finds_the_library() {
 fn every_call_answers_as_the_headers_say() {
     let mut fixture = Fixture::new();
     let flags = fixture.flags(&["--cflags", "--libs"]);
-    let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/c_library");
+    let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/c_library");
     for (compiler, name) in [(["cc", "-std=c11"], "calls.c"), (["c++", "-std=c++20"], "calls.cpp")]
     {
         let program = fixture.compile(&compiler, &here.join(name), &flags);
