@@ -105,7 +105,7 @@ def cluster(folder):
         nodes += [node(folder, number, head) for number in range(1, NODES)]
         ray.init(address=f"127.0.0.1:{head}", _node_ip_address="127.0.0.1", log_to_driver=False)
         try:
-            wait_for(lambda: sum(one["Alive"] for one in ray.nodes()) == NODES, nodes)
+            wait_for(lambda: alive() == NODES, nodes)
             yield nodes
         finally:
             ray.shutdown()
@@ -119,6 +119,10 @@ def cluster(folder):
                 process.kill()
         for one in nodes:
             one.wait()
+
+
+def alive():
+    return sum(one["Alive"] for one in ray.nodes())
 
 
 def is_listening(port):
@@ -199,7 +203,11 @@ def main():
                 yield one
 
         measured("nodes", ray, killing())
-        told["alive"] = sum(one["Alive"] for one in ray.nodes())
+        # It takes Ray a while to believe it, longer than a short batch.
+        deadline = time.monotonic() + PATIENCE
+        while alive() == NODES and time.monotonic() < deadline:
+            time.sleep(0.05)
+        told["alive"] = alive()
     deadline = time.monotonic() + PATIENCE
     while servers() and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-CASES, STEPS = 10_000, 1000
+CASES, STEPS = 10_000, 3000
 
 
 @pytest.mark.skipif(

@@ -26,8 +26,8 @@ use crate::integrator::state::{PreciseState, add};
 use crate::kkt::planar::Elimination;
 use crate::kkt::system::Factors;
 use crate::lagrangian::arrangement::Planar;
-use crate::lagrangian::curvature::Curvature;
 use crate::lagrangian::generators::MatrixKind;
+use crate::lagrangian::mechanics::Kept;
 use crate::lagrangian::nudge::Nudge;
 use crate::lagrangian::planar::PlanarTree;
 use crate::model::mechanism::{Model, Solver};
@@ -79,8 +79,8 @@ struct Systems<const N: usize> {
     room: System<LanesOf<N>>,
     /// Whether `later` has taken the place of `first`.
     is_later: bool,
-    /// Second derivatives where those that are needed were found before; empty where none are.
-    curvature: Option<Curvature<LanesOf<N>>>,
+    /// Second derivatives where those that are needed were found before; none where none are.
+    kept: Option<Kept<LanesOf<N>>>,
     /// The smallest pivots, relative.
     pivots: LanesOf<N>,
 }
@@ -312,7 +312,7 @@ impl<const N: usize> Abreast<N> {
                 later: system(),
                 room: system(),
                 is_later: false,
-                curvature: model.is_foreseen(settings).then(|| Curvature::new(&model.dynamics)),
+                kept: model.is_foreseen(settings).then(|| Kept::new(model)),
                 pivots: LanesOf::ONE,
             },
             diagonal: zeros(),
@@ -427,21 +427,21 @@ impl<const N: usize> Abreast<N> {
     #[inline(always)]
     fn factor(&mut self, model: &Model, settings: &Settings, is_fresh: Truths<N>, is_first: bool) {
         let Self { systems, mid, diagonal, .. } = self;
-        let Systems { first, later, room, is_later, curvature, pivots } = systems;
+        let Systems { first, later, room, is_later, kept, pivots } = systems;
         if is_first {
             *is_later = false;
             *pivots = first.factor(model, settings, mid, diagonal);
             return;
         }
-        if let Some(curvature) = curvature {
-            std::mem::swap(curvature, &mut mid.mechanics.curvature);
+        if let Some(kept) = kept {
+            mid.mechanics.put_aside(kept);
         }
         let own = room.factor(model, settings, mid, diagonal);
         *pivots = LanesOf::choose(is_fresh, own, *pivots);
         if LanesOf::<N>::any(!is_fresh) {
             room.take_where(!is_fresh, if *is_later { &*later } else { &*first });
-            if let Some(curvature) = curvature {
-                mid.mechanics.curvature.take_where(!is_fresh, curvature);
+            if let Some(kept) = kept {
+                mid.mechanics.take_where(!is_fresh, kept);
             }
         }
         std::mem::swap(room, later);
@@ -479,7 +479,7 @@ impl<const N: usize> Abreast<N> {
         let h = settings.time_step_s;
         mid.write_impulse(h, impulse);
         if is_nudged {
-            nudge.move_on(model, &mid.mechanics, residual, h, |_| {}, impulse);
+            nudge.move_on(model, &mut mid.mechanics, residual, h, |_| {}, impulse);
         }
         for (solved, now) in solved.iter_mut().zip([&*increment, &*impulse]) {
             for (solved, now) in solved.iter_mut().zip(now) {

@@ -123,8 +123,10 @@ impl Workspace {
             self.push(at);
         }
         if is_guessed {
-            // The equations are linear in the multipliers: any guess is as good.
-            self.step.multipliers.copy_from_slice(&state.multipliers);
+            if model.dimensions.constraints > 0 {
+                // The equations are linear in the multipliers: any guess is as good.
+                self.step.multipliers.copy_from_slice(&state.multipliers);
+            }
             let report = self.iterate::<BODIES>(model, settings, state, false);
             if report.is_ok() {
                 return report;
@@ -344,7 +346,9 @@ impl Workspace {
 
     /// One correction with the factors at hand.
     fn correct(&mut self, model: &Model) {
-        self.residual.constraints.copy_from_slice(&self.constraints.end.value);
+        if model.dimensions.constraints > 0 {
+            self.residual.constraints.copy_from_slice(&self.constraints.end.value);
+        }
         let [r1, r2] = [&mut self.residual.dynamics, &mut self.residual.constraints];
         self.kkt.solve(model, &self.constraints.end, r1, r2);
         for (lambda, change) in self.step.multipliers.iter_mut().zip(&self.residual.constraints) {

@@ -1,6 +1,7 @@
 //! The Lagrangian of joint trees at a configuration and velocity, without springs: in the plane where the
 //! scene allows it, else in space.
 
+use plantd_math::scalar::{LanesOf, Truths};
 use plantd_math::spatial::Mat3;
 use plantd_math::tree_lu::TreeLu;
 
@@ -9,7 +10,7 @@ use crate::lagrangian::curvature::{Curvature, Entry, SecondDerivatives};
 use crate::lagrangian::forces::Instant;
 use crate::lagrangian::kinematics::Poses;
 use crate::lagrangian::momenta::Momenta;
-use crate::lagrangian::planar::PlanarTree;
+use crate::lagrangian::planar::{PlanarTree, Slopes};
 use crate::model::mechanism::Model;
 use crate::model::tree::JointKind;
 
@@ -21,6 +22,40 @@ pub(crate) struct Mechanics<S: Planar = f64> {
     pub(crate) poses: Poses<S>,
     pub(crate) momenta: Momenta<S>,
     pub(crate) curvature: Curvature<S>,
+}
+
+/// Second derivatives that are put aside, of plants side by side.
+#[derive(Clone, Debug)]
+pub(crate) struct Kept<S> {
+    curvature: Curvature<S>,
+    slopes: Vec<Slopes<S>>,
+}
+
+impl<S: Planar> Kept<S> {
+    pub(crate) fn new(model: &Model) -> Self {
+        let planar = model.planar.as_ref().map_or(0, |joints| joints.len());
+        let slopes = vec![Slopes::default(); planar];
+        Self { curvature: Curvature::new(&model.dynamics), slopes }
+    }
+}
+
+impl<const N: usize> Mechanics<LanesOf<N>> {
+    /// Puts the second derivatives aside.
+    pub(crate) fn put_aside(&mut self, kept: &mut Kept<LanesOf<N>>) {
+        match &mut self.planar {
+            Some(tree) => tree.put_aside(&mut kept.slopes),
+            None => std::mem::swap(&mut self.curvature, &mut kept.curvature),
+        }
+    }
+
+    /// Takes those that were put aside for the lanes that are said.
+    #[inline(always)]
+    pub(crate) fn take_where(&mut self, lanes: Truths<N>, kept: &Kept<LanesOf<N>>) {
+        match &mut self.planar {
+            Some(tree) => tree.take_where(lanes, &kept.slopes),
+            None => self.curvature.take_where(lanes, &kept.curvature),
+        }
+    }
 }
 
 impl<S: Planar> Mechanics<S> {

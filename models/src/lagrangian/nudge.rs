@@ -33,7 +33,8 @@ type Below<S> = (Force<S>, Vec3<S>);
 /// A small change of the motion, and what it makes of the gradient.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Nudge<S = f64> {
-    /// `a`: changes of the dynamic coordinates, of ball joints turns in their own axes.
+    /// `a`: changes of the dynamic coordinates, of ball joints turns in their own axes. In planes those of prescribed
+    /// coordinates follow, which are zero, here and in `b`.
     pub(crate) position: Vec<S>,
     /// `b`.
     pub(crate) velocity: Vec<S>,
@@ -47,22 +48,36 @@ pub(crate) struct Nudge<S = f64> {
 
 impl<S: Planar> Nudge<S> {
     pub(crate) fn new(model: &Model) -> Self {
-        let (nd, joints) = (model.dimensions.dynamic, model.dynamics.joints.len());
-        let zeros = || vec![S::ZERO; nd];
+        let nd = model.dimensions.dynamic;
+        let (changes, joints) = match &model.planar {
+            Some(_) => (model.dimensions.coordinates(), 0),
+            None => (nd, model.dynamics.joints.len()),
+        };
+        let zeros = |count: usize| vec![S::ZERO; count];
         Self {
-            position: zeros(),
-            velocity: zeros(),
-            l_q: zeros(),
-            l_v: if model.orientations.is_empty() { Vec::new() } else { zeros() },
+            position: zeros(changes),
+            velocity: zeros(changes),
+            l_q: zeros(nd),
+            l_v: zeros(if model.orientations.is_empty() { 0 } else { nd }),
             above: vec![Above::default(); joints],
             below: vec![Below::default(); joints],
         }
     }
 
-    /// Finds the changes of `L_q` and `L_v`, of the bodies alone, at the last second derivatives of a tree in
-    /// space. About 75 flops an axis.
+    /// Finds the changes of `L_q` and `L_v`, of the bodies alone, at the last second derivatives.
+    #[inline(always)]
+    pub(crate) fn find(&mut self, model: &Model, mechanics: &mut Mechanics<S>) {
+        match (&mut mechanics.planar, &model.planar) {
+            (Some(planar), Some(joints)) => {
+                planar.nudge(joints, &self.position, &self.velocity, &mut self.l_q);
+            }
+            _ => self.find_in_space(model, mechanics),
+        }
+    }
+
+    /// About 75 flops an axis.
     #[inline(never)]
-    pub(crate) fn find(&mut self, model: &Model, mechanics: &Mechanics<S>) {
+    fn find_in_space(&mut self, model: &Model, mechanics: &Mechanics<S>) {
         in_registers!(S, {
             self.ascend(&model.dynamics.joints, mechanics);
             if model.orientations.is_empty() {
@@ -152,7 +167,7 @@ fn over<S: Scalar>(above: &[Above<S>], parent: usize) -> Above<S> {
 mod tests {
     use super::*;
     use crate::lagrangian::derivatives::Derivatives;
-    use crate::lagrangian::samples::{assert_close, configuration, random_models};
+    use crate::lagrangian::samples::{self, assert_close, configuration, random_models};
     use plantd_scene::builtin;
 
     /// What comes of one pass is what the matrices make of the change.
@@ -167,36 +182,51 @@ mod tests {
             model.planar = None;
             model
         });
-        for model in built_in.into_iter().chain(random) {
-            let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
-            let (at, velocity) = configuration(&model, 1);
-            let mut mechanics = Mechanics::new(&model);
-            let [mut l_q, mut l_v] = [0; 2].map(|_| vec![0.0; nd]);
-            let gradient = [&mut l_q[..], &mut l_v[..]];
-            mechanics.gradient(&model, &at.q, &at.orientations, &velocity, gradient);
-            mechanics.differentiate(&model);
-            let mut dense = Derivatives::new(&model);
-            let inputs = vec![0.0; model.dimensions.inputs];
-            dense.evaluate(&model, (&at.q, &at.orientations), &velocity, &inputs);
+        built_in.into_iter().chain(random).for_each(|model| check(&model));
+    }
 
-            let mut nudge = Nudge::new(&model);
-            for i in 0..nd {
-                nudge.position[i] = (0.7 * i as f64 + 0.2).sin();
-                nudge.velocity[i] = (1.1 * i as f64 + 0.4).cos();
-            }
-            nudge.find(&model, &mechanics);
-            let Nudge { position: a, velocity: b, .. } = &nudge;
-            let sum = |i: usize, entry: &dyn Fn(usize, usize) -> [f64; 2]| -> f64 {
-                (0..nd).map(|j| entry(i, j)[0] * a[j] + entry(i, j)[1] * b[j]).sum()
-            };
-            let of = |i: usize| sum(i, &|i, j| [dense.l_qq[i * n + j], dense.l_qv[i * n + j]]);
-            let expected: Vec<f64> = (0..nd).map(of).collect();
-            assert_close("torque", &nudge.l_q, &expected);
-            let of = |i: usize| sum(i, &|i, j| [dense.l_qv[j * n + i], dense.l_vv[i * n + j]]);
-            for &i in model.orientations.iter().filter(|i| **i < nd) {
-                let expected: Vec<f64> = (i..i + 3).map(of).collect();
-                assert_close("momentum", &nudge.l_v[i..i + 3], &expected);
-            }
+    /// The same in planes: one joint, chains, sliders, branches, prescribed joints, each way that joints lie.
+    #[test]
+    fn in_planes_too() {
+        let names = ["pendulum", "double-pendulum", "cart-pole", "chain-4", "chain-7"];
+        let built_in = names.map(|name| Model::compile(&builtin::scene(name).unwrap()).unwrap());
+        let planes = [(12, ""), (3, ""), (7, ""), (12, "kind = \"prescribed\"")];
+        for model in built_in.into_iter().chain(planes.map(|(n, extra)| samples::oblique(n, extra)))
+        {
+            assert!(model.planar.is_some(), "{} joints", model.dynamics.joints.len());
+            check(&model);
+        }
+    }
+
+    fn check(model: &Model) {
+        let (nd, n) = (model.dimensions.dynamic, model.dimensions.coordinates());
+        let (at, velocity) = configuration(model, 1);
+        let mut mechanics = Mechanics::new(model);
+        let [mut l_q, mut l_v] = [0; 2].map(|_| vec![0.0; nd]);
+        let gradient = [&mut l_q[..], &mut l_v[..]];
+        mechanics.gradient(model, &at.q, &at.orientations, &velocity, gradient);
+        mechanics.differentiate(model);
+        let mut dense = Derivatives::new(model);
+        let inputs = vec![0.0; model.dimensions.inputs];
+        dense.evaluate(model, (&at.q, &at.orientations), &velocity, &inputs);
+
+        let mut nudge = Nudge::new(model);
+        for i in 0..nd {
+            nudge.position[i] = (0.7 * i as f64 + 0.2).sin();
+            nudge.velocity[i] = (1.1 * i as f64 + 0.4).cos();
+        }
+        nudge.find(model, &mut mechanics);
+        let Nudge { position: a, velocity: b, .. } = &nudge;
+        let sum = |i: usize, entry: &dyn Fn(usize, usize) -> [f64; 2]| -> f64 {
+            (0..nd).map(|j| entry(i, j)[0] * a[j] + entry(i, j)[1] * b[j]).sum()
+        };
+        let of = |i: usize| sum(i, &|i, j| [dense.l_qq[i * n + j], dense.l_qv[i * n + j]]);
+        let expected: Vec<f64> = (0..nd).map(of).collect();
+        assert_close("torque", &nudge.l_q, &expected);
+        let of = |i: usize| sum(i, &|i, j| [dense.l_qv[j * n + i], dense.l_vv[i * n + j]]);
+        for &i in model.orientations.iter().filter(|i| **i < nd) {
+            let expected: Vec<f64> = (i..i + 3).map(of).collect();
+            assert_close("momentum", &nudge.l_v[i..i + 3], &expected);
         }
     }
 }

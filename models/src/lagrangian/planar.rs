@@ -26,9 +26,11 @@
 //! [`Momenta`]: crate::lagrangian::momenta::Momenta
 //! [`Curvature`]: crate::lagrangian::curvature::Curvature
 
+mod nudge;
+
 use std::ops::Range;
 
-use plantd_math::scalar::{Scalar, in_registers};
+use plantd_math::scalar::{Compared, LanesOf, Scalar, Truths, in_registers};
 use plantd_math::tree_lu::TreeLu;
 
 use crate::lagrangian::arrangement::{Arrangement, Fours, Ones, Planar, one2, one3, put2};
@@ -102,6 +104,30 @@ impl<S: Planar> PlanarTree<S> {
     }
 }
 
+impl<const N: usize> PlanarTree<LanesOf<N>> {
+    fn links(&mut self) -> &mut [Links<LanesOf<N>>] {
+        match self {
+            Self::Few(tree) | Self::Many(tree) => &mut tree.links,
+        }
+    }
+
+    /// Puts aside what the last [`PlanarTree::differentiate`] has found.
+    pub(crate) fn put_aside(&mut self, kept: &mut [Slopes<LanesOf<N>>]) {
+        for (kept, link) in kept.iter_mut().zip(self.links()) {
+            kept.0 = link.slopes().map(|number| *number);
+        }
+    }
+
+    /// Takes what was put aside for the lanes that are said.
+    pub(crate) fn take_where(&mut self, lanes: Truths<N>, kept: &[Slopes<LanesOf<N>>]) {
+        for (kept, link) in kept.iter().zip(self.links()) {
+            for (own, kept) in link.slopes().into_iter().zip(&kept.0) {
+                *own = LanesOf::choose(lanes, *kept, *own);
+            }
+        }
+    }
+}
+
 impl PlanarTree {
     /// The joints of a tree of more than a few.
     pub(crate) fn many(&self) -> Option<&Joints<Fours>> {
@@ -168,6 +194,17 @@ struct Links<P> {
     weight: P,
 }
 
+/// What [`Joints::differentiate`] finds of a joint, put aside.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Slopes<P>([P; 7]);
+
+impl<S: Compared> Links<S> {
+    fn slopes(&mut self) -> [&mut S; 7] {
+        let ([n, x, y], [m, px, py]) = (self.force.each_mut(), self.slope.each_mut());
+        [n, x, y, m, px, py, &mut self.weight]
+    }
+}
+
 /// What a joint passes on to those below it: sine and cosine of the angle of its body, the angular velocity,
 /// and its own velocity.
 #[derive(Clone, Copy, Debug)]
@@ -198,6 +235,8 @@ pub(crate) struct Joints<A: Arrangement> {
     links: Vec<Links<A::Several>>,
     /// Momentum and first moment of mass, joint by joint, to the end of the last block.
     sums: Vec<[A::Number; 4]>,
+    /// What changes above each joint make of its torque; used by [`PlanarTree::nudge`] alone.
+    from_above: Vec<A::Several>,
     /// Sums over children that do not follow their parent in the list; zero but within a pass.
     branches: Vec<Below<A::Number>>,
     inertia_of_branches: Vec<A::Number>,
@@ -229,6 +268,7 @@ impl<A: Arrangement> Joints<A> {
         Self {
             links: vec![Links::default(); n.div_ceil(A::COUNT)],
             sums: vec![[A::Number::ZERO; 4]; n.next_multiple_of(A::COUNT)],
+            from_above: vec![A::Several::ZERO; n.div_ceil(A::COUNT)],
             branches: vec![Below::NONE; n],
             inertia_of_branches: vec![A::Number::ZERO; n],
             positions: vec![[A::Number::ZERO; 2]; n],

@@ -151,15 +151,20 @@ impl PreciseState {
         collocation: Option<&Collocation>,
         h: f64,
     ) {
-        let nd = model.dimensions.dynamic;
+        let d = model.dimensions;
+        let nd = d.dynamic;
         add(&mut self.q[..nd], &mut self.q_low, &workspace.step.increment);
         add(&mut self.p, &mut self.p_low, &workspace.step.impulse);
-        self.q[nd..].copy_from_slice(&workspace.step.q_end[nd..]);
+        if d.prescribed > 0 {
+            self.q[nd..].copy_from_slice(&workspace.step.q_end[nd..]);
+            self.v.copy_from_slice(&workspace.mid.velocity[nd..]);
+        }
         if !model.orientations.is_empty() {
             workspace.turn(model, self);
         }
-        self.v.copy_from_slice(&workspace.mid.velocity[nd..]);
-        self.multipliers.copy_from_slice(&workspace.step.multipliers);
+        if d.constraints > 0 {
+            self.multipliers.copy_from_slice(&workspace.step.multipliers);
+        }
         match collocation {
             Some(collocation) => self.past.record_stages(&collocation.motion),
             None => {

@@ -151,7 +151,10 @@ fn build(context: &mut Context) -> Outcome {
 fn tests(context: &mut Context) -> Outcome {
     context.must_build()?;
     let mut command = if tools::has("cargo", &["nextest", "--version"]) {
-        context.cargo(&["nextest", "run", "--workspace", "--locked"])
+        let processors = std::thread::available_parallelism().map_or(1, usize::from);
+        let mut command = context.cargo(&["nextest", "run", "--workspace", "--locked"]);
+        command.args(["--profile", "verify", "--test-threads"]).arg((2 * processors).to_string());
+        command
     } else {
         say("cargo-nextest is not installed: cargo test runs the tests");
         let mut command = context.cargo(&["test", "--workspace", "--locked", "--no-fail-fast"]);

@@ -11,52 +11,11 @@ use crate::integrator::settings::Settings;
 use crate::kkt::planar::Diagonal;
 use crate::kkt::system::Recursion;
 use crate::lagrangian::planar::PlanarTree;
+use crate::lagrangian::samples::{oblique, wave};
 use crate::linearization::linearize::Linearization;
 use crate::model::mechanism::{Model, Solver};
 use crate::plant::facade::Plant;
 use crate::plant::initial::Initial;
-
-/// A number between −1 and 1 that looks random.
-fn wave(i: usize) -> f64 {
-    (12.9898 * i as f64 + 0.3).sin()
-}
-
-/// Trees in oblique planes: hinges both ways about, sliders, bodies off the plane, two roots, and a floating
-/// base of massless joints. `extra` goes on the coordinates.
-fn oblique(n: usize, extra: &str) -> Model {
-    let mut text = "format = 1\nname = \"oblique\"\ngravity = [1.0, -2.0, -9.0]\n".to_owned();
-    for i in 0..n {
-        let number = |k| wave(17 * i + k);
-        let (parent, turn) = match i {
-            0 | 5 => ("world".to_owned(), format!("[{}, {}, {}]", number(0), number(1), number(2))),
-            // A floating base, and what hangs from it; then branches.
-            1..5 => (format!("f{}", i - 1), format!("[0.0, 0.0, {}]", number(2))),
-            _ => (format!("f{}", 5 + (i - 6) / 2), format!("[0.0, 0.0, {}]", number(2))),
-        };
-        let joint = match i {
-            0 | 1 => format!("type = \"prismatic\", axis = [{}, {}, 0.0]", number(3), number(4)),
-            _ if i % 4 == 3 => "type = \"revolute\", axis = [0.0, 0.0, -1.0]".to_owned(),
-            _ if i % 7 == 6 => "type = \"prismatic\", axis = [0.6, 0.8, 0.0]".to_owned(),
-            _ => "type = \"revolute\", axis = [0.0, 0.0, 1.0]".to_owned(),
-        };
-        let offset = format!("[{}, {}, {}]", number(5), number(6), number(7));
-        text += &format!(
-            "[[frames]]\nname = \"f{i}\"\nparent = \"{parent}\"\ntranslation = {offset}\n\
-             rotation = {{ rpy = {turn} }}\njoint = {{ {joint} }}\n"
-        );
-        if i > 1 {
-            let center = format!("[{}, {}, {}]", number(8), number(9), number(10));
-            text += &format!(
-                "body = {{ mass = {}, center_of_mass = {center}, inertia = [0.2, 0.3, 0.4, 0.01, 0.02, 0.03] }}\n",
-                1.0 + number(11)
-            );
-        }
-    }
-    for i in 0..n {
-        text += &format!("[[coordinates]]\nname = \"f{i}\"\ninitial = {}\n{extra}\n", wave(i));
-    }
-    Model::compile(&Scene::from_toml(&text).unwrap()).unwrap()
-}
 
 fn assert_close(a: f64, b: f64, scale: f64, what: &str) {
     assert!((a - b).abs() <= 1e-13 * scale, "{what}: {a} {b} of {scale}");
