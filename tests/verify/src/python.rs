@@ -65,11 +65,7 @@ fn wheels(context: &Context) -> PathBuf {
 pub(crate) fn test_client(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment(context)?;
-    // What it needs, and then the package itself, with the server inside if the stage before has made that wheel.
-    install(context, &environment, &["client/python[test]"])?;
-    if let Some(wheel) = wheel_in(&wheels(context)) {
-        install(context, &environment, &["--no-deps", "--force-reinstall", &wheel])?;
-    }
+    install_client(context, &environment, "[test]")?;
     let mut test = Command::new(environment.join("bin/python"));
     test.args(["-m", "pytest", "client/python/tests"]).current_dir(&context.root);
     run(test.env("PLANTD_SERVER", context.binaries().join("plantd")))?;
@@ -101,18 +97,23 @@ pub(crate) fn make_book(context: &mut Context) -> Outcome {
         .to_str()
         .is_some_and(|python| tools::has(python, &["-c", "import plantd.gym, plantd.link"]))
     {
-        pip("client/python[gym,link]")?;
+        install_client(context, &environment, "[gym,link]")?;
     }
     let mut book = Command::new(python);
     book.arg("docs/book.py").arg("--binaries").arg(context.binaries());
     run(book.arg("--output").arg(context.target.join("book")).current_dir(&context.root))
 }
 
-/// The wheel in a folder.
-fn wheel_in(folder: &Path) -> Option<String> {
-    let files = folder.read_dir().ok()?.flatten().map(|entry| entry.path());
-    let wheel = files.into_iter().find(|path| path.extension().is_some_and(|end| end == "whl"))?;
-    wheel.to_str().map(str::to_owned)
+/// Installs the Python package with some of its extras; with the server inside, if the stage before has made that wheel.
+fn install_client(context: &Context, environment: &Path, extras: &str) -> Outcome {
+    let files = wheels(context).read_dir().into_iter().flatten().flatten().map(|file| file.path());
+    let wheel = files.into_iter().find(|path| path.extension().is_some_and(|end| end == "whl"));
+    let Some(wheel) = wheel.as_deref().and_then(Path::to_str) else {
+        return install(context, environment, &[&format!("client/python{extras}")]);
+    };
+    // What it needs, and then the package itself, which may be there as it was before a change.
+    install(context, environment, &[&format!("{wheel}{extras}")])?;
+    install(context, environment, &["--no-deps", "--force-reinstall", wheel])
 }
 
 /// Robots and the engines that they are compared with; what cannot be had is told.
@@ -126,7 +127,7 @@ const PEERS: [(&str, &[&str], &[&str]); 3] = [
 pub(crate) fn compare_robots(context: &mut Context) -> Outcome {
     context.must_build()?;
     let environment = environment(context)?;
-    install(context, &environment, &["client/python"])?;
+    install_client(context, &environment, "")?;
     let mut absent = Vec::new();
     for (script, packages, flags) in PEERS {
         if install(context, &environment, packages).is_err() {
